@@ -13,7 +13,6 @@ from refusals import refusal
 
 from vehest.constants import FloatArray
 from vehest.data.errors import ConfigurationError
-from vehest.data.recording import Recording
 from vehest.sources.unit_spellings import plain_unit
 
 asammdf = pytest.importorskip("asammdf", reason="the measurements of these tests are written by asammdf")
@@ -57,12 +56,8 @@ def one(file: Path, t: FloatArray, samples: Any, unit: str = "m/s", **more: Any)
     return write_mdf(file, {"Only": [signal("v", t, samples, unit, **more)]})
 
 
-def read(file: Path, **options: Any) -> Recording:
-    return read_mdf(file, **{"channels": CHANNELS, **options})
-
-
 def refused(file: Path, **options: Any) -> str:
-    message = refusal(lambda: read(file, **options))
+    message = refusal(lambda: read_mdf(file, **options))
     assert file.name in message
     return message
 
@@ -86,7 +81,7 @@ def tidy(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Any:
 
 
 def test_three_rasters_come_to_one_clock_as_their_formulas_say(drive: Path) -> None:
-    recording = read(drive, vehicle="kart", citation="me")
+    recording = read_mdf(drive, channels=CHANNELS, vehicle="kart", citation="me")
     assert (recording.rate_hz, recording.start_time, recording.vehicle) == (100.0, 0.52, "kart")  # ticks count from the measurement's start
     assert len(recording) == round((19.49 - 0.52) * 100) + 1
     t = recording.time
@@ -100,19 +95,19 @@ def test_three_rasters_come_to_one_clock_as_their_formulas_say(drive: Path) -> N
 
 
 def test_the_clock_of_a_channel_can_be_taken_as_it_is(drive: Path) -> None:
-    recording = read(drive, rate_hz=None, raster="yaw_rate", accept=["aliasing"])
+    recording = read_mdf(drive, channels=CHANNELS, rate_hz=None, raster="yaw_rate", accept=["aliasing"])
     assert (recording.rate_hz, recording.start_time, len(recording)) == (50.0, SLOW[0], len(SLOW))
     np.testing.assert_array_equal(recording["yaw_rate"], np.radians(1.0) * np.degrees(yaw_rate(SLOW)))
     np.testing.assert_allclose(recording["vx"], speed(SLOW), rtol=0, atol=0.01**2 / 8 * 1.0)
-    assert "group 2 'Imu', whose clock is taken, does not come evenly: " in refused(drive, rate_hz=None, raster="ay")
+    assert "group 2 'Imu', whose clock is taken, does not come evenly: " in refused(drive, channels=CHANNELS, rate_hz=None, raster="ay")
 
 
 def test_a_name_in_several_groups_needs_its_group(drive: Path) -> None:
     without = {**CHANNELS, "vx": {"column": "VehSpd", "unit": "km/h"}}
     message = refused(drive, channels=without)
     assert "signal 'VehSpd' stands in several groups: 0 'Powertrain', 1 'Gateway'; say which" in message
-    by_number = read(drive, channels={**CHANNELS, "vx": {"column": "VehSpd", "unit": "km/h", "group": 1}})
-    np.testing.assert_allclose(by_number["vx"], read(drive)["vx"] * 3.7 / 3.6, rtol=1e-4)
+    by_number = read_mdf(drive, channels={**CHANNELS, "vx": {"column": "VehSpd", "unit": "km/h", "group": 1}})
+    np.testing.assert_allclose(by_number["vx"], read_mdf(drive, channels=CHANNELS)["vx"] * 3.7 / 3.6, rtol=1e-4)
     message = refused(drive, channels={**CHANNELS, "vx": {"column": "VehSpd", "unit": "km/h", "group": 2}})
     assert "signal 'VehSpd' is not in group '2', but in 0 'Powertrain', 1 'Gateway'" in message
 
@@ -121,7 +116,7 @@ def test_an_absent_signal_is_answered_with_near_ones(drive: Path, tmp_path: Path
     assert "has no signal 'Vehspeed' (near it: VehSpd)" in refused(drive, channels={"vx": {"column": "Vehspeed", "unit": "km/h"}})
     assert "has no signal 'time'" in refused(drive, channels={"vx": {"column": "time", "unit": "km/h"}})  # a master is no signal
     frames = write_mdf(tmp_path / "bus.mf4", {"CAN": [signal("CAN_DataFrame.ID", FAST, FAST)]})
-    assert "undecoded frames of a bus" in refused(frames, channels=ONE)
+    assert "undecoded frames of a bus" in refused(frames)
 
 
 @pytest.mark.parametrize(
@@ -138,7 +133,7 @@ def test_an_absent_signal_is_answered_with_near_ones(drive: Path, tmp_path: Path
     ids=["linear", "table", "rational"],
 )
 def test_physical_values_are_read(tmp_path: Path, raw: Any, conversion: Any, physical: FloatArray) -> None:
-    recording = read(one(tmp_path / "a.mf4", FAST, raw, conversion=conversion), channels=ONE)
+    recording = read_mdf(one(tmp_path / "a.mf4", FAST, raw, conversion=conversion))
     np.testing.assert_allclose(recording["vx"], physical, rtol=1e-12)
 
 
@@ -147,25 +142,25 @@ def test_text_is_refused(tmp_path: Path) -> None:
     table = one(tmp_path / "a.mf4", FAST, np.arange(2001) % 2, conversion=gear)
     plain = one(tmp_path / "b.mf4", FAST, np.array([b"on"] * 2001), encoding="utf-8")
     for file in (table, plain):
-        assert "signal 'v' of group 0 'Only' holds text; numbers are needed" in refused(file, channels=ONE)
+        assert "signal 'v' of group 0 'Only' holds text; numbers are needed" in refused(file)
     rows = one(tmp_path / "c.mf4", FAST, np.zeros(2001, dtype=[("v", "(3,)<f8")]))
-    assert "holds an array or structure" in refused(rows, channels=ONE)
+    assert "holds an array or structure" in refused(rows)
 
 
 @pytest.mark.parametrize("version", ["2.14", "3.30"])
 def test_other_versions_of_the_format_are_read(tmp_path: Path, drive: Path, version: str) -> None:
-    recording = read(write_mdf(tmp_path / "a.mf4", GROUPS, version))
-    for name, samples in read(drive).channels.items():
+    recording = read_mdf(write_mdf(tmp_path / "a.mf4", GROUPS, version), channels=CHANNELS)
+    for name, samples in read_mdf(drive, channels=CHANNELS).channels.items():
         np.testing.assert_allclose(recording[name], samples, rtol=1e-9, atol=1e-9)
 
 
 def test_a_unit_that_the_file_contradicts_is_refused(tmp_path: Path) -> None:
     file = one(tmp_path / "a.mf4", FAST, FAST, "km/h")
-    message = refused(file, channels=ONE)
+    message = refused(file)
     assert "signal 'v' of group 0 'Only', for channel 'vx', is in 'km/h' by the file and in 'm/s' by conf/dataset" in message
     assert "set file_units: ignore" in message
-    np.testing.assert_allclose(read(file, channels=ONE, file_units="ignore")["vx"], FAST)
-    np.testing.assert_allclose(read(file, channels={"vx": {**ONE["vx"], "factor": 0.5}})["vx"], 0.5 * FAST)
+    np.testing.assert_allclose(read_mdf(file, file_units="ignore")["vx"], FAST)
+    np.testing.assert_allclose(read_mdf(file, channels={"vx": {**ONE["vx"], "factor": 0.5}})["vx"], 0.5 * FAST)
 
 
 @pytest.mark.parametrize(
@@ -186,17 +181,17 @@ def test_spellings_are_known_where_they_mean_one_thing(text: str, plain: str | N
 
 def test_disordered_time_stamps_are_refused_with_their_group(tmp_path: Path) -> None:
     stamps = np.concatenate([FAST[:50], FAST[49:]])
-    message = refused(one(tmp_path / "a.mf4", stamps, np.ones(len(stamps))), channels=ONE)
+    message = refused(one(tmp_path / "a.mf4", stamps, np.ones(len(stamps))))
     assert "signal 'v' of group 0 'Only': time repeats 1 times, first at sample 50 (0.49 s)" in message
 
 
 def test_a_long_gap_must_be_declared(tmp_path: Path) -> None:
     kept = np.delete(FAST, np.s_[500:530])
     file = one(tmp_path / "a.mf4", kept, 3.0 * kept)
-    message = refused(file, channels=ONE)
+    message = refused(file)
     assert "group 0 'Only', for channel 'vx', has a gap of 0.31 s after 4.99 s, the longest of 1 above 0.03 s" in message
     assert "a gap of" in refused(file, channels={"vx": {**ONE["vx"], "max_gap": 0.3}})
-    bridged = read(file, channels={"vx": {**ONE["vx"], "max_gap": 0.31}})
+    bridged = read_mdf(file, channels={"vx": {**ONE["vx"], "max_gap": 0.31}})
     np.testing.assert_allclose(bridged["vx"], 3.0 * bridged.time, rtol=0, atol=1e-12)
 
 
@@ -204,8 +199,8 @@ def test_invalid_samples_are_missing_values(tmp_path: Path) -> None:
     bits = (np.arange(2001) >= 500) & (np.arange(2001) < 520)
     values = np.where(bits, 1e6, 10.0 + FAST)  # what stands at an invalid sample must never be seen
     file = one(tmp_path / "a.mf4", FAST, values, invalidation_bits=bits)
-    assert "holds 20 samples between 5 s and 5.19 s that are marked invalid" in refused(file, channels=ONE)
-    recording = read(file, channels=ONE, gappy=["vx"])
+    assert "holds 20 samples between 5 s and 5.19 s that are marked invalid" in refused(file)
+    recording = read_mdf(file, gappy=["vx"])
     expected = np.where(bits, np.nan, 10.0 + FAST)
     np.testing.assert_allclose(recording["vx"], expected, rtol=1e-12)
 
@@ -213,7 +208,7 @@ def test_invalid_samples_are_missing_values(tmp_path: Path) -> None:
 def test_a_slow_gappy_signal_stands_at_its_nearest_ticks_and_nowhere_else(tmp_path: Path) -> None:
     slow = 0.003 + np.arange(1, 15)  # a GNSS at 1 Hz, 3 ms late, from 1 s to 14 s
     file = write_mdf(tmp_path / "a.mf4", {"A": [signal("v", FAST, FAST)], "G": [signal("w", slow, slow)]})
-    recording = read(file, channels={**ONE, "vx_ref": {"column": "w", "unit": "m/s"}}, gappy=["vx_ref"])
+    recording = read_mdf(file, channels={**ONE, "vx_ref": {"column": "w", "unit": "m/s"}}, gappy=["vx_ref"])
     assert len(recording) == 2001  # it does not shorten the recording
     measured = np.flatnonzero(~np.isnan(recording["vx_ref"]))
     np.testing.assert_array_equal(measured, 100 * np.arange(1, 15))
@@ -230,6 +225,6 @@ def test_a_slow_gappy_signal_stands_at_its_nearest_ticks_and_nowhere_else(tmp_pa
     ],
 )
 def test_a_misspelt_data_set_is_refused_in_one_line(tmp_path: Path, changes: dict[str, Any], said: str) -> None:
-    message = refusal(lambda: read(tmp_path / "a.mf4", **changes), ConfigurationError)
+    message = refusal(lambda: read_mdf(tmp_path / "a.mf4", **{"channels": CHANNELS, **changes}), ConfigurationError)
     assert said in message
     assert "data set 'mine'" in message
