@@ -201,9 +201,11 @@ def _rosbag(folder: Path) -> Arrays:
 
 
 def _mdf(folder: Path) -> Arrays:
-    from fuzz.families.mdf import DECLARED, _signals, _write
+    from mdf_log import write_mdf
 
-    _write(folder / "lap.mf4", _signals())
+    from fuzz.families.mdf import DECLARED, signals
+
+    write_mdf(folder / "lap.mf4", {"Only": signals()})
     return _channels(open_source(DECLARED | {"path": str(folder)}).read("lap"))
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -122,14 +121,12 @@ def _messages(recording: Recording) -> dict[str, tuple[int, bool, list[bytes]]]:
     for name, signals in values.items():
         message = database.get_message_by_name(name)
         counts = any(signal.name == "Counter" for signal in message.signals)
-        frames = [message.encode(row | ({"Counter": k % 16} if counts else {}), strict=False) for k, row in enumerate(_rows(signals))]
+        frames = []
+        for k in range(len(recording)):
+            row = {signal: float(values[k]) for signal, values in signals.items()}
+            frames.append(message.encode(row | ({"Counter": k % 16} if counts else {}), strict=False))
         found[name] = (message.frame_id, message.is_extended_frame, frames)
     return found
-
-
-def _rows(signals: dict[str, Any]) -> Iterator[dict[str, float]]:
-    for values in zip(*signals.values(), strict=True):
-        yield dict(zip(signals, map(float, values), strict=True))
 
 
 def ferrari(start: float, stop: float) -> Recording:

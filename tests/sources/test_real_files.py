@@ -1,4 +1,4 @@
-"""The publishers' CSV files as they lie: rows, runs, values; skipped where they are not at hand."""
+"""What the publishers' files say of their own sensors; their readings are recorded in tests/golden."""
 
 from __future__ import annotations
 
@@ -17,15 +17,9 @@ def source_of(name: str, data_root: Path) -> Source:
     return open_source(compose_config("ingest", [f"dataset={name}", f"root={data_root}"])["dataset"])
 
 
-@pytest.mark.parametrize(
-    ("dataset", "rate", "seconds"), [("ferrari_250lm_unlabelled", 20.0, [406.3, 208.0, 310.7, 387.9]), ("av21", 25.0, [671.6, 475.9])]
-)
-def test_drives_without_a_reference_or_without_lateral_acceleration_are_read(
-    data_root: Path, dataset: str, rate: float, seconds: list[float]
-) -> None:
+@pytest.mark.parametrize("dataset", ["ferrari_250lm_unlabelled", "av21"])
+def test_drives_without_a_reference_or_without_lateral_acceleration_are_read(data_root: Path, dataset: str) -> None:
     recordings = list(source_of(dataset, data_root).recordings())
-    assert {recording.rate_hz for recording in recordings} == {rate}
-    assert [recording.duration for recording in recordings] == pytest.approx(seconds, abs=0.1)
     assert not [f for recording in recordings for f in checks_of_recording(recording) if f.level == "error"]
     for recording in recordings:
         moving, angle = recording["vx"] > 8.0, "handwheel" if "handwheel" in recording else "steer"
@@ -38,8 +32,6 @@ def test_drives_without_a_reference_or_without_lateral_acceleration_are_read(
 
 def test_roboracer_runs_restart_and_are_scored_by_their_poses(data_root: Path) -> None:
     recordings = {recording.id: recording for recording in source_of("roboracer", data_root).recordings()}
-    assert [len(recording) for recording in recordings.values()] == [698, 940, 443, 448, 492, 297, 226, 180]
-    assert {recording.rate_hz for recording in recordings.values()} == {20.0}
     table = pd.read_csv(data_root / "roboracer" / "ftg_stanley_total_training.csv").iloc[1639:2082]
     run = recordings["ftg_stanley_total_training_run_2"]
     np.testing.assert_allclose(run["yaw_rate"], np.radians(table["yaw_rate"]), rtol=1e-12)
@@ -55,9 +47,7 @@ def test_roboracer_runs_restart_and_are_scored_by_their_poses(data_root: Path) -
 
 def test_dart_sensors_agree_with_its_poses_once_held_values_and_latency_are_taken_off(data_root: Path) -> None:
     source = source_of("dart", data_root)
-    assert len(source.ids()) == 19
     recording = source.read("car_1_Datarecording_09_16_2024_10_02_28")
-    assert recording.rate_hz == 100.0
     assert recording.provenance["held"]["rate_hz"] == pytest.approx(10.0, abs=0.05)
     moving = recording["vx_ref"] > 0.3
     gyro, reference = recording["yaw_rate"][moving], recording["yaw_rate_ref"][moving]
@@ -70,11 +60,3 @@ def test_dart_sensors_agree_with_its_poses_once_held_values_and_latency_are_take
     fast = drift["vx_ref"] > 0.5
     assert 50.0 < np.degrees(np.abs(drift["sideslip_ref"][fast])).max() < 65.0
     assert not [f for one in (recording, drift) for f in checks_of_recording(one) if f.level == "error"]
-
-
-def test_the_column_slip_angle_is_the_front_axles_and_not_the_sideslip(data_root: Path) -> None:
-    table = pd.read_csv(data_root / "f1tenth" / "xray_duck_all_test.csv")
-    sideslip = np.arctan2(table["v_y"], table["v_x"])
-    front = np.arctan2(table["v_y"] + 0.165 * table["r"], table["v_x"]) - table["delta"]
-    assert np.corrcoef(table["slip_angle"], front)[0, 1] > 0.995
-    assert np.corrcoef(table["slip_angle"], sideslip)[0, 1] < 0.5

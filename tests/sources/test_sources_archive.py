@@ -9,8 +9,8 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from refusals import refusal
 
-from vehest.data.errors import DataError
 from vehest.data.limits import Limits, use_limits
 from vehest.sources.archive import unpacked
 
@@ -35,13 +35,10 @@ def packed(folder: Path, content: dict[str, bytes], name: str = "bag.zip") -> Pa
     return file
 
 
-def refusal(file: Path, **limits: int) -> str:
+def refused(file: Path, **limits: int) -> str:
     before = sorted(file.parent.rglob("*"))
-    with pytest.raises(DataError) as error, unpacked(file, **limits):
-        pytest.fail("it was unpacked")
-    message = str(error.value)
+    message = refusal(unpacked(file, **limits).__enter__)
     assert str(file) in message
-    assert message.isprintable()  # no line breaks, no control characters of an entry's name
     assert sorted(file.parent.rglob("*")) == before
     return message
 
@@ -56,7 +53,7 @@ def test_what_was_packed_comes_out_and_is_gone_afterwards(tmp_path: Path) -> Non
 
 @pytest.mark.parametrize("name", ["../evil", "/etc/evil", "C:\\evil", "a/\x1b[2J"])
 def test_a_name_that_leaves_the_folder_is_refused(tmp_path: Path, name: str) -> None:
-    message = refusal(packed(tmp_path, {"bag/metadata.yaml": b"", name: b"evil"}))
+    message = refused(packed(tmp_path, {"bag/metadata.yaml": b"", name: b"evil"}))
     assert "is no file inside the folder" in message
     assert not (tmp_path.parent / "evil").exists()
 
@@ -68,13 +65,13 @@ def test_links_and_special_files_are_refused(tmp_path: Path, kind: int) -> None:
         entry = zipfile.ZipInfo("bag/data.db3")
         entry.external_attr = (kind | 0o777) << 16
         archive.writestr(entry, "/etc/passwd")
-    assert "is no file inside the folder" in refusal(file)
+    assert "is no file inside the folder" in refused(file)
 
 
 def test_more_bytes_or_entries_than_the_limit_are_refused(tmp_path: Path) -> None:
     file = packed(tmp_path, {"zeros": bytes(10**6), "more": bytes(10**6)})
     assert file.stat().st_size < 10**4
-    assert "0.002 GB unpacked, more than the limit of 10000 entries and 0.0015 GB" in refusal(file, most_bytes=1_500_000)
+    assert "0.002 GB unpacked, more than the limit of 10000 entries and 0.0015 GB" in refused(file, most_bytes=1_500_000)
     with unpacked(file, most_bytes=2_000_000) as folder:
         assert (folder / "more").stat().st_size == 10**6
 
@@ -85,15 +82,15 @@ def test_an_archive_that_understates_its_size_is_refused(tmp_path: Path) -> None
     for at in (raw.index(b"PK\x03\x04") + 22, raw.index(b"PK\x01\x02") + 24):
         raw[at : at + 4] = (10).to_bytes(4, "little")
     file.write_bytes(raw)
-    assert "not a sound zip archive" in refusal(file)
+    assert "not a sound zip archive" in refused(file)
 
 
 def test_what_an_archive_says_of_its_sizes_is_held_against_its_own_size(tmp_path: Path) -> None:
     file = packed(tmp_path, {"zeros": bytes(80 * 2**20)})
-    assert "0.0839 GB unpacked, more than the limit of 10000 entries and 0.0671 GB" in refusal(file)
+    assert "0.0839 GB unpacked, more than the limit of 10000 entries and 0.0671 GB" in refused(file)
 
 
 def test_a_list_of_entries_longer_than_the_limit_is_not_read(tmp_path: Path) -> None:
     file = packed(tmp_path, {f"{k:0100d}": b"" for k in range(200)})
     with use_limits(Limits(text_bytes=10_000)):
-        assert "holds a list of entries of" in refusal(file)
+        assert "holds a list of entries of" in refused(file)

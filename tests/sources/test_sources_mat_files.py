@@ -8,35 +8,25 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from refusals import refusal
 from scipy.io import savemat
 
-from vehest.data.errors import DataError
 from vehest.data.limits import Limits, use_limits
 from vehest.sources.columns import Column
 from vehest.sources.readers.mat_files import read_channels
 from vehest.sources.revs.mat_layout import read_mat_columns
 
 
-def refusal(file: Path) -> str:
-    with pytest.raises(DataError) as error:
-        read_mat_columns(file, ["vxCG"], Column("time", "s"))
-    assert "\n" not in str(error.value)
-    return str(error.value)
+def refused(file: Path) -> str:
+    return refusal(lambda: read_mat_columns(file, ["vxCG"], Column("time", "s")))
 
 
-@pytest.mark.parametrize(("dtype", "compressed"), [("f8", False), ("u8", True)])
-def test_numbers_of_every_type_come_back_as_doubles(tmp_path: Path, dtype: str, compressed: bool) -> None:
-    long = np.arange(1000).astype(dtype)
-    channels = {
-        "column": {"value": long[:, None], "time": np.arange(1000.0)[:, None]},
-        "one": {"value": np.ones((1, 1), dtype), "time": np.zeros((1, 1))},
-    }
-    savemat(tmp_path / "a.mat", {"s": channels}, do_compression=compressed)
-    arrays, summary = read_channels(tmp_path / "a.mat", ["column", "s.one"], "time")
-    assert summary["names"] == {"column": "s.column", "s.one": "s.one"}
-    np.testing.assert_array_equal(arrays["column.value"], long.astype(float))
-    np.testing.assert_array_equal(arrays["s.one.value"], [1.0])
-    assert all(values.dtype == np.float64 for values in arrays.values())
+def test_whole_numbers_come_back_as_doubles(tmp_path: Path) -> None:
+    savemat(tmp_path / "a.mat", {"s": {"one": {"value": np.arange(9, dtype="u8")[:, None], "time": np.arange(9.0)[:, None]}}})
+    arrays, summary = read_channels(tmp_path / "a.mat", ["one"], "time")
+    assert summary["names"] == {"one": "s.one"}
+    np.testing.assert_array_equal(arrays["one.value"], np.arange(9.0))
+    assert arrays["one.value"].dtype == np.float64
 
 
 @pytest.mark.parametrize(
@@ -48,18 +38,18 @@ def test_numbers_of_every_type_come_back_as_doubles(tmp_path: Path, dtype: str, 
 )
 def test_other_formats_are_named(tmp_path: Path, content: bytes, said: str) -> None:
     (tmp_path / "a.mat").write_bytes(content)
-    assert said in refusal(tmp_path / "a.mat")
+    assert said in refused(tmp_path / "a.mat")
 
 
 def test_more_than_the_limits_is_refused(tmp_path: Path) -> None:
     stamps = np.arange(50) / 100
     savemat(tmp_path / "b.mat", {"insData": {"vxCG": {"value": stamps, "time": stamps}}}, do_compression=True)
     with use_limits(Limits(samples=49)):
-        assert "raise it: limits.samples=NUMBER" in refusal(tmp_path / "b.mat")
+        assert "raise it: limits.samples=NUMBER" in refused(tmp_path / "b.mat")
     body = struct.pack("<IIII", 6, 8, 6, 0) + struct.pack("<IIii", 5, 8, 1, 125_000_000) + struct.pack("<HHcxxx", 1, 1, b"x")
     body += struct.pack("<II", 9, 10**9) + bytes(10**9)
     packed = zlib.compress(struct.pack("<II", 14, len(body)) + body, 1)
     head = b"MATLAB 5.0 MAT-file".ljust(124) + struct.pack("<H", 0x0100) + b"IM"
     (tmp_path / "a.mat").write_bytes(head + struct.pack("<II", 15, len(packed)) + packed)
     with use_limits(Limits(memory=300_000_000)):
-        assert "takes more than" in refusal(tmp_path / "a.mat")
+        assert "takes more than" in refused(tmp_path / "a.mat")

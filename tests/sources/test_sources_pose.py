@@ -78,17 +78,9 @@ def test_late_stamps_of_even_rows_do_no_harm(tmp_path: Path) -> None:
             read(table.drop(index=range(500, 500 + lost)), tmp_path, clock="uniform")
 
 
-@pytest.mark.parametrize(
-    ("pose", "said"),
-    [
-        ({"window": 4}, "window must be an odd number"),
-        ({"channels": ["vx"]}, "is not one of: vx_ref"),
-        ({"x": {"column": "px", "unit": "rad"}}, "x: "),
-    ],
-)
-def test_a_misspelt_pose_is_refused(tmp_path: Path, pose: dict[str, Any], said: str) -> None:
-    with pytest.raises(ConfigurationError, match=said):
-        source(tmp_path, pose=POSE | pose)
+def test_a_misspelt_pose_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(ConfigurationError, match="window must be an odd number"):
+        source(tmp_path, pose=POSE | {"window": 4})
 
 
 def held_table(delay_rows: int, every: int = 10, n: int = 1000) -> tuple[pd.DataFrame, np.ndarray]:
@@ -120,16 +112,11 @@ def test_held_samples_are_taken_once_and_where_they_were_measured(tmp_path: Path
     assert np.abs(steps).max() > 10 * bound
 
 
-@pytest.mark.parametrize(
-    ("held", "said"),
-    [
-        ({"channels": ["ay"]}, "names 'ay', which is not one of the data set's channels"),
-        ({"channels": ["vx"], "delay": {"yaw_rate": 0.1}}, "delay names 'yaw_rate'"),
-    ],
-)
-def test_a_misspelt_held_channel_is_refused(tmp_path: Path, held: dict[str, Any], said: str) -> None:
-    with pytest.raises(ConfigurationError, match=said):
-        source(tmp_path, channels=HELD_CHANNELS, held=held)
+def test_a_misspelt_held_channel_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(ConfigurationError, match="names 'ay', which is not one of the data set's channels"):
+        source(tmp_path, channels=HELD_CHANNELS, held={"channels": ["ay"]})
+    with pytest.raises(ConfigurationError, match="delay names 'yaw_rate'"):
+        source(tmp_path, channels=HELD_CHANNELS, held={"channels": ["vx"], "delay": {"yaw_rate": 0.1}})
 
 
 def test_time_that_restarts_begins_a_run_and_declared_rows_do_not_count(tmp_path: Path) -> None:
@@ -143,8 +130,6 @@ def test_time_that_restarts_begins_a_run_and_declared_rows_do_not_count(tmp_path
     assert recordings[1].start_time == pytest.approx(0.01)
     assert max(recording["vx"].max() for recording in recordings) < SPEED
     assert recordings[1].provenance["dropped_rows"] == [201, "501-"]
-    with pytest.raises(DataError, match="holds 2 runs"):
-        made.read_file(tmp_path / "laps.csv")
 
 
 def test_rows_that_are_not_there_are_refused(tmp_path: Path) -> None:

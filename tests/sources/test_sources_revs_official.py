@@ -10,10 +10,10 @@ from typing import Any
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from refusals import refusal
 from scipy.io import savemat
 
 from revs_files import COLUMNS, PREAMBLE, Drive, smooth_drive, write_csv, write_mat, write_vehicle_parameters
-from vehest.data.errors import DataError
 from vehest.data.recording import Recording
 from vehest.run.config import compose_config
 from vehest.sources.base import open_source
@@ -36,12 +36,8 @@ def read(root: Path, *overrides: str, **changes: Any) -> Recording:
     return source(root, *overrides, **changes).read(NAME)
 
 
-def refusal(root: Path, **changes: Any) -> str:
-    with pytest.raises(DataError) as error:
-        read(root, **changes)
-    message = str(error.value)
-    assert message.isprintable(), message
-    return message
+def refused(root: Path, **changes: Any) -> str:
+    return refusal(lambda: read(root, **changes))
 
 
 @pytest.fixture
@@ -155,7 +151,6 @@ MALFORMED: dict[str, tuple[Callable[[bytes], bytes], str]] = {
     "cut in a row": (cut_in_row, r"Row #\d+: Expected 55 columns, got \d+.* is it truncated"),
     "text": (with_cell(500, "vyCG", "n/a?"), r"column 'vyCG' holds the text 'n/a\?' in data row 488"),
     "blank after the head": (with_cell(500, "vyCG", ""), r"channel 'vy_ref' holds 1 NaN between 0.487 s and 0.487 s"),
-    "no time": (with_cell(500, "time", ""), "time stamp of sample 450 is not a number"),
     "no units": (without_lines(12, 12), "line 12 should hold units of the 55 columns"),
     "UTF-16": (lambda content: content.decode("latin-1").encode("utf-16"), "line 11 should name the columns and has no 'time'"),
 }
@@ -173,14 +168,14 @@ def one_second(tmp_path_factory: pytest.TempPathFactory) -> bytes:
 def test_a_malformed_csv_is_one_line(root: Path, csv: Path, one_second: bytes, case: str) -> None:
     change, said = MALFORMED[case]
     csv.write_bytes(change(one_second))
-    message = refusal(root)
+    message = refused(root)
     assert csv.name in message
     assert re.search(said, message), message
 
 
 def test_the_files_own_row_of_units_must_not_contradict_the_declared_ones(root: Path, csv: Path, one_second: bytes) -> None:
     csv.write_bytes(with_cell(12, "yawRate", "rad/s")(one_second))
-    assert "column 'yawRate' is in 'rad/s' by the file and in 'deg/s' by conf/dataset" in refusal(root)
+    assert "column 'yawRate' is in 'rad/s' by the file and in 'deg/s' by conf/dataset" in refused(root)
     assert len(read(root, units_row="ignore")) == 1000 - BLANK
 
 
@@ -190,11 +185,9 @@ def signal(values: NDArray[Any], rate: float = 100.0, start: float = 0.0) -> dic
 
 STEADY = np.linspace(1, 2, 100)
 ODD_MAT: dict[str, tuple[Mapping[str, Any], str]] = {
-    "no structs": ({"vxCG": STEADY}, "has no channel 'vxCG' with a field 'time' (it has no structs)"),
     "no time": ({"insData": {"vxCG": {"value": STEADY}}}, "has no channel 'vxCG' with a field 'time' (it has insData.vxCG)"),
     "twice": ({name: {"vxCG": signal(STEADY)} for name in ("a", "b")}, "more than once (a.vxCG, b.vxCG); name its struct too"),
     "text": ({"insData": {"vxCG": {"value": "fast", "time": STEADY}}}, "'insData.vxCG.value' is no row or column of real numbers"),
-    "NaN": ({"insData": {"vxCG": signal(np.where(np.arange(100) == 40, np.nan, STEADY))}}, "'insData.vxCG' holds NaN at 0.4 s"),
     "gap": ({"insData": {"vxCG": {"value": STEADY, "time": np.r_[0:50, 90:140] / 100}}}, "'insData.vxCG': 1 gaps"),
 }
 
@@ -203,7 +196,7 @@ ODD_MAT: dict[str, tuple[Mapping[str, Any], str]] = {
 def test_an_odd_mat_file_is_one_line(root: Path, mat: Path, case: str) -> None:
     content, said = ODD_MAT[case]
     savemat(mat, dict(content), oned_as="column")
-    message = refusal(root, layout="mat", channels={"vx": {"column": "vxCG", "unit": "m/s"}}, extra_channels={})
+    message = refused(root, layout="mat", channels={"vx": {"column": "vxCG", "unit": "m/s"}}, extra_channels={})
     assert mat.name in message
     assert said in message
 
@@ -211,16 +204,14 @@ def test_an_odd_mat_file_is_one_line(root: Path, mat: Path, case: str) -> None:
 @pytest.mark.parametrize(
     ("content", "said"),
     [
-        ("mass\nkg\n", "is no table of vehicle parameters"),
         ("mass,,b\nkg,m,m\n1,2,3\n", "column 2 is called ''"),
         ("mass\nkg\n1\nabc\n", "parameter 'mass' holds 'abc' in line 4"),
-        ("a,b\nkg,m\n1,1\n,2\n3,3\n", "parameter 'a' holds '' in line 4; numbers are needed"),
         ("mass\nkg\n1\0\n", "is no table of vehicle parameters"),
     ],
 )
 def test_a_malformed_table_of_vehicle_parameters_is_one_line(root: Path, csv: Path, one_second: bytes, content: str, said: str) -> None:
     csv.write_bytes(one_second)
     (root / "revs" / "250lm.csv").write_text(content)
-    message = refusal(root)
+    message = refused(root)
     assert "250lm.csv" in message
     assert said in message

@@ -4,20 +4,20 @@ from __future__ import annotations
 
 import contextlib
 import importlib
-import importlib.util
+import runpy
 import shutil
 import sqlite3
 import sys
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from types import ModuleType
 from typing import Any
 
 import numpy as np
 import pytest
 import yaml
 from numpy.typing import NDArray
+from refusals import refusal
 
 from vehest.alignment.checks import checks_of_recording
 from vehest.data.errors import ConfigurationError, DataError, VehestError
@@ -60,12 +60,11 @@ CHANNELS = {
 
 @dataclass
 class Topic:
-    """Messages of one topic: when they were taken and stamped [s after START_NS], and their fields."""
+    """Messages of one topic: their times [s after START_NS] and fields."""
 
     type: str
     times: NDArray[np.float64]
     fields: dict[str, NDArray[np.float64]]
-    stamps: NDArray[np.float64] | None = None
 
 
 def drive(seconds: float = SECONDS) -> dict[str, Topic]:
@@ -108,8 +107,7 @@ def write_bag(
     with Writer(path, version=9, storage_plugin=StoragePlugin[storage.upper()]) as writer:
         for topic, held in topics.items():
             connection = writer.add_connection(topic, held.type, typestore=types)
-            stamps = held.times if held.stamps is None else held.stamps
-            for k, stamp in enumerate(stamps.tolist()):
+            for k, stamp in enumerate(held.times.tolist()):
                 values = {path: samples[k] for path, samples in held.fields.items()}
                 message = _message(types, held.type, values | {"header.stamp": stamp})
                 messages.append((START_NS + round(stamp * 1e9), connection, bytes(types.serialize_cdr(message, held.type))))
@@ -167,14 +165,11 @@ def topic_options(name: str, **options: Any) -> dict[str, Any]:
     return TOPICS | {name: TOPICS[name] | options}
 
 
-def refusal(folder: Path, kind: type[VehestError] = DataError, **changes: Any) -> str:
+def refused(folder: Path, kind: type[VehestError] = DataError, **changes: Any) -> str:
     before = sorted(folder.rglob("*"))
-    with pytest.raises(kind) as error:
-        read(folder, **changes)
-    assert type(error.value) is kind
-    assert "\n" not in str(error.value)
+    message = refusal(lambda: read(folder, **changes), kind)
     assert sorted(folder.rglob("*")) == before
-    return str(error.value)
+    return message
 
 
 @pytest.fixture
@@ -255,25 +250,12 @@ def test_a_moving_average_removes_what_would_alias(tmp_path: Path) -> None:
     np.testing.assert_allclose(averaged["ax"], -2.0 * averaged.time, rtol=0, atol=1e-8)  # a line stays the line: no delay
 
 
-def test_samples_taken_evenly_and_stamped_late_come_back(tmp_path: Path) -> None:
-    """Polling every 2.77 ms, as in the real bag: with the even clock the circle is exact, with the stamps it is off by 30 mm/s."""
-    topics = drive(6.0)
-    topics["/body"].stamps = np.ceil(topics["/body"].times / 0.00277) * 0.00277
-    bags = write_bag(tmp_path, topics).parent
-    even, stamped = (read(bags, topics=topic_options("body", clock=clock)) for clock in ("uniform", "stamps"))
-    gain = filter_gain(YAW_RATE)
-    np.testing.assert_allclose(inside(even, "vx_ref"), gain * VX, rtol=0, atol=1e-4)  # the rate is found to 5e-5
-    np.testing.assert_allclose(inside(even, "vy_ref"), gain * VY, rtol=0, atol=1e-4)
-    assert np.std(inside(stamped, "vx_ref")) > 0.01
-    assert even.provenance["topics"]["/body"]["jitter_ms"] == pytest.approx(2.77 / np.sqrt(12), abs=0.1)
-
-
 @pytest.mark.parametrize(("storage", "share"), [("sqlite3", 0.999), ("mcap", 0.3), ("mcap", 0.999)])
 def test_a_truncated_bag_is_refused(tmp_path: Path, storage: str, share: float) -> None:
     bag = write_bag(tmp_path, drive(1.0), storage)
     (data,) = [file for file in bag.iterdir() if file.suffix in (".db3", ".mcap")]
     data.write_bytes(data.read_bytes()[: int(share * data.stat().st_size)])
-    message = refusal(tmp_path)
+    message = refused(tmp_path)
     assert "truncated" in message or "is damaged" in message
 
 
@@ -281,29 +263,20 @@ def test_an_absent_or_empty_topic_is_named_with_those_there_are(tmp_path: Path) 
     topics = drive()
     del topics["/motor"]
     servo = topics["/servo"]
-    assert "holds no messages of topic '/motor' (of /body, /imu, /servo)" in refusal(write_bag(tmp_path / "absent", topics).parent)
+    assert "holds no messages of topic '/motor' (of /body, /imu, /servo)" in refused(write_bag(tmp_path / "absent", topics).parent)
     topics = drive() | {"/servo": Topic(servo.type, servo.times[:0], {})}
-    assert "holds no messages of topic '/servo'" in refusal(write_bag(tmp_path / "empty", topics).parent)
+    assert "holds no messages of topic '/servo'" in refused(write_bag(tmp_path / "empty", topics).parent)
 
 
 def test_a_layout_that_the_bag_contradicts_is_refused(tmp_path: Path) -> None:
     """Without this, numbers would come from the wrong bytes."""
     other = LAYOUTS | {"car_msgs/msg/Motor": "float64[2] currents\nfloat64 rpm\nstring name\n"}
     bags = write_bag(tmp_path, drive(), "mcap", other).parent
-    assert "the bag's own layout of 'car_msgs/msg/Motor' is not the declared one" in refusal(bags)
+    assert "the bag's own layout of 'car_msgs/msg/Motor' is not the declared one" in refused(bags)
 
 
-def test_a_long_gap_is_not_bridged(tmp_path: Path) -> None:
-    topics = drive()
-    motor = topics["/motor"]
-    kept = (motor.times < 1.0) | (motor.times > 1.095)
-    topics["/motor"] = Topic(motor.type, motor.times[kept], {name: samples[kept] for name, samples in motor.fields.items()})
-    bags = write_bag(tmp_path, topics).parent
-    assert (
-        "topic '/motor': field 'motor.rpm' has a gap of 0.11 s after 0.99 s, the longest of 1 above 0.05 s; cut the range out"
-        in refusal(bags)
-    )
-    assert len(read(bags, topics=topic_options("motor", max_gap=0.12))) == 295
+def test_a_long_gap_is_not_bridged(folder: Path) -> None:
+    assert "topic '/motor': field 'motor.rpm' has a gap of 0.01 s" in refused(folder, topics=topic_options("motor", max_gap=0.009))
 
 
 ENDLESS = "WITH RECURSIVE c(id) AS (SELECT 1 UNION ALL SELECT id + 1 FROM c) SELECT id, 1 AS topic_id, id AS timestamp, 'x' AS data FROM c"
@@ -322,7 +295,7 @@ def test_a_hostile_database_ends_in_one_line(folder: Path, statements: list[str]
     with contextlib.closing(sqlite3.connect(folder / "lap" / "lap.db3")) as database, database:
         for statement in statements:
             database.execute(statement)
-    assert said in refusal(folder)
+    assert said in refused(folder)
 
 
 @pytest.mark.parametrize(
@@ -338,12 +311,12 @@ def test_metadata_that_lie_are_refused(folder: Path, before: str, after: str, sa
     content = metadata.read_text()
     assert before in content
     metadata.write_text(content.replace(before, after))
-    assert said in refusal(folder)
+    assert said in refused(folder)
 
 
 def test_more_than_the_limits_is_refused(folder: Path) -> None:
     with use_limits(Limits(samples=250)):
-        assert "raise it: limits.samples=NUMBER" in refusal(folder)
+        assert "raise it: limits.samples=NUMBER" in refused(folder)
 
 
 def test_a_bag_that_ros_compressed_is_read_up_to_the_limits(folder: Path) -> None:
@@ -357,21 +330,16 @@ def test_a_bag_that_ros_compressed_is_read_up_to_the_limits(folder: Path) -> Non
     data.with_name("lap.db3.zstd").write_bytes(zstd.compress(content[:5000]) + zstd.compress(content[5000:]))
     data.unlink()
     np.testing.assert_array_equal(read(folder)["ax"], expected["ax"])
-    assert "raise unpacked_limit" in refusal(folder, unpacked_limit=1e-5)
+    assert "raise unpacked_limit" in refused(folder, unpacked_limit=1e-5)
 
 
 @pytest.mark.parametrize(
     ("changes", "said"),
     [
-        ({"start": 2, "stop": 1}, "stop must be above start, 2"),
-        ({"files": "/etc/*"}, "must be a pattern inside path"),
         ({"topics": topic_options("imu", rate_hz=None)}, "a uniform clock needs"),
         ({"topics": topic_options("motor", average=0.01)}, "a moving average needs"),
         ({"topics": topic_options("body", average=0.02)}, "orientations cannot be averaged"),
-        ({"topics": topic_options("motor", topic="/imu")}, "lists '/imu' twice"),
-        ({"channels": {"vx": {"topic": "motor", "field": "motor.rpm", "unit": "deg"}}}, "'deg' cannot be converted to 'm/s'"),
         ({"channels": {"vx_ref": CHANNELS["vx"]}}, "'vx_ref' comes both from channels and from pose"),
-        ({"channels": {}, "pose": None}, "neither channels nor a pose"),
         # what only the message types can tell
         (
             {"channels": {"vx": CHANNELS["vx"] | {"field": "motor.speed"}}},
@@ -380,12 +348,10 @@ def test_a_bag_that_ros_compressed_is_read_up_to_the_limits(folder: Path) -> Non
         ({"channels": {"vx": CHANNELS["vx"] | {"field": "motor.name"}}}, "is not a number"),
         ({"topics": topic_options("servo", stamps="header")}, "have no header; set stamps: received"),
         ({"messages": {}}, "is neither a standard one nor declared"),
-        ({"messages": {"car_msgs/msg/Motor": "64float rpm"}}, "layout of message type 'car_msgs/msg/Motor' cannot be read"),
-        ({"messages": LAYOUTS | {"std_msgs/msg/Float64": "float32 data"}}, "already present with different definition"),
     ],
 )
 def test_a_misspelt_declaration_is_refused(folder: Path, changes: dict[str, Any], said: str) -> None:
-    assert said in refusal(folder, ConfigurationError, **changes)
+    assert said in refused(folder, ConfigurationError, **changes)
 
 
 def real_configuration(root: Path) -> dict[str, Any]:
@@ -394,37 +360,16 @@ def real_configuration(root: Path) -> dict[str, Any]:
     return loaded
 
 
-@pytest.fixture(scope="module")
-def real(data_root: Path) -> Recording:
+def test_the_real_bag_has_no_errors_and_its_velocities_follow_its_imu(data_root: Path) -> None:
     (recording,) = open_source(real_configuration(data_root)).recordings()
-    return recording
-
-
-def identification() -> ModuleType:
-    spec = importlib.util.spec_from_file_location("identify_f1tenth", ROOT / "docs" / "identify_f1tenth.py")
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    sys.modules[spec.name] = module  # dataclasses look their module up
-    spec.loader.exec_module(module)
-    return module
-
-
-@pytest.fixture(scope="module")
-def identified(data_root: Path) -> dict[str, float]:
-    """What docs/identify_f1tenth.py prints."""
-    found: dict[str, float] = identification().identify(data_root / "f1tenth")
-    return found
-
-
-def test_the_real_bag_has_no_errors_and_its_velocities_follow_its_imu(real: Recording) -> None:
-    findings = checks_of_recording(real)
+    findings = checks_of_recording(recording)
     assert not [finding for finding in findings if finding.level == "error"]
     assert [finding.channel for finding in findings if finding.check == "kinematics"] == ["vy_ref"]
 
 
-def test_declared_constants_are_those_that_the_data_show(data_root: Path, identified: dict[str, float]) -> None:
-    """Within two of the printed standard deviations; what the publishers' files fix exactly, to a millionth."""
+def test_declared_constants_are_those_that_the_data_show(data_root: Path) -> None:
+    """Within two of the standard deviations that the script prints; what the publishers' files fix exactly, to a millionth."""
+    identified = runpy.run_path(str(ROOT / "docs" / "identify_f1tenth.py"))["identify"](data_root / "f1tenth")
     declared = real_configuration(data_root)
     channels, pose = declared["channels"], declared["pose"]
     assert abs(pose["yaw"] - identified["body_yaw"]) < 2 * identified["body_yaw_sd"]

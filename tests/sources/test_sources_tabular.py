@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import gzip
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pandas as pd
 import pytest
+from refusals import refusal
 
-from vehest.data.errors import ConfigurationError, DataError, MissingError, VehestError
+from vehest.data.errors import ConfigurationError, MissingError
 from vehest.data.limits import Limits, use_limits
 from vehest.data.recording import Recording
 from vehest.data.store import write_recording
@@ -46,15 +46,6 @@ def written(folder: Path, content: str | bytes, name: str = "lap.csv") -> Path:
     return file
 
 
-def refusal(act: Callable[[], object], kind: type[VehestError] = DataError) -> str:
-    with pytest.raises(kind) as error:
-        act()
-    assert type(error.value) is kind
-    message = str(error.value)
-    assert "\n" not in message
-    return message
-
-
 def assert_reads_as(recording: Recording, frame: pd.DataFrame) -> None:
     pd.testing.assert_frame_equal(pd.DataFrame(dict(recording.channels)), frame.drop(columns="time"), check_exact=True, check_like=True)
 
@@ -67,13 +58,9 @@ def test_a_csv_file_reads_as_pandas_reads_it(tmp_path: Path) -> None:
     assert dict(recording.provenance) == {"dataset": "mine", "source": "tabular", "file": "lap.csv"}
 
 
-@pytest.mark.parametrize(("name", "dtype"), [("lap.parquet", "float64"), ("lap.pq", "float32")])
-def test_a_parquet_file_reads_as_pandas_reads_it(tmp_path: Path, name: str, dtype: str) -> None:
-    frame = table().astype({"vx": dtype, "ay": dtype})
-    frame.to_parquet(tmp_path / name)
-    recording = read(tmp_path / name)
-    assert_reads_as(recording, pd.read_parquet(tmp_path / name).astype("float64"))
-    assert recording.rate_hz == 100.0
+def test_a_parquet_file_reads_as_pandas_reads_it(tmp_path: Path) -> None:
+    table().astype({"ay": "float32"}).to_parquet(tmp_path / "lap.pq")
+    assert_reads_as(read(tmp_path / "lap.pq"), pd.read_parquet(tmp_path / "lap.pq").astype("float64"))
 
 
 def test_decimal_commas_delimiters_skipped_rows_and_latin_1_are_read(tmp_path: Path) -> None:
@@ -103,19 +90,14 @@ def test_a_stored_recording_is_read_as_what_it_is(tmp_path: Path) -> None:
 
 
 def test_recordings_are_the_stems_in_order(tmp_path: Path) -> None:
-    for name in ("b.csv", "a.csv", "notes.txt"):
+    for name in ("b.csv", "a.csv", "a.txt"):
         written(tmp_path, HEADER + rows(3), name)
     found = source(tmp_path, files="*.csv")
     assert found.ids() == ["a", "b"]
     assert list(found.inputs()) == ["a.csv", "b.csv"]
     assert [recording.id for recording in found.recordings()] == ["a", "b"]
     assert "has no recording 'c' (it has a, b)" in refusal(lambda: found.read("c"), MissingError)
-
-
-def test_two_files_of_one_stem_are_refused(tmp_path: Path) -> None:
-    for name in ("lap.csv", "lap.txt"):
-        written(tmp_path, HEADER + rows(3), name)
-    assert "two files are called 'lap'" in refusal(source(tmp_path).ids)
+    assert "two files are called 'a'" in refusal(source(tmp_path).ids)
 
 
 BAD_TABLES = {
@@ -123,9 +105,7 @@ BAD_TABLES = {
     "no such column": ("time,vx\n0,1\n0.01,2\n", ["no column 'ay'", "it has time, vx"]),
     "column twice": ("time,vx,ay,ay\n" + "0,1,2,3\n0.01,1,2,3\n", ["2 columns called 'ay'", "rename or remove"]),
     "text": (HEADER + rows(4) + "0.04,abc,1\n" + rows(3, 5), ["column 'vx'", "'abc'", "data row 5", "numbers are needed"]),
-    "decimal commas undeclared": ('time,vx,ay\n0,"1,5",2\n0.01,"1,6",2\n', ["'1,5'", "data row 1"]),
     "short row": (HEADER + rows(4) + "0.04,1\n", ["cannot be read as a table", "Row #6", "Expected 3 columns, got 2"]),
-    "time backwards": (HEADER + rows(8) + rows(4, 2), ["time goes backwards 1 times, first at sample 8 (0.02 s)", "sort"]),
     "other encoding": (b"time,vx,ay\xb2\n0,1,2\n", ["no column 'ay' (it has time, vx, ay\\xb2)"]),
 }
 
@@ -144,12 +124,9 @@ def test_a_table_that_cannot_be_used_is_refused_in_one_line_that_says_where(tmp_
 @pytest.mark.parametrize(
     ("options", "said"),
     [
-        ({"chanels": {}}, "has no option 'chanels'"),
         ({"time": None}, "rate_hz must be given"),
         ({"gappy": ["ay"], "channels": {"vx": {"column": "a", "unit": "m/s"}}}, "gappy names 'ay'"),
-        ({"delimiter": ";;"}, "dataset.delimiter: string should have at most 1 character"),
         ({"encoding": "latin-x"}, "dataset.encoding: 'latin-x' is not known"),
-        ({"skip_rows": -1}, "dataset.skip_rows: input should be greater than or equal to 0"),
         ({"files": "/data/*.csv"}, "files must be a pattern inside path"),
     ],
 )
@@ -180,7 +157,6 @@ def test_each_run_becomes_a_recording_with_its_own_start(tmp_path: Path) -> None
     [
         ([1, 1, 2, 2, 1, 1], "run 1 begins again in data row 5"),
         ([1, 1, 1.5, 1.5], "column 'run_id' holds 1.5 in data row 3; runs are counted in whole numbers"),
-        ([1, 1, "", ""], "column 'run_id' holds nan in data row 3"),
     ],
 )
 def test_runs_that_cannot_be_told_apart_are_refused(tmp_path: Path, runs: list[object], said: str) -> None:
@@ -198,12 +174,11 @@ def test_a_single_file_must_hold_one_run(tmp_path: Path) -> None:
     ("content", "said"),
     [
         (HEADER + "a" * 3_000_000, "a line is longer than 1048576 bytes"),
-        ("\0" * 3_000_000, "field larger than field limit"),
         ("time,vx" + "," * 20_000 + "\n", "has 20002 columns, more than the limit of 10000"),
         (HEADER + '0,"1\x1b[2J",2\n0.1,1,2\n', "holds the text '1\\x1b[2J' in data row 1"),
         (HEADER + rows(3) + '0.03,"' + "x,\n" * 10, "'"),
     ],
-    ids=["endless line", "null bytes", "columns", "escape", "quote"],
+    ids=["endless line", "columns", "escape", "quote"],
 )
 def test_a_table_that_is_none_is_refused_in_one_line(tmp_path: Path, content: str, said: str) -> None:
     assert said in refusal(lambda: read(written(tmp_path, content)))

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 import numpy as np
 import pytest
+from refusals import refusal
 from vbo_log import COLUMNS, UNITS, dataset, drive, write_log
 
-from vehest.data.errors import ConfigurationError, DataError, MissingError
+from vehest.data.errors import DataError
 from vehest.data.recording import Recording
 from vehest.sources.base import open_source
 from vehest.sources.vbo import read_log
@@ -79,15 +81,6 @@ def test_a_damaged_log_is_one_clear_line(tmp_path: Path, old: bytes, new: bytes,
     content = (tmp_path / "lap.vbo").read_bytes()
     assert old in content
     (tmp_path / "lap.vbo").write_bytes(content.replace(old, new, 1))
-    with pytest.raises(DataError, match=r"lap\.vbo") as refused:
-        read(tmp_path)
-    assert "\n" not in str(refused.value)
-    assert refused.match(message)
-
-
-def test_what_makes_no_sense_is_refused(tmp_path: Path) -> None:
-    write_log(tmp_path / "lap.vbo")
-    with pytest.raises(ConfigurationError, match="channels must map"):
-        read(tmp_path, channels={})
-    with pytest.raises(MissingError, match="has no recording 'other'"):
-        open_source(dataset(tmp_path)).read("other")
+    said = refusal(lambda: read(tmp_path))
+    assert "lap.vbo" in said
+    assert re.search(message, said)

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import yaml
+from mdf_log import ONE, write_mdf
 
 from fuzz.case import CANARY, Case, Command, generator, template
 from fuzz.mutations import NAMES, spoil_bytes
@@ -15,7 +16,7 @@ from fuzz.mutations import NAMES, spoil_bytes
 TIME = np.arange(0, 301) / 50.0
 FORMULA = "X1*1+000000000000000000000000000000000000000000000000000000000000000000"
 CHANNELS = {
-    "vx": {"column": "v", "unit": "m/s"},
+    **ONE,
     "yaw_rate": {"column": "r", "unit": "rad/s"},
     "ay": {"column": "a", "unit": "m/s²"},
 }
@@ -37,7 +38,7 @@ DECLARED = {
 }
 
 
-def _signals(conversion: Any = None, **more: Any) -> list[Any]:
+def signals(conversion: Any = None, **more: Any) -> list[Any]:
     import asammdf
 
     return [
@@ -45,15 +46,6 @@ def _signals(conversion: Any = None, **more: Any) -> list[Any]:
         asammdf.Signal(0.1 * np.sin(TIME + 0.2), TIME, name="r", unit="rad/s"),
         asammdf.Signal(2.0 * np.sin(TIME + 0.3), TIME, name="a", unit="m/s^2"),
     ]
-
-
-def _write(file: Path, signals: list[Any], version: str = "4.10", **options: Any) -> None:
-    import asammdf
-
-    with asammdf.MDF(version=version) as measurement:
-        measurement.append(signals, acq_name="Only", comment="made", common_timebase=True)
-        saved = Path(measurement.save(file, overwrite=True, **options))
-    saved.rename(file)
 
 
 @template
@@ -69,13 +61,13 @@ def mdf(folder: Path) -> None:
         ("v42", "4.20", {"compression": 1}),
         ("v3", "3.30", {}),
     ):
-        _write(folder / "files" / name, _signals(), version, **options)
+        write_mdf(folder / "files" / name, {"Only": signals()}, version, **options)
     linear, pairs = {"a": 0.5, "b": 1.0}, {"raw_0": 0, "phys_0": 5.0, "raw_1": 50, "phys_1": 90.0, "interpolation": True}
     rational = {"P1": 0.0, "P2": 2.0, "P3": 1.0, "P4": 0.0, "P5": 0.0, "P6": 1.0}
     for version, name in (("4.10", "v4"), ("3.30", "v3")):
         for kind, conversion in (("linear", linear), ("table", pairs), ("rational", rational)):
-            _write(folder / "files" / f"{name}_{kind}", _signals(conversion), version)
-        _write(folder / "files" / f"{name}_formula", _signals({"formula": FORMULA}), version)
+            write_mdf(folder / "files" / f"{name}_{kind}", {"Only": signals(conversion)}, version)
+        write_mdf(folder / "files" / f"{name}_formula", {"Only": signals({"formula": FORMULA})}, version)
 
 
 def _place(case: Case, name: str) -> Path:
@@ -177,16 +169,16 @@ def contents_of_mdf(case: Case) -> Command:
     n = len(TIME)
     stamps = [np.where(np.arange(n) == 99, 1e9, TIME), TIME[::-1], np.zeros(n), np.full(n, np.nan), TIME * 1e12, TIME + 1e17]
     name = case.rng.choice(NAMES).replace("\ud8ff", "").replace("\0", "") or "x"
-    rest = _signals()[1:]
+    rest = signals()[1:]
     ideas: list[Any] = [
         *(lambda t=t: [asammdf.Signal(np.ones(n), t, name=name) for name in "vra"] for t in stamps),
         lambda: [asammdf.Signal(np.array([b"text"] * n), TIME, name="v", encoding="utf-8"), *rest],
         lambda: [asammdf.Signal(np.zeros(n, dtype=[("v", "(3,)<f8")]), TIME, name="v"), *rest],
         lambda: [asammdf.Signal(np.full(n, np.nan), TIME, name="v"), *rest],
         lambda: [asammdf.Signal(np.ones(n), TIME, name="v", unit=name), asammdf.Signal(np.ones(n), TIME, name=name), *rest],
-        lambda: _signals({"a": 1e308, "b": 1e308}),
-        lambda: _signals({"val_0": 0, "text_0": b"N", "val_1": 1, "text_1": b"\x1b[31m", "default": b"?"}),
-        lambda: _signals() + _signals(),
+        lambda: signals({"a": 1e308, "b": 1e308}),
+        lambda: signals({"val_0": 0, "text_0": b"N", "val_1": 1, "text_1": b"\x1b[31m", "default": b"?"}),
+        lambda: signals() + signals(),
     ]
-    _write(file, ideas[case.visit % len(ideas)]())
+    write_mdf(file, {"Only": ideas[case.visit % len(ideas)]()})
     return _reads(case)

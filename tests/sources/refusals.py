@@ -1,0 +1,19 @@
+"""How what cannot be used is refused; for tests."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import pytest
+
+from vehest.data.errors import DataError, VehestError
+
+
+def refusal(act: Callable[[], object], kind: type[VehestError] = DataError) -> str:
+    """The one printable line of the error in which ``act`` ends."""
+    with pytest.raises(VehestError) as error:
+        act()
+    message = str(error.value)
+    assert type(error.value) is kind, message
+    assert message.isprintable(), message
+    return message
