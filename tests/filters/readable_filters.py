@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 from torch.func import jacfwd
 
+from vehest.estimators.rational_ekf import LOST, ROLLING, RationalFilter
 from vehest.filters.gating import Gate
 from vehest.filters.gaussian import Filtered, Gaussian
 from vehest.filters.nonlinear import NonlinearModel
@@ -44,6 +45,40 @@ def extended_filter(model: NonlinearModel, measurements: Tensor, inputs: Tensor,
         state = posterior
     parts = [torch.stack(part) for part in zip(*samples, strict=True)]
     return Filtered(Gaussian(*parts[:2]), Gaussian(*parts[2:4]), *parts[4:])
+
+
+def rational_model(estimator: RationalFilter) -> NonlinearModel:
+    """The model of a `RationalFilter`; inputs are speed and steering angle, and a lost sideslip angle is that of a car that rolls."""
+    track, bound = estimator.track(), torch.as_tensor(estimator.bounds())
+    car, n_tyres, levels = estimator.car, len(estimator.adapted), estimator.values
+    noise = torch.tensor([levels["yaw_rate"], levels["ay"]], dtype=torch.float64).square().diag()
+
+    def adapts(yaw_rate: Tensor, inputs: Tensor) -> bool:
+        return bool((inputs[0] * yaw_rate).abs() >= estimator.adapt_above)
+
+    def process_noise(states: Tensor, inputs: Tensor) -> Tensor:
+        tyres = levels["tyres"] if adapts(states[1] + track.step * states[3], inputs) else 0.0
+        return track.process_noise(states, inputs, levels["steer"], tyres)
+
+    def restart(state: Gaussian[Tensor], inputs: Tensor) -> Gaussian[Tensor]:
+        diverged = not bool(state.mean[0].abs() < estimator.largest_sideslip)
+        if not diverged and bool(state.covariance[0, 0] < LOST**2):
+            return state
+        turn = inputs[1] / (car.cg_to_front_axle + car.cg_to_rear_axle)
+        motion = torch.stack([car.cg_to_rear_axle * turn, inputs[0] * turn, 0.0 * turn, 0.0 * turn])
+        tyres = 0.0 * state.mean[4:] if diverged else state.mean[4:]
+        spread = torch.as_tensor(estimator.start_tyres()) if diverged else state.covariance[4:, 4:]
+        return Gaussian(torch.cat([motion, tyres]), torch.block_diag(torch.tensor(ROLLING, dtype=torch.float64).square().diag(), spread))
+
+    return NonlinearModel(
+        track.transition,
+        track.observation,
+        process_noise,
+        lambda states, inputs: noise,
+        lambda states: torch.maximum(torch.minimum(states, bound), -bound),
+        restart,
+        lambda states, inputs: torch.tensor([True] * 4 + [adapts(states[1], inputs)] * n_tyres),
+    )
 
 
 def gated(run: Callable[[Tensor], Filtered[Any]], measurements: Tensor, gate: Gate) -> Filtered[Any]:

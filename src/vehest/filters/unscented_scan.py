@@ -261,7 +261,9 @@ class UnscentedStepper:
         repair, gate: see `unscented_scan`.
 
     Attributes:
-        mean, covariance: of the state, filtered, (n,) and (n, n).
+        prior: the state before its measurement, mean (n,).
+        state: the same after it; both are valid until the next step and may be changed.
+        innovation, innovation_covariance, gain: of the last update, (m,), (m, m) and (n, m).
     """
 
     def __init__(
@@ -278,10 +280,13 @@ class UnscentedStepper:
         n, dtype = len(mean), mean.dtype.type
         self._setting = _Setting.of(model, rule, n, dtype, repair, gate)
         self._refused = np.zeros((1, measurements), np.int64)
-        self._tape, self._points = _Tape(1, 1, n, measurements, dtype), _Points(self._setting, 1, n, dtype)
-        self._tape.prior_mean[0], self._tape.prior_covariance[0] = mean, covariance
+        self._points = _Points(self._setting, 1, n, dtype)
+        self._tape = tape = _Tape(1, 1, n, measurements, dtype)
+        tape.prior_mean[0], tape.prior_covariance[0] = mean, covariance
         self._inputs: Array | None = None
-        self.mean, self.covariance = self._tape.post_mean[0, 0], self._tape.post_covariance[0, 0]
+        self.prior = Gaussian(tape.prior_mean[0, 0], tape.prior_covariance[0, 0])
+        self.state = Gaussian(tape.post_mean[0, 0], tape.post_covariance[0, 0])
+        self.innovation, self.innovation_covariance, self.gain = tape.innovation[0, 0], tape.own[0, 0], tape.gain[0, 0]
 
     def step(self, measurement: Array, inputs: Array, process_noise: Array | NoiseAt, observation_noise: Array | NoiseAt) -> Array:
         """The filtered mean, (n,), valid until the next step.
@@ -292,14 +297,20 @@ class UnscentedStepper:
             process_noise: Q of the step that led here, (1, n, n), or as a function of the state before.
             observation_noise: R, (1, m, m), or as a function of the predicted state.
         """
-        tape, now = self._tape, inputs[None]
         if self._inputs is not None:
-            before = tape.post_mean[0].copy(), tape.post_covariance[0].copy()
-            _predict(self._setting, tape, 0, self._points, *before, self._inputs, process_noise)
-        seen = measurement[None] if self._setting.gate is None else measurement[None].copy()
-        _update(self._setting, tape, 0, self._points, seen, now, observation_noise, self._refused)
-        self._inputs = now
-        return self.mean
+            self.predict(self._inputs, process_noise)
+        self.update(measurement, inputs, observation_noise)
+        self._inputs = inputs
+        return self.state.mean
+
+    def predict(self, inputs: Array, process_noise: Array | NoiseAt) -> None:
+        """Move the state to the next sample by inputs of this one."""
+        before = self._tape.post_mean[0].copy(), self._tape.post_covariance[0].copy()
+        _predict(self._setting, self._tape, 0, self._points, *before, inputs[None], process_noise)
+
+    def update(self, measurement: Array, inputs: Array, observation_noise: Array | NoiseAt) -> None:
+        """Take in the measurement."""
+        _update(self._setting, self._tape, 0, self._points, measurement[None].copy(), inputs[None], observation_noise, self._refused)
 
 
 def moved(model: PointModel, states: Tensor, inputs: Tensor) -> Tensor:

@@ -68,6 +68,6 @@ class SigmaPointStepper(Stepper):
         step = estimator.filter_step(estimator.checked_sample(sample), self._memory)
         if self._filter is None:
             self._filter = estimator.new_filter(step)
-        dtype, of_vy = self._filter.mean.dtype, estimator.states.index("vy")
+        dtype, of_vy = self._filter.state.mean.dtype, estimator.states.index("vy")
         mean = self._filter.step(step.measurement.astype(dtype), step.inputs.astype(dtype), step.process_noise, step.observation_noise)
-        return dict(zip(estimator.states, mean.tolist(), strict=True)) | {"vy_variance": float(self._filter.covariance[of_vy, of_vy])}
+        return dict(zip(estimator.states, mean.tolist(), strict=True)) | {"vy_variance": float(self._filter.state.covariance[of_vy, of_vy])}
