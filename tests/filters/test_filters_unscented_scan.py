@@ -226,7 +226,7 @@ def test_one_sample_at_a_time_it_is_the_same_filter() -> None:
     for k in range(20):
         mean = stepper.step(measurements[0, k].numpy(), inputs[0, k].numpy(), process, lambda x, u: observation)
         assert mean == pytest.approx(state.mean[0, k].numpy(), abs=1e-12), k
-        assert stepper.covariance == pytest.approx(state.covariance[0, k].numpy(), abs=1e-12), k
+        assert stepper.state.covariance == pytest.approx(state.covariance[0, k].numpy(), abs=1e-12), k
 
 
 def test_one_step_alone_is_the_model() -> None:

@@ -125,6 +125,7 @@ class LearnedUkf(Network, SigmaPointEstimator):
     states = STATES
     training_type = ThroughFilterSettings
     network: CarFilter
+    correlated_noise = True
     dynamics: Literal["pacejka", "residual", "neural", "tyre_network", "friction_tyre_network"] = setting(
         "friction_tyre_network", "pacejka (PC), residual (PCR), neural (NN), tyre_network (NNT) or friction_tyre_network (NNTF)"
     )
@@ -248,6 +249,7 @@ class LearnedUkf(Network, SigmaPointEstimator):
             s.noise,
             step=1.0 / s.rate_hz,
             least=(s.least_speed, s.least_friction),
+            correlated=self.correlated_noise,
             repair=s.repair if repair is None else repair,
         )
 

@@ -29,6 +29,7 @@ OBSERVATION = (50.0, 50.0, 0.1, 0.1)
 INITIAL = (1e-3, 1e-3, 1e-3, 1e-3)
 PACE = 10.0  # by which noise learns faster than in units of its deviations
 OBSERVED_EXACTLY = (0.0, 0.0, 0.0, 1e-3)  # added to variances: the rim speed is measured, and is its own reference
+KAPPA = -2.0  # of the symmetric sigma points
 LEAST_ENTROPY = -9.0  # [nat] of the process noise
 
 
@@ -40,7 +41,7 @@ class CarFilter(nn.Module):
         noise: covariances constant, or dependent on the state.
         step: [s].
         least: smallest possible vx [m/s] and friction.
-        kappa: of the symmetric sigma points.
+        correlated: whether noise has entries off the diagonals of its covariances.
         repair: whether lost definiteness is repaired.
 
     Source: Węgrzynowski et al. 2024, Section III-B; start values as in its authors' code.
@@ -53,22 +54,26 @@ class CarFilter(nn.Module):
     )
 
     def __init__(
-        self, dynamics: Dynamics, noise: NoiseKind, *, step: float, least: tuple[float, float], kappa: float = -2.0, repair: bool = True
+        self,
+        dynamics: Dynamics,
+        noise: NoiseKind,
+        *,
+        step: float,
+        least: tuple[float, float],
+        correlated: bool = True,
+        repair: bool = True,
     ) -> None:
         super().__init__()
-        self.dynamics = dynamics
+        self.dynamics, self.constant = dynamics, noise == "constant"
         n = len(STATES)
-        process = (*PROCESS, FRICTION[noise])
-        if noise == "constant":
-            self.process_noise: nn.Module = ConstantNoise(process)
-            self.observation_noise: nn.Module = ConstantNoise(OBSERVATION)
-        else:
-            self.process_noise = StateDependentNoise(process, n)
-            self.observation_noise = StateDependentNoise(OBSERVATION, n)
+        self.process_noise, self.observation_noise = (
+            ConstantNoise(variances, correlated) if self.constant else StateDependentNoise(variances, n, correlated=correlated)
+            for variances in ((*PROCESS, FRICTION[noise]), OBSERVATION)
+        )
         self.initial_noise = ConstantNoise((*INITIAL, FRICTION[noise]))
         self.step, self.repair = step, repair
         self.lower = (least[0], *[-torch.inf] * 3, least[1])
-        self.rule = symmetric_rule(n, kappa)
+        self.rule = symmetric_rule(n, KAPPA)
 
     def reset(self, generator: torch.Generator) -> None:
         """Draw everything that is random to begin with anew."""
@@ -117,7 +122,7 @@ class CarFilter(nn.Module):
             model: what `point_model` returned, to use it again.
             gate: which measurements are refused; none: all are taken.
         """
-        if states is not None or isinstance(self.process_noise, ConstantNoise):
+        if states is not None or self.constant:
             at = initial.mean.new_zeros(1, 1, len(STATES)) if states is None else states
             noises: list[Tensor | NoiseAt] = [self._process_noise(at, inputs), self.observation_noise(at, inputs)]
         else:
@@ -157,13 +162,10 @@ class CarFilter(nn.Module):
             size = torch.cat([drive.states for drive in drives]).square().mean(0).sqrt()
             process, observation = steps.T @ steps / len(steps), expected.T @ expected / len(expected)
             friction = len(STATES) - 1
-            process[friction, friction] = FRICTION["constant" if isinstance(self.process_noise, ConstantNoise) else "state_dependent"]
+            process[friction, friction] = FRICTION["constant" if self.constant else "state_dependent"]
             observation += observation.new_tensor(OBSERVED_EXACTLY).diag()
         for noise, covariance in ((self.process_noise, process), (self.observation_noise, observation)):
-            if isinstance(noise, StateDependentNoise):
-                noise.begin(covariance, PACE, size)
-            else:
-                noise.begin(covariance, PACE)  # type: ignore[operator]
+            noise.begin(covariance, PACE, size)
         initial = self.initial_covariance().detach().clone()
         initial[friction, friction] = torch.clamp(initial[friction, friction], min=start_spread**2 / 3.0)
         self.initial_noise.begin(initial, PACE)
@@ -198,7 +200,7 @@ class CarFilter(nn.Module):
             return self.filtered(drives.measurements, drives.inputs, initial).steps.filtered.mean
 
     def _settled(self, states: Tensor) -> Tensor | None:
-        return None if isinstance(self.process_noise, ConstantNoise) else states
+        return None if self.constant else states
 
     def _process_noise(self, states: Tensor, inputs: Tensor) -> Tensor:
         return with_entropy(self.process_noise(states, inputs), LEAST_ENTROPY)
