@@ -16,25 +16,9 @@ from vehest.estimators.recursive import Recursive
 from vehest.filters.gating import Gate
 from vehest.filters.gaussian import Gaussian
 from vehest.vehicle.parameters import FERRARI_250LM, SingleTrackParameters
-from vehest.vehicle.single_track import forward_euler, lateral_acceleration, lateral_dynamics
+from vehest.vehicle.single_track import LateralModel, lateral_model
 
 KNOWN = 1e-6  # rad and rad/s, standard deviation of a state that a protocol hands over
-
-
-class SampledModel(NamedTuple):
-    """The model at the times of T samples: x[k+1] = A[k] x[k] + B[k] δ[k],  a_y[k] = C[k] x[k] + D[k] δ[k].
-
-    Attributes:
-        A: (T, 2, 2).
-        B: (T, 2).
-        C: (T, 2).
-        D: (T,).
-    """
-
-    A: FloatArray
-    B: FloatArray
-    C: FloatArray
-    D: FloatArray
 
 
 class FilteredStates(NamedTuple):
@@ -93,12 +77,9 @@ class SideslipFilter(Recursive):
         None, "standard deviations of an innovation beyond which a measurement is refused in use; null: all are taken", positive=True
     )
 
-    def sampled_model(self, vx: FloatArray) -> SampledModel:
-        """The model at forward speeds vx, (T,) [m/s], discretised by forward Euler."""
-        speed = np.maximum(vx, self.minimum_speed)
-        dynamics = forward_euler(lateral_dynamics(self.car, speed), 1.0 / self.rate_hz)
-        acceleration = lateral_acceleration(self.car, speed)
-        return SampledModel(*(part.numpy() for part in (*dynamics, *acceleration)))
+    def sampled_model(self, vx: FloatArray) -> LateralModel:
+        """The model in steps at forward speeds vx, (T,) [m/s]: x[k+1] = A[k] x[k] + B[k] δ[k], a_y[k] = C[k] x[k] + D[k] δ[k]."""
+        return lateral_model(self.car, np.maximum(vx, self.minimum_speed)).in_steps(1.0 / self.rate_hz)
 
     def gate_in_use(self) -> Gate | None:
         """The gate of estimates; numbers are found without, because noise that is too small would close it."""
