@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from vehest.data.declared import setting
 from vehest.data.errors import ConfigurationError
+from vehest.declared import setting
 from vehest.estimators.learned_ukf import MEASURED, LearnedUkf
 from vehest.vehicle.dynamics import STATES, Dynamics, PacejkaCar
 
