@@ -10,7 +10,7 @@ from collections.abc import Callable
 
 import pytest
 import torch
-from readable_filters import extended_filter, gated, rational_model
+from readable_filters import NonlinearModel, extended_filter, gated, rational_model, unscented_filter
 from test_estimators_rational import rational
 from test_filters_extended_scan import compiled_pendulum, measured_pendulum, pendulum_with_radar
 from test_filters_kalman import example, tensors
@@ -29,7 +29,6 @@ from vehest.filters.extended_scan import extended_scan
 from vehest.filters.gating import Gate
 from vehest.filters.gaussian import Filtered, Gaussian
 from vehest.filters.kalman_scan import kalman_scan
-from vehest.filters.nonlinear import NonlinearModel, unscented_filter
 from vehest.filters.sigma_points import symmetric_rule
 from vehest.filters.unscented_scan import PointModel, unscented_scan
 

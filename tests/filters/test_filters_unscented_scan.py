@@ -8,13 +8,13 @@ from typing import NamedTuple
 
 import pytest
 import torch
+from readable_filters import NonlinearModel, unscented_filter
 from test_filters_nonlinear import RULES, STEP, constant, measured_pendulum, pendulum_with_radar, sharp
 from torch import Tensor
 
 from vehest.filters.gaussian import Gaussian
-from vehest.filters.nonlinear import NonlinearFiltered, NonlinearModel, unscented_filter
 from vehest.filters.sigma_points import SigmaRule, symmetric_rule
-from vehest.filters.unscented_scan import TorchModel, UnscentedStepper, moved, unscented_scan
+from vehest.filters.unscented_scan import NonlinearFiltered, TorchModel, UnscentedStepper, moved, unscented_scan
 
 FREE = [-1e9, -1e9, -1e9]
 ANY = {"measurements": torch.zeros(2, 5, 2), "inputs": torch.zeros(2, 5, 1)}

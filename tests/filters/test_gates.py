@@ -8,7 +8,7 @@ from functools import partial
 import numpy as np
 import pytest
 import torch
-from readable_filters import extended_filter, gated
+from readable_filters import extended_filter, gated, unscented_filter
 from scipy.stats import chi2, norm
 from test_filters_kalman import example, tensors
 from test_filters_nonlinear import RULES, linear_as_nonlinear, measured_pendulum, pendulum_with_radar
@@ -18,7 +18,6 @@ from vehest.filters.gating import Gate
 from vehest.filters.gaussian import Filtered, Gaussian
 from vehest.filters.kalman import LinearModel
 from vehest.filters.kalman_scan import kalman_scan
-from vehest.filters.nonlinear import unscented_filter
 from vehest.filters.sigma_points import SigmaRule
 from vehest.filters.unscented_scan import TorchModel, UnscentedStepper, unscented_scan
 

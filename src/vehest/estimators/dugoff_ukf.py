@@ -34,12 +34,11 @@ from vehest.estimators.filtering.track_filter import (
     padded,
 )
 from vehest.estimators.references import reference_sideslip
-from vehest.filters.definiteness import MARGIN
 from vehest.filters.gating import Gate, gate_values, in_words, suffix
 from vehest.filters.gaussian import Filtered
 from vehest.filters.noise_levels import quiet_level
 from vehest.filters.sigma_points import symmetric_rule
-from vehest.filters.unscented_scan import UnscentedStepper
+from vehest.filters.unscented_scan import MARGIN, UnscentedStepper
 from vehest.training.context import FitContext
 from vehest.training.identification import LEAST_PROCESS_YAW_RATE, IdentificationSettings
 from vehest.training.search import SearchRecord, nelder_mead_over_grid, staged_optuna_search

@@ -1,4 +1,4 @@
-"""The unscented filter over long sequences: the same as `unscented_filter`, with compiled steps and their adjoints.
+"""The unscented Kalman filter with additive noise over long sequences, by compiled steps and their adjoints.
 
 A model says how its points move and what is expected at them, and the adjoints of both; everything else is here. Of each step only states
 and what became of the points are kept, so that long sequences need little memory.
@@ -9,25 +9,40 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from vehest.filters.definiteness import MARGIN
 from vehest.filters.gating import Gate
 from vehest.filters.gaussian import Filtered, Gaussian
-from vehest.filters.nonlinear import Function, NonlinearFiltered
 from vehest.filters.sigma_points import SigmaRule
 from vehest.filters.unscented_steps import gate_of, moments_adjoint, moments_of, points_adjoint, points_of, update_adjoint, update_of
 
+MARGIN = 1e-6
+"""Smallest eigenvalue of a repaired covariance, relative to its largest."""
 Array = NDArray[Any]
+Function = Callable[[Tensor, Tensor], Tensor]
+"""Of states (..., n) and inputs (..., p); leading dimensions of both are equal or broadcast."""
 NoiseAt = Callable[[Array, Array], Array]
 """Covariances of noise at estimated states, (B, n) under inputs (B, p) -> (B, k, k)."""
 Share = Callable[[Callable[[int, int], None], int], None]
 """Calls work(first, end) on stretches of so many sequences, side by side if it likes."""
+
+
+class NonlinearFiltered(NamedTuple):
+    """What a nonlinear filter knows after a sequence.
+
+    Attributes:
+        steps: see `Filtered`.
+        repaired: bool, (..., T): a covariance had lost its definiteness at this sample, and was repaired or, in a scan without repair,
+            made everything from there on NaN.
+    """
+
+    steps: Filtered[Tensor]
+    repaired: Tensor
 
 
 class PointModel(ABC):
@@ -120,10 +135,9 @@ class _Setting:
 
     @classmethod
     def of(cls, model: PointModel, rule: SigmaRule, n: int, dtype: Any, repair: bool, gate: Gate | None) -> _Setting:
-        row = np.array([rule.spread, rule.centre_mean, rule.centre_covariance, rule.other], dtype)
         lower = np.full(n, -np.inf, dtype) if model.lower is None else np.asarray(model.lower, dtype)
         limit = None if gate is None else dtype(gate.deviations**2)
-        return cls(model, row, lower, dtype(MARGIN), repair, gate, limit)
+        return cls(model, np.array(rule, dtype), lower, dtype(MARGIN), repair, gate, limit)
 
 
 class _Points:
@@ -196,6 +210,9 @@ def unscented_scan(
 ) -> NonlinearFiltered:
     """Filter sequences; filtered means and covariances are differentiable in every tensor but the inputs, the rest is not.
 
+    Sigma points are drawn again before each update. Where a negative weight of the mean point is what takes the definiteness of an update,
+    the update goes without it; every other covariance that is not positive definite is lifted.
+
     Args:
         model: how points move.
         measurements: y, (B, T, m); what is NaN was not measured.
@@ -212,7 +229,7 @@ def unscented_scan(
     Raises:
         ValueError: shapes do not fit each other.
 
-    Source: as `unscented_filter`; adjoint of the Cholesky factor from Murray 2016, arXiv 1602.07527.
+    Source: Julier & Uhlmann 1997; van der Merwe 2004, Algorithm 3.1; adjoint of the Cholesky factor: Murray 2016, arXiv 1602.07527.
     """
     if measurements.dim() != 3 or not measurements.shape[1]:
         raise ValueError(f"measurements must be of shape (B, T, m) with T > 0, not {tuple(measurements.shape)}")

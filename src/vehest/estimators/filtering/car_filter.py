@@ -15,9 +15,8 @@ from vehest.filters.compiled_noise import compiled_noise
 from vehest.filters.gating import Gate
 from vehest.filters.gaussian import Gaussian
 from vehest.filters.noise_models import ConstantNoise, StateDependentNoise, with_entropy
-from vehest.filters.nonlinear import NonlinearFiltered
 from vehest.filters.sigma_points import symmetric_rule
-from vehest.filters.unscented_scan import Array, NoiseAt, PointModel, TorchModel, moved, unscented_scan
+from vehest.filters.unscented_scan import Array, NoiseAt, NonlinearFiltered, PointModel, TorchModel, moved, unscented_scan
 from vehest.training.through_filter import Drive
 from vehest.vehicle.dynamics import STATES, Dynamics
 

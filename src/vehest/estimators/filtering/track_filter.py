@@ -17,9 +17,8 @@ from vehest.estimators.kernels.dugoff_track import CompiledDugoffTrack
 from vehest.estimators.kernels.threads import over_members
 from vehest.filters.gating import Gate
 from vehest.filters.gaussian import Gaussian
-from vehest.filters.nonlinear import NonlinearFiltered
 from vehest.filters.sigma_points import symmetric_rule
-from vehest.filters.unscented_scan import PointModel, TorchModel, unscented_scan
+from vehest.filters.unscented_scan import NonlinearFiltered, PointModel, TorchModel, unscented_scan
 from vehest.vehicle.dugoff import TRACK_STATES, DugoffTrack
 
 Over = Literal["samples", "recordings"]
