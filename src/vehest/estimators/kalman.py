@@ -18,7 +18,7 @@ from vehest.data.recording import Recording
 from vehest.declared import Group, setting
 from vehest.estimators.base import FitData, FitRecord, Stepper, Trial
 from vehest.estimators.filtering.sideslip_filter import FilteredStates, SideslipFilter
-from vehest.filters.gating import Gate, gate_values, in_words, suffix
+from vehest.filters.gating import Gate
 from vehest.filters.gaussian import Gaussian
 from vehest.filters.kalman import LinearModel
 from vehest.filters.kalman_scan import kalman_scan
@@ -109,7 +109,7 @@ class KalmanFilter(SideslipFilter):
         """Where the noise levels come from, unless it is the training; offsets and the gate."""
         noise = "" if self.learns else "_given_noise" if self.causal else "_own_noise"
         offsets = "".join(f"_{name}_offset" for name in self.offsets.given)
-        return self.name + noise + offsets + suffix(self.gate)
+        return self.name + noise + offsets + self.gate_suffix
 
     @property
     def full_title(self) -> str:
@@ -117,7 +117,7 @@ class KalmanFilter(SideslipFilter):
         noise = "" if self.learns else f", noise {'given' if self.causal else 'read off the recording itself'}"
         names = {"ay": "ay", "steer": "the steering angle"}
         offsets = "".join(f", offset of {names[name]}" for name in self.offsets.given)
-        return self.title + noise + offsets + in_words(self.gate)
+        return self.title + noise + offsets + self.gate_title
 
     def find_numbers(self, data: FitData, training: Any, context: FitContext) -> tuple[Mapping[str, float], FitRecord]:
         """Noise levels of the measured channels of the training recordings."""
@@ -207,7 +207,7 @@ class KalmanFilter(SideslipFilter):
         ]
         front, rear = car.cornering_stiffness_front, car.cornering_stiffness_rear
         return {
-            **gate_values(self.gate_in_use()),
+            **super().c_values(),
             "n": 2 + len(offsets),
             "columns": 4 + len(offsets) + (len(offsets) > 1),
             "offsets": offsets,

@@ -21,7 +21,7 @@ from vehest.declared import Group, setting
 from vehest.estimators.base import FitData, FitRecord, Trial, rate
 from vehest.estimators.filtering.sideslip_filter import FilteredStates, SideslipFilter
 from vehest.estimators.filtering.tyre_fit import NORMAL_95, AxleMotion, TyreFit, axle_motion, fit_motion
-from vehest.filters.gating import Gate, gate_values, in_words, suffix
+from vehest.filters.gating import Gate
 from vehest.filters.gaussian import Gaussian
 from vehest.filters.noise_levels import high_passed_level
 from vehest.filters.sigma_points import cubature_rule
@@ -177,13 +177,13 @@ class RationalFilter(SideslipFilter):
     def variant(self) -> str:
         """The paper's name for these tyres, and whether the filter is another one, holds them straight ahead, or has a gate."""
         kind = KINDS[self.tyres][0] + ("_ukf" if self.filter == "unscented" else "")
-        return kind + ("_held" if self._holds else "") + suffix(self.gate)
+        return kind + ("_held" if self._holds else "") + self.gate_suffix
 
     @property
     def full_title(self) -> str:
         """The paper's name for these tyres, and the filter."""
         held = ", tyres held straight ahead" if self._holds else ""
-        return f"{KINDS[self.tyres][1]}, {self.filter} Kalman filter{held}{in_words(self.gate)}"
+        return f"{KINDS[self.tyres][1]}, {self.filter} Kalman filter{held}{self.gate_title}"
 
     @property
     def _holds(self) -> bool:
@@ -531,7 +531,7 @@ class RationalFilter(SideslipFilter):
         adapted = [_slope_in_c(name) for name in self.adapted]
         step = 1.0 / self.rate_hz
         return {
-            **gate_values(self.gate_in_use()),
+            **super().c_values(),
             "n": 4 + len(adapted),
             "columns": 4 + len(adapted) + max(2, 1 + len(adapted)),
             "linear": self.tyres == "linear",

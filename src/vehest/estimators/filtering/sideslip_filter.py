@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from vehest.constants import FloatArray
 from vehest.declared import setting
+from vehest.estimators.filtering.gated import Gated
 from vehest.estimators.recursive import Recursive
 from vehest.filters.gating import Gate
 from vehest.filters.gaussian import Gaussian
@@ -64,7 +65,7 @@ class FilterState(NamedTuple):
     refused: NDArray[np.int64]
 
 
-class SideslipFilter(Recursive):
+class SideslipFilter(Gated, Recursive):
     """A filter whose state begins with sideslip angle β and yaw rate r of a single track; v = u tan β."""
 
     channels = ("yaw_rate", "vx", "ay", "steer")
@@ -73,17 +74,10 @@ class SideslipFilter(Recursive):
     covariance_of = ("vy", "yaw_rate")
     car: SingleTrackParameters = setting(FERRARI_250LM, "parameters of the car")
     minimum_speed: float = setting(3.0, "speed below which the model is held at this speed", unit="m/s", positive=True)
-    gate: float | None = setting(
-        None, "standard deviations of an innovation beyond which a measurement is refused in use; null: all are taken", positive=True
-    )
 
     def sampled_model(self, vx: FloatArray) -> LateralModel:
         """The model in steps at forward speeds vx, (T,) [m/s]: x[k+1] = A[k] x[k] + B[k] δ[k], a_y[k] = C[k] x[k] + D[k] δ[k]."""
         return lateral_model(self.car, np.maximum(vx, self.minimum_speed)).in_steps(1.0 / self.rate_hz)
-
-    def gate_in_use(self) -> Gate | None:
-        """The gate of estimates; numbers are found without, because noise that is too small would close it."""
-        return Gate.of(self.gate, self.rate_hz)
 
     def first_motion(self, sample: FloatArray, deviation: FloatArray, given: Mapping[str, float]) -> Gaussian[FloatArray]:
         """β and r before the first sample: 0 with standard deviations (n ≥ 2), further states too, or what a protocol hands over."""

@@ -7,7 +7,8 @@ from collections.abc import Mapping
 from typing import Any, ClassVar, NamedTuple
 
 from vehest.constants import FloatArray
-from vehest.estimators.base import Estimator, Stepper
+from vehest.estimators.base import Stepper
+from vehest.estimators.filtering.gated import Gated
 from vehest.filters.unscented_scan import NoiseAt, UnscentedStepper
 
 
@@ -27,7 +28,7 @@ class FilterStep(NamedTuple):
     observation_noise: FloatArray | NoiseAt
 
 
-class SigmaPointEstimator(Estimator):
+class SigmaPointEstimator(Gated):
     """An estimator by an unscented filter.
 
     Attributes:

@@ -18,7 +18,7 @@ from vehest.estimators.kernels.threads import over_members
 from vehest.filters.gating import Gate
 from vehest.filters.gaussian import Gaussian
 from vehest.filters.sigma_points import symmetric_rule
-from vehest.filters.unscented_scan import NonlinearFiltered, PointModel, TorchModel, unscented_scan
+from vehest.filters.unscented_scan import NonlinearFiltered, PointModel, unscented_scan
 from vehest.vehicle.dugoff import TRACK_STATES, DugoffTrack
 
 Over = Literal["samples", "recordings"]
@@ -34,14 +34,10 @@ class TrackFilter:
 
     Where the car is slower than the track's minimum speed, nothing counts as measured, and the state is that of rolling wheels, with the
     deviations `UNKNOWN`.
-
-    Args:
-        track: the model.
-        compiled: whether sigma points move through compiled code, or through the torch it must equal.
     """
 
-    def __init__(self, track: DugoffTrack, *, compiled: bool = True) -> None:
-        self.track, self.compiled = track, compiled
+    def __init__(self, track: DugoffTrack) -> None:
+        self.track = track
         self.rule = symmetric_rule(len(TRACK_STATES), KAPPA)
         self._models: dict[torch.dtype, PointModel] = {}
 
@@ -106,8 +102,7 @@ class TrackFilter:
     def model(self, dtype: torch.dtype) -> PointModel:
         """The track as the scan takes it."""
         if dtype not in self._models:
-            track = self.track
-            self._models[dtype] = CompiledDugoffTrack(track, dtype) if self.compiled else TorchModel(track.transition, track.observation)
+            self._models[dtype] = CompiledDugoffTrack(self.track, dtype)
         return self._models[dtype]
 
 
