@@ -101,7 +101,7 @@ def test_gradients_through_the_filter_reach_measurements_and_both_noises():
         noises = (torch.diag_embed(part.square()) for part in (process, sensors))
         own = TrackFilter(track)
         if not compiled:
-            own._models[torch.float64] = TorchModel(track.transition, track.observation)
+            own.model = TorchModel(track.transition, track.observation)
         filtered = own.filtered(measurements, inputs, *noises)
         return (filtered.steps.filtered.mean * weights).sum()
 

@@ -431,7 +431,7 @@ class DugoffUkf(SigmaPointEstimator):
         """Straight ahead and unknown, or rolling."""
         own = TrackFilter(self.track(sees_sideslip=len(first.measurement) > 4))
         mean, covariance = (part[0].numpy() for part in own.start(torch.as_tensor(first.inputs)[None]))
-        return UnscentedStepper(own.model(torch.float64), mean, covariance, len(first.measurement), own.rule, gate=self.gate_in_use())
+        return UnscentedStepper(own.model, mean, covariance, len(first.measurement), own.rule, gate=self.gate_in_use())
 
     def filter_step(self, sample: FloatArray, memory: dict[str, Any]) -> FilterStep:
         """Measurements as far as the car is fast enough, and the noise of the range that it is in."""

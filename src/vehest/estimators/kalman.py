@@ -12,17 +12,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vehest.constants import FloatArray
-from vehest.data.errors import ConfigurationError, DataError
+from vehest.data.errors import ConfigurationError
 from vehest.data.estimate import Estimate
 from vehest.data.recording import Recording
 from vehest.declared import Group, setting
 from vehest.estimators.base import FitData, FitRecord, Stepper, Trial
-from vehest.estimators.filtering.sideslip_filter import FilteredStates, SideslipFilter
+from vehest.estimators.filtering.sideslip_filter import FilteredStates, SideslipFilter, read_levels
 from vehest.filters.gating import Gate
 from vehest.filters.gaussian import Gaussian
 from vehest.filters.kalman import LinearModel
 from vehest.filters.kalman_scan import kalman_scan
-from vehest.filters.noise_levels import high_passed_level
 from vehest.training.context import FitContext
 
 LEVELS = ("yaw_rate", "ay", "steer")
@@ -124,16 +123,7 @@ class KalmanFilter(SideslipFilter):
         return self._levels_of(data.train), FitRecord()
 
     def _levels_of(self, recordings: Sequence[Recording]) -> dict[str, float]:
-        levels = dict(self.values)
-        for name in self.noise.unknown:
-            among = f"recording{'s' if len(recordings) > 1 else ''} {', '.join(repr(recording.id) for recording in recordings)}"
-            try:
-                levels[name] = high_passed_level([recording[name] for recording in recordings], self.noise.cutoff)
-            except ValueError as error:
-                raise DataError(f"{among}: channel '{name}': {error}; give estimator.noise.{name}") from None
-            if not levels[name] > SILENT:
-                raise DataError(f"{among}: channel '{name}' has no noise that could be read off it; give estimator.noise.{name}")
-        return levels
+        return self.values | read_levels(recordings, self.noise.unknown, self.noise.cutoff, SILENT)
 
     def _estimate_one(self, recording: Recording, initial_state: Mapping[str, float] | None) -> Estimate:
         own = self

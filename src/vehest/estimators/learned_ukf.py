@@ -45,7 +45,6 @@ from vehest.vehicle.dynamics import (
 from vehest.vehicle.planar import F1TENTH_START, Chassis
 from vehest.vehicle.tyres import STILL
 
-DYNAMICS = ("pacejka", "residual", "neural", "tyre_network", "friction_tyre_network")
 SHORT = {"pacejka": "pc", "residual": "pcr", "neural": "nn", "tyre_network": "nnt", "friction_tyre_network": "nntf"}
 TITLES = {
     "pacejka": "Pacejka's tyres",

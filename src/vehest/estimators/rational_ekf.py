@@ -19,11 +19,10 @@ from vehest.data.errors import ConfigurationError, DataError
 from vehest.data.recording import Recording
 from vehest.declared import Group, setting
 from vehest.estimators.base import FitData, FitRecord, Trial, rate
-from vehest.estimators.filtering.sideslip_filter import FilteredStates, SideslipFilter
+from vehest.estimators.filtering.sideslip_filter import FilteredStates, SideslipFilter, read_levels
 from vehest.estimators.filtering.tyre_fit import NORMAL_95, AxleMotion, TyreFit, axle_motion, fit_motion
 from vehest.filters.gating import Gate
 from vehest.filters.gaussian import Gaussian
-from vehest.filters.noise_levels import high_passed_level
 from vehest.filters.sigma_points import cubature_rule
 from vehest.filters.unscented_scan import TorchModel, UnscentedStepper
 from vehest.training.context import FitContext
@@ -130,9 +129,10 @@ class RationalFilter(SideslipFilter):
     def __init__(self, settings: Any) -> None:
         super().__init__(settings)
         given = {name: getattr(settings.curves, name) for name in self.curve_names}
-        self.axle_curves = np.array([_number(given.get(name, math.inf)) for name in CURVES])
+        self.axle_curves = np.array([given.get(name, math.inf) for name in CURVES], np.float64)
         self.curve_covariance = (settings.curves.deviation or GIVEN_DEVIATION) ** 2 * np.eye(len(CURVES))
-        self.values = {name: _number(getattr(settings.noise, name) if name in self.level_names else 0.0) for name in LEVELS}
+        levels = vars(settings.noise) | {name: 0.0 for name in LEVELS if name not in self.level_names}
+        self.values = {name: math.nan if level is None else level for name, level in levels.items()}
         self._seed = 0
 
     def check(self) -> None:
@@ -241,18 +241,19 @@ class RationalFilter(SideslipFilter):
         if training.method == "data":
             self.values = self._levels_of(data.train)
         elif self._searched:
-            extended = self._extended()
-            search = extended._tune(data.train, training, context)
+            extended, drives = self._extended(), self._drives(data.train)
+            search = extended._tune(drives, training, context)
             n = len(self._searched)
             columns = [*(f"start_{name}" for name in self._searched), *self._searched, "train_loss"]
             history = {name: search.starts[:, column].tolist() for column, name in enumerate(columns)}
             boxes = np.array([BOXES[name] for name in self._searched])
             at_limits = np.minimum(search.best[:n] - boxes[:, 0], boxes[:, 1] - search.best[:n]) < EDGE * np.ptp(boxes, axis=1)
             metrics |= {"evaluations": search.evaluations, "best_train_loss": search.cost, "levels_at_limits": int(at_limits.sum())}
-            self.values = extended._calibrated(search.best[:n], [_samples(r) for r in data.train])
+            self.values = extended._calibrated(search.best[:n], drives)
             interrupted = search.interrupted
         if data.validation and all(_has_reference(recording) for recording in data.validation):
-            metrics["best_validation_loss"] = self._mean_squared_error(data.validation, training.skip_seconds)
+            skip = round(training.skip_seconds * self.rate_hz)
+            metrics["best_validation_loss"] = self._cost(self._drives(data.validation), self.values, skip)
         metrics |= {f"noise_{name}": self.values[name] for name in self.level_names}
         metrics["train_seconds"] = time.monotonic() - started
         return FitRecord(history=history, metrics=metrics, interrupted=interrupted)
@@ -278,17 +279,8 @@ class RationalFilter(SideslipFilter):
 
     def _levels_of(self, recordings: Sequence[Recording]) -> dict[str, float]:
         unknown = [name for name in self.level_names if getattr(self.noise, name) is None]
-        levels = {**self.values, **{name: value for name, value in ASSUMED.items() if name in unknown}}
-        for name in ("yaw_rate", "ay"):
-            if name not in unknown:
-                continue
-            try:
-                levels[name] = high_passed_level([recording[name] for recording in recordings], CUTOFF)
-            except ValueError as error:
-                raise DataError(f"channel '{name}' of the training recordings: {error}; give estimator.noise") from None
-            if not levels[name] > 0.0:
-                raise DataError(f"channel '{name}' of the training recordings has no noise that could be read off it; give estimator.noise")
-        return levels
+        assumed = {name: value for name, value in ASSUMED.items() if name in unknown}
+        return self.values | assumed | read_levels(recordings, [name for name in LEVELS[:2] if name in unknown], CUTOFF)
 
     def _extended(self) -> RationalFilter:
         """The extended filter of the same model, by which levels are found: a search through the unscented one would take hours."""
@@ -298,22 +290,23 @@ class RationalFilter(SideslipFilter):
         twin.settings = replace(self.settings, filter="extended")
         return twin
 
-    def _tune(self, recordings: Sequence[Recording], training: NoiseTuningSettings, context: FitContext) -> SearchRecord:
+    def _drives(self, recordings: Sequence[Recording]) -> list[tuple[FloatArray, FloatArray]]:
+        """Samples of ``channels``, (T, 4), and the reference sideslip [rad], (T,), of each recording."""
+        return [(recording.stack(self.channels), _reference(recording)) for recording in recordings]
+
+    def _tune(self, drives: Sequence[tuple[FloatArray, FloatArray]], training: NoiseTuningSettings, context: FitContext) -> SearchRecord:
         """Levels with the smallest error of sideslip, as powers of ten."""
-        pairs = [_samples(recording) for recording in recordings]
-        wanted = [_reference(recording) for recording in recordings]
         skip = round(training.skip_seconds * self.rate_hz)
 
         def cost(powers: FloatArray) -> float:
-            levels = self._calibrated(powers, pairs)
-            return self._cost(pairs, wanted, levels, skip)
+            return self._cost(drives, self._calibrated(powers, drives), skip)
 
         boxes = [BOXES[name] for name in self._searched]
         if training.method == "optuna":
             return optuna_search(cost, boxes, training.trials, self._seed, context)
         return nelder_mead_over_grid(cost, boxes, [STARTS[name] for name in self._searched], training.search, context)
 
-    def _calibrated(self, powers: FloatArray, pairs: Sequence[FloatArray]) -> dict[str, float]:
+    def _calibrated(self, powers: FloatArray, drives: Sequence[tuple[FloatArray, FloatArray]]) -> dict[str, float]:
         """Levels at powers of ten of `_searched`; those of sensors are scaled so that innovations are as large as the filter expects."""
         found = dict(zip(self._searched, (10.0**powers).tolist(), strict=True))
         tyres = found.get("tyres", self.noise.tyres or 0.0)
@@ -326,7 +319,7 @@ class RationalFilter(SideslipFilter):
         scale = FIRST_SCALE
         for _ in range(CALIBRATIONS):
             levels, total, count = scaled(scale), 0.0, 0.0
-            for samples in pairs:
+            for samples, _ in drives:
                 nis, n_measured = self.filter_samples(samples, levels=levels).nis()
                 total, count = total + float(nis.sum()), count + float(n_measured.sum())
             if not (math.isfinite(total) and total > 0.0):
@@ -334,14 +327,10 @@ class RationalFilter(SideslipFilter):
             scale *= math.sqrt(total / max(count, 1.0))
         return scaled(scale)
 
-    def _mean_squared_error(self, recordings: Sequence[Recording], skip_seconds: float) -> float:
-        pairs, wanted = [_samples(r) for r in recordings], [_reference(r) for r in recordings]
-        return self._cost(pairs, wanted, self.values, round(skip_seconds * self.rate_hz))
-
-    def _cost(self, pairs: Sequence[FloatArray], wanted: Sequence[FloatArray], levels: Mapping[str, float], skip: int) -> float:
+    def _cost(self, drives: Sequence[tuple[FloatArray, FloatArray]], levels: Mapping[str, float], skip: int) -> float:
         """Mean squared error of sideslip [rad²] over samples fast enough for the model."""
         total, count = 0.0, 0
-        for samples, reference in zip(pairs, wanted, strict=True):
+        for samples, reference in drives:
             error = (self.filter_samples(samples, levels=levels).mean[:, 0] - reference)[skip:]
             counted = (samples[skip:, 1] >= self.minimum_speed) & np.isfinite(reference[skip:])
             total, count = total + float(np.square(error[counted]).sum()), count + int(counted.sum())
@@ -589,10 +578,6 @@ def _doubts(motion: AxleMotion, kind: Literal["linear", "rational"], fit: TyreFi
     return found
 
 
-def _samples(recording: Recording) -> FloatArray:
-    return recording.stack(SideslipFilter.channels)
-
-
 def _has_reference(recording: Recording) -> bool:
     return "sideslip_ref" in recording or "vy_ref" in recording
 
@@ -608,10 +593,6 @@ def _empty(steps: int, n: int) -> tuple[FloatArray, FloatArray, FloatArray, Floa
     """Room for everything in `FilteredStates` but the last state."""
     pairs = (np.empty((steps, 2, 2)), np.empty((steps, 2)), np.empty((steps, 2, 2)))
     return (np.empty((steps, n)), np.empty((steps, n)), *pairs, np.empty((steps, 2), np.bool_))
-
-
-def _number(value: float | None) -> float:
-    return math.nan if value is None else value
 
 
 ESTIMATOR = RationalFilter

@@ -206,7 +206,6 @@ def unscented_scan(
     repair: bool = True,
     share: Share | None = None,
     gate: Gate | None = None,
-    refused: NDArray[np.int64] | None = None,
 ) -> NonlinearFiltered:
     """Filter sequences; filtered means and covariances are differentiable in every tensor but the inputs, the rest is not.
 
@@ -224,7 +223,6 @@ def unscented_scan(
         repair: whether covariances that are not positive definite are repaired; otherwise the sequence becomes NaN.
         share: how sequences are shared out over threads; none: one thread.
         gate: which measurements are refused; none: all are taken. The decision itself has no gradient.
-        refused: how often on end each measurement was before the first sample, (B, m); after the last one on return. None: never.
 
     Raises:
         ValueError: shapes do not fit each other.
@@ -244,7 +242,6 @@ def unscented_scan(
     dtype = measurements.dtype
     numpy_dtype = np.float32 if dtype == torch.float32 else np.float64
     setting = _Setting.of(model, rule, n, numpy_dtype, repair, gate)
-    refused = np.zeros((sequences, m), np.int64) if refused is None else refused
     noises = [process_noise, observation_noise]
     functions = [noise if not isinstance(noise, Tensor) else None for noise in noises]
     tensors = [
@@ -253,7 +250,7 @@ def unscented_scan(
     ]
     tape = _Tape(steps, sequences, n, m, numpy_dtype)
     post_mean, post_covariance = _Scan.apply(  # type: ignore[no-untyped-call]
-        setting, share or _alone, tape, functions, refused, measurements, inputs, mean, covariance, *tensors, *model.parameters
+        setting, share or _alone, tape, functions, measurements, inputs, mean, covariance, *tensors, *model.parameters
     )
     outside = [torch.from_numpy(values.swapaxes(0, 1)) for values in (tape.prior_mean, tape.prior_covariance, tape.innovation, tape.own)]
     filtered = Filtered(
@@ -358,7 +355,6 @@ class _Scan(torch.autograd.Function):
         share: Share,
         tape: _Tape,
         functions: Sequence[NoiseAt | None],
-        refused: NDArray[np.int64],
         measurements: Tensor,
         inputs: Tensor,
         mean: Tensor,
@@ -378,7 +374,7 @@ class _Scan(torch.autograd.Function):
         def work(start: int, end: int) -> None:
             part = tape if end - start == y.shape[1] else tape.slice(start, end)
             own = [noise[:, start:end] if isinstance(noise, np.ndarray) else noise for noise in noises]
-            _forward(setting, part, y[:, start:end], u[:, start:end], first[0][start:end], first[1][start:end], own, refused[start:end])
+            _forward(setting, part, y[:, start:end], u[:, start:end], first[0][start:end], first[1][start:end], own)
             if part is not tape:
                 tape.put(start, end, part)
 
@@ -416,7 +412,7 @@ class _Scan(torch.autograd.Function):
         share(work, sequences)
         summed = [torch.from_numpy(np.asarray(sum(parts))) for parts in zip(*(gradients[key] for key in sorted(gradients)), strict=True)]
         y_bar, *noise = (torch.from_numpy(bar).transpose(0, 1) for bar in (measured, process, observation))
-        return (None, None, None, None, None, y_bar, None, torch.from_numpy(mean), torch.from_numpy(covariance), *noise, *summed)
+        return (None, None, None, None, y_bar, None, torch.from_numpy(mean), torch.from_numpy(covariance), *noise, *summed)
 
 
 def _forward(
@@ -427,8 +423,8 @@ def _forward(
     mean: Array,
     covariance: Array,
     noises: Sequence[Any],
-    refused: NDArray[np.int64],
 ) -> None:
+    refused = np.zeros(y.shape[1:], np.int64)
     points = _Points(setting, len(mean), mean.shape[1], y.dtype)
     for k in range(len(y)):
         now = np.ascontiguousarray(u[k])

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from functools import partial
-from typing import Literal
+from typing import Any, Literal
 
 import torch
 from torch import Tensor, nn
@@ -16,7 +16,7 @@ from vehest.filters.gating import Gate
 from vehest.filters.gaussian import Gaussian
 from vehest.filters.noise_models import ConstantNoise, StateDependentNoise, with_entropy
 from vehest.filters.sigma_points import symmetric_rule
-from vehest.filters.unscented_scan import Array, NoiseAt, NonlinearFiltered, PointModel, TorchModel, moved, unscented_scan
+from vehest.filters.unscented_scan import NoiseAt, NonlinearFiltered, PointModel, TorchModel, moved, unscented_scan
 from vehest.training.through_filter import Drive
 from vehest.vehicle.dynamics import STATES, Dynamics
 
@@ -46,6 +46,8 @@ class CarFilter(nn.Module):
     Source: Węgrzynowski et al. 2024, Section III-B; start values as in its authors' code.
     """
 
+    process_noise: Any
+    observation_noise: Any
     mirror: tuple[Sequence[float], Sequence[float], Sequence[float]] = (  # left for right
         (1.0, -1.0, -1.0, 1.0, 1.0),
         (-1.0, 1.0),
@@ -141,13 +143,12 @@ class CarFilter(nn.Module):
 
     def noise_at(self) -> tuple[NoiseAt, NoiseAt]:
         """Process and observation noise as functions of arrays of states."""
-        process, observation = self.process_noise, self.observation_noise
-        if isinstance(process, StateDependentNoise) and isinstance(observation, StateDependentNoise):
-            return compiled_noise(process, LEAST_ENTROPY), compiled_noise(observation)
+        if not self.constant:
+            return compiled_noise(self.process_noise, LEAST_ENTROPY), compiled_noise(self.observation_noise)
         nothing = self.initial_noise.unit.new_zeros(1, len(STATES))
         with torch.no_grad():
-            values = [noise(nothing, nothing).contiguous().numpy() for noise in (self._process_noise, observation)]
-        return partial(_whatever, values[0]), partial(_whatever, values[1])
+            values = [noise(nothing, nothing).contiguous().numpy() for noise in (self._process_noise, self.observation_noise)]
+        return (lambda states, inputs: values[0]), (lambda states, inputs: values[1])
 
     def begin_noise(self, drives: Sequence[Drive], start_spread: float) -> None:
         """Start noise from one-step and measurement residuals at the true states; see `Filtering`.
@@ -185,7 +186,7 @@ class CarFilter(nn.Module):
             measurements = drives.measurements[:, begin:end]
             if first:
                 measurements = torch.cat([torch.full_like(measurements[:, :1], torch.nan), measurements[:, 1:]], 1)
-            states = self._settled(drives.states[:, begin:end])
+            states = None if self.constant else drives.states[:, begin:end]
             filtered = self.filtered(measurements, drives.inputs[:, begin:end], initial, states, model).steps.filtered
             means.append(filtered.mean[:, first - begin :])
             covariances.append(filtered.covariance[:, first - begin :])
@@ -198,12 +199,5 @@ class CarFilter(nn.Module):
             initial = Gaussian(drives.states[:, 0], self.initial_covariance())
             return self.filtered(drives.measurements, drives.inputs, initial).steps.filtered.mean
 
-    def _settled(self, states: Tensor) -> Tensor | None:
-        return None if self.constant else states
-
     def _process_noise(self, states: Tensor, inputs: Tensor) -> Tensor:
         return with_entropy(self.process_noise(states, inputs), LEAST_ENTROPY)
-
-
-def _whatever(covariance: Array, states: Array, inputs: Array) -> Array:
-    return covariance

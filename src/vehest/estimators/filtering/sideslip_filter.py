@@ -4,18 +4,21 @@ from __future__ import annotations
 
 import math
 from abc import abstractmethod
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from vehest.constants import FloatArray
+from vehest.data.errors import DataError
+from vehest.data.recording import Recording
 from vehest.declared import setting
 from vehest.estimators.filtering.gated import Gated
 from vehest.estimators.recursive import Recursive
 from vehest.filters.gating import Gate
 from vehest.filters.gaussian import Gaussian
+from vehest.filters.noise_levels import high_passed_level
 from vehest.vehicle.parameters import FERRARI_250LM, SingleTrackParameters
 from vehest.vehicle.single_track import LateralModel, lateral_model
 
@@ -124,3 +127,27 @@ class SideslipFilter(Gated, Recursive):
             "innovations": found.nis,
         }
         return values | self.quantities(mean), FilterState(samples[-1], found.last, refused)
+
+
+def read_levels(recordings: Sequence[Recording], names: Sequence[str], cutoff: float, least: float = 0.0) -> dict[str, float]:
+    """Standard deviations of measured channels above a frequency, by name.
+
+    Args:
+        recordings: of which all samples count together.
+        names: of channels.
+        cutoff: see `high_passed_level`.
+        least: what a level has to exceed to be noise.
+
+    Raises:
+        DataError: a channel has too many gaps, or no noise.
+    """
+    among = f"recording{'s' if len(recordings) > 1 else ''} {', '.join(repr(recording.id) for recording in recordings)}"
+    levels = {}
+    for name in names:
+        try:
+            levels[name] = high_passed_level([recording[name] for recording in recordings], cutoff)
+        except ValueError as error:
+            raise DataError(f"{among}: channel '{name}': {error}; give estimator.noise.{name}") from None
+        if not levels[name] > least:
+            raise DataError(f"{among}: channel '{name}' has no noise that could be read off it; give estimator.noise.{name}")
+    return levels
