@@ -11,7 +11,7 @@ import inspect
 import math
 import re
 from collections.abc import Iterable, Sequence
-from dataclasses import fields
+from dataclasses import fields, is_dataclass
 from pathlib import Path
 from typing import Any
 
@@ -28,6 +28,8 @@ ACROSS_SOURCE = "results/ksnn/tables/overview.csv"
 
 FIGURES_START = re.compile(r"<!-- figures of (\w+)/(\w+): made by docs/make_reference.py from results -->")  # study and figure
 FIGURES_END = "<!-- end of figures -->"
+SETTINGS_START = "<!-- settings: made by docs/make_reference.py from what the families declare -->"
+SETTINGS_END = "<!-- end of settings -->"
 BASELINES = ("zero", "static_map")
 
 ROOT_FILES = ("common", "ingest", "downsample", "train", "eval", "estimate")
@@ -260,17 +262,43 @@ def _arguments(described: type) -> Iterable[str]:
 
 def _family_pages(root: Path) -> list[Path]:
     """Pages of families that show a figure of a study."""
-    return [page for page in sorted((root / "docs" / "estimators").glob("*.md")) if FIGURES_START.search(page.read_text(encoding="utf-8"))]
+    return [page for page in sorted((root / "docs" / "estimators").glob("*.md")) if SETTINGS_START in page.read_text(encoding="utf-8")]
 
 
 def family_page(path: Path, root: Path) -> str:
     """The page of the families that its title names, with what published studies say of them."""
     text = path.read_text(encoding="utf-8")
+    estimators = re.findall(r"`(\w+)`", text.partition("\n")[0])
+    tables = [part for name in estimators for part in _settings(name, many=len(estimators) > 1)]
+    text = _between(text, SETTINGS_START, SETTINGS_END, "\n" + "\n\n".join(tables) + "\n")
     start = FIGURES_START.search(text)
-    assert start is not None
-    estimators, (study, figure) = re.findall(r"`(\w+)`", text.partition("\n")[0]), start.groups()
+    if start is None:
+        return text
+    study, figure = start.groups()
     parts = [*_on_test_sets(estimators, root), *_in_study(study, root), *_shown(study, figure, root)]
     return _between(text, start.group(), FIGURES_END, "\n" + "\n\n".join(parts) + "\n")
+
+
+def _settings(name: str, many: bool) -> Iterable[str]:
+    """Settings and fitted numbers of a family, as its class declares them."""
+    from vehest.estimators.registry import estimator_class
+
+    rows = list(_declared(estimator_class(name).settings_type(), ""))
+    if many:
+        yield f"`{name}`:"
+    yield _table(("`estimator.`", "default", "unit", "meaning"), rows)
+
+
+def _declared(settings: Any, above: str) -> Iterable[tuple[str, str, str, str]]:
+    from vehest.declared import Group, declaration
+
+    for field in fields(settings):
+        value, declared = getattr(settings, field.name), declaration(field)
+        if isinstance(value, Group):
+            yield from _declared(value, f"{above}{field.name}.")
+        elif declared is not None:
+            default = "fitted" if declared.is_fitted else "[…]" if is_dataclass(value) else f"`{_as_yaml(value)}`"
+            yield f"`{above}{field.name}`", default, declared.unit, declared.doc
 
 
 def _rows(path: Path) -> list[dict[str, str]]:

@@ -6,8 +6,8 @@ Embedding and learnt positions, encoder layers of torch's own, and a read-out of
 import torch
 from torch import Tensor, nn
 
-from vehest.declared import setting
 from vehest.data.errors import ConfigurationError
+from vehest.declared import setting
 from vehest.estimators.networks.windowed import StandardisedNetwork, WindowedEstimator
 
 

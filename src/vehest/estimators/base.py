@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from abc import ABC, abstractmethod
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import Field, dataclass, field, make_dataclass
@@ -58,13 +59,13 @@ class Trial(NamedTuple):
     """A family in the first comparison on a car that nobody has trained on (`vehest new`).
 
     Attributes:
-        place: among the trials of all families, the most promising and cheap first; families of one place are one sweep.
+        place: among the trials of all families, the most promising and cheap first; those that differ in place alone are one sweep.
         about: text for people.
         overrides: of settings and training; ``{wheelbase}`` and ``{mass}`` are those of the car, ``{car}`` all of its parameters that the
             family's settings have.
     """
 
-    place: int
+    place: float
     about: str
     overrides: str = ""
 
@@ -301,15 +302,15 @@ class Estimator(ABC):
             DataError: one is missing, or is refused.
         """
         try:
-            values = np.array([float(sample[name]) for name in self.channels])
+            values = [float(sample[name]) for name in self.channels]
         except KeyError as error:
             raise DataError(f"the sample has no channel {error}; it needs {', '.join(self.channels)}") from None
-        for name, value in zip(self.channels, values, strict=True):
-            if ("infinite" in self.refuses and np.isinf(value)) or (
-                "NaN" in self.refuses and np.isnan(value) and name not in self.skippable
-            ):
-                raise DataError(f"the sample's '{name}' is {value}, which estimator '{self.name}' cannot take")
-        return values
+        if not all(map(math.isfinite, values)):
+            for name, value in zip(self.channels, values, strict=True):
+                what = "infinite" if math.isinf(value) else "NaN"
+                if not math.isfinite(value) and what in self.refuses and not (what == "NaN" and name in self.skippable):
+                    raise DataError(f"the sample's '{name}' is {value}, which estimator '{self.name}' cannot take")
+        return np.array(values)
 
     def _wrapped(
         self,

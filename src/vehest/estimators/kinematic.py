@@ -28,7 +28,7 @@ class Kinematic(Recursive):
     """
 
     name, title = "kinematic", "Kinematic integration"
-    trials = (Trial(0, "baselines: v = 0, two numbers, leaky integration; seconds"),)
+    trials = (Trial(0.2, "baselines: v = 0, two numbers, leaky integration; seconds"),)
     channels = ("vx", "yaw_rate", "ay")
     ignores_initial_state = True
     template = "kinematic"

@@ -26,7 +26,7 @@ class StaticMap(Recursive):
     """
 
     name, title = "static_map", "Static map"
-    trials = (Trial(0, "baselines: v = 0, two numbers, leaky integration; seconds"),)
+    trials = (Trial(0.1, "baselines: v = 0, two numbers, leaky integration; seconds"),)
     channels = ("vx", "yaw_rate")
     ignores_initial_state = True
     template = "static"

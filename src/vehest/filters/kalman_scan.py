@@ -67,6 +67,8 @@ def kalman_scan(
 
 
 def _contiguous(values: FloatArray, shape: tuple[int, ...], name: str) -> FloatArray:
+    if values.shape == shape and values.dtype == np.float64:
+        return np.ascontiguousarray(values)
     try:
         return np.ascontiguousarray(np.broadcast_to(np.asarray(values, dtype=np.float64), shape))
     except ValueError:

@@ -22,6 +22,7 @@ from vehest.filters.noise_levels import high_passed_level
 from vehest.vehicle.parameters import FERRARI_250LM, SingleTrackParameters
 from vehest.vehicle.single_track import LateralModel, lateral_model
 
+MEASURED = [0, 2]  # yaw rate and lateral acceleration among the channels
 KNOWN = 1e-6  # rad and rad/s, standard deviation of a state that a protocol hands over
 
 
@@ -113,13 +114,15 @@ class SideslipFilter(Gated, Recursive):
         """Lateral velocity [m/s], yaw rate [rad/s], their covariances and innovations, and what further states say."""
         rows, refused = samples, state.refused.copy()
         if state.sample is not None:
-            rows = np.vstack([state.sample, samples])
-            rows[0, [self.channels.index(name) for name in self.skippable]] = np.nan
+            rows = np.empty((len(samples) + 1, len(self.channels)))
+            rows[0], rows[1:] = state.sample, samples
+            rows[0, MEASURED] = np.nan
         found = self.filter_samples(rows, state.state, self.gate_in_use(), refused)
         own = slice(len(rows) - len(samples), None)
         mean, vx = found.mean[own], samples[:, 1]
         tangent = np.tan(mean[:, 0])
-        scale = np.stack([vx * (1.0 + tangent**2), np.ones_like(vx)], axis=1)
+        scale = np.ones((len(samples), 2))
+        scale[:, 0] = vx * (1.0 + tangent**2)
         values = {
             "vy": vx * tangent,
             "yaw_rate": mean[:, 1].copy(),

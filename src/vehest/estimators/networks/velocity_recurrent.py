@@ -160,6 +160,7 @@ class RecurrentVelocityEstimator(Network):
         self.channels = tuple(dict.fromkeys(("vx", *self.inputs)))
         self.learns_from = tuple(REFERENCES[name] for name in self.outputs)
         self.network = self.new_network()
+        self._columns = [self.channels.index(name) for name in self.inputs]
 
     def check(self) -> None:
         """Raises:
@@ -228,7 +229,7 @@ class RecurrentVelocityEstimator(Network):
 
     def run(self, samples: FloatArray, state: State) -> tuple[dict[str, Any], State]:
         """Velocities [m/s, rad/s]."""
-        inputs = torch.as_tensor(samples[:, [self.channels.index(name) for name in self.inputs]], dtype=self.network.input_mean.dtype)
+        inputs = torch.as_tensor(samples[:, self._columns], dtype=self.network.input_mean.dtype)
         pieces = []
         with torch.no_grad():
             for piece in inputs.split(CHUNK):

@@ -15,7 +15,6 @@ from vehest.data.errors import ConfigurationError, VehestError, printable
 from vehest.data.files import written_aside
 from vehest.data.limits import limits_from_config, use_limits
 from vehest.data.recording_summary import RecordingSummary
-from vehest.estimators.base import Trial
 from vehest.estimators.registry import estimator_class, estimator_names
 from vehest.run.config import compose_config
 from vehest.run.config_files import choices
@@ -154,12 +153,11 @@ def _words(made: Draft, plan: Plan, left: Sequence[Question]) -> list[str]:
 def _plan_of(contents: Sequence[RecordingSummary], vehicle: Mapping[str, float | None]) -> Plan:
     """Sweeps over the families that recordings and known values of the car allow; an empty plan where they allow none."""
     plan, values = Plan(), _car(vehicle)
-    sweeps: dict[Trial, list[str]] = {}
-    for name in estimator_names():
-        for trial in estimator_class(name).trials:
-            sweeps.setdefault(trial, []).append(name)
-    for trial in sorted(sweeps):
-        names, overrides = sweeps[trial], trial.overrides
+    trials = sorted((trial, name) for name in estimator_names() for trial in estimator_class(name).trials)
+    sweeps: dict[tuple[str, str], list[str]] = {}
+    for trial, name in trials:
+        sweeps.setdefault(trial[1:], []).append(name)
+    for (about, overrides), names in sweeps.items():
         if PRETRAINED in overrides and min(own.rate_hz for own in contents) < PRETRAINED_HZ * (1 - 1e-9):
             continue  # the next entry trains the same family from scratch
         unknown = [name for name in ("wheelbase", "mass") if not vehicle[name] and ("{car}" in overrides or f"{{{name}}}" in overrides)]
@@ -169,7 +167,7 @@ def _plan_of(contents: Sequence[RecordingSummary], vehicle: Mapping[str, float |
         tried = [name for name in names if not lacks[name]]
         plan.lacking.update({name: lack for name, lack in lacks.items() if lack})
         if tried:
-            plan.sweeps.append(([f"estimator={','.join(tried)}", *words], trial.about))
+            plan.sweeps.append(([f"estimator={','.join(tried)}", *words], about))
             plan.estimators.extend(tried)
     known = {name for names in sweeps.values() for name in names} | {"learned_ukf_variant"}  # which only a paper's study compares
     others = [name for name in (*choices("estimator"), *estimator_names()) if name not in known]
