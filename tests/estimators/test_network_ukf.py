@@ -12,6 +12,7 @@ from test_sample_network import loaded_drive
 
 from dugoff_drive import TYRES
 from vehest.data.errors import ConfigurationError, DataError
+from vehest.data.schema import settings_from_config
 from vehest.estimators import cnn_ukf
 from vehest.estimators.base import FitData
 from vehest.estimators.cnn_ukf import CnnUkf, EndToEnd, EndToEndSettings
@@ -335,4 +336,4 @@ def test_one_recording_decides_less_where_recordings_count() -> None:
 )
 def test_settings_of_a_training_that_make_no_sense_are_refused(settings: type, wrong: dict[str, object]) -> None:
     with pytest.raises(ConfigurationError, match=next(iter(wrong))):
-        settings(**wrong)
+        settings_from_config(settings, wrong, "training")
