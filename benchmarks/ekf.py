@@ -27,7 +27,7 @@ MOST_SECONDS, MOST_DIFFERENCE = 60.0, 1e-9
 
 def main() -> None:
     """Measure, write, print."""
-    from readable_filters import extended_filter
+    from readable_filters import extended_filter, rational_model
 
     from vehest.estimators.rational_ekf import RationalFilter
     from vehest.filters.gaussian import Gaussian
@@ -45,9 +45,9 @@ def main() -> None:
     compiled = estimator.filter_samples(short)
     first = Gaussian(*map(torch.as_tensor, estimator.first_gaussian(short[0], {})))
     inputs = (torch.as_tensor(short[:, [0, 2]]), torch.as_tensor(short[:, [1, 3]]))
-    extended_filter(estimator.nonlinear_model(), inputs[0][:5], inputs[1][:5], first)
+    extended_filter(rational_model(estimator), inputs[0][:5], inputs[1][:5], first)
     started = time.process_time()
-    readable = extended_filter(estimator.nonlinear_model(), *inputs, first).filtered.mean.numpy()
+    readable = extended_filter(rational_model(estimator), *inputs, first).filtered.mean.numpy()
     baseline = (time.process_time() - started) * steps / SHORT
     before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     started = time.process_time()

@@ -154,7 +154,7 @@ def measured(dataset: str, folder: Path, output: Path, root: str) -> list[dict[s
         except ConfigurationError as error:
             print(f"{folder.name}: {error}")
             continue
-        files = program_files(GuardedStepper(model, trust), precision, model.full_title)[0]  # type: ignore[arg-type]
+        files = program_files(GuardedStepper(model, trust), precision, model.full_title)  # type: ignore[arg-type]
         with tempfile.TemporaryDirectory() as temporary:
             place = Path(temporary)
             for name, text in files.items():

@@ -9,7 +9,7 @@ from vehest.data.recording import Recording
 from vehest.vehicle.dugoff import DugoffAxle, DugoffTrack, LoadedCar
 
 FRONT, REAR = DugoffAxle(1.2e5, 1.0, 0.005), DugoffAxle(1.7e5, 1.05, 0.004)
-TYRES = {f"{name}_{axle}": value for axle, own in (("front", FRONT), ("rear", REAR)) for name, value in vars(own).items()}
+TYRES = {f"{name}_{axle}": value for axle, own in (("front", FRONT), ("rear", REAR)) for name, value in own._asdict().items()}
 NOISE = {"ay": 0.06, "yaw_rate": 0.002, "fy": 70.0}
 
 

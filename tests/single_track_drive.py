@@ -5,9 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from vehest.data.recording import Recording
-from vehest.estimators.filtering.sideslip_filter import SampledModel
 from vehest.vehicle.parameters import FERRARI_250LM
-from vehest.vehicle.single_track import forward_euler, lateral_acceleration, lateral_dynamics
+from vehest.vehicle.single_track import lateral_model
 
 NOISE = {"yaw_rate": 0.01, "ay": 0.5, "steer": 0.01}
 
@@ -23,8 +22,7 @@ def linear_drive(
     time = np.arange(round(seconds * rate_hz)) / rate_hz
     vx = 28.0 + 9.0 * np.sin(0.3 * time + generator.uniform(0, 6))
     steer = 0.05 * np.sin(0.8 * time + generator.uniform(0, 6)) + 0.02 * np.sin(2.9 * time)
-    dynamics = forward_euler(lateral_dynamics(FERRARI_250LM, vx), 1.0 / rate_hz)
-    model = SampledModel(*(part.numpy() for part in (*dynamics, *lateral_acceleration(FERRARI_250LM, vx))))
+    model = lateral_model(FERRARI_250LM, vx).in_steps(1.0 / rate_hz)
     states = np.zeros((len(time), 2))
     disturbed = steer + noise["steer"] * generator.standard_normal(len(time))
     for k in range(len(time) - 1):

@@ -10,7 +10,7 @@ from collections.abc import Callable
 
 import pytest
 import torch
-from readable_filters import extended_filter, gated
+from readable_filters import NonlinearModel, extended_filter, gated, rational_model, unscented_filter
 from test_estimators_rational import rational
 from test_filters_extended_scan import compiled_pendulum, measured_pendulum, pendulum_with_radar
 from test_filters_kalman import example, tensors
@@ -29,7 +29,6 @@ from vehest.filters.extended_scan import extended_scan
 from vehest.filters.gating import Gate
 from vehest.filters.gaussian import Filtered, Gaussian
 from vehest.filters.kalman_scan import kalman_scan
-from vehest.filters.nonlinear import NonlinearModel, unscented_filter
 from vehest.filters.sigma_points import symmetric_rule
 from vehest.filters.unscented_scan import PointModel, unscented_scan
 
@@ -90,7 +89,7 @@ def rational_with(gate: Gate | None = None, **config: object) -> Callable[[], Fo
         samples[:, [0, 2]] = spoilt(torch.as_tensor(samples[:, [0, 2]])).numpy()
         first = Gaussian(*map(torch.as_tensor, estimator.first_gaussian(samples[0], {})))
         y, u = torch.as_tensor(samples[:, [0, 2]]), torch.as_tensor(samples[:, [1, 3]])
-        readable = behind(gate, lambda y: extended_filter(estimator.nonlinear_model(), y, u, first), y).filtered
+        readable = behind(gate, lambda y: extended_filter(rational_model(estimator), y, u, first), y).filtered
         compiled = estimator.filter_samples(samples, gate=gate)
         variances = readable.covariance.diagonal(dim1=-2, dim2=-1)
         return [readable.mean, variances.clamp(min=0.0).sqrt()], of_the_same_numbers([compiled.mean, compiled.deviation])

@@ -6,7 +6,6 @@ import itertools
 
 import numpy as np
 import pytest
-import torch
 from scipy.integrate import solve_ivp
 
 from conftest import planar_drive
@@ -16,7 +15,7 @@ from vehest.estimators.base import FitData
 from vehest.estimators.registry import estimator_class
 from vehest.training.context import NoTraining
 from vehest.vehicle.parameters import SingleTrackParameters
-from vehest.vehicle.single_track import lateral_dynamics
+from vehest.vehicle.single_track import lateral_model
 
 BASELINES = ("zero", "static_map", "kinematic", "data_sheet")
 
@@ -37,7 +36,7 @@ def steady_drive(car: SingleTrackParameters, seconds: float = 30.0) -> Recording
     generator = np.random.default_rng(3)
     vx = generator.uniform(8.0, 35.0, round(20 * seconds))
     steer = generator.uniform(-0.05, 0.05, len(vx))
-    matrix, steering = (part.numpy() for part in lateral_dynamics(car, torch.as_tensor(vx)))
+    matrix, steering, *_ = lateral_model(car, vx)
     states = -np.linalg.solve(matrix, (steering * steer[:, None])[..., None])[..., 0]
     channels = {"vx": vx, "yaw_rate": states[:, 1], "ay": vx * states[:, 1], "vy_ref": vx * states[:, 0]}
     return Recording("steady", "car", 20.0, 0.0, channels, "simulated")

@@ -9,7 +9,7 @@ import time
 import numpy as np
 import pytest
 import torch
-from readable_filters import extended_filter
+from readable_filters import extended_filter, rational_model
 
 from rational_drive import CURVES, NOISE, changed, rational_drive
 from vehest.data.errors import ConfigurationError, DataError, MissingError
@@ -115,7 +115,7 @@ def test_compiled_filter_is_the_extended_filter_of_the_same_model(config, drive)
     ours = estimator.filter_samples(samples)
     first = estimator.first_gaussian(samples[0], {})
     measurements, inputs = torch.as_tensor(samples[:, [0, 2]]), torch.as_tensor(samples[:, [1, 3]])
-    theirs = extended_filter(estimator.nonlinear_model(), measurements, inputs, Gaussian(*map(torch.as_tensor, first)))
+    theirs = extended_filter(rational_model(estimator), measurements, inputs, Gaussian(*map(torch.as_tensor, first)))
     assert np.abs(ours.mean - theirs.filtered.mean.numpy()).max() < 1e-9
     assert np.abs(ours.last.covariance - theirs.filtered.covariance[-1].numpy()).max() < 1e-9
     assert np.abs(ours.innovation - theirs.innovation.numpy()).max() < 1e-9
@@ -133,7 +133,7 @@ def test_both_forms_begin_anew_where_an_unstable_car_was_lost(unstable):
     samples[:, 1], samples[:, 3] = 25.0, 0.02
     ours, first = estimator.filter_samples(samples), estimator.first_gaussian(samples[0], {})
     measurements, inputs = torch.as_tensor(samples[:, [0, 2]]), torch.as_tensor(samples[:, [1, 3]])
-    theirs = extended_filter(estimator.nonlinear_model(), measurements, inputs, Gaussian(*map(torch.as_tensor, first))).filtered
+    theirs = extended_filter(rational_model(estimator), measurements, inputs, Gaussian(*map(torch.as_tensor, first))).filtered
     assert np.abs(ours.mean - theirs.mean.numpy()).max() < 1e-9
     assert np.abs(ours.last.covariance - theirs.covariance[-1].numpy()).max() < 1e-9
     unscented = rational("rational", curves=curves, filter="unscented").filter_samples(samples)
@@ -150,7 +150,7 @@ def test_a_sideslip_angle_beyond_its_limit_starts_motion_and_tyres_anew_in_both_
     samples = short.stack(estimator.channels)
     ours, first = estimator.filter_samples(samples), estimator.first_gaussian(samples[0], {})
     measurements, inputs = torch.as_tensor(samples[:, [0, 2]]), torch.as_tensor(samples[:, [1, 3]])
-    theirs = extended_filter(estimator.nonlinear_model(), measurements, inputs, Gaussian(*map(torch.as_tensor, first))).filtered
+    theirs = extended_filter(rational_model(estimator), measurements, inputs, Gaussian(*map(torch.as_tensor, first))).filtered
     assert np.abs(ours.mean - theirs.mean.numpy()).max() < 1e-9
     assert np.abs(ours.last.covariance - theirs.covariance[-1].numpy()).max() < 1e-9
     free = rational(tyres).filter_samples(samples).mean

@@ -13,7 +13,7 @@ from vehest.data.errors import ConfigurationError, DataError
 from vehest.data.recording import Recording
 from vehest.estimators.base import FitData
 from vehest.estimators.filtering.car_filter import LEAST_ENTROPY
-from vehest.estimators.learned_ukf import DYNAMICS, LearnedUkf
+from vehest.estimators.learned_ukf import SHORT, LearnedUkf
 from vehest.estimators.learned_ukf_variant import LearnedUkfVariant
 from vehest.estimators.registry import estimator_class
 from vehest.filters.noise_models import with_entropy
@@ -92,7 +92,7 @@ def test_variants_are_called_as_in_the_paper() -> None:
     assert {name: LearnedUkf.from_config(config).variant for name, config in cases.items()} == {name: name for name in cases}
 
 
-@pytest.mark.parametrize("dynamics", DYNAMICS)
+@pytest.mark.parametrize("dynamics", SHORT)
 def test_every_candidate_learns_and_estimates_with_a_covariance(dynamics: str) -> None:
     made = estimator(
         dynamics=dynamics, noise="constant" if dynamics == "pacejka" else "state_dependent", through_filter=dynamics != "residual"
@@ -216,7 +216,7 @@ def test_pure_noise_stays_finite_and_within_what_is_possible(dtype: str) -> None
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("dynamics", DYNAMICS)
+@pytest.mark.parametrize("dynamics", SHORT)
 def test_ten_minutes_of_pure_noise_stay_finite(dynamics: str) -> None:
     made = estimator(dynamics=dynamics)
     made.fit(data(), quick(one_step=20, dtype="float32"))

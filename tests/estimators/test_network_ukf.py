@@ -12,6 +12,7 @@ from test_sample_network import loaded_drive
 
 from dugoff_drive import TYRES
 from vehest.data.errors import ConfigurationError, DataError
+from vehest.data.schema import settings_from_config
 from vehest.estimators import cnn_ukf
 from vehest.estimators.base import FitData
 from vehest.estimators.cnn_ukf import CnnUkf, EndToEnd, EndToEndSettings
@@ -22,6 +23,7 @@ from vehest.estimators.model_files import load_model, save_model
 from vehest.estimators.network_ukf import LEAST_VARIANCE, NetworkUkf
 from vehest.estimators.networks.sample_network import learnt_samples
 from vehest.estimators.registry import estimator_class
+from vehest.filters.unscented_scan import TorchModel
 from vehest.training.context import FitContext
 from vehest.training.identification import IdentificationSettings
 from vehest.training.samples import Draw
@@ -188,7 +190,9 @@ def test_gradients_end_to_end_are_those_of_automatic_differentiation() -> None:
     estimator, training = end_to_end()
     batch = next(iter(training.batches(torch.Generator().manual_seed(2))))
     found = training.loss(batch)
-    expected_filter = TrackFilter(estimator.track(sees_sideslip=True), compiled=False)
+    track = estimator.track(sees_sideslip=True)
+    expected_filter = TrackFilter(track)
+    expected_filter.model = TorchModel(track.transition, track.observation)
     ours, training.filter = training.filter, expected_filter
     expected = training.loss(batch)
     assert found.item() == pytest.approx(expected.item(), rel=1e-10)
@@ -332,4 +336,4 @@ def test_one_recording_decides_less_where_recordings_count() -> None:
 )
 def test_settings_of_a_training_that_make_no_sense_are_refused(settings: type, wrong: dict[str, object]) -> None:
     with pytest.raises(ConfigurationError, match=next(iter(wrong))):
-        settings(**wrong)
+        settings_from_config(settings, wrong, "training")

@@ -17,13 +17,21 @@ STEP = 0.01
 LOWER = [-1e9, -1e9, -1e9, -1e9, 0.05]
 SIZES = [3.0, 0.3, 1.0, 3.0, 0.6, 0.2, 0.3, 0.3, 0.3, 2.0]
 CARS = {
-    "NNTF": lambda: TyreNetworkCar(hidden=(12, 7), input_scale=SIZES[:9], force_scale=25.0),
+    "NNTF": lambda: scaled(TyreNetworkCar(hidden=(12, 7))),
     "NNTF in SI units": lambda: TyreNetworkCar(hidden=(12, 7)),
-    "NNT": lambda: TyreNetworkCar(friction_scaled=False, hidden=(12, 7), input_scale=SIZES, force_scale=25.0),
+    "NNT": lambda: scaled(TyreNetworkCar(friction_scaled=False, hidden=(12, 7))),
     "PC": PacejkaCar,
     "PCR": lambda: ResidualCar(hidden=(12, 7)),
     "NN": lambda: NeuralCar(hidden=(12, 7)),
 }
+
+
+def scaled(car: TyreNetworkCar) -> TyreNetworkCar:
+    car.network.input_scale.copy_(torch.tensor(SIZES)[: len(car.network.input_scale)])
+    car.network.output_scale.fill_(25.0)
+    return car
+
+
 KINDS = pytest.mark.parametrize("kind", CARS)
 
 

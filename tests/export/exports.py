@@ -116,7 +116,7 @@ class Export:
 
     def write(self) -> Export:
         self.folder.mkdir(parents=True, exist_ok=True)
-        for name, text in program_files(self.stepper(), self.precision, self.name)[0].items():  # type: ignore[arg-type]
+        for name, text in program_files(self.stepper(), self.precision, self.name).items():  # type: ignore[arg-type]
             (self.folder / name).write_text(text)
         return self
 

@@ -76,7 +76,7 @@ def sources() -> dict[str, str]:
         found[f"{name}/vehest_types.h"] = types_header(own, "double")
         found |= {f"{name}/vehest_method.h": method.header, f"{name}/vehest_method.c": method.source}
     stepper = GuardedStepper(by_hand("kinematic"), trust_by_hand(), 500.0)
-    files = program_files(stepper, "float", "Kinematic integration, weights set by hand")[0]
+    files = program_files(stepper, "float", "Kinematic integration, weights set by hand")
     return found | {f"contract/{name}": text for name, text in files.items() if "method" not in name}
 
 

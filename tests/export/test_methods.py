@@ -231,8 +231,9 @@ CURVES = {"c1_front": 0.1, "c2_front": 0.7e5, "c1_rear": 0.1, "c2_rear": 1.2e5}
 
 
 def test_every_file_of_a_ksnn_names_the_patent():
-    source = method_source(case_of("ksnn", {}).estimator, "double")
-    assert all("PCT/IT2023/050058" in text for text in (source.header, source.source, " ".join(source.notes)))
+    estimator = case_of("ksnn", {}).estimator
+    source = method_source(estimator, "double")
+    assert all("PCT/IT2023/050058" in text for text in (source.header, source.source, " ".join(estimator.notice)))
 
 
 def test_a_value_that_float_cannot_hold_is_refused():

@@ -57,7 +57,7 @@ def _fuzz(export: Export, place, steps: int, *options: str) -> None:
 @pytest.mark.parametrize("family", FAMILIES)
 def test_the_stack_is_bounded_and_nothing_is_allocated(tmp_path, family, precision):
     tool("gcc")
-    files = program_files(Export(family, precision, tmp_path).stepper(), precision, family)[0]
+    files = program_files(Export(family, precision, tmp_path).stepper(), precision, family)
     found = [own for own in (footprint(files, target) for target in TARGETS) if own is not None]
     assert found
     for own in found:
@@ -114,7 +114,7 @@ def run_on_board(export: Export, board) -> str:
 
 def test_sizes_are_those_of_the_linked_objects(tmp_path):
     tool("gcc")
-    files = program_files(Export("kinematic", "double", tmp_path).stepper(), "double", "x")[0]
+    files = program_files(Export("kinematic", "double", tmp_path).stepper(), "double", "x")
     own = footprint(files, HOST)
     assert 4_000 < own.code < 40_000
     assert 1_000 < own.state < 10_000

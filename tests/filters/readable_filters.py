@@ -1,19 +1,237 @@
-"""Filters to compare compiled ones with: an extended filter as its equations stand, and a gate around any filter that has none."""
+"""Filters to compare compiled ones with: unscented and extended as their equations stand, in torch, and a gate around any filter."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from typing import Any
+from dataclasses import dataclass, replace
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
 from torch.func import jacfwd
 
+from vehest.estimators.rational_ekf import LOST, ROLLING, RationalFilter
 from vehest.filters.gating import Gate
 from vehest.filters.gaussian import Filtered, Gaussian
-from vehest.filters.nonlinear import NonlinearModel
 from vehest.filters.sigma_points import SigmaRule
+from vehest.filters.unscented_scan import MARGIN, Function, NonlinearFiltered
+
+
+def sigma_points(rule: SigmaRule, mean: Tensor, factor: Tensor) -> Tensor:
+    """Points of N(mean, L Lᵀ).
+
+    Args:
+        mean: (..., n).
+        factor: L, lower triangular, (..., n, n).
+
+    Returns:
+        (..., 2n + 1, n), the mean first.
+    """
+    offsets = rule.spread * factor.mT
+    centre = mean.unsqueeze(-2)
+    return torch.cat([centre, centre + offsets, centre - offsets], dim=-2)
+
+
+def mean_of(rule: SigmaRule, values: Tensor) -> Tensor:
+    """Weighted mean of values at the points, (..., 2n + 1, m) -> (..., m)."""
+    return rule.centre_mean * values[..., 0, :] + rule.other * values[..., 1:, :].sum(-2)
+
+
+def covariance_of(rule: SigmaRule, deviations: Tensor, others: Tensor) -> Tensor:
+    """Weighted Σ w d eᵀ of deviations from the mean, (..., 2n + 1, m) and (..., 2n + 1, k) -> (..., m, k)."""
+    centre = deviations[..., 0, :].unsqueeze(-1) * others[..., 0, :].unsqueeze(-2)
+    return rule.centre_covariance * centre + rule.other * (deviations[..., 1:, :].mT @ others[..., 1:, :])
+
+
+def stacked(states: list[Gaussian[Tensor]], axis: int) -> Gaussian[Tensor]:
+    """States of successive samples as one, with the samples along an axis of the means."""
+    return Gaussian(torch.stack([state.mean for state in states], axis), torch.stack([state.covariance for state in states], axis))
+
+
+def symmetric(matrix: Tensor) -> Tensor:
+    """The symmetric part, which rounding has left a little (..., n, n)."""
+    return 0.5 * (matrix + matrix.mT)
+
+
+class Factor(NamedTuple):
+    """A covariance and its factor.
+
+    Attributes:
+        covariance: the repaired one, (..., n, n); NaN where it could not be.
+        factor: L with L Lᵀ = covariance, lower triangular, (..., n, n).
+        repaired: bool, (...).
+    """
+
+    covariance: Tensor
+    factor: Tensor
+    repaired: Tensor
+
+
+def factorised(covariance: Tensor) -> Factor:
+    """Cholesky factor of a covariance, lifted first where it is not positive definite.
+
+    Lifting adds the same to every eigenvalue, as much as is needed for a margin of `MARGIN`; what is added counts as a constant in
+    gradients. Covariances that are not finite stay NaN, each for itself: the others of a batch go on.
+
+    Args:
+        covariance: symmetric, (..., n, n).
+    """
+    finite = torch.isfinite(covariance).all(-1).all(-1)
+    identity = torch.eye(covariance.shape[-1], dtype=covariance.dtype, device=covariance.device)
+    safe = torch.where(finite[..., None, None], covariance, identity)
+    factor, info = torch.linalg.cholesky_ex(safe)
+    lost = info > 0
+    if bool(lost.any()):
+        with torch.no_grad():
+            eigenvalues = torch.linalg.eigvalsh(safe)
+            lift = MARGIN * eigenvalues.abs().amax(-1) - eigenvalues[..., 0]
+        safe = safe + torch.where(lost, lift, 0.0)[..., None, None] * identity
+        factor, info = torch.linalg.cholesky_ex(safe)
+    whole = (finite & (info == 0))[..., None, None]
+    return Factor(torch.where(whole, safe, torch.nan), torch.where(whole, factor, torch.nan), lost & finite)
+
+
+@dataclass(frozen=True)
+class NonlinearModel:
+    """A nonlinear model with Gaussian noise.
+
+    x[k+1] = f(x[k], u[k]) + w[k],  w[k] ~ N(0, Q(x[k], u[k]))
+    y[k]   = h(x[k], u[k]) + v[k],  v[k] ~ N(0, R(x[k], u[k]))
+
+    Args:
+        transition: f, (..., n).
+        observation: h, (..., m).
+        process_noise: Q of the estimated state, (..., n, n).
+        observation_noise: R of the predicted state, (..., m, m).
+        constrain: puts a state back into what is possible, such as a friction above 0; none: everything is.
+        restart: what is known instead after a prediction that leaves too little known, of state and u[k]; none: nothing else.
+        free: bool, which states a measurement may change, (..., n), of the predicted state; none: all. What is held keeps its variance
+            (Schmidt's consider state).
+    """
+
+    transition: Function
+    observation: Function
+    process_noise: Function
+    observation_noise: Function
+    constrain: Callable[[Tensor], Tensor] | None = None
+    restart: Callable[[Gaussian[Tensor], Tensor], Gaussian[Tensor]] | None = None
+    free: Function | None = None
+
+    def possible(self, state: Tensor) -> Tensor:
+        """States that `constrain` allows."""
+        return state if self.constrain is None else self.constrain(state)
+
+
+class _Updated(NamedTuple):
+    state: Gaussian[Tensor]
+    innovation: Tensor
+    innovation_covariance: Tensor
+    log_likelihood: Tensor
+    lost: Tensor
+
+
+def unscented_filter(
+    model: NonlinearModel, measurements: Tensor, inputs: Tensor, initial: Gaussian[Tensor], rule: SigmaRule
+) -> NonlinearFiltered:
+    """The unscented Kalman filter with additive noise; sigma points are drawn again before each update.
+
+    Covariances that are not positive definite are repaired. Where a negative weight of the mean point is what takes the definiteness of an
+    update, the update goes without it; everything else is lifted.
+
+    Args:
+        model: see `NonlinearModel`.
+        measurements: y, (..., T, m); what is NaN was not measured and is skipped, and gradients stay finite.
+        inputs: u, (..., T, p).
+        initial: state at the first sample before its measurement, mean (..., n).
+        rule: which sigma points.
+
+    Source: Julier & Uhlmann 1997; van der Merwe 2004, Algorithm 3.1 with the points drawn again.
+    """
+    batch, n = measurements.shape[:-2], initial.mean.shape[-1]
+    state = Gaussian(initial.mean.expand(*batch, n), initial.covariance.expand(*batch, n, n))
+    predictions, updates, lost = [], [], []
+    for k in range(measurements.shape[-2]):
+        repaired = torch.zeros(batch, dtype=torch.bool, device=measurements.device)
+        if k > 0:
+            state, repaired = _predicted(model, state, inputs[..., k - 1, :], rule)
+            state = state if model.restart is None else model.restart(state, inputs[..., k, :])
+        predictions.append(state)
+        prior, factor, again = factorised(state.covariance)
+        update = _updated(model, Gaussian(state.mean, prior), factor, measurements[..., k, :], inputs[..., k, :], rule)
+        updates.append(update)
+        lost.append(repaired | again | update.lost)
+        state = update.state
+    axis = len(batch)
+    steps = Filtered(
+        stacked(predictions, axis),
+        stacked([update.state for update in updates], axis),
+        torch.stack([update.innovation for update in updates], axis),
+        torch.stack([update.innovation_covariance for update in updates], axis),
+        ~torch.isnan(measurements),
+        torch.stack([update.log_likelihood for update in updates], axis),
+    )
+    return NonlinearFiltered(steps, torch.stack(lost, axis))
+
+
+def _predicted(model: NonlinearModel, state: Gaussian[Tensor], u: Tensor, rule: SigmaRule) -> tuple[Gaussian[Tensor], Tensor]:
+    """The state one sample later, and whether its covariance had to be repaired."""
+    _, factor, repaired = factorised(state.covariance)
+    drawn = model.possible(sigma_points(rule, state.mean, factor))
+    after = model.transition(drawn, u.unsqueeze(-2))
+    mean = mean_of(rule, after)
+    deviations = after - mean.unsqueeze(-2)
+    covariance = symmetric(covariance_of(rule, deviations, deviations) + model.process_noise(state.mean, u))
+    return Gaussian(model.possible(mean), covariance), repaired
+
+
+def _updated(model: NonlinearModel, state: Gaussian[Tensor], factor: Tensor, y: Tensor, u: Tensor, rule: SigmaRule) -> _Updated:
+    """The state given a measurement, of which NaN is skipped."""
+    drawn = model.possible(sigma_points(rule, state.mean, factor))
+    expected = model.observation(drawn, u.unsqueeze(-2))
+    mean = mean_of(rule, expected)
+    measured = ~torch.isnan(y)
+    zero = torch.zeros((), dtype=y.dtype, device=y.device)
+    identity = torch.eye(y.shape[-1], dtype=y.dtype, device=y.device)
+    spread = torch.where(measured.unsqueeze(-2), expected - mean.unsqueeze(-2), zero)
+    deviations = drawn - state.mean.unsqueeze(-2)
+    noise = torch.where(measured.unsqueeze(-1) & measured.unsqueeze(-2), model.observation_noise(state.mean, u), identity)
+    innovation = torch.where(measured, torch.where(measured, y, zero) - mean, zero)
+
+    def conditioned(rule: SigmaRule) -> _Updated:
+        covariance, factor, lost = factorised(symmetric(covariance_of(rule, spread, spread) + noise))
+        cross = covariance_of(rule, deviations, spread)
+        gain = torch.cholesky_solve(cross.mT, factor).mT
+        reduction = gain @ covariance @ gain.mT
+        if model.free is not None:
+            gain = torch.where(model.free(state.mean, u).unsqueeze(-1), gain, zero)
+            both = gain @ cross.mT
+            reduction = both + both.mT - gain @ covariance @ gain.mT
+        posterior = model.possible(state.mean + (gain @ innovation.unsqueeze(-1)).squeeze(-1))
+        whitened = torch.linalg.solve_triangular(factor, innovation.unsqueeze(-1), upper=False).squeeze(-1)
+        determinant = 2.0 * factor.diagonal(dim1=-2, dim2=-1).log().sum(-1)
+        count = measured.sum(-1, dtype=y.dtype)
+        likelihood = -0.5 * (whitened.square().sum(-1) + determinant + count * math.log(2.0 * math.pi))
+        return _Updated(Gaussian(posterior, symmetric(state.covariance - reduction)), innovation, covariance, likelihood, lost)
+
+    updated = conditioned(rule)
+    if rule.centre_covariance >= 0.0:
+        return updated
+    lost = updated.lost | factorised(updated.state.covariance).repaired
+    if not bool(lost.any()):
+        return updated
+    without = conditioned(replace(rule, centre_covariance=0.0))
+
+    def chosen(one: Tensor, other: Tensor) -> Tensor:
+        return torch.where(lost.reshape(*lost.shape, *[1] * (one.dim() - lost.dim())), one, other)
+
+    return _Updated(
+        Gaussian(*map(chosen, without.state, updated.state)),
+        innovation,
+        chosen(without.innovation_covariance, updated.innovation_covariance),
+        chosen(without.log_likelihood, updated.log_likelihood),
+        lost,
+    )
 
 
 def extended_filter(model: NonlinearModel, measurements: Tensor, inputs: Tensor, initial: Gaussian[Tensor]) -> Filtered[Tensor]:
@@ -44,6 +262,40 @@ def extended_filter(model: NonlinearModel, measurements: Tensor, inputs: Tensor,
         state = posterior
     parts = [torch.stack(part) for part in zip(*samples, strict=True)]
     return Filtered(Gaussian(*parts[:2]), Gaussian(*parts[2:4]), *parts[4:])
+
+
+def rational_model(estimator: RationalFilter) -> NonlinearModel:
+    """The model of a `RationalFilter`; inputs are speed and steering angle, and a lost sideslip angle is that of a car that rolls."""
+    track, bound = estimator.track(), torch.as_tensor(estimator.bounds())
+    car, n_tyres, levels = estimator.car, len(estimator.adapted), estimator.values
+    noise = torch.tensor([levels["yaw_rate"], levels["ay"]], dtype=torch.float64).square().diag()
+
+    def adapts(yaw_rate: Tensor, inputs: Tensor) -> bool:
+        return bool((inputs[0] * yaw_rate).abs() >= estimator.adapt_above)
+
+    def process_noise(states: Tensor, inputs: Tensor) -> Tensor:
+        tyres = levels["tyres"] if adapts(states[1] + track.step * states[3], inputs) else 0.0
+        return track.process_noise(states, inputs, levels["steer"], tyres)
+
+    def restart(state: Gaussian[Tensor], inputs: Tensor) -> Gaussian[Tensor]:
+        diverged = not bool(state.mean[0].abs() < estimator.largest_sideslip)
+        if not diverged and bool(state.covariance[0, 0] < LOST**2):
+            return state
+        turn = inputs[1] / (car.cg_to_front_axle + car.cg_to_rear_axle)
+        motion = torch.stack([car.cg_to_rear_axle * turn, inputs[0] * turn, 0.0 * turn, 0.0 * turn])
+        tyres = 0.0 * state.mean[4:] if diverged else state.mean[4:]
+        spread = torch.as_tensor(estimator.start_tyres()) if diverged else state.covariance[4:, 4:]
+        return Gaussian(torch.cat([motion, tyres]), torch.block_diag(torch.tensor(ROLLING, dtype=torch.float64).square().diag(), spread))
+
+    return NonlinearModel(
+        track.transition,
+        track.observation,
+        process_noise,
+        lambda states, inputs: noise,
+        lambda states: torch.maximum(torch.minimum(states, bound), -bound),
+        restart,
+        lambda states, inputs: torch.tensor([True] * 4 + [adapts(states[1], inputs)] * n_tyres),
+    )
 
 
 def gated(run: Callable[[Tensor], Filtered[Any]], measurements: Tensor, gate: Gate) -> Filtered[Any]:

@@ -6,14 +6,22 @@ import filterpy.kalman as filterpy
 import numpy as np
 import pytest
 import torch
-from readable_filters import extended_filter, scaled_rule
+from readable_filters import (
+    NonlinearModel,
+    covariance_of,
+    extended_filter,
+    factorised,
+    mean_of,
+    scaled_rule,
+    sigma_points,
+    unscented_filter,
+)
 from test_filters_kalman import arrays, example, tensors
 
-from vehest.filters.definiteness import MARGIN, factorised
 from vehest.filters.gaussian import Filtered, Gaussian
 from vehest.filters.kalman_scan import kalman_scan
-from vehest.filters.nonlinear import NonlinearModel, unscented_filter
 from vehest.filters.sigma_points import cubature_rule, symmetric_rule
+from vehest.filters.unscented_scan import MARGIN
 
 RULES = {"symmetric": symmetric_rule(3, 0.5), "scaled": scaled_rule(3, 0.5, 2.0, 1.0), "cubature": cubature_rule(3)}
 STEP = 0.1
@@ -76,17 +84,17 @@ def test_sigma_points_have_the_mean_and_covariance_they_stand_for(name):
     covariance = root @ root.mT + 0.1 * torch.eye(3, dtype=torch.float64)
     mean = torch.randn(4, 3, generator=generator, dtype=torch.float64)
     rule = RULES[name]
-    points = rule.points(mean, torch.linalg.cholesky(covariance))
+    points = sigma_points(rule, mean, torch.linalg.cholesky(covariance))
     deviations = points - mean.unsqueeze(-2)
-    assert torch.allclose(rule.mean(points), mean, atol=1e-12)
-    assert torch.allclose(rule.covariance(deviations, deviations), covariance, atol=1e-12)
+    assert torch.allclose(mean_of(rule, points), mean, atol=1e-12)
+    assert torch.allclose(covariance_of(rule, deviations, deviations), covariance, atol=1e-12)
 
 
 def test_kappa_of_the_learned_dynamics_paper_meets_the_fourth_moments_of_a_normal_distribution():
     rule = symmetric_rule(5, -2.0)
-    points = rule.points(torch.zeros(5, dtype=torch.float64), torch.eye(5, dtype=torch.float64))
+    points = sigma_points(rule, torch.zeros(5, dtype=torch.float64), torch.eye(5, dtype=torch.float64))
     assert rule.centre_mean == pytest.approx(-2.0 / 3.0)
-    assert rule.mean(points**4) == pytest.approx(torch.full((5,), 3.0), abs=1e-12)
+    assert mean_of(rule, points**4) == pytest.approx(torch.full((5,), 3.0), abs=1e-12)
 
 
 def test_rules_are_those_of_an_independent_library():
@@ -94,7 +102,7 @@ def test_rules_are_those_of_an_independent_library():
     theirs = {"symmetric": filterpy.JulierSigmaPoints(3, 0.5), "scaled": filterpy.MerweScaledSigmaPoints(3, 0.5, 2.0, 1.0)}
     for name, known in theirs.items():
         rule = RULES[name]
-        points = rule.points(torch.from_numpy(mean), torch.linalg.cholesky(torch.from_numpy(covariance)))
+        points = sigma_points(rule, torch.from_numpy(mean), torch.linalg.cholesky(torch.from_numpy(covariance)))
         assert points.numpy() == pytest.approx(known.sigma_points(mean, covariance), abs=1e-12)
         assert [rule.centre_mean, *[rule.other] * 6] == pytest.approx(known.Wm)
         assert [rule.centre_covariance, *[rule.other] * 6] == pytest.approx(known.Wc)

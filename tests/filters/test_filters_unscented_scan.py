@@ -8,13 +8,13 @@ from typing import NamedTuple
 
 import pytest
 import torch
+from readable_filters import NonlinearModel, unscented_filter
 from test_filters_nonlinear import RULES, STEP, constant, measured_pendulum, pendulum_with_radar, sharp
 from torch import Tensor
 
 from vehest.filters.gaussian import Gaussian
-from vehest.filters.nonlinear import NonlinearFiltered, NonlinearModel, unscented_filter
 from vehest.filters.sigma_points import SigmaRule, symmetric_rule
-from vehest.filters.unscented_scan import TorchModel, UnscentedStepper, moved, unscented_scan
+from vehest.filters.unscented_scan import NonlinearFiltered, TorchModel, UnscentedStepper, moved, unscented_scan
 
 FREE = [-1e9, -1e9, -1e9]
 ANY = {"measurements": torch.zeros(2, 5, 2), "inputs": torch.zeros(2, 5, 1)}
@@ -226,7 +226,7 @@ def test_one_sample_at_a_time_it_is_the_same_filter() -> None:
     for k in range(20):
         mean = stepper.step(measurements[0, k].numpy(), inputs[0, k].numpy(), process, lambda x, u: observation)
         assert mean == pytest.approx(state.mean[0, k].numpy(), abs=1e-12), k
-        assert stepper.covariance == pytest.approx(state.covariance[0, k].numpy(), abs=1e-12), k
+        assert stepper.state.covariance == pytest.approx(state.covariance[0, k].numpy(), abs=1e-12), k
 
 
 def test_one_step_alone_is_the_model() -> None:

@@ -8,7 +8,7 @@ from functools import partial
 import numpy as np
 import pytest
 import torch
-from readable_filters import extended_filter, gated
+from readable_filters import extended_filter, gated, unscented_filter
 from scipy.stats import chi2, norm
 from test_filters_kalman import example, tensors
 from test_filters_nonlinear import RULES, linear_as_nonlinear, measured_pendulum, pendulum_with_radar
@@ -18,7 +18,6 @@ from vehest.filters.gating import Gate
 from vehest.filters.gaussian import Filtered, Gaussian
 from vehest.filters.kalman import LinearModel
 from vehest.filters.kalman_scan import kalman_scan
-from vehest.filters.nonlinear import unscented_filter
 from vehest.filters.sigma_points import SigmaRule
 from vehest.filters.unscented_scan import TorchModel, UnscentedStepper, unscented_scan
 
@@ -32,12 +31,10 @@ def walk(steps: int) -> tuple[LinearModel[np.ndarray], Gaussian[np.ndarray]]:
     return LinearModel(*(np.broadcast_to(part, (steps, *part.shape)) for part in model)), Gaussian(np.zeros(1), np.eye(1))
 
 
-def pendulum(y: Tensor, u: Tensor, first: Gaussian[Tensor], gate: Gate | None, refused: np.ndarray | None = None):
+def pendulum(y: Tensor, u: Tensor, first: Gaussian[Tensor], gate: Gate | None):
     model = pendulum_with_radar()
     noises = [noise(NOTHING, NOTHING) for noise in (model.process_noise, model.observation_noise)]
-    return unscented_scan(
-        TorchModel(model.transition, model.observation), y, u, first, *noises, RULES["symmetric"], gate=gate, refused=refused
-    )
+    return unscented_scan(TorchModel(model.transition, model.observation), y, u, first, *noises, RULES["symmetric"], gate=gate)
 
 
 def by_the_filter(u: Tensor, first: Gaussian[Tensor], rule: SigmaRule, y: Tensor) -> Filtered[Tensor]:
@@ -167,19 +164,6 @@ def test_sample_by_sample_the_gate_is_that_of_the_whole_sequence() -> None:
     process, observation = (noise(NOTHING, NOTHING)[None].numpy() for noise in (model.process_noise, model.observation_noise))
     for k in range(30):
         assert stepper.step(y[0, k].numpy(), u[0, k].numpy(), process, observation) == pytest.approx(whole[k], abs=1e-12), k
-
-
-def test_a_count_of_refusals_carries_over_from_one_piece_to_the_next() -> None:
-    y, u, first = outliers(30, 1)
-    gate, refused = Gate(4.0, PATIENCE), np.zeros((1, 2), np.int64)
-    whole = pendulum(y, u, first, gate).steps
-    state = Gaussian(*(part[:, 17] for part in pendulum(y[:, :18], u[:, :18], first, gate, refused).steps.filtered))
-    assert refused[0, 1] == 3, "in the middle of a contradiction"
-    rest = y[:, 17:].clone()
-    rest[:, 0] = torch.nan  # part of the state already
-    later = pendulum(rest, u[:, 17:], state, gate, refused).steps
-    assert torch.equal(later.measured[:, 1:], whole.measured[:, 18:])
-    assert torch.allclose(later.filtered.mean[:, 1:], whole.filtered.mean[:, 18:], rtol=0, atol=1e-12)
 
 
 def test_every_sequence_has_its_own_gate_however_they_are_shared_out() -> None:

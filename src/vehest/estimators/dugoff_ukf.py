@@ -20,7 +20,7 @@ from vehest.data.estimate import Estimate
 from vehest.data.recording import Recording
 from vehest.declared import Group, setting
 from vehest.estimators.base import FitData, FitRecord, Trial
-from vehest.estimators.filtering.dugoff_fit import DUGOFF_PARAMETERS, fit_dugoff
+from vehest.estimators.filtering.dugoff_fit import fit_dugoff
 from vehest.estimators.filtering.sigma_point_stepper import FilterStep, SigmaPointEstimator
 from vehest.estimators.filtering.track_filter import (
     KAPPA,
@@ -34,12 +34,11 @@ from vehest.estimators.filtering.track_filter import (
     padded,
 )
 from vehest.estimators.references import reference_sideslip
-from vehest.filters.definiteness import MARGIN
-from vehest.filters.gating import Gate, gate_values, in_words, suffix
+from vehest.filters.gating import Gate
 from vehest.filters.gaussian import Filtered
 from vehest.filters.noise_levels import quiet_level
 from vehest.filters.sigma_points import symmetric_rule
-from vehest.filters.unscented_scan import UnscentedStepper
+from vehest.filters.unscented_scan import MARGIN, UnscentedStepper
 from vehest.training.context import FitContext
 from vehest.training.identification import LEAST_PROCESS_YAW_RATE, IdentificationSettings
 from vehest.training.search import SearchRecord, nelder_mead_over_grid, staged_optuna_search
@@ -96,10 +95,10 @@ class AxleTyres(Group):
     group = "estimator.tyres"
     cornering_stiffness_front: float | None = setting(None, "of the front axle", unit="N/rad", positive=True)
     friction_front: float | None = setting(None, "of its tyres where they hardly slide", positive=True)
-    reduction_front: float | None = setting(None, "share of that which is lost per m/s of sliding", unit="s/m")
+    reduction_front: float | None = setting(None, "share of that which is lost per m/s of sliding", unit="s/m", least=0.0)
     cornering_stiffness_rear: float | None = setting(None, "of the rear axle", unit="N/rad", positive=True)
     friction_rear: float | None = setting(None, "likewise", positive=True)
-    reduction_rear: float | None = setting(None, "likewise", unit="s/m")
+    reduction_rear: float | None = setting(None, "likewise", unit="s/m", least=0.0)
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -157,9 +156,6 @@ class DugoffUkf(SigmaPointEstimator):
     )
     nonlinear_from: float = setting(4.0, "|ay| from which the car behaves non-linearly, so that forces are trusted", unit="m/s²")
     linear_below: float = setting(3.0, "|ay| down to which it then stays so", unit="m/s²", least=0.0)
-    gate: float | None = setting(
-        None, "standard deviations of an innovation beyond which a measurement is refused in use; null: all are taken", positive=True
-    )
     correlated_samples: float = setting(
         1.0,
         "samples over which errors of sensors are alike, by which their variance is larger; about rate_hz / (2 f) of white noise behind a "
@@ -173,8 +169,9 @@ class DugoffUkf(SigmaPointEstimator):
     def __init__(self, settings: Any) -> None:
         super().__init__(settings)
         self.channels = CHANNELS[self.inputs]
-        self.axle_tyres = np.array([_number(getattr(settings.tyres, name)) for name in TYRES])
-        self.levels = {name: _number(getattr(settings.noise, name)) for name in self.level_names}
+        self.axle_tyres = np.array([getattr(settings.tyres, name) for name in TYRES], np.float64)
+        given = np.array([getattr(settings.noise, name) for name in self.level_names], np.float64)
+        self.levels = dict(zip(self.level_names, given.tolist(), strict=True))
         self._seed = 0
 
     def check(self) -> None:
@@ -195,12 +192,12 @@ class DugoffUkf(SigmaPointEstimator):
     def variant(self) -> str:
         """What is measured, the curve, and the gate."""
         s = self.settings
-        return f"dugoff_{s.inputs}" + ("_smooth" if s.curve == "smooth" else "") + suffix(s.gate)
+        return f"dugoff_{s.inputs}" + ("_smooth" if s.curve == "smooth" else "") + self.gate_suffix
 
     @property
     def full_title(self) -> str:
         """Title with what is measured, and the gate."""
-        return f"{self.title}, {'with' if self.inputs == 'full' else 'without'} tyre forces{in_words(self.gate)}"
+        return f"{self.title}, {'with' if self.inputs == 'full' else 'without'} tyre forces{self.gate_title}"
 
     @property
     def learns(self) -> bool:
@@ -223,6 +220,13 @@ class DugoffUkf(SigmaPointEstimator):
 
     def _unknown(self, names: Sequence[str]) -> list[str]:
         return [name for name in names if getattr(self.noise, name) is None]
+
+    def require_fitted(self) -> None:
+        """Raises:
+        ConfigurationError: tyres or levels are neither given nor found.
+        """
+        self.track()
+        self.noise_covariances(self.levels)
 
     def seed(self, seed: int) -> None:
         """Seed of the genetic searches and of Optuna's trials."""
@@ -289,7 +293,7 @@ class DugoffUkf(SigmaPointEstimator):
             restarts=training.restarts,
             generations=training.generations,
         )
-        self.axle_tyres = np.array([getattr(axle, name) for axle in (fit.front, fit.rear) for name in DUGOFF_PARAMETERS])
+        self.axle_tyres = fit.parameters.ravel()
         spread = dict(zip((f"{name}_spread" for name in TYRES), fit.spread.ravel().tolist(), strict=True))
         rms = dict(zip(("residual_front", "residual_rear"), fit.residual_rms.tolist(), strict=True))
         return {**dict(zip(TYRES, self.axle_tyres.tolist(), strict=True)), **spread, **rms}
@@ -405,10 +409,6 @@ class DugoffUkf(SigmaPointEstimator):
         """Samples (T, n) of ``channels`` as the filter takes them: measurements of sensors (T, 4), inputs (T, 3)."""
         return samples_of(samples[:, : len(CHANNELS[self.inputs])])
 
-    def gate_in_use(self) -> Gate | None:
-        """That of the filter in use."""
-        return Gate.of(self.gate, self.rate_hz)
-
     def trusts_forces(self, ay: FloatArray, before: bool = False) -> NDArray[np.bool_]:
         """Where forces are trusted, (T,), given the measured lateral acceleration (T,) [m/s²]; see `in_nonlinear_range`."""
         return in_nonlinear_range(ay, self.nonlinear_from, self.linear_below, before)
@@ -431,7 +431,7 @@ class DugoffUkf(SigmaPointEstimator):
         """Straight ahead and unknown, or rolling."""
         own = TrackFilter(self.track(sees_sideslip=len(first.measurement) > 4))
         mean, covariance = (part[0].numpy() for part in own.start(torch.as_tensor(first.inputs)[None]))
-        return UnscentedStepper(own.model(torch.float64), mean, covariance, len(first.measurement), own.rule, gate=self.gate_in_use())
+        return UnscentedStepper(own.model, mean, covariance, len(first.measurement), own.rule, gate=self.gate_in_use())
 
     def filter_step(self, sample: FloatArray, memory: dict[str, Any]) -> FilterStep:
         """Measurements as far as the car is fast enough, and the noise of the range that it is in."""
@@ -486,7 +486,7 @@ class DugoffUkf(SigmaPointEstimator):
         measured = 4 if forces else 2  # forces that are never measured need no row
         return {
             "network": False,
-            **gate_values(self.gate_in_use()),
+            **super().c_values(),
             "n": len(TRACK_STATES),
             "m": measured,
             "rule": symmetric_rule(len(TRACK_STATES), KAPPA),
@@ -543,10 +543,6 @@ def samples_of(samples: FloatArray) -> tuple[FloatArray, FloatArray]:
     wheels = samples[:, len(INERTIAL) :]
     forces = [wheels[:, 0] + wheels[:, 1], wheels[:, 2] + wheels[:, 3]] if wheels.shape[1] else [np.full(len(samples), np.nan)] * 2
     return np.stack([ay, yaw_rate, *forces], 1), np.stack([vx, steer, ax], 1)
-
-
-def _number(value: float | None) -> float:
-    return math.nan if value is None else value
 
 
 ESTIMATOR = DugoffUkf

@@ -14,7 +14,7 @@ from vehest.data.errors import ConfigurationError
 from vehest.declared import Group, setting
 from vehest.estimators.base import Stepper, Trial
 from vehest.estimators.filtering.sideslip_filter import SideslipFilter
-from vehest.filters.gating import in_words, refuses, suffix
+from vehest.filters.gating import refuses
 from vehest.filters.gaussian import Gaussian
 from vehest.filters.kalman import LinearModel, smoothed_means
 from vehest.filters.kalman_scan import kalman_scan
@@ -83,12 +83,12 @@ class FactorGraph(SideslipFilter):
     @property
     def variant(self) -> str:
         """Batch, or how long the window is and its gate."""
-        return f"factor_graph_lag_{self.window:g}s{suffix(self.gate)}" if self.causal else "factor_graph_batch"
+        return f"factor_graph_lag_{self.window:g}s{self.gate_suffix}" if self.causal else "factor_graph_batch"
 
     @property
     def full_title(self) -> str:
         """Title with how it is solved."""
-        own = f"fixed lag of {self.window:g} s{in_words(self.gate)}" if self.causal else "batch"
+        own = f"fixed lag of {self.window:g} s{self.gate_title}" if self.causal else "batch"
         return f"{self.title}, {own}"
 
     def first_gaussian(self, sample: FloatArray, given: Mapping[str, float]) -> Gaussian[FloatArray]:

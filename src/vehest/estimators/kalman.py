@@ -12,17 +12,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vehest.constants import FloatArray
-from vehest.data.errors import ConfigurationError, DataError
+from vehest.data.errors import ConfigurationError
 from vehest.data.estimate import Estimate
 from vehest.data.recording import Recording
 from vehest.declared import Group, setting
 from vehest.estimators.base import FitData, FitRecord, Stepper, Trial
-from vehest.estimators.filtering.sideslip_filter import FilteredStates, SideslipFilter
-from vehest.filters.gating import Gate, gate_values, in_words, suffix
+from vehest.estimators.filtering.sideslip_filter import FilteredStates, SideslipFilter, read_levels
+from vehest.filters.gating import Gate
 from vehest.filters.gaussian import Gaussian
 from vehest.filters.kalman import LinearModel
 from vehest.filters.kalman_scan import kalman_scan
-from vehest.filters.noise_levels import high_passed_level
 from vehest.training.context import FitContext
 
 LEVELS = ("yaw_rate", "ay", "steer")
@@ -109,7 +108,7 @@ class KalmanFilter(SideslipFilter):
         """Where the noise levels come from, unless it is the training; offsets and the gate."""
         noise = "" if self.learns else "_given_noise" if self.causal else "_own_noise"
         offsets = "".join(f"_{name}_offset" for name in self.offsets.given)
-        return self.name + noise + offsets + suffix(self.gate)
+        return self.name + noise + offsets + self.gate_suffix
 
     @property
     def full_title(self) -> str:
@@ -117,23 +116,14 @@ class KalmanFilter(SideslipFilter):
         noise = "" if self.learns else f", noise {'given' if self.causal else 'read off the recording itself'}"
         names = {"ay": "ay", "steer": "the steering angle"}
         offsets = "".join(f", offset of {names[name]}" for name in self.offsets.given)
-        return self.title + noise + offsets + in_words(self.gate)
+        return self.title + noise + offsets + self.gate_title
 
     def find_numbers(self, data: FitData, training: Any, context: FitContext) -> tuple[Mapping[str, float], FitRecord]:
         """Noise levels of the measured channels of the training recordings."""
         return self._levels_of(data.train), FitRecord()
 
     def _levels_of(self, recordings: Sequence[Recording]) -> dict[str, float]:
-        levels = dict(self.values)
-        for name in self.noise.unknown:
-            among = f"recording{'s' if len(recordings) > 1 else ''} {', '.join(repr(recording.id) for recording in recordings)}"
-            try:
-                levels[name] = high_passed_level([recording[name] for recording in recordings], self.noise.cutoff)
-            except ValueError as error:
-                raise DataError(f"{among}: channel '{name}': {error}; give estimator.noise.{name}") from None
-            if not levels[name] > SILENT:
-                raise DataError(f"{among}: channel '{name}' has no noise that could be read off it; give estimator.noise.{name}")
-        return levels
+        return self.values | read_levels(recordings, self.noise.unknown, self.noise.cutoff, SILENT)
 
     def _estimate_one(self, recording: Recording, initial_state: Mapping[str, float] | None) -> Estimate:
         own = self
@@ -207,7 +197,7 @@ class KalmanFilter(SideslipFilter):
         ]
         front, rear = car.cornering_stiffness_front, car.cornering_stiffness_rear
         return {
-            **gate_values(self.gate_in_use()),
+            **super().c_values(),
             "n": 2 + len(offsets),
             "columns": 4 + len(offsets) + (len(offsets) > 1),
             "offsets": offsets,

@@ -22,11 +22,9 @@ from vehest.estimators.filtering.car_filter import LEAST_ENTROPY, CarFilter
 from vehest.estimators.filtering.sigma_point_stepper import FilterStep, SigmaPointEstimator
 from vehest.estimators.network import Network
 from vehest.estimators.phase_records import record_of_phases
-from vehest.filters.definiteness import MARGIN
-from vehest.filters.gating import Gate, gate_values, in_words, suffix
 from vehest.filters.gaussian import Gaussian
 from vehest.filters.noise_models import StateDependentNoise
-from vehest.filters.unscented_scan import UnscentedStepper
+from vehest.filters.unscented_scan import MARGIN, UnscentedStepper
 from vehest.training.context import FitContext
 from vehest.training.sequences import PhaseRecord, train_phases
 from vehest.training.through_filter import Drive, ThroughFilterSettings, Weights, filter_phases, one_step_phase
@@ -47,7 +45,6 @@ from vehest.vehicle.dynamics import (
 from vehest.vehicle.planar import F1TENTH_START, Chassis
 from vehest.vehicle.tyres import STILL
 
-DYNAMICS = ("pacejka", "residual", "neural", "tyre_network", "friction_tyre_network")
 SHORT = {"pacejka": "pc", "residual": "pcr", "neural": "nn", "tyre_network": "nnt", "friction_tyre_network": "nntf"}
 TITLES = {
     "pacejka": "Pacejka's tyres",
@@ -125,6 +122,7 @@ class LearnedUkf(Network, SigmaPointEstimator):
     states = STATES
     training_type = ThroughFilterSettings
     network: CarFilter
+    correlated_noise = True
     dynamics: Literal["pacejka", "residual", "neural", "tyre_network", "friction_tyre_network"] = setting(
         "friction_tyre_network", "pacejka (PC), residual (PCR), neural (NN), tyre_network (NNT) or friction_tyre_network (NNTF)"
     )
@@ -137,9 +135,6 @@ class LearnedUkf(Network, SigmaPointEstimator):
     repair: bool = setting(True, "whether covariances that lose definiteness are repaired; otherwise the estimate is NaN from there on")
     least_speed: float = setting(0.05, "smallest forward speed that the state may have", unit="m/s", positive=True)
     least_friction: float = setting(0.05, "smallest friction that the state may have", positive=True)
-    gate: float | None = setting(
-        None, "standard deviations of an innovation beyond which a measurement is refused in use; null: all are taken", positive=True
-    )
     car: CarSettings = setting(CarSettings(), "known of the car, and where learning starts")
 
     def __init__(self, settings: Any) -> None:
@@ -170,7 +165,7 @@ class LearnedUkf(Network, SigmaPointEstimator):
         subscript = ("u" if s.through_filter else "") + ("h" if s.noise == "state_dependent" else "")
         name = SHORT[s.dynamics] + (f"_{subscript}" if subscript else "")
         name += "" if s.start_friction in (None, s.friction) else f"_mu{s.start_friction:g}"
-        return name + ("" if s.repair else "_unrepaired") + ("" if s.scaled else "_si") + suffix(s.gate)
+        return name + ("" if s.repair else "_unrepaired") + ("" if s.scaled else "_si") + self.gate_suffix
 
     @property
     def full_title(self) -> str:
@@ -180,7 +175,7 @@ class LearnedUkf(Network, SigmaPointEstimator):
         if s.start_friction not in (None, s.friction):
             how.append(f"friction from {s.start_friction:g}")
         how += ["no repair"] * (not s.repair)
-        return f"{self.title}, {', '.join(how)}{in_words(s.gate)}"
+        return f"{self.title}, {', '.join(how)}{self.gate_title}"
 
     @property
     def batch_key(self) -> tuple[Any, ...]:
@@ -248,6 +243,7 @@ class LearnedUkf(Network, SigmaPointEstimator):
             s.noise,
             step=1.0 / s.rate_hz,
             least=(s.least_speed, s.least_friction),
+            correlated=self.correlated_noise,
             repair=s.repair if repair is None else repair,
         )
 
@@ -330,10 +326,6 @@ class LearnedUkf(Network, SigmaPointEstimator):
             estimates.append(self._wrapped(seen, own.pop("vy"), covariance[row], STATES, **own, **extra))
         return estimates
 
-    def gate_in_use(self) -> Gate | None:
-        """That of the filter in use; it learns without."""
-        return Gate.of(self.gate, self.rate_hz)
-
     def drive(self, recording: Recording, dtype: torch.dtype) -> Drive:
         """A recording as its filter takes it: true states (T, 5), inputs (T, 2), measurements (T, 4); friction is that of training.
 
@@ -374,7 +366,7 @@ class LearnedUkf(Network, SigmaPointEstimator):
         with torch.no_grad():
             process, observation = own.process_noise, own.observation_noise
             return {
-                **gate_values(self.gate_in_use()),
+                **super().c_values(),
                 **_dynamics_in_c(own.dynamics),
                 "n": len(STATES),
                 "m": len(MEASURED),

@@ -4,9 +4,7 @@ from __future__ import annotations
 
 from vehest.data.errors import ConfigurationError
 from vehest.declared import setting
-from vehest.estimators.filtering.car_filter import FRICTION, OBSERVATION, PROCESS, CarFilter
-from vehest.estimators.learned_ukf import LearnedUkf
-from vehest.filters.diagonal_noise import DiagonalNoise, DiagonalStateDependentNoise
+from vehest.estimators.learned_ukf import MEASURED, LearnedUkf
 from vehest.vehicle.dynamics import STATES, Dynamics, PacejkaCar
 
 
@@ -48,27 +46,8 @@ class LearnedUkfVariant(LearnedUkf):
     @property
     def n_parameters(self) -> int:
         """Those that can change: without entries off the diagonals of diagonal noise."""
-        held = 0
-        for noise in (self.filter.process_noise, self.filter.observation_noise):
-            if isinstance(noise, DiagonalNoise):
-                held += noise.factor.numel() - noise.n
-            elif isinstance(noise, DiagonalStateDependentNoise):
-                entries = noise.constant.factor.numel()
-                held += (entries - noise.constant.n) * (2 + noise.weight.shape[1])
-        return super().n_parameters - held
-
-    def new_network(self, repair: bool | None = None) -> CarFilter:
-        """The filter before it learns."""
-        made = super().new_network(repair)
-        if self.correlated_noise:
-            return made
-        process = (*PROCESS, FRICTION[self.noise])
-        if self.noise == "constant":
-            made.process_noise, made.observation_noise = DiagonalNoise(process), DiagonalNoise(OBSERVATION)
-        else:
-            made.process_noise = DiagonalStateDependentNoise(process, len(STATES))
-            made.observation_noise = DiagonalStateDependentNoise(OBSERVATION, len(STATES))
-        return made
+        held = sum(n * (n - 1) // 2 for n in (len(STATES), len(MEASURED))) * (1 if self.noise == "constant" else 2 + len(STATES))
+        return super().n_parameters - held * (not self.correlated_noise)
 
     def _new_dynamics(self) -> Dynamics:
         car = self.car

@@ -14,7 +14,6 @@ from vehest.data.recording import Recording
 from vehest.estimators.base import FitData, FitRecord
 from vehest.estimators.dugoff_ukf import CHANNELS, DugoffUkf, PseudoMeasurement
 from vehest.estimators.networks.sample_network import INPUTS, NAMED, OnSamples
-from vehest.filters.gating import suffix
 from vehest.training.context import FitContext
 
 LEAST_VARIANCE = 1e-6
@@ -47,7 +46,7 @@ class NetworkUkf(OnSamples, DugoffUkf):
     @property
     def variant(self) -> str:
         """Which inputs it sees, and the gate."""
-        return self.inputs + suffix(self.gate) + NAMED[self.normalisation]
+        return self.inputs + self.gate_suffix + NAMED[self.normalisation]
 
     @property
     def learns(self) -> bool:

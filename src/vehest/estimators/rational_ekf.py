@@ -13,20 +13,18 @@ from typing import Any, Literal
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from torch import Tensor
 
 from vehest.constants import FloatArray
 from vehest.data.errors import ConfigurationError, DataError
 from vehest.data.recording import Recording
 from vehest.declared import Group, setting
 from vehest.estimators.base import FitData, FitRecord, Trial, rate
-from vehest.estimators.filtering.sideslip_filter import FilteredStates, SideslipFilter
+from vehest.estimators.filtering.sideslip_filter import FilteredStates, SideslipFilter, read_levels
 from vehest.estimators.filtering.tyre_fit import NORMAL_95, AxleMotion, TyreFit, axle_motion, fit_motion
-from vehest.filters.gating import Gate, gate_values, in_words, suffix
+from vehest.filters.gating import Gate
 from vehest.filters.gaussian import Gaussian
-from vehest.filters.noise_levels import high_passed_level
-from vehest.filters.nonlinear import NonlinearModel, unscented_filter
 from vehest.filters.sigma_points import cubature_rule
+from vehest.filters.unscented_scan import TorchModel, UnscentedStepper
 from vehest.training.context import FitContext
 from vehest.training.noise_tuning import NoiseTuningSettings
 from vehest.training.search import SearchRecord, nelder_mead_over_grid, optuna_search
@@ -131,9 +129,10 @@ class RationalFilter(SideslipFilter):
     def __init__(self, settings: Any) -> None:
         super().__init__(settings)
         given = {name: getattr(settings.curves, name) for name in self.curve_names}
-        self.axle_curves = np.array([_number(given.get(name, math.inf)) for name in CURVES])
+        self.axle_curves = np.array([given.get(name, math.inf) for name in CURVES], np.float64)
         self.curve_covariance = (settings.curves.deviation or GIVEN_DEVIATION) ** 2 * np.eye(len(CURVES))
-        self.values = {name: _number(getattr(settings.noise, name) if name in self.level_names else 0.0) for name in LEVELS}
+        levels = vars(settings.noise) | {name: 0.0 for name in LEVELS if name not in self.level_names}
+        self.values = {name: math.nan if level is None else level for name, level in levels.items()}
         self._seed = 0
 
     def check(self) -> None:
@@ -178,13 +177,13 @@ class RationalFilter(SideslipFilter):
     def variant(self) -> str:
         """The paper's name for these tyres, and whether the filter is another one, holds them straight ahead, or has a gate."""
         kind = KINDS[self.tyres][0] + ("_ukf" if self.filter == "unscented" else "")
-        return kind + ("_held" if self._holds else "") + suffix(self.gate)
+        return kind + ("_held" if self._holds else "") + self.gate_suffix
 
     @property
     def full_title(self) -> str:
         """The paper's name for these tyres, and the filter."""
         held = ", tyres held straight ahead" if self._holds else ""
-        return f"{KINDS[self.tyres][1]}, {self.filter} Kalman filter{held}{in_words(self.gate)}"
+        return f"{KINDS[self.tyres][1]}, {self.filter} Kalman filter{held}{self.gate_title}"
 
     @property
     def _holds(self) -> bool:
@@ -242,18 +241,19 @@ class RationalFilter(SideslipFilter):
         if training.method == "data":
             self.values = self._levels_of(data.train)
         elif self._searched:
-            extended = self._extended()
-            search = extended._tune(data.train, training, context)
+            extended, drives = self._extended(), self._drives(data.train)
+            search = extended._tune(drives, training, context)
             n = len(self._searched)
             columns = [*(f"start_{name}" for name in self._searched), *self._searched, "train_loss"]
             history = {name: search.starts[:, column].tolist() for column, name in enumerate(columns)}
             boxes = np.array([BOXES[name] for name in self._searched])
             at_limits = np.minimum(search.best[:n] - boxes[:, 0], boxes[:, 1] - search.best[:n]) < EDGE * np.ptp(boxes, axis=1)
             metrics |= {"evaluations": search.evaluations, "best_train_loss": search.cost, "levels_at_limits": int(at_limits.sum())}
-            self.values = extended._calibrated(search.best[:n], [_samples(r) for r in data.train])
+            self.values = extended._calibrated(search.best[:n], drives)
             interrupted = search.interrupted
         if data.validation and all(_has_reference(recording) for recording in data.validation):
-            metrics["best_validation_loss"] = self._mean_squared_error(data.validation, training.skip_seconds)
+            skip = round(training.skip_seconds * self.rate_hz)
+            metrics["best_validation_loss"] = self._cost(self._drives(data.validation), self.values, skip)
         metrics |= {f"noise_{name}": self.values[name] for name in self.level_names}
         metrics["train_seconds"] = time.monotonic() - started
         return FitRecord(history=history, metrics=metrics, interrupted=interrupted)
@@ -279,17 +279,8 @@ class RationalFilter(SideslipFilter):
 
     def _levels_of(self, recordings: Sequence[Recording]) -> dict[str, float]:
         unknown = [name for name in self.level_names if getattr(self.noise, name) is None]
-        levels = {**self.values, **{name: value for name, value in ASSUMED.items() if name in unknown}}
-        for name in ("yaw_rate", "ay"):
-            if name not in unknown:
-                continue
-            try:
-                levels[name] = high_passed_level([recording[name] for recording in recordings], CUTOFF)
-            except ValueError as error:
-                raise DataError(f"channel '{name}' of the training recordings: {error}; give estimator.noise") from None
-            if not levels[name] > 0.0:
-                raise DataError(f"channel '{name}' of the training recordings has no noise that could be read off it; give estimator.noise")
-        return levels
+        assumed = {name: value for name, value in ASSUMED.items() if name in unknown}
+        return self.values | assumed | read_levels(recordings, [name for name in LEVELS[:2] if name in unknown], CUTOFF)
 
     def _extended(self) -> RationalFilter:
         """The extended filter of the same model, by which levels are found: a search through the unscented one would take hours."""
@@ -299,22 +290,23 @@ class RationalFilter(SideslipFilter):
         twin.settings = replace(self.settings, filter="extended")
         return twin
 
-    def _tune(self, recordings: Sequence[Recording], training: NoiseTuningSettings, context: FitContext) -> SearchRecord:
+    def _drives(self, recordings: Sequence[Recording]) -> list[tuple[FloatArray, FloatArray]]:
+        """Samples of ``channels``, (T, 4), and the reference sideslip [rad], (T,), of each recording."""
+        return [(recording.stack(self.channels), _reference(recording)) for recording in recordings]
+
+    def _tune(self, drives: Sequence[tuple[FloatArray, FloatArray]], training: NoiseTuningSettings, context: FitContext) -> SearchRecord:
         """Levels with the smallest error of sideslip, as powers of ten."""
-        pairs = [_samples(recording) for recording in recordings]
-        wanted = [_reference(recording) for recording in recordings]
         skip = round(training.skip_seconds * self.rate_hz)
 
         def cost(powers: FloatArray) -> float:
-            levels = self._calibrated(powers, pairs)
-            return self._cost(pairs, wanted, levels, skip)
+            return self._cost(drives, self._calibrated(powers, drives), skip)
 
         boxes = [BOXES[name] for name in self._searched]
         if training.method == "optuna":
             return optuna_search(cost, boxes, training.trials, self._seed, context)
         return nelder_mead_over_grid(cost, boxes, [STARTS[name] for name in self._searched], training.search, context)
 
-    def _calibrated(self, powers: FloatArray, pairs: Sequence[FloatArray]) -> dict[str, float]:
+    def _calibrated(self, powers: FloatArray, drives: Sequence[tuple[FloatArray, FloatArray]]) -> dict[str, float]:
         """Levels at powers of ten of `_searched`; those of sensors are scaled so that innovations are as large as the filter expects."""
         found = dict(zip(self._searched, (10.0**powers).tolist(), strict=True))
         tyres = found.get("tyres", self.noise.tyres or 0.0)
@@ -327,7 +319,7 @@ class RationalFilter(SideslipFilter):
         scale = FIRST_SCALE
         for _ in range(CALIBRATIONS):
             levels, total, count = scaled(scale), 0.0, 0.0
-            for samples in pairs:
+            for samples, _ in drives:
                 nis, n_measured = self.filter_samples(samples, levels=levels).nis()
                 total, count = total + float(nis.sum()), count + float(n_measured.sum())
             if not (math.isfinite(total) and total > 0.0):
@@ -335,14 +327,10 @@ class RationalFilter(SideslipFilter):
             scale *= math.sqrt(total / max(count, 1.0))
         return scaled(scale)
 
-    def _mean_squared_error(self, recordings: Sequence[Recording], skip_seconds: float) -> float:
-        pairs, wanted = [_samples(r) for r in recordings], [_reference(r) for r in recordings]
-        return self._cost(pairs, wanted, self.values, round(skip_seconds * self.rate_hz))
-
-    def _cost(self, pairs: Sequence[FloatArray], wanted: Sequence[FloatArray], levels: Mapping[str, float], skip: int) -> float:
+    def _cost(self, drives: Sequence[tuple[FloatArray, FloatArray]], levels: Mapping[str, float], skip: int) -> float:
         """Mean squared error of sideslip [rad²] over samples fast enough for the model."""
         total, count = 0.0, 0
-        for samples, reference in zip(pairs, wanted, strict=True):
+        for samples, reference in drives:
             error = (self.filter_samples(samples, levels=levels).mean[:, 0] - reference)[skip:]
             counted = (samples[skip:, 1] >= self.minimum_speed) & np.isfinite(reference[skip:])
             total, count = total + float(np.square(error[counted]).sum()), count + int(counted.sum())
@@ -424,95 +412,55 @@ class RationalFilter(SideslipFilter):
         means, deviation, *others = out
         return FilteredStates(means, *others, Gaussian(mean, covariance), deviation)  # type: ignore[call-arg, arg-type]
 
-    def nonlinear_model(self, levels: Mapping[str, float] | None = None) -> NonlinearModel:
-        """The same for the filters of `vehest.filters.nonlinear`; inputs are speed and steering angle."""
-        levels = self.values if levels is None else levels
-        track, bound = self.track(), torch.as_tensor(self.bounds())
-        n_tyres = len(self.adapted)
-        tyres = torch.full((n_tyres,), levels["tyres"], dtype=torch.float64)
-        noise = torch.tensor([levels["yaw_rate"], levels["ay"]], dtype=torch.float64).square().diag()
-
-        def process_noise(states: Tensor, inputs: Tensor) -> Tensor:
-            moved = states[..., 1] + track.step * states[..., 3]
-            return track.process_noise(states, inputs, levels["steer"], tyres * self._adapts(moved, inputs).unsqueeze(-1))
-
-        def free(states: Tensor, inputs: Tensor) -> Tensor:
-            adapts = self._adapts(states[..., 1], inputs).unsqueeze(-1)
-            return torch.cat([torch.ones_like(states[..., :4], dtype=torch.bool), adapts.expand(*adapts.shape[:-1], n_tyres)], -1)
-
-        return NonlinearModel(
-            track.transition,
-            track.observation,
-            process_noise,
-            lambda states, inputs: noise.expand(*states.shape[:-1], 2, 2),
-            lambda states: torch.maximum(torch.minimum(states, bound), -bound),
-            self._restart_if_diverged,
-            free if self._holds else None,
-        )
-
-    def _adapts(self, yaw_rate: Tensor, inputs: Tensor) -> Tensor:
-        """Whether the car corners hard enough for its tyres to show."""
-        return (inputs[..., 0] * yaw_rate).abs() >= self.adapt_above
-
     def _unscented(self, samples: FloatArray, first: Gaussian[FloatArray], levels: Mapping[str, float]) -> FilteredStates:
-        """Stretch by stretch: where the car moves the filter, where it hardly does the rolling car."""
-        model, slow = self.nonlinear_model(levels), samples[:, 1] < self.minimum_speed
-        n, state, at = len(first.mean), first, 0
-        out = _empty(len(samples), n)
-        rule = cubature_rule(n)
-        while at < len(samples):
-            if slow[at]:
-                state = Gaussian(
-                    *(p.numpy() for p in self._rolled(Gaussian(*map(torch.as_tensor, state)), torch.as_tensor(samples[at, [1, 3]])))
-                )
-                nothing = (np.zeros((1, 2)), np.eye(2)[None], np.zeros((1, 2), np.bool_))
-                _write(out, slice(at, at + 1), state.mean[None], state.covariance[None], *nothing)
-                at += 1
-                continue
-            end = at + int(np.argmax(slow[at:])) if slow[at:].any() else len(samples)
-            before = 1 if at else 0  # one more sample, whose measurements the state holds already
-            rows = samples[at - before : end].copy()
-            rows[:before, [0, 2]] = np.nan
-            inputs = torch.as_tensor(np.stack([np.maximum(rows[:, 1], self.minimum_speed), rows[:, 3]], 1))
-            initial = Gaussian(torch.as_tensor(state.mean), torch.as_tensor(state.covariance))
-            with torch.no_grad():
-                steps = unscented_filter(model, torch.as_tensor(rows[:, [0, 2]]), inputs, initial, rule).steps
-            parts = (*steps.filtered, steps.innovation, steps.innovation_covariance, torch.as_tensor(steps.measured))
-            _write(out, slice(at, end), *(part.numpy()[before:] for part in parts))
-            state = Gaussian(steps.filtered.mean[-1].numpy(), steps.filtered.covariance[-1].numpy())
-            at = end
-        means, deviation, *others = out
-        return FilteredStates(means, *others, state, deviation)  # type: ignore[call-arg, arg-type]
+        """The same by sigma points; what is held keeps its variance (Schmidt's consider state)."""
+        from vehest.estimators.kernels.rational_ekf import _roll
 
-    def _restart_if_diverged(self, state: Gaussian[Tensor], inputs: Tensor) -> Gaussian[Tensor]:
-        """The motion of a car that rolls, where the sideslip angle is lost; without measurements the model may be unstable.
-
-        Where it is beyond its limit the tyres are taken to be the reason, and start anew as well.
-        """
-        diverged = ~(state.mean[..., 0].abs() < self.largest_sideslip)
-        lost = diverged | ~(state.covariance[..., 0, 0] < LOST**2)
-        if not bool(lost.any()):
-            return state
-        anew = self._rolled(state, inputs)
-        mean, covariance = anew.mean.clone(), anew.covariance.clone()
-        start = torch.as_tensor(self.start_tyres(), dtype=covariance.dtype)
-        mean[..., 4:] = torch.where(diverged[..., None], 0.0, mean[..., 4:])
-        covariance[..., 4:, 4:] = torch.where(diverged[..., None, None], start, covariance[..., 4:, 4:])
-        anew = Gaussian(mean, covariance)
-        return Gaussian(
-            torch.where(lost[..., None], anew.mean, state.mean), torch.where(lost[..., None, None], anew.covariance, state.covariance)
+        car, track, bound = self.car, self.track(), self.bounds()
+        limit = torch.as_tensor(bound)  # points are drawn again each time, so they may be kept within it in place
+        model = TorchModel(
+            lambda points, inputs: track.transition(points.clamp_(-limit, limit), inputs),
+            lambda points, inputs: track.observation(points.clamp_(-limit, limit), inputs),
         )
+        filtered = UnscentedStepper(model, *first, 2, cubature_rule(len(bound)))
+        prior, (mean, covariance) = filtered.prior, filtered.state
+        mean[:], covariance[:] = first
+        sensors = np.square([[levels["yaw_rate"], levels["ay"]]])[..., None] * np.eye(2)
+        geometry = np.array([car.mass, car.yaw_inertia, car.cg_to_front_axle, car.cg_to_rear_axle])
+        out = _empty(len(samples), len(bound))
 
-    def _rolled(self, state: Gaussian[Tensor], inputs: Tensor) -> Gaussian[Tensor]:
-        """The state with the motion of a car that rolls without slip, under speed and steering angle, (..., 2)."""
-        car = self.car
-        turn = inputs[..., 1] / (car.cg_to_front_axle + car.cg_to_rear_axle)
-        mean, covariance = state.mean.clone(), state.covariance.clone()
-        mean[..., :4] = torch.stack([car.cg_to_rear_axle * turn, inputs[..., 0] * turn, 0.0 * turn, 0.0 * turn], -1)
-        covariance[..., :4, :] = 0.0
-        covariance[..., :, :4] = 0.0
-        covariance[..., range(4), range(4)] = torch.as_tensor(ROLLING, dtype=covariance.dtype).square()
-        return Gaussian(mean, covariance)
+        def process_noise(states: FloatArray, inputs: FloatArray) -> FloatArray:
+            turn = inputs[0, 0] * (states[0, 1] + track.step * states[0, 3])
+            tyres = levels["tyres"] if abs(turn) >= self.adapt_above else 0.0
+            return track.process_noise(torch.as_tensor(states), torch.as_tensor(inputs), levels["steer"], tyres).numpy()
+
+        for k, (yaw_rate, vx, ay, steer) in enumerate(samples):
+            if vx < self.minimum_speed:
+                _roll.py_func(mean, covariance, np.square(ROLLING), geometry, vx, steer)
+                innovation, spread, measured = np.zeros(2), np.eye(2), np.zeros(2, bool)
+            else:
+                if k:
+                    filtered.predict(np.array([max(samples[k - 1, 1], self.minimum_speed), samples[k - 1, 3]]), process_noise)
+                    prior.mean.clip(-bound, bound, out=prior.mean)
+                    diverged = not abs(prior.mean[0]) < self.largest_sideslip
+                    if diverged or not prior.covariance[0, 0] < LOST**2:
+                        _roll.py_func(*prior, np.square(ROLLING), geometry, vx, steer)
+                    if diverged:
+                        prior.mean[4:], prior.covariance[4:, 4:] = 0.0, self.start_tyres()
+                filtered.update(np.array([yaw_rate, ay]), np.array([vx, steer]), sensors)
+                innovation, spread, measured = filtered.innovation, filtered.innovation_covariance, ~np.isnan([yaw_rate, ay])
+                if abs(vx * prior.mean[1]) < self.adapt_above:
+                    gain = filtered.gain.copy()
+                    gain[4:] = 0.0
+                    both = gain @ spread @ filtered.gain.T
+                    covariance[:] = prior.covariance - both - both.T + gain @ spread @ gain.T
+                    mean[:] = prior.mean + gain @ innovation
+                mean.clip(-bound, bound, out=mean)
+            deviation = np.sqrt(np.maximum(np.diagonal(covariance), 0.0))
+            for target, values in zip(out, (mean, deviation, covariance[:2, :2], innovation, spread, measured), strict=True):
+                target[k] = values
+        means, deviations, *others = out
+        return FilteredStates(means, *others, Gaussian(mean.copy(), covariance.copy()), deviations)  # type: ignore[call-arg, arg-type]
 
     def parameters_of(self, states: FloatArray) -> dict[str, FloatArray]:
         """Tyre parameters of states, (T, n), in SI units: name -> (T,)."""
@@ -572,7 +520,7 @@ class RationalFilter(SideslipFilter):
         adapted = [_slope_in_c(name) for name in self.adapted]
         step = 1.0 / self.rate_hz
         return {
-            **gate_values(self.gate_in_use()),
+            **super().c_values(),
             "n": 4 + len(adapted),
             "columns": 4 + len(adapted) + max(2, 1 + len(adapted)),
             "linear": self.tyres == "linear",
@@ -630,10 +578,6 @@ def _doubts(motion: AxleMotion, kind: Literal["linear", "rational"], fit: TyreFi
     return found
 
 
-def _samples(recording: Recording) -> FloatArray:
-    return recording.stack(SideslipFilter.channels)
-
-
 def _has_reference(recording: Recording) -> bool:
     return "sideslip_ref" in recording or "vy_ref" in recording
 
@@ -646,19 +590,9 @@ def _reference(recording: Recording) -> FloatArray:
 
 
 def _empty(steps: int, n: int) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, FloatArray, NDArray[np.bool_]]:
-    """Room for everything in a `FilteredDrive` but the last state."""
+    """Room for everything in `FilteredStates` but the last state."""
     pairs = (np.empty((steps, 2, 2)), np.empty((steps, 2)), np.empty((steps, 2, 2)))
     return (np.empty((steps, n)), np.empty((steps, n)), *pairs, np.empty((steps, 2), np.bool_))
-
-
-def _write(out: Sequence[Any], at: slice, mean: Any, covariance: Any, innovation: Any, innovation_covariance: Any, measured: Any) -> None:
-    deviation = np.sqrt(np.maximum(np.diagonal(covariance, axis1=1, axis2=2), 0.0))
-    for target, values in zip(out, (mean, deviation, covariance[:, :2, :2], innovation, innovation_covariance, measured), strict=True):
-        target[at] = values
-
-
-def _number(value: float | None) -> float:
-    return math.nan if value is None else value
 
 
 ESTIMATOR = RationalFilter

@@ -12,10 +12,9 @@ from vehest.data.channels import CHANNELS
 from vehest.data.errors import ConfigurationError, printable
 from vehest.data.files import written_aside
 from vehest.estimators.base import Estimator
-from vehest.export.estimator_source import context_of
 from vehest.export.measure import STRICT, TARGETS, Footprint, footprint
-from vehest.export.program import TOLERANCES, program_files, render_text, vector_files
-from vehest.export.rendering import Precision
+from vehest.export.program import TOLERANCES, context_of, program_files, vector_files
+from vehest.export.rendering import Precision, render
 from vehest.export.vectors import SECONDS, in_float64
 from vehest.trust import health
 from vehest.trust.contract import GuardedStepper
@@ -67,9 +66,9 @@ def export_model(
     stepper = GuardedStepper(estimator, trust, bus_rate_hz, elsewhere=elsewhere)
     if precision == "float":
         refuse_unresolved(trust)
-    files, notes = program_files(stepper, kind, estimator.full_title)
+    files = program_files(stepper, kind, estimator.full_title)
     found = [own for own in (footprint(files, target) for target in TARGETS) if own is not None]
-    files["README.md"] = readme(stepper, kind, notes, found, has_trust=trust is not None, elsewhere=elsewhere)
+    files["README.md"] = readme(stepper, kind, found, has_trust=trust is not None, elsewhere=elsewhere)
     files |= vector_files(GuardedStepper(in_float64(estimator), trust, bus_rate_hz, elsewhere=elsewhere))
     with written_aside(out, replace_folder=True) as aside:
         aside.mkdir()
@@ -81,14 +80,13 @@ def export_model(
 def readme(
     stepper: GuardedStepper,
     precision: Precision,
-    notes: Sequence[str],
     footprints: Sequence[Footprint],
     *,
     has_trust: bool,
     elsewhere: bool,
 ) -> str:
     """What people need to know of an export: how it is called, units, what it takes, licences."""
-    context = context_of(stepper, precision, stepper.estimator.full_title, notes)
+    context = context_of(stepper, precision, stepper.estimator.full_title)
     context |= {
         "channels": [(name, CHANNELS[name].meaning) for name in stepper.estimator.channels],
         "units": {name: CHANNELS[name].unit for name in stepper.estimator.channels},
@@ -102,7 +100,7 @@ def readme(
         "tolerance": f"{TOLERANCES[precision]:.0e}",
         "kind": precision,
     }
-    return render_text("readme.md.j2", **context)
+    return render("readme.md.j2", "double", **context)
 
 
 def refuse_unresolved(trust: Trust | None) -> None:

@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import sys
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from vehest.data.channels import channel
 from vehest.data.errors import ConfigurationError
@@ -14,19 +13,11 @@ from vehest.estimators.registry import estimator_class, estimator_names
 from vehest.export.rendering import Precision, ascii_only, render, render_block
 
 
-@dataclass(frozen=True)
-class MethodSource:
-    """A method in C.
-
-    Args:
-        header: vehest_method.h.
-        source: vehest_method.c.
-        notes: lines for its users, such as a patent.
-    """
+class MethodSource(NamedTuple):
+    """``vehest_method.h`` and ``vehest_method.c``."""
 
     header: str
     source: str
-    notes: tuple[str, ...] = ()
 
 
 def method_source(estimator: Estimator, precision: Precision) -> MethodSource:
@@ -48,7 +39,7 @@ def method_source(estimator: Estimator, precision: Precision) -> MethodSource:
     values = {**_common(estimator), **estimator.c_values(), **refuses}
     state = render_block(path, "state", precision, beside, **values).rstrip()
     header = render("method.h.j2", precision, **values, state=state)
-    return MethodSource(header, render(path, precision, beside, **values), estimator.notice)
+    return MethodSource(header, render(path, precision, beside, **values))
 
 
 def types_header(estimator: Estimator, precision: Precision) -> str:

@@ -1,46 +1,124 @@
-"""All files of an export, as text."""
+"""All files of an export, as text: the method, the contract around it with explicit state, a program and test vectors."""
 
 from __future__ import annotations
 
+import math
+from functools import partial
 from typing import Any
 
 import numpy as np
 
-from vehest.export.estimator_source import estimator_files
+from vehest.data.channels import CHANNELS
 from vehest.export.method import method_source
-from vehest.export.rendering import Precision, ascii_only, render
+from vehest.export.rendering import Precision, ascii_only, braced, limit, render, truths, whole
+from vehest.export.tables import band_table, front_end_table, guard_table, health_table
 from vehest.export.vectors import COLUMNS, drive_for, replayed, table_text
+from vehest.trust import health_kernel, verdict, watch
 from vehest.trust.contract import GuardedStepper
+from vehest.trust.guard import BRIDGED_SECONDS, STANDSTILL_SPEED, STANDSTILL_YAW_RATE
 
 TOLERANCES = {"double": 1e-9, "float": 1e-3}
 """Precision -> by how much the outcome of the vectors may differ from that of Python [m/s, rad]."""
+KINDS = (
+    "FREE",
+    "FROZEN",
+    "HELD",
+    "JUMP",
+    "OFFSET",
+    "SCALE",
+    "SIGN",
+    "UNIT",
+    "CONTRADICTION",
+    "OUTSIDE",
+    "MISSING",
+    "SPIN",
+    "LOCKED",
+    "DROPOUT",
+    "LATE",
+)
 
 
-def program_files(stepper: GuardedStepper, precision: Precision, title: str) -> tuple[dict[str, str], tuple[str, ...]]:
-    """Sources that build anywhere: the model, and `main` around it, name -> text; and the notes of the method.
+def brief(value: float) -> str:
+    """A number as people write it, with a decimal point."""
+    text = f"{value:.12g}"
+    return text if any(c in text for c in ".en") else f"{text}.0"
+
+
+def program_files(stepper: GuardedStepper, precision: Precision, title: str) -> dict[str, str]:
+    """Sources that build anywhere: the method, the contract around it, and `main`, name -> text.
+
+    Args:
+        stepper: in its initial state; what it holds is written.
+        precision: of ``vehest_real``.
+        title: what is estimated by what, for the banners.
 
     Raises:
         ConfigurationError: the estimator cannot be written in C.
     """
-    method = method_source(stepper.estimator, precision)
-    files = {"vehest_method.h": method.header, "vehest_method.c": method.source}
-    files |= estimator_files(stepper, precision, title, method.notes)
-    sources = sorted(name for name in files if name.endswith(".c"))
-    exact, notes = precision == "double", [ascii_only(note) for note in method.notes]
+    header, source = method_source(stepper.estimator, precision)
+    context = context_of(stepper, precision, title)
+    wanted = ["types.h", "estimator.h", "estimator.c", *(["health.h", "health.c"] if context["health"] is not None else [])]
+    files = {"vehest_method.h": header, "vehest_method.c": source}
+    files |= {f"vehest_{name}": render(f"{name}.j2", precision, **context) for name in wanted}
     values = {
-        "names": list(stepper.estimator.channels),
+        "names": context["names"],
         "tolerance": TOLERANCES[precision],
-        "exact": exact,
-        "notes": notes,
-        "sources": sources,
+        "exact": precision == "double",
+        "notes": context["notes"],
+        "sources": sorted(name for name in files if name.endswith(".c")),
     }
-    files |= {"main.c": render_text("main.c.j2", **values), "Makefile": render_text("makefile.j2", **values)}
-    return files, method.notes
+    files["main.c"] = render("main.c.j2", "double", **values)  # files hold double, whatever the model computes in
+    files["Makefile"] = render("makefile.j2", "double", **values)
+    return files
 
 
-def render_text(template: str, **values: Any) -> str:
-    """The text of a template that is no part of the model: files hold double, whatever the model computes in."""
-    return render(template, "double", **values)
+def context_of(stepper: GuardedStepper, precision: Precision, title: str) -> dict[str, Any]:
+    """What the templates of the contract are filled in with."""
+    estimator, monitor, guard = stepper.estimator, stepper._monitor, stepper._guard
+    rate, front = float(estimator.settings.rate_hz), stepper._front
+    top_speed, largest_tan, _, interval = stepper._watch._settings.tolist()
+    guards = [(guard_table(guard), "", "Limits at the method's rate.")]
+    if front is not None:
+        guards.append((guard_table(front._guard), "BUS_", "Limits at the bus's rate."))
+    health, number = health_table(monitor._health), partial(limit, precision=precision)
+    return {
+        "title": ascii_only(title),
+        "notes": [ascii_only(note) for note in estimator.notice],
+        "channels": [(name, ascii_only(CHANNELS[name].meaning)) for name in estimator.channels],
+        "names": list(estimator.channels),
+        "skippable": [name in estimator.skippable for name in estimator.channels],
+        "numbers": monitor._numbers,
+        "rate_hz": rate,
+        "input_rate_hz": float(stepper._rate),
+        "horizon_steps": estimator.horizon_steps,
+        "warm_up_steps": estimator.warm_up_steps,
+        "guards": guards,
+        "standstill_speed": STANDSTILL_SPEED,
+        "standstill_yaw_rate": STANDSTILL_YAW_RATE,
+        "front": front_end_table(front) if front is not None else None,
+        "interval": interval,
+        "top_speed": top_speed,
+        "largest_tan_sideslip": largest_tan,
+        "remembering": math.exp(-interval / watch.REMEMBERED_SECONDS),
+        "fading": math.exp(-interval / watch.FADE_SECONDS),
+        "w": vars(watch),
+        "verdict": vars(verdict),
+        "kernel": vars(health_kernel),
+        "k": vars(health_kernel),
+        "kinds": KINDS,
+        "health": health,
+        "h": health,
+        "r": number,
+        "reals": lambda values: braced(values, number),
+        "whole": whole,
+        "truths": truths,
+        "brief": brief,
+        "starts_anew": monitor._starts_anew,
+        "rollback": monitor._rollback,
+        "bands": band_table(stepper),
+        "most_bridged": math.ceil(BRIDGED_SECONDS * stepper._rate) + 1,
+        "pi": math.pi,
+    }
 
 
 def vector_files(stepper: GuardedStepper) -> dict[str, str]:

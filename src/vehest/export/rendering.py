@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import re
 import textwrap
+from collections.abc import Callable
 from functools import cache, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
@@ -20,6 +21,9 @@ if TYPE_CHECKING:
 Precision = Literal["double", "float"]
 
 WIDTH = 128  # of a line of a table, its indent aside
+LARGEST_FLOAT = float(np.finfo(np.float32).max)
+LEAST_FLOAT = float(np.finfo(np.float32).tiny)
+LINE = 110  # characters of a line of the contract's tables
 _COMMENT = re.compile(r"(/\*.*?\*/)", re.DOTALL)
 _FLOATING = re.compile(r"(?<![\w.])(\d+\.\d*(?:[eE][+-]?\d+)?|\d+[eE][+-]?\d+)(?![\w.])")
 _BLANK = re.compile(r"\n{3,}")
@@ -68,6 +72,51 @@ def literal(value: float, precision: Precision) -> str:
         raise ConfigurationError(f"the model holds {value}, which is no {precision} number; fit it anew, or export with precision double")
     text = f"{number:.9g}" if precision == "float" else repr(number)
     return text if any(mark in text for mark in ".e") else f"{text}.0"
+
+
+def limit(value: float, precision: Precision) -> str:
+    """A literal of a number that may be infinite; what a float cannot hold becomes infinite or 0."""
+    value = float(value)
+    if precision == "float":
+        value = math.copysign(math.inf, value) if abs(value) > LARGEST_FLOAT else 0.0 if abs(value) < LEAST_FLOAT else value
+    if math.isinf(value):
+        return "VEHEST_INFINITY" if value > 0 else "-VEHEST_INFINITY"
+    return literal(value, precision)
+
+
+def braced(values: Any, write: Callable[[Any], str]) -> str:
+    """An array of any depth as the initialiser of a table, in lines that can be read."""
+    array = np.asarray(values)
+    if array.ndim == 0:
+        return write(array.item())
+    if array.ndim == 1:
+        return _wrapped([write(value) for value in array.tolist()])
+    rows = ",\n".join(braced(row, write) for row in array)
+    return "{\n" + "\n".join(f"    {line}" for line in rows.split("\n")) + "\n}"
+
+
+def _wrapped(words: list[str]) -> str:
+    """Words in braces, on one line if they fit on it."""
+    if sum(len(word) + 2 for word in words) <= LINE:
+        return "{ " + ", ".join(words) + " }"
+    lines, line = [], ""
+    for word in words:
+        if line and len(line) + len(word) + 2 > LINE:
+            lines.append(line.rstrip())
+            line = ""
+        line += f"{word}, "
+    lines.append(line.rstrip().rstrip(","))
+    return "{\n" + "\n".join(f"    {line}" for line in lines) + "\n}"
+
+
+def whole(values: Any) -> str:
+    """The initialiser of a table of whole numbers."""
+    return braced(np.asarray(values, np.int64), str)
+
+
+def truths(values: Any) -> str:
+    """The initialiser of a table of ``bool``."""
+    return braced(np.asarray(values, bool), lambda value: "true" if value else "false")
 
 
 def table(values: Any, precision: Precision) -> str:

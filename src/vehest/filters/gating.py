@@ -41,18 +41,3 @@ def refuses(error, variance, limit, patience, refused, i):  # type: ignore[no-un
         return False
     refused[i] = min(refused[i] + 1, 2 * patience)
     return refused[i] <= patience
-
-
-def suffix(gate: float | None) -> str:
-    """Of the name of a filter's variant."""
-    return "" if gate is None else f"_gate{gate:g}"
-
-
-def in_words(gate: float | None) -> str:
-    """Of a filter's title."""
-    return "" if gate is None else f", innovations gated at {gate:g} sigma"
-
-
-def gate_values(gate: Gate | None) -> dict[str, float]:
-    """What C templates need of a gate; patience is 0 without one."""
-    return {"limit": 0.0 if gate is None else gate.deviations**2, "patience": 0 if gate is None else gate.patience}

@@ -5,7 +5,6 @@ from __future__ import annotations
 from typing import Generic, NamedTuple, TypeVar
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
@@ -44,13 +43,3 @@ class Filtered(NamedTuple, Generic[Array]):
     innovation_covariance: Array
     measured: Tensor | NDArray[np.bool_]
     log_likelihood: Array
-
-
-def stacked(states: list[Gaussian[Tensor]], axis: int) -> Gaussian[Tensor]:
-    """States of successive samples as one, with the samples along an axis of the means."""
-    return Gaussian(torch.stack([state.mean for state in states], axis), torch.stack([state.covariance for state in states], axis))
-
-
-def symmetric(matrix: Tensor) -> Tensor:
-    """The symmetric part, which rounding has left a little (..., n, n)."""
-    return 0.5 * (matrix + matrix.mT)

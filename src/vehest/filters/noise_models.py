@@ -17,30 +17,37 @@ class ConstantNoise(nn.Module):
 
     Args:
         variances: its diagonal to begin with, n of them.
+        correlated: whether entries off the diagonal are learnt; otherwise they stay zero.
         floor: see `FLOOR`.
 
     Source: Węgrzynowski et al. 2024, Eq. 7.
     """
 
     unit: Tensor
+    learnt: Tensor
 
-    def __init__(self, variances: Sequence[float], floor: float = FLOOR) -> None:
+    def __init__(self, variances: Sequence[float], correlated: bool = True, floor: float = FLOOR) -> None:
         super().__init__()
         start = torch.tensor(list(variances))
         self.floor = floor
         self.n = len(start)
         self.factor = nn.Parameter(start.sqrt().diag()[_lower(self.n)])
         self.register_buffer("unit", torch.ones(self.n))
+        rows, columns = _lower(self.n)
+        self.register_buffer("learnt", (rows == columns) | correlated, persistent=False)
 
-    def begin(self, covariance: Tensor, pace: float) -> None:
+    def begin(self, covariance: Tensor, pace: float, state_unit: Tensor | None = None) -> None:
         """Start from a covariance, (n, n), and learn in units of ``pace`` times its deviations, so that all entries learn alike."""
         with torch.no_grad():
+            if not self.learnt.all():
+                covariance = covariance.diagonal().diag()
             self.unit.copy_(pace * covariance.diagonal().sqrt())
             self.factor.copy_((torch.linalg.cholesky(covariance) / self.unit.unsqueeze(-1))[_lower(self.n)])
 
     def forward(self, state: Tensor, inputs: Tensor) -> Tensor:
         """The covariance, (..., n, n), the same for every state (..., k)."""
-        return _product(self.factor * self.unit[_lower(self.n)[0]], self.n, self.floor).expand(*state.shape[:-1], self.n, self.n)
+        factor = self.factor * self.unit[_lower(self.n)[0]] * self.learnt
+        return _product(factor, self.n, self.floor).expand(*state.shape[:-1], self.n, self.n)
 
 
 class StateDependentNoise(nn.Module):
@@ -52,7 +59,7 @@ class StateDependentNoise(nn.Module):
         scale: weight of the part that depends on the state.
         deviation: of the random weights of L to begin with; its offsets start at 0.
         generator: of these.
-        floor: see `FLOOR`.
+        correlated: whether both parts have entries off their diagonals.
 
     Source: Węgrzynowski et al. 2024, Section III-B.3; scale and start values as in its authors' code.
     """
@@ -68,10 +75,10 @@ class StateDependentNoise(nn.Module):
         scale: float = 0.01,
         deviation: float = 1e-3,
         generator: torch.Generator | None = None,
-        floor: float = FLOOR,
+        correlated: bool = True,
     ) -> None:
         super().__init__()
-        self.constant = ConstantNoise(variances, floor)
+        self.constant = ConstantNoise(variances, correlated)
         self.scale = scale
         count = self.constant.n * (self.constant.n + 1) // 2
         self.deviation = deviation
@@ -91,11 +98,13 @@ class StateDependentNoise(nn.Module):
     def reset(self, generator: torch.Generator | None = None) -> None:
         """Draw the weights anew."""
         with torch.no_grad():
-            self.weight.copy_(self.deviation * torch.randn(self.weight.shape, generator=generator))
+            drawn = self.deviation * torch.randn(self.weight.shape, generator=generator)
+            self.weight.copy_(torch.where(self.constant.learnt.unsqueeze(-1), drawn, 0.0))
 
     def forward(self, state: Tensor, inputs: Tensor) -> Tensor:
         """The covariance of each state, (..., n, n)."""
         factor = nn.functional.linear(state / self.state_unit, self.weight, self.offset) * self.unit[_lower(self.constant.n)[0]]
+        factor = factor * self.constant.learnt
         return self.constant(state, inputs) + self.scale * _product(factor, self.constant.n, 0.0)
 
 

@@ -3,17 +3,13 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
-
-import torch
-from torch import Tensor
+from typing import NamedTuple
 
 
-@dataclass(frozen=True)
-class SigmaRule:
+class SigmaRule(NamedTuple):
     """Symmetric points: the mean, and mean ± spread · columns of the covariance's Cholesky factor.
 
-    Args:
+    Attributes:
         spread: distance in columns of the factor, positive.
         centre_mean: weight of the mean point in means.
         centre_covariance: its weight in covariances.
@@ -24,29 +20,6 @@ class SigmaRule:
     centre_mean: float
     centre_covariance: float
     other: float
-
-    def points(self, mean: Tensor, factor: Tensor) -> Tensor:
-        """Points of N(mean, L Lᵀ).
-
-        Args:
-            mean: (..., n).
-            factor: L, lower triangular, (..., n, n).
-
-        Returns:
-            (..., 2n + 1, n), the mean first.
-        """
-        offsets = self.spread * factor.mT
-        centre = mean.unsqueeze(-2)
-        return torch.cat([centre, centre + offsets, centre - offsets], dim=-2)
-
-    def mean(self, values: Tensor) -> Tensor:
-        """Weighted mean of values at the points, (..., 2n + 1, m) -> (..., m)."""
-        return self.centre_mean * values[..., 0, :] + self.other * values[..., 1:, :].sum(-2)
-
-    def covariance(self, deviations: Tensor, others: Tensor) -> Tensor:
-        """Weighted Σ w d eᵀ of deviations from the mean, (..., 2n + 1, m) and (..., 2n + 1, k) -> (..., m, k)."""
-        centre = deviations[..., 0, :].unsqueeze(-1) * others[..., 0, :].unsqueeze(-2)
-        return self.centre_covariance * centre + self.other * (deviations[..., 1:, :].mT @ others[..., 1:, :])
 
 
 def symmetric_rule(n: int, kappa: float) -> SigmaRule:

@@ -1,4 +1,4 @@
-"""The unscented filter over long sequences: the same as `unscented_filter`, with compiled steps and their adjoints.
+"""The unscented Kalman filter with additive noise over long sequences, by compiled steps and their adjoints.
 
 A model says how its points move and what is expected at them, and the adjoints of both; everything else is here. Of each step only states
 and what became of the points are kept, so that long sequences need little memory.
@@ -9,25 +9,40 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from vehest.filters.definiteness import MARGIN
 from vehest.filters.gating import Gate
 from vehest.filters.gaussian import Filtered, Gaussian
-from vehest.filters.nonlinear import Function, NonlinearFiltered
 from vehest.filters.sigma_points import SigmaRule
 from vehest.filters.unscented_steps import gate_of, moments_adjoint, moments_of, points_adjoint, points_of, update_adjoint, update_of
 
+MARGIN = 1e-6
+"""Smallest eigenvalue of a repaired covariance, relative to its largest."""
 Array = NDArray[Any]
+Function = Callable[[Tensor, Tensor], Tensor]
+"""Of states (..., n) and inputs (..., p); leading dimensions of both are equal or broadcast."""
 NoiseAt = Callable[[Array, Array], Array]
 """Covariances of noise at estimated states, (B, n) under inputs (B, p) -> (B, k, k)."""
 Share = Callable[[Callable[[int, int], None], int], None]
 """Calls work(first, end) on stretches of so many sequences, side by side if it likes."""
+
+
+class NonlinearFiltered(NamedTuple):
+    """What a nonlinear filter knows after a sequence.
+
+    Attributes:
+        steps: see `Filtered`.
+        repaired: bool, (..., T): a covariance had lost its definiteness at this sample, and was repaired or, in a scan without repair,
+            made everything from there on NaN.
+    """
+
+    steps: Filtered[Tensor]
+    repaired: Tensor
 
 
 class PointModel(ABC):
@@ -120,10 +135,9 @@ class _Setting:
 
     @classmethod
     def of(cls, model: PointModel, rule: SigmaRule, n: int, dtype: Any, repair: bool, gate: Gate | None) -> _Setting:
-        row = np.array([rule.spread, rule.centre_mean, rule.centre_covariance, rule.other], dtype)
         lower = np.full(n, -np.inf, dtype) if model.lower is None else np.asarray(model.lower, dtype)
         limit = None if gate is None else dtype(gate.deviations**2)
-        return cls(model, row, lower, dtype(MARGIN), repair, gate, limit)
+        return cls(model, np.array(rule, dtype), lower, dtype(MARGIN), repair, gate, limit)
 
 
 class _Points:
@@ -192,9 +206,11 @@ def unscented_scan(
     repair: bool = True,
     share: Share | None = None,
     gate: Gate | None = None,
-    refused: NDArray[np.int64] | None = None,
 ) -> NonlinearFiltered:
     """Filter sequences; filtered means and covariances are differentiable in every tensor but the inputs, the rest is not.
+
+    Sigma points are drawn again before each update. Where a negative weight of the mean point is what takes the definiteness of an update,
+    the update goes without it; every other covariance that is not positive definite is lifted.
 
     Args:
         model: how points move.
@@ -207,12 +223,11 @@ def unscented_scan(
         repair: whether covariances that are not positive definite are repaired; otherwise the sequence becomes NaN.
         share: how sequences are shared out over threads; none: one thread.
         gate: which measurements are refused; none: all are taken. The decision itself has no gradient.
-        refused: how often on end each measurement was before the first sample, (B, m); after the last one on return. None: never.
 
     Raises:
         ValueError: shapes do not fit each other.
 
-    Source: as `unscented_filter`; adjoint of the Cholesky factor from Murray 2016, arXiv 1602.07527.
+    Source: Julier & Uhlmann 1997; van der Merwe 2004, Algorithm 3.1; adjoint of the Cholesky factor: Murray 2016, arXiv 1602.07527.
     """
     if measurements.dim() != 3 or not measurements.shape[1]:
         raise ValueError(f"measurements must be of shape (B, T, m) with T > 0, not {tuple(measurements.shape)}")
@@ -227,7 +242,6 @@ def unscented_scan(
     dtype = measurements.dtype
     numpy_dtype = np.float32 if dtype == torch.float32 else np.float64
     setting = _Setting.of(model, rule, n, numpy_dtype, repair, gate)
-    refused = np.zeros((sequences, m), np.int64) if refused is None else refused
     noises = [process_noise, observation_noise]
     functions = [noise if not isinstance(noise, Tensor) else None for noise in noises]
     tensors = [
@@ -236,7 +250,7 @@ def unscented_scan(
     ]
     tape = _Tape(steps, sequences, n, m, numpy_dtype)
     post_mean, post_covariance = _Scan.apply(  # type: ignore[no-untyped-call]
-        setting, share or _alone, tape, functions, refused, measurements, inputs, mean, covariance, *tensors, *model.parameters
+        setting, share or _alone, tape, functions, measurements, inputs, mean, covariance, *tensors, *model.parameters
     )
     outside = [torch.from_numpy(values.swapaxes(0, 1)) for values in (tape.prior_mean, tape.prior_covariance, tape.innovation, tape.own)]
     filtered = Filtered(
@@ -261,7 +275,9 @@ class UnscentedStepper:
         repair, gate: see `unscented_scan`.
 
     Attributes:
-        mean, covariance: of the state, filtered, (n,) and (n, n).
+        prior: the state before its measurement, mean (n,).
+        state: the same after it; both are valid until the next step and may be changed.
+        innovation, innovation_covariance, gain: of the last update, (m,), (m, m) and (n, m).
     """
 
     def __init__(
@@ -278,10 +294,13 @@ class UnscentedStepper:
         n, dtype = len(mean), mean.dtype.type
         self._setting = _Setting.of(model, rule, n, dtype, repair, gate)
         self._refused = np.zeros((1, measurements), np.int64)
-        self._tape, self._points = _Tape(1, 1, n, measurements, dtype), _Points(self._setting, 1, n, dtype)
-        self._tape.prior_mean[0], self._tape.prior_covariance[0] = mean, covariance
+        self._points = _Points(self._setting, 1, n, dtype)
+        self._tape = tape = _Tape(1, 1, n, measurements, dtype)
+        tape.prior_mean[0], tape.prior_covariance[0] = mean, covariance
         self._inputs: Array | None = None
-        self.mean, self.covariance = self._tape.post_mean[0, 0], self._tape.post_covariance[0, 0]
+        self.prior = Gaussian(tape.prior_mean[0, 0], tape.prior_covariance[0, 0])
+        self.state = Gaussian(tape.post_mean[0, 0], tape.post_covariance[0, 0])
+        self.innovation, self.innovation_covariance, self.gain = tape.innovation[0, 0], tape.own[0, 0], tape.gain[0, 0]
 
     def step(self, measurement: Array, inputs: Array, process_noise: Array | NoiseAt, observation_noise: Array | NoiseAt) -> Array:
         """The filtered mean, (n,), valid until the next step.
@@ -292,14 +311,20 @@ class UnscentedStepper:
             process_noise: Q of the step that led here, (1, n, n), or as a function of the state before.
             observation_noise: R, (1, m, m), or as a function of the predicted state.
         """
-        tape, now = self._tape, inputs[None]
         if self._inputs is not None:
-            before = tape.post_mean[0].copy(), tape.post_covariance[0].copy()
-            _predict(self._setting, tape, 0, self._points, *before, self._inputs, process_noise)
-        seen = measurement[None] if self._setting.gate is None else measurement[None].copy()
-        _update(self._setting, tape, 0, self._points, seen, now, observation_noise, self._refused)
-        self._inputs = now
-        return self.mean
+            self.predict(self._inputs, process_noise)
+        self.update(measurement, inputs, observation_noise)
+        self._inputs = inputs
+        return self.state.mean
+
+    def predict(self, inputs: Array, process_noise: Array | NoiseAt) -> None:
+        """Move the state to the next sample by inputs of this one."""
+        before = self._tape.post_mean[0].copy(), self._tape.post_covariance[0].copy()
+        _predict(self._setting, self._tape, 0, self._points, *before, inputs[None], process_noise)
+
+    def update(self, measurement: Array, inputs: Array, observation_noise: Array | NoiseAt) -> None:
+        """Take in the measurement."""
+        _update(self._setting, self._tape, 0, self._points, measurement[None].copy(), inputs[None], observation_noise, self._refused)
 
 
 def moved(model: PointModel, states: Tensor, inputs: Tensor) -> Tensor:
@@ -330,7 +355,6 @@ class _Scan(torch.autograd.Function):
         share: Share,
         tape: _Tape,
         functions: Sequence[NoiseAt | None],
-        refused: NDArray[np.int64],
         measurements: Tensor,
         inputs: Tensor,
         mean: Tensor,
@@ -350,7 +374,7 @@ class _Scan(torch.autograd.Function):
         def work(start: int, end: int) -> None:
             part = tape if end - start == y.shape[1] else tape.slice(start, end)
             own = [noise[:, start:end] if isinstance(noise, np.ndarray) else noise for noise in noises]
-            _forward(setting, part, y[:, start:end], u[:, start:end], first[0][start:end], first[1][start:end], own, refused[start:end])
+            _forward(setting, part, y[:, start:end], u[:, start:end], first[0][start:end], first[1][start:end], own)
             if part is not tape:
                 tape.put(start, end, part)
 
@@ -388,7 +412,7 @@ class _Scan(torch.autograd.Function):
         share(work, sequences)
         summed = [torch.from_numpy(np.asarray(sum(parts))) for parts in zip(*(gradients[key] for key in sorted(gradients)), strict=True)]
         y_bar, *noise = (torch.from_numpy(bar).transpose(0, 1) for bar in (measured, process, observation))
-        return (None, None, None, None, None, y_bar, None, torch.from_numpy(mean), torch.from_numpy(covariance), *noise, *summed)
+        return (None, None, None, None, y_bar, None, torch.from_numpy(mean), torch.from_numpy(covariance), *noise, *summed)
 
 
 def _forward(
@@ -399,8 +423,8 @@ def _forward(
     mean: Array,
     covariance: Array,
     noises: Sequence[Any],
-    refused: NDArray[np.int64],
 ) -> None:
+    refused = np.zeros(y.shape[1:], np.int64)
     points = _Points(setting, len(mean), mean.shape[1], y.dtype)
     for k in range(len(y)):
         now = np.ascontiguousarray(u[k])

@@ -18,7 +18,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, fields
-from typing import Literal
+from typing import Any, Literal, NamedTuple
 
 import torch
 from torch import Tensor
@@ -77,32 +77,21 @@ BMW_545I = LoadedCar()
 """BMW 545i of Bertipaglia et al. 2024."""
 
 
-@dataclass(frozen=True)
-class DugoffAxle:
-    """Parameters of an axle's tyres.
+class DugoffAxle(NamedTuple):
+    """Parameters of an axle's tyres; tensors where many are tried at once.
 
-    Args:
+    Attributes:
         cornering_stiffness: C [N/rad].
         friction: μ₀ of a tyre that hardly slides [1].
         reduction: e_r, share of the friction that is lost per m/s of sliding [s/m].
-
-    Raises:
-        ValueError: stiffness or friction is not positive, or the reduction is negative.
     """
 
-    cornering_stiffness: float
-    friction: float
-    reduction: float
-
-    def __post_init__(self) -> None:
-        for name in ("cornering_stiffness", "friction"):
-            if not getattr(self, name) > 0:
-                raise ValueError(f"{name} must be positive, not {getattr(self, name)}")
-        if not self.reduction >= 0:
-            raise ValueError(f"reduction must not be negative, not {self.reduction}")
+    cornering_stiffness: Any
+    friction: Any
+    reduction: Any
 
     def force(self, tangent: Tensor, load: Tensor, vx: Tensor, tyres: Tyres) -> Tensor:
-        """Lateral force of the axle in the wheels' axes, positive to the left.
+        """Lateral force of the axle in the wheels' axes, positive to the left; everything broadcasts.
 
         Args:
             tangent: of the slip angle, positive where it makes a force to the left (...).
@@ -113,24 +102,12 @@ class DugoffAxle:
         Returns:
             (...) [N], differentiable everywhere, at a slip of zero too.
         """
-        return dugoff_force(tangent, load, vx, self.cornering_stiffness, self.friction, self.reduction, tyres)
-
-
-def dugoff_force(
-    tangent: Tensor,
-    load: Tensor,
-    vx: Tensor,
-    cornering_stiffness: float | Tensor,
-    friction: float | Tensor,
-    reduction: float | Tensor,
-    tyres: Tyres,
-) -> Tensor:
-    """The same of parameters that may be tensors, where many are tried at once; everything broadcasts."""
-    slide = tangent.abs()
-    half = friction * (1.0 - reduction * vx * slide).clamp(min=LEAST_SHARE) * load / (2.0 * cornering_stiffness)
-    ratio = half / torch.maximum(slide, half.detach() / LARGEST_RATIO[tyres])
-    used = ratio * (2.0 - ratio) if tyres == "plain" else torch.tanh(2.0 * ratio)
-    return cornering_stiffness * tangent * used
+        slide = tangent.abs()
+        half = self.friction * (1.0 - self.reduction * vx * slide).clamp(min=LEAST_SHARE) * load / (2.0 * self.cornering_stiffness)
+        ratio = half / torch.maximum(slide, half.detach() / LARGEST_RATIO[tyres])
+        used = ratio * (2.0 - ratio) if tyres == "plain" else torch.tanh(2.0 * ratio)
+        force: Tensor = self.cornering_stiffness * tangent * used
+        return force
 
 
 @dataclass(frozen=True)

@@ -6,20 +6,17 @@ Source: Węgrzynowski et al. 2024, Section III-B.2; sizes, inputs and start valu
 from __future__ import annotations
 
 from abc import abstractmethod
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from itertools import pairwise
 from typing import NamedTuple
 
 import torch
 from torch import Tensor, nn
 
-from vehest.vehicle.integration import rk4
 from vehest.vehicle.planar import F1TENTH, F1TENTH_START, Chassis, Motion, PlanarCar
 from vehest.vehicle.tyres import PacejkaTyres, Slips, TyreForces
 
 STATES = ("vx", "vy", "yaw_rate", "rim_speed", "friction")
-INPUTS = ("steer", "motor_current")
-MEASUREMENTS = ("ax", "ay", "yaw_rate", "rim_speed")
 
 PACEJKA_START: Mapping[str, float] = {
     "friction": 0.8916,
@@ -33,25 +30,18 @@ UNSCALED = 0.4  # factor of the forces of a tyre network that does not know the 
 
 
 class Perceptron(nn.Sequential):
-    """Fully connected layers with sigmoids between them; inputs and outputs are divided and multiplied by fixed scales.
-
-    Args:
-        scales: of the inputs; what an input is divided by.
-        hidden: sizes of the hidden layers.
-        outputs: what outputs are multiplied by.
-    """
+    """Fully connected layers with sigmoids between them; inputs are divided and outputs multiplied by fixed scales, 1 to begin with."""
 
     input_scale: Tensor
     output_scale: Tensor
 
-    def __init__(self, scales: Sequence[float], hidden: Sequence[int], outputs: Sequence[float]) -> None:
-        sizes = [len(scales), *hidden, len(outputs)]
+    def __init__(self, *sizes: int) -> None:
         layers: list[nn.Module] = []
         for before, after in pairwise(sizes):
             layers += [nn.Linear(before, after), nn.Sigmoid()]
         super().__init__(*layers[:-1])
-        self.register_buffer("input_scale", torch.tensor(list(scales)))
-        self.register_buffer("output_scale", torch.tensor(list(outputs)))
+        self.register_buffer("input_scale", torch.ones(sizes[0]))
+        self.register_buffer("output_scale", torch.ones(sizes[-1]))
 
     def forward(self, values: Tensor) -> Tensor:
         """(..., inputs) -> (..., outputs)."""
@@ -74,6 +64,15 @@ class Perceptron(nn.Sequential):
         pairs[0] = (pairs[0][0] / self.input_scale, pairs[0][1])
         pairs[-1] = (pairs[-1][0] * self.output_scale.unsqueeze(-1), pairs[-1][1] * self.output_scale)
         return pairs
+
+
+def rk4(derivative: Callable[[Tensor, Tensor], Tensor], state: Tensor, inputs: Tensor, step: float) -> Tensor:
+    """The state, (..., n), one step [s] later by the classical Runge-Kutta method (Kutta 1901), inputs (..., p) held over it."""
+    first = derivative(state, inputs)
+    second = derivative(state + 0.5 * step * first, inputs)
+    third = derivative(state + 0.5 * step * second, inputs)
+    fourth = derivative(state + step * third, inputs)
+    return state + step / 6.0 * (first + 2.0 * second + 2.0 * third + fourth)
 
 
 class Dynamics(nn.Module):
@@ -114,17 +113,10 @@ class Dynamics(nn.Module):
 class PacejkaCar(Dynamics):
     """PC: single track with Pacejka's curves (Eqs. 2 and 3). Its friction is learnt once and not the state's."""
 
-    def __init__(
-        self,
-        chassis: Chassis = F1TENTH,
-        start: Mapping[str, float] = F1TENTH_START,
-        tyres: Mapping[str, float] = PACEJKA_START,
-        *,
-        with_curvature: bool = False,
-    ) -> None:
+    def __init__(self, chassis: Chassis = F1TENTH, start: Mapping[str, float] = F1TENTH_START, *, with_curvature: bool = False) -> None:
         super().__init__()
         self.car = PlanarCar(chassis, start)
-        self.tyres = PacejkaTyres(tyres, with_curvature=with_curvature)
+        self.tyres = PacejkaTyres(PACEJKA_START, with_curvature=with_curvature)
 
     def motion(self, state: Tensor, inputs: Tensor) -> Motion:
         """See `Dynamics.motion`."""
@@ -135,15 +127,10 @@ class ResidualCar(PacejkaCar):
     """PCR: the same, and a network that adds to its rates."""
 
     def __init__(
-        self,
-        chassis: Chassis = F1TENTH,
-        start: Mapping[str, float] = F1TENTH_START,
-        tyres: Mapping[str, float] = PACEJKA_START,
-        *,
-        hidden: Sequence[int] = (256, 256),
+        self, chassis: Chassis = F1TENTH, start: Mapping[str, float] = F1TENTH_START, *, hidden: Sequence[int] = (256, 256)
     ) -> None:
-        super().__init__(chassis, start, tyres)
-        self.network = Perceptron([1.0] * 6, hidden, [1.0] * 4)
+        super().__init__(chassis, start)
+        self.network = Perceptron(6, *hidden, 4)
 
     def motion(self, state: Tensor, inputs: Tensor) -> Motion:
         """See `Dynamics.motion`."""
@@ -155,7 +142,7 @@ class NeuralCar(Dynamics):
 
     def __init__(self, hidden: Sequence[int] = (256, 256)) -> None:
         super().__init__()
-        self.network = Perceptron([1.0] * 6, hidden, [1.0] * 4)
+        self.network = Perceptron(6, *hidden, 4)
 
     def motion(self, state: Tensor, inputs: Tensor) -> Motion:
         """See `Dynamics.motion`."""
@@ -170,8 +157,6 @@ class TyreNetworkCar(Dynamics):
 
     Args:
         friction_scaled: whether forces are scaled by friction (NNTF).
-        input_scale: what the network's inputs are divided by; none: 1.
-        force_scale: [N] what its outputs are multiplied by.
     """
 
     def __init__(
@@ -181,14 +166,11 @@ class TyreNetworkCar(Dynamics):
         *,
         friction_scaled: bool = True,
         hidden: Sequence[int] = (64, 64),
-        input_scale: Sequence[float] | None = None,
-        force_scale: float = 1.0,
     ) -> None:
         super().__init__()
         self.car = PlanarCar(chassis, start)
         self.friction_scaled = friction_scaled
-        count = 9 if friction_scaled else 10
-        self.network = Perceptron([1.0] * count if input_scale is None else input_scale, hidden, [force_scale] * 4)
+        self.network = Perceptron(9 if friction_scaled else 10, *hidden, 4)
 
     def forces(self, state: Tensor, inputs: Tensor, slips: Slips) -> TyreForces:
         """Forces of both axles [N]."""

@@ -4,12 +4,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass, fields
 
-from torch import Tensor
-
 
 @dataclass(frozen=True)
 class SingleTrackParameters:
-    """A car as a single track: each axle one tyre on the centre line. Any of them may be a tensor, where gradients are wanted.
+    """A car as a single track: each axle one tyre on the centre line.
 
     Args:
         mass: [kg].
@@ -23,17 +21,17 @@ class SingleTrackParameters:
         ValueError: a number that is not positive.
     """
 
-    mass: float | Tensor
-    yaw_inertia: float | Tensor
-    cg_to_front_axle: float | Tensor
-    cg_to_rear_axle: float | Tensor
-    cornering_stiffness_front: float | Tensor
-    cornering_stiffness_rear: float | Tensor
+    mass: float
+    yaw_inertia: float
+    cg_to_front_axle: float
+    cg_to_rear_axle: float
+    cornering_stiffness_front: float
+    cornering_stiffness_rear: float
 
     def __post_init__(self) -> None:
         for entry in fields(self):
             value = getattr(self, entry.name)
-            if not isinstance(value, Tensor) and not value > 0:
+            if not value > 0:
                 raise ValueError(f"{entry.name} must be positive, not {value}")
 
 

@@ -18,8 +18,7 @@ import torch
 from torch import Tensor, nn
 
 from vehest.constants import GRAVITY
-from vehest.vehicle.positive import PositiveParameters
-from vehest.vehicle.tyres import Slips, TyreForces, slips_of
+from vehest.vehicle.tyres import STILL, PositiveParameters, Slips, TyreForces
 
 
 @dataclass(frozen=True)
@@ -86,9 +85,14 @@ class PlanarCar(nn.Module):
         return self.chassis.wheelbase - self.learnt["cg_to_rear_axle"]
 
     def slips(self, state: Tensor, inputs: Tensor) -> Slips:
-        """How the tyres slide."""
+        """How the tyres slide; as in the authors' code."""
         vx, vy, yaw_rate, rim_speed = state[..., :4].unbind(-1)
-        return slips_of(vx, vy, yaw_rate, rim_speed, inputs[..., 0], self.to_front_axle, self.learnt["cg_to_rear_axle"])
+        along = vx + STILL
+        return Slips(
+            torch.atan((vy + self.to_front_axle * yaw_rate) / along) - inputs[..., 0],
+            torch.atan((vy - self.learnt["cg_to_rear_axle"] * yaw_rate) / along),
+            (rim_speed - vx) / along,
+        )
 
     def loads(self) -> tuple[Tensor, Tensor]:
         """Static load of the front and the rear axle [N]."""

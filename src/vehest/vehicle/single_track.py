@@ -14,78 +14,43 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-import torch
-from numpy.typing import NDArray
-from torch import Tensor
 
+from vehest.constants import FloatArray
 from vehest.vehicle.parameters import SingleTrackParameters
 
 
-class LateralDynamics(NamedTuple):
-    """dx/dt = A x + B δ, or x⁺ = A x + B δ where it was discretised.
+class LateralModel(NamedTuple):
+    """dx/dt = A x + B δ, or x⁺ = A x + B δ in steps, and a_y = C x + D δ [m/s²].
 
     Attributes:
         A: (..., 2, 2).
         B: (..., 2).
-    """
-
-    A: Tensor
-    B: Tensor
-
-
-class LateralAcceleration(NamedTuple):
-    """a_y = C x + D δ [m/s²].
-
-    Attributes:
         C: (..., 2).
         D: (...).
     """
 
-    C: Tensor
-    D: Tensor
+    A: FloatArray
+    B: FloatArray
+    C: FloatArray
+    D: FloatArray
+
+    def in_steps(self, step: float) -> LateralModel:
+        """Forward Euler, x⁺ = (I + τA) x + τB δ; stable while τ(Cf + Cr)/(m u) and τ(lf² Cf + lr² Cr)/(J u) stay below about 2."""
+        return self._replace(A=np.eye(2) + step * self.A, B=step * self.B)
 
 
-def lateral_dynamics(car: SingleTrackParameters, vx: Tensor | NDArray[np.float64]) -> LateralDynamics:
-    """The differential equation of (β, r).
-
-    Args:
-        car: its parameters; tensors must broadcast against vx.
-        vx: forward speed u, positive (...) [m/s].
-    """
-    u = torch.as_tensor(vx)
+def lateral_model(car: SingleTrackParameters, vx: FloatArray) -> LateralModel:
+    """The model at forward speeds u, positive (...) [m/s]; it is continuous."""
+    u = np.asarray(vx, np.float64)
     front, rear, lf, lr = car.cornering_stiffness_front, car.cornering_stiffness_rear, car.cg_to_front_axle, car.cg_to_rear_axle
-    moment = lf * front - lr * rear
-    same = torch.zeros_like(u)  # for entries that do not depend on the speed
+    moment, same = lf * front - lr * rear, np.ones_like(u)
+    per_momentum = 1.0 / (car.mass * u)
     A = [
-        -(front + rear) / (car.mass * u),
-        -(1.0 + moment / (car.mass * u * u)),
-        same - moment / car.yaw_inertia,
-        -(lf * lf * front + lr * lr * rear) / (car.yaw_inertia * u),
+        -(front + rear) * per_momentum,
+        -(1.0 + moment * (1.0 / (car.mass * u * u))),
+        -moment / car.yaw_inertia * same,
+        -(lf * lf * front + lr * lr * rear) * (1.0 / (car.yaw_inertia * u)),
     ]
-    B = [front / (car.mass * u), same + lf * front / car.yaw_inertia]
-    return LateralDynamics(torch.stack(A, -1).unflatten(-1, (2, 2)), torch.stack(B, -1))
-
-
-def lateral_acceleration(car: SingleTrackParameters, vx: Tensor | NDArray[np.float64]) -> LateralAcceleration:
-    """What an accelerometer at the centre of gravity reads.
-
-    Args:
-        car: its parameters; tensors must broadcast against vx.
-        vx: forward speed u, positive (...) [m/s].
-    """
-    u = torch.as_tensor(vx)
-    front, rear = car.cornering_stiffness_front, car.cornering_stiffness_rear
-    same = torch.zeros_like(u)
-    moment = car.cg_to_front_axle * front - car.cg_to_rear_axle * rear
-    return LateralAcceleration(torch.stack([same - (front + rear) / car.mass, -moment / (car.mass * u)], -1), same + front / car.mass)
-
-
-def forward_euler(dynamics: LateralDynamics, step: float) -> LateralDynamics:
-    """The same in steps: x⁺ = (I + τA) x + τB δ.
-
-    Args:
-        dynamics: continuous.
-        step: sampling time τ [s]; stable while τ(Cf + Cr)/(m u) and τ(lf² Cf + lr² Cr)/(J u) stay below about 2.
-    """
-    identity = torch.eye(2, dtype=dynamics.A.dtype, device=dynamics.A.device)
-    return LateralDynamics(identity + step * dynamics.A, step * dynamics.B)
+    B = [front * per_momentum, lf * front / car.yaw_inertia * same]
+    C = [-(front + rear) / car.mass * same, -moment * per_momentum]
+    return LateralModel(np.stack(A, -1).reshape(*u.shape, 2, 2), np.stack(B, -1), np.stack(C, -1), front / car.mass * same)

@@ -72,23 +72,18 @@ class TyreTrack:
         """Yaw rate [rad/s] and lateral acceleration [m/s²] of states (..., n), (..., 2); Eqs. 38 to 40."""
         return torch.stack([states[..., 1], inputs[..., 0] * (states[..., 2] + states[..., 1])], -1)
 
-    def steering_slope(self, states: Tensor, inputs: Tensor) -> Tensor:
-        """By how much a steering angle changes the next state, (..., n); the first column of B in Eqs. 45, 52 and 60."""
-        front, _ = self.axles(states, inputs)
-        slope = torch.zeros_like(states)
-        slope[..., 2] = front.per_slip / (self.car.mass * inputs[..., 0])
-        slope[..., 3] = self.car.cg_to_front_axle * front.per_slip / self.car.yaw_inertia
-        return slope
-
-    def process_noise(self, states: Tensor, inputs: Tensor, steer: float, tyres: Tensor) -> Tensor:
-        """Q = Δt B Λ Bᵀ (Eqs. 41 to 45), (..., n, n).
+    def process_noise(self, states: Tensor, inputs: Tensor, steer: float, tyres: float) -> Tensor:
+        """Q = Δt B Λ Bᵀ (Eqs. 41 to 45), (..., n, n); the steering angle changes the next state by the first column of B (Eqs. 52, 60).
 
         Args:
             states: (..., n).
             inputs: (..., 2).
             steer: standard deviation of the steering angle for a second's step [rad √s].
-            tyres: of the logarithms of the adapted parameters, (n - 4,) [1/√s].
+            tyres: of the logarithms of the adapted parameters [1/√s].
         """
-        slope = steer * self.steering_slope(states, inputs)
-        wander = torch.cat([tyres.new_zeros(len(MOTION)), tyres]).square().diag()
+        front, _ = self.axles(states, inputs)
+        slope = torch.zeros_like(states)
+        slope[..., 2] = steer * (front.per_slip / (self.car.mass * inputs[..., 0]))
+        slope[..., 3] = steer * (self.car.cg_to_front_axle * front.per_slip / self.car.yaw_inertia)
+        wander = torch.tensor([0.0] * len(MOTION) + [tyres] * len(self.adapted), dtype=states.dtype).square().diag()
         return self.step * (slope.unsqueeze(-1) * slope.unsqueeze(-2) + wander)

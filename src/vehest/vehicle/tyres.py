@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from typing import NamedTuple
 
 import torch
 from torch import Tensor, nn
-
-from vehest.vehicle.positive import PositiveParameters
 
 STILL = 1e-6
 """Added to speeds that slips are divided by [m/s]."""
@@ -37,26 +36,26 @@ class TyreForces(NamedTuple):
     rear_y: Tensor
 
 
-def slips_of(
-    vx: Tensor, vy: Tensor, yaw_rate: Tensor, rim_speed: Tensor, steer: Tensor, front: Tensor | float, rear: Tensor | float
-) -> Slips:
-    """Slips of a single track.
+class PositiveParameters(nn.Module):
+    """Named positive numbers, learnt from values as their logarithms.
 
-    Args:
-        vx, vy: velocity of the centre of gravity [m/s].
-        yaw_rate: [rad/s].
-        rim_speed: speed of the wheels' rims, as if they rolled [m/s].
-        steer: angle of the front wheels [rad].
-        front, rear: distances of the axles from the centre of gravity [m].
+    Raises:
+        ValueError: a value is not positive.
 
-    Source: Węgrzynowski et al. 2024, and its authors' code.
+    Source: Węgrzynowski et al. 2024, Section III-B.4.
     """
-    along = vx + STILL
-    return Slips(
-        torch.atan((vy + front * yaw_rate) / along) - steer,
-        torch.atan((vy - rear * yaw_rate) / along),
-        (rim_speed - vx) / along,
-    )
+
+    def __init__(self, values: Mapping[str, float]) -> None:
+        super().__init__()
+        for name, value in values.items():
+            if not (math.isfinite(value) and value > 0.0):
+                raise ValueError(f"{name} must be positive, not {value}")
+            self.register_parameter(f"log_{name}", nn.Parameter(torch.tensor(math.log(value))))
+
+    def __getitem__(self, name: str) -> Tensor:
+        """The value of a parameter."""
+        logarithm: Tensor = getattr(self, f"log_{name}")
+        return logarithm.exp()
 
 
 def magic_formula(slip: Tensor, stiffness: Tensor, shape: Tensor, curvature: Tensor | float = 0.0) -> Tensor:
@@ -91,16 +90,10 @@ class PacejkaTyres(nn.Module):
         self.parameters_of = PositiveParameters(start)
         self.curvature = nn.Parameter(torch.zeros(3)) if with_curvature else None
 
-    def forward(self, slips: Slips, loads: tuple[Tensor, Tensor], friction: Tensor | None = None) -> TyreForces:
-        """Forces of both axles.
-
-        Args:
-            slips: see `Slips`.
-            loads: on the front and the rear axle [N].
-            friction: instead of the learnt one, where it is estimated.
-        """
+    def forward(self, slips: Slips, loads: tuple[Tensor, Tensor]) -> TyreForces:
+        """Forces of both axles under loads on the front and the rear axle [N]."""
         p = self.parameters_of
-        mu = p["friction"] if friction is None else friction
+        mu = p["friction"]
         ex, ef, er = (0.0, 0.0, 0.0) if self.curvature is None else self.curvature
         along = mu * p["D_x"] * magic_formula(slips.ratio, p["B_x"], p["C_x"], ex)
         front = -mu * p["D_front"] * magic_formula(slips.front, p["B_front"], p["C_front"], ef)

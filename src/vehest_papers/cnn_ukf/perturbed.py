@@ -16,13 +16,13 @@ from vehest.data.recording import Recording
 from vehest.estimators.base import Estimator
 from vehest.estimators.dugoff_ukf import finite
 from vehest.estimators.ensemble_ukf import BOX, EnsembleUkf, scaled_variance
-from vehest.estimators.filtering.dugoff_fit import DUGOFF_PARAMETERS
 from vehest.estimators.model_files import load_model
 from vehest.estimators.network_ukf import LEAST_VARIANCE
 from vehest.report.document import Column, Figure, Table
 from vehest.report.style import DOUBLE_COLUMN, legend_above, new_figure, paper_style
 from vehest.training.context import FitContext
 from vehest.training.search import staged_optuna_search
+from vehest.vehicle.dugoff import DugoffAxle
 from vehest_papers.cnn_ukf import paper
 from vehest_papers.cnn_ukf.manoeuvres import manoeuvres_of
 from vehest_papers.cnn_ukf.measures import MSE, MSE_NL, Comparison
@@ -65,7 +65,7 @@ def with_stiffness(fitted: Estimator, front: float, rear: float) -> Estimator:
     of_filter = filter_of(changed)
     if of_filter is None:
         raise DataError(f"estimator '{fitted.name}' has no cornering stiffness")
-    of_filter.axle_tyres[[0, len(DUGOFF_PARAMETERS)]] *= 1.0 + np.array([front, rear])
+    of_filter.axle_tyres[[0, len(DugoffAxle._fields)]] *= 1.0 + np.array([front, rear])
     return changed
 
 

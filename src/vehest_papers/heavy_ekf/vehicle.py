@@ -16,7 +16,7 @@ from vehest.report.style import fixed
 from vehest.studies.artefacts import PartArtefacts
 from vehest.studies.kit.claims import Claim, Verdict
 from vehest.vehicle.parameters import SingleTrackParameters
-from vehest.vehicle.single_track import lateral_dynamics
+from vehest.vehicle.single_track import lateral_model
 from vehest_papers.heavy_ekf import paper
 from vehest_papers.kit.reading import recordings_of
 
@@ -71,7 +71,7 @@ def eigenvalues_table(car: SingleTrackParameters) -> Table:
 
 def eigenvalues(car: SingleTrackParameters, speed: FloatArray) -> np.ndarray[tuple[int, int], np.dtype[np.complex128]]:
     """Both eigenvalues of (β, r) at each speed, (K, 2) [1/s]."""
-    return np.asarray(np.linalg.eigvals(lateral_dynamics(car, speed).A.numpy()), dtype=np.complex128)
+    return np.asarray(np.linalg.eigvals(lateral_model(car, speed).A), dtype=np.complex128)
 
 
 def ratios(car: SingleTrackParameters, speed: FloatArray) -> FloatArray:

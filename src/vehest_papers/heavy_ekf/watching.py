@@ -32,12 +32,12 @@ CORNERING = 1.5  # m/s²
 def observability_of(own: RationalFilter, drive: Recording, minimum_speed: float) -> Observability:
     """Of the filter's states along its own estimates."""
     samples = drive.stack(own.channels)
-    model = own.nonlinear_model()
+    track = own.track()
     states = own.filter_samples(samples).mean
     inputs = np.stack([np.maximum(samples[:, 1], minimum_speed), samples[:, 3]], axis=1)
     return observability_along(
-        model.transition,
-        model.observation,
+        track.transition,
+        track.observation,
         states,
         inputs,
         sizes=np.array([*SIZES, *[PARAMETER_SIZE] * len(own.adapted)]),

@@ -15,8 +15,7 @@ from vehest.estimators.learned_ukf import LearnedUkf
 from vehest.estimators.model_files import load_model
 from vehest.evaluation.metrics import WEIGHTS, sequences
 from vehest.filters.gaussian import Gaussian
-from vehest.filters.nonlinear import NonlinearFiltered
-from vehest.filters.unscented_scan import Array, PointModel
+from vehest.filters.unscented_scan import Array, NonlinearFiltered, PointModel
 from vehest.studies.artefacts import EvaluatedModel, PartArtefacts
 from vehest.training.through_filter import Drive
 from vehest.vehicle.dynamics import STATES

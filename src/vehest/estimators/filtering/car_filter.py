@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from functools import partial
-from typing import Literal
+from typing import Any, Literal
 
 import torch
 from torch import Tensor, nn
@@ -15,9 +15,8 @@ from vehest.filters.compiled_noise import compiled_noise
 from vehest.filters.gating import Gate
 from vehest.filters.gaussian import Gaussian
 from vehest.filters.noise_models import ConstantNoise, StateDependentNoise, with_entropy
-from vehest.filters.nonlinear import NonlinearFiltered
 from vehest.filters.sigma_points import symmetric_rule
-from vehest.filters.unscented_scan import Array, NoiseAt, PointModel, TorchModel, moved, unscented_scan
+from vehest.filters.unscented_scan import NoiseAt, NonlinearFiltered, PointModel, TorchModel, moved, unscented_scan
 from vehest.training.through_filter import Drive
 from vehest.vehicle.dynamics import STATES, Dynamics
 
@@ -29,6 +28,7 @@ OBSERVATION = (50.0, 50.0, 0.1, 0.1)
 INITIAL = (1e-3, 1e-3, 1e-3, 1e-3)
 PACE = 10.0  # by which noise learns faster than in units of its deviations
 OBSERVED_EXACTLY = (0.0, 0.0, 0.0, 1e-3)  # added to variances: the rim speed is measured, and is its own reference
+KAPPA = -2.0  # of the symmetric sigma points
 LEAST_ENTROPY = -9.0  # [nat] of the process noise
 
 
@@ -40,12 +40,14 @@ class CarFilter(nn.Module):
         noise: covariances constant, or dependent on the state.
         step: [s].
         least: smallest possible vx [m/s] and friction.
-        kappa: of the symmetric sigma points.
+        correlated: whether noise has entries off the diagonals of its covariances.
         repair: whether lost definiteness is repaired.
 
     Source: Węgrzynowski et al. 2024, Section III-B; start values as in its authors' code.
     """
 
+    process_noise: Any
+    observation_noise: Any
     mirror: tuple[Sequence[float], Sequence[float], Sequence[float]] = (  # left for right
         (1.0, -1.0, -1.0, 1.0, 1.0),
         (-1.0, 1.0),
@@ -53,22 +55,26 @@ class CarFilter(nn.Module):
     )
 
     def __init__(
-        self, dynamics: Dynamics, noise: NoiseKind, *, step: float, least: tuple[float, float], kappa: float = -2.0, repair: bool = True
+        self,
+        dynamics: Dynamics,
+        noise: NoiseKind,
+        *,
+        step: float,
+        least: tuple[float, float],
+        correlated: bool = True,
+        repair: bool = True,
     ) -> None:
         super().__init__()
-        self.dynamics = dynamics
+        self.dynamics, self.constant = dynamics, noise == "constant"
         n = len(STATES)
-        process = (*PROCESS, FRICTION[noise])
-        if noise == "constant":
-            self.process_noise: nn.Module = ConstantNoise(process)
-            self.observation_noise: nn.Module = ConstantNoise(OBSERVATION)
-        else:
-            self.process_noise = StateDependentNoise(process, n)
-            self.observation_noise = StateDependentNoise(OBSERVATION, n)
+        self.process_noise, self.observation_noise = (
+            ConstantNoise(variances, correlated) if self.constant else StateDependentNoise(variances, n, correlated=correlated)
+            for variances in ((*PROCESS, FRICTION[noise]), OBSERVATION)
+        )
         self.initial_noise = ConstantNoise((*INITIAL, FRICTION[noise]))
         self.step, self.repair = step, repair
         self.lower = (least[0], *[-torch.inf] * 3, least[1])
-        self.rule = symmetric_rule(n, kappa)
+        self.rule = symmetric_rule(n, KAPPA)
 
     def reset(self, generator: torch.Generator) -> None:
         """Draw everything that is random to begin with anew."""
@@ -117,7 +123,7 @@ class CarFilter(nn.Module):
             model: what `point_model` returned, to use it again.
             gate: which measurements are refused; none: all are taken.
         """
-        if states is not None or isinstance(self.process_noise, ConstantNoise):
+        if states is not None or self.constant:
             at = initial.mean.new_zeros(1, 1, len(STATES)) if states is None else states
             noises: list[Tensor | NoiseAt] = [self._process_noise(at, inputs), self.observation_noise(at, inputs)]
         else:
@@ -137,13 +143,12 @@ class CarFilter(nn.Module):
 
     def noise_at(self) -> tuple[NoiseAt, NoiseAt]:
         """Process and observation noise as functions of arrays of states."""
-        process, observation = self.process_noise, self.observation_noise
-        if isinstance(process, StateDependentNoise) and isinstance(observation, StateDependentNoise):
-            return compiled_noise(process, LEAST_ENTROPY), compiled_noise(observation)
+        if not self.constant:
+            return compiled_noise(self.process_noise, LEAST_ENTROPY), compiled_noise(self.observation_noise)
         nothing = self.initial_noise.unit.new_zeros(1, len(STATES))
         with torch.no_grad():
-            values = [noise(nothing, nothing).contiguous().numpy() for noise in (self._process_noise, observation)]
-        return partial(_whatever, values[0]), partial(_whatever, values[1])
+            values = [noise(nothing, nothing).contiguous().numpy() for noise in (self._process_noise, self.observation_noise)]
+        return (lambda states, inputs: values[0]), (lambda states, inputs: values[1])
 
     def begin_noise(self, drives: Sequence[Drive], start_spread: float) -> None:
         """Start noise from one-step and measurement residuals at the true states; see `Filtering`.
@@ -157,13 +162,10 @@ class CarFilter(nn.Module):
             size = torch.cat([drive.states for drive in drives]).square().mean(0).sqrt()
             process, observation = steps.T @ steps / len(steps), expected.T @ expected / len(expected)
             friction = len(STATES) - 1
-            process[friction, friction] = FRICTION["constant" if isinstance(self.process_noise, ConstantNoise) else "state_dependent"]
+            process[friction, friction] = FRICTION["constant" if self.constant else "state_dependent"]
             observation += observation.new_tensor(OBSERVED_EXACTLY).diag()
         for noise, covariance in ((self.process_noise, process), (self.observation_noise, observation)):
-            if isinstance(noise, StateDependentNoise):
-                noise.begin(covariance, PACE, size)
-            else:
-                noise.begin(covariance, PACE)  # type: ignore[operator]
+            noise.begin(covariance, PACE, size)
         initial = self.initial_covariance().detach().clone()
         initial[friction, friction] = torch.clamp(initial[friction, friction], min=start_spread**2 / 3.0)
         self.initial_noise.begin(initial, PACE)
@@ -184,7 +186,7 @@ class CarFilter(nn.Module):
             measurements = drives.measurements[:, begin:end]
             if first:
                 measurements = torch.cat([torch.full_like(measurements[:, :1], torch.nan), measurements[:, 1:]], 1)
-            states = self._settled(drives.states[:, begin:end])
+            states = None if self.constant else drives.states[:, begin:end]
             filtered = self.filtered(measurements, drives.inputs[:, begin:end], initial, states, model).steps.filtered
             means.append(filtered.mean[:, first - begin :])
             covariances.append(filtered.covariance[:, first - begin :])
@@ -197,12 +199,5 @@ class CarFilter(nn.Module):
             initial = Gaussian(drives.states[:, 0], self.initial_covariance())
             return self.filtered(drives.measurements, drives.inputs, initial).steps.filtered.mean
 
-    def _settled(self, states: Tensor) -> Tensor | None:
-        return None if isinstance(self.process_noise, ConstantNoise) else states
-
     def _process_noise(self, states: Tensor, inputs: Tensor) -> Tensor:
         return with_entropy(self.process_noise(states, inputs), LEAST_ENTROPY)
-
-
-def _whatever(covariance: Array, states: Array, inputs: Array) -> Array:
-    return covariance

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -13,32 +13,26 @@ from vehest.constants import FloatArray
 from vehest.data.errors import DataError
 from vehest.data.recording import Recording
 from vehest.estimators.filtering.tyre_fit import axle_motion
-from vehest.vehicle.dugoff import DugoffAxle, LoadedCar, Tyres, dugoff_force
+from vehest.vehicle.dugoff import DugoffAxle, LoadedCar, Tyres
 
-DUGOFF_PARAMETERS = ("cornering_stiffness", "friction", "reduction")
 BOUNDS = ((2.0, 60.0), (0.3, 2.0), (0.0, 0.05))
 """Cornering stiffness over the axle's load at rest [1/rad], friction [1], reduction [s/m]."""
 MOST_SAMPLES = 1500  # evenly thinned to
 POPULATION = 15  # a parameter
 
 
-@dataclass(frozen=True, eq=False)
-class DugoffFit:
-    """Tyres of both axles.
+class DugoffFit(NamedTuple):
+    """Tyres of the front and of the rear axle, in the order of `DugoffAxle`.
 
-    Args:
-        front: of the front axle.
-        rear: of the rear axle.
-        spread: half of the range of each parameter over restarts, in the order of `DUGOFF_PARAMETERS`, (2, 3).
-        residual_rms: of the front and of the rear force, (2,) [N].
-        force_rms: of the forces themselves, (2,) [N].
+    Attributes:
+        parameters: (2, 3).
+        spread: half of the range of each over restarts, (2, 3).
+        residual_rms: of the forces, (2,) [N].
     """
 
-    front: DugoffAxle
-    rear: DugoffAxle
+    parameters: FloatArray
     spread: FloatArray
     residual_rms: FloatArray
-    force_rms: FloatArray
 
 
 def fit_dugoff(
@@ -85,8 +79,8 @@ def fit_dugoff(
         force = torch.as_tensor(forces[axle])
 
         def cost(candidates: FloatArray, tangent=tangent, force=force, load=loads[axle], scale=scale, rms=rms):  # type: ignore[no-untyped-def]
-            stiffness, friction, reduction = torch.as_tensor(candidates * scale[:, None])[:, :, None]
-            error = dugoff_force(tangent, load, vx, stiffness, friction, reduction, tyres) - force
+            axle = DugoffAxle(*torch.as_tensor(candidates * scale[:, None])[:, :, None])
+            error = axle.force(tangent, load, vx, tyres) - force
             return error.square().mean(-1).sqrt().numpy() / rms
 
         searches = [
@@ -105,7 +99,5 @@ def fit_dugoff(
         ]
         parameters = np.array([search.x * scale for search in searches])
         best = min(searches, key=lambda search: float(search.fun))
-        found.append((best.x * scale, 0.5 * np.ptp(parameters, axis=0), float(best.fun) * rms, rms))
-    front, rear = (DugoffAxle(*values.tolist()) for values, *_ in found)
-    spread, residual, size = (np.array([entry[part] for entry in found]) for part in (1, 2, 3))
-    return DugoffFit(front, rear, spread, residual, size)
+        found.append((best.x * scale, 0.5 * np.ptp(parameters, axis=0), float(best.fun) * rms))
+    return DugoffFit(*(np.array(part) for part in zip(*found, strict=True)))

@@ -4,38 +4,26 @@ from __future__ import annotations
 
 import math
 from abc import abstractmethod
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from vehest.constants import FloatArray
+from vehest.data.errors import DataError
+from vehest.data.recording import Recording
 from vehest.declared import setting
+from vehest.estimators.filtering.gated import Gated
 from vehest.estimators.recursive import Recursive
 from vehest.filters.gating import Gate
 from vehest.filters.gaussian import Gaussian
+from vehest.filters.noise_levels import high_passed_level
 from vehest.vehicle.parameters import FERRARI_250LM, SingleTrackParameters
-from vehest.vehicle.single_track import forward_euler, lateral_acceleration, lateral_dynamics
+from vehest.vehicle.single_track import LateralModel, lateral_model
 
 MEASURED = [0, 2]  # yaw rate and lateral acceleration among the channels
 KNOWN = 1e-6  # rad and rad/s, standard deviation of a state that a protocol hands over
-
-
-class SampledModel(NamedTuple):
-    """The model at the times of T samples: x[k+1] = A[k] x[k] + B[k] δ[k],  a_y[k] = C[k] x[k] + D[k] δ[k].
-
-    Attributes:
-        A: (T, 2, 2).
-        B: (T, 2).
-        C: (T, 2).
-        D: (T,).
-    """
-
-    A: FloatArray
-    B: FloatArray
-    C: FloatArray
-    D: FloatArray
 
 
 class FilteredStates(NamedTuple):
@@ -81,7 +69,7 @@ class FilterState(NamedTuple):
     refused: NDArray[np.int64]
 
 
-class SideslipFilter(Recursive):
+class SideslipFilter(Gated, Recursive):
     """A filter whose state begins with sideslip angle β and yaw rate r of a single track; v = u tan β."""
 
     channels = ("yaw_rate", "vx", "ay", "steer")
@@ -90,20 +78,10 @@ class SideslipFilter(Recursive):
     covariance_of = ("vy", "yaw_rate")
     car: SingleTrackParameters = setting(FERRARI_250LM, "parameters of the car")
     minimum_speed: float = setting(3.0, "speed below which the model is held at this speed", unit="m/s", positive=True)
-    gate: float | None = setting(
-        None, "standard deviations of an innovation beyond which a measurement is refused in use; null: all are taken", positive=True
-    )
 
-    def sampled_model(self, vx: FloatArray) -> SampledModel:
-        """The model at forward speeds vx, (T,) [m/s], discretised by forward Euler."""
-        speed = np.maximum(vx, self.minimum_speed)
-        dynamics = forward_euler(lateral_dynamics(self.car, speed), 1.0 / self.rate_hz)
-        acceleration = lateral_acceleration(self.car, speed)
-        return SampledModel(*(part.numpy() for part in (*dynamics, *acceleration)))
-
-    def gate_in_use(self) -> Gate | None:
-        """The gate of estimates; numbers are found without, because noise that is too small would close it."""
-        return Gate.of(self.gate, self.rate_hz)
+    def sampled_model(self, vx: FloatArray) -> LateralModel:
+        """The model in steps at forward speeds vx, (T,) [m/s]: x[k+1] = A[k] x[k] + B[k] δ[k], a_y[k] = C[k] x[k] + D[k] δ[k]."""
+        return lateral_model(self.car, np.maximum(vx, self.minimum_speed)).in_steps(1.0 / self.rate_hz)
 
     def first_motion(self, sample: FloatArray, deviation: FloatArray, given: Mapping[str, float]) -> Gaussian[FloatArray]:
         """β and r before the first sample: 0 with standard deviations (n ≥ 2), further states too, or what a protocol hands over."""
@@ -152,3 +130,27 @@ class SideslipFilter(Recursive):
             "innovations": found.nis,
         }
         return values | self.quantities(mean), FilterState(samples[-1], found.last, refused)
+
+
+def read_levels(recordings: Sequence[Recording], names: Sequence[str], cutoff: float, least: float = 0.0) -> dict[str, float]:
+    """Standard deviations of measured channels above a frequency, by name.
+
+    Args:
+        recordings: of which all samples count together.
+        names: of channels.
+        cutoff: see `high_passed_level`.
+        least: what a level has to exceed to be noise.
+
+    Raises:
+        DataError: a channel has too many gaps, or no noise.
+    """
+    among = f"recording{'s' if len(recordings) > 1 else ''} {', '.join(repr(recording.id) for recording in recordings)}"
+    levels = {}
+    for name in names:
+        try:
+            levels[name] = high_passed_level([recording[name] for recording in recordings], cutoff)
+        except ValueError as error:
+            raise DataError(f"{among}: channel '{name}': {error}; give estimator.noise.{name}") from None
+        if not levels[name] > least:
+            raise DataError(f"{among}: channel '{name}' has no noise that could be read off it; give estimator.noise.{name}")
+    return levels

@@ -7,7 +7,8 @@ from collections.abc import Mapping
 from typing import Any, ClassVar, NamedTuple
 
 from vehest.constants import FloatArray
-from vehest.estimators.base import Estimator, Stepper
+from vehest.estimators.base import Stepper
+from vehest.estimators.filtering.gated import Gated
 from vehest.filters.unscented_scan import NoiseAt, UnscentedStepper
 
 
@@ -27,7 +28,7 @@ class FilterStep(NamedTuple):
     observation_noise: FloatArray | NoiseAt
 
 
-class SigmaPointEstimator(Estimator):
+class SigmaPointEstimator(Gated):
     """An estimator by an unscented filter.
 
     Attributes:
@@ -68,6 +69,6 @@ class SigmaPointStepper(Stepper):
         step = estimator.filter_step(estimator.checked_sample(sample), self._memory)
         if self._filter is None:
             self._filter = estimator.new_filter(step)
-        dtype, of_vy = self._filter.mean.dtype, estimator.states.index("vy")
+        dtype, of_vy = self._filter.state.mean.dtype, estimator.states.index("vy")
         mean = self._filter.step(step.measurement.astype(dtype), step.inputs.astype(dtype), step.process_noise, step.observation_noise)
-        return dict(zip(estimator.states, mean.tolist(), strict=True)) | {"vy_variance": float(self._filter.covariance[of_vy, of_vy])}
+        return dict(zip(estimator.states, mean.tolist(), strict=True)) | {"vy_variance": float(self._filter.state.covariance[of_vy, of_vy])}

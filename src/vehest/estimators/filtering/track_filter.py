@@ -17,9 +17,8 @@ from vehest.estimators.kernels.dugoff_track import CompiledDugoffTrack
 from vehest.estimators.kernels.threads import over_members
 from vehest.filters.gating import Gate
 from vehest.filters.gaussian import Gaussian
-from vehest.filters.nonlinear import NonlinearFiltered
 from vehest.filters.sigma_points import symmetric_rule
-from vehest.filters.unscented_scan import PointModel, TorchModel, unscented_scan
+from vehest.filters.unscented_scan import NonlinearFiltered, PointModel, unscented_scan
 from vehest.vehicle.dugoff import TRACK_STATES, DugoffTrack
 
 Over = Literal["samples", "recordings"]
@@ -35,16 +34,12 @@ class TrackFilter:
 
     Where the car is slower than the track's minimum speed, nothing counts as measured, and the state is that of rolling wheels, with the
     deviations `UNKNOWN`.
-
-    Args:
-        track: the model.
-        compiled: whether sigma points move through compiled code, or through the torch it must equal.
     """
 
-    def __init__(self, track: DugoffTrack, *, compiled: bool = True) -> None:
-        self.track, self.compiled = track, compiled
+    def __init__(self, track: DugoffTrack) -> None:
+        self.track = track
         self.rule = symmetric_rule(len(TRACK_STATES), KAPPA)
-        self._models: dict[torch.dtype, PointModel] = {}
+        self.model: PointModel = CompiledDugoffTrack(track)
 
     def filtered(
         self,
@@ -54,7 +49,6 @@ class TrackFilter:
         observation_noise: Tensor,
         initial: Gaussian[Tensor] | None = None,
         gate: Gate | None = None,
-        refused: NDArray[np.int64] | None = None,
     ) -> NonlinearFiltered:
         """Filter sequences of one length; means and covariances are differentiable in measurements and noise.
 
@@ -65,7 +59,6 @@ class TrackFilter:
             observation_noise: (B, T, m, m) or what broadcasts to it.
             initial: state before the first measurement, mean (2,) or (B, 2); none: `start` of every sequence.
             gate: which measurements are refused; none: all are taken.
-            refused: see `unscented_scan`.
 
         Raises:
             ValueError: shapes do not fit each other.
@@ -76,7 +69,7 @@ class TrackFilter:
             measurements = torch.where(slow, torch.nan, measurements)
             process_noise = torch.where(slow[..., None], rolling, process_noise)
         return unscented_scan(
-            self.model(measurements.dtype),
+            self.model,
             measurements,
             inputs,
             self.start(inputs[:, 0]) if initial is None else initial,
@@ -85,7 +78,6 @@ class TrackFilter:
             self.rule,
             share=partial(over_members, pieces=1),
             gate=gate,
-            refused=refused,
         )
 
     def start(self, inputs: Tensor, states: Sequence[Mapping[str, float] | None] | None = None) -> Gaussian[Tensor]:
@@ -103,13 +95,6 @@ class TrackFilter:
                 if given and name in given:
                     mean[row, column], deviation[row, column] = given[name], KNOWN
         return Gaussian(mean, torch.diag_embed(deviation.square()))
-
-    def model(self, dtype: torch.dtype) -> PointModel:
-        """The track as the scan takes it."""
-        if dtype not in self._models:
-            track = self.track
-            self._models[dtype] = CompiledDugoffTrack(track, dtype) if self.compiled else TorchModel(track.transition, track.observation)
-        return self._models[dtype]
 
 
 def in_nonlinear_range(ay: FloatArray, enter: float, leave: float, before: bool = False) -> NDArray[np.bool_]:

@@ -41,7 +41,7 @@ def read_csv(
         DataError: it has other lines, lacks a column, a cell cannot be read, or a column begins after half of the rows.
     """
     time, head = columns[0], read_head(file).split(b"\n")[: preamble_lines + 2]
-    lines = [_decoded(line).strip() for line in (*head, b"", b"")]
+    lines = [_decoded(line).strip() for line in (*head, *[b""] * (preamble_lines + 2))]
     names, units = (
         [cell.strip() for cell in next(csv.reader(line.splitlines()), [])] for line in lines[preamble_lines : preamble_lines + 2]
     )

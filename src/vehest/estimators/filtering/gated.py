@@ -1,0 +1,36 @@
+"""Base of filters with a gate in use."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from vehest.declared import setting
+from vehest.estimators.base import Estimator
+from vehest.filters.gating import Gate
+
+
+class Gated(Estimator):
+    """A filter that may refuse measurements in use; it learns without, because noise that is too small would close the gate."""
+
+    gate: float | None = setting(
+        None, "standard deviations of an innovation beyond which a measurement is refused in use; null: all are taken", positive=True
+    )
+
+    def gate_in_use(self) -> Gate | None:
+        """The gate of estimates."""
+        return Gate.of(self.gate, self.rate_hz)
+
+    @property
+    def gate_suffix(self) -> str:
+        """Of the name of a variant."""
+        return "" if self.gate is None else f"_gate{self.gate:g}"
+
+    @property
+    def gate_title(self) -> str:
+        """Of the title."""
+        return "" if self.gate is None else f", innovations gated at {self.gate:g} sigma"
+
+    def c_values(self) -> dict[str, Any]:
+        """Limit and patience of the gate; patience is 0 without one."""
+        gate = self.gate_in_use()
+        return {"limit": 0.0 if gate is None else gate.deviations**2, "patience": 0 if gate is None else gate.patience}
