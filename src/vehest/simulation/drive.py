@@ -16,10 +16,9 @@ from vehest.simulation.driving.car import Car, car_of
 from vehest.simulation.driving.driver import DRIVER_RATE_HZ, Command, Observation
 from vehest.simulation.driving.manoeuvre import SETTLING_TIME, Controller, Manoeuvre
 from vehest.simulation.errors import SimulationError
-from vehest.simulation.plant.compiled import LIBRARY, LIBRARY_VERSION
 from vehest.simulation.plant.motion import Motion
 from vehest.simulation.plant.multi_body import MultiBodyPlant, PlantState, road_gravity
-from vehest.simulation.plant.parameters import Vehicle
+from vehest.simulation.plant.parameters import LIBRARY, LIBRARY_VERSION, Vehicle
 from vehest.simulation.plant.regimes import STEER, VX, VY, YAW, YAW_RATE, X, Y
 from vehest.simulation.plant.stability import StabilityControl, StabilityState
 from vehest.simulation.plant.stability import stability_control as make_stability_control

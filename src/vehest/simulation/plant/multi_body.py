@@ -24,7 +24,6 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
-from vehiclemodels.init_mb import init_mb
 
 from vehest.constants import GRAVITY, FloatArray
 from vehest.data.errors import ConfigurationError
@@ -32,7 +31,7 @@ from vehest.simulation.errors import SimulationError
 from vehest.simulation.plant import compiled
 from vehest.simulation.plant.compiled import N_INPUTS
 from vehest.simulation.plant.motion import Motion
-from vehest.simulation.plant.parameters import Vehicle, compiled_parameters, library_parameters, parameter_vector
+from vehest.simulation.plant.parameters import Vehicle, compiled_parameters, parameter_vector
 from vehest.simulation.plant.regimes import (
     FIRST_WHEEL,
     HEAVE,
@@ -166,9 +165,11 @@ class MultiBodyPlant:
     @cached_property
     def _at_rest(self) -> FloatArray:
         """The state in which the springs carry the car, at the origin; (29,)."""
-        values = np.array(init_mb([0.0] * 7, library_parameters(self.vehicle)), dtype=np.float64)
+        p, values = self.parameters, np.zeros(compiled.N_STATES)
+        values[HEAVE_FRONT] = (p.m_s * GRAVITY * p.b / (p.a + p.b) + p.m_uf * GRAVITY) / (2.0 * p.K_zt)
+        values[HEAVE_REAR] = (p.m_s * GRAVITY * p.a / (p.a + p.b) + p.m_ur * GRAVITY) / (2.0 * p.K_zt)
         values[PITCH] = (values[HEAVE_REAR] - values[HEAVE_FRONT]) / self.wheelbase
-        values[HEAVE] = values[HEAVE_FRONT] + self.parameters.a * values[PITCH]
+        values[HEAVE] = values[HEAVE_FRONT] + p.a * values[PITCH]
         return values
 
     def initial_state(self, x: float, y: float, yaw: float, vx: float) -> PlantState:
