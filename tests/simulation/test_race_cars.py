@@ -237,7 +237,7 @@ def test_each_race_car_has_an_installation_of_its_own() -> None:
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"payload": {"weight": 3.0}}, "payload is a mapping"),
+        ({"payload": {"weight": 3.0}}, "payload.mass is missing"),
         ({"tyres": {"cold": 0.9}}, "cold is a share between 0 and 0.5"),
         ({"sensors": "racing"}, "sensors 'racing' is not one of"),
     ],

@@ -77,11 +77,11 @@ class DrivingStyle:
     """
 
     grip_fraction: float
-    grip_ripple: float = 0.05
-    line_offset: float = 0.5
-    wavelengths: tuple[float, ...] = WAVELENGTHS
-    grip_phases: tuple[float, ...] = (0.0, 0.0, 0.0)
-    line_phases: tuple[float, ...] = (0.0, 0.0, 0.0)
+    grip_ripple: float
+    line_offset: float
+    wavelengths: tuple[float, ...]
+    grip_phases: tuple[float, ...]
+    line_phases: tuple[float, ...]
 
     def __post_init__(self) -> None:
         low, high = self.grip_fraction - abs(self.grip_ripple), self.grip_fraction + abs(self.grip_ripple)
@@ -173,12 +173,12 @@ class Command(NamedTuple):
     finished: bool = False
 
 
-def draw_style(seed: int, grip_range: tuple[float, float] = (0.65, 0.9), ripple: float = 0.05, line_offset: float = 0.5) -> DrivingStyle:
-    """The style that belongs to a seed: grip fraction uniform in ``grip_range`` (assumed), phases around the circle."""
+def draw_style(seed: int, grip_range: tuple[float, float], ripple: float, line_offset: float) -> DrivingStyle:
+    """The style that belongs to a seed: grip fraction uniform in ``grip_range``, phases around the circle."""
     generator = np.random.default_rng(np.random.SeedSequence(entropy=seed, spawn_key=(0,)))
     grip_fraction = float(generator.uniform(*grip_range))
     phases = generator.uniform(0.0, 2.0 * math.pi, (2, len(WAVELENGTHS))).tolist()
-    return DrivingStyle(grip_fraction, ripple, line_offset, grip_phases=tuple(phases[0]), line_phases=tuple(phases[1]))
+    return DrivingStyle(grip_fraction, ripple, line_offset, WAVELENGTHS, tuple(phases[0]), tuple(phases[1]))
 
 
 def plan_laps(

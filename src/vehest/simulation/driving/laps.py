@@ -247,7 +247,7 @@ FASTEST_SEVERITY = 0.95
 
 
 class LapDriver(Follower):
-    """Follows a plan of laps from just before the second, so that the first sample is taken on the line, to an end.
+    """Follows a plan of laps from just before the second one to an end; the first sample is taken on the start line.
 
     Args:
         plan: of one lap more than is recorded.

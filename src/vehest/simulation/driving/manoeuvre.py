@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
@@ -80,6 +81,7 @@ class LineDriver(Follower):
         driver: who drives.
         drawn: what the seed decided.
         end: distance at which the drive is over [m]; by default the plan's end.
+        end_time: at which it is over at the latest [s].
         speed_at: see Follower.
     """
 
@@ -89,16 +91,18 @@ class LineDriver(Follower):
         car: Car,
         driver: Driver,
         drawn: dict[str, Any],
+        *,
         end: float | None = None,
+        end_time: float = math.inf,
         speed_at: Callable[[float], tuple[float, float]] | None = None,
     ) -> None:
         super().__init__(plan, car, driver, speed_at=speed_at)
-        self.drawn, self._end = drawn, plan.length - 1.0 if end is None else end
+        self.drawn, self._end, self._end_time = drawn, plan.length - 1.0 if end is None else end, end_time
 
     def command(self, time: float, seen: Observation) -> Command:
         """As planned, until the end."""
         decision = super().command(time, seen)
-        return decision._replace(finished=True) if decision.progress >= self._end else decision
+        return decision._replace(finished=decision.progress >= self._end or time >= self._end_time)
 
 
 class OpenArea:

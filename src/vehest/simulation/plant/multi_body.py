@@ -60,9 +60,13 @@ MIRRORED = (1, 0, 3, 2)
 """The library's left front, right front, left rear and right rear wheel in the order of motion.WHEELS."""
 
 
+def _state(place: int, meaning: str) -> Any:
+    return property(lambda state: float(state.values[place]), doc=meaning)
+
+
 @dataclass(frozen=True, eq=False)
 class PlantState:
-    """Where and how the car is.
+    """State of the car.
 
     Args:
         values: the library's states, (29,).
@@ -76,40 +80,11 @@ class PlantState:
     spun: bool = False
     held: FloatArray = field(default_factory=lambda: np.zeros(4))
 
-    @property
-    def x(self) -> float:
-        """Position along the ground's first axis [m]."""
-        return float(self.values[X])
-
-    @property
-    def y(self) -> float:
-        """Position along the ground's second axis [m]."""
-        return float(self.values[Y])
-
-    @property
-    def yaw(self) -> float:
-        """Heading, not wrapped [rad]."""
-        return float(self.values[YAW])
-
-    @property
-    def vx(self) -> float:
-        """Forward velocity [m/s]."""
-        return float(self.values[VX])
-
-    @property
-    def vy(self) -> float:
-        """Lateral velocity, positive to the left [m/s]."""
-        return float(self.values[VY])
-
-    @property
-    def yaw_rate(self) -> float:
-        """Positive to the left [rad/s]."""
-        return float(self.values[YAW_RATE])
-
-    @property
-    def steer(self) -> float:
-        """Road-wheel angle of the front axle, positive to the left [rad]."""
-        return float(self.values[STEER])
+    x, y = _state(X, "Position on the ground [m]."), _state(Y, "Position on the ground [m].")
+    yaw = _state(YAW, "Heading, not wrapped [rad].")
+    vx, vy = _state(VX, "Forward velocity [m/s]."), _state(VY, "Lateral velocity, positive to the left [m/s].")
+    yaw_rate = _state(YAW_RATE, "Positive to the left [rad/s].")
+    steer = _state(STEER, "Road-wheel angle of the front axle, positive to the left [rad].")
 
     @property
     def stands(self) -> bool:

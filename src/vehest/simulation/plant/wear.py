@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from typing import Any
 
 from vehest.data.errors import ConfigurationError
-from vehest.simulation.plant.parameters import is_number
+from vehest.data.schema import validated
 
 
 @dataclass(frozen=True)
@@ -52,7 +51,4 @@ def stint_from_config(values: Any) -> Stint:
     Raises:
         ConfigurationError: an unknown name, or see Stint.
     """
-    known = [entry.name for entry in fields(Stint)]
-    if not isinstance(values, Mapping) or set(values) - set(known) or not all(is_number(value) for value in values.values()):
-        raise ConfigurationError(f"tyres is a mapping of numbers from {', '.join(known)}, not {values}")
-    return Stint(**{str(name): float(value) for name, value in values.items()})
+    return validated(Stint, values, "tyres", error=ConfigurationError)

@@ -1,6 +1,6 @@
-"""Simulated sensors: what they show of a true motion, with errors that can be switched off one by one.
+"""Channels that the simulated sensors show of a true motion, and how provenance describes the sensors.
 
-How large the errors are stands in ``sensor_levels``, how they are changed in ``sensor_config``, how they arise in ``sensor_errors``.
+true motion -> tilt, mounting and vibration of the inertial unit -> errors of each sensor (errors.py), as large as levels.py has them
 """
 
 from __future__ import annotations
@@ -12,27 +12,8 @@ import numpy as np
 
 from vehest.constants import GRAVITY, FloatArray
 from vehest.simulation.plant.motion import WHEELS, Motion
-from vehest.simulation.sensors.config import sensor_levels_from_config, switched_off
 from vehest.simulation.sensors.errors import shown, stream
-from vehest.simulation.sensors.levels import PRESETS, Mounting, Reference, SensorLevel, SensorLevels, Tilt, Vibration, ideal_sensors
-
-__all__ = [
-    "GRAVITY",
-    "PRESETS",
-    "Mounting",
-    "Reference",
-    "SensorLevel",
-    "SensorLevels",
-    "Tilt",
-    "Vibration",
-    "body_rates",
-    "described",
-    "ideal_sensors",
-    "measure",
-    "sensor_levels_from_config",
-    "specific_force",
-    "switched_off",
-]
+from vehest.simulation.sensors.levels import Reference, SensorLevels, Tilt, Vibration
 
 
 def measure(motion: Motion, levels: SensorLevels, seed: int) -> dict[str, FloatArray]:
