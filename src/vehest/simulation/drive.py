@@ -30,7 +30,7 @@ from vehest.simulation.sensors.levels import PRESETS, SensorLevels
 from vehest.simulation.sensors.recording import described, measure
 
 RATE_HZ = 100.0
-"""At which recordings are sampled unless a data set says otherwise [Hz]."""
+"""Default sampling rate of recordings [Hz]."""
 AFTER_STAND = 1.0
 """Recorded after the car has come to its stand [s]."""
 LONGEST_STOP = 60.0
@@ -41,10 +41,10 @@ STOPPING_SHARE = 0.7
 
 @dataclass(frozen=True)
 class Flags:
-    """How a drive went.
+    """Outcome of a drive.
 
     Args:
-        spun: the car slid beyond what its equations of rolling hold for.
+        spun: the car slid beyond the validity of its equations of rolling.
         left_road: it was further beside its line than the manoeuvre's half_width.
         stood: it stands at the end.
         completed: the manoeuvre came to its own end, and was not cut off because it took too long.
@@ -68,13 +68,13 @@ class Flags:
 
 @dataclass(frozen=True, eq=False)
 class Trip:
-    """What happened in a drive before any sensor saw it.
+    """True motion and outcome of a drive.
 
     Args:
         motion: true motion, first sample after the settling time.
         lateral_error: the car's place left of its line [m], (T,); NaN where there is no line.
         flags: how it went.
-        drawn: what the seed decided.
+        drawn: values that the seed drew.
     """
 
     motion: Motion
@@ -97,18 +97,18 @@ def simulate_drive(
 ) -> Recording:
     """A recording of one drive; the same arguments give the same samples, bit by bit.
 
-    A car that spins or leaves the road brakes to its stand, and the recording ends AFTER_STAND later; provenance says so under ``flags``.
+    A car that spins or leaves the road brakes to its stand, and the recording ends AFTER_STAND later; its provenance has ``flags``.
 
     Args:
         id: name of the recording.
         vehicle: the car.
-        manoeuvre: what it does.
+        manoeuvre: its manoeuvre.
         seed: of the driver, of what the manoeuvre draws, of patches on the surface and of the sensors' errors; zero or positive.
         rate_hz: sampling rate; a whole number of plant steps must fit between samples [Hz].
         sensors: levels of the sensors' errors.
         stability_control: whether the car has it switched on.
         surface: of the road.
-        stint: what the tyres lose over the drive, of which the driver knows nothing; by default nothing.
+        stint: loss of grip over the drive, unknown to the driver; by default none.
 
     Raises:
         ConfigurationError: a value that makes no sense, or a car that cannot do the manoeuvre.
@@ -282,7 +282,7 @@ class _Ride:
         return along, across
 
     def keep_sample(self) -> None:
-        """Keep what is true now for the recording."""
+        """Keep the present state as a sample."""
         self._states.append(self.state)
         self._inputs.append(self.inputs)
         self._interventions += self.stability.active

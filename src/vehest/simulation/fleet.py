@@ -48,16 +48,16 @@ class Variation:
 
 @dataclass(frozen=True)
 class Variations:
-    """What a data set varies."""
+    """Variations of a data set."""
 
     vary: Annotated[tuple[Variation, ...], "a list of {parameters, factor, log}"]
 
 
 def variations_from_config(entries: Any) -> tuple[Variation, ...]:
-    """Variations as a data set's ``vary`` spells them: a list of ``{parameters: [m, m_s], factor: [0.9, 1.2]}``, ``log: true`` if wanted.
+    """Variations from a data set's ``vary``: a list of ``{parameters: [m, m_s], factor: [0.9, 1.2]}``, ``log: true`` if wanted.
 
     Raises:
-        ConfigurationError: an entry says something else.
+        ConfigurationError: an entry is no variation.
     """
     return validated(Variations, {"vary": entries}, "", error=ConfigurationError).vary
 
@@ -121,7 +121,7 @@ class SensorVariation:
 
     @classmethod
     def from_config(cls, entries: Any) -> SensorVariation:
-        """Variation as a data set's ``vary_sensors`` spells it: ``{noise: [0.5, 2], delay: [0, 1.5]}``.
+        """Variation from a data set's ``vary_sensors``: ``{noise: [0.5, 2], delay: [0, 1.5]}``.
 
         Raises:
             ConfigurationError: an unknown kind of error, or no range.

@@ -23,7 +23,7 @@ PLANAR_MANOEUVRES: Mapping[str, type[Freestyle]] = {Freestyle.name: Freestyle}
 """Manoeuvres of the planar plant's cars by name."""
 
 CHANNELS = ("vx", "yaw_rate", "ax", "ay", "steer", "motor_speed", "motor_current", "vx_ref", "vy_ref", "yaw_rate_ref")
-"""What such a car records: it has no sensor at its single wheels, and the inertial unit's other axes are not kept."""
+"""Channels of such a car: it has no sensor at its single wheels, and the inertial unit's other axes are not kept."""
 
 SPUN = np.pi / 2.0
 """Sideslip angle beyond which a drive counts as one with a spin [rad]."""
@@ -46,8 +46,8 @@ def simulate_planar_drive(
 
     Args:
         id: name of the recording.
-        car: what is driven.
-        manoeuvre: what it does.
+        car: the car.
+        manoeuvre: its manoeuvre.
         seed: of the driver, of patches on the surface and of the sensors' errors; zero or positive.
         rate_hz: sampling rate; a whole number of plant steps must fit between samples [Hz].
         sensors: levels of the sensors' errors.

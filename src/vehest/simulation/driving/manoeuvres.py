@@ -1,7 +1,7 @@
 """Manoeuvres by name, and made from a configuration.
 
 A manoeuvre is a frozen dataclass of its parameters; its controller drives a car on a surface as a seed draws it. A parameter of type Range
-is a number, or a pair from which every drive draws one, uniformly. ``severity`` is the share of the grip that the driver means to use, on
+is a number, or a pair from which every drive draws one, uniformly. ``severity`` is the share of the grip that the driver uses on
 the surface of the drive. Values without a source are assumed.
 
 Time is zero at the first sample of the recording; SETTLING_TIME before it the car starts, rolling straight ahead.

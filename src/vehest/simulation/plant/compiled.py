@@ -146,7 +146,7 @@ def _brake_arm(p):  # type: ignore[no-untyped-def]
 
 @_kernel
 def _yaw_moment(wanted, forces, p):  # type: ignore[no-untyped-def]
-    """The wanted moment, within what the friction of the braked side's loads can give."""
+    """The wanted moment, within the friction of the braked side's loads."""
     left = p.tire.p_dx1 * forces[8] + p.tire_rear.p_dx1 * forces[10]
     right = p.tire.p_dx1 * forces[9] + p.tire_rear.p_dx1 * forces[11]
     # A positive moment, to the left of ISO 8855, brakes the wheels that the library calls right.
@@ -168,10 +168,10 @@ def _n_substeps(regime, x, p, step):  # type: ignore[no-untyped-def]
 
 @_kernel
 def _relax(held, regime, forces, x, vector, part):  # type: ignore[no-untyped-def]
-    """Lateral forces over load after a part of a step: while rolling they follow what the slip asks for over a length of the way.
+    """Lateral forces over load after a part of a step: while rolling they follow the slip over a length of the way.
 
-    The usual first-order relaxation (Pacejka, Tyre and Vehicle Dynamics, Chapter 7), of the force over the load, exact for what was asked
-    for at the part's beginning; at the tyres of a slow or sliding car, which other equations hold, there is no lag.
+    The usual first-order relaxation (Pacejka, Tyre and Vehicle Dynamics, Chapter 7) of the force over the load, exact for the slip at the
+    part's beginning. Tyres of a slow or sliding car, which other equations hold, have no lag.
     """
     for i in range(4):
         if regime == ROLLING:
@@ -260,7 +260,7 @@ class _Kept:
     """
 
     def __init__(self, function: Callable[..., Any]) -> None:
-        # numba looks code up by the name, file and date of the outermost function; what else goes into it is in the digest.
+        # numba looks code up by the name, file and date of the outermost function; the digest stands for the rest.
         function.__qualname__ = f"{function.__name__}_{_digest()}"
         self.dispatcher: Any = function
         self.lock: Path | None = None

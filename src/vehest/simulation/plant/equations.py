@@ -44,10 +44,10 @@ from vehest.simulation.plant.regimes import (
 )
 
 SMALLEST_WHEEL_VELOCITY = 0.5
-"""What slips are divided by at least [m/s]; below, a rolling wheel still has no slip, and slip stiffness stays finite."""
+"""Smallest divisor of slips [m/s]; below it a rolling wheel still has no slip, and slip stiffness stays finite."""
 
 SMALLEST_LOAD = 1.0
-"""Of a wheel [N]: what is left of it in the air. Tyre formulas divide by the load."""
+"""Of a wheel, also in the air [N]: tyre formulas divide by the load."""
 
 HEAVE_RATE = 12
 JOINT_FRONT, JOINT_REAR = 27, 28
@@ -55,7 +55,7 @@ JOINT_FRONT, JOINT_REAR = 27, 28
 # Places of an axle's lateral velocity and of the lateral play of its joint among the states, and its parameters. Roll, roll rate, lateral
 # velocity, heave and heave rate of an axle follow one another.
 _Axle = namedtuple("_Axle", "vy joint lever track mass inertia static spring damper torsion joint_height camber camber_squared")
-# What an axle does to the body: suspension forces, joint force, rate of the joint's play; and the camber of its wheels.
+# Forces of an axle's suspension and joint on the body, rate of the joint's play, and camber of the wheels.
 _Suspension = namedtuple("_Suspension", "left right joint joint_rate camber_left camber_right")
 _Wheels = namedtuple("_Wheels", "along_left along_right across_left across_right load_left load_right")
 
@@ -81,7 +81,7 @@ def acceleration_limit(velocity, acceleration, limits):  # type: ignore[no-untyp
 
 @_kernel
 def _bent(stiffness, curvature, slip):  # type: ignore[no-untyped-def]
-    """atan(B s - E (B s - atan(B s))): what the magic formula takes the sine or cosine of, but for the shape factor."""
+    """atan(B s - E (B s - atan(B s))), whose sine or cosine the magic formula takes, times the shape factor."""
     product = stiffness * slip
     return math.atan(product - curvature * (product - math.atan(product)))
 
@@ -108,7 +108,7 @@ def lateral_force(angle, camber, load, tyre):  # type: ignore[no-untyped-def]
 
 @_kernel
 def _weighted(force, shape, stiffness, curvature, shift, slip):  # type: ignore[no-untyped-def]
-    """A force of pure slip, less what slip in the other direction takes of it."""
+    """A force of pure slip, reduced by slip in the other direction."""
     at_none = math.cos(shape * _bent(stiffness, curvature, shift))
     return force / at_none * math.cos(shape * _bent(stiffness, curvature, slip + shift))
 

@@ -5,13 +5,13 @@ with suspension, load transfer and combined-slip tyres. The library's vertical a
 rate speeds up the wheels it calls left. Read as a mirror image, the equations are those of a car in ISO 8855 axes:
 steering, yaw and lateral quantities keep their sign, left and right wheels change places, roll and pitch change sign.
 
-What the equations leave out, and so does the plant: aerodynamic drag and lift, rolling resistance, bump stops, a
+The equations, and so the plant, leave out: aerodynamic drag and lift, rolling resistance, bump stops, a
 differential, anti-lock brakes. Longitudinal forces pitch the body as if all of the mass were the body's. Drag, and gravity
 along and across a road that is not level, come in as external accelerations (drive.py); wheel loads stay those of a level road.
 
 The published tyre has shifts that change sign with camber, so that its force jumps there by about 4 % of the wheel load.
 With them the integration converges to first order where that happens, and on a straight the lateral acceleration has
-small steps; the vehicles of conf/vehicle go without those shifts where their files say so.
+small steps; the vehicles of conf/vehicle go without those shifts where their files state it.
 """
 
 from __future__ import annotations

@@ -61,11 +61,11 @@ class Vehicle:
     """A car that the multi-body plant can drive.
 
     Args:
-        name: what recordings call it.
+        name: in recordings.
         parameter_set: number of the published set it starts from.
         overrides: values that replace the published ones, by the library's names; a mapping inside it replaces
             values of a group (``tire``, ``tire_rear``, ``steering``, ``longitudinal``).
-        driver: values of a driver who knows this car, by the driver's names; the plant does not read them.
+        driver: values of this car for its driver (car.py); the plant does not read them.
         relaxation: way over which a tyre's lateral force follows its slip, front and rear [m]; zero for at once.
 
     Raises:
@@ -220,7 +220,7 @@ def _override(parameters: Any, overrides: Mapping[str, Any], vehicle_name: str, 
 
 
 def is_number(value: Any) -> bool:
-    """Whether a value is a finite number; true and false are none."""
+    """Whether a value is a finite number, not a truth value."""
     return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
 
 

@@ -24,7 +24,7 @@ class PlanarCar:
     """A car that the planar plant can drive; a parameter of zero takes its effect away.
 
     Args:
-        name: what recordings call it.
+        name: in recordings.
         mass: [kg].
         yaw_inertia: about the vertical axis through the centre of gravity [kg m²].
         cg_to_front_axle, cg_to_rear_axle: distances from the centre of gravity [m].

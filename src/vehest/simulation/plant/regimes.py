@@ -1,7 +1,7 @@
-"""Where the multi-body equations do not hold: near standstill, and in a spin.
+"""Regimes of the plant beside the multi-body equations: near standstill, and in a spin.
 
-Three regimes share one state vector and one set of suspension equations; what differs is where the forces of the tyres
-come from, and how the planar motion follows.
+Three regimes share one state vector and one set of suspension equations; they differ in the forces of the tyres and
+in how the planar motion follows.
 
 - ROLLING: tyre formulas and the multi-body equations as they are. Slip and its stiffness grow with 1/vx.
 - SLOW: below about 1 m/s the wheels roll without slip and the car follows its front wheels (kinematic single track).
@@ -9,8 +9,8 @@ come from, and how the planar motion follows.
 - SLIDING: after a spin the wheels are locked, and every contact patch slides against its velocity with the friction
   that the lateral tyre formula has at a right angle. It ends at standstill.
 
-All functions are compiled and use the library's axes, whose vertical axis points down. In them a positive
-quantity to the right is what a positive quantity to the left is in ISO 8855 axes; see multi_body.py.
+All functions are compiled and use the library's axes, whose vertical axis points down. A positive
+quantity to the right in them is one to the left in ISO 8855 axes; see multi_body.py.
 """
 
 from __future__ import annotations

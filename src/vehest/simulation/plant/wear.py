@@ -1,4 +1,4 @@
-"""What tyres lose over a stint: grip while they are cold, and grip that is worn away."""
+"""Loss of grip over a stint: cold tyres, and wear."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from vehest.data.schema import validated
 
 @dataclass(frozen=True)
 class Stint:
-    """Friction of the tyres over the time of a drive, as a factor of what it is when they are warm and new; all values are assumed.
+    """Friction of the tyres over the time of a drive, over that of warm, new tyres; all values are assumed.
 
     factor(t) = (1 - cold exp(-t/warm_time)) (1 - wear min(t/wear_time, 1))
 
@@ -46,7 +46,7 @@ class Stint:
 
 
 def stint_from_config(values: Any) -> Stint:
-    """A stint as a drive's ``tyres`` spells it: ``{cold: 0.06, wear: 0.04}``.
+    """A stint from a drive's ``tyres``: ``{cold: 0.06, wear: 0.04}``.
 
     Raises:
         ConfigurationError: an unknown name, or see Stint.

@@ -25,7 +25,7 @@ class Surface:
     uniformly, and a length drawn from ``patch_length``, uniformly. Friction changes over two metres between them.
 
     Args:
-        name: what recordings call it.
+        name: in recordings.
         friction: scale of the tyres' friction; 1 is the dry road of the vehicle's tyre data.
         patches: lowest scale of a patch.
         patch_length: shortest and longest patch [m].

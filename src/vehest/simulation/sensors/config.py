@@ -18,7 +18,7 @@ from vehest.simulation.sensors.levels import (
 )
 
 OFF = "off"
-"""How a configuration says so; YAML makes False of it, a command line leaves it as it is."""
+"""Switches errors off; YAML reads False, a command line the text."""
 
 
 def switched_off(levels: SensorLevels, *names: str) -> SensorLevels:
@@ -115,7 +115,7 @@ def _changed_value(old: Any, change: Any, where: str) -> Any:
 
 
 def _off_at(levels: Any, path: list[str], name: str) -> Any:
-    """Levels with what stands at a path off; ``name`` is the whole path, for complaints."""
+    """Levels with the errors at a path off; ``name`` is the whole path, for messages."""
     key, rest = path[0], path[1:]
     choices = [entry.name for entry in fields(levels) if entry.name not in NO_ERRORS]
     if key not in choices:

@@ -1,4 +1,4 @@
-"""How good simulated sensors are: presets, each number with its source."""
+"""Error levels of simulated sensors: presets, each number with its source."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from vehest.data.errors import ConfigurationError
 
 @dataclass(frozen=True)
 class SensorLevel:
-    """How large the errors of one sensor are; ``unit`` is its channel's unit.
+    """Errors of one sensor; ``unit`` is its channel's unit.
 
     shown = quantise((1 + gain) (1 + scale) true(t - delay) + bias + offset + drift(t) + noise(t))
 
@@ -181,7 +181,7 @@ GNSS = Reference(
 
 OPTICAL = Reference(
     kind="optical",
-    # All assumed, of the order that is usual for optical two-axis sensors: no data sheet of one was at hand.
+    # All assumed, of the order that is usual for optical two-axis sensors: no data sheet was available.
     vx=SensorLevel(noise=0.004, quantisation=0.003, delay=0.008, scale=0.001),
     vy=SensorLevel(noise=0.004, quantisation=0.003, delay=0.008, scale=0.001),
     yaw_rate=SensorLevel(noise=1.75e-4, offset=0.001, delay=0.008),
@@ -213,7 +213,7 @@ _WHEEL_FORCE = SensorLevel(noise=10.0, offset=100.0, drift=50.0, quantisation=6.
 class SensorLevels:
     """Errors of all sensors of a car; the defaults are those of production sensors, the preset ``default``.
 
-    Each sensor and each kind of error has a random stream of its own: what one level is changes nothing else.
+    Each sensor and each kind of error has a random stream of its own: one level changes no other error.
 
     Args:
         vx: of the forward speed, which is the true speed with the errors of an odometer, not computed from the wheels: 0.05 m/s at

@@ -20,7 +20,7 @@ def measure(motion: Motion, levels: SensorLevels, seed: int) -> dict[str, FloatA
     """Channels (canonical name -> (T,), SI units) that the sensors show of a motion; the same arguments give the same samples.
 
     Args:
-        motion: what the car really did.
+        motion: true motion.
         levels: of the sensors' errors.
         seed: of the errors; each error of each sensor draws from a stream of its own, so that changing one level leaves the rest alone.
     """
@@ -44,7 +44,7 @@ def measure(motion: Motion, levels: SensorLevels, seed: int) -> dict[str, FloatA
 
 
 def described(levels: SensorLevels, motion: Motion) -> dict[str, Any]:
-    """What provenance says of the sensors that measured a motion: all but those of a motor, and a vibration, that are not there."""
+    """Sensors that measured a motion, for provenance; without those of a motor, and a vibration, that are not there."""
     absent = {name for name in ("motor_speed", "motor_current") if getattr(motion, name) is None}
     if levels.vibration == Vibration():
         absent.add("vibration")
@@ -54,7 +54,7 @@ def described(levels: SensorLevels, motion: Motion) -> dict[str, Any]:
 
 
 _IDLE = {"gain": 0.0, "bias": 0.0, "roll_share": 1.0}
-"""Values that do nothing, and are not said."""
+"""Values without effect, left out."""
 
 
 def _without_idle(value: Any) -> Any:
@@ -154,7 +154,7 @@ def _turned(vector: FloatArray, roll: FloatArray | float, pitch: FloatArray | fl
 
 
 def _reference(motion: Motion, reference: Reference, seed: int) -> dict[str, FloatArray]:
-    """Reference channels: velocity where the sensor sits, in its axes, moved to the centre of gravity with what it knows."""
+    """Reference channels: velocity where the sensor sits, in its axes, moved to the centre of gravity."""
     rate_hz = motion.rate_hz
     forward = motion.vx - motion.yaw_rate * reference.lever_y + motion.pitch_rate * reference.lever_z
     left = motion.vy + motion.yaw_rate * reference.lever_x - motion.roll_rate * reference.lever_z
