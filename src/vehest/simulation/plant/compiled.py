@@ -42,6 +42,13 @@ from vehest.simulation.plant.regimes import (
     wheel_velocities,
 )
 
+if numba.config.DISABLE_JIT:
+
+    def to_fixed_tuple(values, length):  # type: ignore[no-untyped-def]
+        """As numba's, which runs compiled only."""
+        return tuple(values[:length])
+
+
 try:
     import fcntl
 except ImportError:  # Windows

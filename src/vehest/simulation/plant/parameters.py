@@ -114,7 +114,7 @@ def vehicle_from_configuration(configuration: Mapping[str, Any]) -> Vehicle:
     return Vehicle(str(configuration["name"]), configuration["parameter_set"], _plain(overrides), _plain(driver), relaxation)
 
 
-def loaded(vehicle: Vehicle, mass: float, forward: float = 0.0, up: float = 0.0) -> Vehicle:
+def loaded(vehicle: Vehicle, mass: float, forward: float, up: float) -> Vehicle:
     """The vehicle with a payload, a point mass that its springs carry; the same one without.
 
     Unsprung masses are shared anew between the axles, so that body and car keep one centre of gravity in plan.
