@@ -293,9 +293,7 @@ def multi_body(x, steering_velocity, acceleration, contact, p, derivatives):  # 
     derivatives[HEAVE] = x[HEAVE_RATE]
     derivatives[HEAVE_RATE] = GRAVITY - 1.0 / p.m_s * (springs * cosine - joints * sine)
 
-    braking_share, driving_share = p.T_sb, p.T_se
-    share = driving_share if u[1] > 0.0 else braking_share
-    torque = p.m * radius * u[1]
+    share, torque = p.T_se if u[1] > 0.0 else p.T_sb, p.m * radius * u[1]
     pulls = x0, x1, x2, x3
     for i in range(4):
         of_axle = share if i < 2 else 1.0 - share
