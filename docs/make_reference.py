@@ -120,7 +120,7 @@ def manoeuvres_page(root: Path) -> str:
         "How a data set uses them: [sources/simulated.md](sources/simulated.md).",
         "## Manoeuvres",
         "A parameter with a pair as its default is a range: give a number, or a pair from which every drive draws, uniformly. `severity` "
-        "is the share of the grip that the driver means to use, on the surface at hand.",
+        "is the share of the grip that the driver means to use, on the surface of the drive.",
     ]
     for name, made in sorted(MANOEUVRES.items()):
         parts += _manoeuvre(name, made)

@@ -32,7 +32,8 @@ from vehest.run.downsample import transforms_of
 from vehest.simulation.plant.motion import Motion
 from vehest.simulation.plant.multi_body import MultiBodyPlant
 from vehest.simulation.plant.parameters import vehicle_from_configuration
-from vehest.simulation.sensors.recording import SensorLevel, ideal_sensors, measure, specific_force
+from vehest.simulation.sensors.levels import SensorLevel, ideal_sensors
+from vehest.simulation.sensors.recording import measure, specific_force
 from vehest.sources.base import open_source
 
 IMU = ("lever_arm", "mounting", "delay", "offsets")

@@ -120,7 +120,7 @@ def test_a_payload_moves_the_static_loads_as_levers_say() -> None:
 
 def test_a_payload_off_the_axles_is_refused() -> None:
     with pytest.raises(ConfigurationError, match="puts the centre of gravity off the axles"):
-        loaded(plant_of("corvette_grand_sport").vehicle, 5000.0, forward=-3.0)
+        loaded(plant_of("corvette_grand_sport").vehicle, 5000.0, forward=-3.0, up=0.0)
 
 
 def test_tyres_warm_up_and_wear() -> None:
@@ -237,7 +237,7 @@ def test_each_race_car_has_an_installation_of_its_own() -> None:
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"payload": {"weight": 3.0}}, "payload is a mapping"),
+        ({"payload": {"weight": 3.0}}, "payload.mass is missing"),
         ({"tyres": {"cold": 0.9}}, "cold is a share between 0 and 0.5"),
         ({"sensors": "racing"}, "sensors 'racing' is not one of"),
     ],

@@ -20,7 +20,7 @@ from vehest.data.recording import Recording
 from vehest.simulation.drive import Trip, simulate_drive
 from vehest.simulation.drive import drive as drive_plant
 from vehest.simulation.driving.car import car_of
-from vehest.simulation.driving.driver import Driver, DrivingStyle, draw_style, speed_profile
+from vehest.simulation.driving.driver import Driver, draw_style, speed_profile
 from vehest.simulation.driving.manoeuvres import manoeuvre_from_config
 from vehest.simulation.errors import SimulationError
 from vehest.simulation.plant import compiled
@@ -30,7 +30,7 @@ from vehest.simulation.road.course import Compound, Corner, Course, Layout, Stra
 from vehest.simulation.road.lines import least_within
 from vehest.simulation.road.surface import Surface, surface_from_config
 from vehest.simulation.road.tracks import LAYOUTS
-from vehest.simulation.sensors.recording import ideal_sensors
+from vehest.simulation.sensors.levels import ideal_sensors
 
 CONFIGURATION = Path(__file__).parents[2] / "conf" / "vehicle" / "bmw_320i_low.yaml"
 LOWERED = vehicle_from_configuration(yaml.safe_load(CONFIGURATION.read_text(encoding="utf-8")))
@@ -294,7 +294,7 @@ def test_speed_profile_uses_a_banked_corner_and_respects_a_slippery_one() -> Non
 
 def test_style_beyond_the_grip_is_an_error() -> None:
     with pytest.raises(ConfigurationError, match="grip fraction"):
-        DrivingStyle(grip_fraction=1.1)
+        draw_style(0, (1.1, 1.1), 0.05, 0.5)
 
 
 def test_vehicles_own_driver_values_count() -> None:
@@ -366,7 +366,7 @@ def test_same_seed_gives_the_same_samples_here_and_in_two_processes_at_once(reco
 def test_other_seeds_give_other_drives(recording: Recording) -> None:
     other = drive(seed=2)
     assert np.abs(recording["vx"] - other["vx"]).max() > 0.5
-    assert np.abs(draw_style(1).grip_fraction - draw_style(2).grip_fraction) > 0.01
+    assert np.abs(draw_style(1, (0.65, 0.9), 0.05, 0.5).grip_fraction - draw_style(2, (0.65, 0.9), 0.05, 0.5).grip_fraction) > 0.01
 
 
 def test_sampling_rate_does_not_change_the_drive() -> None:
@@ -432,10 +432,15 @@ def test_rollover_says_which_drive_and_when() -> None:
     assert raised.value.exit_code == 3
 
 
-@pytest.mark.parametrize("options", [{"rate_hz": 30.0}, {"rate_hz": 0.0}, {"duration": 0.0}, {"seed": -1}, {"step": 0.0}, {"step": 3e-3}])
+@pytest.mark.parametrize("options", [{"rate_hz": 30.0}, {"rate_hz": 0.0}, {"duration": 0.0}, {"seed": -1}])
 def test_drive_that_makes_no_sense_is_refused(options: dict[str, float]) -> None:
     with pytest.raises(ConfigurationError):
         drive(**{"seed": 0, "duration": 1.0, **options})
+
+
+def test_step_that_does_not_fit_the_rate_is_refused() -> None:
+    with pytest.raises(ConfigurationError, match=r"step of 0\.003 s"):
+        trip(0, step=3e-3, duration=1.0)
 
 
 def test_surface_is_a_plain_value() -> None:

@@ -18,22 +18,9 @@ from vehest.data.errors import ConfigurationError
 from vehest.data.recording import Recording
 from vehest.data.transforms import MountingCorrection
 from vehest.simulation.plant.motion import WHEELS, Motion
-from vehest.simulation.sensors.recording import (
-    PRESETS,
-    Mounting,
-    Reference,
-    SensorLevel,
-    SensorLevels,
-    Tilt,
-    Vibration,
-    body_rates,
-    described,
-    ideal_sensors,
-    measure,
-    sensor_levels_from_config,
-    specific_force,
-    switched_off,
-)
+from vehest.simulation.sensors.config import sensor_levels_from_config, switched_off
+from vehest.simulation.sensors.levels import PRESETS, Mounting, Reference, SensorLevel, SensorLevels, Tilt, Vibration, ideal_sensors
+from vehest.simulation.sensors.recording import body_rates, described, measure, specific_force
 from vehest_papers.proving_ground.noise_reading import noise_density, read_off
 
 G = 9.81
@@ -521,7 +508,7 @@ def test_reference_kinds_are_different() -> None:
         ("{ay: {noise: loud}}", "sensors: ay.noise is a number, not 'loud'"),
         ("{ay: {noise: true}}", "sensors: ay.noise is a number, not True"),
         ("{ay: {noise: -1}}", "sensors: ay: noise must be zero or positive, not -1.0"),
-        ("{ay: {noise: .nan}}", "sensors: ay: noise must be zero or positive, not nan"),
+        ("{ay: {noise: .nan}}", "sensors: ay: noise must be finite, not nan"),
         ("{ay: {drift_time: 0}}", "drift_time must be positive"),
         ("{ay: 0.1}", "sensors: ay is a mapping of what changes, or off, not 0.1"),
         ("{ay: on}", "sensors: ay is a mapping of what changes, or off, not True"),

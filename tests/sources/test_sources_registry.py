@@ -15,7 +15,7 @@ from vehest.data.errors import ConfigurationError
 from vehest.run.config import compose_config, missing_keys
 from vehest.simulation.fleet import SensorVariation, variations_from_config, varied
 from vehest.simulation.plant.parameters import compiled_parameters, vehicle_from_configuration
-from vehest.simulation.sensors.recording import SensorLevels
+from vehest.simulation.sensors.levels import SensorLevels
 from vehest.sources.base import kind_of, open_source, source_class, source_names
 from vehest.sources.simulated import SimulatedSource
 

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import json
 import math
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from typing import Any
 
@@ -12,21 +14,23 @@ import numpy as np
 from vehest.constants import GRAVITY, FloatArray
 from vehest.data.errors import ConfigurationError
 from vehest.data.recording import Recording
-from vehest.simulation.driving.car import Car, car_of
+from vehest.simulation.driving.car import car_of
 from vehest.simulation.driving.driver import DRIVER_RATE_HZ, Command, Observation
 from vehest.simulation.driving.manoeuvre import SETTLING_TIME, Controller, Manoeuvre
 from vehest.simulation.errors import SimulationError
-from vehest.simulation.plant.compiled import LIBRARY, LIBRARY_VERSION
 from vehest.simulation.plant.motion import Motion
 from vehest.simulation.plant.multi_body import MultiBodyPlant, PlantState, road_gravity
-from vehest.simulation.plant.parameters import Vehicle
+from vehest.simulation.plant.parameters import LIBRARY, LIBRARY_VERSION, Vehicle
 from vehest.simulation.plant.regimes import STEER, VX, VY, YAW, YAW_RATE, X, Y
 from vehest.simulation.plant.stability import StabilityControl, StabilityState
 from vehest.simulation.plant.stability import stability_control as make_stability_control
 from vehest.simulation.plant.wear import Stint
 from vehest.simulation.road.surface import SURFACES, Surface
-from vehest.simulation.sensors.recording import SensorLevels, described, measure
+from vehest.simulation.sensors.levels import PRESETS, SensorLevels
+from vehest.simulation.sensors.recording import described, measure
 
+RATE_HZ = 100.0
+"""Default sampling rate of recordings [Hz]."""
 AFTER_STAND = 1.0
 """Recorded after the car has come to its stand [s]."""
 LONGEST_STOP = 60.0
@@ -37,10 +41,10 @@ STOPPING_SHARE = 0.7
 
 @dataclass(frozen=True)
 class Flags:
-    """How a drive went.
+    """Outcome of a drive.
 
     Args:
-        spun: the car slid beyond what its equations of rolling hold for.
+        spun: the car slid beyond the validity of its equations of rolling.
         left_road: it was further beside its line than the manoeuvre's half_width.
         stood: it stands at the end.
         completed: the manoeuvre came to its own end, and was not cut off because it took too long.
@@ -64,13 +68,13 @@ class Flags:
 
 @dataclass(frozen=True, eq=False)
 class Trip:
-    """What happened in a drive before any sensor saw it.
+    """True motion and outcome of a drive.
 
     Args:
         motion: true motion, first sample after the settling time.
         lateral_error: the car's place left of its line [m], (T,); NaN where there is no line.
         flags: how it went.
-        drawn: what the seed decided.
+        drawn: values that the seed drew.
     """
 
     motion: Motion
@@ -85,66 +89,78 @@ def simulate_drive(
     vehicle: Vehicle,
     manoeuvre: Manoeuvre,
     seed: int,
-    rate_hz: float = 100.0,
-    sensors: SensorLevels | None = None,
+    rate_hz: float = RATE_HZ,
+    sensors: SensorLevels = PRESETS["default"],
     stability_control: bool = False,
-    surface: Surface | None = None,
+    surface: Surface = SURFACES["dry"],
     stint: Stint | None = None,
-    step: float = 1e-3,
 ) -> Recording:
     """A recording of one drive; the same arguments give the same samples, bit by bit.
 
-    A car that spins or leaves the road brakes to its stand, and the recording ends AFTER_STAND later; provenance says so under ``flags``.
+    A car that spins or leaves the road brakes to its stand, and the recording ends AFTER_STAND later; its provenance has ``flags``.
 
     Args:
         id: name of the recording.
         vehicle: the car.
-        manoeuvre: what it does.
+        manoeuvre: its manoeuvre.
         seed: of the driver, of what the manoeuvre draws, of patches on the surface and of the sensors' errors; zero or positive.
         rate_hz: sampling rate; a whole number of plant steps must fit between samples [Hz].
-        sensors: levels of the sensors' errors; by default SensorLevels().
+        sensors: levels of the sensors' errors.
         stability_control: whether the car has it switched on.
-        surface: of the road; by default dry.
-        stint: what the tyres lose over the drive, of which the driver knows nothing; by default nothing.
-        step: of the plant [s].
+        surface: of the road.
+        stint: loss of grip over the drive, unknown to the driver; by default none.
 
     Raises:
         ConfigurationError: a value that makes no sense, or a car that cannot do the manoeuvre.
         SimulationError: the car rolled over, or a state is not finite.
     """
+    plant = MultiBodyPlant(vehicle)
+    with naming(id, seed):
+        trip = drive(plant, manoeuvre, seed, rate_hz=rate_hz, surface=surface, stability_control=stability_control, stint=stint)
+    about = {
+        "plant": "CommonRoad multi-body",
+        "library": f"{LIBRARY} {LIBRARY_VERSION}",
+        "parameter_set": vehicle.parameter_set,
+        "overrides": vehicle.overrides,
+        "plant_step": plant.step,
+        "manoeuvre": manoeuvre.description(),
+        "drawn": trip.drawn,
+        "surface": asdict(surface),
+        **({"tyres": asdict(stint)} if stint is not None else {}),
+        **({"relaxation": vehicle.relaxation} if any(vehicle.relaxation) else {}),
+        "stability_control": stability_control,
+    }
+    return recording_of(id, vehicle.name, trip, measure(trip.motion, sensors, seed), about, sensors, seed)
+
+
+@contextmanager
+def naming(id: str, seed: int) -> Iterator[None]:
+    """Names drive and seed in the errors of a simulation.
+
+    Raises:
+        ConfigurationError: the seed is negative.
+    """
     if seed < 0:
         raise ConfigurationError(f"drive '{id}': a seed must be zero or positive, not {seed}")
-    sensors, surface = sensors or SensorLevels(), surface or SURFACES["dry"]
-    plant = MultiBodyPlant(vehicle, step)
     try:
-        trip = drive(plant, manoeuvre, seed, rate_hz=rate_hz, surface=surface, stability_control=stability_control, stint=stint)
+        yield
     except SimulationError as error:
         raise SimulationError(f"drive '{id}' with seed {seed}: {error}") from error
+
+
+def recording_of(
+    id: str, vehicle: str, trip: Trip, channels: dict[str, FloatArray], about: dict[str, Any], sensors: SensorLevels, seed: int
+) -> Recording:
+    """The recording of a trip; its provenance is ``about``, then seed, sensors and flags."""
+    provenance = {**about, "seed": seed, "sensors": described(sensors, trip.motion), "flags": asdict(trip.flags)}
     return Recording(
         id=id,
-        vehicle=vehicle.name,
-        rate_hz=rate_hz,
+        vehicle=vehicle,
+        rate_hz=trip.motion.rate_hz,
         start_time=0.0,
-        channels=measure(trip.motion, sensors, seed),
+        channels=channels,
         kind="simulated",
-        provenance=as_json(
-            {
-                "plant": "CommonRoad multi-body",
-                "library": f"{LIBRARY} {LIBRARY_VERSION}",
-                "parameter_set": vehicle.parameter_set,
-                "overrides": vehicle.overrides,
-                "plant_step": step,
-                "manoeuvre": manoeuvre.description(),
-                "drawn": trip.drawn,
-                "surface": asdict(surface),
-                **({"tyres": asdict(stint)} if stint is not None else {}),
-                **({"relaxation": vehicle.relaxation} if any(vehicle.relaxation) else {}),
-                "stability_control": stability_control,
-                "seed": seed,
-                "sensors": described(sensors, trip.motion),
-                "flags": asdict(trip.flags),
-            }
-        ),
+        provenance=json.loads(json.dumps(provenance)),  # as it comes back from a file: lists for tuples
     )
 
 
@@ -153,8 +169,8 @@ def drive(
     manoeuvre: Manoeuvre,
     seed: int,
     *,
-    rate_hz: float = 100.0,
-    surface: Surface | None = None,
+    rate_hz: float = RATE_HZ,
+    surface: Surface = SURFACES["dry"],
     stability_control: bool = False,
     stint: Stint | None = None,
 ) -> Trip:
@@ -166,12 +182,8 @@ def drive(
     """
     per_command = whole_steps(DRIVER_RATE_HZ, plant.step, "driver's")
     per_sample = whole_steps(rate_hz, plant.step, "sampling")
-    car, surface = car_of(plant), surface or SURFACES["dry"]
-    controller = manoeuvre.controller(car, surface, seed)
-    half_width = float(getattr(manoeuvre, "half_width", math.inf))
-    log = _Log(rate_hz)
-    control = make_stability_control(plant) if stability_control else None
-    ride = _Ride(plant, car, controller, control, half_width, manoeuvre.longest, stint)
+    controller = manoeuvre.controller(car_of(plant), surface, seed)
+    ride = _Ride(plant, manoeuvre, controller, make_stability_control(plant) if stability_control else None, stint)
 
     stride = math.gcd(per_command, per_sample)
     first_sample = math.ceil(SETTLING_TIME / (plant.step * per_command)) * per_command
@@ -181,33 +193,27 @@ def drive(
         if now % per_command == 0 and not ride.decide(time):
             break
         if now >= first_sample and (now - first_sample) % per_sample == 0:
-            log.keep(ride)
+            ride.keep_sample()
         try:
             ride.state = plant.advance(ride.state, ride.inputs, stride, ride.decision.friction)
         except SimulationError as error:
             raise SimulationError(f"manoeuvre '{manoeuvre.name}', {time:.2f} s after the first sample: {error}") from error
         now += stride
-    if not log.states:
+    trip = ride.trip(plant, rate_hz, controller.drawn)
+    if trip is None:
         raise ConfigurationError(f"manoeuvre '{manoeuvre.name}' is over before the first sample at {rate_hz} Hz")
-    return log.trip(plant, ride, controller.drawn)
+    return trip
 
 
 class _Ride:
-    """A car, its driver, and how it goes at the moment."""
+    """A car and its driver during a drive."""
 
     def __init__(
-        self,
-        plant: MultiBodyPlant,
-        car: Car,
-        controller: Controller,
-        stability_control: StabilityControl | None,
-        half_width: float,
-        longest: float,
-        stint: Stint | None = None,
+        self, plant: MultiBodyPlant, manoeuvre: Manoeuvre, controller: Controller, control: StabilityControl | None, stint: Stint | None
     ) -> None:
-        self._stint = stint
-        self._car, self._controller, self._half_width, self._longest = car, controller, half_width, longest
-        self.stability_control, self.stability = stability_control, StabilityState()
+        self._car, self._controller, self._stint = car_of(plant), controller, stint
+        self._half_width, self._longest = float(getattr(manoeuvre, "half_width", math.inf)), manoeuvre.longest
+        self.stability_control, self.stability = control, StabilityState()
         self.state = plant.initial_state(*controller.start)
         self.inputs = np.zeros(5)
         self.decision = Command(0.0, 0.0)
@@ -215,6 +221,10 @@ class _Ride:
         self.left_road = self.completed = False
         self.gave_up_at: float | None = None
         self._stands_since: float | None = None
+        self._states: list[PlantState] = []
+        self._inputs: list[FloatArray] = []
+        self._road: list[tuple[float, float, float, float]] = []
+        self._interventions = 0
 
     def decide(self, time: float) -> bool:
         """The driver's next command [s]; false if the drive is over."""
@@ -271,45 +281,33 @@ class _Ride:
         self.bank, self.grade = math.asin(-across / GRAVITY), math.asin(along / GRAVITY)
         return along, across
 
+    def keep_sample(self) -> None:
+        """Keep the present state as a sample."""
+        self._states.append(self.state)
+        self._inputs.append(self.inputs)
+        self._interventions += self.stability.active
+        self._road.append((self.decision.friction, self.bank, self.grade, self.decision.lateral_error))
 
-class _Log:
-    """Samples of a ride."""
-
-    def __init__(self, rate_hz: float) -> None:
-        self._rate_hz = rate_hz
-        self.states: list[PlantState] = []
-        self._inputs: list[FloatArray] = []
-        self._road: list[tuple[float, float, float, float]] = []
-        self._interventions = 0
-
-    def keep(self, ride: _Ride) -> None:
-        self.states.append(ride.state)
-        self._inputs.append(ride.inputs)
-        self._interventions += ride.stability.active
-        self._road.append((ride.decision.friction, ride.bank, ride.grade, ride.decision.lateral_error))
-
-    def trip(self, plant: MultiBodyPlant, ride: _Ride, drawn: dict[str, Any]) -> Trip:
+    def trip(self, plant: MultiBodyPlant, rate_hz: float, drawn: dict[str, Any]) -> Trip | None:
+        """The samples that were kept, if any."""
+        if not self._states:
+            return None
         friction, bank, grade, lateral_error = np.array(self._road).T
-        motion = plant.motion(self.states, np.array(self._inputs), self._rate_hz, friction=friction, bank=bank, grade=grade)
+        motion = plant.motion(self._states, np.array(self._inputs), rate_hz, friction=friction, bank=bank, grade=grade)
         moving = np.hypot(motion.vx, motion.vy) > 1.0
         on_line = np.abs(lateral_error[np.isfinite(lateral_error)])
         flags = Flags(
-            spun=ride.state.spun,
-            left_road=ride.left_road,
-            stood=ride.state.stands,
-            completed=ride.completed,
-            gave_up_at=ride.gave_up_at,
+            spun=self.state.spun,
+            left_road=self.left_road,
+            stood=self.state.stands,
+            completed=self.completed,
+            gave_up_at=self.gave_up_at,
             largest_lateral_error=float(on_line.max()) if len(on_line) else None,
             largest_sideslip=float(np.abs(motion.sideslip[moving]).max(initial=0.0)),
             largest_ay=float(np.abs(motion.ay).max()),
-            stability_share=self._interventions / len(motion) if ride.stability_control is not None else None,
+            stability_share=self._interventions / len(motion) if self.stability_control is not None else None,
         )
         return Trip(motion, lateral_error.copy(), flags, drawn)
-
-
-def as_json(values: dict[str, Any]) -> dict[str, Any]:
-    """The values as they come back from a JSON file: lists for tuples."""
-    return json.loads(json.dumps(values))  # type: ignore[no-any-return]
 
 
 def whole_steps(rate_hz: float, step: float, what: str) -> int:

@@ -4,16 +4,20 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields, replace
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 
 from vehest.data.errors import ConfigurationError
+from vehest.data.schema import validated
 from vehest.simulation.plant.parameters import REAR_TYRE, Vehicle, is_number, library_parameters, rear_tyre
 from vehest.simulation.plant.planar_car import PlanarCar, scaled_car
 from vehest.simulation.sensors.levels import SensorLevel, SensorLevels
 
 _STREAM = 4  # of a drive's seed: 0 to 3 are the driver's, the sensors', the surface's and the manoeuvre's
+
+
+Scales = Annotated[tuple[float, float], "a pair [lowest, highest] of scales"]
 
 
 @dataclass(frozen=True)
@@ -27,8 +31,12 @@ class Variation:
     """
 
     parameters: tuple[str, ...]
-    factor: tuple[float, float]
+    factor: Scales
     log: bool = False
+
+    def __post_init__(self) -> None:
+        if not 0.0 < self.factor[0] <= self.factor[1]:
+            raise ConfigurationError(f"vary: a factor is a pair [lowest, highest] of positive scales, not {list(self.factor)}")
 
     def drawn(self, generator: np.random.Generator) -> float:
         """A scale."""
@@ -38,28 +46,20 @@ class Variation:
         return float(generator.uniform(low, high))
 
 
+@dataclass(frozen=True)
+class Variations:
+    """Variations of a data set."""
+
+    vary: Annotated[tuple[Variation, ...], "a list of {parameters, factor, log}"]
+
+
 def variations_from_config(entries: Any) -> tuple[Variation, ...]:
-    """Variations as a data set's ``vary`` spells them: a list of ``{parameters: [m, m_s], factor: [0.9, 1.2]}``, ``log: true`` if wanted.
+    """Variations from a data set's ``vary``: a list of ``{parameters: [m, m_s], factor: [0.9, 1.2]}``, ``log: true`` if wanted.
 
     Raises:
-        ConfigurationError: an entry says something else.
+        ConfigurationError: an entry is no variation.
     """
-    if isinstance(entries, str | Mapping) or not isinstance(entries, Sequence):
-        raise ConfigurationError(f"vary is a list of {{parameters, factor, log}}, not {entries}")
-    variations = []
-    for entry in entries:
-        named = (
-            isinstance(entry, Mapping)
-            and set(entry) - {"log"} == {"parameters", "factor"}
-            and isinstance(entry["parameters"], list | tuple)
-        )
-        if not named or not all(isinstance(name, str) for name in entry["parameters"]) or not isinstance(entry.get("log", False), bool):
-            raise ConfigurationError(f"vary: an entry is {{parameters: [m, m_s], factor: [0.9, 1.2]}}, not {entry}")
-        factor = _range(entry["factor"], "vary")
-        if factor[0] == 0.0:
-            raise ConfigurationError(f"vary: a factor must be positive, not {entry['factor']}")
-        variations.append(Variation(tuple(entry["parameters"]), factor, bool(entry.get("log", False))))
-    return tuple(variations)
+    return validated(Variations, {"vary": entries}, "", error=ConfigurationError).vary
 
 
 def varied(vehicle: Vehicle, variations: Sequence[Variation], seed: int) -> Vehicle:
@@ -121,7 +121,7 @@ class SensorVariation:
 
     @classmethod
     def from_config(cls, entries: Any) -> SensorVariation:
-        """Variation as a data set's ``vary_sensors`` spells it: ``{noise: [0.5, 2], delay: [0, 1.5]}``.
+        """Variation from a data set's ``vary_sensors``: ``{noise: [0.5, 2], delay: [0, 1.5]}``.
 
         Raises:
             ConfigurationError: an unknown kind of error, or no range.

@@ -9,32 +9,21 @@ import numpy as np
 
 from vehest.data.errors import ConfigurationError
 from vehest.data.recording import Recording
-from vehest.simulation.drive import Flags, Trip, as_json, whole_steps
+from vehest.simulation.drive import RATE_HZ, Flags, Trip, naming, recording_of, whole_steps
 from vehest.simulation.driving.driver import Observation
 from vehest.simulation.driving.freestyle import COMMAND_RATE_HZ, Freestyle
 from vehest.simulation.driving.manoeuvre import SETTLING_TIME
-from vehest.simulation.errors import SimulationError
 from vehest.simulation.plant.planar import STEER, VX, VY, YAW, YAW_RATE, PlanarPlant, X, Y
 from vehest.simulation.plant.planar_car import PlanarCar
 from vehest.simulation.road.surface import SURFACES, Surface
-from vehest.simulation.sensors.recording import PRESETS, SensorLevels, described, measure
+from vehest.simulation.sensors.levels import PRESETS, SensorLevels
+from vehest.simulation.sensors.recording import measure
 
 PLANAR_MANOEUVRES: Mapping[str, type[Freestyle]] = {Freestyle.name: Freestyle}
 """Manoeuvres of the planar plant's cars by name."""
 
-CHANNELS = (
-    "vx",
-    "yaw_rate",
-    "ax",
-    "ay",
-    "steer",
-    "motor_speed",
-    "motor_current",
-    "vx_ref",
-    "vy_ref",
-    "yaw_rate_ref",
-)
-"""What such a car records: it has no sensor at its single wheels, and the inertial unit's other axes are not kept."""
+CHANNELS = ("vx", "yaw_rate", "ax", "ay", "steer", "motor_speed", "motor_current", "vx_ref", "vy_ref", "yaw_rate_ref")
+"""Channels of such a car: it has no sensor at its single wheels, and the inertial unit's other axes are not kept."""
 
 SPUN = np.pi / 2.0
 """Sideslip angle beyond which a drive counts as one with a spin [rad]."""
@@ -46,11 +35,10 @@ def simulate_planar_drive(
     car: PlanarCar,
     manoeuvre: Freestyle,
     seed: int,
-    rate_hz: float = 100.0,
-    sensors: SensorLevels | None = None,
+    rate_hz: float = RATE_HZ,
+    sensors: SensorLevels = PRESETS["small_car"],
     stability_control: bool = False,
-    surface: Surface | None = None,
-    step: float = 1e-3,
+    surface: Surface = SURFACES["dry"],
 ) -> Recording:
     """A recording of one drive; the same arguments give the same samples, bit by bit.
 
@@ -58,55 +46,40 @@ def simulate_planar_drive(
 
     Args:
         id: name of the recording.
-        car: what is driven.
-        manoeuvre: what it does.
+        car: the car.
+        manoeuvre: its manoeuvre.
         seed: of the driver, of patches on the surface and of the sensors' errors; zero or positive.
         rate_hz: sampling rate; a whole number of plant steps must fit between samples [Hz].
-        sensors: levels of the sensors' errors; by default the preset ``small_car``.
+        sensors: levels of the sensors' errors.
         stability_control: such a car has none; anything but False is refused.
-        surface: of the floor; by default dry.
-        step: of the plant [s].
+        surface: of the floor.
 
     Raises:
         ConfigurationError: a value that makes no sense.
         SimulationError: a state is not finite.
     """
-    if seed < 0:
-        raise ConfigurationError(f"drive '{id}': a seed must be zero or positive, not {seed}")
     if stability_control:
         raise ConfigurationError(f"drive '{id}': vehicle '{car.name}' has no stability control")
-    sensors, surface = sensors or PRESETS["small_car"], surface or SURFACES["dry"]
-    try:
-        trip = drive_freely(PlanarPlant(car, step), manoeuvre, seed, rate_hz=rate_hz, surface=surface)
-    except SimulationError as error:
-        raise SimulationError(f"drive '{id}' with seed {seed}: {error}") from error
+    plant = PlanarPlant(car)
+    with naming(id, seed):
+        trip = drive_freely(plant, manoeuvre, seed, rate_hz=rate_hz, surface=surface)
     shown = measure(trip.motion, sensors, seed)
     shown["vx"] = car.wheel_radius * shown["motor_speed"]
-    return Recording(
-        id=id,
-        vehicle=car.name,
-        rate_hz=rate_hz,
-        start_time=0.0,
-        channels={name: shown[name] for name in CHANNELS},
-        kind="simulated",
-        provenance=as_json(
-            {
-                "plant": "planar, four wheels",
-                "parameters": car.parameters,
-                "plant_step": step,
-                "manoeuvre": manoeuvre.description(),
-                "drawn": trip.drawn,
-                "surface": asdict(surface),
-                "stability_control": False,
-                "seed": seed,
-                "sensors": described(sensors, trip.motion),
-                "flags": asdict(trip.flags),
-            }
-        ),
-    )
+    about = {
+        "plant": "planar, four wheels",
+        "parameters": car.parameters,
+        "plant_step": plant.step,
+        "manoeuvre": manoeuvre.description(),
+        "drawn": trip.drawn,
+        "surface": asdict(surface),
+        "stability_control": False,
+    }
+    return recording_of(id, car.name, trip, {name: shown[name] for name in CHANNELS}, about, sensors, seed)
 
 
-def drive_freely(plant: PlanarPlant, manoeuvre: Freestyle, seed: int, *, rate_hz: float = 100.0, surface: Surface | None = None) -> Trip:
+def drive_freely(
+    plant: PlanarPlant, manoeuvre: Freestyle, seed: int, *, rate_hz: float = RATE_HZ, surface: Surface = SURFACES["dry"]
+) -> Trip:
     """Drive a car for the time of a recording and keep its true motion; it starts from standstill, SETTLING_TIME before the first sample.
 
     Raises:
@@ -116,7 +89,7 @@ def drive_freely(plant: PlanarPlant, manoeuvre: Freestyle, seed: int, *, rate_hz
     per_command = whole_steps(COMMAND_RATE_HZ, plant.step, "driver's")
     per_sample = whole_steps(rate_hz, plant.step, "sampling")
     stride = int(np.gcd(per_command, per_sample))
-    driver = manoeuvre.driver(plant.car, surface or SURFACES["dry"], seed)
+    driver = manoeuvre.driver(plant.car, surface, seed)
     first_sample = round(SETTLING_TIME / plant.step)
     state, kept, acting = plant.initial_state(), [], []
     for now in range(0, first_sample + round(driver.duration * rate_hz) * per_sample, stride):

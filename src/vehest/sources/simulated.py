@@ -72,7 +72,7 @@ class SimulatedSource(Source):
 
     def __init__(self, dataset: Mapping[str, Any]) -> None:
         from vehest.simulation.fleet import SensorVariation, variations_from_config
-        from vehest.simulation.sensors.recording import sensor_levels_from_config
+        from vehest.simulation.sensors.config import sensor_levels_from_config
 
         super().__init__(dataset)
         options, rate_hz = self.options, self.options.rate_hz
@@ -115,7 +115,7 @@ class SimulatedSource(Source):
     def _simulation(self, drive_id: str, variations: Sequence[Any]) -> partial[Recording]:
         """The simulation of a drive, with its vehicle varied."""
         from vehest.simulation.road.surface import surface_from_config
-        from vehest.simulation.sensors.recording import sensor_levels_from_config
+        from vehest.simulation.sensors.config import sensor_levels_from_config
 
         drive, seed = self.drives[drive_id], self.seed_of(drive_id)
         vehicle = self._vehicle_of(drive)

@@ -1,1 +1,1 @@
-"""How it is driven: what a driver knows of a car, the driver, and manoeuvres."""
+"""The driver, the car as the driver knows it, and manoeuvres."""

@@ -1,4 +1,4 @@
-"""What a driver knows of a car: its size, its limits, and how much steering it wants at which lateral acceleration.
+"""The car as its driver knows it: size, limits, and steering over lateral acceleration.
 
 Sizes and limits are the vehicle's parameters. The steering is measured: the car goes into an ever tighter turn at constant speed until
 it follows no more, as in the constant-speed test of ISO 4138.

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from typing import Any, ClassVar
 
@@ -86,28 +85,7 @@ class SteadyCircle(Manoeuvre):
         line = circle(radius, side, run_in, around, transition)
         plan = plan_along(line, speed, surface, seed)
         drawn = {"radius": radius, "severity": severity, "side": SIDES[side], "driver": asdict(driver)}
-        return TimedLineDriver(plan, car, driver, drawn, entered + growing + self.hold_time, speed_at)
-
-
-class TimedLineDriver(LineDriver):
-    """Follows a line until a time [s]."""
-
-    def __init__(
-        self,
-        plan: Plan,
-        car: Car,
-        driver: Driver,
-        drawn: dict[str, Any],
-        end_time: float,
-        speed_at: Callable[[float], tuple[float, float]] | None,
-    ) -> None:
-        super().__init__(plan, car, driver, drawn, speed_at=speed_at)
-        self._end_time = end_time
-
-    def command(self, time: float, seen: Observation) -> Command:
-        """As planned, until the time."""
-        decision = super().command(time, seen)
-        return decision._replace(finished=True) if time >= self._end_time else decision
+        return LineDriver(plan, car, driver, drawn, end_time=entered + growing + self.hold_time, speed_at=speed_at)
 
 
 @dataclass(frozen=True)
@@ -161,25 +139,16 @@ class BrakingInTurn(Manoeuvre):
             "radius": radius, "severity": severity, "speed": speed, "deceleration": deceleration, "brakes_at": brakes_at,
             "side": SIDES[side], "driver": asdict(driver),
         }  # fmt: skip
-        return TurnBraker(plan, car, driver, drawn, brakes_at, deceleration, self.steering == "held", self.until_speed)
+        return TurnBraker(self, plan, car, driver, drawn)
 
 
 class TurnBraker(LineDriver):
-    """Follows a circle, then brakes until a speed [m/s] is reached or the car stands."""
+    """Follows a circle, then brakes until the manoeuvre's speed is reached or the car stands."""
 
-    def __init__(
-        self,
-        plan: Plan,
-        car: Car,
-        driver: Driver,
-        drawn: dict[str, Any],
-        brakes_at: float,
-        deceleration: float,
-        held: bool,
-        until_speed: float,
-    ) -> None:
+    def __init__(self, manoeuvre: BrakingInTurn, plan: Plan, car: Car, driver: Driver, drawn: dict[str, Any]) -> None:
         super().__init__(plan, car, driver, drawn)
-        self._brakes_at, self._deceleration, self._held, self._until_speed = brakes_at, deceleration, held, until_speed
+        self._brakes_at, self._deceleration = drawn["brakes_at"], drawn["deceleration"]
+        self._held, self._until_speed = manoeuvre.steering == "held", manoeuvre.until_speed
 
     def command(self, time: float, seen: Observation) -> Command:
         """Around the circle, then braking, with the steering held or not."""

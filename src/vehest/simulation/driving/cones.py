@@ -124,7 +124,7 @@ class Slalom(Manoeuvre):
 
 
 def _require_cone_values(manoeuvre: DoubleLaneChange | Slalom) -> None:
-    """Check what both have."""
+    """Check the parameters of both."""
     require(manoeuvre, severity=(0.05, 1.3), half_width=(0.5, 50.0))
     require_one_of(manoeuvre, "side", SIDE_CHOICES)
     if manoeuvre.speed is not None:

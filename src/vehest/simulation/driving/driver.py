@@ -21,7 +21,7 @@ from vehest.simulation.driving.car import Car
 from vehest.simulation.road.course import Course
 
 DRIVER_RATE_HZ = 100.0
-"""How often a driver decides what to do [Hz]."""
+"""Rate of a driver's decisions [Hz]."""
 
 LOWEST_CORRECTION, HIGHEST_CORRECTION = 0.5, 2.0
 """Frequencies between which a driver corrects [Hz]; assumed."""
@@ -40,8 +40,8 @@ class Driver:
         response: by how much later a car answers per speed [s²/m]. The driver takes the road's curvature as far ahead as this lag and the
             one of steering.
         yaw_damping: steering angle per error of the yaw rate [s].
-        countersteer: steering angle per sideslip beyond what the turn wants.
-        slide: sideslip beyond what the turn wants from which on the driver countersteers and lifts [rad].
+        countersteer: steering angle per sideslip beyond that of the turn.
+        slide: sideslip beyond that of the turn from which on the driver countersteers and lifts [rad].
         speed_gain: wanted acceleration per speed error [1/s].
         braking_share: share of the grip that is used for braking straight ahead.
         saturation: share of the grip up to which the driver asks for more lateral acceleration when off the line.
@@ -60,7 +60,7 @@ class Driver:
 
 @dataclass(frozen=True)
 class DrivingStyle:
-    """What differs from drive to drive and, slowly, along one drive.
+    """Differences from drive to drive and, slowly, along one drive.
 
     Both variations are sums of sines of the distance driven, whose wavelengths do not divide a lap.
 
@@ -77,11 +77,11 @@ class DrivingStyle:
     """
 
     grip_fraction: float
-    grip_ripple: float = 0.05
-    line_offset: float = 0.5
-    wavelengths: tuple[float, ...] = WAVELENGTHS
-    grip_phases: tuple[float, ...] = (0.0, 0.0, 0.0)
-    line_phases: tuple[float, ...] = (0.0, 0.0, 0.0)
+    grip_ripple: float
+    line_offset: float
+    wavelengths: tuple[float, ...]
+    grip_phases: tuple[float, ...]
+    line_phases: tuple[float, ...]
 
     def __post_init__(self) -> None:
         low, high = self.grip_fraction - abs(self.grip_ripple), self.grip_fraction + abs(self.grip_ripple)
@@ -91,7 +91,7 @@ class DrivingStyle:
 
 @dataclass(frozen=True, eq=False)
 class Plan:
-    """What the driver means to do, over the distance along the way; all arrays have shape (N,).
+    """Planned line and speed over the distance along the way; all arrays have shape (N,).
 
     Args:
         distance: [m], uniform from 0.
@@ -126,7 +126,7 @@ class Plan:
 
 
 class Observation(NamedTuple):
-    """What the driver sees and feels of the car: place [m], heading [rad], velocity [m/s], yaw rate [rad/s], steering angle [rad]."""
+    """The car as the driver perceives it: place [m], heading [rad], velocity [m/s], yaw rate [rad/s], steering angle [rad]."""
 
     x: float
     y: float
@@ -143,12 +143,12 @@ class Observation(NamedTuple):
 
     @property
     def sideslip(self) -> float:
-        """atan2(vy, vx), zero below 1 m/s where it says nothing [rad]."""
+        """atan2(vy, vx), zero below 1 m/s [rad]."""
         return math.atan2(self.vy, self.vx) if self.speed > 1.0 else 0.0
 
 
 class Command(NamedTuple):
-    """What the driver does now, and the road at the car.
+    """The driver's command, and the road at the car.
 
     Args:
         steering_velocity: of the road wheels [rad/s].
@@ -173,12 +173,12 @@ class Command(NamedTuple):
     finished: bool = False
 
 
-def draw_style(seed: int, grip_range: tuple[float, float] = (0.65, 0.9), ripple: float = 0.05, line_offset: float = 0.5) -> DrivingStyle:
-    """The style that belongs to a seed: grip fraction uniform in ``grip_range`` (assumed), phases around the circle."""
+def draw_style(seed: int, grip_range: tuple[float, float], ripple: float, line_offset: float) -> DrivingStyle:
+    """The style that belongs to a seed: grip fraction uniform in ``grip_range``, phases around the circle."""
     generator = np.random.default_rng(np.random.SeedSequence(entropy=seed, spawn_key=(0,)))
     grip_fraction = float(generator.uniform(*grip_range))
     phases = generator.uniform(0.0, 2.0 * math.pi, (2, len(WAVELENGTHS))).tolist()
-    return DrivingStyle(grip_fraction, ripple, line_offset, grip_phases=tuple(phases[0]), line_phases=tuple(phases[1]))
+    return DrivingStyle(grip_fraction, ripple, line_offset, WAVELENGTHS, tuple(phases[0]), tuple(phases[1]))
 
 
 def plan_laps(
@@ -189,8 +189,8 @@ def plan_laps(
     Args:
         course: where.
         car: whose limits are kept.
-        driver: who drives.
-        style: how.
+        driver: its driver.
+        style: of driving.
         n_laps: at least one.
         friction: of one lap, on the course's samples, shape (N,).
         highest_speed: [m/s], one value or one for each of the n_laps·(N - 1) + 1 samples.
@@ -234,8 +234,8 @@ def speed_profile(
         used: (N,), grip that is used at most [m/s²]; braking gets ``driver.braking_share`` of it, driving ``car.driving_share``.
         spacing: distance between samples [m].
         car: whose power and top speed are used.
-        driver: who brakes.
-        highest_speed: that the driver wants [m/s].
+        driver: its driver.
+        highest_speed: limit of the driver [m/s].
         bank: of the road, positive with its left side higher [rad]; gravity helps or hinders.
         grade: of the road, positive downhill [rad].
     """
@@ -259,7 +259,7 @@ def speed_profile(
 
 
 class Hands:
-    """What a driver's hands do beside following a line: corrections between 0.5 and 2 Hz, as a driver at the limit makes them all the time.
+    """Steering corrections between 0.5 and 2 Hz beside following a line, as drivers make them at the limit.
 
     Args:
         size: root mean square of the lateral acceleration that is asked for, in a corner at the limit [m/s²]; a third of it on a straight.
@@ -282,8 +282,8 @@ class Follower:
 
     Args:
         plan: line and speed.
-        car: what is driven.
-        driver: who drives.
+        car: the car.
+        driver: its driver.
         progress: where on the plan the car starts [m].
         speed_at: wanted speed [m/s] and acceleration [m/s²] at a time [s]; by default the plan's, by place.
         hands: corrections beside the line; by default none.
@@ -318,7 +318,7 @@ class Follower:
         return x, y, heading, self._speed_at(-math.inf)[0] if self._speed_at else speed
 
     def command(self, time: float, seen: Observation) -> Command:
-        """What the driver does at a time [s], given what is seen of the car."""
+        """The command at a time [s] for an observation of the car."""
         car, driver = self.car, self.driver
         speed, sideslip = seen.speed, seen.sideslip
         lateral_error, heading_error, here, share = self._locate(seen, sideslip)
@@ -366,8 +366,7 @@ class Follower:
     def _steer(self, meant: float, more: float, speed: float, bank: float, friction: float) -> float:
         """Steering angle [rad] of the curvature that is meant, and of ``more`` [1/m] to get back to the line.
 
-        The latter with no more steering than half of the grip takes: at the limit a car hardly answers, and a driver who asks it
-        ever harder weaves.
+        The latter takes no more steering than at half of the grip: at the limit a car hardly answers, and more steering makes it weave.
         """
         car = self.car
         held = car.steer_for(meant, meant * speed**2 + GRAVITY * math.sin(bank), friction)
@@ -398,7 +397,7 @@ class Follower:
 
 
 def steering_velocity(car: Car, driver: Driver, wanted: float, steer: float) -> float:
-    """Of the road wheels towards a wanted angle [rad/s], within what the car allows."""
+    """Steering velocity of the road wheels towards a wanted angle, within the car's limits [rad/s]."""
     wanted = max(-car.largest_steer, min(car.largest_steer, wanted))
     return max(-car.steering_rate, min(car.steering_rate, (wanted - steer) / driver.steering_lag))
 

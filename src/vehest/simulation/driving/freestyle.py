@@ -1,4 +1,4 @@
-"""Freestyle driving of a small car: drifts, doughnuts, wheel spin and hard braking, one after the other as they come to mind."""
+"""Freestyle driving of a small car: drifts, doughnuts, wheel spin and hard braking, in random order."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ FAST = 1.0
 CALM = 0.12
 """Sideslip angle below which the driver brakes, and has caught a slide [rad]."""
 COUNTERSTEER = 1.5
-"""Road-wheel angle over sideslip angle in a slide that he catches."""
+"""Road-wheel angle over sideslip angle in a slide that is caught."""
 
 
 @dataclass(frozen=True)
@@ -32,13 +32,13 @@ class Freestyle:
     """A remotely controlled car on an open area, thrown from turn to turn; all habits are assumed.
 
     The driver holds the steering at a stop, half way or straight for a while, then goes on to the next; gives gas in bursts as long as the
-    car is slower than he wants it, coasts, brakes where it is much faster; and countersteers where it slides more than he likes.
+    car is slower than wanted, coasts, brakes where it is much faster, and countersteers where it slides more than allowed.
 
     Args:
         duration: of the recording [s].
-        speed: lowest and highest speed that he wants now and then [m/s].
+        speed: lowest and highest wanted speed [m/s].
         current: of a burst of gas, lowest and highest [A].
-        sideslip: beyond which he takes the gas away and countersteers, drawn anew for each slide [rad].
+        sideslip: beyond which the driver lifts and countersteers, drawn anew for each slide [rad].
         brakes: share of the decisions that are a full braking.
         kicks: share of the decisions that are a burst with the largest current.
         straights: share of the steering decisions that are straight ahead.
@@ -77,10 +77,10 @@ class FreestyleDriver:
     """Drives one car for the time of one recording.
 
     Args:
-        style: how.
-        car: what is driven.
-        area: where.
-        generator: decides.
+        style: of driving.
+        car: the car.
+        area: with its friction.
+        generator: of the decisions.
     """
 
     def __init__(self, style: Freestyle, car: PlanarCar, area: OpenArea, generator: np.random.Generator) -> None:
@@ -92,7 +92,7 @@ class FreestyleDriver:
         self._side, self._held_sideslip, self._saves = 1.0, draw(style.sideslip, generator), False
 
     def inputs(self, time: float, seen: Observation) -> Inputs:
-        """What the driver does at a time [s]; to be asked COMMAND_RATE_HZ times a second."""
+        """The driver's inputs at a time [s]; called COMMAND_RATE_HZ times a second."""
         self._progress += seen.speed / COMMAND_RATE_HZ
         sideslip = math.atan2(seen.vy, seen.vx) if seen.speed > SLOW else 0.0
         if not self._saves and abs(sideslip) > self._held_sideslip:
@@ -122,7 +122,7 @@ class FreestyleDriver:
         return self._steer
 
     def _next_gas(self, time: float, seen: Observation) -> float:
-        """Bursts up to the wanted speed, coasting above it, brakes where it is much too fast or for the fun of it."""
+        """Bursts up to the wanted speed, coasting above it, brakes where it is much too fast, and at random."""
         generator, style, largest = self._generator, self._style, self._car.largest_current
         if time >= self._speed_until:
             self._wanted = float(generator.uniform(*as_range(style.speed)))

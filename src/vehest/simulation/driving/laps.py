@@ -28,7 +28,7 @@ from vehest.simulation.road.surface import Surface
 
 _TRAFFIC_STREAM = 5  # of a drive's seed; 0 to 4 are the style's, the sensors', the surface's, the manoeuvre's and the fleet's
 TRAFFIC_LENGTH = (50.0, 400.0)
-"""Of a stretch behind somebody slower [m]; assumed."""
+"""Of a stretch behind a slower car [m]; assumed."""
 
 
 @dataclass(frozen=True)
@@ -46,7 +46,7 @@ class Laps(Manoeuvre):
         flat: leaves out the course's bank and grade.
         half_width: of the road, beyond which the car has left it [m].
         corrections: of the driver's hands, see `Hands` [m/s²].
-        traffic: stretches per lap, on average, on which somebody slower is ahead.
+        traffic: stretches per lap, on average, behind a slower car.
         traffic_speed: of those, drawn for each [m/s].
     """
 
@@ -117,7 +117,7 @@ class Laps(Manoeuvre):
         return LapDriver(plan(laps + 2), car, driver, course.length, end, drawn, end_time=end_time, hands=hands)
 
     def _held_up(self, course: Course, n_laps: int, highest: float, seed: int) -> FloatArray:
-        """Highest speeds along the way [m/s]: those of whoever is ahead, on stretches that are drawn lap by lap."""
+        """Highest speeds along the way [m/s]: those of slower cars ahead, on stretches that are drawn lap by lap."""
         cells, spacing = len(course.arc_length) - 1, float(course.arc_length[1])
         speeds = np.full(n_laps * cells + 1, highest)
         for lap in range(n_laps):
@@ -247,15 +247,15 @@ FASTEST_SEVERITY = 0.95
 
 
 class LapDriver(Follower):
-    """Follows a plan of laps from just before the second, so that the first sample is taken on the line, to an end.
+    """Follows a plan of laps from just before the second one to an end; the first sample is taken on the start line.
 
     Args:
         plan: of one lap more than is recorded.
-        car: what is driven.
-        driver: who drives.
+        car: the car.
+        driver: its driver.
         lap: length of a lap [m].
         end: distance at which the drive is over, or the stop begins [m].
-        drawn: what the seed decided.
+        drawn: values that the seed drew.
         stop_time: time from the end to the stand [s]; by default the drive is over at the end.
         end_time: at which the drive is over wherever the car is [s].
         hands: corrections beside the line; by default none.

@@ -1,7 +1,8 @@
-"""What a manoeuvre is: its parameters, what a seed draws from them, and the controller it gives a drive."""
+"""Base of the manoeuvres: limits of parameters, values drawn by a seed, and controllers."""
 
 from __future__ import annotations
 
+import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
@@ -35,17 +36,17 @@ class Controller(Protocol):
 
     @property
     def drawn(self) -> dict[str, Any]:
-        """What the seed decided, in words and numbers that JSON can hold."""
+        """Values that the seed drew, as JSON can hold them."""
         ...
 
     def command(self, time: float, seen: Observation) -> Command:
-        """What the driver does at a time [s]; called every hundredth of a second."""
+        """The driver's command at a time [s]; called DRIVER_RATE_HZ times a second."""
         ...
 
 
 @dataclass(frozen=True)
 class Manoeuvre(ABC):
-    """What all manoeuvres share."""
+    """Base of all manoeuvres."""
 
     name: ClassVar[str]
 
@@ -56,7 +57,7 @@ class Manoeuvre(ABC):
 
     @abstractmethod
     def controller(self, car: Car, surface: Surface, seed: int) -> Controller:
-        """A driver for this car on this surface, as the seed wants it.
+        """The controller of this car on this surface, as the seed draws it.
 
         Raises:
             ConfigurationError: the car cannot do this.
@@ -76,10 +77,11 @@ class LineDriver(Follower):
 
     Args:
         plan: line and speed.
-        car: what is driven.
-        driver: who drives.
-        drawn: what the seed decided.
+        car: the car.
+        driver: its driver.
+        drawn: values that the seed drew.
         end: distance at which the drive is over [m]; by default the plan's end.
+        end_time: at which it is over at the latest [s].
         speed_at: see Follower.
     """
 
@@ -89,16 +91,18 @@ class LineDriver(Follower):
         car: Car,
         driver: Driver,
         drawn: dict[str, Any],
+        *,
         end: float | None = None,
+        end_time: float = math.inf,
         speed_at: Callable[[float], tuple[float, float]] | None = None,
     ) -> None:
         super().__init__(plan, car, driver, speed_at=speed_at)
-        self.drawn, self._end = drawn, plan.length - 1.0 if end is None else end
+        self.drawn, self._end, self._end_time = drawn, plan.length - 1.0 if end is None else end, end_time
 
     def command(self, time: float, seen: Observation) -> Command:
         """As planned, until the end."""
         decision = super().command(time, seen)
-        return decision._replace(finished=True) if decision.progress >= self._end else decision
+        return decision._replace(finished=decision.progress >= self._end or time >= self._end_time)
 
 
 class OpenArea:
@@ -119,11 +123,9 @@ class OpenArea:
 
 
 SIDES = {1.0: "left", -1.0: "right"}
-"""Names of what draw_side gives."""
-
-
+"""Names of the values of draw_side."""
 SIDE_CHOICES = ("left", "right", "either")
-"""What a manoeuvre's ``side`` may be."""
+"""Values of a manoeuvre's ``side``."""
 
 
 def require_one_of(manoeuvre: Any, key: str, choices: tuple[Any, ...]) -> None:
@@ -157,7 +159,7 @@ def as_range(value: Range) -> tuple[float, float]:
 
 
 def generator_of(seed: int) -> np.random.Generator:
-    """Of what a manoeuvre draws, in the order in which it draws."""
+    """Generator of a manoeuvre's draws; their order is fixed."""
     return np.random.default_rng(np.random.SeedSequence(entropy=seed, spawn_key=(_STREAM, 0)))
 
 
@@ -173,7 +175,7 @@ def draw_side(side: str, generator: np.random.Generator) -> float:
 
 
 def draw_driver(seed: int) -> Driver:
-    """The habits of the person who drives; their spread is assumed."""
+    """Habits of the driver; their spread is assumed."""
     generator = np.random.default_rng(np.random.SeedSequence(entropy=seed, spawn_key=(_STREAM, 1)))
     usual = Driver()
     spread = {"preview_time": 0.1, "response": 0.1, "steering_lag": 0.15, "yaw_damping": 0.15, "countersteer": 0.2}

@@ -1,8 +1,8 @@
-"""Manoeuvres: what a drive consists of, from the first sample to the last.
+"""Manoeuvres by name, and made from a configuration.
 
-Each is a frozen dataclass of its parameters, made from a configuration by ``manoeuvre_from_config``, and gives a controller for a car,
-a surface and a seed. A parameter of type Range is a number, or a pair from which every drive draws one, uniformly. ``severity`` is always
-the share of the grip that the driver means to use, on the surface at hand. Values without a source are assumed.
+A manoeuvre is a frozen dataclass of its parameters; its controller drives a car on a surface as a seed draws it. A parameter of type Range
+is a number, or a pair from which every drive draws one, uniformly. ``severity`` is the share of the grip that the driver uses on
+the surface of the drive. Values without a source are assumed.
 
 Time is zero at the first sample of the recording; SETTLING_TIME before it the car starts, rolling straight ahead.
 """
@@ -10,16 +10,15 @@ Time is zero at the first sample of the recording; SETTLING_TIME before it the c
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import fields
 from typing import TYPE_CHECKING, Any, TypeVar
 
 from vehest.data.errors import ConfigurationError
+from vehest.data.schema import validated
 from vehest.simulation.driving.circles import BrakingInTurn, SteadyCircle
 from vehest.simulation.driving.cones import DoubleLaneChange, Slalom
 from vehest.simulation.driving.laps import FastLap, Laps, SpeedLaps
 from vehest.simulation.driving.manoeuvre import Manoeuvre
 from vehest.simulation.driving.open_loop import RandomSteer, Spiral, StepSteer
-from vehest.simulation.plant.parameters import is_number
 
 if TYPE_CHECKING:
     from _typeshed import DataclassInstance
@@ -52,43 +51,10 @@ def one_of(configuration: Mapping[str, Any], among: Mapping[str, type[Made]]) ->
     Raises:
         ConfigurationError: there is no such manoeuvre or parameter, or a value makes no sense.
     """
-    values = {key: _tupled(value) for key, value in configuration.items()}
+    values = dict(configuration)
     name = values.pop("name", None)
     if not isinstance(name, str) or name not in among:
         raise ConfigurationError(f"there is no manoeuvre '{name}'; there are {', '.join(sorted(among))}")
-    known = {entry.name for entry in fields(among[name])}
-    unknown = sorted(set(values) - known)
-    if unknown:
-        raise ConfigurationError(f"manoeuvre '{name}': unknown keys {unknown}; it has {sorted(known)}")
-    for entry in fields(among[name]):
-        if entry.name in values and not _fits(values[entry.name], str(entry.type)):
-            shown = _KINDS.get(str(entry.type).removesuffix(" | None"), str(entry.type))
-            raise ConfigurationError(f"manoeuvre '{name}': {entry.name} must be {shown}, not {configuration[entry.name]}")
-    return among[name](**values)
-
-
-_KINDS = {
-    "Range": "a number or a pair of numbers",
-    "float": "a number",
-    "int": "a whole number",
-    "bool": "true or false",
-    "str": "a name",
-    "tuple[float, float]": "a pair of numbers",
-    "tuple[float, ...]": "a list of numbers",
-}
-
-
-def _fits(value: Any, kind: str) -> bool:
-    """Whether a value is of a field's type, as the dataclass spells it."""
-    if kind.endswith(" | None"):
-        return value is None or _fits(value, kind.removesuffix(" | None"))
-    if kind in ("bool", "str"):
-        return isinstance(value, {"bool": bool, "str": str}[kind])
-    if isinstance(value, tuple):
-        pair = len(value) == 2 and kind in ("Range", "tuple[float, float]")
-        return (pair or (kind == "tuple[float, ...]" and len(value) > 0)) and all(is_number(entry) for entry in value)
-    return kind in ("Range", "float", "int") and is_number(value) and (kind != "int" or isinstance(value, int))
-
-
-def _tupled(value: Any) -> Any:
-    return tuple(value) if isinstance(value, list | tuple) else value
+    validated(among[name], values, f"manoeuvre '{name}'", error=ConfigurationError)
+    # Made of the values as they are written, whole numbers too, which provenance keeps.
+    return among[name](**{key: tuple(value) if isinstance(value, list) else value for key, value in values.items()})

@@ -1,30 +1,26 @@
-"""CommonRoad's multi-body equations and a fixed-step Runge-Kutta method, compiled.
+"""The multi-body equations in their three regimes, and a Runge-Kutta method of fixed step, compiled.
 
-The library's functions are bound again to compiled versions of the functions they call; the equations of motion come
-with the changes of rewriting.py, and nothing of them is written here a second time. Regimes are those of regimes.py.
+Flow: parameter vector -> MultiBodyValues -> multi_body (equations.py) and regimes (regimes.py) -> Runge-Kutta steps (advance) or
+derivatives and forces at given states (evaluate).
 """
 
 from __future__ import annotations
 
 import hashlib
-import importlib.metadata
 import inspect
 import math
-import types
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
 import numba
 import numpy as np
-from vehiclemodels.utils import tire_model
-from vehiclemodels.utils.acceleration_constraints import acceleration_constraints
-from vehiclemodels.utils.steering_constraints import steering_constraints
-from vehiclemodels.vehicle_dynamics_mb import vehicle_dynamics_mb
+from numba.np.unsafe.ndarray import to_fixed_tuple
 
-from vehest.simulation.plant import parameters as parameter_tuples
-from vehest.simulation.plant import regimes
+from vehest.simulation.plant import equations, regimes
+from vehest.simulation.plant.equations import SMALLEST_WHEEL_VELOCITY, acceleration_limit, lateral_force, multi_body
+from vehest.simulation.plant.parameters import LongitudinalValues, MultiBodyValues, SteeringValues, TyreValues
 from vehest.simulation.plant.regimes import (
     FIRST_WHEEL,
     PITCH_RATE,
@@ -41,20 +37,22 @@ from vehest.simulation.plant.regimes import (
     WHEEL_RELAXATION,
     YAW,
     YAW_RATE,
-    forces_of_contact,
     next_regime,
     slow_motion,
     wheel_velocities,
 )
-from vehest.simulation.plant.rewriting import CONTACT_FORCES, SMALLEST_WHEEL_VELOCITY, rewritten_source
+
+if numba.config.DISABLE_JIT:
+
+    def to_fixed_tuple(values, length):  # type: ignore[no-untyped-def]
+        """As numba's, which runs compiled only."""
+        return tuple(values[:length])
+
 
 try:
     import fcntl
 except ImportError:  # Windows
     fcntl = None  # type: ignore[assignment]
-
-LIBRARY = "commonroad-vehicle-models"
-LIBRARY_VERSION = importlib.metadata.version(LIBRARY)
 
 N_STATES = 29
 N_INPUTS = 5
@@ -71,88 +69,41 @@ OVERSPEED = 1.1
 LARGEST_LOAD_FACTOR = 1.5
 """Wheel load over static load that sub-steps are stable for; assumed: at low speed, load transfer is that of braking."""
 
-_REWRITTEN = rewritten_source(vehicle_dynamics_mb, f"{LIBRARY} {LIBRARY_VERSION}")
+_kernel = numba.njit(error_model="numpy")  # as in NumPy, a division by zero gives an infinite value, which the plant reports
 
 
-def _compile(function: Callable[..., Any]) -> Any:
-    # As in NumPy, a division by zero gives an infinite value, which the plant reports with the time it happened at.
-    return numba.njit(error_model="numpy")(function)
+# Places of the groups in a parameter vector.
+_STEERING = len(MultiBodyValues._fields) - 4
+_LONGITUDINAL = _STEERING + len(SteeringValues._fields)
+_FRONT = _LONGITUDINAL + len(LongitudinalValues._fields)
+_REAR = _FRONT + len(TyreValues._fields)
+_FRICTIONS = tuple(tyre + TyreValues._fields.index(name) for tyre in (_FRONT, _REAR) for name in ("p_dx1", "p_dy1"))
+_LENGTHS = tuple(len(values_class._fields) for values_class in (SteeringValues, LongitudinalValues, TyreValues))
 
 
-def _compile_bound(function: Callable[..., Any], names: Mapping[str, Any]) -> Any:
-    """Compile a library function with some of the global names it uses bound to compiled objects."""
-    bindings = {**function.__globals__, **names}  # type: ignore[attr-defined]
-    return _compile(types.FunctionType(function.__code__, bindings, function.__name__))  # type: ignore[attr-defined]
+@_kernel
+def _unpack(vector, friction):  # type: ignore[no-untyped-def]
+    """MultiBodyValues of a parameter vector, friction scaled. Nested tuples as arguments would cost as much as ten evaluations."""
+    values = vector.copy()
+    for place in _FRICTIONS:
+        values[place] *= friction
+    steering = SteeringValues(*to_fixed_tuple(values[_STEERING:], _LENGTHS[0]))
+    longitudinal = LongitudinalValues(*to_fixed_tuple(values[_LONGITUDINAL:], _LENGTHS[1]))
+    front, rear = TyreValues(*to_fixed_tuple(values[_FRONT:], _LENGTHS[2])), TyreValues(*to_fixed_tuple(values[_REAR:], _LENGTHS[2]))
+    return MultiBodyValues(*to_fixed_tuple(values, _STEERING), steering, longitudinal, front, rear)  # type: ignore[call-arg]
 
 
-def _compile_source(source: str, name: str, names: Mapping[str, Any]) -> Any:
-    bindings = dict(names)
-    exec(compile(source, f"<{name}>", "exec"), bindings)
-    return _compile(bindings[name])
-
-
-def _compile_tyre_model() -> types.ModuleType:
-    compiled = types.ModuleType("compiled_tyre_model")
-    sign = _compile(tire_model.sign)
-    for name in (
-        "formula_longitudinal",
-        "formula_lateral",
-        "formula_longitudinal_comb",
-        "formula_lateral_comb",
-    ):
-        setattr(compiled, name, _compile_bound(getattr(tire_model, name), {"sign": sign}))
-    return compiled
-
-
-_tyre_model = _compile_tyre_model()
-_formula_lateral = _tyre_model.formula_lateral
-
-
-def _compile_multi_body() -> Any:
-    names = {
-        "steering_constraints": _compile(steering_constraints),
-        "acceleration_constraints": _compile(acceleration_constraints),
-        "tireModel": _tyre_model,
-        CONTACT_FORCES: forces_of_contact,
-    }
-    return _compile_source(_REWRITTEN, vehicle_dynamics_mb.__name__, {**vehicle_dynamics_mb.__globals__, **names})
-
-
-def _unpacking_source() -> str:
-    """Source of a function that makes MultiBodyValues of a vector of values, friction scaled."""
-    places = iter(range(10_000))
-
-    def expression(values_class: Any) -> str:
-        return f"{values_class.__name__}({', '.join(argument(values_class, name, places) for name in values_class._fields)})"
-
-    def argument(values_class: Any, name: str, places: Iterator[int]) -> str:
-        if values_class is parameter_tuples.MultiBodyValues and name in parameter_tuples.GROUPS:
-            return expression(parameter_tuples.GROUPS[name])
-        scale = " * friction" if name in ("p_dx1", "p_dy1") else ""
-        return f"vector[{next(places)}]{scale}"
-
-    return f"def unpack(vector, friction):\n    return {expression(parameter_tuples.MultiBodyValues)}"
-
-
-multi_body = _compile_multi_body()
-"""multi_body(x, (steering velocity, acceleration), p, contact) -> derivatives, twelve forces: see rewriting.py."""
-# Passed as a vector, because taking nested tuples apart at every call costs as much as ten evaluations.
-_unpack = _compile_source(_unpacking_source(), "unpack", vars(parameter_tuples))
-
-
-@_compile
+@_kernel
 def _sliding_friction(tyre):  # type: ignore[no-untyped-def]
     """Lateral force over load of an upright wheel that slips at a right angle."""
-    return abs(_formula_lateral(0.5 * math.pi, 0.0, 1.0, tyre)[0])
+    return abs(lateral_force(0.5 * math.pi, 0.0, 1.0, tyre)[0])
 
 
-@_compile
+@_kernel
 def _right_hand_side(x, contact, p, derivatives):  # type: ignore[no-untyped-def]
     """Fill derivatives (29,) of the state; returns the twelve tyre forces in the library's order and the wheels' axes."""
     regime, inputs = contact[0], contact[1]
-    f, forces = multi_body(x, (inputs[0], _engine_limit(x, inputs[1], p)), p, contact)
-    for i in range(N_STATES):
-        derivatives[i] = f[i]
+    forces = multi_body(x, inputs[0], _engine_limit(x, inputs[1], p), contact, p, derivatives)
     derivatives[VY_FRONT] += inputs[4]
     derivatives[VY_REAR] += inputs[4]
     if regime == ROLLING:
@@ -184,7 +135,7 @@ def _right_hand_side(x, contact, p, derivatives):  # type: ignore[no-untyped-def
     return forces
 
 
-@_compile
+@_kernel
 def _engine_limit(x, acceleration, p):  # type: ignore[no-untyped-def]
     """Wanted acceleration, within power at the speed of the driven wheels; the library's limit takes the car's speed."""
     front, rear = x[FIRST_WHEEL] + x[FIRST_WHEEL + 1], x[FIRST_WHEEL + 2] + x[FIRST_WHEEL + 3]
@@ -194,25 +145,22 @@ def _engine_limit(x, acceleration, p):  # type: ignore[no-untyped-def]
     return min(acceleration, p.longitudinal.a_max * p.longitudinal.v_switch / max(velocity, p.longitudinal.v_switch))
 
 
-@_compile
+@_kernel
 def _brake_arm(p):  # type: ignore[no-untyped-def]
     """Yaw moment per braking force on one side, shared equally by front and rear [m]."""
     return 0.25 * (p.T_f + p.T_r)
 
 
-@_compile
+@_kernel
 def _yaw_moment(wanted, forces, p):  # type: ignore[no-untyped-def]
-    """The wanted moment, within what the friction of the braked side's loads can give."""
+    """The wanted moment, within the friction of the braked side's loads."""
     left = p.tire.p_dx1 * forces[8] + p.tire_rear.p_dx1 * forces[10]
     right = p.tire.p_dx1 * forces[9] + p.tire_rear.p_dx1 * forces[11]
     # A positive moment, to the left of ISO 8855, brakes the wheels that the library calls right.
     return min(max(wanted, -left * _brake_arm(p)), right * _brake_arm(p))
 
 
-acceleration_limit = _compile(acceleration_constraints)
-
-
-@_compile
+@_kernel
 def _n_substeps(regime, x, p, step):  # type: ignore[no-untyped-def]
     """Parts of a step in which the slip of the slowest wheel is stable."""
     if regime != ROLLING:
@@ -225,12 +173,12 @@ def _n_substeps(regime, x, p, step):  # type: ignore[no-untyped-def]
     return math.ceil(step / (per_velocity * max(slowest, SMALLEST_WHEEL_VELOCITY)))
 
 
-@_compile
+@_kernel
 def _relax(held, regime, forces, x, vector, part):  # type: ignore[no-untyped-def]
-    """Lateral forces over load after a part of a step: while rolling they follow what the slip asks for over a length of the way.
+    """Lateral forces over load after a part of a step: while rolling they follow the slip over a length of the way.
 
-    The usual first-order relaxation (Pacejka, Tyre and Vehicle Dynamics, Chapter 7), of the force over the load, exact for what was asked
-    for at the part's beginning; at the tyres of a slow or sliding car, which other equations hold, there is no lag.
+    The usual first-order relaxation (Pacejka, Tyre and Vehicle Dynamics, Chapter 7) of the force over the load, exact for the slip at the
+    part's beginning. Tyres of a slow or sliding car, which other equations hold, have no lag.
     """
     for i in range(4):
         if regime == ROLLING:
@@ -319,7 +267,7 @@ class _Kept:
     """
 
     def __init__(self, function: Callable[..., Any]) -> None:
-        # numba looks code up by the name, file and date of the outermost function; what else goes into it is in the digest.
+        # numba looks code up by the name, file and date of the outermost function; the digest stands for the rest.
         function.__qualname__ = f"{function.__name__}_{_digest()}"
         self.dispatcher: Any = function
         self.lock: Path | None = None
@@ -330,7 +278,7 @@ class _Kept:
             self.dispatcher = numba.njit(cache=True, error_model="numpy")(function)
             self.lock = Path(self.dispatcher.stats.cache_path) / f"{Path(__file__).stem}.lock"
         except RuntimeError:  # no place for a cache
-            self.dispatcher = _compile(function)
+            self.dispatcher = _kernel(function)
 
     def __call__(self, *arguments: Any) -> Any:
         if self._is_ready:
@@ -352,7 +300,7 @@ def _held(lock: Path | None) -> Iterator[None]:
 
 
 def _digest() -> str:
-    sources = (_REWRITTEN, _unpacking_source(), inspect.getsource(regimes), inspect.getsource(tire_model), LIBRARY_VERSION)
+    sources = (inspect.getsource(equations), inspect.getsource(regimes), repr(MultiBodyValues._fields))
     return hashlib.sha256("\n".join(sources).encode()).hexdigest()[:12]
 
 

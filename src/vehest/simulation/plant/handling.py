@@ -1,4 +1,4 @@
-"""Steady-state handling of a vehicle: what a slow ramp of the steering angle at constant speed shows."""
+"""Steady-state handling of a vehicle: a slow ramp of the steering angle at constant speed."""
 
 from __future__ import annotations
 
@@ -51,5 +51,5 @@ def ramp_steer(
 
 
 def understeer_angle(motion: Motion, wheelbase: float) -> FloatArray:
-    """Steering angle beyond what the path's curvature needs without slip, positive in understeer to the left (T,) [rad]."""
+    """Steering angle beyond that of the path's curvature without slip, positive in understeer to the left (T,) [rad]."""
     return motion.steer - np.arctan(wheelbase * motion.yaw_rate / motion.vx)

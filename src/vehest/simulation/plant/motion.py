@@ -1,4 +1,4 @@
-"""What a simulated car really did: the truth that sensors measure."""
+"""True motion of a simulated car, which sensors measure."""
 
 from __future__ import annotations
 

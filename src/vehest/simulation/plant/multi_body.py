@@ -5,13 +5,13 @@ with suspension, load transfer and combined-slip tyres. The library's vertical a
 rate speeds up the wheels it calls left. Read as a mirror image, the equations are those of a car in ISO 8855 axes:
 steering, yaw and lateral quantities keep their sign, left and right wheels change places, roll and pitch change sign.
 
-What the equations leave out, and so does the plant: aerodynamic drag and lift, rolling resistance, bump stops, a
+The equations, and so the plant, leave out: aerodynamic drag and lift, rolling resistance, bump stops, a
 differential, anti-lock brakes. Longitudinal forces pitch the body as if all of the mass were the body's. Drag, and gravity
 along and across a road that is not level, come in as external accelerations (drive.py); wheel loads stay those of a level road.
 
 The published tyre has shifts that change sign with camber, so that its force jumps there by about 4 % of the wheel load.
 With them the integration converges to first order where that happens, and on a straight the lateral acceleration has
-small steps; the vehicles of conf/vehicle go without those shifts where their files say so.
+small steps; the vehicles of conf/vehicle go without those shifts where their files state it.
 """
 
 from __future__ import annotations
@@ -24,7 +24,6 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
-from vehiclemodels.init_mb import init_mb
 
 from vehest.constants import GRAVITY, FloatArray
 from vehest.data.errors import ConfigurationError
@@ -32,7 +31,7 @@ from vehest.simulation.errors import SimulationError
 from vehest.simulation.plant import compiled
 from vehest.simulation.plant.compiled import N_INPUTS
 from vehest.simulation.plant.motion import Motion
-from vehest.simulation.plant.parameters import Vehicle, compiled_parameters, library_parameters, parameter_vector
+from vehest.simulation.plant.parameters import Vehicle, compiled_parameters, parameter_vector
 from vehest.simulation.plant.regimes import (
     FIRST_WHEEL,
     HEAVE,
@@ -61,9 +60,13 @@ MIRRORED = (1, 0, 3, 2)
 """The library's left front, right front, left rear and right rear wheel in the order of motion.WHEELS."""
 
 
+def _state(place: int, meaning: str) -> Any:
+    return property(lambda state: float(state.values[place]), doc=meaning)
+
+
 @dataclass(frozen=True, eq=False)
 class PlantState:
-    """Where and how the car is.
+    """State of the car.
 
     Args:
         values: the library's states, (29,).
@@ -77,40 +80,11 @@ class PlantState:
     spun: bool = False
     held: FloatArray = field(default_factory=lambda: np.zeros(4))
 
-    @property
-    def x(self) -> float:
-        """Position along the ground's first axis [m]."""
-        return float(self.values[X])
-
-    @property
-    def y(self) -> float:
-        """Position along the ground's second axis [m]."""
-        return float(self.values[Y])
-
-    @property
-    def yaw(self) -> float:
-        """Heading, not wrapped [rad]."""
-        return float(self.values[YAW])
-
-    @property
-    def vx(self) -> float:
-        """Forward velocity [m/s]."""
-        return float(self.values[VX])
-
-    @property
-    def vy(self) -> float:
-        """Lateral velocity, positive to the left [m/s]."""
-        return float(self.values[VY])
-
-    @property
-    def yaw_rate(self) -> float:
-        """Positive to the left [rad/s]."""
-        return float(self.values[YAW_RATE])
-
-    @property
-    def steer(self) -> float:
-        """Road-wheel angle of the front axle, positive to the left [rad]."""
-        return float(self.values[STEER])
+    x, y = _state(X, "Position on the ground [m]."), _state(Y, "Position on the ground [m].")
+    yaw = _state(YAW, "Heading, not wrapped [rad].")
+    vx, vy = _state(VX, "Forward velocity [m/s]."), _state(VY, "Lateral velocity, positive to the left [m/s].")
+    yaw_rate = _state(YAW_RATE, "Positive to the left [rad/s].")
+    steer = _state(STEER, "Road-wheel angle of the front axle, positive to the left [rad].")
 
     @property
     def stands(self) -> bool:
@@ -166,9 +140,11 @@ class MultiBodyPlant:
     @cached_property
     def _at_rest(self) -> FloatArray:
         """The state in which the springs carry the car, at the origin; (29,)."""
-        values = np.array(init_mb([0.0] * 7, library_parameters(self.vehicle)), dtype=np.float64)
+        p, values = self.parameters, np.zeros(compiled.N_STATES)
+        values[HEAVE_FRONT] = (p.m_s * GRAVITY * p.b / (p.a + p.b) + p.m_uf * GRAVITY) / (2.0 * p.K_zt)
+        values[HEAVE_REAR] = (p.m_s * GRAVITY * p.a / (p.a + p.b) + p.m_ur * GRAVITY) / (2.0 * p.K_zt)
         values[PITCH] = (values[HEAVE_REAR] - values[HEAVE_FRONT]) / self.wheelbase
-        values[HEAVE] = values[HEAVE_FRONT] + self.parameters.a * values[PITCH]
+        values[HEAVE] = values[HEAVE_FRONT] + p.a * values[PITCH]
         return values
 
     def initial_state(self, x: float, y: float, yaw: float, vx: float) -> PlantState:

@@ -12,6 +12,7 @@ from collections.abc import Mapping
 from copy import deepcopy
 from dataclasses import dataclass, field, fields, is_dataclass, replace
 from functools import cache
+from importlib import metadata
 from types import MappingProxyType
 from typing import Any
 
@@ -24,6 +25,10 @@ from vehiclemodels.vehicle_parameters import VehicleParameters, setup_vehicle_pa
 from vehest.constants import FloatArray
 from vehest.data.errors import ConfigurationError
 
+LIBRARY = "commonroad-vehicle-models"
+LIBRARY_VERSION = metadata.version(LIBRARY)
+"""Of the package whose parameter files are read."""
+
 PUBLISHED_SETS: Mapping[int, str] = MappingProxyType({1: "Ford Escort", 2: "BMW 320i", 3: "VW Vanagon"})
 """Sets for which CommonRoad publishes all multi-body values (Althoff and Würsching 2020, appendix)."""
 
@@ -32,21 +37,20 @@ def _field_names(library_class: type) -> list[str]:
     return [entry.name for entry in fields(library_class)]
 
 
-_FRONT_TYRE, REAR_TYRE = "tire", "tire_rear"
+REAR_TYRE = "tire_rear"
 
-# The library's dataclasses again as named tuples, which compiled code can read; no trailer, but a rear tyre.
+# The library's dataclasses again as named tuples, which compiled code can read; no trailer, but a rear tyre. Groups stand last.
 SteeringValues = namedtuple("SteeringValues", _field_names(SteeringParameters))  # type: ignore[misc]
 LongitudinalValues = namedtuple("LongitudinalValues", _field_names(LongitudinalParameters))  # type: ignore[misc]
 TyreValues = namedtuple("TyreValues", _field_names(TireParameters))  # type: ignore[misc]
-MultiBodyValues = namedtuple(  # type: ignore[misc]
-    "MultiBodyValues", [*(name for name in _field_names(VehicleParameters) if name != "trailer"), REAR_TYRE]
-)
-
 GROUPS: Mapping[str, type] = MappingProxyType(
-    {"steering": SteeringValues, "longitudinal": LongitudinalValues, _FRONT_TYRE: TyreValues, REAR_TYRE: TyreValues}
+    {"steering": SteeringValues, "longitudinal": LongitudinalValues, "tire": TyreValues, REAR_TYRE: TyreValues}
 )
 """Fields of MultiBodyValues that are named tuples themselves."""
 
+MultiBodyValues = namedtuple(  # type: ignore[misc]
+    "MultiBodyValues", [*(name for name in _field_names(VehicleParameters) if name not in (*GROUPS, "trailer")), *GROUPS]
+)
 
 POSITIVE = ("m", "m_s", "m_uf", "m_ur", "a", "b", "I_z", "I_Phi_s", "I_y_s", "I_y_w", "T_f", "T_r", "R_w", "K_zt", "K_sf", "K_sr", "w")
 """Parameters without which a car does not exist."""
@@ -57,11 +61,11 @@ class Vehicle:
     """A car that the multi-body plant can drive.
 
     Args:
-        name: what recordings call it.
+        name: in recordings.
         parameter_set: number of the published set it starts from.
         overrides: values that replace the published ones, by the library's names; a mapping inside it replaces
             values of a group (``tire``, ``tire_rear``, ``steering``, ``longitudinal``).
-        driver: values of a driver who knows this car, by the driver's names; the plant does not read them.
+        driver: values of this car for its driver (car.py); the plant does not read them.
         relaxation: way over which a tyre's lateral force follows its slip, front and rear [m]; zero for at once.
 
     Raises:
@@ -110,7 +114,7 @@ def vehicle_from_configuration(configuration: Mapping[str, Any]) -> Vehicle:
     return Vehicle(str(configuration["name"]), configuration["parameter_set"], _plain(overrides), _plain(driver), relaxation)
 
 
-def loaded(vehicle: Vehicle, mass: float, forward: float = 0.0, up: float = 0.0) -> Vehicle:
+def loaded(vehicle: Vehicle, mass: float, forward: float, up: float) -> Vehicle:
     """The vehicle with a payload, a point mass that its springs carry; the same one without.
 
     Unsprung masses are shared anew between the axles, so that body and car keep one centre of gravity in plan.
@@ -216,7 +220,7 @@ def _override(parameters: Any, overrides: Mapping[str, Any], vehicle_name: str, 
 
 
 def is_number(value: Any) -> bool:
-    """Whether a value is a finite number; true and false are none."""
+    """Whether a value is a finite number, not a truth value."""
     return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
 
 

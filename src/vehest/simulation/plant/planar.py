@@ -132,7 +132,7 @@ def _advance(state, wanted_steer, wanted_current, scale, p, step, n_steps):  # t
 
 @dataclass(frozen=True, eq=False)
 class Inputs:
-    """What acts on the car from outside.
+    """Inputs of the car.
 
     Args:
         steer: wanted road-wheel angle [rad].
@@ -149,7 +149,7 @@ class PlanarPlant:
     """A car and its equations of motion.
 
     Args:
-        car: what is driven.
+        car: the car.
         step: of the integration [s].
 
     Raises:
@@ -191,7 +191,7 @@ class PlanarPlant:
         return after
 
     def motion(self, states: Sequence[FloatArray], inputs: Sequence[Inputs], rate_hz: float) -> Motion:
-        """What the car did, from its states (22,) and what acted on it at each sample."""
+        """Motion from the states (22,) and the inputs at each sample."""
         values, car = np.array(states), self.car
         found = [self.derivative(state, acting) for state, acting in zip(states, inputs, strict=True)]
         rates, forces = np.array([rate for rate, _ in found]), np.array([force for _, force in found])

@@ -3,22 +3,28 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, fields, replace
-from typing import Any
+from dataclasses import dataclass, fields
+from typing import Annotated, Any
+
+from pydantic import Field
 
 from vehest.data.errors import ConfigurationError
-from vehest.simulation.plant.parameters import is_number
+from vehest.data.schema import validated
+
+Positive = Annotated[float, Field(gt=0.0)]
+ZeroOrPositive = Annotated[float, Field(ge=0.0)]
+Share = Annotated[float, Field(ge=0.0, le=1.0)]
 
 PLANAR = "planar"
-"""What ``plant`` of a vehicle's configuration says to be this plant's; without it the vehicle is the multi-body plant's."""
+"""Value of ``plant`` in a vehicle's configuration that selects this plant; without it the vehicle is the multi-body plant's."""
 
 
 @dataclass(frozen=True)
 class PlanarCar:
-    """A car that the planar plant can drive.
+    """A car that the planar plant can drive; a parameter of zero takes its effect away.
 
     Args:
-        name: what recordings call it.
+        name: in recordings.
         mass: [kg].
         yaw_inertia: about the vertical axis through the centre of gravity [kg m²].
         cg_to_front_axle, cg_to_rear_axle: distances from the centre of gravity [m].
@@ -47,56 +53,40 @@ class PlanarCar:
         steering_time: time constant of the servo [s].
         current_time: time constant of the motor's current [s].
         largest_current: either sign [A].
-
-    Raises:
-        ConfigurationError: a value is not a finite number, or not positive where it must be.
     """
 
     name: str
-    mass: float
-    yaw_inertia: float
-    cg_to_front_axle: float
-    cg_to_rear_axle: float
-    track: float
-    cg_height: float
-    wheel_radius: float
-    wheel_inertia: float
-    motor_inertia: float
-    torque_constant: float
-    coulomb_torque: float
-    viscous_torque: float
-    axle_lock: float
-    centre_lock: float
-    air_drag: float
-    friction: float
-    load_sensitivity: float
-    stiffness_factor_front: float
-    stiffness_factor_rear: float
-    shape_factor: float
-    relaxation_length: float
-    carcass_damping: float
-    roll_share_front: float
-    load_time: float
-    roll_gradient: float
-    pitch_gradient: float
-    largest_steer: float
-    steering_rate: float
-    steering_time: float
-    current_time: float
-    largest_current: float
-
-    def __post_init__(self) -> None:
-        for name in PARAMETERS:
-            value = getattr(self, name)
-            if not is_number(value):
-                raise ConfigurationError(f"vehicle '{self.name}': {name} must be a finite number, not {value!r}")
-            if not (value > 0.0 or (value == 0.0 and name in MAY_BE_ZERO)):
-                raise ConfigurationError(
-                    f"vehicle '{self.name}': {name} must be {'zero or ' if name in MAY_BE_ZERO else ''}positive, not {value}"
-                )
-        for name, most in (("shape_factor", 2.0), ("load_sensitivity", 0.5), ("roll_share_front", 1.0), ("carcass_damping", 1.0)):
-            if getattr(self, name) > most:
-                raise ConfigurationError(f"vehicle '{self.name}': {name} must be at most {most:g}, not {getattr(self, name)}")
+    mass: Positive
+    yaw_inertia: Positive
+    cg_to_front_axle: Positive
+    cg_to_rear_axle: Positive
+    track: Positive
+    cg_height: ZeroOrPositive
+    wheel_radius: Positive
+    wheel_inertia: Positive
+    motor_inertia: Positive
+    torque_constant: Positive
+    coulomb_torque: ZeroOrPositive
+    viscous_torque: ZeroOrPositive
+    axle_lock: ZeroOrPositive
+    centre_lock: ZeroOrPositive
+    air_drag: ZeroOrPositive
+    friction: Positive
+    load_sensitivity: Annotated[float, Field(ge=0.0, le=0.5)]
+    stiffness_factor_front: Positive
+    stiffness_factor_rear: Positive
+    shape_factor: Annotated[float, Field(gt=0.0, le=2.0)]
+    relaxation_length: Positive
+    carcass_damping: Share
+    roll_share_front: Share
+    load_time: Positive
+    roll_gradient: ZeroOrPositive
+    pitch_gradient: ZeroOrPositive
+    largest_steer: Positive
+    steering_rate: Positive
+    steering_time: Positive
+    current_time: Positive
+    largest_current: Positive
 
     @property
     def wheelbase(self) -> float:
@@ -112,53 +102,37 @@ class PlanarCar:
 PARAMETERS = tuple(entry.name for entry in fields(PlanarCar) if entry.name != "name")
 """Names of the plant's parameters, in order."""
 
-MAY_BE_ZERO = frozenset(
-    {
-        "cg_height",
-        "coulomb_torque",
-        "viscous_torque",
-        "axle_lock",
-        "centre_lock",
-        "air_drag",
-        "load_sensitivity",
-        "carcass_damping",
-        "roll_share_front",
-        "roll_gradient",
-        "pitch_gradient",
-    }
-)
-"""Parameters of effects that may be absent."""
+
+@dataclass(frozen=True)
+class PlanarVehicle:
+    """A vehicle's configuration."""
+
+    name: str
+    plant: str
+    parameters: Annotated[dict[str, Any], "a mapping"]
 
 
 def planar_car_from_configuration(configuration: Mapping[str, Any]) -> PlanarCar:
     """A car from the keys ``name``, ``plant`` and ``parameters``.
 
     Raises:
-        ConfigurationError: a key or a parameter is missing or unknown, or see PlanarCar.
+        ConfigurationError: a key or a parameter is missing or unknown, or a value makes no sense.
     """
-    known = {"name", "plant", "parameters"}
-    unknown, missing = sorted(set(configuration) - known), sorted(known - set(configuration))
-    if unknown or missing:
-        raise ConfigurationError(f"planar vehicle: unknown keys {unknown}, missing keys {missing}; it has {sorted(known)}")
-    name, values = str(configuration["name"]), configuration["parameters"]
-    if not isinstance(values, Mapping):
-        raise ConfigurationError(f"vehicle '{name}': parameters must be a mapping, not {values!r}")
-    unknown, missing = sorted(set(values) - set(PARAMETERS)), sorted(set(PARAMETERS) - set(values))
-    if unknown or missing:
-        raise ConfigurationError(
-            f"vehicle '{name}': unknown parameters {unknown}, missing parameters {missing}; the planar plant has {', '.join(PARAMETERS)}"
-        )
-    return PlanarCar(name, **values)
+    whole = validated(PlanarVehicle, dict(configuration), "planar vehicle", error=ConfigurationError)
+    return _checked(whole.name, whole.parameters)
 
 
 def scaled_car(car: PlanarCar, factors: Mapping[str, float]) -> PlanarCar:
     """The car with some of its parameters scaled.
 
     Raises:
-        ConfigurationError: a name is no parameter, or see PlanarCar.
+        ConfigurationError: a name is no parameter, or the scaled value makes no sense.
     """
     unknown = sorted(set(factors) - set(PARAMETERS))
     if unknown:
         raise ConfigurationError(f"vary: '{unknown[0]}' is no parameter of vehicle '{car.name}' that can be scaled")
-    changes: dict[str, Any] = {name: getattr(car, name) * factor for name, factor in factors.items()}
-    return replace(car, **changes)
+    return _checked(car.name, {name: value * factors.get(name, 1.0) for name, value in car.parameters.items()})
+
+
+def _checked(name: str, parameters: dict[str, Any]) -> PlanarCar:
+    return validated(PlanarCar, {"name": name, **parameters}, f"vehicle '{name}'", error=ConfigurationError)

@@ -1,7 +1,7 @@
-"""Where the multi-body equations do not hold: near standstill, and in a spin.
+"""Regimes of the plant beside the multi-body equations: near standstill, and in a spin.
 
-Three regimes share one state vector and one set of suspension equations; what differs is where the forces of the tyres
-come from, and how the planar motion follows.
+Three regimes share one state vector and one set of suspension equations; they differ in the forces of the tyres and
+in how the planar motion follows.
 
 - ROLLING: tyre formulas and the multi-body equations as they are. Slip and its stiffness grow with 1/vx.
 - SLOW: below about 1 m/s the wheels roll without slip and the car follows its front wheels (kinematic single track).
@@ -9,8 +9,8 @@ come from, and how the planar motion follows.
 - SLIDING: after a spin the wheels are locked, and every contact patch slides against its velocity with the friction
   that the lateral tyre formula has at a right angle. It ends at standstill.
 
-All functions are compiled (compiled.py) and use the library's axes, whose vertical axis points down. In them a positive
-quantity to the right is what a positive quantity to the left is in ISO 8855 axes; see plant.py.
+All functions are compiled and use the library's axes, whose vertical axis points down. A positive
+quantity to the right in them is one to the left in ISO 8855 axes; see multi_body.py.
 """
 
 from __future__ import annotations
@@ -109,8 +109,8 @@ def wheel_velocities(x, p):  # type: ignore[no-untyped-def]
 
 
 @_kernel
-def forces_of_contact(contact, x, u, p, fx0, fx1, fx2, fx3, fy0, fy1, fy2, fy3, fz0, fz1, fz2, fz3):  # type: ignore[no-untyped-def]
-    """Longitudinal and lateral forces of the four tyres in the wheels' axes, where the tyre formulas gave fx and fy.
+def forces_of_contact(contact, x, u, p, along, across, loads):  # type: ignore[no-untyped-def]
+    """Longitudinal and lateral forces of the four tyres in the wheels' axes.
 
     Args:
         contact: regime, inputs of the plant, friction of sliding front and rear tyres, whether lateral forces lag, and eight lateral forces
@@ -118,14 +118,15 @@ def forces_of_contact(contact, x, u, p, fx0, fx1, fx2, fx3, fy0, fy1, fy2, fy3, 
         x: state.
         u: steering velocity and acceleration within the vehicle's limits.
         p: parameters.
-        fx0, fx1, fx2, fx3, fy0, fy1, fy2, fy3, fz0, fz1, fz2, fz3: forces, in the library's order of wheels.
+        along, across, loads: longitudinal and lateral forces of the tyre formulas and wheel loads, four each.
     """
     regime, inputs, friction_front, friction_rear, lags, held = contact
     if regime == ROLLING and lags:
-        held[4], held[5], held[6], held[7] = fy0 / fz0, fy1 / fz1, fy2 / fz2, fy3 / fz3
-        return fx0, fx1, fx2, fx3, held[0] * fz0, held[1] * fz1, held[2] * fz2, held[3] * fz3
+        for i in range(4):
+            held[4 + i] = across[i] / loads[i]
+        return *along, held[0] * loads[0], held[1] * loads[1], held[2] * loads[2], held[3] * loads[3]
     if regime == ROLLING:
-        return fx0, fx1, fx2, fx3, fy0, fy1, fy2, fy3
+        return *along, *across
     sine, cosine = math.sin(x[STEER]), math.cos(x[STEER])
     if regime == SLOW:
         front_x, rear_x, front_y, rear_y = _forces_needed(x, u, inputs, p)
@@ -134,20 +135,11 @@ def forces_of_contact(contact, x, u, p, fx0, fx1, fx2, fx3, fy0, fy1, fy2, fy3, 
         return front_x, front_x, rear_x, rear_x, front_y, front_y, rear_y, rear_y
     half_front, half_rear = 0.5 * p.T_f * x[YAW_RATE], 0.5 * p.T_r * x[YAW_RATE]
     front_vy, rear_vy = x[VY] + p.a * x[YAW_RATE], x[VY] - p.b * x[YAW_RATE]
-    x0, y0 = _coulomb(friction_front * fz0, x[VX] + half_front, front_vy)
-    x1, y1 = _coulomb(friction_front * fz1, x[VX] - half_front, front_vy)
-    x2, y2 = _coulomb(friction_rear * fz2, x[VX] + half_rear, rear_vy)
-    x3, y3 = _coulomb(friction_rear * fz3, x[VX] - half_rear, rear_vy)
-    return (
-        x0 * cosine + y0 * sine,
-        x1 * cosine + y1 * sine,
-        x2,
-        x3,
-        y0 * cosine - x0 * sine,
-        y1 * cosine - x1 * sine,
-        y2,
-        y3,
-    )
+    x0, y0 = _coulomb(friction_front * loads[0], x[VX] + half_front, front_vy)
+    x1, y1 = _coulomb(friction_front * loads[1], x[VX] - half_front, front_vy)
+    x2, y2 = _coulomb(friction_rear * loads[2], x[VX] + half_rear, rear_vy)
+    x3, y3 = _coulomb(friction_rear * loads[3], x[VX] - half_rear, rear_vy)
+    return x0 * cosine + y0 * sine, x1 * cosine + y1 * sine, x2, x3, y0 * cosine - x0 * sine, y1 * cosine - x1 * sine, y2, y3
 
 
 @_kernel

@@ -1,7 +1,7 @@
 """Stability control: a yaw moment by braking one side, when the car does not yaw as its driver asks.
 
-The reference is what a linear single track would do in steady state at this steering angle, no more than friction allows
-at this speed, and as late as a car answers (e.g. Rajamani, "Vehicle Dynamics and Control", chapter on electronic
+The reference is the steady yaw rate of a linear single track at this steering angle, limited by friction
+at this speed and delayed as a car answers (e.g. Rajamani, "Vehicle Dynamics and Control", chapter on electronic
 stability control). The control acts between two thresholds of the yaw rate's error, with hysteresis.
 """
 
@@ -16,7 +16,7 @@ from vehest.simulation.plant.multi_body import MultiBodyPlant
 
 @dataclass(frozen=True)
 class StabilityState:
-    """What the control remembers and does.
+    """State of the control.
 
     Args:
         reference: yaw rate that it follows [rad/s].
@@ -61,10 +61,10 @@ class StabilityControl:
     def step(
         self, before: StabilityState, interval: float, *, steer: float, vx: float, yaw_rate: float, friction: float = 1.0
     ) -> StabilityState:
-        """What the control does from now on.
+        """The control's next state.
 
         Args:
-            before: what it did until now.
+            before: its state until now.
             interval: time since then [s].
             steer: road-wheel angle [rad].
             vx: forward speed [m/s].
@@ -87,7 +87,7 @@ class StabilityControl:
 def stability_control(plant: MultiBodyPlant) -> StabilityControl:
     """A control for this car, from its parameters.
 
-    Its largest moment is what the friction of one side gives under its static load. A side that is braked against a spin carries more;
+    Its largest moment is that of one side's friction under its static load. A side that is braked against a spin carries more;
     the rest is left for cornering.
     """
     parameters = plant.parameters

@@ -1,19 +1,18 @@
-"""What tyres lose over a stint: grip while they are cold, and grip that is worn away."""
+"""Loss of grip over a stint: cold tyres, and wear."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from typing import Any
 
 from vehest.data.errors import ConfigurationError
-from vehest.simulation.plant.parameters import is_number
+from vehest.data.schema import validated
 
 
 @dataclass(frozen=True)
 class Stint:
-    """Friction of the tyres over the time of a drive, as a factor of what it is when they are warm and new; all values are assumed.
+    """Friction of the tyres over the time of a drive, over that of warm, new tyres; all values are assumed.
 
     factor(t) = (1 - cold exp(-t/warm_time)) (1 - wear min(t/wear_time, 1))
 
@@ -47,12 +46,9 @@ class Stint:
 
 
 def stint_from_config(values: Any) -> Stint:
-    """A stint as a drive's ``tyres`` spells it: ``{cold: 0.06, wear: 0.04}``.
+    """A stint from a drive's ``tyres``: ``{cold: 0.06, wear: 0.04}``.
 
     Raises:
         ConfigurationError: an unknown name, or see Stint.
     """
-    known = [entry.name for entry in fields(Stint)]
-    if not isinstance(values, Mapping) or set(values) - set(known) or not all(is_number(value) for value in values.values()):
-        raise ConfigurationError(f"tyres is a mapping of numbers from {', '.join(known)}, not {values}")
-    return Stint(**{str(name): float(value) for name, value in values.items()})
+    return validated(Stint, values, "tyres", error=ConfigurationError)

@@ -1,1 +1,1 @@
-"""What is driven on: courses and their segments, lines across open areas, surfaces."""
+"""Courses and their segments, lines across open areas, surfaces."""

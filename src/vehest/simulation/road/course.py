@@ -23,7 +23,7 @@ class Course:
     """A closed centre line, sampled from arc length 0 to the full length; first and last sample are the same place.
 
     Args:
-        name: what recordings call it.
+        name: in recordings.
         arc_length: (N,) [m], uniform.
         x, y: (N,) [m].
         heading: (N,), not wrapped [rad].

@@ -15,7 +15,7 @@ from vehest.constants import FloatArray
 SPACING = 0.5
 """Of the samples of a line [m]."""
 CLEARANCE = 0.15
-"""Room that a driver means to leave between the car and a cone [m]; assumed."""
+"""Room between the car and a cone [m]; assumed."""
 _KNOTS = 1.5
 """Spacing of the points that are sought for the smoothest line [m]."""
 _SMOOTH = 6.0

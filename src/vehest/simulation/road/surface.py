@@ -4,14 +4,15 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, fields
-from typing import Any
+from dataclasses import dataclass
+from typing import Annotated, Any
 
 import numpy as np
+from pydantic import Field
 
 from vehest.constants import FloatArray
 from vehest.data.errors import ConfigurationError
-from vehest.simulation.plant.parameters import is_number
+from vehest.data.schema import validated
 
 _STREAM = 2  # of a drive's seed; 0 is the driver's, 1 the sensors'
 
@@ -24,7 +25,7 @@ class Surface:
     uniformly, and a length drawn from ``patch_length``, uniformly. Friction changes over two metres between them.
 
     Args:
-        name: what recordings call it.
+        name: in recordings.
         friction: scale of the tyres' friction; 1 is the dry road of the vehicle's tyre data.
         patches: lowest scale of a patch.
         patch_length: shortest and longest patch [m].
@@ -38,7 +39,7 @@ class Surface:
     friction: float = 1.0
     patches: float | None = None
     patch_length: tuple[float, float] = (20.0, 80.0)
-    seed: int | None = None
+    seed: Annotated[int, Field(ge=0), "a whole number, zero or positive"] | None = None
 
     def __post_init__(self) -> None:
         lowest = self.friction if self.patches is None else self.patches
@@ -98,19 +99,4 @@ def surface_from_config(configuration: str | Mapping[str, Any] | None) -> Surfac
         raise ConfigurationError(
             f"a surface is one of {', '.join(SURFACES)}, or a mapping such as {{friction: 0.6}}, not {configuration!r}"
         )
-    known = {entry.name for entry in fields(Surface)}
-    unknown = sorted(set(configuration) - known)
-    if unknown:
-        raise ConfigurationError(f"surface: unknown keys {unknown}; it has {sorted(known)}")
-    values: dict[str, Any] = {"name": "own", **configuration}
-    name, seed, length = str(values["name"]), values.get("seed"), values.get("patch_length")
-    for key in ("friction", "patches"):
-        if key in values and not is_number(values[key]):
-            raise ConfigurationError(f"surface '{name}': {key} must be a number, not {values[key]!r}")
-    if seed is not None and (isinstance(seed, bool) or not isinstance(seed, int) or seed < 0):
-        raise ConfigurationError(f"surface '{name}': seed must be a whole number, zero or positive, not {seed!r}")
-    if length is not None:
-        if not isinstance(length, list | tuple) or len(length) != 2 or not all(is_number(end) for end in length):
-            raise ConfigurationError(f"surface '{name}': patch_length is a pair [shortest, longest] in metres, not {length!r}")
-        values["patch_length"] = (float(length[0]), float(length[1]))
-    return Surface(**values)
+    return validated(Surface, {"name": "own", **configuration}, "surface", error=ConfigurationError)

@@ -10,7 +10,7 @@ from vehest.simulation.road.segments import Compound, Segment, Straight, left, r
 
 @dataclass(frozen=True)
 class Layout:
-    """What a course is made of.
+    """Layout of a course.
 
     Args:
         segments: in the order they are driven.

@@ -1,1 +1,1 @@
-"""What is measured of a motion: presets of sensors, their errors, and recordings of what they show."""
+"""Simulated sensors: presets, errors, and the channels they give."""

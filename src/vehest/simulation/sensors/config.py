@@ -1,4 +1,4 @@
-"""How a configuration or a study changes the presets of simulated sensors, down to one error of one sensor."""
+"""Levels of simulated sensors from a configuration: a preset, and changes down to one error of one sensor."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from vehest.simulation.sensors.levels import (
 )
 
 OFF = "off"
-"""How a configuration says so; YAML makes False of it, a command line leaves it as it is."""
+"""Switches errors off; YAML reads False, a command line the text."""
 
 
 def switched_off(levels: SensorLevels, *names: str) -> SensorLevels:
@@ -46,9 +46,7 @@ def switched_off(levels: SensorLevels, *names: str) -> SensorLevels:
 
 
 def sensor_levels_from_config(value: Any) -> SensorLevels:
-    """Levels as a data set's ``sensors`` spells them.
-
-    ``race``, or a mapping that starts from a ``preset`` (by default ``default``) and changes some of it::
+    """Levels from a data set's ``sensors``: a preset's name, or a mapping that changes a ``preset`` (by default ``default``)::
 
         {preset: race, reference: optical, ay: {noise: 0, offset: 0.05}, steer: off, tilt: {bank: off}, switched_off: ["*.drift"]}
 
@@ -58,27 +56,20 @@ def sensor_levels_from_config(value: Any) -> SensorLevels:
     Raises:
         ConfigurationError: an unknown name, with those there are, or a value that makes no sense.
     """
-    if value is None:
-        return PRESETS["default"]
-    if isinstance(value, str):
-        return _preset(value)
-    if not isinstance(value, Mapping):
+    if value is not None and not isinstance(value, str | Mapping):
         raise ConfigurationError(f"sensors is the name of a preset ({', '.join(PRESETS)}) or a mapping, not {value!r}")
-    changes = {str(key): change for key, change in value.items()}
-    levels = _preset(str(changes.pop("preset", "default")))
+    given = {"preset": value} if isinstance(value, str) else value or {}
+    changes = {str(key): change for key, change in given.items()}
+    preset = str(changes.pop("preset", "default"))
+    if preset not in PRESETS:
+        raise ConfigurationError(f"sensors '{preset}' is not one of: {', '.join(PRESETS)}")
     off = changes.pop("switched_off", ())
     if isinstance(off, str):
         off = [off]
     if not isinstance(off, Iterable) or isinstance(off, Mapping):
         raise ConfigurationError(f"sensors: switched_off is a list of names such as ay.noise, not {off!r}")
-    levels = _changed(levels, changes, "sensors", also=("preset", "switched_off"))
+    levels = _changed(PRESETS[preset], changes, "sensors", also=("preset", "switched_off"))
     return switched_off(levels, *off)
-
-
-def _preset(name: str) -> SensorLevels:
-    if name not in PRESETS:
-        raise ConfigurationError(f"sensors '{name}' is not one of: {', '.join(PRESETS)}")
-    return PRESETS[name]
 
 
 def _reference(kind: Any) -> Reference:
@@ -124,7 +115,7 @@ def _changed_value(old: Any, change: Any, where: str) -> Any:
 
 
 def _off_at(levels: Any, path: list[str], name: str) -> Any:
-    """Levels with what stands at a path off; ``name`` is the whole path, for complaints."""
+    """Levels with the errors at a path off; ``name`` is the whole path, for messages."""
     key, rest = path[0], path[1:]
     choices = [entry.name for entry in fields(levels) if entry.name not in NO_ERRORS]
     if key not in choices:

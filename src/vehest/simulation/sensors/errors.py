@@ -1,4 +1,4 @@
-"""What a sensor does to a true signal: delay, scale, offset, drift, noise and quantisation, each from a random stream of its own."""
+"""Errors of a sensor: delay, scale, offset, drift, noise and quantisation, each from a random stream of its own."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ STREAM = 1
 
 
 def shown(true: FloatArray, level: SensorLevel, rate_hz: float, seed: int, name: str) -> FloatArray:
-    """What a sensor shows of a true signal (T,).
+    """Signal of a sensor (T,) for a true signal.
 
     Args:
         true: (T,), uniformly sampled.
@@ -42,7 +42,7 @@ def shown(true: FloatArray, level: SensorLevel, rate_hz: float, seed: int, name:
 
 
 def stream(seed: int, name: str) -> np.random.Generator:
-    """The random stream of one error of one sensor in one drive, whatever other errors there are."""
+    """The random stream of one error of one sensor in one drive, independent of other errors."""
     return np.random.default_rng(np.random.SeedSequence(entropy=seed, spawn_key=(STREAM, zlib.crc32(name.encode()))))
 
 

@@ -1,4 +1,4 @@
-"""How good simulated sensors are: presets, each number with its source."""
+"""Error levels of simulated sensors: presets, each number with its source."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from vehest.data.errors import ConfigurationError
 
 @dataclass(frozen=True)
 class SensorLevel:
-    """How large the errors of one sensor are; ``unit`` is its channel's unit.
+    """Errors of one sensor; ``unit`` is its channel's unit.
 
     shown = quantise((1 + gain) (1 + scale) true(t - delay) + bias + offset + drift(t) + noise(t))
 
@@ -46,23 +46,18 @@ class SensorLevel:
     bias: float = 0.0
 
     def __post_init__(self) -> None:
-        for entry in fields(self):
-            value = getattr(self, entry.name)
-            if entry.name in ("gain", "bias") and not math.isfinite(value):
-                raise ConfigurationError(f"{entry.name} must be finite, not {value}")
-            if entry.name not in ("gain", "bias") and not (math.isfinite(value) and value >= 0.0):
-                raise ConfigurationError(f"{entry.name} must be zero or positive, not {value}")
+        _require_finite(self, *(entry.name for entry in fields(self) if entry.name not in ("gain", "bias")))
         if self.drift_time == 0.0:
             raise ConfigurationError("drift_time must be positive, not 0")
 
 
-def _require_finite(levels: Any, not_negative: str) -> None:
+def _require_finite(levels: Any, *not_negative: str) -> None:
     for entry in fields(levels):
         value = getattr(levels, entry.name)
         if isinstance(value, float) and not math.isfinite(value):
             raise ConfigurationError(f"{entry.name} must be finite, not {value}")
-    if getattr(levels, not_negative) < 0.0:
-        raise ConfigurationError(f"{not_negative} must be zero or positive, not {getattr(levels, not_negative)}")
+        if entry.name in not_negative and value < 0.0:
+            raise ConfigurationError(f"{entry.name} must be zero or positive, not {value}")
 
 
 @dataclass(frozen=True)
@@ -87,7 +82,7 @@ class Mounting:
     misalignment: float = 0.0
 
     def __post_init__(self) -> None:
-        _require_finite(self, not_negative="misalignment")
+        _require_finite(self, "misalignment")
 
 
 @dataclass(frozen=True)
@@ -111,8 +106,7 @@ class Tilt:
     roll_share: float = 1.0
 
     def __post_init__(self) -> None:
-        if not math.isfinite(self.roll_share):
-            raise ConfigurationError(f"roll_share must be finite, not {self.roll_share}")
+        _require_finite(self)
 
 
 @dataclass(frozen=True)
@@ -132,9 +126,7 @@ class Vibration:
     ay: float = 0.0
 
     def __post_init__(self) -> None:
-        _require_finite(self, not_negative="yaw_rate")
-        _require_finite(self, not_negative="ax")
-        _require_finite(self, not_negative="ay")
+        _require_finite(self, "yaw_rate", "ax", "ay")
 
 
 @dataclass(frozen=True)
@@ -167,7 +159,7 @@ class Reference:
     lever_error: float = 0.0
 
     def __post_init__(self) -> None:
-        _require_finite(self, not_negative="lever_error")
+        _require_finite(self, "lever_error")
         if self.heading.delay or self.heading.scale or self.heading.quantisation:
             raise ConfigurationError("heading has noise, offset and drift only")
 
@@ -189,7 +181,7 @@ GNSS = Reference(
 
 OPTICAL = Reference(
     kind="optical",
-    # All assumed, of the order that is usual for optical two-axis sensors: no data sheet of one was at hand.
+    # All assumed, of the order that is usual for optical two-axis sensors: no data sheet was available.
     vx=SensorLevel(noise=0.004, quantisation=0.003, delay=0.008, scale=0.001),
     vy=SensorLevel(noise=0.004, quantisation=0.003, delay=0.008, scale=0.001),
     yaw_rate=SensorLevel(noise=1.75e-4, offset=0.001, delay=0.008),
@@ -212,11 +204,16 @@ MOTION_CAPTURE = Reference(
 REFERENCES: dict[str, Reference] = {reference.kind: reference for reference in (OPTICAL, GNSS, MOTION_CAPTURE, Reference())}
 
 
+_GYRO = SensorLevel(noise=2.5e-4, offset=0.002, drift=5e-4, quantisation=1.75e-4, delay=0.008, scale=0.01)
+_ACCELEROMETER = SensorLevel(noise=0.0083, offset=0.03, drift=0.01, quantisation=0.00196, delay=0.008, scale=0.01)
+_WHEEL_FORCE = SensorLevel(noise=10.0, offset=100.0, drift=50.0, quantisation=6.0, delay=0.005, scale=0.005)
+
+
 @dataclass(frozen=True)
 class SensorLevels:
     """Errors of all sensors of a car; the defaults are those of production sensors, the preset ``default``.
 
-    Each sensor and each kind of error has a random stream of its own: what one level is changes nothing else.
+    Each sensor and each kind of error has a random stream of its own: one level changes no other error.
 
     Args:
         vx: of the forward speed, which is the true speed with the errors of an odometer, not computed from the wheels: 0.05 m/s at
@@ -245,16 +242,16 @@ class SensorLevels:
     """
 
     vx: SensorLevel = SensorLevel(noise=0.0071, quantisation=0.0028, delay=0.02, scale=0.005)
-    yaw_rate: SensorLevel = SensorLevel(noise=2.5e-4, offset=0.002, drift=5e-4, quantisation=1.75e-4, delay=0.008, scale=0.01)
-    roll_rate: SensorLevel = SensorLevel(noise=2.5e-4, offset=0.002, drift=5e-4, quantisation=1.75e-4, delay=0.008, scale=0.01)
-    pitch_rate: SensorLevel = SensorLevel(noise=2.5e-4, offset=0.002, drift=5e-4, quantisation=1.75e-4, delay=0.008, scale=0.01)
-    ax: SensorLevel = SensorLevel(noise=0.0083, offset=0.03, drift=0.01, quantisation=0.00196, delay=0.008, scale=0.01)
-    ay: SensorLevel = SensorLevel(noise=0.0083, offset=0.03, drift=0.01, quantisation=0.00196, delay=0.008, scale=0.01)
+    yaw_rate: SensorLevel = _GYRO
+    roll_rate: SensorLevel = _GYRO
+    pitch_rate: SensorLevel = _GYRO
+    ax: SensorLevel = _ACCELEROMETER
+    ay: SensorLevel = _ACCELEROMETER
     steer: SensorLevel = SensorLevel(noise=7.1e-5, offset=0.0017, quantisation=1.1e-4, delay=0.01)
     wheel_speed: SensorLevel = SensorLevel(noise=0.0071, quantisation=0.01, delay=0.01, scale=0.005)
-    fx: SensorLevel = SensorLevel(noise=10.0, offset=100.0, drift=50.0, quantisation=6.0, delay=0.005, scale=0.005)
-    fy: SensorLevel = SensorLevel(noise=10.0, offset=100.0, drift=50.0, quantisation=6.0, delay=0.005, scale=0.005)
-    fz: SensorLevel = SensorLevel(noise=10.0, offset=100.0, drift=50.0, quantisation=6.0, delay=0.005, scale=0.005)
+    fx: SensorLevel = _WHEEL_FORCE
+    fy: SensorLevel = _WHEEL_FORCE
+    fz: SensorLevel = _WHEEL_FORCE
     imu: Mounting = Mounting(misalignment=0.0035)
     tilt: Tilt = Tilt()
     reference: Reference = GNSS
@@ -279,14 +276,16 @@ def without_errors(level: Any) -> Any:
     return False if isinstance(level, bool) else 0.0
 
 
+def _gyros(level: SensorLevel) -> dict[str, Any]:
+    """The level of the yaw rate's gyro for all three, assumed for the other two."""
+    return {"yaw_rate": level, "roll_rate": level, "pitch_rate": level}
+
+
 # The Ferrari's figures are what noise_reading.read_off finds in 55,001 samples of Palm Beach 2014, 20140222_01_01_03; its sensors cannot
 # be told from the car and the road they shake with. What a recording without truth cannot show is assumed, or taken from ``default``.
 RACE = SensorLevels(
     vx=SensorLevel(noise=0.0017),  # read off; it is the reference's own speed
-    # Noise and delay read off; offset and scale assumed.
-    yaw_rate=SensorLevel(noise=6.5e-4, offset=5e-4, delay=0.0116, scale=0.003),
-    roll_rate=SensorLevel(noise=6.5e-4, offset=5e-4, delay=0.0116, scale=0.003),  # assumed, as yaw_rate
-    pitch_rate=SensorLevel(noise=6.5e-4, offset=5e-4, delay=0.0116, scale=0.003),
+    **_gyros(SensorLevel(noise=6.5e-4, offset=5e-4, delay=0.0116, scale=0.003)),  # noise and delay read off; offset and scale assumed
     # Read off but for the scale (assumed). Offset: the mean of what the accelerations lack against the reference's velocities; drift:
     # what is left of that below 0.5 Hz when delays, white noise and the gravity of roll and pitch are taken out, a banked road included;
     # its time is known to a factor of two. Delays are known to some 3 ms, by what other bands than 0.2 to 2 Hz give.
@@ -303,9 +302,7 @@ RACE = SensorLevels(
 # (docs/compare_tyre_sets.py).
 SMALL_CAR = SensorLevels(
     # vx stays: a planar drive shows the motor's speed at the rim instead. So do the tyres' forces, which nobody measures there.
-    yaw_rate=SensorLevel(noise=0.006, offset=0.0065, delay=0.005),  # noise, offset read off; delay assumed
-    roll_rate=SensorLevel(noise=0.006, offset=0.0065, delay=0.005),  # assumed, as yaw_rate
-    pitch_rate=SensorLevel(noise=0.006, offset=0.0065, delay=0.005),  # assumed, as yaw_rate
+    **_gyros(SensorLevel(noise=0.006, offset=0.0065, delay=0.005)),  # noise, offset read off; delay assumed
     ax=SensorLevel(noise=0.17, offset=0.1, delay=0.005),  # noise read off; offset and delay assumed
     ay=SensorLevel(noise=0.17, offset=0.15, delay=0.005),  # noise as ax; offset as docs/sources/f1tenth.md finds it; delay assumed
     steer=SensorLevel(noise=2e-4, offset=0.005),  # assumed: the servo's command, and how well its neutral is trimmed

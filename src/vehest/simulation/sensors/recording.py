@@ -1,6 +1,6 @@
-"""Simulated sensors: what they show of a true motion, with errors that can be switched off one by one.
+"""Channels that the simulated sensors show of a true motion, and how provenance describes the sensors.
 
-How large the errors are stands in ``sensor_levels``, how they are changed in ``sensor_config``, how they arise in ``sensor_errors``.
+true motion -> tilt, mounting and vibration of the inertial unit -> errors of each sensor (errors.py), as large as levels.py has them
 """
 
 from __future__ import annotations
@@ -12,34 +12,15 @@ import numpy as np
 
 from vehest.constants import GRAVITY, FloatArray
 from vehest.simulation.plant.motion import WHEELS, Motion
-from vehest.simulation.sensors.config import sensor_levels_from_config, switched_off
 from vehest.simulation.sensors.errors import shown, stream
-from vehest.simulation.sensors.levels import PRESETS, Mounting, Reference, SensorLevel, SensorLevels, Tilt, Vibration, ideal_sensors
-
-__all__ = [
-    "GRAVITY",
-    "PRESETS",
-    "Mounting",
-    "Reference",
-    "SensorLevel",
-    "SensorLevels",
-    "Tilt",
-    "Vibration",
-    "body_rates",
-    "described",
-    "ideal_sensors",
-    "measure",
-    "sensor_levels_from_config",
-    "specific_force",
-    "switched_off",
-]
+from vehest.simulation.sensors.levels import Reference, SensorLevels, Tilt, Vibration
 
 
 def measure(motion: Motion, levels: SensorLevels, seed: int) -> dict[str, FloatArray]:
     """Channels (canonical name -> (T,), SI units) that the sensors show of a motion; the same arguments give the same samples.
 
     Args:
-        motion: what the car really did.
+        motion: true motion.
         levels: of the sensors' errors.
         seed: of the errors; each error of each sensor draws from a stream of its own, so that changing one level leaves the rest alone.
     """
@@ -63,7 +44,7 @@ def measure(motion: Motion, levels: SensorLevels, seed: int) -> dict[str, FloatA
 
 
 def described(levels: SensorLevels, motion: Motion) -> dict[str, Any]:
-    """What provenance says of the sensors that measured a motion: all but those of a motor, and a vibration, that are not there."""
+    """Sensors that measured a motion, for provenance; without those of a motor, and a vibration, that are not there."""
     absent = {name for name in ("motor_speed", "motor_current") if getattr(motion, name) is None}
     if levels.vibration == Vibration():
         absent.add("vibration")
@@ -73,7 +54,7 @@ def described(levels: SensorLevels, motion: Motion) -> dict[str, Any]:
 
 
 _IDLE = {"gain": 0.0, "bias": 0.0, "roll_share": 1.0}
-"""Values that do nothing, and are not said."""
+"""Values without effect, left out."""
 
 
 def _without_idle(value: Any) -> Any:
@@ -173,7 +154,7 @@ def _turned(vector: FloatArray, roll: FloatArray | float, pitch: FloatArray | fl
 
 
 def _reference(motion: Motion, reference: Reference, seed: int) -> dict[str, FloatArray]:
-    """Reference channels: velocity where the sensor sits, in its axes, moved to the centre of gravity with what it knows."""
+    """Reference channels: velocity where the sensor sits, in its axes, moved to the centre of gravity."""
     rate_hz = motion.rate_hz
     forward = motion.vx - motion.yaw_rate * reference.lever_y + motion.pitch_rate * reference.lever_z
     left = motion.vy + motion.yaw_rate * reference.lever_x - motion.roll_rate * reference.lever_z
