@@ -21,13 +21,12 @@ from vehest.estimators.dugoff_ukf import PseudoMeasurement, with_variance
 from vehest.estimators.filtering.track_filter import TrackFilter
 from vehest.estimators.network_ukf import LEAST_VARIANCE, NetworkUkf
 from vehest.estimators.networks.sample_network import SampleNetwork, clip_sideslip, learnt_samples
-from vehest.estimators.phase_records import record_of_phases
 from vehest.estimators.references import reference_sideslip
 from vehest.filters.gaussian import Gaussian
 from vehest.training.context import FitContext
 from vehest.training.identification import IdentificationSettings
 from vehest.training.samples import Draw, Samples, sample_phase
-from vehest.training.sequences import Phase, PhaseSettings, train_phases
+from vehest.training.sequences import Phase, PhaseSettings, record_of_phases, train_phases
 
 START = (0.1, 0.02)  # m/s, rad/s: standard deviations of the true state that a training sequence starts from
 MOST_NOISE = 0.5  # m/s, rad/s, rad: middle of the logistic functions, beyond which no deviation starts or is pre-trained

@@ -18,12 +18,11 @@ from vehest.estimators.dugoff_ukf import PseudoMeasurement, finite
 from vehest.estimators.kernels.sample_network import gaussian_likelihood
 from vehest.estimators.network_ukf import LEAST_VARIANCE, NetworkUkf
 from vehest.estimators.networks.sample_network import SampleNetwork, clip_sideslip, learnt_samples
-from vehest.estimators.phase_records import record_of_phases
 from vehest.training.context import FitContext
 from vehest.training.identification import IdentificationSettings
 from vehest.training.samples import SampleSettings, sample_phase
 from vehest.training.search import SearchRecord, nelder_mead_over_grid, staged_optuna_search
-from vehest.training.sequences import PhaseSettings, train_phases
+from vehest.training.sequences import PhaseSettings, record_of_phases, train_phases
 
 BOX = ((-6.0, 4.0), (0.2, 2.0))
 """Admissible p₁ and p₂ of Eq. 11; (0, 1) leaves the variance as it is."""

@@ -21,14 +21,13 @@ from vehest.estimators.base import Estimator, FitData, FitRecord, Trial
 from vehest.estimators.filtering.car_filter import LEAST_ENTROPY, CarFilter
 from vehest.estimators.filtering.sigma_point_stepper import FilterStep, SigmaPointEstimator
 from vehest.estimators.network import Network
-from vehest.estimators.phase_records import record_of_phases
 from vehest.filters.definiteness import MARGIN
 from vehest.filters.gating import Gate, gate_values, in_words, suffix
 from vehest.filters.gaussian import Gaussian
 from vehest.filters.noise_models import StateDependentNoise
 from vehest.filters.unscented_scan import UnscentedStepper
 from vehest.training.context import FitContext
-from vehest.training.sequences import PhaseRecord, train_phases
+from vehest.training.sequences import PhaseRecord, record_of_phases, train_phases
 from vehest.training.through_filter import Drive, ThroughFilterSettings, Weights, filter_phases, one_step_phase
 from vehest.vehicle.dynamics import (
     PACEJKA,

@@ -19,10 +19,9 @@ from vehest.estimators.networks.sample_network import (
     clip_sideslip,
     learnt_samples,
 )
-from vehest.estimators.phase_records import record_of_phases
 from vehest.training.context import FitContext
 from vehest.training.samples import SampleSettings, sample_phase
-from vehest.training.sequences import train_phases
+from vehest.training.sequences import record_of_phases, train_phases
 
 
 class SideslipFfnn(OnSamples):

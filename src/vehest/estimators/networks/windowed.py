@@ -79,24 +79,7 @@ class WindowedEstimator(Network):
             if started is not None:
                 member.network.load_state_dict({name: tensor.to(getattr(torch, training.dtype)) for name, tensor in started.items()})
         networks = [member.network for member in windowed]
-        records = train_members(networks, [member._seed for member in windowed], sets[0], sets[1], training, context)
-        return [
-            FitRecord(
-                history={
-                    "epoch": list(range(1, record.epochs + 1)),
-                    "train_loss": record.train_loss,
-                    "validation_loss": record.validation_loss,
-                },
-                metrics={
-                    "epochs": record.epochs,
-                    "best_epoch": record.best_epoch,
-                    "best_validation_loss": record.best_validation_loss,
-                    "train_seconds": record.seconds / len(records),
-                },
-                interrupted=record.interrupted,
-            )
-            for record in records
-        ]
+        return train_members(networks, [member._seed for member in windowed], sets[0], sets[1], training, context)
 
     def _seeded_network(self, train: list[Recording], dtype: torch.dtype) -> nn.Module:
         """A network to train, with initial weights from the member's seed."""
