@@ -26,7 +26,7 @@ from vehest.filters.gaussian import Gaussian
 from vehest.training.context import FitContext
 from vehest.training.identification import IdentificationSettings
 from vehest.training.samples import Draw, Samples, sample_phase
-from vehest.training.sequences import Phase, PhaseSettings, record_of_phases, train_phases
+from vehest.training.sequences import Phase, PhaseSettings, drawn_starts, record_of_phases, train_phases
 
 START = (0.1, 0.02)  # m/s, rad/s: standard deviations of the true state that a training sequence starts from
 MOST_NOISE = 0.5  # m/s, rad/s, rad: middle of the logistic functions, beyond which no deviation starts or is pre-trained
@@ -258,14 +258,7 @@ class EndToEnd:
 
     def batches(self, generator: torch.Generator) -> Iterator[Cuts]:
         """As many sequences of each recording as fit into it, from an offset that is drawn, in random order."""
-        steps, firsts = self.training.steps, []
-        for length, offset in zip(self.lengths, self.offsets.tolist(), strict=False):
-            count = length // steps
-            if count:
-                shift = int(torch.randint(length - count * steps + 1, (), generator=generator))
-                firsts += [offset + shift + number * steps for number in range(count)]
-        order = torch.tensor(firsts)[torch.randperm(len(firsts), generator=generator)]
-        for chosen in order.split(self.training.batch_size):
+        for chosen in drawn_starts(self.lengths, self.training.steps, generator).split(self.training.batch_size):
             seeds = torch.randint(2**62, (1,), generator=generator)
             yield self.cut(chosen, seeds)
 

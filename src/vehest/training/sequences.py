@@ -344,6 +344,22 @@ class _Run:
         return enough and names == known[: len(names)] and shapes == {name: value.shape for name, value in self.state.items()}
 
 
+def drawn_starts(lengths: Sequence[int], steps: int, generator: torch.Generator) -> Tensor:
+    """First rows of as many sequences of ``steps`` samples as fit into each of drives that lie one after another, in random order.
+
+    Those of a drive follow one another from an offset that is drawn.
+    """
+    firsts: list[int] = []
+    offset = 0
+    for length in lengths:
+        used = length // steps * steps
+        if used:
+            shift = offset + int(torch.randint(length - used + 1, (), generator=generator))
+            firsts += range(shift, shift + used, steps)
+        offset += length
+    return torch.tensor(firsts)[torch.randperm(len(firsts), generator=generator)]
+
+
 def _shared_state(phases: Sequence[Phase]) -> dict[str, Tensor]:
     """Parameters and buffers of all phases, each once, under the first phase that has it."""
     state: dict[str, Tensor] = {}

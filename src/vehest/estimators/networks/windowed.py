@@ -177,10 +177,14 @@ def _check_state(network: nn.Module) -> None:
 
 
 class StandardisedNetwork(nn.Module):
-    """Base of networks that see standardised measurements and predict a standardised lateral velocity.
+    """Base of networks that see standardised measurements and predict standardised velocities.
 
-    Means and standard deviations are those of the training recordings; they are not parameters. `prepared` standardises what ``forward``
-    sees; what it predicts goes back to m/s by ``output * self.output_scale + self.output_mean``.
+    Means and standard deviations are those of the training recordings; they are kept with the weights and are not parameters. `prepared`
+    standardises what ``forward`` sees; what it predicts goes back to SI units by ``output * self.output_scale + self.output_mean``.
+
+    Args:
+        n_channels: measured channels.
+        outputs: shape of what is predicted of one instant.
     """
 
     input_mean: Tensor
@@ -188,28 +192,22 @@ class StandardisedNetwork(nn.Module):
     output_mean: Tensor
     output_scale: Tensor
 
-    def __init__(self, n_channels: int) -> None:
+    def __init__(self, n_channels: int, outputs: tuple[int, ...] = ()) -> None:
         super().__init__()
-        self.register_buffer("input_mean", torch.zeros(n_channels))
-        self.register_buffer("input_scale", torch.ones(n_channels))
-        self.register_buffer("output_mean", torch.zeros(()))
-        self.register_buffer("output_scale", torch.ones(()))
+        for name, shape in (("input", (n_channels,)), ("output", outputs)):
+            self.register_buffer(f"{name}_mean", torch.zeros(shape))
+            self.register_buffer(f"{name}_scale", torch.ones(shape))
 
-    def standardise(self, train: Sequence[Recording], channels: Sequence[str]) -> None:
+    def standardise(self, train: Sequence[Recording], channels: Sequence[str], references: Sequence[str] = (TARGET,)) -> None:
         """Take means and standard deviations from recordings."""
-        inputs = np.concatenate([recording.stack(channels) for recording in train])
-        outputs = np.concatenate([recording[TARGET] for recording in train])
-        for buffer, value in (
-            (self.input_mean, inputs.mean(axis=0)),
-            (self.input_scale, np.maximum(inputs.std(axis=0), 1e-6)),
-            (self.output_mean, outputs.mean()),
-            (self.output_scale, max(float(outputs.std()), 1e-6)),
+        for mean, scale, names in (
+            (self.input_mean, self.input_scale, channels),
+            (self.output_mean, self.output_scale, references),
         ):
-            buffer.copy_(torch.as_tensor(value))
+            samples = np.concatenate([recording.stack(names) for recording in train])
+            mean.copy_(torch.as_tensor(samples.mean(axis=0)).reshape(mean.shape))
+            scale.copy_(torch.as_tensor(np.maximum(samples.std(axis=0), 1e-6)).reshape(scale.shape))
 
     def prepared(self, series: Tensor) -> Tensor:
         """Standardised measurements."""
         return (series - self.input_mean) / self.input_scale
-
-    def constrain(self, parameters: Mapping[str, Tensor]) -> None:
-        """Any weights are admissible."""
