@@ -21,7 +21,7 @@ from vehest.estimators.networks.sample_network import SampleNetwork, clip_sidesl
 from vehest.training.context import FitContext
 from vehest.training.identification import IdentificationSettings
 from vehest.training.samples import SampleSettings, sample_phase
-from vehest.training.search import SearchRecord, nelder_mead_over_grid, staged_optuna_search
+from vehest.training.search import SearchRecord, nelder_mead_over_grid, optuna_search
 from vehest.training.sequences import PhaseSettings, record_of_phases, train_phases
 
 BOX = ((-6.0, 4.0), (0.2, 2.0))
@@ -129,7 +129,7 @@ class EnsembleUkf(NetworkUkf):
             return finite(self.mean_squared_error(recordings, how.skip_seconds, over=how.error, pseudo=pseudo))
 
         if how.method == "optuna":
-            return staged_optuna_search(cost, BOX, training.scaling_trials, self._seed, quiet, stages=how.stages, shrink=how.shrink)
+            return optuna_search(cost, BOX, training.scaling_trials, self._seed, quiet, stages=how.stages, shrink=how.shrink)
         return nelder_mead_over_grid(cost, BOX, STARTS, how.search, quiet)
 
     def _mean_and_variance(self, inputs: FloatArray) -> tuple[FloatArray, FloatArray]:

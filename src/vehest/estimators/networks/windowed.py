@@ -32,7 +32,7 @@ class WindowedEstimator(Network):
     """A memoryless network: N measurements r[k-N+1 … k] to the lateral velocity at k+1 (Da Lio et al. 2023, Fig. 1).
 
     The network is any ``nn.Module`` that maps windows (B, N, C) to (B,), in plain PyTorch; what it may have besides, a compiled recursion
-    for example, is in `vehest.training.members.WindowNetworkHooks`.
+    for example, is in `vehest.training.members`.
     """
 
     channels = ("yaw_rate", "vx", "ay", "ax")
