@@ -54,15 +54,11 @@ def _feed_back(driven: Tensor, previous: Tensor, weight: Tensor, read_out: Tenso
 class VelocityLstm(RecurrentVelocityEstimator):
     """Robust LSTM of Bou Ghosn et al. 2023; the previous estimate starts from ``initial_state``, else from measured velocities."""
 
-    name = "velocity_lstm"
-    title = "Velocity LSTM"
+    name, title = "velocity_lstm", "Velocity LSTM"
     trials = (TRIAL,)
+    network_type = VelocityLstmNetwork
     dropout: float = setting(0.075, "share of the hidden state that is hidden from the dense layers in training", least=0.0, below=1.0)
     n_dense: int = setting(64, "neurons of the hidden dense layer; assumed", least=1)
-
-    def new_network(self) -> VelocityLstmNetwork:
-        """A network of these sizes."""
-        return VelocityLstmNetwork(self.settings)
 
 
 ESTIMATOR = VelocityLstm

@@ -126,7 +126,7 @@ def optuna_search(
     Raises:
         MissingError: Optuna is not installed.
 
-    Source: Bergstra et al., Advances in Neural Information Processing Systems 24, 2011; Akiba et al., KDD 2019; two stages as in Bertipaglia
+    Source: Bergstra et al., Advances in Neural Information Processing Systems 24, 2011; Akiba et al., KDD 2019; stages as in Bertipaglia
     et al., IEEE Intelligent Vehicles Symposium 2022.
     """
     try:

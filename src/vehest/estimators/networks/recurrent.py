@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import abstractmethod
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any, ClassVar
 
 import numpy as np
@@ -22,21 +22,26 @@ class RecurrentNetwork(StandardisedNetwork):
 
     Args:
         settings: sizes.
+
+    Attributes:
         n_gates: gates of the cell.
-        n_channels: measured channels.
+        compiled_last_state: `last_state` as a compiled recursion, see `vehest.estimators.kernels.lanes.last_state`.
 
     Shapes:
         prepared windows: (..., N, C), standardised.
         returns: (...) lateral velocity [m/s] one step after the window.
     """
 
-    def __init__(self, settings: Any, n_gates: int, n_channels: int) -> None:
-        super().__init__(n_channels)
-        states = settings.n_states
+    n_gates: ClassVar[int]
+    compiled_last_state: ClassVar[Callable[..., Tensor]]
+
+    def __init__(self, settings: Any) -> None:
+        channels, states = len(RecurrentEstimator.channels), settings.n_states
+        super().__init__(channels)
         self.settings = settings
-        self.input_weight = nn.Parameter(torch.empty(n_gates, states, n_channels))
-        self.state_weight = nn.Parameter(torch.empty(n_gates, states, states))
-        self.gate_bias = nn.Parameter(torch.empty(n_gates, states))
+        self.input_weight = nn.Parameter(torch.empty(self.n_gates, states, channels))
+        self.state_weight = nn.Parameter(torch.empty(self.n_gates, states, states))
+        self.gate_bias = nn.Parameter(torch.empty(self.n_gates, states))
         self.output_weight = nn.Parameter(torch.empty(states))
         self.output_bias = nn.Parameter(torch.empty(()))
 
@@ -65,19 +70,9 @@ class RecurrentNetwork(StandardisedNetwork):
 
     def compiled_members(self, parameters: Mapping[str, Tensor], prepared: Tensor, starts: Tensor) -> Tensor:
         """The same for M members by the compiled recursion, (M, B)."""
-        state = self._kernel()(
-            parameters["input_weight"],
-            parameters["state_weight"],
-            parameters["gate_bias"],
-            prepared,
-            starts,
-            self.settings.window,
-        )
+        weights = [parameters[name] for name in ("input_weight", "state_weight", "gate_bias")]
+        state = self.compiled_last_state(*weights, prepared, starts, self.settings.window)
         return self._read_out(state, parameters["output_weight"].unsqueeze(1), parameters["output_bias"].unsqueeze(1))
-
-    @abstractmethod
-    def _kernel(self) -> Any:
-        """The compiled recursion, ``last_state`` of its module in estimators/kernels."""
 
 
 class RecurrentEstimator(WindowedEstimator):
@@ -99,7 +94,7 @@ class RecurrentEstimator(WindowedEstimator):
 
     def new_network(self) -> RecurrentNetwork:
         """A network to load weights into."""
-        return self.network_type(self.settings)  # type: ignore[call-arg]
+        return self.network_type(self.settings)
 
     def c_values(self) -> dict[str, Any]:
         """Weights and sizes."""

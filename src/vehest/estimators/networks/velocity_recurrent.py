@@ -132,6 +132,7 @@ class RecurrentVelocityEstimator(Network):
     channels: tuple[str, ...]  # type: ignore[misc]  # depends on the settings
     training_type = SequenceSettings
     template = "velocity_recurrent"
+    network_type: ClassVar[type[VelocityNetwork]]
     network: VelocityNetwork
     inputs: tuple[str, ...] = setting(
         ("yaw_rate", "ax", "ay", "motor_speed", "motor_current", "steer"), "measured channels that the network sees"
@@ -162,6 +163,10 @@ class RecurrentVelocityEstimator(Network):
                 raise ConfigurationError(f"estimator.inputs: '{name}' comes from a reference sensor, which an estimator never sees")
         if "vy" not in self.outputs or not set(self.outputs) <= set(REFERENCES):
             raise ConfigurationError(f"estimator.outputs must be of {', '.join(REFERENCES)}, vy among them, not {', '.join(self.outputs)}")
+
+    def new_network(self) -> VelocityNetwork:
+        """A network of these sizes."""
+        return self.network_type(self.settings)
 
     @property
     def variant(self) -> str:
