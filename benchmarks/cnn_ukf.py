@@ -67,7 +67,7 @@ def end_to_end(recordings: list[Any], dropout: float) -> tuple[Any, Any]:
     tyres = {f"{name}_{axle}": value for axle in ("front", "rear") for name, value in TYRES.items()}
     estimator = CnnUkf.from_config({"tyres": tyres, "noise": LEVELS, "dropout": dropout})
     assert isinstance(estimator, CnnUkf)
-    raw = learnt_samples(recordings, estimator.inputs, estimator.name)
+    raw = learnt_samples(recordings, estimator.network_inputs, estimator.name)
     estimator.network.scale(*raw)
     estimator.network.reset([torch.Generator().manual_seed(0)])
     with torch.no_grad():

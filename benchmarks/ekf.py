@@ -43,7 +43,7 @@ def main() -> None:
     samples = generator.standard_normal((steps, 4)) * [0.2, 1.0, 3.0, 0.03] + [0.0, 25.0, 0.0, 0.0]
     short = samples[:SHORT]
     compiled = estimator.filter_samples(short)
-    first = Gaussian(*map(torch.as_tensor, estimator.start(short[0])))
+    first = Gaussian(*map(torch.as_tensor, estimator.first_gaussian(short[0], {})))
     inputs = (torch.as_tensor(short[:, [0, 2]]), torch.as_tensor(short[:, [1, 3]]))
     extended_filter(estimator.nonlinear_model(), inputs[0][:5], inputs[1][:5], first)
     started = time.process_time()

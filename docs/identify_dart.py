@@ -21,7 +21,7 @@ import yaml
 from numpy.typing import NDArray
 from scipy import signal
 
-from vehest.sources.pose import planar_motion
+from vehest.sources.pose import PoseOptions
 from vehest.sources.table_rows import dropped_rows_from_config, kept_rows
 
 Array = NDArray[np.float64]
@@ -107,7 +107,7 @@ def _described(table: pd.DataFrame) -> str:
 
 def _drive(name: str, table: pd.DataFrame) -> Drive:
     place = table[["vicon x", "vicon y"]].to_numpy(np.float64)
-    motion = planar_motion(place, np.unwrap(table["vicon yaw"].to_numpy(np.float64)), 1.0 / RATE, window=WINDOW, order=2)
+    motion = PoseOptions(window=WINDOW).motion(place, np.unwrap(table["vicon yaw"].to_numpy(np.float64)), 1.0 / RATE)
     new = np.flatnonzero(np.diff(table["elapsed time sensors"]) != 0) + 1
     return Drive(name, table, motion.vx, motion.vy, motion.yaw_rate, new)
 

@@ -26,9 +26,10 @@ from vehest.data.errors import VehestError
 from vehest.data.recording import Recording
 from vehest.sources.base import open_source
 from vehest.sources.clocks import uniform_times
-from vehest.sources.pose import ground_plane, planar_motion
+from vehest.sources.limited import Reading
+from vehest.sources.pose import PoseOptions, ground_plane
 from vehest.sources.rosbag import POSE_FIELDS
-from vehest.sources.rosbag.topics import Bag, Wanted, read_bag
+from vehest.sources.rosbag.topics import read_bag
 
 Array = NDArray[np.float64]
 
@@ -105,7 +106,7 @@ def identify(folder: Path, say: Callable[[str], None] = lambda line: None) -> di
     return found
 
 
-def _read(folder: Path, declared: dict[str, Any]) -> Bag:
+def _read(folder: Path, declared: dict[str, Any]) -> Reading:
     topics = declared["topics"]
     fields = {
         "imu": ("linear_acceleration.x", "linear_acceleration.y", "linear_acceleration.z", "angular_velocity.z"),
@@ -113,35 +114,36 @@ def _read(folder: Path, declared: dict[str, Any]) -> Bag:
         "servo": ("data",),
         "body": tuple(f"pose.{part}" for part in POSE_FIELDS),
     }
-    wanted = [Wanted(topics[name]["topic"], topics[name]["type"], paths) for name, paths in fields.items()]
-    return read_bag(folder / f"{BAG}.zip", wanted, declared["messages"])
+    wanted = [(topics[name]["topic"], topics[name]["type"], paths) for name, paths in fields.items()]
+    return read_bag(folder / f"{BAG}.zip", "read_topics", topics=wanted, layouts=declared["messages"])
 
 
-def _clocks(bag: Bag, say: Callable[[str], None]) -> dict[str, float]:
+def _seconds(bag: Reading, topic: str, clock: str = "stamped") -> Array:
+    """Stamps of a topic's messages after the start of the bag [s]; ``clock`` is stamped or received."""
+    return np.asarray((bag.arrays[f"{topic}@{clock}"] - bag.summary["start"]) * 1e-9)
+
+
+def _clocks(bag: Reading, say: Callable[[str], None]) -> dict[str, float]:
     say("\n## Whose time stamps, and which clock")
     found = {}
     for topic, rate in (("/imu", 400.0), ("/vesc/core", 100.0), ("/optitrack/rigid_body_0", 100.0)):
-        data = bag.topics[topic]
-        assert data.stamped is not None
-        stamps, received = ((times - bag.start) * 1e-9 for times in (data.stamped, data.received))
-        late = (data.received - data.stamped) * 1e-6
+        stamps, received = _seconds(bag, topic), _seconds(bag, topic, "received")
+        late = (bag.arrays[f"{topic}@received"] - bag.arrays[f"{topic}@stamped"]) * 1e-6
         kept = stamps >= START
         steps = 1e3 * np.diff(stamps[kept])
-        even = uniform_times(stamps[kept], rate, topic)
-        received_even = uniform_times(received[received >= START], rate, topic)
+        _, rate_hz, jitter = uniform_times(stamps[kept], rate, topic)
+        *_, received_jitter = uniform_times(received[received >= START], rate, topic)
         say(
-            f"{topic}: {len(stamps)} messages, {even.rate_hz:.4f} Hz; header to reception {np.median(late):.2f} ms, "
+            f"{topic}: {len(stamps)} messages, {rate_hz:.4f} Hz; header to reception {np.median(late):.2f} ms, "
             f"at most {late.max():.1f}; intervals of headers {steps.min():.3f} to {steps.max():.2f} ms; "
-            f"about an even clock headers {1e3 * even.jitter:.2f}, receptions {1e3 * received_even.jitter:.2f} ms (RMS)"
+            f"about an even clock headers {1e3 * jitter:.2f}, receptions {1e3 * received_jitter:.2f} ms (RMS)"
         )
-        found[f"rate {topic}"] = float(even.rate_hz or 0.0)
-    data = bag.topics["/optitrack/rigid_body_0"]
-    assert data.stamped is not None
-    stamps = (data.stamped - bag.start) * 1e-9
+        found[f"rate {topic}"] = rate_hz
+    stamps = _seconds(bag, "/optitrack/rigid_body_0")
     kept = stamps >= START
     stamps = stamps[kept]
-    even = uniform_times(stamps, 100.0, "pose").times
-    place = np.stack([data.fields[f"pose.position.{axis}"][kept] for axis in "xy"], axis=1)
+    even, *_ = uniform_times(stamps, 100.0, "pose")
+    place = np.stack([bag.arrays[f"/optitrack/rigid_body_0.pose.position.{axis}"][kept] for axis in "xy"], axis=1)
     fast = np.flatnonzero(np.hypot(*np.gradient(place, even, axis=0).T) > 1.0)
     for name, times in (("header", stamps), ("even", even)):
         found[f"pose_roughness_{name}"] = _roughness(times, place, fast[(fast > 8) & (fast < len(stamps) - 8)])
@@ -163,35 +165,32 @@ def _roughness(times: Array, place: Array, at: NDArray[np.int64]) -> float:
     return float(np.sqrt(np.mean(squares)))
 
 
-def _drive(bag: Bag) -> Drive:
+def _drive(bag: Reading) -> Drive:
     """The bag on a clock of 100 Hz, before anything is identified."""
 
     def even(topic: str, rate: float) -> tuple[Array, NDArray[np.bool_]]:
-        stamped = bag.topics[topic].stamped
-        assert stamped is not None
-        stamps = (stamped - bag.start) * 1e-9
+        stamps = _seconds(bag, topic)
         kept = stamps >= START
-        return uniform_times(stamps[kept], rate, topic).times, kept
+        return uniform_times(stamps[kept], rate, topic)[0], kept
 
     imu_times, imu_kept = even("/imu", 400.0)
     vesc_times, vesc_kept = even("/vesc/core", 100.0)
     body_times, body_kept = even("/optitrack/rigid_body_0", 100.0)
-    servo_times = (bag.topics["/vesc/servo_position_command"].received - bag.start) * 1e-9
-    poses = np.stack([bag.topics["/optitrack/rigid_body_0"].fields[f"pose.{part}"][body_kept] for part in POSE_FIELDS], axis=1)
+    servo_times = _seconds(bag, "/vesc/servo_position_command", "received")
+    poses = np.stack([bag.arrays[f"/optitrack/rigid_body_0.pose.{part}"][body_kept] for part in POSE_FIELDS], axis=1)
     plane, yaw = ground_plane(poses[:, :3], poses[:, 3:], "z", "pose")
-    motion = planar_motion(plane, yaw, float(np.diff(body_times).mean()), window=9, order=2)
+    motion = PoseOptions().motion(plane, yaw, float(np.diff(body_times).mean()))
     begin, end = max(imu_times[0], vesc_times[0], body_times[0]), min(imu_times[-1], vesc_times[-1], body_times[-1], servo_times[-1])
     grid = np.arange(np.ceil(begin * RATE), np.floor(end * RATE) + 1) / RATE
-    imu, vesc = bag.topics["/imu"].fields, bag.topics["/vesc/core"].fields
     return Drive(
         "bag",
         *(np.interp(grid, body_times, samples) for samples in (motion.vx, motion.vy, motion.yaw_rate)),
         *(
-            np.interp(grid, imu_times, imu[name][imu_kept])
+            np.interp(grid, imu_times, bag.arrays[f"/imu.{name}"][imu_kept])
             for name in ("linear_acceleration.x", "linear_acceleration.y", "angular_velocity.z")
         ),
-        *(np.interp(grid, vesc_times, vesc[name][vesc_kept]) for name in ("state.speed", "state.avg_iq")),
-        np.interp(grid, servo_times, bag.topics["/vesc/servo_position_command"].fields["data"]),
+        *(np.interp(grid, vesc_times, bag.arrays[f"/vesc/core.{name}"][vesc_kept]) for name in ("state.speed", "state.avg_iq")),
+        np.interp(grid, servo_times, bag.arrays["/vesc/servo_position_command.data"]),
     )
 
 
@@ -224,7 +223,7 @@ def _rigid_body(drive: Drive, say: Callable[[str], None]) -> dict[str, float]:
     return {"body_yaw": yaw, "body_yaw_sd": spread[0], "rear_axle_to_body": lever, "rear_axle_to_body_sd": spread[1]}
 
 
-def _imu(unturned: Drive, drive: Drive, bag: Bag, say: Callable[[str], None]) -> dict[str, float]:
+def _imu(unturned: Drive, drive: Drive, bag: Reading, say: Callable[[str], None]) -> dict[str, float]:
     say(f"\n## IMU against motion capture (both below {CUTOFF:g} Hz)")
     lateral, forward, turning, _ = _planar_accelerations(drive)
     one = np.ones_like(lateral)
@@ -247,7 +246,7 @@ def _imu(unturned: Drive, drive: Drive, bag: Bag, say: Callable[[str], None]) ->
         say(f"{name}: {factors[0]:+.3f} ± {spread[0]:.3f} times the car's, correlation {correlation:+.3f}{rest}, offset {factors[-1]:+.4f}")
     crossed, crossed_sd = _regression(_planar_accelerations(unturned), _smooth(drive.ay), inner)
     say(f"acc_y before the rigid body is turned: the other axis' {crossed[1]:+.3f} ± {crossed_sd[1]:.3f}")
-    acc_z = bag.topics["/imu"].fields["linear_acceleration.z"]
+    acc_z = bag.arrays["/imu.linear_acceleration.z"]
     still = np.abs(drive.motor) < 1.0
     still &= signal.convolve(np.abs(drive.motor), np.ones(101), mode="same") < 1.0
     say(

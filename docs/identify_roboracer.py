@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from scipy import signal
 
 from vehest.data.units import factor_to_si
-from vehest.sources.pose import planar_motion
+from vehest.sources.pose import PoseOptions
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -92,7 +92,7 @@ def _runs(stem: str, table: pd.DataFrame) -> Iterator[Run]:
     for number, (start, stop) in enumerate(pairwise(edges)):
         rows = table.iloc[start:stop].reset_index(drop=True)
         place = rows[["pose_x", "pose_y"]].to_numpy(np.float64)
-        motion = planar_motion(place, np.unwrap(rows["yaw"].to_numpy(np.float64)), 1.0 / RATE, window=5, order=2)
+        motion = PoseOptions(window=5).motion(place, np.unwrap(rows["yaw"].to_numpy(np.float64)), 1.0 / RATE)
         lost = np.zeros(len(rows), dtype=np.bool_)
         lost[1:-1] = np.linalg.norm(np.diff(place, n=2, axis=0), axis=1) * RATE**2 > IMPOSSIBLE
         yield Run(f"{stem}_run_{number}", rows, motion.vx, motion.vy, motion.yaw_rate, lost)

@@ -316,8 +316,8 @@ def test_pages_know_every_name():
     for source in source_names():
         own = page(f"docs/sources/{source}.md")
         assert f"(sources/{source}.md)" in data
-        for name in class_of(source).keys:
-            assert f"`{name}`" in own, f"docs/sources/{source}.md does not explain {name}"
+        for option in fields(class_of(source).options_type):
+            assert f"`{option.name}`" in own, f"docs/sources/{source}.md does not explain {option.name}"
     named_checks = {"read", "impossible", "unit", "sign", "kinematics", "nan", "stuck", "saturated", "offset", "dropout", "reverse"}
     for name in set(COMMON_KEYS) | set(TRANSFORMS) | named_checks:
         assert f"`{name}`" in data, f"docs/data.md does not explain {name}"

@@ -14,7 +14,7 @@ import numpy as np
 from numba import njit
 
 from vehest.constants import GRAVITY
-from vehest.data.declared import fitted, setting
+from vehest.declared import fitted, setting
 from vehest.estimators.base import FitRecord
 from vehest.estimators.recursive import Recursive
 from vehest.filters.extended_scan import CompiledModel, extended_scan, with_jacobian

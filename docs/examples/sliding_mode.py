@@ -10,7 +10,7 @@ Sources: Slotine, Hedrick & Misawa, J. Dyn. Sys. Meas. Control 109 (3), 1987; Fa
 
 import numpy as np
 
-from vehest.data.declared import fitted, setting
+from vehest.declared import fitted, setting
 from vehest.data.errors import ConfigurationError
 from vehest.estimators.recursive import Recursive, compiled
 from vehest.training.search import DirectSearchSettings

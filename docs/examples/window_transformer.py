@@ -6,7 +6,7 @@ Embedding and learnt positions, encoder layers of torch's own, and a read-out of
 import torch
 from torch import Tensor, nn
 
-from vehest.data.declared import setting
+from vehest.declared import setting
 from vehest.data.errors import ConfigurationError
 from vehest.estimators.networks.windowed import StandardisedNetwork, WindowedEstimator
 

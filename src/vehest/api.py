@@ -23,8 +23,8 @@ from vehest.estimators.base import Estimator
 from vehest.estimators.model_files import save_model as _save_model
 from vehest.run.estimate import PRETRAINED, estimate_recording, open_model, read_table, score_on, train_on, write_estimate_table
 from vehest.trust.contract import GuardedStepper
+from vehest.trust.health import reason_in_words
 from vehest.trust.record import Trust, write_trust
-from vehest.trust.verdict import reason_in_words
 
 __all__ = [
     "Estimate",

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from vehest.data.errors import ConfigurationError
-from vehest.trust.verdict import NO_ESTIMATE, reason_in_words
+from vehest.trust.health import NO_ESTIMATE, reason_in_words
 
 cantools = pytest.importorskip("cantools", reason="cantools is not installed: pip install 'vehest[bus]'")
 pytest.importorskip("can", reason="python-can is not installed: pip install 'vehest[bus]'")

@@ -14,9 +14,7 @@ import pytest
 import vehest
 from conftest import planar_drive
 from vehest.bus.mapping import from_dataset, from_names
-from vehest.bus.receiver import Figures, Said
-from vehest.bus.sampling import Sample
-from vehest.bus.view import LiveView, PlainView, Shown, rows_of, view_on
+from vehest.bus.view import Figures, View, rows_of
 from vehest.data.errors import ConfigurationError, DataError, MissingError, VehestError
 from vehest.data.recording import Recording
 from vehest.run.replay import replay_log
@@ -145,10 +143,10 @@ def test_a_data_set_says_the_same_as_words_do(tmp_path: Path) -> None:
     written = write_log(drive(1.0), tmp_path)
     dataset = {"name": "mine", "source": "can", "dbc": str(written.dbc), "path": str(tmp_path), "rate_hz": 100, "channels": SIGNALS}
     declared = from_dataset(dataset, CHANNELS)
-    told = from_names(written.dbc, CHANNELS, told=told_for(CHANNELS).split(","))
-    assert declared.factors == told.factors
+    named = from_names(written.dbc, CHANNELS, words=told_for(CHANNELS).split(","))
+    assert declared.factors == named.factors
     assert {name: (one.message.name, one.signal) for name, one in declared.wanted.items()} == {
-        name: (one.message.name, one.signal) for name, one in told.wanted.items()
+        name: (one.message.name, one.signal) for name, one in named.wanted.items()
     }
 
 
@@ -156,10 +154,10 @@ def test_a_data_set_says_the_same_as_words_do(tmp_path: Path) -> None:
     ("words", "said"),
     [
         ({"signals": "ay"}, "takes CHANNEL=MESSAGE.SIGNAL"),
-        ({"signals": "speed=VehSpd"}, "'speed' is no channel"),
+        ({"signals": "speed=VehSpd"}, "'speed', which the model does not read"),
         ({"signals": "steer=SteerAng"}, "'steer', which the model does not read"),
         ({"signals": "vx=VehSpd"}, "reads channel 'yaw_rate', and no signal"),
-        ({"signals": told_for(CHANNELS).replace("VehSpd:km/h", "VehSpd:parsec")}, "'parsec' is no unit"),
+        ({"signals": told_for(CHANNELS).replace("VehSpd:km/h", "VehSpd:parsec")}, "'parsec' of signal 'Speed.VehSpd' is no unit"),
         ({"signals": told_for(CHANNELS).replace("VehSpd:km/h", "VehSpd:m/s")}, "is in 'km/h' by the file and in 'm/s'"),
         ({"signals": told_for(CHANNELS).replace("Speed.VehSpd", "Counter")}, "stands in several messages"),
         ({"dbc": None}, "nothing describes the bus"),
@@ -203,23 +201,19 @@ def test_a_damaged_log_ends_a_replay_in_one_line_in_real_time_too(tmp_path: Path
             replayed(written, speed=speed)
 
 
-def shown(**values: float) -> Shown:
-    figures = Figures(sent=30, received=20, samples=10, lost=1, estimates=2, latest=0.0012)
-    return Shown(figures, Said(0.1, 0.1, values), Sample(10.1, {}, ()), 0.0)
+FIGURES = Figures(frames_sent=30, frames_received=20, samples=10, samples_lost=1, estimates=2, latest_ms=1.2)
 
 
-def test_the_view_says_estimate_band_health_and_reason_in_words() -> None:
-    rows = dict(
-        rows_of(
-            shown(vy=0.5, sideslip=math.radians(-1.25), band_vy=0.1, band_sideslip=math.radians(0.5), health=2.0, health_reason=3e5), 20.0
-        )
-    )
+def test_the_view_shows_estimate_band_health_and_reason_in_words() -> None:
+    values = {"vy": 0.5, "sideslip": math.radians(-1.25), "band_vy": 0.1, "band_sideslip": math.radians(0.5)}
+    rows = dict(rows_of(FIGURES, {**values, "health": 2.0, "health_reason": 3e5}, 10.1, 20.0))
+    assert rows["time"] == "10.1 s"
     assert rows["v"] == "+0.500 ± 0.100 m/s"
     assert rows["β"] == "-1.25 ± 0.50 °"
     assert rows["health"] == "invalid: there is no estimate"
     assert rows["rate"] == "20.0 estimates/s"
     assert rows["samples"] == "10, 1 lost"
-    assert dict(rows_of(Shown(Figures(), None, None, 0.0), 0.0))["health"] == "-"
+    assert dict(rows_of(Figures(), {}, 0.0, 0.0))["health"] == "-"
 
 
 class Terminal(io.StringIO):
@@ -227,20 +221,15 @@ class Terminal(io.StringIO):
         return True
 
 
-def test_what_is_no_terminal_gets_plain_lines_and_a_terminal_a_table() -> None:
-    said = shown(vy=0.5, sideslip=0.0, health=0.0, health_reason=0.0)
-    plain = io.StringIO()
-    view = view_on(plain, "drive")
-    assert isinstance(view, PlainView)
-    with view:
-        view.show(said)
+def test_a_terminal_gets_a_table_and_any_other_stream_plain_lines() -> None:
+    values = {"vy": 0.5, "sideslip": 0.0, "health": 0.0, "health_reason": 0.0}
+    plain, terminal = io.StringIO(), Terminal()
+    for stream in (plain, terminal):
+        with View(stream, "drive") as view:
+            view.show(FIGURES, values, 1.0)
+            view.show(FIGURES, values, 1.1)
     assert plain.getvalue().count("\n") == 1
     assert "\x1b" not in plain.getvalue()
-    terminal = Terminal()
-    live = view_on(terminal, "drive")
-    assert isinstance(live, LiveView)
-    with live:
-        live.show(said)
     assert "+0.500 m/s" in terminal.getvalue()
 
 

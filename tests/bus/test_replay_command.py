@@ -12,7 +12,7 @@ import yaml
 
 from conftest import planar_drive
 from place import Place
-from vehest.bus.view import Shown, View
+from vehest.bus.view import Figures, View
 
 pytest.importorskip("can", reason="python-can is not installed: pip install 'vehest[bus]'")
 pytest.importorskip("cantools", reason="cantools is not installed: pip install 'vehest[bus]'")
@@ -73,16 +73,11 @@ def test_what_is_wrong_is_one_line_and_nothing_is_left_behind(bus: Place) -> Non
 
 
 def test_ctrl_c_ends_with_figures_and_keeps_what_was_written(bus: Place, monkeypatch: pytest.MonkeyPatch) -> None:
-    class Impatient(View):
-        def is_due(self, samples: int) -> bool:
-            return samples == 400
+    def interrupt(self: View, figures: Figures, values: object, seconds: float) -> None:
+        if figures.samples == 400:
+            signal.raise_signal(signal.SIGINT)
 
-        def show(self, shown: Shown) -> None:
-            if shown.figures.samples == 400:
-                monkeypatch.setattr(self, "is_due", lambda samples: False)
-                signal.raise_signal(signal.SIGINT)
-
-    monkeypatch.setattr("vehest.run.replay.standard_view", lambda title, quiet: Impatient())
+    monkeypatch.setattr(View, "show", interrupt)
     words = ("--dbc", "raw/bus/car.dbc", "--signals", TOLD, "--speed", "max", "-o", "out.csv")
     code, out, err = bus("replay", "raw/bus/drive.asc", *words)
     assert code == 130

@@ -16,9 +16,7 @@ def arrivals(n: int = 2000, phase: float = 0.003, jitter: float = 0.0, period: f
     return phase + period * np.arange(n) + rng.uniform(0.0, jitter, n) if jitter else phase + period * np.arange(n)
 
 
-def run(
-    timing: Timing, frames: list[tuple[float, dict[str, float]]], until: float
-) -> list[tuple[float, dict[str, float], tuple[str, ...]]]:
+def run(timing: Timing, frames: list[tuple[float, dict[str, float]]], until: float) -> list[tuple[float, dict[str, float], list[str]]]:
     sampler, found = Sampler(timing), []
     for stamp, values in sorted(frames, key=lambda frame: frame[0]):
         while sampler.next_time < stamp:
@@ -54,7 +52,7 @@ def test_lost_frames_are_missing_samples_and_only_those() -> None:
     timing = timing_of({"ay": stamps, "vx": stamps})
     frames = [(stamp, {"ay": float(k)} if k in lost else {"ay": float(k), "vx": float(k)}) for k, stamp in enumerate(stamps)]
     found = run(timing, frames, stamps[-1])
-    assert {int(values["ay"]) for _, values, missing in found if missing == ("vx",)} == lost
+    assert {int(values["ay"]) for _, values, missing in found if missing == ["vx"]} == lost
     assert all("vx" not in values for _, values, missing in found if missing)
 
 

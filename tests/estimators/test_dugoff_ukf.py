@@ -58,7 +58,7 @@ def test_tyres_are_found_without_measured_forces():
     drives = [dugoff_drive(25.0, seed) for seed in (1, 2)]
     estimator = DugoffUkf.from_config({"inputs": "imu"})
     estimator.fit(FitData([drive.select([n for n in drive.channels if not n.startswith("fy")]) for drive in drives], []), QUICK)
-    assert estimator.tyres[0] == pytest.approx(TYRES["cornering_stiffness_front"], rel=0.1)
+    assert estimator.axle_tyres[0] == pytest.approx(TYRES["cornering_stiffness_front"], rel=0.1)
     assert estimator.channels == ("yaw_rate", "vx", "ay", "steer", "ax")
 
 

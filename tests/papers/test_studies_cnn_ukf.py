@@ -335,7 +335,7 @@ def test_tyres_and_body_are_changed_in_a_copy() -> None:
         fitted = estimator_class(name).from_config({"tyres": TYRES, "noise": LEVELS})
         changed, heavy = perturbed.with_stiffness(fitted, 0.1, -0.1), perturbed.with_body(fitted, 1.1, 0.9)
         before, after, other = ((own if isinstance(own, DugoffUkf) else own.model) for own in (fitted, changed, heavy))  # type: ignore[attr-defined]
-        np.testing.assert_allclose(after.tyres / before.tyres, [1.1, 1.0, 1.0, 0.9, 1.0, 1.0])
+        np.testing.assert_allclose(after.axle_tyres / before.axle_tyres, [1.1, 1.0, 1.0, 0.9, 1.0, 1.0])
         assert other.track().car.mass == pytest.approx(1.1 * before.track().car.mass)
         assert other.track().car.yaw_inertia == pytest.approx(0.9 * before.track().car.yaw_inertia)
     for change in (perturbed.with_stiffness, perturbed.with_body):

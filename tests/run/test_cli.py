@@ -26,7 +26,7 @@ from vehest.data.store import read_recording
 from vehest.run import runner
 from vehest.run.artefacts import read_artefact
 from vehest.run.signals import TimeLimit
-from vehest.trust.verdict import reason_in_words
+from vehest.trust.health import reason_in_words
 
 
 def _statuses(err: str) -> list[tuple[str, str]]:

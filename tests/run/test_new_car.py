@@ -38,7 +38,7 @@ def test_enter_takes_what_is_proposed_and_what_is_known_of_the_car_is_used(log) 
     assert [entry["name"] for entry in dataset["transforms"]] == ["velocity_from_sideslip", "steering_ratio"]
     pipeline = yaml.safe_load(Path(FILES[2]).read_text(encoding="utf-8"))
     sweeps = [" ".join(sweep) for sweep in pipeline["parts"]["all"]["sweeps"]]
-    assert sweeps[0] == "estimator=zero,static_map,kinematic"
+    assert sweeps[0] == "estimator=kinematic,static_map,zero"
     assert sweeps[1] == "estimator=data_sheet estimator.wheelbase=2.7"
     assert any("estimator=kalman" in sweep and "estimator.car.mass=1500" in sweep for sweep in sweeps)
 
@@ -99,7 +99,7 @@ def test_run_takes_what_was_written(capsys, log) -> None:
     code, _, err = run_vehest(capsys, "run", "my_car", "--dry-run", "tracking=none")
     assert code == 0, err
     planned = [line.split()[2] for line in err.splitlines() if line.startswith("would   train")]
-    assert planned[0].startswith("zero-")
+    assert planned[0].startswith("kinematic-")
     assert {name.split("-")[0] for name in planned} >= {
         "static_map",
         "data_sheet",

@@ -582,7 +582,7 @@ TABULAR = {"name": "mine", "source": "tabular", "rate_hz": 100}
         ({"files": 3}, "dataset.files must be text"),
         ({"skip_rows": 1.5}, "dataset.skip_rows must be a whole number"),
         ({"channels": [1]}, "dataset.channels must be a mapping"),
-        ({"channels": {"vx": 3}}, "channel 'vx' must say column, unit"),
+        ({"channels": {"vx": 3}}, "channel 'vx': it must be a group of options, not 3"),
         ({"channels": {"vx": {"column": 3.5, "unit": "m/s"}}}, "channel 'vx': column must be text"),
         ({"channels": {"vx": {"column": "v"}}}, "channel 'vx': unit is missing"),
         ({"channels": {"vx": {"column": "v", "unit": "m/s", "factor": True}}}, "factor must be a number"),

@@ -1,14 +1,7 @@
-"""A recording as the log of a CAN bus, written by cantools and python-can: jittering stamps, lost frames, units and signs of a supplier.
-
-As a script: the Ferrari's drive, or a stretch of it, as a log with its DBC.
-
-    python tests/sources/can_drive.py FOLDER --start 550 --stop 700
-"""
+"""A recording as the log of a CAN bus, written by cantools and python-can: jittering stamps, lost frames, units and signs of a supplier."""
 
 from __future__ import annotations
 
-import argparse
-import sys
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -147,20 +140,3 @@ def ferrari(start: float, stop: float) -> Recording:
     source = open_source(compose_config("ingest", ["dataset=ferrari_250lm"])["dataset"])
     recording = source.read(source.ids()[0])
     return recording.cut(start, stop)
-
-
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
-    parser.add_argument("folder", type=Path)
-    parser.add_argument("--start", type=float, default=550.0)
-    parser.add_argument("--stop", type=float, default=700.0)
-    parser.add_argument("--suffix", default=".asc")
-    parser.add_argument("--jitter", type=float, default=0.001)
-    parser.add_argument("--lost", type=float, default=0.01)
-    asked = parser.parse_args()
-    written = write_log(ferrari(asked.start, asked.stop), asked.folder, asked.suffix, jitter=asked.jitter, lost=asked.lost)
-    sys.stdout.write(f"{written.log}\n{written.dbc}\n")
-
-
-if __name__ == "__main__":
-    main()

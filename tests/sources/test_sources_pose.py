@@ -82,17 +82,13 @@ def test_late_stamps_of_even_rows_do_no_harm(tmp_path: Path) -> None:
     ("pose", "said"),
     [
         ({"window": 4}, "window must be an odd number"),
-        ({"channels": ["vx"]}, "channels must be a list of vx_ref"),
+        ({"channels": ["vx"]}, "is not one of: vx_ref"),
         ({"x": {"column": "px", "unit": "rad"}}, "x: "),
-        ({"field": "pose"}, "field"),
     ],
 )
 def test_a_misspelt_pose_is_refused(tmp_path: Path, pose: dict[str, Any], said: str) -> None:
     with pytest.raises(ConfigurationError, match=said):
         source(tmp_path, pose=POSE | pose)
-
-
-# Channels that are held between their samples
 
 
 def held_table(delay_rows: int, every: int = 10, n: int = 1000) -> tuple[pd.DataFrame, np.ndarray]:
@@ -129,16 +125,11 @@ def test_held_samples_are_taken_once_and_where_they_were_measured(tmp_path: Path
     [
         ({"channels": ["ay"]}, "names 'ay', which is not one of the data set's channels"),
         ({"channels": ["vx"], "delay": {"yaw_rate": 0.1}}, "delay names 'yaw_rate'"),
-        ({"channels": ["vx"], "delay": "late"}, "delay"),
-        ({}, "channels"),
     ],
 )
 def test_a_misspelt_held_channel_is_refused(tmp_path: Path, held: dict[str, Any], said: str) -> None:
     with pytest.raises(ConfigurationError, match=said):
         source(tmp_path, channels=HELD_CHANNELS, held=held)
-
-
-# Rows and runs
 
 
 def test_time_that_restarts_begins_a_run_and_declared_rows_do_not_count(tmp_path: Path) -> None:

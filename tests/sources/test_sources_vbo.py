@@ -87,13 +87,7 @@ def test_a_damaged_log_is_one_clear_line(tmp_path: Path, old: bytes, new: bytes,
 
 def test_what_makes_no_sense_is_refused(tmp_path: Path) -> None:
     write_log(tmp_path / "lap.vbo")
-    for more, message in (
-        ({"channels": {}}, "channels must map"),
-        ({"gappy": ["steer"]}, "gappy names 'steer'"),
-        ({"files": "/etc/*"}, "files must be a pattern inside path"),
-        ({"rows": 1}, "has no option 'rows'"),
-    ):
-        with pytest.raises(ConfigurationError, match=message):
-            read(tmp_path, **more)
+    with pytest.raises(ConfigurationError, match="channels must map"):
+        read(tmp_path, channels={})
     with pytest.raises(MissingError, match="has no recording 'other'"):
         open_source(dataset(tmp_path)).read("other")

@@ -48,27 +48,10 @@ def write_log(file: Path, first: float = 38_870.45, *, swapped: bool = False, un
         begin = f"053 {stamp} +3608.25426832 -1087.02882814 {velocity:07.4f} 195.27 +0040.11 -0000.01 +0000.00 +0000.00 0.000000"
         rest = f"{0.02:+.6E} {vy:+.9E} {turn:+.9E} {ax:+.9E} {ay:+.9E} {slip[0][k]:+.9E} {slip[1][k]:+.9E} "
         rows.append(f"{begin} {rest}")
-    offsets = "\n".join(
-        f"Offsets Slip ({point}): {{{lateral:+07.3f} {longitudinal:+07.3f}}}" for point, (lateral, longitudinal) in AXLES.items()
-    )
-    text = "\r\n".join(
-        [
-            "File created on 12/09/2018 @ 12:47   \r\n",
-            "[header]\r\nsatellites\r\ntime\r\n",
-            "[channel units]",
-            *units,
-            "",
-            "[comments]",
-            *offsets.splitlines(),
-            "",
-            "[module Information]\r\n026524 - VB3i - 2 5 79\r\n",
-            "[column names]",
-            COLUMNS,
-            "",
-            "[data]",
-            *rows,
-        ]
-    )
+    offsets = [f"Offsets Slip ({point}): {{{lateral:+07.3f} {longitudinal:+07.3f}}}" for point, (lateral, longitudinal) in AXLES.items()]
+    head = ["File created on 12/09/2018 @ 12:47   \r\n", "[header]\r\nsatellites\r\ntime\r\n", "[channel units]", *units, ""]
+    middle = ["[comments]", *offsets, "", "[module Information]\r\n026524 - VB3i - 2 5 79\r\n", "[column names]", COLUMNS, ""]
+    text = "\r\n".join([*head, *middle, "[data]", *rows])
     file.write_bytes((text + "\r\n" + end).encode("latin-1", "replace"))
 
 

@@ -13,24 +13,26 @@ from vehest.data.estimate import Estimate
 from vehest.data.recording import Recording
 from vehest.trust.bands import (
     LEVELS,
+    LOWEST_SPEED,
     OTHER_VEHICLE,
     SHOWN_LEVEL,
-    Origin,
+    TERMS,
+    Bands,
     Piece,
     band_inputs,
     band_rows,
     block_labels,
     calibrated,
     fitted_scale,
-    half_widths_of_rows,
     pooled_quantile,
+    terms_of,
     turns_of,
     with_bands,
 )
 from vehest.trust.record import TRUST, About, Trust, read_trust, write_trust
 
 CHANNELS = ("yaw_rate", "vx", "ay", "ax", "steer")
-ORIGIN = Origin(("my car",), ("mine",), ("one (all)",), ("two (all)",), CHANNELS)
+ORIGIN = {"vehicles": ("my car",), "datasets": ("mine",), "scaled_on": ("one (all)",), "calibrated_on": ("two (all)",), "horizon_steps": 0}
 
 
 def piece_of(rng: np.random.Generator, n: int, deviation: float = 0.1, variance: float = math.nan) -> Piece:
@@ -40,12 +42,14 @@ def piece_of(rng: np.random.Generator, n: int, deviation: float = 0.1, variance:
     shared = np.repeat(rng.standard_normal(n // 100 + 1), 100)[:n]
     error = sigma * (shared + rng.standard_normal(n)) / math.sqrt(2.0)
     time = np.arange(n) / 20.0
-    return Piece(rows, rng.standard_normal(n), np.full(n, variance), error, error / rows[:, 1], 0.3 * np.sin(0.5 * time), 20.0)
+    return Piece(
+        rows, rng.standard_normal(n), np.full(n, variance), np.stack([error, error / rows[:, 1]], 1), 0.3 * np.sin(0.5 * time), 20.0
+    )
 
 
 def bands_of(seed: int = 0, **changes):
     rng = np.random.default_rng(seed)
-    return calibrated([piece_of(rng, 6000, **changes)], [piece_of(rng, 4000, **changes)], ORIGIN)
+    return calibrated([piece_of(rng, 6000, **changes)], [piece_of(rng, 4000, **changes)], CHANNELS, **ORIGIN)
 
 
 def test_scale_follows_a_planted_growth_with_acceleration():
@@ -118,11 +122,11 @@ def test_coverage_on_further_ranges_of_the_whole_calibration():
     """Scale, blocks and factors together: 60 calibrations on 32 turns, each judged on 100 s more."""
     rng, covered = np.random.default_rng(5), []
     for _ in range(60):
-        bands = calibrated([piece_of(rng, 3000)], [piece_of(rng, 4000)], ORIGIN)
+        bands = calibrated([piece_of(rng, 3000)], [piece_of(rng, 4000)], CHANNELS, **ORIGIN)
         further = piece_of(rng, 2000)
-        half = bands.half_widths(further.rows, further.vy, further.variance)
-        errors = np.abs(np.stack([further.error_vy, further.error_sideslip], axis=1))[:, :, None]
-        covered.append((errors <= half).mean(axis=0))
+        shown = bands.half_widths(further.rows, further.vy, further.variance)[:, :, None]
+        half = shown * np.stack([own.beside(SHOWN_LEVEL) for own in (bands.vy, bands.sideslip)])
+        covered.append((np.abs(further.errors)[:, :, None] <= half).mean(axis=0))
     mean, error = np.mean(covered, axis=0), np.std(covered, axis=0) / math.sqrt(60)
     assert np.all(mean[:, :3] >= np.array(LEVELS)[:3] - 3.0 * error[:, :3])
     assert np.all(mean[:, :3] <= np.array(LEVELS)[:3] + 0.09)
@@ -132,8 +136,24 @@ def test_band_is_wider_where_errors_are():
     bands = bands_of()
     rows = np.tile([0.0, 25.0, 0.0, 0.0, 0.0], (2, 1))
     rows[1, 2] = 6.0
-    calm, hard = bands.half_widths(rows, np.zeros(2), np.full(2, np.nan))[:, 0, 2]
+    calm, hard = bands.half_widths(rows, np.zeros(2), np.full(2, np.nan))[:, 0]
     assert hard / calm == pytest.approx(math.sqrt(0.1**2 + 0.3**2) / 0.1, rel=0.25)
+
+
+def by_numpy(bands: Bands, rows: np.ndarray, vy: np.ndarray, variance: np.ndarray, *, elsewhere: bool) -> np.ndarray:
+    """Half widths at the level that is shown, (T, 2), by the formulas of `vehest.trust.bands`."""
+    terms = terms_of(rows, vy, variance, bands.packed().columns)
+    largest = np.array([bands.largest.get(name, 0.0) for name in TERMS])
+    terms = np.where(np.isfinite(terms), terms, largest)
+    features = np.array([name not in ("variance", "one") for name in TERMS]) & (largest > 0)
+    wider = np.maximum((np.abs(terms[:, features]) / largest[features]).max(axis=1), 1.0) * (OTHER_VEHICLE if elsewhere else 1.0)
+    half = []
+    for own, feature in ((bands.vy, terms), (bands.sideslip, terms / np.maximum(np.abs(rows[:, [1]]), LOWEST_SPEED))):
+        weights = np.array([own.weights.get(name, 0.0) for name in TERMS])
+        scale = np.sqrt(np.maximum(np.square(feature) @ weights, own.floor**2))
+        half.append(scale * wider * own.factors[LEVELS.index(SHOWN_LEVEL)])
+    half[1] = np.where(half[1] < math.pi, half[1], math.pi)
+    return np.where(np.isfinite(vy)[:, None], np.stack(half, axis=1), np.nan)
 
 
 @pytest.mark.parametrize("variance", [math.nan, 0.01])
@@ -144,11 +164,8 @@ def test_kernel_agrees_with_numpy(variance, elsewhere):
     rows, vy, spread = own.rows * 2.0, own.vy.copy(), own.variance.copy()
     rows[10, 0], rows[20, 1], vy[30], spread[40] = np.nan, np.nan, np.nan, -1.0
     rows[50, 1] = 0.0
-    half = bands.half_widths(rows, vy, spread, elsewhere=elsewhere)[:, :, LEVELS.index(SHOWN_LEVEL)]
-    for kernel in (band_rows, half_widths_of_rows):
-        found = np.empty((300, 2))
-        kernel(rows, vy, spread, *bands.packed(elsewhere=elsewhere), found)
-        np.testing.assert_allclose(found, half, rtol=1e-13, equal_nan=True)
+    found = bands.half_widths(rows, vy, spread, elsewhere=elsewhere)
+    np.testing.assert_allclose(found, by_numpy(bands, rows, vy, spread, elsewhere=elsewhere), rtol=1e-13, equal_nan=True)
 
 
 def test_rows_one_by_one_are_rows_together():
@@ -166,7 +183,7 @@ def test_band_is_finite_where_an_estimate_is_and_nowhere_else():
     rows[:10] = np.nan
     vy[15] = np.nan
     half = bands.half_widths(rows, vy, own.variance)
-    assert np.isfinite(half).all(axis=(1, 2)).tolist() == [k != 15 for k in range(20)]
+    assert np.isfinite(half).all(axis=1).tolist() == [k != 15 for k in range(20)]
     assert (half[:10, 1] == math.pi).all()  # without a speed nothing is known of the angle
 
 
@@ -175,9 +192,9 @@ def test_widening_is_the_excess_over_the_training_s_largest():
     flat = replace(bands, vy=replace(bands.vy, weights={"one": 1.0}))
     rows = np.tile([0.0, 25.0, 0.0, 0.0, 0.0], (2, 1))
     rows[1, 2] = 1.7 * bands.largest["ay"]
-    inside, outside = flat.half_widths(rows, np.zeros(2), np.full(2, np.nan))[:, 0, 2]
+    inside, outside = flat.half_widths(rows, np.zeros(2), np.full(2, np.nan))[:, 0]
     assert outside / inside == pytest.approx(1.7)
-    assert flat.half_widths(rows, np.zeros(2), np.full(2, np.nan), elsewhere=True)[0, 0, 2] == pytest.approx(OTHER_VEHICLE * inside)
+    assert flat.half_widths(rows, np.zeros(2), np.full(2, np.nan), elsewhere=True)[0, 0] == pytest.approx(OTHER_VEHICLE * inside)
 
 
 def test_what_was_not_measured_counts_as_the_training_s_largest():
@@ -217,9 +234,9 @@ def test_bands_say_what_they_were_calibrated_on():
 
 def test_calibration_without_a_reference_is_refused():
     rng = np.random.default_rng(9)
-    blind = replace(piece_of(rng, 100), error_vy=np.full(100, np.nan))
+    blind = replace(piece_of(rng, 100), errors=np.full((100, 2), np.nan))
     with pytest.raises(DataError, match="no sample of the validation ranges"):
-        calibrated([piece_of(rng, 100)], [blind], ORIGIN)
+        calibrated([piece_of(rng, 100)], [blind], CHANNELS, **ORIGIN)
 
 
 def test_an_estimate_gets_the_bands_of_the_last_sample_that_it_saw():
@@ -229,7 +246,7 @@ def test_an_estimate_gets_the_bands_of_the_last_sample_that_it_saw():
     estimate = Estimate("lap", "some", 20.0, 0.0, {"vy": own.vy, "sideslip": np.arctan2(own.vy, own.rows[:, 1])})
     ahead = replace(bands_of(), horizon_steps=1)
     found = with_bands(estimate, measured, ahead)
-    expected = ahead.half_widths(own.rows[:-1], own.vy[1:], own.variance[1:])[:, :, 2]
+    expected = ahead.half_widths(own.rows[:-1], own.vy[1:], own.variance[1:])
     np.testing.assert_allclose(np.stack([found["band_vy"], found["band_sideslip"]], 1)[1:], expected, rtol=1e-13)
     rows, _, variance = band_inputs(estimate, measured, CHANNELS, 0)
     assert np.array_equal(rows, own.rows)

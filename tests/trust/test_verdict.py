@@ -9,13 +9,9 @@ import pytest
 
 from vehest.trust import health_kernel as kernel
 from vehest.trust.guard import RESTART, USE
-from vehest.trust.health import NUMBERS
+from vehest.trust.health import BEYOND_SPEED, NO_ESTIMATE, NUMBERS, reason_in_words
 from vehest.trust.verdict import (
-    BEYOND_SPEED,
-    NO_ESTIMATE,
     isolate_rows,
-    numbers_of,
-    reason_in_words,
     verdict_rows,
     widen_rows,
 )
@@ -24,6 +20,7 @@ from vehest.trust.watch import CLIPPED, EXTRAPOLATED, SPINNING
 CHANNELS = ("yaw_rate", "vx", "ay")
 SKIPPABLE = np.array([True, False, True])
 STEPS = 60
+NUMBERS_OF = np.array([NUMBERS[name] for name in CHANNELS])
 
 
 def code(kind: int, channel: str) -> float:
@@ -35,7 +32,7 @@ def heeded(kind: int, channel: str, *, rollback: int = 0, starts_anew: bool = Tr
     statuses, reasons = np.zeros(STEPS), np.zeros(STEPS)
     statuses[first:last], reasons[first:last] = status, code(kind, channel)
     rows, measured, flow = np.ones((STEPS, 3)), np.ones((STEPS, 3), np.bool_), np.full(STEPS, USE, np.int8)
-    isolate_rows(statuses, reasons, numbers_of(CHANNELS), SKIPPABLE, starts_anew, rollback, rows, measured, flow, np.zeros(2))
+    isolate_rows(statuses, reasons, NUMBERS_OF, SKIPPABLE, starts_anew, rollback, rows, measured, flow, np.zeros(2))
     return rows, measured, flow
 
 
@@ -81,9 +78,7 @@ def test_one_row_at_a_time_heeds_the_same():
     state = np.zeros(2)
     for k in range(STEPS):
         part = slice(k, k + 1)
-        isolate_rows(
-            statuses[part], reasons[part], numbers_of(CHANNELS), SKIPPABLE, False, 10, rows[part], measured[part], flow[part], state
-        )
+        isolate_rows(statuses[part], reasons[part], NUMBERS_OF, SKIPPABLE, False, 10, rows[part], measured[part], flow[part], state)
     assert np.array_equal(flow, heeded(kernel.SCALE, "vx", rollback=10, starts_anew=False)[2])
 
 
@@ -92,7 +87,7 @@ def test_the_verdict_names_what_guard_and_watch_know():
     measured = np.ones((5, 3), np.bool_)
     measured[1, 1] = False
     status, reason = np.zeros(5), np.zeros(5)
-    verdict_rows(np.ones(5), marks, np.zeros(5, np.int8), measured, ~SKIPPABLE, numbers_of(CHANNELS), status, reason)
+    verdict_rows(np.ones(5), marks, np.zeros(5, np.int8), measured, ~SKIPPABLE, NUMBERS_OF, status, reason)
     assert status.tolist() == [0, 1, 1, 2, 2]
     said = [reason_in_words(own) for own in reason]
     assert said == [

@@ -1,92 +1,55 @@
-"""A log's frames onto a bus, in real time or as fast as it goes, and a model that takes them off it."""
+"""Sends a log's frames onto a bus, in real time or as fast as possible; a model takes them off it and sends its estimates.
+
+log -> sender -> bus -> Receiver -> estimates -> bus -> sender -> Output
+"""
 
 from __future__ import annotations
 
 import gc
 import math
+import resource
 import sys
 import threading
 import time
 from array import array
 from collections.abc import Callable, Iterable, Iterator
-from contextlib import contextmanager, suppress
+from contextlib import closing, contextmanager, suppress
 from dataclasses import dataclass
 from itertools import chain
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from vehest.bus.mapping import BusSignals
-from vehest.bus.messages import FIRST_ID, EstimateFrames, check_id
+from vehest.bus.messages import EstimateFrames
 from vehest.bus.outputs import Output
-from vehest.bus.receiver import Figures, Receiver, Said, warmed_up
-from vehest.bus.sampling import Sampler, Timing, timing_of
-from vehest.bus.view import Shown, View
+from vehest.bus.sampling import Sample, Sampler, Timing, timing_of
+from vehest.bus.view import Figures, View
 from vehest.data.errors import ConfigurationError, DataError, MissingError
 from vehest.data.text_files import first_line
-from vehest.sources.can import decoded, is_on, never_occurs
+from vehest.sources.can import channel_values, channels_by_message, decoded, is_on, never_occurs
 from vehest.sources.can.logs import Frames
 from vehest.trust.contract import GuardedStepper
 
 SURVEY_SECONDS = 20.0
-LEAD_SECONDS = 0.5
-"""From the start of a replay in real time to its first frame."""
-
-PATIENCE = 0.25
-"""Seconds after which the receiver looks whether it is to stop."""
-
-SWITCH_SECONDS = 2e-4
-"""How long another thread of Python may go on when the receiver has something to do."""
+LEAD_SECONDS = 0.5  # from the start of a replay in real time to its first frame
+PATIENCE = 0.25  # s, after which a thread looks whether it is to stop
+MEMORY_EVERY = 100  # samples
+SWITCH_SECONDS = 2e-4  # that another thread of Python may go on when the receiver has something to do
 
 
-@dataclass(frozen=True)
-class Bus:
-    """Where frames go.
-
-    Args:
-        interface: of python-can: ``virtual``, ``socketcan`` and others.
-        channel: of that interface.
-        speed: times real time; None for as fast as it goes.
-        first_id: identifier of the estimates.
-    """
-
-    interface: str = "virtual"
-    channel: str = "vehest"
-    speed: float | None = 1.0
-    first_id: int = FIRST_ID
-
-    def __post_init__(self) -> None:
-        check_id(self.first_id)
-        if self.speed is not None and not (math.isfinite(self.speed) and self.speed > 0):
-            raise ConfigurationError(f"--speed must be a positive number or max, not {self.speed:g}")
-        if self.speed is None and self.interface != "virtual":
-            raise ConfigurationError(f"as fast as it goes needs the virtual bus, not '{self.interface}'; give --speed 1")
-
-
-@dataclass(frozen=True)
-class Survey:
-    """What a log says of its bus before it is replayed.
-
-    Args:
-        first: time of its first frame [s].
-        timing: of the wanted signals.
-    """
-
-    first: float
-    timing: Timing
-
-
-def survey(log: Frames, signals: BusSignals, rate_hz: float | None = None) -> Survey:
-    """Look at the first seconds of a log, and further on for signals that come later.
+def survey(log: Frames, signals: BusSignals, rate_hz: float | None = None) -> Timing:
+    """Timing of a bus from the first seconds of a log, and from further on for signals that come later.
 
     Raises:
         DataError: it cannot be used, or a signal never occurs.
         ConfigurationError: the rate is none.
     """
     stamps = {name: array("d") for name in signals.wanted}
-    first = math.nan
+    first = math.inf
     for frame, values in decoded(log, signals.database, signals.wanted, signals.bus):
-        first = frame.timestamp if math.isnan(first) else first
+        first = min(first, frame.timestamp)
         for name in values:
             stamps[name].append(frame.timestamp)
         if frame.timestamp - first > SURVEY_SECONDS and all(len(times) > 1 for times in stamps.values()):
@@ -98,206 +61,236 @@ def survey(log: Frames, signals: BusSignals, rate_hz: float | None = None) -> Su
             raise DataError(
                 f"'{log.file}': stamps of message '{wanted.message.name}' repeat or go back; where two buses carry it, name one"
             )
-    return Survey(first, timing_of({name: np.array(times) for name, times in stamps.items()}, rate_hz))
+    return timing_of({name: np.array(times) for name, times in stamps.items()}, rate_hz)
 
 
-def replay(
-    log: Frames,
-    signals: BusSignals,
-    found: Survey,
-    make_stepper: Callable[[], GuardedStepper],
-    bus: Bus,
-    make_output: Callable[[list[str]], Output],
-    view: View,
-    stopped: Callable[[], bool] = lambda: False,
-) -> tuple[Figures, Output]:
-    """Replay a log onto a bus and let a model estimate from what it takes off it.
+@dataclass(frozen=True)
+class Bus:
+    """An interface of python-can and its channel, and the speed: times real time, or None for as fast as possible."""
+
+    interface: str = "virtual"
+    channel: str = "vehest"
+    speed: float | None = 1.0
+
+    @contextmanager
+    def ends(self, messages: Iterable[tuple[int, bool]]) -> Iterator[tuple[Any, Any]]:
+        """The sender's end of the bus, and the control unit's, which hears the messages only.
+
+        Raises:
+            MissingError: it cannot be opened.
+        """
+        import can
+
+        options: dict[str, Any] = {"interface": self.interface, "channel": self.channel}
+        if self.interface == "virtual":
+            options |= {"preserve_timestamps": self.speed is None, "ignore_config": True}
+        mask = {False: 0x7FF, True: 0x1FFFFFFF}
+        filters: Any = [{"can_id": identifier, "can_mask": mask[long], "extended": long} for identifier, long in messages]
+        opened: list[Any] = []
+        try:
+            try:
+                opened.append(can.Bus(**options))
+                opened.append(can.Bus(**options, can_filters=filters))
+            except Exception as error:  # each interface has errors of its own
+                what = f"cannot open channel '{self.channel}' of interface '{self.interface}' ({first_line(error)[:160]})"
+                raise MissingError(f"{what}; --interface virtual needs nothing") from None
+            yield opened[0], opened[1]
+        finally:
+            for one in opened:
+                with suppress(Exception):
+                    one.shutdown()
+
+
+class Replay:
+    """A log's frames, sent onto a bus by the car, and a control unit that estimates from what it hears there.
 
     Args:
         log: frames to send.
         signals: of the bus that the model reads.
-        found: what the log says of its bus.
-        make_stepper: of the model, at the rate of the samples; called twice, since the first is for warming up.
+        timing: of the log.
         bus: where frames go.
-        make_output: what writes estimates that hold these quantities.
-        view: shown to people.
+        frames: writes estimates as frames.
         stopped: whether to end early; what was written is kept.
 
     Raises:
-        ConfigurationError: the log or the DBC has the identifiers of the estimates.
-        MissingError: the bus cannot be opened, or an output not be written.
+        ConfigurationError: the DBC has the identifiers of the estimates.
     """
-    for identifier in (bus.first_id, bus.first_id + 1):
-        if (identifier, False) in signals.database.taken:
-            raise ConfigurationError(f"'{signals.database.file}' has a message {identifier:#x}, as estimates would; give another --id")
-    stepper = make_stepper()
-    names = warmed_up(make_stepper(), found.timing.rate_hz, tuple(signals.wanted))
-    with _two_buses(bus, signals) as (sender, unit), make_output(names) as output, view:
-        run = _Run(log, signals, found, stepper, bus, output, view, stopped, sender, unit)
-        with _undisturbed():
-            run.go()
-    return run.receiver.figures, output
-
-
-class _Run:
-    """One replay: a sender, which is the car, and a receiver, which is the control unit."""
 
     def __init__(
-        self,
-        log: Frames,
-        signals: BusSignals,
-        found: Survey,
-        stepper: GuardedStepper,
-        bus: Bus,
-        output: Output,
-        view: View,
-        stopped: Callable[[], bool],
-        sender: Any,
-        unit: Any,
+        self, log: Frames, signals: BusSignals, timing: Timing, bus: Bus, frames: EstimateFrames, stopped: Callable[[], bool]
     ) -> None:
-        self.log, self.signals, self.first, self.bus = log, signals, found.first, bus
-        self.output, self.view, self.stopped = output, view, stopped
-        self.sender, self.unit = sender, unit
+        for identifier in frames.identifiers:
+            if (identifier, False) in signals.database.taken:
+                raise ConfigurationError(f"'{signals.database.file}' has a message {identifier:#x}, as estimates would; give another --id")
+        self.log, self.signals, self.bus, self.frames, self.stopped = log, signals, bus, frames, stopped
+        self.timing, self.first, self.sampler, self.figures = timing, timing.first, Sampler(timing), Figures()
+        self.channels_of = channels_by_message(signals.wanted)
         self.speed = bus.speed or 1.0
-        self.begin = 0.0
-        self.frames_of_estimates = EstimateFrames(bus.first_id)
-        finished = None if bus.speed is None else lambda: self._on_bus(time.time())
-        self.receiver = Receiver(signals, Sampler(found.timing), stepper, self._send, finished)
-        self.said: Said | None = None
-        self.last = math.inf  # time of the last frame, once it was sent [s]
+        self.begin = 0.0  # time of the clock on the wall at the first frame [s]
+        self.last = self.first  # time of the last frame that was sent [s]
+        self.over = threading.Event()  # all frames were sent, or it was stopped
         self.failure: BaseException | None = None
-        self.over = threading.Event()
+        self.resident = 0  # memory at first [bytes]
 
-    def go(self) -> None:
-        """From the first frame to the last, or until it is stopped."""
-        if self.bus.speed is None:
-            self._as_fast_as_it_goes()
-        else:
-            self._in_real_time()
-        self._drain_sender()
-        self._show()
+    def run(self, make_stepper: Callable[[], GuardedStepper], out: Path | None, view: View) -> Figures:
+        """Estimate at the rate of the samples; the first stepper is for warming up.
 
-    def _on_bus(self, wall: float) -> float:
-        """Time of the bus at a time of the clock on the wall [s]."""
-        return self.first + (wall - self.begin) * self.speed
+        Raises:
+            DataError: the log is damaged.
+            MissingError: the bus cannot be opened, or ``out`` not be written.
+        """
+        names = warmed_up(make_stepper(), self.timing.rate_hz, tuple(self.signals.wanted))
+        self.stepper, self.view = make_stepper(), view
+        horizon = self.stepper.horizon_steps / self.stepper.estimator.settings.rate_hz
+        self.ahead = horizon - self.stepper.delay - self.timing.offset
+        with (
+            self.bus.ends(self.signals.database.messages) as (self.sender, self.unit),
+            closing(Output(out, names, self.frames.identifiers[0])) as self.output,
+            view,
+            _undisturbed(),
+        ):
+            frames = (frame for frame in self.log if frame.timestamp >= self.first and is_on(frame, self.signals.bus))
+            if self.bus.speed is None:
+                self._as_fast_as_possible(frames)
+            else:
+                self._in_real_time(frames)
+            self._drain_sender()
+        return self.figures
 
-    def _frames(self) -> Iterator[Any]:
-        """Frames of the log, those before the first that is wanted and those of other buses left out."""
-        for frame in self.log:
-            if frame.timestamp >= self.first and is_on(frame, self.signals.bus):
-                yield frame
-
-    def _as_fast_as_it_goes(self) -> None:
-        last = self.first
-        for frame in self._frames():
+    def _as_fast_as_possible(self, frames: Iterable[Any]) -> None:
+        for frame in frames:
             if self.stopped():
                 return
-            self.sender.send(frame)
-            self.receiver.figures.sent += 1
-            last = frame.timestamp
-            while (received := self.unit.recv(0)) is not None:
-                self.receiver.frame(received, received.timestamp)
-            self._drain_sender()
-            self._show()
-        self.receiver.advance(last + self.receiver.sampler.cycle)
+            self._send(frame)
+            while (heard := self.unit.recv(0)) is not None:
+                self._receive(heard, heard.timestamp)
+        self._advance(self.last + self.sampler.cycle)
 
-    def _in_real_time(self) -> None:
-        frames = self._frames()
+    def _in_real_time(self, frames: Iterator[Any]) -> None:
         head = next(frames, None)  # what looks at the log beforehand has its time now
         self.begin = time.time() + LEAD_SECONDS
-        thread = threading.Thread(target=self._send_in_time, args=(chain([head] if head else [], frames),), name="sender", daemon=True)
+        every = chain([head] if head else [], frames)
+        thread = threading.Thread(target=self._send_in_time, args=(every,), name="sender", daemon=True)
         thread.start()
-        receiver, sampler = self.receiver, self.receiver.sampler
         try:
             while not self.stopped():
-                ended = self.over.is_set() and self._on_bus(time.time()) > self.last + sampler.cycle
-                wait = self.begin + (sampler.next_time - self.first) / self.speed - time.time()
-                frame = self.unit.recv(0.0 if ended else min(max(wait, 0.0), PATIENCE))
-                if frame is not None:
-                    receiver.frame(frame, self._on_bus(frame.timestamp))
+                ended = self.over.is_set() and self._on_bus(time.time()) > self.last + self.sampler.cycle
+                wait = self.begin + (self.sampler.next_time - self.first) / self.speed - time.time()
+                heard = self.unit.recv(0.0 if ended else min(max(wait, 0.0), PATIENCE))
+                if heard is not None:
+                    self._receive(heard, self._on_bus(heard.timestamp))
                 elif ended:  # and nothing is left that a late receiver has not taken
-                    receiver.advance(self.last + sampler.cycle)
+                    self._advance(self.last + self.sampler.cycle)
                     break
                 else:
-                    receiver.advance(self._on_bus(time.time()))
-                self._show()
+                    self._advance(self._on_bus(time.time()))
         finally:
             self.over.set()
             thread.join(timeout=5.0)
         if self.failure is not None:
             raise self.failure
 
+    def _on_bus(self, wall: float) -> float:
+        """Time of the bus at a time of the clock on the wall [s]."""
+        return self.first + (wall - self.begin) * self.speed
+
+    # The car
+
     def _send_in_time(self, frames: Iterable[Any]) -> None:
-        """The sender's thread: each frame at its time; between them what others sent is taken off the bus."""
-        last = self.first
+        """The car's thread: each frame at its time."""
         try:
             for frame in frames:
                 due = self.begin + (frame.timestamp - self.first) / self.speed
-                while (left := due - time.time()) > 0:
-                    if self.over.is_set():
-                        return
+                while (left := due - time.time()) > 0 and not self.over.is_set():
                     time.sleep(min(left, PATIENCE))
                 if self.over.is_set():
                     return
-                self.sender.send(frame)
-                self.receiver.figures.sent += 1
-                last = frame.timestamp
-                self._drain_sender()
+                self._send(frame)
         except BaseException as error:
             self.failure = error
         finally:
-            self.last = last
             self.over.set()
 
+    def _send(self, frame: Any) -> None:
+        self.sender.send(frame)
+        self.figures.frames_sent += 1
+        self.last = frame.timestamp
+        self._drain_sender()
+
     def _drain_sender(self) -> None:
-        """What the sender hears: the estimates, whose frames are written."""
+        """Write the frames of estimates that the car hears."""
         while (heard := self.sender.recv(0)) is not None:
-            if heard.arbitration_id in (self.bus.first_id, self.bus.first_id + 1) and not heard.is_extended_id:
-                stamp = heard.timestamp if self.bus.speed is None else self._on_bus(heard.timestamp)
-                self.output.frame(heard, stamp)
+            if heard.arbitration_id in self.frames.identifiers and not heard.is_extended_id:
+                if self.bus.speed is not None:
+                    heard.timestamp = self._on_bus(heard.timestamp)
+                self.output.frame(heard)
 
-    def _send(self, said: Said) -> None:
-        for frame in self.frames_of_estimates(said.values, said.sampled):
-            self.unit.send(frame)
-        self.output.estimate(said)
-        self.said = said
+    # The control unit
 
-    def _show(self) -> None:
-        if self.view.is_due(self.receiver.figures.samples):
-            self.view.show(Shown(self.receiver.figures, self.said, self.receiver.last_sample, self.first))
-
-
-@contextmanager
-def _two_buses(bus: Bus, signals: BusSignals) -> Iterator[tuple[Any, Any]]:
-    """The sender's end of a bus, and the control unit's, which hears wanted messages only.
-
-    Raises:
-        MissingError: it cannot be opened.
-    """
-    try:
-        import can
-    except ImportError:
-        raise MissingError("CAN needs the packages python-can and cantools; pip install 'vehest[bus]'") from None
-    options: dict[str, Any] = {"interface": bus.interface, "channel": bus.channel}
-    if bus.interface == "virtual":
-        options |= {"preserve_timestamps": bus.speed is None, "ignore_config": True}
-    mask = {False: 0x7FF, True: 0x1FFFFFFF}
-    filters: Any = [
-        {"can_id": identifier, "can_mask": mask[extended], "extended": extended} for identifier, extended in signals.database.messages
-    ]
-    opened: list[Any] = []
-    try:
+    def _receive(self, frame: Any, stamp: float) -> None:
+        """Take a frame that was stamped [s]; samples whose instant lies before are dealt with first."""
+        message = self.signals.database.messages.get((frame.arbitration_id, frame.is_extended_id))
+        if message is None or frame.is_error_frame or frame.is_remote_frame:
+            return
+        self._advance(stamp)
+        self.figures.frames_received += 1
         try:
-            opened.append(can.Bus(**options))
-            opened.append(can.Bus(**options, can_filters=filters))
-        except Exception as error:  # each interface has errors of its own
-            what = f"cannot open channel '{bus.channel}' of interface '{bus.interface}' ({first_line(error)[:160]})"
-            raise MissingError(f"{what}; --interface virtual needs nothing") from None
-        yield opened[0], opened[1]
-    finally:
-        for one in opened:
-            with suppress(Exception):
-                one.shutdown()
+            values = channel_values(message.decode(frame.data), self.channels_of[message.name], self.signals.wanted)
+        except DataError:
+            self.figures.frames_too_short += 1
+            return
+        self.sampler.take({name: value * self.signals.factors[name] for name, value in values.items()}, stamp)
+
+    def _advance(self, now: float) -> None:
+        """Deal with the samples whose instant lies before now [s]."""
+        while self.sampler.next_time < now:
+            sample, started = self.sampler.sample(), time.perf_counter()
+            self._estimate(sample)
+            took = time.perf_counter() - started if self.bus.speed is None else self._on_bus(time.time()) - sample.time
+            self._count(sample, took)
+            self.view.show(self.figures, self.stepper.last, sample.time - self.first)
+
+    def _estimate(self, sample: Sample) -> None:
+        last = self.stepper.last
+        values = self.stepper.step(sample.values or None)
+        if values is not last:
+            self.figures.estimates += 1
+            for frame in self.frames(values, sample.time):
+                self.unit.send(frame)
+            self.output.estimate(sample.time + self.ahead, sample.time, values)
+
+    def _count(self, sample: Sample, took: float) -> None:
+        figures, cycle = self.figures, self.sampler.cycle
+        figures.seconds = figures.samples * cycle
+        figures.samples += 1
+        figures.latest_ms = max(figures.latest_ms, 1e3 * took)
+        figures.deadlines_missed += took > cycle
+        figures.samples_lost += bool(sample.missing)
+        for name in sample.missing:
+            figures.missing[name] = figures.missing.get(name, 0) + 1
+        if figures.samples % MEMORY_EVERY == 0:
+            now = resident_bytes()
+            self.resident = self.resident or now
+            figures.memory_growth_mb = max(figures.memory_growth_mb, (now - self.resident) / 1e6)
+
+
+def resident_bytes() -> int:
+    """Resident memory of this process; where the system does not tell, the most that it ever was."""
+    try:
+        return int(Path("/proc/self/statm").read_bytes().split()[1]) * resource.getpagesize()
+    except OSError:
+        return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * (1 if sys.platform == "darwin" else 1024)
+
+
+def warmed_up(stepper: GuardedStepper, rate_hz: float, channels: tuple[str, ...]) -> list[str]:
+    """Step until everything is compiled and loaded; returns the names of what the steps returned, in their order."""
+    model = stepper.estimator
+    names: dict[str, None] = {}
+    for k in range(math.ceil((model.warm_up_steps / model.settings.rate_hz + 1.0) * rate_hz)):
+        ripple = 0.01 * math.sin(0.7 * k)
+        sample = {name: (20.0 if name in ("vx", "motor_speed") or name.startswith("wheel_speed") else 0.0) + ripple for name in channels}
+        names |= dict.fromkeys(stepper.step(sample))
+    return list(names)
 
 
 @contextmanager

@@ -8,8 +8,10 @@ follow the sender's clock, which is not the receiver's, by a phase-locked loop o
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
+from itertools import pairwise
+from typing import NamedTuple
 
 import numpy as np
 
@@ -17,41 +19,26 @@ from vehest.constants import FloatArray
 from vehest.data.errors import ConfigurationError
 from vehest.sources.clocks import mean_step, plain_rate
 
-GAIN = 0.02
-"""Share of the deviation of an arrival by which the next instant is moved: a time constant of 50 samples."""
-
-WHOLE = 0.05
-"""Share of a cycle by which a message's period may differ from whole cycles, for its phase to count."""
-
-PLAIN = 5e-3
-SLACK = 1e-9
+GAIN = 0.02  # share of an arrival's deviation by which the next instant moves: a time constant of 50 samples
+WHOLE = 0.05  # share of a cycle by which a message's period may differ from whole cycles, for its phase to count
+PLAIN = 5e-3  # relative distance to a round rate that is taken for it
+SLACK = 1e-9  # s
 
 
 @dataclass(frozen=True)
 class Timing:
-    """When the messages of a bus come.
+    """When the messages of a bus arrive."""
 
-    Args:
-        rate_hz: of the samples.
-        periods: channel -> interval between its values [s].
-        clock: channel whose frames tell the sender's clock.
-        offset: from the arrival of those to the instant of the sample [s].
-        start: instant of the first sample [s].
-    """
-
-    rate_hz: float
-    periods: Mapping[str, float]
-    clock: str
-    offset: float
-    start: float
+    rate_hz: float  # of the samples
+    periods: Mapping[str, float]  # channel -> interval between its values [s]
+    clock: str  # channel whose frames give the sender's clock
+    offset: float  # from their arrival to the instant of the sample [s]
+    start: float  # instant of the first sample [s]
+    first: float = 0.0  # time of the first frame [s]
 
 
 def timing_of(stamps: Mapping[str, FloatArray], rate_hz: float | None = None) -> Timing:
-    """When messages come, from a while of a bus.
-
-    Args:
-        stamps: channel -> times of its frames [s], each at least two.
-        rate_hz: of the samples; without it that of the fastest channel.
+    """Timing of a bus from channel -> times of its frames [s], at least two each, at ``rate_hz``, by default that of the fastest channel.
 
     Raises:
         ConfigurationError: a rate that is no rate.
@@ -65,12 +52,15 @@ def timing_of(stamps: Mapping[str, FloatArray], rate_hz: float | None = None) ->
     if not (math.isfinite(rate_hz) and rate_hz > 0):
         raise ConfigurationError(f"the rate of a bus must be a positive number [Hz], not {rate_hz}")
     cycle = 1.0 / rate_hz
-    phases = {name: found for name, times in stamps.items() if (found := _phase(times, periods[name], cycle)) is not None}
-    middle = _middle_of_longest_gap(phases.values(), cycle)
+    phases = {name: phase for name, times in stamps.items() if (phase := _phase(times, periods[name], cycle)) is not None}
+    marks = sorted(phases.values())
+    marks += [first + cycle for first in marks[:1]]
+    pauses = [(after - before, before) for before, after in pairwise(marks)]
+    longest, begin = max(pauses, default=(0.0, 0.0))
+    middle = (begin + 0.5 * longest) % cycle
     offset = (middle - phases[clock]) % cycle if clock in phases else 0.5 * cycle
-    first = max(times[0] for times in stamps.values() if len(times))
-    start = first + (middle - first) % cycle
-    return Timing(rate_hz, periods, clock, offset, start)
+    begins = [float(times[0]) for times in stamps.values()]
+    return Timing(rate_hz, periods, clock, offset, max(begins) + (middle - max(begins)) % cycle, min(begins))
 
 
 def _phase(times: FloatArray, period: float, cycle: float) -> float | None:
@@ -81,39 +71,16 @@ def _phase(times: FloatArray, period: float, cycle: float) -> float | None:
     return float(np.angle(mean) / (2 * np.pi) * cycle % cycle) if abs(mean) > 0.5 else None
 
 
-def _middle_of_longest_gap(phases: Iterable[float], cycle: float) -> float:
-    found = sorted(phases)
-    if not found:
-        return 0.0
-    gaps = [(after - before, before) for before, after in zip(found, [*found[1:], found[0] + cycle], strict=True)]
-    longest, begin = max(gaps)
-    return (begin + 0.5 * longest) % cycle
+class Sample(NamedTuple):
+    """What is known of a bus at one instant."""
 
-
-@dataclass(frozen=True)
-class Sample:
-    """What was known of a bus at one instant.
-
-    Args:
-        time: on the bus's clock [s].
-        values: channel -> value [SI] of what is fresh.
-        missing: channels of which nothing is.
-    """
-
-    time: float
-    values: Mapping[str, float]
-    missing: tuple[str, ...]
+    time: float  # on the bus's clock [s]
+    values: dict[str, float]  # channel -> value [SI] that is fresh
+    missing: list[str]  # the other channels
 
 
 class Sampler:
-    """Forms samples; frames are to come in the order of their stamps.
-
-    Args:
-        timing: of the bus.
-
-    Attributes:
-        next_time: instant of the next sample [s]; it holds what arrives up to then.
-    """
+    """Forms samples; frames are to come in the order of their stamps. ``next_time`` is the instant of the next sample [s]."""
 
     def __init__(self, timing: Timing) -> None:
         self.timing, self.cycle = timing, 1.0 / timing.rate_hz
@@ -139,4 +106,4 @@ class Sampler:
         }
         self.next_time = time + self.cycle + GAIN * self._deviation
         self._deviation = 0.0
-        return Sample(time, fresh, tuple(name for name in self._values if name not in fresh))
+        return Sample(time, fresh, [name for name in self._values if name not in fresh])

@@ -1,18 +1,14 @@
-"""What people see of a model on a bus: a table that changes in place on a terminal, else a line now and then."""
+"""Figures of a model on a bus, shown while it runs: a table that changes in place on a terminal, else a line every ten seconds."""
 
 from __future__ import annotations
 
 import math
-import sys
-import threading
 import time
-from dataclasses import dataclass
-from types import TracebackType
-from typing import Any, Self, TextIO
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any, TextIO
 
-from vehest.bus.receiver import Figures, Said
-from vehest.bus.sampling import Sample
-from vehest.trust.verdict import reason_in_words
+from vehest.trust.health import reason_in_words
 
 HEALTH = ("valid", "degraded", "invalid")
 STYLES = {"valid": "green", "degraded": "yellow", "invalid": "bold red"}
@@ -20,59 +16,48 @@ PER_SECOND = 5.0
 LINE_SECONDS = 10.0
 
 
-@dataclass(frozen=True)
-class Shown:
-    """What there is to show.
+@dataclass
+class Figures:
+    """How a replay goes, under the names that it reports."""
 
-    Args:
-        figures: so far.
-        said: last estimate.
-        sample: last one.
-        first: time of the log's first frame [s].
-    """
+    seconds: float = 0.0  # on the bus's clock, from the first sample to the last
+    frames_sent: int = 0  # of the log, put on the bus
+    frames_received: int = 0  # of them, those that carry wanted signals
+    frames_too_short: int = 0  # of these, those that are shorter than the DBC says
+    samples: int = 0
+    samples_lost: int = 0  # of them, those at which a channel was missing: lost, late or invalid
+    missing: dict[str, int] = field(default_factory=dict)  # channel -> at how many
+    estimates: int = 0  # that were sent
+    latest_ms: float = 0.0  # longest time from a sample's instant until its estimate was sent; as fast as possible: that a sample took
+    deadlines_missed: int = 0  # samples for which that was longer than a cycle of the bus
+    memory_growth_mb: float = 0.0  # most resident memory above that after the first second
 
-    figures: Figures
-    said: Said | None
-    sample: Sample | None
-    first: float
+    def plain(self) -> dict[str, Any]:
+        """Figures for people and scripts."""
+        return {name: round(value, 3) if isinstance(value, float) else value for name, value in vars(self).items()}
 
 
-def rows_of(shown: Shown, estimates_hz: float) -> list[tuple[str, str]]:
-    """Names and values, as people read them.
-
-    Args:
-        shown: what there is.
-        estimates_hz: rate at which estimates came of late.
-    """
-    figures, values = shown.figures, shown.said.values if shown.said is not None else {}
-    now = shown.sample.time - shown.first if shown.sample is not None else 0.0
-    rows = [
-        ("time", f"{now:.1f} s"),
+def rows_of(figures: Figures, values: Mapping[str, float], seconds: float, estimates_hz: float) -> list[tuple[str, str]]:
+    """Names and texts of an estimate's ``values``, ``seconds`` after the first frame, and of figures."""
+    health = "-"
+    if "health" in values:
+        reason = reason_in_words(values["health_reason"])
+        health = HEALTH[int(values["health"])] + (f": {reason}" if reason else "")
+    return [
+        ("time", f"{seconds:.1f} s"),
         ("v", _with_band(values, "vy", 1.0, "m/s", 3)),
         ("β", _with_band(values, "sideslip", 180.0 / math.pi, "°", 2)),
-    ]
-    if "yaw_rate" in values:
-        rows.append(("yaw rate", f"{values['yaw_rate']:+.3f} rad/s"))
-    rows += [
-        ("health", health_in_words(values)),
+        *([("yaw rate", f"{values['yaw_rate']:+.3f} rad/s")] if "yaw_rate" in values else []),
+        ("health", health),
         ("rate", f"{estimates_hz:.1f} estimates/s"),
-        ("frames", f"{figures.received} taken, {figures.sent} sent"),
-        ("samples", f"{figures.samples}, {figures.lost} lost"),
-        ("latest", f"{1e3 * figures.latest:.2f} ms"),
-        ("deadlines missed", str(figures.missed)),
+        ("frames", f"{figures.frames_received} taken, {figures.frames_sent} sent"),
+        ("samples", f"{figures.samples}, {figures.samples_lost} lost"),
+        ("latest", f"{figures.latest_ms:.2f} ms"),
+        ("deadlines missed", str(figures.deadlines_missed)),
     ]
-    return rows
 
 
-def health_in_words(values: Any) -> str:
-    """Health and its reason; a dash before the first estimate."""
-    if "health" not in values:
-        return "-"
-    word, reason = HEALTH[int(values["health"])], reason_in_words(values["health_reason"])
-    return f"{word}: {reason}" if reason else word
-
-
-def _with_band(values: Any, name: str, factor: float, unit: str, digits: int) -> str:
+def _with_band(values: Mapping[str, float], name: str, factor: float, unit: str, digits: int) -> str:
     value, band = values.get(name, math.nan), values.get(f"band_{name}", math.nan)
     if math.isnan(value):
         return "-"
@@ -81,121 +66,48 @@ def _with_band(values: Any, name: str, factor: float, unit: str, digits: int) ->
 
 
 class View:
-    """Shows nothing."""
+    """Shows a replay on a stream; on None nothing."""
 
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
-        """Leave what was shown last."""
-
-    def is_due(self, samples: int) -> bool:
-        """Whether it is time to show something anew, after so many samples."""
-        return False
-
-    def show(self, shown: Shown) -> None:
-        """Show it."""
-
-
-class _Paced(View):
-    """One that shows something so often by the clock on the wall."""
-
-    def __init__(self, stream: TextIO, seconds: float) -> None:
-        self.stream, self.seconds = stream, seconds
-        self._next, self._samples = 0.0, -1
-        self._then: tuple[float, int] | None = None
-
-    def is_due(self, samples: int) -> bool:
-        """Right after a sample, so that the most time is left until the next one."""
-        if samples == self._samples:
-            return False
-        self._samples = samples
-        return time.monotonic() >= self._next
-
-    def show(self, shown: Shown) -> None:
-        """Show it, with the rate since the last time."""
-        now = time.monotonic()
-        rate = 0.0
-        if self._then is not None and now > self._then[0]:
-            rate = (shown.figures.estimates - self._then[1]) / (now - self._then[0])
-        self._then, self._next = (now, shown.figures.estimates), now + self.seconds
-        self.put(rows_of(shown, rate))
-
-    def put(self, rows: list[tuple[str, str]]) -> None:
-        """Print the rows."""
-        raise NotImplementedError
-
-
-class PlainView(_Paced):
-    """A line every so many seconds, for what is no terminal."""
-
-    def __init__(self, stream: TextIO, seconds: float = LINE_SECONDS) -> None:
-        super().__init__(stream, seconds)
-
-    def put(self, rows: list[tuple[str, str]]) -> None:
-        """Print a line."""
-        self.stream.write(", ".join(f"{name} {value}" for name, value in rows) + "\n")
-        self.stream.flush()
-
-
-class LiveView(_Paced):
-    """A table in a terminal, drawn by a thread of its own, so that no sample waits for it."""
-
-    def __init__(self, stream: TextIO, title: str) -> None:
-        super().__init__(stream, 1.0 / PER_SECOND)
-        self.title = title
+    def __init__(self, stream: TextIO | None, title: str) -> None:
+        self._stream, self._title = stream, title
         self._live: Any = None
         self._rows: list[tuple[str, str]] = []
-        self._changed, self._over = threading.Event(), False
-        self._thread: threading.Thread | None = None
+        self._then, self._estimates = time.monotonic(), 0
+        self._due = 0.0 if stream is not None else math.inf
 
-    def __enter__(self) -> Self:
-        from rich.console import Console
-        from rich.live import Live
+    def __enter__(self) -> View:
+        if self._stream is not None and self._stream.isatty():
+            from rich.console import Console
+            from rich.live import Live
 
-        self._live = Live(console=Console(file=self.stream), auto_refresh=False)
-        self._live.start()
-        self._thread = threading.Thread(target=self._draw, name="view", daemon=True)
-        self._thread.start()
+            console = Console(file=self._stream)  # drawn by a thread of rich, so that no sample waits for it
+            self._live = Live(console=console, refresh_per_second=PER_SECOND, get_renderable=self._table)
+            self._live.start()
         return self
 
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
-        """Draw what is there last, and give the terminal back."""
-        self._over = True
-        self._changed.set()
-        if self._thread is not None:
-            self._thread.join(timeout=2.0)
-        self._live.stop()
+    def __exit__(self, *_: object) -> None:
+        if self._live is not None:
+            self._live.stop()
 
-    def put(self, rows: list[tuple[str, str]]) -> None:
-        """Have the rows drawn."""
-        self._rows = rows
-        self._changed.set()
-
-    def _draw(self) -> None:
-        while not self._over:
-            self._changed.wait()
-            self._changed.clear()
-            self._live.update(self._table(), refresh=True)
+    def show(self, figures: Figures, values: Mapping[str, float], seconds: float) -> None:
+        """Show an estimate and figures, if it is time to, ``seconds`` after the first frame."""
+        now = time.monotonic()
+        if now < self._due:
+            return
+        rate = (figures.estimates - self._estimates) / max(now - self._then, 1e-6)
+        self._then, self._estimates = now, figures.estimates
+        self._rows = rows_of(figures, values, seconds, rate)
+        self._due = now + (1.0 / PER_SECOND if self._live is not None else LINE_SECONDS)
+        if self._live is None and self._stream is not None:
+            self._stream.write(", ".join(f"{name} {text}" for name, text in self._rows) + "\n")
+            self._stream.flush()
 
     def _table(self) -> Any:
         from rich.table import Table
         from rich.text import Text
 
-        table = Table(box=None, show_header=False, title=Text(self.title), title_justify="left", pad_edge=False)
-        for name, value in self._rows:
-            style = STYLES.get(value.partition(":")[0], "") if name == "health" else ""
-            table.add_row(Text(name, style="bold"), Text(value, style=style))
+        table = Table(box=None, show_header=False, title=Text(self._title), title_justify="left", pad_edge=False)
+        for name, text in self._rows:
+            style = STYLES.get(text.partition(":")[0], "") if name == "health" else ""
+            table.add_row(Text(name, style="bold"), Text(text, style=style))
         return table
-
-
-def view_on(stream: TextIO, title: str, *, quiet: bool = False) -> View:
-    """A view for a stream, by whether it is a terminal."""
-    if quiet:
-        return View()
-    return LiveView(stream, title) if stream.isatty() else PlainView(stream)
-
-
-def standard_view(title: str, *, quiet: bool = False) -> View:
-    """A view on standard error."""
-    return view_on(sys.stderr, title, quiet=quiet)

@@ -11,11 +11,11 @@ from typing import Any, ClassVar, NamedTuple
 import numpy as np
 
 from vehest.constants import FloatArray
-from vehest.data.declared import Group, setting
 from vehest.data.errors import DataError
 from vehest.data.estimate import Estimate
 from vehest.data.recording import Recording
 from vehest.data.schema import settings_from_config
+from vehest.declared import Group, setting
 from vehest.training.context import FitContext
 from vehest.training.context import FitRecord as FitRecord
 

@@ -13,9 +13,9 @@ from torch import Tensor
 from torch.utils.hooks import RemovableHandle
 
 from vehest.constants import FloatArray
-from vehest.data.declared import Group, setting
 from vehest.data.errors import DataError
 from vehest.data.recording import Recording
+from vehest.declared import Group, setting
 from vehest.estimators.base import FitData, FitRecord, Trial
 from vehest.estimators.dugoff_ukf import PseudoMeasurement, with_variance
 from vehest.estimators.filtering.track_filter import TrackFilter

@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 
 from vehest.constants import GRAVITY, FloatArray
-from vehest.data.declared import setting
 from vehest.data.errors import ConfigurationError
+from vehest.declared import setting
 from vehest.estimators.base import Trial
 from vehest.estimators.recursive import Recursive
 

@@ -15,10 +15,10 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from vehest.constants import GRAVITY, FloatArray
-from vehest.data.declared import Group, setting
 from vehest.data.errors import ConfigurationError, DataError
 from vehest.data.estimate import Estimate
 from vehest.data.recording import Recording
+from vehest.declared import Group, setting
 from vehest.estimators.base import FitData, FitRecord, Trial
 from vehest.estimators.filtering.dugoff_fit import DUGOFF_PARAMETERS, fit_dugoff
 from vehest.estimators.filtering.sigma_point_stepper import FilterStep, SigmaPointEstimator

@@ -10,9 +10,9 @@ import numpy as np
 import torch
 
 from vehest.constants import FloatArray
-from vehest.data.declared import setting
 from vehest.data.errors import ConfigurationError, DataError
 from vehest.data.recording import Recording
+from vehest.declared import setting
 from vehest.estimators.base import FitData, FitRecord, Trial
 from vehest.estimators.dugoff_ukf import PseudoMeasurement, finite
 from vehest.estimators.kernels.sample_network import gaussian_likelihood

@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vehest.constants import FloatArray
-from vehest.data.declared import Group, setting
 from vehest.data.errors import ConfigurationError
+from vehest.declared import Group, setting
 from vehest.estimators.base import Stepper, Trial
 from vehest.estimators.filtering.sideslip_filter import SideslipFilter
 from vehest.filters.gating import in_words, refuses, suffix

@@ -12,10 +12,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vehest.constants import FloatArray
-from vehest.data.declared import Group, setting
 from vehest.data.errors import ConfigurationError, DataError
 from vehest.data.estimate import Estimate
 from vehest.data.recording import Recording
+from vehest.declared import Group, setting
 from vehest.estimators.base import FitData, FitRecord, Stepper, Trial
 from vehest.estimators.filtering.sideslip_filter import FilteredStates, SideslipFilter
 from vehest.filters.gating import Gate, gate_values, in_words, suffix

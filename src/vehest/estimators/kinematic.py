@@ -11,8 +11,8 @@ from scipy.optimize import minimize_scalar
 from scipy.signal import lfilter
 
 from vehest.constants import FloatArray
-from vehest.data.declared import fitted
 from vehest.data.recording import Recording
+from vehest.declared import fitted
 from vehest.estimators.base import Trial
 from vehest.estimators.recursive import Recursive
 

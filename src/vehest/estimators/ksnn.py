@@ -12,8 +12,8 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from vehest.data.declared import setting
 from vehest.data.recording import Recording
+from vehest.declared import setting
 from vehest.estimators.base import Trial
 from vehest.estimators.kernels import ksnn as kernel
 from vehest.estimators.networks.windowed import WindowedEstimator

@@ -13,10 +13,10 @@ import torch
 from torch import Tensor, nn
 
 from vehest.constants import GRAVITY, FloatArray
-from vehest.data.declared import Group, setting
 from vehest.data.errors import ConfigurationError, DataError
 from vehest.data.estimate import Estimate
 from vehest.data.recording import Recording
+from vehest.declared import Group, setting
 from vehest.estimators.base import Estimator, FitData, FitRecord, Trial
 from vehest.estimators.filtering.car_filter import LEAST_ENTROPY, CarFilter
 from vehest.estimators.filtering.sigma_point_stepper import FilterStep, SigmaPointEstimator

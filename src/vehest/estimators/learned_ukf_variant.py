@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from vehest.data.declared import setting
 from vehest.data.errors import ConfigurationError
+from vehest.declared import setting
 from vehest.estimators.filtering.car_filter import FRICTION, OBSERVATION, PROCESS, CarFilter
 from vehest.estimators.learned_ukf import LearnedUkf
 from vehest.filters.diagonal_noise import DiagonalNoise, DiagonalStateDependentNoise

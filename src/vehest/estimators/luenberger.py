@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from vehest.constants import FloatArray
-from vehest.data.declared import fitted
+from vehest.declared import fitted
 from vehest.estimators.base import Trial
 from vehest.estimators.recursive import Recursive
 from vehest.training.search import DirectSearchSettings

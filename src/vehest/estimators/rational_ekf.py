@@ -16,9 +16,9 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from vehest.constants import FloatArray
-from vehest.data.declared import Group, setting
 from vehest.data.errors import ConfigurationError, DataError
 from vehest.data.recording import Recording
+from vehest.declared import Group, setting
 from vehest.estimators.base import FitData, FitRecord, Trial, rate
 from vehest.estimators.filtering.sideslip_filter import FilteredStates, SideslipFilter
 from vehest.estimators.filtering.tyre_fit import NORMAL_95, AxleMotion, TyreFit, axle_motion, fit_motion

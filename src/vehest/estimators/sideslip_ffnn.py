@@ -8,7 +8,7 @@ import numpy as np
 import torch
 
 from vehest.constants import FloatArray
-from vehest.data.declared import setting
+from vehest.declared import setting
 from vehest.estimators.base import FitData, FitRecord, Trial
 from vehest.estimators.kernels.sample_network import squared_error
 from vehest.estimators.networks.sample_network import (

@@ -7,7 +7,7 @@ from typing import Any
 from torch import Tensor, nn
 from torch.nn import functional
 
-from vehest.data.declared import setting
+from vehest.declared import setting
 from vehest.estimators.networks.velocity_recurrent import TRIAL, RecurrentVelocityEstimator, State, VelocityNetwork
 
 

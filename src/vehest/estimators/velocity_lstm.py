@@ -7,7 +7,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from vehest.data.declared import setting
+from vehest.declared import setting
 from vehest.estimators.networks.velocity_recurrent import TRIAL, RecurrentVelocityEstimator, State, VelocityNetwork
 
 

@@ -17,7 +17,7 @@ from vehest.export.measure import STRICT, TARGETS, Footprint, footprint
 from vehest.export.program import TOLERANCES, program_files, render_text, vector_files
 from vehest.export.rendering import Precision
 from vehest.export.vectors import SECONDS, in_float64
-from vehest.trust import health, verdict
+from vehest.trust import health
 from vehest.trust.contract import GuardedStepper
 from vehest.trust.record import Trust
 from vehest.version import __version__
@@ -124,8 +124,7 @@ def refuse_unresolved(trust: Trust | None) -> None:
 
 def _reasons() -> dict[int, str]:
     """Kind of a reason -> what it says."""
-    words = {kind: text.format(channel="CHANNEL", partner="PARTNER") for kind, text in health.WORDS.items() if kind}
-    return words | verdict.OWN_WORDS
+    return {kind: text.format(channel="CHANNEL", partner="PARTNER") for kind, (text, _) in health.REASONS.items() if kind}
 
 
 def _refuse_foreign(out: Path) -> None:

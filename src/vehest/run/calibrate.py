@@ -24,7 +24,7 @@ from vehest.estimators.model_files import load_model, read_description
 from vehest.estimators.registry import estimator_class
 from vehest.run.artefacts import Artefact, StagePlan, read_artefact
 from vehest.run.train import file_digest, recording_file
-from vehest.trust.bands import Origin, Piece, band_inputs, calibrated
+from vehest.trust.bands import Piece, band_inputs, calibrated
 from vehest.trust.guard import learn_limits
 from vehest.trust.health import learn_health
 from vehest.trust.record import TRUST, About, Trust, read_trust, write_trust
@@ -89,15 +89,16 @@ def learn_trust(estimator: Estimator, train: Sequence[Stretch], validation: Sequ
     """
     bands, guard, health, notes = None, None, None, []
     try:
-        origin = Origin(
+        bands = calibrated(
+            _pieces(estimator, train),
+            _pieces(estimator, validation),
+            tuple(estimator.channels),
             vehicles=tuple(dict.fromkeys(stretch.recording.vehicle for stretch in validation)),
             datasets=tuple(dict.fromkeys(stretch.dataset for stretch in validation if stretch.dataset)),
             scaled_on=tuple(stretch.name for stretch in train),
             calibrated_on=tuple(stretch.name for stretch in validation),
-            channels=tuple(estimator.channels),
             horizon_steps=estimator.horizon_steps,
         )
-        bands = calibrated(_pieces(estimator, train), _pieces(estimator, validation), origin)
     except DataError as error:  # such as a missing reference, which does not prevent an evaluation
         notes.append(str(error))
     try:
@@ -119,11 +120,10 @@ def _pieces(estimator: Estimator, stretches: Sequence[Stretch]) -> list[Piece]:
         recording = stretch.recording
         rows, vy, variance = band_inputs(estimate, recording, tuple(estimator.channels), estimator.horizon_steps)
         scored = slice(*recording.index_range(stretch.start + SKIP_SECONDS, recording.end_time))
-        error = vy - recording["vy_ref"]
         turned = estimate["sideslip"] - np.arctan2(recording["vy_ref"], recording["vx"])
-        turned = np.remainder(turned + np.pi, 2.0 * np.pi) - np.pi
+        errors = np.stack([vy - recording["vy_ref"], np.remainder(turned + np.pi, 2.0 * np.pi) - np.pi], axis=1)
         yaw_rate = recording["yaw_rate"][scored] if "yaw_rate" in recording else None
-        found.append(Piece(rows[scored], vy[scored], variance[scored], error[scored], turned[scored], yaw_rate, recording.rate_hz))
+        found.append(Piece(rows[scored], vy[scored], variance[scored], errors[scored], yaw_rate, recording.rate_hz))
     return found
 
 

@@ -40,9 +40,8 @@ from vehest.run.train import STAGE as TRAIN
 from vehest.run.train import new_estimator
 from vehest.sources.base import read_single
 from vehest.trust.contract import estimate_guarded
-from vehest.trust.health import domain_verdict
+from vehest.trust.health import domain_verdict, reason_in_words
 from vehest.trust.record import Trust, is_other_vehicle
-from vehest.trust.verdict import reason_in_words
 
 SUFFIXES = (".parquet", ".csv")
 CONTRADICTIONS = ("sign", "unit")  # checks that compare channels with each other

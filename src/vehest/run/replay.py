@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+import math
+import sys
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
-from vehest.bus import outputs
 from vehest.bus.mapping import BusSignals, from_dataset, from_names
-from vehest.bus.replay import Bus, replay, survey
-from vehest.bus.view import standard_view
+from vehest.bus.messages import EstimateFrames
+from vehest.bus.outputs import output_files
+from vehest.bus.outputs import write_dbc as write_dbc_file
+from vehest.bus.replay import Bus, Replay, survey
+from vehest.bus.view import View
 from vehest.data.errors import ConfigurationError
 from vehest.data.limits import limits_from_config, use_limits
 from vehest.estimators.base import Estimator
@@ -46,40 +50,33 @@ def replay_log(
     Raises:
         VehestError: options make no sense together, or log, DBC, model or bus cannot be used.
     """
-    bus = Bus(interface, channel, _speed(speed), _identifier(identifier))
-    for path in (out, write_dbc):
-        if path is not None and any(path.resolve() == other.resolve() for other in (log, dbc) if other is not None):
+    bus, estimates = Bus(interface, channel, _speed(speed)), EstimateFrames(_identifier(identifier))
+    if bus.speed is None and interface != "virtual":
+        raise ConfigurationError(f"--speed max needs the virtual bus, not '{interface}'; give --speed 1")
+    written = output_files(out) + ([write_dbc] if write_dbc else [])
+    for path in written:
+        if any(path.resolve() == other.resolve() for other in (log, dbc) if other is not None):
             raise ConfigurationError(f"'{path}' is an input; name another file")
-    if out is not None:
-        outputs.check_output(out)
     config = compose_config("estimate", [*([f"dataset={dataset}"] if dataset else []), *overrides])
     folder, fitted, trust = open_model(model, Path(config["output"]), say)
     with use_limits(limits_from_config(config["limits"])):
         wanted = _signals(config if dataset else None, dbc, signals, fitted)
         frames = read_frames(log)
-        found = survey(frames, wanted, bus_rate)
-        faster = found.timing.rate_hz if abs(found.timing.rate_hz / fitted.settings.rate_hz - 1.0) > SAME_RATE else None
+        timing = survey(frames, wanted, bus_rate)
+        faster = timing.rate_hz if abs(timing.rate_hz / fitted.settings.rate_hz - 1.0) > SAME_RATE else None
         if write_dbc is not None:
-            outputs.write_dbc(write_dbc, bus.first_id)
-        figures, output = replay(
-            frames,
-            wanted,
-            found,
-            lambda: GuardedStepper(fitted, trust, faster),
-            bus,
-            lambda names: outputs.open_output(out, names, bus.first_id),
-            standard_view(f"{log.name} on {bus.interface} {bus.channel}", quiet=quiet),
-            stopped,
-        )
+            write_dbc_file(write_dbc, estimates.identifiers[0])
+        view = View(None if quiet else sys.stderr, f"{log.name} on {bus.interface} {bus.channel}")
+        figures = Replay(frames, wanted, timing, bus, estimates, stopped).run(lambda: GuardedStepper(fitted, trust, faster), out, view)
     return {
         "log": str(log),
         "model": PRETRAINED if model == PRETRAINED else str(folder),
-        "samples_hz": found.timing.rate_hz,
+        "samples_hz": timing.rate_hz,
         "estimates_hz": fitted.settings.rate_hz,
         "delay_ms": round(1e3 * GuardedStepper(fitted, trust, faster).delay, 3),
         **figures.plain(),
         "stopped": stopped(),
-        "written": [str(file) for file in (*output.files, *([write_dbc] if write_dbc else []))],
+        "written": [str(file) for file in written],
         **({"note": pretrained_note()} if model == PRETRAINED else {}),
     }
 
@@ -98,7 +95,8 @@ def _signals(described: Config | None, dbc: Path | None, signals: str, model: Es
 
 def _speed(text: str) -> float | None:
     with suppress(ValueError):
-        return None if text == "max" else float(text)
+        if text == "max" or 0 < float(text) < math.inf:
+            return None if text == "max" else float(text)
     raise ConfigurationError(f"--speed must be a positive number or max, not '{text}'")
 
 

@@ -37,16 +37,11 @@ class _Archive(io.FileIO):
 
 
 @contextmanager
-def unpacked(file: Path, *, most_bytes: int = MOST_BYTES, most_files: int = MOST_FILES) -> Iterator[Path]:
+def unpacked(file: Path, *, most_bytes: int = MOST_BYTES) -> Iterator[Path]:
     """Yield a temporary folder with the contents of a zip archive; it is removed afterwards.
 
     All entries are checked before anything is written: no path outside the folder, no links or special files, no more bytes or files than
     the limits. zipfile unpacks no entry beyond its stated size, and checks its checksum. Archives inside stay packed.
-
-    Args:
-        file: the archive.
-        most_bytes: limit of the unpacked files together [bytes]; 8 GB.
-        most_files: limit of their number, folders included.
 
     Raises:
         DataError: the archive is refused, truncated or corrupt.
@@ -56,12 +51,10 @@ def unpacked(file: Path, *, most_bytes: int = MOST_BYTES, most_files: int = MOST
         try:
             with _Archive(regular_file(file)) as stream, zipfile.ZipFile(stream) as archive:
                 entries = archive.infolist()
-                size = sum(entry.file_size for entry in entries)
-                if len(entries) > most_files or size > most_bytes:
-                    limits = f"{most_files} entries and {most_bytes / 1e9:.3g} GB"
-                    raise DataError(f"'{file}' holds {len(entries)} entries, {size / 1e9:.3g} GB unpacked, more than the limit of {limits}")
-                if size > max(SMALL, MOST_EXPANSION * file.stat().st_size):
-                    raise DataError(f"'{file}' would unpack to more than {MOST_EXPANSION} times its size; unpack it by hand")
+                size, most = sum(entry.file_size for entry in entries), min(most_bytes, max(SMALL, MOST_EXPANSION * file.stat().st_size))
+                if len(entries) > MOST_FILES or size > most:
+                    limits = f"more than the limit of {MOST_FILES} entries and {most / 1e9:.3g} GB; unpack it by hand"
+                    raise DataError(f"'{file}' holds {len(entries)} entries, {size / 1e9:.3g} GB unpacked, {limits}")
                 targets = {entry: folder / _checked_path(file, entry) for entry in entries if not entry.is_dir()}
                 for entry, target in targets.items():
                     target.parent.mkdir(parents=True, exist_ok=True)
@@ -93,10 +86,9 @@ def temporary_folder(file: Path) -> Iterator[Path]:
 
 def _checked_path(file: Path, entry: zipfile.ZipInfo) -> PurePosixPath:
     """Path of an entry inside the folder."""
-    name = entry.filename
+    name, kind = entry.filename, stat.S_IFMT(entry.external_attr >> 16)
     path = PurePosixPath(name.replace("\\", "/"))
-    if path.is_absolute() or PureWindowsPath(name).drive or ".." in path.parts or not path.parts or not name.isprintable():
-        raise DataError(f"'{file}': entry {name!r} would be written outside of the folder; do not trust this archive")
-    if stat.S_IFMT(entry.external_attr >> 16) not in (0, stat.S_IFREG, stat.S_IFDIR):
-        raise DataError(f"'{file}': entry {name!r} is a link or a special file; pack the file itself")
+    leaves = path.is_absolute() or PureWindowsPath(name).drive or ".." in path.parts or not path.parts or not name.isprintable()
+    if leaves or kind not in (0, stat.S_IFREG, stat.S_IFDIR):
+        raise DataError(f"'{file}': entry {name!r} is no file inside the folder, but a link or elsewhere; do not trust this archive")
     return path

@@ -9,11 +9,11 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from functools import cache
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, Literal, TypeVar
+from typing import Annotated, Any, ClassVar, Literal, TypeVar, cast
 
 import vehest.sources as package
 from vehest.data.derived import ScaleToWheelbase
-from vehest.data.errors import ConfigurationError, DataError, MissingError
+from vehest.data.errors import ConfigurationError, MissingError
 from vehest.data.files import regular_file
 from vehest.data.recording import Kind, Recording
 from vehest.data.schema import validated
@@ -69,17 +69,15 @@ COMMON_KEYS = frozenset(field.name for field in fields(CommonOptions))
 
 def origin_in_words(recording: Recording) -> list[str]:
     """Where a recording's channels were measured and which were derived, by its data set, a line each."""
-    declared = recording.provenance.get(DERIVED) or {}
-    lines = []
-    if "reference_point" in declared:
+    declared, lines = recording.provenance.get(DERIVED) or {}, []
+    if point := declared.get("reference_point"):
         moved = ", moved to it" if declared.get("moved_to_centre_of_gravity") else ""
-        lines.append(f"reference measured {_point_in_words(declared['reference_point'])}{moved}")
-    if "imu_point" in declared:
-        lines.append(f"inertial unit {_point_in_words(declared['imu_point'])}")
-    if declared.get("transforms"):
-        lines.append(f"derived by {', '.join(str(entry.get('name')) for entry in declared['transforms'])}")
-    held = recording.provenance.get("held")
-    if held:
+        lines.append(f"reference measured {_point_in_words(point)}{moved}")
+    if point := declared.get("imu_point"):
+        lines.append(f"inertial unit {_point_in_words(point)}")
+    if transforms := declared.get("transforms"):
+        lines.append(f"derived by {', '.join(str(entry.get('name')) for entry in transforms)}")
+    if held := recording.provenance.get("held"):
         lines.append(f"{', '.join(held['channels'])} sampled at {held['rate_hz']:.4g} Hz, straight lines in between")
     return lines
 
@@ -90,7 +88,7 @@ def _point_in_words(point: Any) -> str:
     x, y = float(point.get("x", 0.0)), float(point.get("y", 0.0))
     parts = [f"{abs(x):g} m {'ahead of' if x > 0 else 'behind'}"] if x else []
     parts += [f"{abs(y):g} m to the {'left' if y > 0 else 'right'} of"] if y else []
-    return f"{' and '.join(parts)} the centre of gravity" if parts else "at the centre of gravity"
+    return f"{' and '.join(parts) or 'at'} the centre of gravity"
 
 
 Options = TypeVar("Options")
@@ -104,7 +102,6 @@ class Source(ABC):
 
     Attributes:
         options_type: dataclass of its own options, with their types and defaults.
-        keys: names of those options, which follow from ``options_type``.
         options: the options of this data set.
         version: raised when the recordings that it makes change.
 
@@ -113,45 +110,36 @@ class Source(ABC):
     """
 
     options_type: ClassVar[type]
-    keys: ClassVar[frozenset[str]]
     options: Any
     version: ClassVar[str] = "1"
     slow: ClassVar[bool] = False  # whether a recording takes so long that each is kept as soon as it is made
-
-    def __init_subclass__(cls) -> None:
-        if "options_type" in vars(cls):
-            cls.keys = frozenset(field.name for field in fields(cls.options_type))
 
     def __init__(self, dataset: Mapping[str, Any]) -> None:
         self.dataset = dict(dataset)
         self.name = str(dataset.get("name", "unnamed"))
         self.where = f"data set '{self.name}'"
         check_name(self.name, "data set")
-        unknown = sorted(set(dataset) - COMMON_KEYS - self.keys)
-        if unknown:
-            what = f"source '{dataset.get('source')}' has no option '{unknown[0]}'; it has {', '.join(sorted(self.keys))}"
+        keys = {field.name for field in fields(self.options_type)}
+        if unknown := sorted(set(dataset) - COMMON_KEYS - keys):
+            what = f"source '{dataset.get('source')}' has no option '{unknown[0]}'; it has {', '.join(sorted(keys))}"
             raise ConfigurationError(f"{self.where}: {what}")
-        common = self._validated(CommonOptions, COMMON_KEYS)
+        common = self._validated(CommonOptions)
         self.reference_point = common.reference_point
         try:
             self.transforms = [transform_from_config(entry) for entry in common.transforms or ()]
         except ConfigurationError as error:
             raise ConfigurationError(f"{self.where}: {error}") from None
         if isinstance(self.reference_point, Point) and any(isinstance(transform, ScaleToWheelbase) for transform in self.transforms):
-            what = "a reference point is in metres of the unscaled car; move the reference by the transform reference_lever, before"
-            raise ConfigurationError(f"{self.where}: {what} scale_to_wheelbase")
-        if dataset.get("source") == SIMULATED and common.kind != SIMULATED and "kind" in dataset:
+            what = "reference_point does not go with scale_to_wheelbase; put the transform reference_lever before it instead"
+            raise ConfigurationError(f"{self.where}: {what}")
+        if dataset.get("source") == SIMULATED and dataset.get("kind", SIMULATED) != SIMULATED:
             raise ConfigurationError(f"{self.where}: source '{SIMULATED}' makes simulated recordings; leave kind out")
-        self.options = self._validated(self.options_type, self.keys)
+        self.options = self._validated(self.options_type)
 
-    def _validated(self, kind: type[Options], keys: frozenset[str]) -> Options:
-        own = {key: value for key, value in self.dataset.items() if key in keys}
+    def _validated(self, kind: type[Options]) -> Options:
+        names = {field.name for field in fields(cast(Any, kind))}
+        own = {key: value for key, value in self.dataset.items() if key in names}
         return validated(kind, own, self.where, error=ConfigurationError, group="dataset")
-
-    @property
-    def kind(self) -> Kind:
-        """``real`` or ``simulated``."""
-        return kind_of(self.dataset)
 
     @abstractmethod
     def inputs(self) -> dict[str, str | Path]:
@@ -268,35 +256,12 @@ def existing_folder(path: Any, dataset: str) -> Path:
     Raises:
         MissingError: no root was given, or the folder is not there.
     """
-    if str(path or "None").split("/")[0] in {"None", "null"}:
-        raise MissingError(f"data set '{dataset}': no data root is set; give root=FOLDER or set VEHEST_DATA")
     folder = Path(str(path)).expanduser()
-    if not folder.is_dir():
-        raise MissingError(f"data set '{dataset}': there is no folder '{folder}'; give root=FOLDER or set VEHEST_DATA")
+    has_root = bool(path) and folder.parts[:1] not in {("None",), ("null",)}
+    if not (has_root and folder.is_dir()):
+        what = f"there is no folder '{folder}'" if has_root else "no data root is set"
+        raise MissingError(f"data set '{dataset}': {what}; give root=FOLDER or set VEHEST_DATA")
     return folder
-
-
-def matching_files(dataset: Mapping[str, Any], default: str) -> list[Path]:
-    """Files in a data set's ``path`` that match its ``files``, in alphabetical order; their stems are recordings' names.
-
-    Args:
-        dataset: its configuration.
-        default: pattern if it names none.
-
-    Raises:
-        MissingError: there is no folder, or no file matches.
-        DataError: two files have the same stem.
-    """
-    name = str(dataset.get("name", "unnamed"))
-    folder, pattern = existing_folder(dataset.get("path"), name), str(dataset.get("files", default))
-    files = sorted(file for file in folder.glob(pattern) if file.is_file())
-    if not files:
-        raise MissingError(f"data set '{name}': no file in '{folder}' matches '{pattern}'")
-    stems = [file.stem for file in files]
-    doubled = sorted({stem for stem in stems if stems.count(stem) > 1})
-    if doubled:
-        raise DataError(f"data set '{name}': two files are called '{doubled[0]}', a recording's name must be unique")
-    return files
 
 
 def require_files(files: Sequence[Path], dataset: str) -> None:

@@ -23,28 +23,23 @@ def seconds_of_text(column: pa.ChunkedArray) -> FloatArray | None:
     Args:
         column: strings, (N,).
     """
-    text = column.combine_chunks() if isinstance(column, pa.ChunkedArray) else column
-    found = compute.extract_regex(text, pattern=WRITTEN)
+    found = compute.extract_regex(column.combine_chunks(), pattern=WRITTEN)
     if not len(found) or found.null_count:
         return None
-    seconds = compute.cast(compute.replace_substring(found.field("second"), ",", "."), pa.float64())
-    hours, minutes = (compute.cast(found.field(part), pa.float64()) for part in ("hour", "minute"))
+    seconds = compute.replace_substring(found.field("second"), ",", ".")
+    hours, minutes, seconds = (compute.cast(part, pa.float64()) for part in (found.field("hour"), found.field("minute"), seconds))
     times = np.asarray(hours) * 3600.0 + np.asarray(minutes) * 60.0 + np.asarray(seconds)
-    dates = found.field("date").to_pylist() if compute.any(compute.not_equal(found.field("date"), "")).as_py() else []
-    if dates:
-        days = _days(dates)
-        return None if days is None else times + DAY * days
+    dates = found.field("date")
+    if not compute.any(compute.not_equal(dates, "")).as_py():
+        return past_midnight(times)
+    padded = compute.replace_substring_regex(dates, r"\b(\d)\.", r"0\1.")
+    try:
+        days = compute.replace_substring_regex(padded, r"^(\d+)\.(\d+)\.(\d+)$", r"\3-\2-\1").cast(pa.date32()).cast(pa.int32())
+    except pa.ArrowInvalid:
+        return None
+    return np.asarray(times + DAY * np.asarray(days), dtype=np.float64)
+
+
+def past_midnight(times: FloatArray) -> FloatArray:
+    """Times since midnight that go on past the next [s], (N,), of times of day."""
     return np.asarray(times + DAY * np.concatenate([[0.0], np.cumsum(np.diff(times) < -0.5 * DAY)]), dtype=np.float64)
-
-
-def _days(dates: list[str]) -> FloatArray | None:
-    """Days since 1970, (N,); None where one is no date."""
-    known: dict[str, float] = {}
-    for date in set(dates):
-        parts = date.split(".")
-        plain = date if len(parts) != 3 else f"{int(parts[2]):04d}-{int(parts[1]):02d}-{int(parts[0]):02d}"
-        try:
-            known[date] = float(np.datetime64(plain, "D").astype(np.int64))
-        except ValueError:
-            return None
-    return np.array([known[date] for date in dates])

@@ -6,6 +6,7 @@ stamps -> `require_clock` -> `uniform_clock` or, with software delay, `uniform_t
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Literal
 
@@ -89,9 +90,7 @@ def _order_fault(stamps: FloatArray, fix: str, may_repeat: bool) -> str:
         return f"fewer than two time stamps; {fix}"
     odd = np.flatnonzero(~(np.abs(stamps) <= LATEST_TIME))
     if len(odd):
-        time = float(stamps[odd[0]])
-        what = f"{time:.6g} s, which is no time of a drive" if math.isfinite(time) else "not a number"
-        return f"time stamp of sample {odd[0]} is {what}; {fix}"
+        return f"time stamp of sample {odd[0]} is {stamps[odd[0]]:.6g} s, which is no time of a drive; {fix}"
     steps = np.diff(stamps)
     for what, bad in (("goes backwards", steps < 0), ("repeats", (steps == 0) & (not may_repeat))):
         if bad.any():
@@ -103,11 +102,10 @@ def _order_fault(stamps: FloatArray, fix: str, may_repeat: bool) -> str:
 def unevenness(stamps: FloatArray) -> str:
     """Gaps, jitter or drift of increasing time stamps [s], in words; empty where they are even."""
     steps = np.diff(stamps)
-    step = float(np.median(steps))
-    gaps = np.flatnonzero(steps > GAP * step)
-    if len(gaps):
-        longest = gaps[np.argmax(steps[gaps])]
-        return f"{len(gaps)} gaps, the longest of {steps[longest]:.6g} s after {stamps[longest]:.12g} s (interval {step:.6g} s)"
+    step, longest = float(np.median(steps)), int(np.argmax(steps))
+    if steps[longest] > GAP * step:
+        gaps = f"{(steps > GAP * step).sum()} gaps, the longest of {steps[longest]:.6g} s after {stamps[longest]:.12g} s"
+        return f"{gaps} (interval {step:.6g} s)"
     jitter = float(np.abs(steps - step).max() / step)
     if jitter > MOST_JITTER:
         return f"intervals deviate by up to {100 * jitter:.2g} % from the median of {step:.6g} s"
@@ -118,25 +116,30 @@ def unevenness(stamps: FloatArray) -> str:
     return ""
 
 
+def require_samples(values: FloatArray, times: FloatArray, longest: float, where: str) -> None:
+    """Refuse samples, shape (T,), that are no finite numbers or whose increasing times [s] lie further apart than ``longest`` [s].
+
+    Raises:
+        DataError: there are such; ``where`` names file and signal.
+    """
+    bad, steps = np.flatnonzero(~np.isfinite(values)), np.diff(times)
+    if len(bad):
+        what = f"{len(bad)} samples between {times[bad[0]]:.6g} s and {times[bad[-1]]:.6g} s that are marked invalid or no finite numbers"
+        raise DataError(f"{where} holds {what}; cut the range out, or declare the channel gappy")
+    at = int(np.argmax(steps))
+    if steps[at] > longest:
+        what = f"a gap of {steps[at]:.6g} s after {times[at]:.6g} s, the longest of {(steps > longest).sum()} above {longest:.6g} s"
+        raise DataError(f"{where} has {what}; cut the range out, or raise max_gap if values may be interpolated over that time")
+
+
 @dataclass(frozen=True)
 class Clock:
-    """A uniform clock, and how to bring samples onto it.
+    """A uniform clock, and how to bring samples onto it."""
 
-    Args:
-        start_time: time of the first sample [s].
-        rate_hz: sampling rate [Hz].
-        n_samples: samples on the uniform clock.
-        stamps: the file's own time stamps, where samples must be interpolated [s].
-    """
-
-    start_time: float
+    start_time: float  # s
     rate_hz: float
     n_samples: int
-    stamps: FloatArray | None = None
-
-    def times_of_rows(self) -> FloatArray:
-        """Times of the file's rows [s]."""
-        return self.ticks() if self.stamps is None else self.stamps
+    stamps: FloatArray | None = None  # the file's own time stamps, where samples must be interpolated [s]
 
     def ticks(self) -> FloatArray:
         """Times of the uniform clock [s]."""
@@ -170,45 +173,25 @@ def uniform_clock(stamps: FloatArray, where: str, policy: ClockPolicy = "strict"
             hold more samples than the limits allow.
     """
     require_clock(stamps, where, may_repeat=policy == "uniform")
-    start, elapsed, intervals = float(stamps[0]), float(stamps[-1] - stamps[0]), len(stamps) - 1
-    if policy == "uniform":
-        nominal = plain_rate(1.0 / float(np.median(np.diff(stamps))), INTERPOLATED_TOLERANCE)
-        sampled = uniform_times(stamps, nominal, where, fix="leave rows out by drop_rows or set clock: interpolate")
-        return Clock(float(sampled.times[0]), plain_rate(float(sampled.rate_hz or 0.0), min(MOST_STRETCH / intervals, 1e-4)), len(stamps))
+    start, elapsed, steps = float(stamps[0]), float(stamps[-1] - stamps[0]), np.diff(stamps)
     if policy == "interpolate":
-        rate = plain_rate(1.0 / mean_step(np.diff(stamps)), INTERPOLATED_TOLERANCE)
+        rate = plain_rate(1.0 / mean_step(steps), INTERPOLATED_TOLERANCE)
         n_samples = int(np.floor(elapsed * rate + 1e-3)) + 1
         check_limit("samples", n_samples, f"{where}: an even clock of {rate:.6g} Hz over {len(stamps)} rows would hold {n_samples} samples")
         return Clock(start, rate, n_samples, stamps)
-    if uneven := unevenness(stamps):
+    rate, deviation = len(steps) / elapsed, MOST_DRIFT
+    if policy == "uniform":
+        nominal, deviation = plain_rate(1.0 / float(np.median(steps)), INTERPOLATED_TOLERANCE), MOST_STRETCH
+        times, rate, _ = uniform_times(stamps, nominal, where, fix="leave rows out by drop_rows or set clock: interpolate")
+        start = float(times[0])
+    elif uneven := unevenness(stamps):
         raise DataError(f"{where}: {uneven}; {fix}")
-    return Clock(start, plain_rate(intervals / elapsed, min(MOST_DRIFT / intervals, 1e-4)), len(stamps))
-
-
-@dataclass(frozen=True)
-class SampleTimes:
-    """Times of samples and how their stamps scatter about them.
-
-    Args:
-        times: strictly increasing [s], shape (T,).
-        rate_hz: the rate found [Hz]; None where the stamps themselves are the times.
-        jitter: root mean square of stamp minus time [s]; of the intervals where the stamps themselves are the times.
-    """
-
-    times: FloatArray
-    rate_hz: float | None
-    jitter: float
-
-
-def stamped_times(stamps: FloatArray, where: str) -> SampleTimes:
-    """The stamps [s], shape (T,), themselves as times; raises `DataError` as `require_clock` does."""
-    require_clock(stamps, where, "repair or cut the range out, or take clock: uniform if samples come in batches")
-    return SampleTimes(stamps, None, float(np.diff(stamps).std()))
+    return Clock(start, plain_rate(rate, min(deviation / len(steps), 1e-4)), len(stamps))
 
 
 def uniform_times(
     stamps: FloatArray, rate_hz: float, where: str, tolerated: float = 0.0, fix: str = "cut the range out or set clock: stamps"
-) -> SampleTimes:
+) -> tuple[FloatArray, float, float]:
     """Times of a sensor that samples evenly, from time stamps with software delay.
 
     A straight line through stamps over their number, by least squares; stamps beyond three standard deviations, as a stalled
@@ -220,6 +203,9 @@ def uniform_times(
         where: file and topic, for messages.
         tolerated: wandering of the stamps about the line that does not matter [s].
         fix: what to do where samples are missing, for messages.
+
+    Returns:
+        times [s], shape (T,), the rate found [Hz], and the root mean square of stamps minus times [s].
 
     Raises:
         DataError: too few samples, stamps that go backwards or are no numbers, another rate, or samples that are missing.
@@ -246,7 +232,7 @@ def uniform_times(
             f"{where}: stamps are {1e3 * shifts[worst]:.3g} ms away from a uniform clock of {found:.6g} Hz about "
             f"{stamps[edges[worst]]:.6g} s: samples are missing or the clock drifts; {fix}"
         )
-    return SampleTimes(times, found, float(np.sqrt(np.mean(np.square(late)))))
+    return times, found, float(np.sqrt(np.mean(np.square(late))))
 
 
 def _robust_line(number: FloatArray, stamps: FloatArray) -> tuple[float, float]:
@@ -264,15 +250,32 @@ def _robust_line(number: FloatArray, stamps: FloatArray) -> tuple[float, float]:
     return slope, offset - slope * middle + origin
 
 
-def common_ticks(begin: float, end: float, rate_hz: float, where: str) -> FloatArray:
+def common_span(spans: Mapping[str, tuple[float, float]], where: str) -> tuple[float, float]:
+    """Time that all spans [s] have in common; their keys name them in messages.
+
+    Raises:
+        DataError: there is none.
+    """
+    late, early = max(spans, key=lambda name: spans[name][0]), min(spans, key=lambda name: spans[name][1])
+    begin, end = spans[late][0], spans[early][1]
+    if begin >= end:
+        what = f"{late} begins at {begin:.6g} s, {early} ends at {end:.6g} s"
+        raise DataError(f"{where}: {what}: nothing is common to all; leave one out, declare it gappy or take stamps of one clock")
+    return begin, end
+
+
+def ticks_within(begin: float, end: float, rate_hz: float, where: str) -> FloatArray:
     """Whole multiples of a sampling interval from ``begin`` to ``end`` [s], shape (T,).
 
     Raises:
-        DataError: they are more than the limits allow.
+        DataError: they are fewer than two or more than the limits allow.
     """
     n_samples = (end - begin) * rate_hz
     check_limit("samples", n_samples, f"{where} would become {n_samples:.0f} samples from {begin:.6g} s to {end:.6g} s at {rate_hz:g} Hz")
-    return np.arange(math.ceil(begin * rate_hz - SLACK), math.floor(end * rate_hz + SLACK) + 1) / rate_hz
+    ticks = np.arange(math.ceil(begin * rate_hz - SLACK), math.floor(end * rate_hz + SLACK) + 1) / rate_hz
+    if len(ticks) < 2:
+        raise DataError(f"{where} would become fewer than two samples from {begin:.6g} s to {end:.6g} s at {rate_hz:g} Hz")
+    return ticks
 
 
 def at_ticks(samples: FloatArray, stamps: FloatArray, ticks: FloatArray, *, hold: bool = False, slack: float = 0.0) -> FloatArray:

@@ -6,10 +6,10 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Annotated, Any, Literal
 
-from pydantic import Field
+from pydantic import BeforeValidator, Field
 
 from vehest.constants import FloatArray
-from vehest.data.channels import CHANNELS, channel
+from vehest.data.channels import channel
 from vehest.data.errors import ConfigurationError, DataError
 from vehest.data.schema import validated
 from vehest.data.units import factor_to_si
@@ -17,6 +17,7 @@ from vehest.sources.clocks import HIGHEST_RATE
 
 ChannelMap = Annotated[dict[str, Any], "a mapping from a channel to its column and unit"]
 ChannelNames = Annotated[tuple[str, ...], "a list of channels"]
+ColumnName = Annotated[str, BeforeValidator(lambda name: str(name) if type(name) is int else name)]  # YAML reads 3 as a number
 Positive = Annotated[float, Field(gt=0)]
 Rate = Annotated[float, Field(gt=0, le=HIGHEST_RATE)]
 
@@ -32,7 +33,7 @@ class Column:
         factor: what the file's values must be multiplied with to be in ``unit``, such as 1 / wheel radius.
     """
 
-    column: str
+    column: ColumnName
     unit: str
     sign: Literal[1, -1] = 1
     factor: Annotated[float, "a number other than 0"] = 1.0
@@ -44,12 +45,7 @@ class Column:
 
 
 def columns_from_config(entries: Mapping[str, Any], dataset: str, kind: type[Column] = Column) -> dict[str, Column]:
-    """The map of channels that a data set declares.
-
-    Args:
-        entries: channel -> its declaration.
-        dataset: for messages.
-        kind: of which the declarations are.
+    """Channel -> its declaration of ``kind``, as a data set declares them.
 
     Raises:
         ConfigurationError: an unknown channel, unit or key.
@@ -58,45 +54,23 @@ def columns_from_config(entries: Mapping[str, Any], dataset: str, kind: type[Col
     for name, entry in entries.items():
         where = f"data set '{dataset}': channel '{name}'"
         try:
-            unit = channel(str(name)).unit
+            columns[str(name)] = column_from_config(entry, where, channel(str(name)).unit, kind)
         except DataError as error:
             raise ConfigurationError(f"{where}: {error}") from None
-        columns[str(name)] = column_from_config(entry, where, unit, kind)
     return columns
 
 
-def column_from_config(entry: Any, where: str, si_unit: str | None = None, kind: type[Column] = Column) -> Column:
-    """One column's declaration.
-
-    Args:
-        entry: mapping of column, unit and, if need be, sign and factor.
-        where: for messages.
-        si_unit: to which the unit must be convertible; None for any.
-        kind: of which the declaration is.
+def column_from_config(entry: Any, where: str, si_unit: str, kind: type[Column] = Column) -> Column:
+    """A declaration of ``kind`` whose unit is convertible to ``si_unit``.
 
     Raises:
         ConfigurationError: a key is missing or unknown, or the unit is of another quantity.
     """
-    if not isinstance(entry, Mapping):
-        raise ConfigurationError(f"{where} must say column, unit and, if need be, sign and factor, not {str(entry)[:80]}")
-    name = entry.get("column")
-    named = {**entry, "column": str(name)} if type(name) is int else dict(entry)  # YAML reads a column called 3 as a number
-    column = validated(kind, named, where, error=ConfigurationError)
+    column = validated(kind, entry, where, error=ConfigurationError)
     if column.factor == 0:
         raise ConfigurationError(f"{where}: factor must be a number other than 0")
-    if si_unit is not None:
-        try:
-            factor_to_si(column.unit, si_unit)
-        except DataError as error:
-            raise ConfigurationError(f"{where}: {error}") from None
+    try:
+        factor_to_si(column.unit, si_unit)
+    except DataError as error:
+        raise ConfigurationError(f"{where}: {error}") from None
     return column
-
-
-def time_column_from_config(entry: Any, dataset: str) -> Column:
-    """The declaration of the time column; raises `ConfigurationError` as `column_from_config` does."""
-    return column_from_config(entry, f"data set '{dataset}': time", "s")
-
-
-def identity_columns(names: list[str]) -> dict[str, Column]:
-    """Columns that already carry a channel's name and unit."""
-    return {name: Column(name, CHANNELS[name].unit) for name in names if name in CHANNELS}

@@ -13,8 +13,10 @@ from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Literal
+from typing import Annotated, Literal
 from urllib.parse import quote
+
+from pydantic import AfterValidator, Field
 
 from vehest.data.errors import ConfigurationError, DataError, MissingError
 from vehest.data.files import remove_leftovers, sha256_of, writing_error, written_aside
@@ -26,54 +28,46 @@ from vehest.sources.resuming import Progress, ResumingDownloader
 CHECKSUMS = "checksums.txt"
 UNDER_WAY = ".download"
 NAME = re.compile(r'[^./\\:*?"<>|\s-][^/\\:*?"<>|\x00-\x1f\x7f]*')
-SHA256 = re.compile(r"[0-9a-fA-F]{64}")
+
+
+def _file_name(name: str) -> str:
+    if not NAME.fullmatch(name) or name == CHECKSUMS:
+        raise ValueError(f"{name!r} is not the name of a file in one folder, such as drive_1.csv")
+    return name
+
+
+FileName = Annotated[str, AfterValidator(_file_name)]
+Sha256 = Annotated[str, Field(pattern=r"^[0-9a-fA-F]{64}$")]
 
 
 @dataclass(frozen=True)
 class DownloadOptions:
     """Option ``download`` of a data set; without ``files`` the source names them."""
 
-    url: str
-    files: tuple[str, ...] | None = None
-    sha256: dict[str, str] | None = None
+    url: Annotated[str, Field(pattern=r"^https?://[^\s/\[]\S*$")]
+    files: tuple[FileName, ...] | None = None
+    sha256: dict[FileName, Sha256] | None = None
 
 
 @dataclass(frozen=True)
 class Outcome:
-    """Result for one file.
-
-    Args:
-        name: of the file.
-        what: ``fetched``; ``matched`` its recorded checksum; or was there and its checksum ``recorded`` on first sight.
-        sha256: of its bytes.
-        size: bytes.
-        resumed_at: bytes that an earlier attempt had left, 0 for a file in one go.
-    """
+    """Result for one file."""
 
     name: str
-    what: Literal["fetched", "matched", "recorded"]
+    what: Literal["fetched", "matched", "recorded"]  # matched its known checksum; was there and its checksum is recorded on first sight
     sha256: str
-    size: int
-    resumed_at: int = 0
+    size: int  # bytes
+    resumed_at: int = 0  # bytes that an earlier attempt had left
 
 
 @dataclass(frozen=True)
 class Download:
-    """Files of a data set, their address and their folder.
+    """Files of a data set, the folder where they belong, and the address of the folder that they come from."""
 
-    Args:
-        dataset: name of the data set.
-        folder: where the files belong.
-        url: address of the folder that they come from.
-        files: their names.
-        sha256: checksums known beforehand, by name.
-    """
-
-    dataset: str
     folder: Path
     url: str
     files: tuple[str, ...]
-    sha256: Mapping[str, str] = field(default_factory=dict)
+    sha256: Mapping[str, str] = field(default_factory=dict)  # checksums known beforehand, by name
 
     def address(self, name: str) -> str:
         """Address of a file."""
@@ -85,8 +79,7 @@ class Download:
         Raises:
             DataError: a file, or the record of checksums, is damaged or another one.
         """
-        known = self._known()
-        return [name for name in self.files if self._checked(name, known) is None]
+        return [name for name in self.files if self._checked(name) is None]
 
     def fetch(self, progress: Progress | None = None) -> Iterator[Outcome]:
         """Download missing files one after another; a file takes its name once it is complete, checked and recorded.
@@ -110,58 +103,40 @@ class Download:
     def _outcome(self, name: str, progress: Progress | None) -> Outcome:
         import pooch
 
-        path, known, record = self.folder / name, self._known(), self.folder / CHECKSUMS
-        found = self._checked(name, known)
+        path, recorded, found = self.folder / name, name in _read_checksums(self.folder), self._checked(name)
         if found is not None:
-            recorded = name in _read_checksums(record)
-            _record(record, name, found)
+            _record(self.folder, name, found)
             return Outcome(name, "matched" if recorded else "recorded", found, path.stat().st_size)
-        downloader = ResumingDownloader(self.folder / UNDER_WAY / f"{name}.part", progress)
+        address, under_way = self.address(name), self.folder / UNDER_WAY
+        downloader = ResumingDownloader(under_way / f"{name}.part", progress)
         pooch.get_logger().setLevel("WARNING")
         try:
-            complete = pooch.retrieve(self.address(name), known.get(name), name, self.folder / UNDER_WAY, downloader=downloader)
-            found = sha256_of(Path(complete))
-            _record(record, name, found)
+            complete = Path(pooch.retrieve(address, self._expected(name), name, under_way, downloader=downloader))
+            found = sha256_of(complete)
+            _record(self.folder, name, found)
             os.replace(complete, path)
         except OSError as error:
             if error.errno is not None:
                 raise writing_error(path, error) from error
-            reason = str(error).rsplit(": ", 1)[-1].split("', ")[0].rstrip("'\")")  # the innermost of the errors that requests reports
-            trust = "no trusted connection, " if "SSLError" in str(error) else ""
             part = "; the same command goes on after what has arrived" if downloader.part.exists() else ""
-            raise MissingError(f"cannot fetch {self.address(name)}: {trust}{reason[:160]}{part}") from None
+            raise MissingError(f"cannot fetch {address}: {str(error)[-200:]}{part}") from None  # the cause comes last
         except ValueError as error:  # of pooch, which has removed the file
-            raise DataError(f"{self.address(name)}: {error} {self._origin(name)}") from None
+            raise DataError(f"{address}: {error} (known by download.sha256 or {self.folder / CHECKSUMS})") from None
         return Outcome(name, "fetched", found, path.stat().st_size, downloader.resumed_at)
 
-    def _checked(self, name: str, known: Mapping[str, str]) -> str | None:
-        """Checksum of a file that is there and has the known one; None where it is not there."""
-        path = self.folder / name
-        if path.is_dir():
-            raise DataError(f"'{path}' is a folder where a file belongs; remove it and run again")
+    def _checked(self, name: str) -> str | None:
+        """Checksum of a file that is there and has the expected one; None where it is not there."""
+        path, expected = self.folder / name, self._expected(name)
         if not path.is_file() or not path.stat().st_size:
             return None
         found = sha256_of(path)
-        if known.get(name, found) != found:
-            raise DataError(
-                f"'{path}' has the sha256 {found}, expected is {known[name]} {self._origin(name)}: it was changed or is damaged; "
-                f"remove the file to fetch it again, or that line to accept it"
-            )
+        if expected not in (None, found):
+            what = f"'{path}' has the sha256 {found}, expected is {expected}: it was changed or is damaged"
+            raise DataError(f"{what}; remove the file to fetch it again, or correct download.sha256 or {CHECKSUMS} to accept it")
         return found
 
-    def _known(self) -> dict[str, str]:
-        """Checksums by name, the declared and the recorded ones."""
-        recorded = _read_checksums(self.folder / CHECKSUMS)
-        for name, declared in self.sha256.items():
-            if recorded.get(name, declared) != declared:
-                raise DataError(
-                    f"'{self.folder / CHECKSUMS}' records the sha256 {recorded[name]} for '{name}', download.sha256 of data set "
-                    f"'{self.dataset}' declares {declared}; remove the one that is wrong"
-                )
-        return {**recorded, **self.sha256}
-
-    def _origin(self, name: str) -> str:
-        return f"(download.sha256 of data set '{self.dataset}')" if name in self.sha256 else f"(recorded in '{self.folder / CHECKSUMS}')"
+    def _expected(self, name: str) -> str | None:
+        return self.sha256.get(name) or _read_checksums(self.folder).get(name)
 
 
 def download_of(source: Source) -> Download:
@@ -173,24 +148,18 @@ def download_of(source: Source) -> Download:
     """
     where = f"data set '{source.name}'"
     options = validated(DownloadOptions, source.dataset.get("download"), where, error=ConfigurationError, group="dataset.download")
-    if not re.fullmatch(r"https?://[^\s/\[]\S*", options.url):
-        raise ConfigurationError(f"{where}: download.url must be an address such as https://example.org/folder, not '{options.url}'")
-    files = tuple(source.file_names()) if options.files is None else options.files
+    try:
+        files = tuple(map(_file_name, source.file_names())) if options.files is None else options.files
+    except ValueError as error:
+        raise ConfigurationError(f"{where}: {error}") from None
     if not files or len(set(files)) < len(files):
         raise ConfigurationError(f"{where}: download.files must list the names of files, each once, not {list(files)}")
-    sha256 = options.sha256 or {}
-    for name in (*files, *sha256):
-        if not NAME.fullmatch(name) or name == CHECKSUMS:
-            raise ConfigurationError(f"{where}: download: {name!r} is not the name of a file in one folder, such as drive_1.csv")
-    for name, digest in sha256.items():
-        if not SHA256.fullmatch(digest):
-            raise ConfigurationError(f"{where}: download.sha256 of '{name}' must be 64 hexadecimal digits, not '{digest}'")
     path = str(source.dataset.get("path") or "None")
     folder = existing_folder(None, source.name) if path.split("/")[0] in {"None", "null"} else Path(path).expanduser()
-    return Download(source.name, folder, options.url, files, {name: digest.lower() for name, digest in sha256.items()})
+    return Download(folder, options.url, files, {name: digest.lower() for name, digest in (options.sha256 or {}).items()})
 
 
-def _read_checksums(file: Path) -> dict[str, str]:
+def _read_checksums(folder: Path) -> dict[str, str]:
     """Recorded checksums by name, empty if there is no record.
 
     Raises:
@@ -198,23 +167,22 @@ def _read_checksums(file: Path) -> dict[str, str]:
     """
     import pooch
 
+    file = folder / CHECKSUMS
     if not os.path.lexists(file):
         return {}
     read_text(file)  # which is bounded, and refuses pipes
-    registry = pooch.create(file.parent, "")
+    registry = pooch.create(folder, "")
     try:
         registry.load_registry(file)
     except (OSError, ValueError) as error:
         raise DataError(f"'{file}' is no record of checksums ({first_line(error)}); repair it, or remove it to record anew") from None
-    for name, digest in registry.registry.items():
-        if not SHA256.fullmatch(digest):
-            raise DataError(f"'{file}': the checksum of '{name}' must be 64 hexadecimal digits, not '{digest}'; repair or remove the line")
     return dict(registry.registry)
 
 
-def _record(file: Path, name: str, sha256: str) -> None:
+def _record(folder: Path, name: str, sha256: str) -> None:
     """Add a line to the record of checksums, unless it has one of that name."""
-    if name not in _read_checksums(file):
+    if name not in _read_checksums(folder):
+        file = folder / CHECKSUMS
         text = file.read_text(encoding="utf-8").rstrip("\n") + "\n" if file.exists() else ""
         with written_aside(file) as aside:
             aside.write_text(f"{text}{shlex.quote(name)} {sha256}\n", encoding="utf-8")

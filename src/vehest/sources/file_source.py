@@ -9,7 +9,7 @@ from typing import Any
 from vehest.constants import FloatArray
 from vehest.data.errors import ConfigurationError, DataError, MissingError
 from vehest.data.recording import Recording
-from vehest.sources.base import Source, matching_files
+from vehest.sources.base import Source, existing_folder, kind_of
 from vehest.sources.clocks import Clock
 from vehest.sources.tables import listed
 
@@ -24,27 +24,46 @@ class FileSource(Source):
     gappy: frozenset[str] = frozenset()
 
     def ids(self) -> list[str]:
-        """Stems of the files, in alphabetical order."""
-        return [file.stem for file in self._files()]
+        """Names of the files, in alphabetical order."""
+        return [self._id_of(file) for file in self._files()]
 
     def inputs(self) -> dict[str, str | Path]:
         """The files."""
         return {file.name: file for file in self._files()}
 
     def read_raw(self, recording_id: str) -> Recording:
-        """Read one file by its stem.
+        """Read one file by its name.
 
         Raises:
             MissingError: there is none of that name.
             DataError: it cannot be used.
         """
         for file in self._files():
-            if file.stem == recording_id:
+            if self._id_of(file) == recording_id:
                 return self.read_raw_file(file)
         raise self._no_recording(recording_id)
 
     def _files(self) -> list[Path]:
-        return matching_files(self.dataset, self.options.files)
+        """Files of the data set, in alphabetical order.
+
+        Raises:
+            MissingError: there is no folder, or no file matches.
+            DataError: two files have the same name.
+        """
+        folder = existing_folder(self.dataset.get("path"), self.name)
+        files = self._matching(folder)
+        if not files:
+            raise MissingError(f"{self.where}: no file in '{folder}' matches '{self.options.files}'")
+        names = [self._id_of(file) for file in files]
+        if doubled := sorted({name for name in names if names.count(name) > 1}):
+            raise DataError(f"{self.where}: two files are called '{doubled[0]}', a recording's name must be unique")
+        return files
+
+    def _matching(self, folder: Path) -> list[Path]:
+        return sorted(file for file in folder.glob(self.options.files) if file.is_file())
+
+    def _id_of(self, file: Path) -> str:
+        return file.stem
 
     def _no_recording(self, recording_id: str) -> MissingError:
         return MissingError(f"{self.where} has no recording '{recording_id}' (it has {listed(self.ids())})")
@@ -70,7 +89,7 @@ class FileSource(Source):
                 rate_hz=clock.rate_hz,
                 start_time=clock.start_time,
                 channels=channels,
-                kind=self.kind,
+                kind=kind_of(self.dataset),
                 gappy=self.gappy,
                 provenance={"dataset": self.name, "source": self.dataset["source"], **provenance},
             )

@@ -14,10 +14,10 @@ import sys
 import threading
 from collections.abc import Mapping
 from contextlib import suppress
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any, BinaryIO, NamedTuple, cast
 
 import pyarrow as pa
 from numpy.typing import NDArray
@@ -32,20 +32,16 @@ SECONDS = 15.0  # of processor time for a small file
 SECONDS_PER_BYTE = 1e-6
 WAITING = 8.0  # times the processor time: a busy machine, or one without limits of its own
 MEMORY_PER_BYTE = 10.0
+NO_MEMORY = 77  # exit status
+_COMMAND = [sys.executable, "-P", "-m", "vehest.sources.limited"]
 _ONE_THREAD = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUMEXPR_NUM_THREADS"), "1")
 
 
-@dataclass(frozen=True)
-class Reading:
-    """What a reader returned.
+class Reading(NamedTuple):
+    """What a reader returned."""
 
-    Args:
-        arrays: name -> samples, one-dimensional.
-        summary: everything else, as JSON holds it.
-    """
-
-    arrays: Arrays
-    summary: dict[str, Any]
+    arrays: Arrays  # name -> samples, one-dimensional
+    summary: dict[str, Any]  # everything else, as JSON holds it
 
 
 def read_limited(reader: str, file: Path, **request: Any) -> Reading:
@@ -65,18 +61,21 @@ def read_limited(reader: str, file: Path, **request: Any) -> Reading:
     """
     size = sum(part.stat().st_size for part in (file.rglob("*") if file.is_dir() else [file]) if part.is_file())
     seconds, memory = SECONDS + SECONDS_PER_BYTE * size, current_limits().memory + MEMORY_PER_BYTE * size
-    order: dict[str, Any] = {"reader": reader, "file": str(file), "request": request, "limits": asdict(current_limits())}
-    order |= {"seconds": seconds, "memory": memory}
+    order = {
+        "reader": reader,
+        "file": str(file),
+        "request": request,
+        "limits": asdict(current_limits()),
+        "seconds": seconds,
+        "memory": memory,
+    }
     environment = {**os.environ, **_ONE_THREAD, "ARROW_DEFAULT_MEMORY_POOL": "system"}
     environment["PYTHONPATH"] = os.pathsep.join(path for path in sys.path if path)
-    command = [sys.executable, "-P", "-m", "vehest.sources.limited"]
-    with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, env=environment) as process:
-        assert process.stdin is not None
-        assert process.stdout is not None
+    with subprocess.Popen(_COMMAND, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, env=environment) as process:
         timer = threading.Timer(WAITING * seconds, process.kill)
         timer.start()
         try:
-            with suppress(BrokenPipeError), process.stdin as stdin:
+            with suppress(BrokenPipeError), cast(BinaryIO, process.stdin) as stdin:
                 stdin.write(json.dumps(order).encode())
             table = pa.ipc.open_stream(process.stdout).read_all()
         except (pa.ArrowException, OSError):
@@ -105,44 +104,32 @@ def _ended(file: Path, code: int, seconds: float, memory: float) -> DataError:
     """The error of a reading process that gave no answer."""
     if code in (-getattr(signal, "SIGXCPU", 0), -getattr(signal, "SIGKILL", 0)):
         return DataError(f"'{file}' takes more than {seconds:.0f} s to read, too long for its size; it is damaged, or of another format")
-    if code == _NO_MEMORY:
+    if code == NO_MEMORY:
         return DataError(f"'{file}' takes more than {memory / 1e6:.0f} MB of memory; if that is meant, raise it: limits.memory=NUMBER")
     return DataError(f"'{file}' is damaged: reading it ends with status {code}")
 
 
-_NO_MEMORY = 77
-
-
 def _answer(order: Mapping[str, Any]) -> tuple[Arrays, dict[str, Any]]:
-    """What the reader returns, or the error that it raises."""
+    """What the reader returns within memory and processor time, without writing a file, or the error that it raises."""
     module, _, name = order["reader"].partition(":")
     file, read = Path(order["file"]), getattr(importlib.import_module(module), name)
-    _limit(int(order["memory"]), int(order["seconds"]))
+    with suppress(ImportError):
+        import resource
+
+        limits = {resource.RLIMIT_DATA: int(order["memory"]), resource.RLIMIT_CPU: int(order["seconds"])}
+        for kind, most in {**limits, resource.RLIMIT_FSIZE: 0, resource.RLIMIT_CORE: 0}.items():
+            with suppress(ValueError, OSError):
+                resource.setrlimit(kind, (most, most))
     try:
         with use_limits(Limits(**order["limits"])):
             return read(file, **order["request"])
     except VehestError as error:
         return {}, {"error": type(error).__name__, "message": str(error)}
     except MemoryError:
-        os._exit(_NO_MEMORY)
+        os._exit(NO_MEMORY)
     except Exception as error:
-        first = next(iter(str(error).splitlines()), "")[:160]
-        return {}, {"error": "DataError", "message": f"'{file}' is damaged ({printable(first) or type(error).__name__}); make it again"}
-
-
-def _limit(memory: int, seconds: int) -> None:
-    """Limit this process: memory [bytes], processor time [s], no file written."""
-    with suppress(ImportError):
-        import resource
-
-        for kind, most in (
-            (resource.RLIMIT_DATA, memory),
-            (resource.RLIMIT_CPU, seconds),
-            (resource.RLIMIT_FSIZE, 0),
-            (resource.RLIMIT_CORE, 0),
-        ):
-            with suppress(ValueError, OSError):
-                resource.setrlimit(kind, (most, most))
+        what = printable(str(error).partition("\n")[0][:160]) or type(error).__name__
+        return {}, {"error": "DataError", "message": f"'{file}' is damaged ({what}); make it again"}
 
 
 def _send(stream: BinaryIO, arrays: Arrays, answer: Mapping[str, Any]) -> None:

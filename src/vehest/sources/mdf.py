@@ -8,13 +8,13 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
-from vehest.data.errors import ConfigurationError, DataError
+from vehest.data.errors import DataError
 from vehest.data.files import regular_file
 from vehest.sources.clocks import clock_fault
-from vehest.sources.limited import Reading, read_limited, require_package
-from vehest.sources.signals import Signal, SignalOptions, SignalSource
+from vehest.sources.limited import read_limited, require_package
+from vehest.sources.signals import Signal, SignalChannel, SignalOptions, SignalSource
 
 Wanted = Mapping[str, tuple[str, int | str | None]]
 """Key -> name of a signal, and number or name of its group, where the name occurs in several."""
@@ -27,24 +27,21 @@ class MdfOptions(SignalOptions):
     files: str = "*.mf4"
 
 
+@dataclass(frozen=True)
+class MdfChannel(SignalChannel):
+    """A channel's signal, with the number or name of its group where its name occurs in several."""
+
+    group: Annotated[int | str | None, "the number or name of a group"] = None
+
+
 class MdfSource(SignalSource):
-    """Measurements, a recording each; a channel may say in which ``group`` its signal stands."""
+    """Measurements, a recording each."""
 
     options_type = MdfOptions
-    pattern = "*.mf4"
-    own_keys = frozenset({"group"})
-
-    def __init__(self, dataset: Mapping[str, Any]) -> None:
-        super().__init__(dataset)
-        self.groups = {name: self._group(name, dataset["channels"][name].get("group")) for name in self.channels}
-
-    def _group(self, channel: str, group: Any) -> int | str | None:
-        if group is not None and (isinstance(group, bool) or not isinstance(group, int | str)):
-            raise ConfigurationError(f"{self.where}: channel '{channel}': group must be the number or name of a group, not {group}")
-        return group
+    channel_type = MdfChannel
 
     def _read_signals(self, file: Path) -> tuple[dict[str, Signal], dict[str, Any]]:
-        wanted = {name: (declared.column, self.groups[name]) for name, declared in self.channels.items()}
+        wanted = {name: (declared.column, declared.group) for name, declared in self.channels.items()}
         signals, _, about = read_measurement(file, wanted)
         rates = {signal.origin.removeprefix("group "): round(signal.rate_hz, 3) for signal in signals.values()}
         return signals, {"version": about["version"], "measured": about["start"], "groups": rates}
@@ -67,25 +64,19 @@ def read_measurement(file: Path, wanted: Wanted | None) -> tuple[dict[str, Signa
     """
     require_package("asammdf", "mdf", f"reading '{file}'")
     reading = read_limited("vehest.sources.readers.mdf:read", regular_file(file), wanted=wanted)
-    unusable = _unusable_clocks(reading)
     signals, skipped = {}, list(reading.summary["skipped"])
+    groups = {place["group"] for place in reading.summary["signals"].values()}
+    faults = {group: clock_fault(reading.arrays[f"stamps {group}"], "repair the measurement, or cut the range out") for group in groups}
     for key, place in reading.summary["signals"].items():
-        reason = unusable.get(place["group"])
+        reason = faults[place["group"]]
         where = f"signal '{place['name']}' of group {place['title']}"
-        if reason is None:
+        if not reason:
             signals[key] = Signal(f"group {place['title']}", reading.arrays[f"stamps {place['group']}"], reading.arrays[key], place["unit"])
         elif wanted is not None:
             raise DataError(f"'{file}': {where}: {reason}")
         else:
             skipped.append(f"{where}: {reason}")
     return signals, skipped, reading.summary
-
-
-def _unusable_clocks(reading: Reading) -> dict[int, str]:
-    """Group -> what is wrong with its time stamps."""
-    groups = {place["group"] for place in reading.summary["signals"].values()}
-    faults = {group: clock_fault(reading.arrays[f"stamps {group}"], "repair the measurement, or cut the range out") for group in groups}
-    return {group: fault for group, fault in faults.items() if fault}
 
 
 SOURCE = MdfSource

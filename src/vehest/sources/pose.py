@@ -4,32 +4,28 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, Literal
+from functools import partial
+from typing import Literal, get_args
 
 import numpy as np
 from scipy import signal
 
 from vehest.constants import FloatArray
-from vehest.data.errors import ConfigurationError, DataError
+from vehest.data.errors import DataError
 
 UpAxis = Literal["y", "z"]
-POSE_CHANNELS = ("vx_ref", "vy_ref", "yaw_rate_ref", "sideslip_ref")
+PoseChannel = Literal["vx_ref", "vy_ref", "yaw_rate_ref", "sideslip_ref"]
+POSE_CHANNELS: tuple[PoseChannel, ...] = get_args(PoseChannel)
 """Channels that poses give."""
 
 
 @dataclass(frozen=True)
 class PlanarMotion:
-    """Motion of a car in the plane, in ISO 8855 axes.
+    """Motion of a car's reference point in the plane, in ISO 8855 axes, shape (T,) each."""
 
-    Args:
-        vx: forward velocity of the reference point [m/s], shape (T,).
-        vy: leftward velocity of the reference point [m/s], shape (T,).
-        yaw_rate: yaw rate [rad/s], shape (T,).
-    """
-
-    vx: FloatArray
-    vy: FloatArray
-    yaw_rate: FloatArray
+    vx: FloatArray  # m/s
+    vy: FloatArray  # m/s
+    yaw_rate: FloatArray  # rad/s
 
     def at(self, times: FloatArray, grid: FloatArray) -> PlanarMotion:
         """The same on another clock, along straight lines."""
@@ -41,39 +37,47 @@ class PlanarMotion:
         return {name: made[name] for name in names}
 
 
-def planar_motion(
-    positions: FloatArray,
-    yaw: FloatArray,
-    interval: float,
-    *,
-    window: int,
-    order: int,
-    mounting_yaw: float = 0.0,
-    lever: tuple[float, float] = (0.0, 0.0),
-) -> PlanarMotion:
-    """Differentiate poses by a Savitzky-Golay filter and turn the velocity into the car's axes.
+@dataclass(frozen=True, kw_only=True)
+class PoseOptions:
+    """How reference channels are made of poses."""
 
-    Args:
-        positions: of the rigid body's origin, x and y with z up [m], evenly sampled, shape (T, 2).
-        yaw: of the rigid body, unwrapped [rad], shape (T,).
-        interval: between two samples [s].
-        window: samples of the filter, odd.
-        order: of its polynomial.
-        mounting_yaw: from the rigid body's x axis to the car's forward axis, counter-clockwise [rad].
-        lever: from the rigid body's origin to the reference point, forward and left in the car's axes [m].
+    window: int = 9  # samples of the Savitzky-Golay filter
+    order: int = 2  # of its polynomial
+    lever_x: float = 0.0  # from the rigid body's origin forward to the reference point, in the car's axes [m]
+    lever_y: float = 0.0  # to the left [m]
+    channels: tuple[PoseChannel, ...] = POSE_CHANNELS
 
-    Source:
-        Savitzky & Golay, Smoothing and differentiation of data by simplified least squares procedures, Analytical Chemistry 36 (8), 1964.
-    """
-    velocity_x, velocity_y = (signal.savgol_filter(positions[:, axis], window, order, deriv=1, delta=interval) for axis in (0, 1))
-    yaw_rate = signal.savgol_filter(yaw, window, order, deriv=1, delta=interval)
-    heading = signal.savgol_filter(yaw, window, order) + mounting_yaw
-    cosine, sine = np.cos(heading), np.sin(heading)
-    return PlanarMotion(
-        vx=cosine * velocity_x + sine * velocity_y - yaw_rate * lever[1],
-        vy=-sine * velocity_x + cosine * velocity_y + yaw_rate * lever[0],
-        yaw_rate=yaw_rate,
-    )
+    def __post_init__(self) -> None:
+        if not 1 <= self.order < self.window or self.window % 2 == 0:
+            raise ValueError(f"window must be an odd number above order, and order at least 1, not {self.window} and {self.order}")
+
+    def motion(self, positions: FloatArray, yaw: FloatArray, interval: float, turned: float = 0.0, where: str = "poses") -> PlanarMotion:
+        """Differentiate poses by a Savitzky-Golay filter and turn the velocity into the car's axes.
+
+        Args:
+            positions: of the rigid body's origin, x and y with z up [m], evenly sampled, shape (T, 2).
+            yaw: of the rigid body, unwrapped [rad], shape (T,).
+            interval: between two samples [s].
+            turned: from the rigid body's x axis to the car's forward axis, counter-clockwise [rad].
+            where: file and topic, for messages.
+
+        Raises:
+            DataError: there are fewer poses than the window holds.
+
+        Source:
+            Savitzky & Golay, Smoothing and differentiation of data by simplified least squares procedures, Anal. Chem. 36 (8), 1964.
+        """
+        if len(yaw) < self.window:
+            raise DataError(f"{where}: {len(yaw)} poses are fewer than the {self.window} of the filter's window")
+        derivative = partial(signal.savgol_filter, window_length=self.window, polyorder=self.order, deriv=1, delta=interval)
+        velocity_x, velocity_y, yaw_rate = derivative(positions[:, 0]), derivative(positions[:, 1]), derivative(yaw)
+        heading = signal.savgol_filter(yaw, self.window, self.order) + turned
+        cosine, sine = np.cos(heading), np.sin(heading)
+        return PlanarMotion(
+            vx=cosine * velocity_x + sine * velocity_y - yaw_rate * self.lever_y,
+            vy=-sine * velocity_x + cosine * velocity_y + yaw_rate * self.lever_x,
+            yaw_rate=yaw_rate,
+        )
 
 
 def ground_plane(positions: FloatArray, orientations: FloatArray, up: UpAxis, where: str) -> tuple[FloatArray, FloatArray]:
@@ -105,18 +109,3 @@ def ground_plane(positions: FloatArray, orientations: FloatArray, up: UpAxis, wh
         plane = np.stack([positions[:, 0], -positions[:, 2]], axis=1)
         y, z = -z, y
     return plane, np.unwrap(np.arctan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z)))
-
-
-def require_filter(window: Any, order: Any, where: str) -> tuple[int, int]:
-    """Window and order of a Savitzky-Golay filter as a data set declares them; raises `ConfigurationError` where they are none."""
-    if not isinstance(window, int) or not isinstance(order, int) or not 1 <= order < window or window % 2 == 0:
-        raise ConfigurationError(f"{where}: window must be an odd number of samples above an order of 1 or more, not {window} and {order}")
-    return window, order
-
-
-def require_pose_channels(names: Any, where: str) -> tuple[str, ...]:
-    """Channels of poses as a data set declares them; raises `ConfigurationError` for another one."""
-    unknown = [name for name in names if name not in POSE_CHANNELS] if isinstance(names, list | tuple) else [names]
-    if unknown:
-        raise ConfigurationError(f"{where}: channels must be a list of {', '.join(POSE_CHANNELS)}, not '{unknown[0]}'")
-    return tuple(names)

@@ -12,7 +12,7 @@ from vehest.data.errors import MissingError
 from vehest.version import __version__
 
 CHUNK = 1 << 15  # bytes
-CONNECT, READ = 15.0, 60.0  # s
+TIMEOUTS = (15.0, 60.0)  # s, to connect and between two chunks
 ATTEMPTS = 5  # in a row that bring nothing new
 PAUSE = 1.0  # s, before the second of them; then twice as long each
 CHANGED = frozenset({206, 416})  # statuses of an answer to a range that is of another version of the file
@@ -37,7 +37,7 @@ class ResumingDownloader:
         """Download ``url`` into ``output_file``.
 
         Raises:
-            MissingError: the server refuses, or sends a web page or nothing.
+            MissingError: the server refuses, or sends a web page.
             requests.RequestException: it is out of reach; what has arrived is kept.
             OSError: the disk is full or not writable.
         """
@@ -65,36 +65,29 @@ class ResumingDownloader:
         have = self._size() if known == url and validator else 0
         headers = {"Accept-Encoding": "identity", "User-Agent": f"vehest/{__version__}"}  # offsets are those of the file itself
         headers |= {"Range": f"bytes={have}-", "If-Range": validator} if have else {}
-        with requests.get(url, headers=headers, stream=True, timeout=(CONNECT, READ)) as response:
-            status, told = f"the server answers {response.status_code} {response.reason}", _validator(response.headers)
-            begins = response.headers.get("Content-Range", "").startswith(f"bytes {have}-")
-            resumed = response.status_code == 206 and begins and told in ("", validator)
-            if response.status_code in CHANGED and not resumed:
+        with requests.get(url, headers=headers, stream=True, timeout=TIMEOUTS) as response:
+            status, about = response.status_code, response.headers
+            begins = status == 206 and about.get("Content-Range", "").startswith(f"bytes {have}-")
+            resumed = begins and _validator(about) in ("", validator)
+            if status in CHANGED and not resumed:
                 self.part.unlink(missing_ok=True)
-            if response.status_code in PASSING and not resumed:
-                raise requests.ConnectionError(status)
-            if response.status_code not in (200, 206):
-                raise MissingError(f"cannot fetch {url}: {status}; is the address right?")
-            if "html" in response.headers.get("Content-Type", ""):
-                raise MissingError(
-                    f"{url} is a web page, not a file: open it in a browser and put the file into the data set's folder by hand"
-                )
-            length = response.headers.get("Content-Length", "")
+            if status in PASSING and not resumed:
+                raise requests.ConnectionError(f"the server answers {status} {response.reason}")
+            if status not in (200, 206):
+                raise MissingError(f"cannot fetch {url}: the server answers {status} {response.reason}; is the address right?")
+            if "html" in about.get("Content-Type", ""):
+                raise MissingError(f"{url} is a web page, not a file; put the file into the data set's folder by hand")
+            length = about.get("Content-Length", "")
             if not length.isdecimal() and not response.raw.chunked:
-                raise MissingError(
-                    f"cannot fetch {url}: the server does not state its length, so that a break would not show; fetch it by hand"
-                )
+                raise MissingError(f"cannot fetch {url}: the server does not state its length, so that a break would not show")
             self.resumed_at = have = have if resumed else 0
-            self.version.write_text(f"{url}\n{validator if resumed else told}", encoding="utf-8")
-            total = have + int(length) if length.isdecimal() else None
+            self.version.write_text(f"{url}\n{validator if resumed else _validator(about)}", encoding="utf-8")
             with open(self.part, "ab" if resumed else "wb") as stream:
                 for chunk in response.iter_content(CHUNK):  # a short answer is a ConnectionError
                     stream.write(chunk)
                     stream.flush()  # what has arrived survives a kill
                     if self.progress is not None:
-                        self.progress(self.part.stem, stream.tell(), total)
-        if not self._size():
-            raise MissingError(f"cannot fetch {url}: the server sends an empty file")
+                        self.progress(self.part.stem, stream.tell(), have + int(length) if length.isdecimal() else None)
 
     def _size(self) -> int:
         return self.part.stat().st_size if self.part.is_file() else 0

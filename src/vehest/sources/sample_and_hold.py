@@ -7,7 +7,6 @@ from dataclasses import dataclass
 from typing import Annotated, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from vehest.constants import FloatArray
 from vehest.data.channels import channel
@@ -19,18 +18,11 @@ from vehest.sources.columns import Column
 
 @dataclass(frozen=True)
 class SampleAndHold:
-    """Channels whose values stand in every row, though they are new in few.
-
-    Args:
-        channels: their names.
-        updated: column that changes with every new sample, such as a time stamp of the sensors' own; None: a sample is new in the rows
-            in which any of the channels changes.
-        delay: how much later than it was taken a sample first stands in a row [s], of all channels or of some.
-    """
+    """Channels whose values stand in every row, though they are new in few: where ``updated`` changes, or else any of their columns."""
 
     channels: Annotated[tuple[str, ...], "a list of channels"]
-    updated: str | int | None = None
-    delay: float | dict[str, float] = 0.0
+    updated: str | int | None = None  # column that changes with every new sample, such as a time stamp of the sensors' own
+    delay: float | dict[str, float] = 0.0  # how much later than it was taken a sample first stands in a row [s], of all channels or some
 
     @property
     def delays(self) -> dict[str, float]:
@@ -60,17 +52,18 @@ class SampleAndHold:
         Raises:
             DataError: the channels change in fewer than two rows, or no tick lies between two samples of each.
         """
-        markers = [str(self.updated)] if self.updated is not None else list(dict.fromkeys(column.column for column in columns.values()))
-        rows = _changes([values[name] for name in markers])
+        markers = {column.column for column in columns.values()} if self.updated is None else {str(self.updated)}
+        rows = np.flatnonzero(np.any([np.diff(values[name]) != 0 for name in markers], axis=0)) + 1  # the first row's sample may be older
         if len(rows) < 2:
             raise DataError(f"{where}: the held channels change in {len(rows)} rows; was their sensor connected? leave the file out")
-        times, ticks = clock.times_of_rows()[rows], clock.ticks()
+        ticks = clock.ticks()
+        times = (ticks if clock.stamps is None else clock.stamps)[rows]
         found = {}
         for name, column in columns.items():
             samples, taken = column.to_si(values[column.column], channel(name).unit)[rows], times
             if self.updated is None:
-                samples, taken = with_repeats(samples, times)
-            found[name] = between_samples(samples, taken, self.delays[name], ticks)
+                samples, taken = _with_repeats(samples, times)
+            found[name] = np.interp(ticks, taken - self.delays[name], samples, left=np.nan, right=np.nan)
         begin, end = (times[edge] - np.array([self.delays[name] for name in columns]) for edge in (0, -1))
         inside = np.flatnonzero((ticks >= begin.max()) & (ticks <= end.min()))
         if not len(inside):
@@ -85,21 +78,14 @@ def held_from_config(entry: Any, known: Sequence[str], where: str) -> SampleAndH
         ConfigurationError: it names a channel that the data set does not declare, or makes no sense.
     """
     held = validated(SampleAndHold, entry, where, error=ConfigurationError)
-    for name in held.channels:
-        if name not in known:
-            raise ConfigurationError(f"{where} names '{name}', which is not one of the data set's channels")
-    for name in held.delay if isinstance(held.delay, dict) else ():
-        if name not in held.channels:
-            raise ConfigurationError(f"{where}: delay names '{name}', which is not one of its channels")
+    if unknown := [name for name in held.channels if name not in known]:
+        raise ConfigurationError(f"{where} names '{unknown[0]}', which is not one of the data set's channels")
+    if unknown := sorted(set(held.delay if isinstance(held.delay, dict) else ()) - set(held.channels)):
+        raise ConfigurationError(f"{where}: delay names '{unknown[0]}', which is not one of its channels")
     return held
 
 
-def between_samples(samples: FloatArray, times: FloatArray, delay: float, grid: FloatArray) -> FloatArray:
-    """A held channel on another clock: straight lines between its samples, NaN outside."""
-    return np.interp(grid, times - delay, samples, left=np.nan, right=np.nan)
-
-
-def with_repeats(samples: FloatArray, times: FloatArray) -> tuple[FloatArray, FloatArray]:
+def _with_repeats(samples: FloatArray, times: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Samples and times where no column marks updates: a value that stays was sampled again, up to an interval before the next change.
 
     The interval is the median one between changes. Without this a straight line would be drawn through all of a standstill.
@@ -108,9 +94,3 @@ def with_repeats(samples: FloatArray, times: FloatArray) -> tuple[FloatArray, Fl
     typical = float(np.median(intervals))
     late = np.flatnonzero(intervals > 1.5 * typical)
     return np.insert(samples, late + 1, samples[late]), np.insert(times, late + 1, times[late + 1] - typical)
-
-
-def _changes(columns: Sequence[FloatArray]) -> NDArray[np.int64]:
-    """Rows, counted from 0, in which any column differs from the row before; the sample of the first row may be older."""
-    changed = np.any([np.diff(column) != 0 for column in columns], axis=0)
-    return np.flatnonzero(changed).astype(np.int64) + 1

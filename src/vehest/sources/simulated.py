@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import zlib
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from importlib import metadata
@@ -24,31 +24,27 @@ SurfaceFile = Annotated[str | dict[str, Any], "one of dry, wet, patchy, or a map
 
 
 @dataclass(frozen=True)
-class Drive:
-    """One of ``drives`` as a data set declares it, or ``count`` of them; for None the data set's own value holds.
+class Payload:
+    """A mass [kg] and its place forward and up of the centre of gravity [m]."""
 
-    Args:
-        id: name of the recording.
-        manoeuvre: its name and parameters.
-        count: of drives ``ID_001``, ``ID_002`` and so on.
-        seed: of everything that is drawn; without it one that follows from the data set's and the drive's name.
-        vehicle: name of one of the data set's vehicles.
-        surface: name or configuration.
-        stability_control: whether it is switched on.
-        sensors: a preset's name, or what differs from one.
-        payload: mass [kg] and its place forward and up of the centre of gravity [m]; None: empty.
-        tyres: lag of cold tyres and wear over the drive; None: neither.
-    """
+    mass: float
+    forward: float = 0.0
+    up: float = 0.0
+
+
+@dataclass(frozen=True)
+class Drive:
+    """One of ``drives`` as a data set declares it, or ``count`` of them; for None the data set's own value holds."""
 
     id: str | int
     manoeuvre: Annotated[dict[str, Any], "a mapping with a name, such as {name: laps}"]
-    count: Annotated[int, Field(ge=0), "a whole number of drives"] | None = None
-    seed: Whole | None = None
+    count: Annotated[int, Field(ge=0), "a whole number of drives"] | None = None  # called ID_001, ID_002 and so on
+    seed: Whole | None = None  # None: one that follows from the data set's and the drive's name
     vehicle: Annotated[str | int, "the name of one of the vehicles"] | None = None
     surface: SurfaceFile | None = None
     stability_control: bool | None = None
     sensors: Annotated[str | dict[str, Any], "a preset, or a mapping of what differs from one"] | None = None
-    payload: Annotated[dict[str, float], "a mapping such as {mass: 60, forward: -0.4, up: 0.1}"] | None = None
+    payload: Payload | None = None
     tyres: Annotated[dict[str, float], "a mapping such as {cold: 0.06, wear: 0.04}"] | None = None
 
 
@@ -126,7 +122,7 @@ class SimulatedSource(Source):
         stability_control = self.options.stability_control if drive.stability_control is None else drive.stability_control
         sensors = self.sensors if drive.sensors is None else sensor_levels_from_config(drive.sensors)
         return partial(
-            _simulator_of(vehicle, variations, seed, drive.payload, drive.tyres),
+            _simulator_of(vehicle, variations, seed, drive),
             id=drive_id,
             manoeuvre=_manoeuvre_of(drive.manoeuvre, vehicle, stability_control),
             seed=seed,
@@ -155,11 +151,10 @@ class SimulatedSource(Source):
                 raise ConfigurationError(f"{where}: give seed for a single drive, or count, not both")
             n_drives = len(drives) + (entry.count or 0)
             check_limit("jobs", n_drives, f"{where}: the data set would have {n_drives} drives", ConfigurationError)
-            numbered = [f"{name}_{number:03d}" for number in range(1, (entry.count or 0) + 1)]
-            for drive_id in [name] if entry.count is None else numbered:
-                if drive_id in drives:
-                    raise ConfigurationError(f"{self.where}: two drives are called '{drive_id}', names must differ")
-                drives[drive_id] = entry
+            own = [name] if entry.count is None else [f"{name}_{number:03d}" for number in range(1, entry.count + 1)]
+            if doubled := [drive_id for drive_id in own if drive_id in drives]:
+                raise ConfigurationError(f"{self.where}: two drives are called '{doubled[0]}', names must differ")
+            drives |= dict.fromkeys(own, entry)
         return drives
 
     def _vehicle_of(self, drive: Drive) -> Mapping[str, Any]:
@@ -175,14 +170,8 @@ def _is_planar(vehicle: Mapping[str, Any]) -> bool:
     return vehicle.get("plant") == PLANAR
 
 
-def _simulator_of(
-    vehicle: Mapping[str, Any],
-    variations: Sequence[Any],
-    seed: int,
-    payload: Mapping[str, float] | None = None,
-    tyres: Mapping[str, float] | None = None,
-) -> Callable[..., Recording]:
-    """The simulator of a vehicle, varied by the seed of a drive, with a payload and with tyres that age."""
+def _simulator_of(vehicle: Mapping[str, Any], variations: Sequence[Any], seed: int, drive: Drive | None = None) -> partial[Recording]:
+    """The simulator of a vehicle, varied by the seed of a drive, with the drive's payload and tyres that age."""
     from vehest.simulation.drive import simulate_drive
     from vehest.simulation.fleet import varied, varied_planar
     from vehest.simulation.planar_drive import simulate_planar_drive
@@ -190,15 +179,14 @@ def _simulator_of(
     from vehest.simulation.plant.planar_car import planar_car_from_configuration
     from vehest.simulation.plant.wear import stint_from_config
 
+    payload, tyres = (drive.payload, drive.tyres) if drive else (None, None)
     if _is_planar(vehicle):
         if payload or tyres:
             raise ConfigurationError(f"vehicle '{vehicle.get('name')}': payload and tyres are of the multi-body plant only; leave them out")
         return partial(simulate_planar_drive, car=varied_planar(planar_car_from_configuration(vehicle), variations, seed))
     own = varied(vehicle_from_configuration(vehicle), variations, seed)
     if payload:
-        if "mass" not in payload or set(payload) - {"mass", "forward", "up"}:
-            raise ConfigurationError(f"payload is a mapping {{mass, forward, up}}, not {payload}")
-        own = loaded(own, **payload)
+        own = loaded(own, payload.mass, payload.forward, payload.up)
     return partial(simulate_drive, vehicle=own, stint=stint_from_config(tyres) if tyres else None)
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Annotated, Any
+from typing import Any
 
 import numpy as np
 
@@ -13,41 +13,31 @@ from vehest.data.errors import ConfigurationError, DataError
 from vehest.data.schema import validated
 from vehest.sources.clocks import Clock
 from vehest.sources.columns import Column, column_from_config
-from vehest.sources.pose import POSE_CHANNELS, planar_motion, require_filter, require_pose_channels
+from vehest.sources.pose import PoseOptions
 
 UNITS = {"x": "m", "y": "m", "yaw": "rad"}
 
 
 @dataclass(frozen=True)
-class TablePose:
-    """How reference channels are made of poses; see `vehest.sources.pose.planar_motion`.
+class TablePose(PoseOptions):
+    """Columns of poses.
 
     Args:
         x: column of the position and its unit, z up.
         y: the same.
         yaw: column of the yaw angle and its unit.
-        window: samples of the Savitzky-Golay filter.
-        order: of its polynomial.
         yaw_offset: from the rigid body's x axis to the car's forward axis, counter-clockwise [rad].
-        lever_x: from the rigid body's origin forward to the reference point [m].
-        lever_y: to the left [m].
-        channels: which of vx_ref, vy_ref, yaw_rate_ref, sideslip_ref.
     """
 
-    x: dict[str, Any]
-    y: dict[str, Any]
-    yaw: dict[str, Any]
-    window: int = 9
-    order: int = 2
+    x: Column
+    y: Column
+    yaw: Column
     yaw_offset: float = 0.0
-    lever_x: float = 0.0
-    lever_y: float = 0.0
-    channels: Annotated[tuple[str, ...], "a list of channels"] = POSE_CHANNELS
 
     @property
     def columns(self) -> dict[str, Column]:
-        """Columns of ``x``, ``y`` [m] and ``yaw`` [rad]."""
-        return {name: column_from_config(getattr(self, name), f"pose: {name}", unit) for name, unit in UNITS.items()}
+        """Columns of ``x``, ``y`` and ``yaw``."""
+        return {"x": self.x, "y": self.y, "yaw": self.yaw}
 
     def made_of(self, values: Mapping[str, FloatArray], clock: Clock, where: str) -> dict[str, FloatArray]:
         """Reference channels on the recording's clock, on which poses are differentiated: offline, by half a window.
@@ -55,25 +45,14 @@ class TablePose:
         Raises:
             DataError: a pose is missing, or there are fewer than the filter's window.
         """
-        found = {}
-        for name, column in self.columns.items():
-            samples = column.to_si(values[column.column], UNITS[name])
+        poses = {name: column.to_si(values[column.column], UNITS[name]) for name, column in self.columns.items()}
+        for name, samples in poses.items():
             odd = np.flatnonzero(~np.isfinite(samples))
             if len(odd):
-                what = f"pose column '{column.column}' holds {len(odd)} values that are no numbers, the first in row {odd[0] + 1}"
-                raise DataError(f"{where}: {what} of the run; leave them out by drop_rows")
-            found[name] = clock.align(np.unwrap(samples) if name == "yaw" else samples)
-        if len(found["x"]) < self.window:
-            raise DataError(f"{where}: {len(found['x'])} poses are fewer than the {self.window} of the filter's window")
-        motion = planar_motion(
-            np.stack([found["x"], found["y"]], axis=1),
-            found["yaw"],
-            1.0 / clock.rate_hz,
-            window=self.window,
-            order=self.order,
-            mounting_yaw=self.yaw_offset,
-            lever=(self.lever_x, self.lever_y),
-        )
+                what = f"pose column '{self.columns[name].column}' holds no number in {len(odd)} rows of the run, first in row {odd[0] + 1}"
+                raise DataError(f"{where}: {what}; leave them out by drop_rows")
+        x, y, yaw = (clock.align(samples) for samples in (poses["x"], poses["y"], np.unwrap(poses["yaw"])))
+        motion = self.motion(np.stack([x, y], axis=1), yaw, 1.0 / clock.rate_hz, self.yaw_offset, where)
         return motion.channels(self.channels)
 
 
@@ -85,7 +64,5 @@ def table_pose_from_config(entry: Any, where: str) -> TablePose:
     """
     pose = validated(TablePose, entry, where, error=ConfigurationError)
     for name, unit in UNITS.items():
-        column_from_config(getattr(pose, name), f"{where}: {name}", unit)
-    require_filter(pose.window, pose.order, where)
-    require_pose_channels(pose.channels, where)
+        column_from_config(entry[name], f"{where}: {name}", unit)
     return pose

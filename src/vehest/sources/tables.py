@@ -30,25 +30,16 @@ PACKED = {".gz": "gzip", ".bz2": "bz2", ".zst": "zstd", ".lz4": "lz4"}
 
 @dataclass(frozen=True)
 class TextLayout:
-    """Layout of a table of text.
-
-    Args:
-        delimiter: between cells.
-        decimal: mark of numbers.
-        encoding: of the text.
-        skip_rows: lines above the names; above the rows where ``names`` are given.
-        rows_below_names: lines between the names and the rows.
-        missing: cells without a sample, beside empty ones, NaN, NA and null.
-        names: of the columns where the file has no line of them.
-    """
+    """Layout of a table of text."""
 
     delimiter: str = ","
     decimal: str = "."
     encoding: str = "utf8"
-    skip_rows: int = 0
-    rows_below_names: int = 0
-    missing: tuple[str, ...] = ()
-    names: tuple[str, ...] | None = None
+    skip_rows: int = 0  # lines above the names; above the rows where names are given
+    rows_below_names: int = 0  # lines between the names and the rows
+    missing: tuple[str, ...] = ()  # cells without a sample, beside empty ones, NaN, NA and null
+    names: tuple[str, ...] | None = None  # of the columns where the file has no line of them
+    clock: str | None = None  # column of times as a clock shows them, which become seconds
 
 
 def is_parquet(file: Path) -> bool:
@@ -69,42 +60,28 @@ def column_names(file: Path, layout: TextLayout = TextLayout()) -> list[str]:
         with parquet_file(file) as table:
             names = list(table.schema_arrow.names)
     else:
+        decoder = codecs.getincrementaldecoder(layout.encoding)(errors="backslashreplace")
         try:
-            lines = first_lines(file, layout)
-            names = next(csv.reader(lines[:1], delimiter=layout.delimiter))
-        except StopIteration:
-            raise DataError(f"'{file}' holds nothing but empty lines") from None
-        except (*DAMAGE, csv.Error) as error:
+            lines = re.split(r"\r\n|\n|\r", decoder.decode(read_head(file)).removeprefix("\ufeff"))[layout.skip_rows :]
+            names = next(csv.reader(filter(None, lines), delimiter=layout.delimiter), [])
+        except (ValueError, csv.Error) as error:
             raise _unreadable(file, error) from None
     check_limit("columns", len(names), f"'{file}' has {len(names)} columns")
     return names
 
 
-def first_lines(file: Path, layout: TextLayout) -> list[str]:
-    """Lines from the one of names on that are not empty, as far as a megabyte goes."""
-    with table_stream(file) as stream:
-        text = codecs.getincrementaldecoder(layout.encoding)(errors="backslashreplace").decode(stream.read(BLOCK))
-    return [line for line in re.split(r"\r\n|\n|\r", text.removeprefix("\ufeff"))[layout.skip_rows :] if line]
-
-
-def read_columns(file: Path, wanted: Sequence[str], layout: TextLayout = TextLayout(), clock: str | None = None) -> dict[str, FloatArray]:
-    """Columns of numbers, shape (T,) each, NaN where a sample is missing.
-
-    Args:
-        file: a table.
-        wanted: names of columns.
-        layout: of a table of text.
-        clock: the wanted column that holds times as a clock shows them; it is returned in seconds.
+def read_head(file: Path, size: int = BLOCK) -> bytes:
+    """First bytes of a table, unpacked.
 
     Raises:
         MissingError: there is no such file.
-        DataError: it cannot be read, lacks a column, or holds text where numbers belong.
+        DataError: it cannot be read.
     """
-    require_columns(file, column_names(file, layout), wanted)
-    if is_parquet(file):
-        with parquet_file(file) as table:
-            return read_numbers(file, table, wanted)
-    return parse_columns(file, partial(table_stream, file), wanted, layout, clock)
+    try:
+        with table_stream(file) as stream:
+            return bytes(stream.read(size))
+    except DAMAGE as error:
+        raise _unreadable(file, error) from None
 
 
 def require_columns(file: Path, names: Sequence[str], wanted: Iterable[str]) -> None:
@@ -121,20 +98,26 @@ def require_columns(file: Path, names: Sequence[str], wanted: Iterable[str]) -> 
             raise DataError(f"'{file}' has no column '{name}' (it has {listed(names)}); correct the map in conf/dataset")
 
 
-def parse_columns(
-    file: Path, opened: Callable[[], pa.NativeFile], wanted: Sequence[str], layout: TextLayout, clock: str | None = None
-) -> dict[str, FloatArray]:
-    """Columns of numbers of a table of text, as `read_columns` does.
+def read_columns(file: Path, wanted: Sequence[str], layout: TextLayout = TextLayout(), text: bytes | None = None) -> dict[str, FloatArray]:
+    """Columns of numbers, shape (T,) each, NaN where a sample is missing.
 
     Args:
-        file: for messages.
-        opened: opens the table's text.
-        wanted: names of columns that are there once each.
-        layout: of the table.
-        clock: the wanted column that holds times as a clock shows them.
+        file: a table.
+        wanted: names of columns.
+        layout: of a table of text.
+        text: of the table where it is not the file's own.
+
+    Raises:
+        MissingError: there is no such file.
+        DataError: it cannot be read, lacks a column, or holds text where numbers belong.
     """
+    require_columns(file, column_names(file, layout), wanted)
+    if is_parquet(file):
+        with parquet_file(file) as parquet:
+            return read_numbers(file, parquet, wanted)
+    opened = partial(table_stream, file) if text is None else partial(pa.BufferReader, text)
     convert = pc.ConvertOptions(
-        column_types={name: pa.string() if name == clock else pa.float64() for name in wanted},
+        column_types={name: pa.string() if name == layout.clock else pa.float64() for name in wanted},
         include_columns=list(wanted),
         decimal_point=layout.decimal,
         null_values=[*pc.ConvertOptions().null_values, *layout.missing],
@@ -145,13 +128,13 @@ def parse_columns(
         try:
             table = parse_table(opened, layout, convert, threads=False)  # its errors state the row
         except DAMAGE as error:
-            raise _wrong_cell(file, layout, str(error)) or _unreadable(file, error) from None
+            raise _unreadable(file, error, layout) from None
     if not table.num_rows:
         raise DataError(f"'{file}' has {'a header and ' if layout.names is None else ''}no rows")
     check_limit("samples", table.num_rows, f"'{file}' has {table.num_rows} rows")
     columns = {name: table.column(name) for name in wanted}
-    del table
-    return {name: _seconds(file, name, columns.pop(name)) if name == clock else columns.pop(name).to_numpy() for name in wanted}
+    del table  # so that a column is dropped as soon as it is converted
+    return {name: _seconds(file, name, columns.pop(name)) if name == layout.clock else columns.pop(name).to_numpy() for name in wanted}
 
 
 def parse_table(opened: Callable[[], pa.NativeFile], layout: TextLayout, convert: pc.ConvertOptions, *, threads: bool = True) -> pa.Table:
@@ -201,16 +184,12 @@ def _seconds(file: Path, name: str, cells: pa.ChunkedArray) -> FloatArray:
     return seconds
 
 
-def _wrong_cell(file: Path, layout: TextLayout, message: str) -> DataError | None:
-    """The error for text in a column of numbers; None where pyarrow's message is of something else."""
-    found = re.search(r"CSV column #(\d+): Row #(\d+): .*invalid value '(.*)'", message, re.DOTALL)
-    if found is None:
-        return None
-    name, above = column_names(file, layout)[int(found[1])], layout.skip_rows + layout.rows_below_names + (layout.names is None)
-    text = printable(found[3] if len(found[3]) <= 40 else f"{found[3][:40]}…")
-    return DataError(f"'{file}': column '{name}' holds the text '{text}' in data row {int(found[2]) - above}; numbers are needed")
-
-
-def _unreadable(file: Path, error: Exception) -> DataError:
+def _unreadable(file: Path, error: Exception, layout: TextLayout | None = None) -> DataError:
+    """The error of pyarrow in one line; with a layout, a cell of text by its column's name."""
+    cell = re.search(r"CSV column #(\d+): Row #(\d+): .*invalid value '(.*)'", str(error), re.DOTALL)
+    if cell is not None and layout is not None:
+        name, above = column_names(file, layout)[int(cell[1])], layout.skip_rows + layout.rows_below_names + (layout.names is None)
+        where = f"column '{name}' holds the text '{printable(cell[3][:40])}' in data row {int(cell[2]) - above}"
+        return DataError(f"'{file}': {where}; numbers are needed")
     problem = f"a line is longer than {BLOCK} bytes" if "straddl" in str(error) else printable(first_line(error))
     return DataError(f"'{file}' cannot be read as a table ({problem}); is it truncated, or of another format or encoding?")

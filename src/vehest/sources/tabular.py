@@ -8,6 +8,8 @@ from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import Annotated, Any
 
+from pydantic import AfterValidator, Field
+
 from vehest.constants import FloatArray
 from vehest.data.channels import CHANNELS, channel
 from vehest.data.errors import ConfigurationError, DataError, MissingError
@@ -15,14 +17,31 @@ from vehest.data.recording import Recording
 from vehest.data.store import is_stored_recording, read_recording
 from vehest.sources.base import open_source, require_files
 from vehest.sources.clocks import Clock, ClockPolicy, uniform_clock
-from vehest.sources.columns import ChannelMap, ChannelNames, Column, columns_from_config, identity_columns, time_column_from_config
+from vehest.sources.columns import (
+    ChannelMap,
+    ChannelNames,
+    Column,
+    ColumnName,
+    Positive,
+    column_from_config,
+    columns_from_config,
+)
 from vehest.sources.file_source import FileSource
 from vehest.sources.sample_and_hold import held_from_config
 from vehest.sources.table_pose import table_pose_from_config
 from vehest.sources.table_rows import counted_runs, dropped_rows_from_config, kept_rows, restarted_runs
 from vehest.sources.tables import TextLayout, column_names, listed, read_columns
 
-MOST_SKIPPED_ROWS = 10_000
+
+def _encoding(name: str) -> str:
+    try:
+        "0,1".encode(name).decode(name)  # which codecs that are none of text refuse
+    except (LookupError, ValueError):
+        raise ValueError(f"'{name}' is not known; use for example utf8 or latin-1") from None
+    return name
+
+
+Character = Annotated[str, Field(min_length=1, max_length=1)]
 
 
 @dataclass(frozen=True)
@@ -33,38 +52,34 @@ class TabularOptions:
     files: str = "*.csv"
     exclude: Annotated[tuple[str, ...], "a list of patterns over the files' stems"] | None = None
     drop_rows: Annotated[dict[str, tuple[int | str, ...]], "a mapping from a file's stem to a list of rows"] | None = None
-    runs: str | int | None = None
+    runs: ColumnName | None = None
     time_restarts: bool = False
     time: dict[str, Any] | None = None
-    rate_hz: float | None = None
+    rate_hz: Positive | None = None
     clock: ClockPolicy = "strict"
     channels: ChannelMap | None = None
     gappy: ChannelNames | None = None
     held: dict[str, Any] | None = None
     pose: dict[str, Any] | None = None
-    delimiter: str = ","
-    decimal: str = "."
-    encoding: str = "utf8"
-    skip_rows: int = 0
+    delimiter: Character = ","
+    decimal: Character = "."
+    encoding: Annotated[str, AfterValidator(_encoding)] = "utf8"
+    skip_rows: Annotated[int, Field(ge=0, le=10_000)] = 0
 
 
 class TabularSource(FileSource):
     """Tables, a recording each, or one for each uninterrupted run that a column of them counts."""
 
     options_type = TabularOptions
-    written_clock: str | None = None  # column of times that are written as a clock's
 
     def __init__(self, dataset: Mapping[str, Any]) -> None:
         super().__init__(dataset)
         options, where = self.options, self.where
         self.columns = None if options.channels is None else columns_from_config(options.channels, self.name)
-        self.time = None if options.time is None else self._time_column(options.time)
+        self.time = None if options.time is None else column_from_config(options.time, f"{where}: time", "s")
         if self.time is None and options.rate_hz is None:
             raise ConfigurationError(f"{where}: without a time column, rate_hz must be given")
-        if options.rate_hz is not None and not options.rate_hz > 0:
-            raise ConfigurationError(f"{where}: rate_hz must be a positive number, not {options.rate_hz}")
-        self.runs = None if options.runs is None else str(options.runs)
-        if options.time_restarts and (self.runs is not None or self.time is None):
+        if options.time_restarts and (options.runs is not None or self.time is None):
             raise ConfigurationError(f"{where}: time_restarts needs a time column, and no column that counts runs")
         self.dropped = dropped_rows_from_config(options.drop_rows or {}, where)
         self.gappy = self._gappy_among(CHANNELS if self.columns is None else self.columns)
@@ -74,16 +89,11 @@ class TabularSource(FileSource):
         if doubled:
             raise ConfigurationError(f"{where}: channel '{doubled[0]}' comes both from channels and from pose; leave one out")
         self._require_pattern()
-        self.layout = self._layout()
-        self._known_runs: dict[Path, dict[int, slice]] = {}
+        self.layout = TextLayout(options.delimiter, options.decimal, options.encoding, options.skip_rows)
+        self._known_runs: dict[Path, dict[int | None, slice]] = {}
 
     def ids(self) -> list[str]:
-        """Stems of the files, in alphabetical order; where a column counts runs, ``STEM_run_N`` in the order of the file.
-
-        Raises:
-            MissingError: no file is there, or one is empty.
-            DataError: the column of runs cannot be read.
-        """
+        """Stems of the files, in alphabetical order; where a column counts runs, ``STEM_run_N`` in the order of the file."""
         return list(self._found())
 
     def read_raw(self, recording_id: str) -> Recording:
@@ -100,60 +110,30 @@ class TabularSource(FileSource):
             MissingError: it is not there or empty.
             DataError: it cannot be read, lacks a column, holds text where numbers belong, or holds several runs.
         """
-        require_files([file], self.name)
-        runs = list(self._runs_of(file)) if self._has_runs and not is_stored_recording(file) else [None]
+        runs = list(self._runs_of(file))
         if len(runs) > 1:
             raise DataError(f"'{file}' holds {len(runs)} runs ({listed([str(run) for run in runs])}); keep the rows of one")
         return self._read(file, runs[0])
-
-    def unused_columns(self, file: Path) -> list[str]:
-        """Names of a table's columns that could be declared as channels."""
-        channels = CHANNELS if self.columns is None else [column.column for column in self.columns.values()]
-        used = {"", self.runs, self.time.column if self.time else None, *channels}
-        return [name for name in column_names(file, self.layout) if name not in used]
-
-    def _time_column(self, entry: Any) -> Column:
-        return time_column_from_config(entry, self.name)
-
-    def _layout(self) -> TextLayout:
-        """Layout of the tables of text.
-
-        Raises:
-            ConfigurationError: an option of it makes no sense.
-        """
-        options, where = self.options, self.where
-        for name in ("delimiter", "decimal"):
-            if len(getattr(options, name)) != 1:
-                raise ConfigurationError(f"{where}: {name} must be one character, not '{getattr(options, name)}'")
-        try:
-            "0,1".encode(options.encoding).decode(options.encoding)  # which codecs that are none of text refuse
-        except (LookupError, ValueError):
-            raise ConfigurationError(f"{where}: encoding '{options.encoding}' is not known; use for example utf8 or latin-1") from None
-        if not 0 <= options.skip_rows <= MOST_SKIPPED_ROWS:
-            raise ConfigurationError(f"{where}: skip_rows must be a whole number up to {MOST_SKIPPED_ROWS}, not {options.skip_rows}")
-        return TextLayout(options.delimiter, options.decimal, options.encoding, options.skip_rows)
 
     def _read(self, file: Path, run: int | None) -> Recording:
         require_files([file], self.name)
         if is_stored_recording(file):
             return read_recording(file)
-        names = column_names(file, self.layout)
-        columns = identity_columns(names) if self.columns is None else self.columns
+        names, columns = column_names(file, self.layout), self.columns
+        if columns is None:
+            columns = {name: Column(name, CHANNELS[name].unit) for name in names if name in CHANNELS}
         if not columns:
-            raise DataError(
-                f"'{file}' has no column that is named like a channel (it has {listed(names)}); declare the columns in conf/dataset"
-            )
+            what = f"has no column that is named like a channel (it has {listed(names)})"
+            raise DataError(f"'{file}' {what}; declare the columns in conf/dataset")
         wanted = [column.column for column in (*columns.values(), *(self.pose.columns.values() if self.pose else ()))]
-        extra = [self.time and self.time.column, self.runs, self.held and self.held.updated]
+        extra = [self.time and self.time.column, self.options.runs, self.held and self.held.updated]
         values = self._values(file, list(dict.fromkeys([*wanted, *(str(name) for name in extra if name is not None)])))
-        if run is not None:
-            rows = self._runs_of(file)[run]
-            values = {name: samples[rows] for name, samples in values.items()}
-        return self._made_of(file, run, columns, values)
+        rows = self._runs_of(file)[run]
+        return self._made_of(file, run, columns, {name: samples[rows] for name, samples in values.items()})
 
     def _values(self, file: Path, wanted: list[str]) -> dict[str, FloatArray]:
         """Columns without the rows that the data set leaves out."""
-        values = read_columns(file, wanted, self.layout, self.written_clock)
+        values = read_columns(file, wanted, self.layout)
         dropped = self.dropped.get(file.stem)
         if dropped is None:
             return values
@@ -187,20 +167,14 @@ class TabularSource(FileSource):
             provenance["held"] = self.held.description(rate)
         return self._recording(_name_of(file, run), f"'{file}'", clock, channels, provenance)
 
-    @property
-    def _has_runs(self) -> bool:
-        return self.runs is not None or self.options.time_restarts
-
     def _files(self) -> list[Path]:
         """Tables of the data set, without those that it excludes."""
         found = super()._files()
         stems, patterns = {file.stem for file in found}, self.options.exclude or ()
-        for pattern in patterns:
-            if not any(fnmatchcase(stem, pattern) for stem in stems):
-                raise MissingError(f"{self.where}: exclude names '{pattern}', which no file is called")
-        for stem in self.dropped:
-            if stem not in stems:
-                raise MissingError(f"{self.where}: drop_rows names '{stem}', which no file is called")
+        for option, named in (("exclude", patterns), ("drop_rows", self.dropped)):
+            for name in named:
+                if name not in stems and not any(fnmatchcase(stem, name) for stem in stems):
+                    raise MissingError(f"{self.where}: {option} names '{name}', which no file is called")
         kept = [file for file in found if not any(fnmatchcase(file.stem, pattern) for pattern in patterns)]
         if not kept:
             raise MissingError(f"{self.where}: exclude leaves none of its files")
@@ -208,18 +182,18 @@ class TabularSource(FileSource):
 
     def _found(self) -> dict[str, tuple[Path, int | None]]:
         """Name of each recording -> its file and run."""
-        files = self._files()
-        if not self._has_runs:
-            return {_name_of(file, None): (file, None) for file in files}
-        require_files(files, self.name)
-        return {_name_of(file, run): (file, run) for file in files for run in self._runs_of(file)}
+        return {_name_of(file, run): (file, run) for file in self._files() for run in self._runs_of(file)}
 
-    def _runs_of(self, file: Path) -> dict[int, slice]:
-        """Number of each run in a table -> its rows, counted without those that are left out."""
+    def _runs_of(self, file: Path) -> Mapping[int | None, slice]:
+        """Number of each run in a table -> its rows without those that are left out; all rows under None where no runs are counted."""
+        counter = self.time.column if self.time and self.options.time_restarts else self.options.runs
+        if counter is None or is_stored_recording(file):
+            return {None: slice(None)}
         if file not in self._known_runs:
-            column = self.runs if self.runs is not None or self.time is None else self.time.column
-            numbers = self._values(file, [str(column)])[str(column)]
-            self._known_runs[file] = restarted_runs(numbers) if self.runs is None else counted_runs(numbers, self.runs, file)
+            require_files([file], self.name)
+            numbers = self._values(file, [counter])[counter]
+            restarts = self.options.time_restarts
+            self._known_runs[file] = restarted_runs(numbers) if restarts else counted_runs(numbers, counter, file)
         return self._known_runs[file]
 
 
@@ -238,7 +212,11 @@ def unused_columns(dataset: Mapping[str, Any], file: Path | None = None) -> list
     if type(source) is not TabularSource:
         return []
     table = file or next(Path(entry) for entry in source.inputs().values())
-    return [] if is_stored_recording(table) else source.unused_columns(table)
+    if is_stored_recording(table):
+        return []
+    channels = CHANNELS if source.columns is None else [column.column for column in source.columns.values()]
+    used = {"", source.options.runs, source.time and source.time.column, *channels}
+    return [name for name in column_names(table, source.layout) if name not in used]
 
 
 def _name_of(file: Path, run: int | None) -> str:

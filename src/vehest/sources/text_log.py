@@ -8,14 +8,12 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
+from pydantic import Field
 
 from vehest.constants import FloatArray
-from vehest.data.errors import ConfigurationError
-from vehest.sources.columns import Column
-from vehest.sources.tables import TextLayout
 from vehest.sources.tabular import TabularOptions, TabularSource
 
 CLOCK = "clock"
@@ -27,8 +25,8 @@ LONGEST_BRIDGE = 10.0  # s
 class TextLogOptions(TabularOptions):
     """Options of the source; docs/sources/text_log.md describes them."""
 
-    rows_below_names: int = 0
-    bridge: float | None = None
+    rows_below_names: Annotated[int, Field(ge=0, le=100)] = 0
+    bridge: Annotated[float, Field(gt=0, le=LONGEST_BRIDGE)] | None = None
     missing: tuple[str, ...] | None = None
 
 
@@ -38,23 +36,12 @@ class TextLogSource(TabularSource):
     options_type = TextLogOptions
 
     def __init__(self, dataset: Mapping[str, Any]) -> None:
+        time, clock = dataset.get("time"), None
+        if isinstance(time, Mapping) and time.get("unit") == CLOCK:
+            dataset, clock = {**dataset, "time": {**time, "unit": "s"}}, str(time.get("column"))
         super().__init__(dataset)
-        bridge = self.options.bridge
-        if bridge is not None and not 0.0 < bridge <= LONGEST_BRIDGE:
-            raise ConfigurationError(f"{self.where}: bridge must be a time up to {LONGEST_BRIDGE:g} s, not {bridge}")
-
-    def _time_column(self, entry: Any) -> Column:
-        if isinstance(entry, Mapping) and entry.get("unit") == CLOCK:
-            column = super()._time_column({**entry, "unit": "s"})
-            self.written_clock = column.column
-            return column
-        return super()._time_column(entry)
-
-    def _layout(self) -> TextLayout:
-        below = self.options.rows_below_names
-        if not 0 <= below <= 100:
-            raise ConfigurationError(f"{self.where}: rows_below_names must be a number of lines up to 100, not {below}")
-        return replace(super()._layout(), rows_below_names=below, missing=self.options.missing or ())
+        below, missing = self.options.rows_below_names, self.options.missing or ()
+        self.layout = replace(self.layout, rows_below_names=below, missing=missing, clock=clock)
 
     def _values(self, file: Path, wanted: list[str]) -> dict[str, FloatArray]:
         """Columns without the rows that the data set leaves out, and without gaps that are short enough."""
@@ -62,10 +49,10 @@ class TextLogSource(TabularSource):
         if longest is None:
             return values
         clock = self.time.column if self.time is not None else None
-        if self.time is not None and self.time.column in values:
-            times = self.time.to_si(values[self.time.column], "s")
+        if self.time is not None and clock in values:
+            times = self.time.to_si(values[clock], "s")
         else:
-            times = np.arange(len(next(iter(values.values())))) / float(self.options.rate_hz or 1.0)
+            times = np.arange(len(next(iter(values.values())))) / (self.options.rate_hz or 1.0)
         return {name: samples if name == clock else bridged(samples, times, longest) for name, samples in values.items()}
 
 

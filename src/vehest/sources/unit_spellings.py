@@ -61,8 +61,8 @@ def require_unit(written: str, column: Column, si_unit: str, where: str, fix: st
     if plain is None or column.factor != 1.0:
         return
     try:
-        same = factor_to_si(plain, si_unit) == factor_to_si(column.unit, si_unit)
+        if factor_to_si(plain, si_unit) == factor_to_si(column.unit, si_unit):
+            return
     except DataError:  # of another quantity
-        same = False
-    if not same:
-        raise DataError(f"{where} is in '{written}' by the file and in '{column.unit}' by conf/dataset; correct the unit there, or {fix}")
+        pass
+    raise DataError(f"{where} is in '{written}' by the file and in '{column.unit}' by conf/dataset; correct the unit there, or {fix}")

@@ -8,36 +8,35 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping
-from dataclasses import dataclass, field
-from functools import partial
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pyarrow as pa
 
 from vehest.constants import FloatArray
 from vehest.data.channels import channel
 from vehest.data.errors import ConfigurationError, DataError, printable
 from vehest.data.files import regular_file
-from vehest.data.limits import check_limit
 from vehest.data.recording import Recording
 from vehest.sources.base import require_files
+from vehest.sources.clock_times import past_midnight
 from vehest.sources.clocks import ClockPolicy, uniform_clock
 from vehest.sources.columns import ChannelMap, ChannelNames, columns_from_config
 from vehest.sources.file_source import FileSource
-from vehest.sources.tables import TextLayout, parse_columns, require_columns
+from vehest.sources.tables import TextLayout, read_columns, require_columns
 from vehest.sources.unit_spellings import require_unit
 
 LONGEST_HEAD = 1 << 20  # bytes before the rows
-DAY, HALF_A_DAY = 86_400.0, 43_200.0  # s
+UNITS = {"velocity": "km/h", "vert-vel": "km/h", "Longacc": "g", "Latacc": "g"}
+"""Units that the format has without saying so."""
 JUMP = 1.5  # intervals by which the last row may come late
 KMH = 3.6
 FASTEST_STILL, LEAST_TURN = 5.0, 0.05  # m/s, rad/s: below, slip at two wheels says nothing
 FEWEST = 100  # samples that turn
 LEAST_DIFFERENCE = 0.25  # of the slip angles' difference that the yaw rate makes between the axles
 SLIP_CHECK = "slip_offsets"
-OFFSETS = re.compile(r"Offsets Slip \((\w+)\)\s*:\s*\{\s*([-+]?[\d.]+)\s+([-+]?[\d.]+)\s*\}")
+OFFSETS = re.compile(r"Offsets Slip \((\w+)\)\s*:\s*\{\s*([-+]?\d+(?:\.\d*)?)\s+([-+]?\d+(?:\.\d*)?)\s*\}")
 
 
 @dataclass(frozen=True)
@@ -53,23 +52,13 @@ class VboOptions:
 
 @dataclass(frozen=True)
 class Log:
-    """Rows and sections of a file.
+    """Rows and sections of a file."""
 
-    Args:
-        columns: name -> values in the file's unit, (T,).
-        units: name -> unit as the file writes it; only of columns that have one.
-        seconds: clock time since midnight, going on past it [s], (T,).
-        offsets: point (``CoG``, ``FL``, …) -> lateral and longitudinal distance from the antenna at which slip is given [m].
-        created: first line of the file.
-        n_dropped: rows at the end that were cut off or came late.
-    """
-
-    columns: Mapping[str, FloatArray]
-    units: Mapping[str, str]
-    seconds: FloatArray
-    offsets: Mapping[str, tuple[float, float]] = field(default_factory=dict)
-    created: str = ""
-    n_dropped: int = 0
+    columns: Mapping[str, FloatArray]  # name -> values in the file's unit, (T,)
+    units: Mapping[str, str]  # name -> unit as the file writes it; only of columns that have one
+    seconds: FloatArray  # clock time since midnight, going on past it [s], (T,)
+    offsets: Mapping[str, tuple[float, float]]  # point, such as FL -> lateral and longitudinal distance from the antenna [m]
+    provenance: Mapping[str, Any]  # first line, offsets, and rows at the end that were cut off or came late
 
 
 class VboSource(FileSource):
@@ -97,23 +86,14 @@ class VboSource(FileSource):
         log = read_log(file)
         used = [column.column for column in self.columns.values()]
         require_columns(file, list(log.columns), used)
-        for name, column in self.columns.items():
-            where = f"'{file}': column '{column.column}', for channel '{name}',"
-            require_unit(log.units.get(column.column, ""), column, channel(name).unit, where, "declare a factor")
         if any(name.startswith(("Slip_", "Lat._Vel")) for name in used) and SLIP_CHECK not in (self.dataset.get("accept") or []):
             require_slip_offsets(log, f"'{file}'")
-        clock = uniform_clock(log.seconds, f"'{file}'", self.options.clock)
-        channels = {
-            name: clock.align(column.to_si(log.columns[column.column], channel(name).unit), gappy=name in self.gappy)
-            for name, column in self.columns.items()
-        }
-        provenance = {
-            "file": file.name,
-            "created": log.created,
-            "slip_offsets_lateral_longitudinal_m": {point: list(pair) for point, pair in log.offsets.items()},
-            "rows_dropped_at_the_end": log.n_dropped,
-        }
-        return self._recording(file.stem, f"'{file}'", clock, channels, provenance)
+        clock, channels = uniform_clock(log.seconds, f"'{file}'", self.options.clock), {}
+        for name, column in self.columns.items():
+            unit, where = channel(name).unit, f"'{file}': column '{column.column}', for channel '{name}',"
+            require_unit(log.units.get(column.column, ""), column, unit, where, "declare a factor")
+            channels[name] = clock.align(column.to_si(log.columns[column.column], unit), gappy=name in self.gappy)
+        return self._recording(file.stem, f"'{file}'", clock, channels, {"file": file.name, **log.provenance})
 
 
 def read_log(file: Path) -> Log:
@@ -124,22 +104,36 @@ def read_log(file: Path) -> Log:
     Raises:
         DataError: it is no such file, is damaged, or is more than the limits allow.
     """
-    content = regular_file(file).read_bytes()
-    head, mark, rows = content.partition(b"[data]")
+    head, mark, rows = regular_file(file).read_bytes().partition(b"[data]")
     if not mark or len(head) > LONGEST_HEAD:
         raise DataError(f"'{file}' has no section [data]; is it a log of a VBOX?")
-    sections = _sections(head.decode("latin-1"))
-    names = " ".join(sections.get("column names", [])).split()
-    check_limit("columns", len(names), f"'{file}' has {len(names)} columns")
-    require_columns(file, names, ["time", *names])
-    columns, n_dropped = _numbers(rows, names, file)
+    lines = "\n".join(head.decode("latin-1").splitlines())
+    first, *parts = re.split(r"^\[([^\]\n]+)\]\s*?$", lines, flags=re.MULTILINE)
+    sections = {title.strip().lower(): text for title, text in zip(parts[::2], parts[1::2], strict=True)}
+    names = sections.get("column names", "").split()
+    text = re.sub(rb" ?\r?\n ?", b"\n", re.sub(rb"[ \t]+", b" ", rows.strip()))
+    last = text.rfind(b"\n") + 1
+    cut_off = last > 0 and text.count(b" ", last) < len(names) - 1
+    columns = read_columns(
+        file, list(dict.fromkeys(["time", *names])), TextLayout(delimiter=" ", names=tuple(names)), text=text[:last] if cut_off else text
+    )
     seconds = _seconds(columns.pop("time"), file)
-    if len(seconds) > 2 and seconds[-1] - seconds[-2] > JUMP * float(np.median(np.diff(seconds))):
-        columns, seconds, n_dropped = {name: own[:-1] for name, own in columns.items()}, seconds[:-1], n_dropped + 1
-    comments = "\n".join(sections.get("comments", []))
-    offsets = {point: (float(lateral), float(longitudinal)) for point, lateral, longitudinal in OFFSETS.findall(comments)}
-    created = printable(" ".join(sections.get("", [""])[0].split()))[:80]
-    return Log(columns, _units(sections, names), seconds, offsets, created, n_dropped)
+    late = len(seconds) > 2 and bool(seconds[-1] - seconds[-2] > JUMP * np.median(np.diff(seconds)))
+    if late:
+        columns, seconds = {name: own[:-1] for name, own in columns.items()}, seconds[:-1]
+
+    units = [line.strip() for line in sections.get("channel units", "").splitlines()[1:]]  # of the last columns, an empty line for none
+    if units and not units[-1]:
+        units.pop()
+    own = dict(zip(names[len(names) - len(units) :], units, strict=True)) if len(units) <= len(names) else {}
+    found = OFFSETS.findall(sections.get("comments", ""))
+    offsets = {point: (float(lateral), float(longitudinal)) for point, lateral, longitudinal in found}
+    provenance = {
+        "created": printable(" ".join(first.partition("\n")[0].split()))[:80],
+        "slip_offsets_lateral_longitudinal_m": {point: list(pair) for point, pair in offsets.items()},
+        "rows_dropped_at_the_end": cut_off + late,
+    }
+    return Log(columns, {name: unit for name, unit in {**UNITS, **own}.items() if unit}, seconds, offsets, provenance)
 
 
 def require_slip_offsets(log: Log, where: str) -> None:
@@ -170,39 +164,6 @@ def require_slip_offsets(log: Log, where: str) -> None:
         )
 
 
-def _sections(head: str) -> dict[str, list[str]]:
-    """Name of each section -> its lines; what comes before the first one has no name."""
-    sections: dict[str, list[str]] = {"": []}
-    lines = sections[""]
-    for line in head.splitlines():
-        title = re.fullmatch(r"\[([^\]]+)\]\s*", line)
-        if title:
-            lines = sections.setdefault(title[1].strip().lower(), [])
-        else:
-            lines.append(line)
-    return sections
-
-
-def _units(sections: Mapping[str, list[str]], names: list[str]) -> dict[str, str]:
-    """Units of the last columns, an empty line for one without; an empty line ends the section."""
-    lines = [line.strip() for line in sections.get("channel units", [])]
-    if lines and not lines[-1]:
-        lines.pop()
-    known = {"velocity": "km/h", "vert-vel": "km/h"} | ({"Longacc": "g", "Latacc": "g"})
-    own = dict(zip(names[-len(lines) :], lines, strict=False)) if 0 < len(lines) <= len(names) else {}
-    return {name: unit for name, unit in {**known, **own}.items() if unit}
-
-
-def _numbers(rows: bytes, names: list[str], file: Path) -> tuple[dict[str, FloatArray], int]:
-    """Columns of numbers, (T,) each, and how many rows at the end were cut off."""
-    text = re.sub(rb"[ \t]+", b" ", rows.strip())
-    text = re.sub(rb" ?\r?\n ?", b"\n", text)
-    last = text.rfind(b"\n") + 1
-    cut_off = last > 0 and text.count(b" ", last) < len(names) - 1
-    opened = partial(pa.BufferReader, text[:last] if cut_off else text)
-    return parse_columns(file, opened, names, TextLayout(delimiter=" ", names=tuple(names))), int(cut_off)
-
-
 def _seconds(stamps: FloatArray, file: Path) -> FloatArray:
     """Clock times hhmmss.ss as seconds since midnight, going on past it."""
     milliseconds = np.rint(np.where(np.isfinite(stamps), stamps, -1.0) * 1000.0)  # hh mm ss.sss
@@ -210,8 +171,7 @@ def _seconds(stamps: FloatArray, file: Path) -> FloatArray:
     odd = np.flatnonzero(~((milliseconds >= 0.0) & (hours < 24.0) & (minutes < 60.0) & (seconds < 60.0)))
     if len(odd):
         raise DataError(f"'{file}': time {stamps[odd[0]]} in data row {odd[0] + 1} is no clock time hhmmss")
-    since_midnight = 3600.0 * hours + 60.0 * minutes + seconds
-    return since_midnight + DAY * np.concatenate([[0], np.cumsum(np.diff(since_midnight) < -HALF_A_DAY)])
+    return past_midnight(3600.0 * hours + 60.0 * minutes + seconds)
 
 
 SOURCE = VboSource

@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal
 
-from vehest.data.declared import setting
 from vehest.data.errors import ConfigurationError
+from vehest.declared import setting
 from vehest.training.noise_tuning import NoiseTuningSettings
 
 LEAST_PROCESS_YAW_RATE = 1e-5  # [rad/s], of the search for the yaw rate's process noise

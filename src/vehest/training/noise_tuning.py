@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import ClassVar, Literal
 
-from vehest.data.declared import Group, setting
+from vehest.declared import Group, setting
 from vehest.training.search import DirectSearchSettings
 
 

@@ -9,7 +9,7 @@ from typing import ClassVar, Literal, NamedTuple
 import torch
 from torch import Tensor, nn
 
-from vehest.data.declared import Group, setting
+from vehest.declared import Group, setting
 from vehest.training.sequences import Phase, PhaseSettings
 
 

@@ -12,8 +12,8 @@ import numpy as np
 from scipy import optimize
 
 from vehest.constants import FloatArray
-from vehest.data.declared import Group, setting
 from vehest.data.errors import MissingError
+from vehest.declared import Group, setting
 from vehest.training.context import FitContext, Progress
 
 FIRST_STEP = 0.05

@@ -13,8 +13,8 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from vehest.data.declared import Group, setting
 from vehest.data.errors import ConfigurationError, DataError
+from vehest.declared import Group, setting
 from vehest.training.checkpoints import Checkpoint, load_checkpoint, save_checkpoint
 from vehest.training.context import FitContext, FitRecord, Progress, record_of_epochs
 

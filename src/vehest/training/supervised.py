@@ -12,9 +12,9 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from vehest.data.declared import Group, setting
 from vehest.data.errors import DataError
 from vehest.data.windows import WindowSet
+from vehest.declared import Group, setting
 from vehest.training.checkpoints import Checkpoint, load_checkpoint, save_checkpoint
 from vehest.training.context import FitContext, FitRecord, Progress, record_of_epochs
 from vehest.training.members import FlatParameters, constrain, fixed_state, is_plain, predict_members, prepare

@@ -15,8 +15,8 @@ from typing import ClassVar, Literal, NamedTuple, Protocol
 import torch
 from torch import Tensor
 
-from vehest.data.declared import Group, setting
 from vehest.data.errors import ConfigurationError, DataError
+from vehest.declared import Group, setting
 from vehest.training.sequences import Phase, PhaseSettings
 
 

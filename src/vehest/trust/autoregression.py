@@ -103,19 +103,16 @@ def _least_squares(regressors: FloatArray, targets: FloatArray, columns: int) ->
     return np.linalg.solve(gram, design.T @ targets)
 
 
-@dataclass(frozen=True, eq=False)
-class NoiseLevels:
-    """How large innovations are at a speed, in their standard deviations over all of training."""
+def learn_noise_levels(innovations: FloatArray, covariance: FloatArray, speed: FloatArray, n_levels: int) -> tuple[FloatArray, FloatArray]:
+    """Size of innovations (T, C) at a speed, in their standard deviations over all of training.
 
-    speeds: FloatArray  # (L,), rising
-    factors: FloatArray  # (L, C); between the speeds by straight lines, constant outside
-
-
-def learn_noise_levels(innovations: FloatArray, covariance: FloatArray, speed: FloatArray, n_levels: int) -> NoiseLevels:
-    """Root mean squares of innovations (T, C), outliers cut off, in bins of speed (T,) with equal numbers of samples."""
+    Returns:
+        Speeds, (L,), rising, at the medians of bins of speed (T,) with equal numbers of samples; and root mean squares there, (L, C),
+        outliers cut off, between which straight lines hold.
+    """
     known = np.isfinite(innovations).all(1) & np.isfinite(speed)
     own, speed = innovations[known] / np.sqrt(np.diag(covariance)), np.abs(speed[known])
     bins = np.array_split(np.argsort(speed, kind="stable"), n_levels)
     speeds = np.array([float(np.median(speed[rows])) for rows in bins])
     factors = np.array([np.sqrt(np.mean(np.square(np.clip(own[rows], -OUTLIER / 2, OUTLIER / 2)), axis=0)) for rows in bins])
-    return NoiseLevels(speeds, np.clip(factors, *LEVELS))
+    return speeds, np.clip(factors, *LEVELS)

@@ -19,9 +19,9 @@ al., Distribution-free predictive inference for regression, JASA 113 (523), 2018
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -67,13 +67,11 @@ class Quantity:
     effective_blocks: float  # how many equal blocks the squared scores are spread over (Kish 1965)
 
     def __post_init__(self) -> None:
-        unknown = [name for name in self.weights if name not in TERMS]
-        if unknown:
-            raise DataError(f"weights name {unknown[0]}, which is not one of: {', '.join(TERMS)}")
+        _check_terms("weights", self.weights)
         if len(self.factors) != len(LEVELS) or len(self.beyond) != len(LEVELS):
             raise DataError(f"factors and beyond must have {len(LEVELS)} values, one a level ({', '.join(map(str, LEVELS))})")
-        if min(self.weights.values(), default=0.0) < 0 or not self.floor > 0 or min(self.factors) < 0:
-            raise DataError("weights and factors must not be negative, and floor must be positive")
+        if not self.floor > 0 or min(self.factors) < 0:
+            raise DataError("factors must not be negative, and floor must be positive")
 
     def beside(self, level: float) -> FloatArray:
         """Half widths of all `LEVELS` over that of one, (L,)."""
@@ -100,9 +98,7 @@ class Bands:
     sideslip: Quantity  # the band of β
 
     def __post_init__(self) -> None:
-        unknown = [name for name in self.largest if name not in TERMS]
-        if unknown or min(self.largest.values(), default=0.0) < 0:
-            raise DataError(f"largest must name sizes of: {', '.join(TERMS)}")
+        _check_terms("largest", self.largest)
 
     def packed(self, *, elsewhere: bool = False) -> PackedBands:
         """Arguments of `band_rows` for `SHOWN_LEVEL`; ``elsewhere``: the car or its tyres are others than those calibrated on."""
@@ -113,21 +109,15 @@ class Bands:
         return PackedBands(_columns(self.channels), numbers)
 
     def half_widths(self, rows: FloatArray, vy: FloatArray, variance: FloatArray, *, elsewhere: bool = False) -> FloatArray:
-        """Half widths of all levels, (T, 2, L): v [m/s] and β [rad]; NaN where there is no estimate. Arguments as of `band_rows`.
+        """Half widths at `SHOWN_LEVEL`, (T, 2): v [m/s] and β [rad]; NaN where there is no estimate. Arguments as of `band_rows`."""
+        bands = np.empty((len(vy), 2))
+        band_rows(rows, vy, variance, *self.packed(elsewhere=elsewhere), bands)
+        return bands
 
-        NaN in ``rows`` was not measured and counts as the training's largest.
-        """
-        terms = terms_of(rows, vy, variance, _columns(self.channels))
-        largest = np.array([self.largest.get(name, 0.0) for name in TERMS])
-        terms = np.where(np.isfinite(terms), terms, largest)
-        wider = _widening(terms, largest) * (OTHER_VEHICLE if elsewhere else 1.0)
-        speed = np.abs(rows[:, self.channels.index("vx")]) if "vx" in self.channels else np.full(len(rows), np.nan)
-        in_sideslip = terms / np.maximum(speed, LOWEST_SPEED)[:, None]
-        scales = np.stack([_scale(terms, self.vy), _scale(in_sideslip, self.sideslip)], 1)
-        half = (scales * wider[:, None])[:, :, None] * np.array([self.vy.factors, self.sideslip.factors])
-        half[:, 1] = np.where(half[:, 1] < math.pi, half[:, 1], math.pi)  # without a speed, too
-        half[~np.isfinite(vy)] = np.nan
-        return half
+
+def _check_terms(what: str, numbers: Mapping[str, float]) -> None:
+    if not numbers.keys() <= set(TERMS) or min(numbers.values(), default=0.0) < 0:
+        raise DataError(f"{what} must be numbers from 0 on, of: {', '.join(TERMS)}")
 
 
 class PackedBands(NamedTuple):
@@ -137,12 +127,11 @@ class PackedBands(NamedTuple):
     numbers: FloatArray  # factors, squared floors of v and β, lowest speed, weights of `TERMS` for v and β, their largest sizes, (29,)
 
 
-def half_widths_of_rows(
-    rows: FloatArray, vy: FloatArray, variance: FloatArray, columns: NDArray[np.int64], numbers: FloatArray, bands: FloatArray
-) -> None:
+@entry(nogil=True)
+def band_rows(rows, vy, variance, columns, numbers, bands):  # type: ignore[no-untyped-def]
     """``bands`` of one level, (T, 2), v [m/s] and β [rad], of inputs (T, C), estimates [m/s] and their variances [m²/s²] or NaN.
 
-    ``columns`` and ``numbers`` are of `PackedBands`; the same numbers as `Bands.half_widths`, sample by sample.
+    NaN in ``rows`` was not measured and counts as the training's largest; ``columns`` and ``numbers`` are of `PackedBands`.
     """
     n_terms = (len(numbers) - _HEAD) // 3
     terms = np.empty(n_terms)
@@ -175,9 +164,6 @@ def half_widths_of_rows(
             bands[k, 1] = min(numbers[1] * wider * math.sqrt(max(squared_sideslip / (speed * speed), numbers[3])), math.pi)
 
 
-band_rows = entry(nogil=True)(half_widths_of_rows)
-
-
 def with_bands(estimate: Estimate, measured: Recording, bands: Bands, *, elsewhere: bool = False) -> Estimate:
     """An estimate of ``measured`` with its 90 % half widths as ``band_vy`` [m/s] and ``band_sideslip`` [rad].
 
@@ -185,10 +171,8 @@ def with_bands(estimate: Estimate, measured: Recording, bands: Bands, *, elsewhe
         DataError: the estimate is not on the recording's clock, or the recording lacks a channel.
     """
     rows, vy, variance = band_inputs(estimate, measured, bands.channels, bands.horizon_steps)
-    found, packed = np.empty((len(vy), 2)), bands.packed(elsewhere=elsewhere)
-    band_rows(rows, vy, variance, *packed, found)
-    own = {"band_vy": found[:, 0].copy(), "band_sideslip": found[:, 1].copy()}
-    return replace(estimate, channels={**estimate.channels, **own})
+    half = bands.half_widths(rows, vy, variance, elsewhere=elsewhere)
+    return replace(estimate, channels={**estimate.channels, "band_vy": half[:, 0].copy(), "band_sideslip": half[:, 1].copy()})
 
 
 def band_inputs(
@@ -212,28 +196,8 @@ def band_inputs(
     return rows, np.ascontiguousarray(estimate["vy"], dtype=np.float64), variance
 
 
-def terms_of(rows: FloatArray, vy: FloatArray, variance: FloatArray, columns: NDArray[np.int64]) -> FloatArray:
-    """`TERMS` of each sample without their squares, (T, 8); NaN where a channel is not read or was not measured."""
-    read = [rows[:, column] if column >= 0 else np.full(len(rows), np.nan) for column in columns]
-    vx, ax, ay, yaw_rate, steer = read
-    deviation = np.sqrt(np.where(variance >= 0.0, variance, np.nan))
-    return np.stack([deviation, np.ones(len(rows)), vx, ax, ay, yaw_rate * vx, steer * vx, vy], axis=1)
-
-
 def _columns(channels: Sequence[str]) -> NDArray[np.int64]:
     return np.array([channels.index(name) if name in channels else -1 for name in COLUMNS], dtype=np.int64)
-
-
-def _widening(terms: FloatArray, largest: FloatArray) -> FloatArray:
-    """w of each sample, (T,); terms of a size that training never had count nothing."""
-    known = (np.arange(len(TERMS)) >= _FIRST_FEATURE) & (largest > 0)
-    excess = np.abs(terms[:, known]) / largest[known]
-    return np.maximum(excess.max(axis=1, initial=1.0), 1.0)
-
-
-def _scale(terms: FloatArray, own: Quantity) -> FloatArray:
-    weights = np.array([own.weights.get(name, 0.0) for name in TERMS])
-    return np.asarray(np.sqrt(np.maximum(np.square(terms) @ weights, own.floor**2)))
 
 
 # Calibration
@@ -246,31 +210,20 @@ class Piece:
     rows: FloatArray  # inputs of the model, (T, C)
     vy: FloatArray  # estimate, (T,) [m/s]
     variance: FloatArray  # of its error, (T,) [m²/s²], NaN where there is none
-    error_vy: FloatArray  # v̂ - v, (T,) [m/s]; NaN where either is not known, or nothing is to be learnt from
-    error_sideslip: FloatArray  # β̂ - β, (T,) [rad]; likewise
+    errors: FloatArray  # v̂ - v [m/s] and β̂ - β [rad], (T, 2); NaN where either is not known, or nothing is to be learnt from
     yaw_rate: FloatArray | None  # measured, (T,) [rad/s]; None if it was not
     rate_hz: float  # of the samples [Hz]
 
     @property
     def known(self) -> NDArray[np.bool_]:
         """Samples whose errors are known, (T,)."""
-        return np.isfinite(self.error_vy) & np.isfinite(self.error_sideslip)
+        return np.asarray(np.isfinite(self.errors).all(axis=1))
 
 
-@dataclass(frozen=True)
-class Origin:
-    """Origin of bands; see `Bands`."""
-
-    vehicles: tuple[str, ...]
-    datasets: tuple[str, ...]
-    scaled_on: tuple[str, ...]
-    calibrated_on: tuple[str, ...]
-    channels: tuple[str, ...]
-    horizon_steps: int = 0
-
-
-def calibrated(training: Sequence[Piece], validation: Sequence[Piece], origin: Origin) -> Bands:
+def calibrated(training: Sequence[Piece], validation: Sequence[Piece], channels: tuple[str, ...], **origin: Any) -> Bands:
     """Bands of a model: scale and domain from training ranges, factors from validation ranges that it has not learnt from.
+
+    ``channels`` are the columns of the rows; ``origin`` holds what else `Bands` says of the model and its recordings.
 
     Raises:
         DataError: there is no sample whose error is known, in one of the two.
@@ -278,61 +231,53 @@ def calibrated(training: Sequence[Piece], validation: Sequence[Piece], origin: O
     for pieces, what in ((training, "training"), (validation, "validation")):
         if not any(piece.known.any() for piece in pieces):
             raise DataError(f"no sample of the {what} ranges has both an estimate and a reference to calibrate bands by")
-    columns = _columns(origin.channels)
-    terms, error_vy, error_sideslip, speed = _together(training, columns)
+    columns = _columns(channels)
+    terms = np.concatenate([terms_of(piece.rows, piece.vy, piece.variance, columns)[piece.known] for piece in training])
     largest = np.array([np.quantile(own[np.isfinite(own)], DOMAIN_QUANTILE) if np.isfinite(own).any() else 0.0 for own in np.abs(terms).T])
-    filled = np.where(np.isfinite(terms), terms, largest)
-    usable = _usable(terms)
+    vx = np.abs(terms[:, TERMS.index("vx")])
+    speed = np.maximum(np.where(np.isfinite(vx), vx, LOWEST_SPEED), LOWEST_SPEED)
+    usable = np.isfinite(terms).any(axis=0)
+    if usable[TERMS.index("variance")]:  # a filter: of its variance and a constant alone
+        usable[_FIRST_FEATURE:] = False
     names = [name for name, chosen in zip(TERMS, usable, strict=True) if chosen]
-    in_vy, in_sideslip = filled[:, usable], filled[:, usable] / speed[:, None]
-    vy, sideslip = (_unit_quantity(names, *fitted_scale(own, errors)) for own, errors in ((in_vy, error_vy), (in_sideslip, error_sideslip)))
+    filled = np.where(np.isfinite(terms), terms, largest)[:, usable]
+    errors = np.concatenate([piece.errors[piece.known] for piece in training])
+    scales = []
+    for own, error in zip((filled, filled / speed[:, None]), errors.T, strict=True):
+        weights, floor = fitted_scale(own, error)
+        kept = {name: float(weight) for name, weight in zip(names, weights, strict=True) if weight > 0}
+        scales.append(Quantity(kept, floor, (1.0,) * len(LEVELS), (False,) * len(LEVELS), 1.0))
     labels, kind = block_labels([piece.yaw_rate for piece in validation], [len(piece.vy) for piece in validation], validation[0].rate_hz)
     blocks = np.concatenate(labels)[np.concatenate([piece.known for piece in validation])]
     bands = Bands(
-        **vars(origin),
+        **origin,
+        channels=channels,
         blocks=kind,
         n_blocks=len(np.unique(blocks)),
         seconds=len(blocks) / validation[0].rate_hz,
         largest={name: float(size) for name, size in zip(TERMS, largest, strict=True) if size > 0 and name != "one"},
-        vy=vy,
-        sideslip=sideslip,
+        vy=scales[0],
+        sideslip=scales[1],
     )
-    half = np.concatenate([bands.half_widths(piece.rows, piece.vy, piece.variance)[piece.known, :, 0] for piece in validation])
-    errors = np.concatenate([np.stack([piece.error_vy, piece.error_sideslip], 1)[piece.known] for piece in validation])
-    scores = np.abs(errors) / half
-    return replace(bands, vy=_with_factors(vy, scores[:, 0], blocks), sideslip=_with_factors(sideslip, scores[:, 1], blocks))
+    half = [bands.half_widths(piece.rows, piece.vy, piece.variance)[piece.known] for piece in validation]
+    scores = np.abs(np.concatenate([piece.errors[piece.known] for piece in validation])) / np.concatenate(half)
+    vy, sideslip = (_with_factors(own, score, blocks) for own, score in zip(scales, scores.T, strict=True))
+    return replace(bands, vy=vy, sideslip=sideslip)
 
 
-def _unit_quantity(names: Sequence[str], weights: FloatArray, floor: float) -> Quantity:
-    """A scale whose factors are still 1."""
-    kept = {name: float(weight) for name, weight in zip(names, weights, strict=True) if weight > 0}
-    return Quantity(kept, floor, (1.0,) * len(LEVELS), (False,) * len(LEVELS), 1.0)
-
-
-def _together(pieces: Sequence[Piece], columns: NDArray[np.int64]) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-    """Terms (N, 8), errors of v and β (N,) and speeds (N,) of all samples whose errors are known."""
-    terms = np.concatenate([terms_of(p.rows, p.vy, p.variance, columns)[p.known] for p in pieces])
-    error_vy, error_sideslip = (np.concatenate([getattr(p, name)[p.known] for p in pieces]) for name in ("error_vy", "error_sideslip"))
-    speed = np.abs(terms[:, TERMS.index("vx")])
-    return terms, error_vy, error_sideslip, np.maximum(np.where(np.isfinite(speed), speed, LOWEST_SPEED), LOWEST_SPEED)
-
-
-def _usable(terms: FloatArray) -> NDArray[np.bool_]:
-    """Terms that s² is made of: P and a constant where the method gives a variance, else all that were measured."""
-    measured: NDArray[np.bool_] = np.any(np.isfinite(terms), axis=0)
-    if measured[TERMS.index("variance")]:
-        measured[_FIRST_FEATURE:] = False
-    return measured
+def terms_of(rows: FloatArray, vy: FloatArray, variance: FloatArray, columns: NDArray[np.int64]) -> FloatArray:
+    """`TERMS` of each sample without their squares, (T, 8); NaN where a channel is not read or was not measured."""
+    vx, ax, ay, yaw_rate, steer = (rows[:, column] if column >= 0 else np.full(len(rows), np.nan) for column in columns)
+    deviation = np.sqrt(np.where(variance >= 0.0, variance, np.nan))
+    return np.stack([deviation, np.ones(len(rows)), vx, ax, ay, yaw_rate * vx, steer * vx, vy], axis=1)
 
 
 def _with_factors(own: Quantity, scores: FloatArray, blocks: NDArray[np.int64]) -> Quantity:
-    found = [pooled_quantile(scores, blocks, level) for level in LEVELS]
+    factors, beyond = zip(*(pooled_quantile(scores, blocks, level) for level in LEVELS), strict=True)
     squared = np.bincount(np.unique(blocks, return_inverse=True)[1], weights=np.square(scores))
     total = float(np.sum(np.square(squared)))
     effective = float(squared.sum()) ** 2 / total if total > 0 else float(len(squared))
-    return replace(
-        own, factors=tuple(factor for factor, _ in found), beyond=tuple(beyond for _, beyond in found), effective_blocks=effective
-    )
+    return replace(own, factors=factors, beyond=beyond, effective_blocks=effective)
 
 
 def fitted_scale(terms: FloatArray, errors: FloatArray) -> tuple[FloatArray, float]:

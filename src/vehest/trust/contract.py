@@ -16,6 +16,7 @@ from __future__ import annotations
 import math
 import warnings
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from typing import Any
 
 import numpy as np
@@ -28,14 +29,14 @@ from vehest.estimators.base import Estimator, Stepper
 from vehest.trust.front_end import FrontEnd
 from vehest.trust.guard import BRIDGED_SECONDS, RESTART, USE, WAIT, Cleaned, Guard, GuardLimits, usual_limits
 from vehest.trust.health import Health
-from vehest.trust.monitor import Monitor
 from vehest.trust.record import Trust
-from vehest.trust.verdict import starts_anew
+from vehest.trust.verdict import Monitor, starts_anew
 from vehest.trust.watch import Watch, Watched
 
 FAILURES = (DataError, ArithmeticError, np.linalg.LinAlgError, RuntimeError, ValueError)
 """Failures of an estimator on senseless samples; it then starts anew."""
 
+NO_NUMBER = (KeyError, TypeError, ValueError, OverflowError)
 MOTION = ("vx", "yaw_rate", "ay")
 RATE_INTERVALS, RATE_TOLERANCE = 20, 0.2
 """Number of intervals, and deviation of their median, for the warning that samples come at another rate."""
@@ -76,14 +77,15 @@ def estimate_guarded(
     if missing:
         raise DataError(f"recording '{recording.id}' has no channel '{missing[0]}', which estimator '{estimator.name}' needs")
     rows = np.ascontiguousarray(np.stack([np.asarray(samples[name], np.float64) for name in estimator.channels], axis=1))
-    limits = limits_for(estimator, trust)
-    rate = estimator.settings.rate_hz
+    limits, rate = limits_for(estimator, trust), estimator.settings.rate_hz
     cleaned = Guard(estimator.channels, estimator.skippable, limits, rate, remembers=starts_anew(estimator))(rows)
     monitor = Monitor(estimator, trust, elsewhere=elsewhere)
     verdict = monitor.before(rows, cleaned)
     run = _Run(estimator, recording, cleaned, Watch(limits, estimator.warm_up_steps, rate), initial_state)
-    run.go()
-    return run.outcome(monitor, verdict)
+    at = 0
+    while at < len(rows):
+        at = run.piece(at)
+    return run.estimate(monitor, verdict)
 
 
 class _Run:
@@ -94,34 +96,25 @@ class _Run:
     ) -> None:
         self.estimator, self.recording, self.cleaned, self.watch = estimator, recording, cleaned, watch
         self.initial_state = initial_state
-        self.horizon = estimator.horizon_steps
-        steps = len(cleaned.rows)
+        self.motion, steps = motion_of(estimator.channels, cleaned), len(cleaned.rows)
         self.out, self.marks = np.full(steps, np.nan), np.zeros(steps, np.int8)
         self.vx, self.variance = np.full(steps, np.nan), np.full(steps, np.nan)
         self.others: dict[str, FloatArray] = {}
         self.covariance: FloatArray | None = None
         self.covariance_of: tuple[str, ...] = ()
-        self.motion = motion_of(estimator.channels, cleaned)
 
-    def go(self) -> None:
-        """From the first row to the last."""
-        at, steps = 0, len(self.out)
-        while at < steps:
-            waits = self.cleaned.flow[at:] == WAIT
-            if waits[0]:
-                end = at + (int(np.argmin(waits)) if not waits.all() else len(waits))
-                at = self._watched(at, end, np.full(end - at, np.nan))[0]
-                continue
-            ends = self.cleaned.flow[at + 1 :] != USE
-            at = self._piece(at, at + 1 + int(np.argmax(ends)) if ends.any() else steps)
-
-    def _piece(self, start: int, end: int) -> int:
-        """Estimate from a start on, up to ``end`` or until the estimator is lost; returns the row to go on with.
+    def piece(self, start: int) -> int:
+        """Go on from a row up to the next wait or restart, or until the estimator is lost; returns the row to go on with.
 
         After a loss the next attempt is short at first, so that an estimator that is lost again and again takes no quadratic time.
         """
-        short = start > 0 and self.watch.state[5] > 0
-        reach = min(start + self._first_reach, end) if short else end
+        flow = self.cleaned.flow
+        ends = np.flatnonzero(flow[start + 1 :] != (flow[start] if flow[start] == WAIT else USE))
+        end = start + 1 + int(ends[0]) if len(ends) else len(flow)
+        if flow[start] == WAIT:
+            return self._watched(start, end, np.full(end - start, np.nan))[0]
+        first_reach = self.estimator.warm_up_steps + math.ceil(2.0 * self.estimator.settings.rate_hz)
+        reach = min(start + first_reach, end) if start > 0 and self.watch.state[5] > 0 else end
         while True:
             before = self.watch.state.copy()
             at, lost = self._watched(start, reach, self._raw(start, reach))
@@ -130,33 +123,25 @@ class _Run:
             self.watch.state[:] = before
             reach = min(start + 2 * (reach - start), end)
 
-    @property
-    def _first_reach(self) -> int:
-        return self.estimator.warm_up_steps + math.ceil(2.0 * self.estimator.settings.rate_hz)
-
     def _watched(self, start: int, end: int, raw: FloatArray) -> tuple[int, bool]:
         motion = self.motion[start:end]
         motion = np.where(np.isnan(motion), np.stack([self.vx[start:end], motion[:, 1], motion[:, 2]], axis=1), motion)
         watched = self.watch(raw, np.ascontiguousarray(motion), self.cleaned.flow[start:end])
-        done = start + watched.done
+        done = start + len(watched.vy)
         self.out[start:done], self.marks[start:done] = watched.vy, watched.marks
         return done, watched.lost
 
     def _raw(self, start: int, end: int) -> FloatArray:
         """The estimator's v after each row of a piece that it begins anew, (T,)."""
-        extra = self.horizon  # rows after the last, whose values no estimate at their time depends on
+        extra = self.estimator.horizon_steps  # rows after the last, whose values no estimate at their time depends on
         rows = np.concatenate([self.cleaned.rows[start:end], np.repeat(self.cleaned.rows[end - 1 : end], extra, axis=0)])
         channels = dict(zip(self.estimator.channels, rows.T, strict=True))
-        r = self.recording
-        gappy = frozenset(self.estimator.skippable)
-        piece = Recording(r.id, r.vehicle, self.estimator.settings.rate_hz, r.start_time, channels, r.kind, gappy)
-        state = self.initial_state if start == 0 else None
+        r, rate = self.recording, self.estimator.settings.rate_hz
+        piece = Recording(r.id, r.vehicle, rate, r.start_time, channels, r.kind, frozenset(self.estimator.skippable))
         try:
-            estimate = self.estimator.estimate([piece], state)[0]
+            estimate = self.estimator.estimate([piece], self.initial_state if start == 0 else None)[0]
         except FAILURES:
-            if not self.estimator.causal:
-                return np.full(end - start, np.nan)
-            return self._stepped(start, end)
+            return self._stepped(start, end) if self.estimator.causal else np.full(end - start, np.nan)
         shift = slice(extra, extra + end - start)
         if "vx" in estimate.channels:
             self.vx[start:end] = estimate["vx"][shift]
@@ -187,14 +172,16 @@ class _Run:
             self.variance[k] = found.get("vy_variance", math.nan)
         return raw
 
-    def outcome(self, monitor: Monitor, verdict: Health) -> Estimate:
-        """The estimate on the recording's clock: that after row k holds ``horizon`` samples later, its health at once."""
+    def estimate(self, monitor: Monitor, verdict: Health) -> Estimate:
+        """The estimate on the recording's clock: that after row k holds ``horizon_steps`` samples later, its health at once."""
+        r, horizon = self.recording, self.estimator.horizon_steps
         vx = np.where(np.isnan(self.motion[:, 0]), self.vx, self.motion[:, 0])
-        vx = np.where(np.isnan(vx), held(vx), vx)
-        bands = monitor.after(verdict, Watched(self.out, self.marks, len(self.out), lost=False), self.cleaned, vx, self.variance)
+        last = np.maximum.accumulate(np.where(np.isnan(vx), -1, np.arange(len(vx))))
+        vx = np.where(last < 0, np.nan, vx[last])
+        bands = monitor.after(verdict, Watched(self.out, self.marks, lost=False), self.cleaned, vx, self.variance)
 
         def later(values: FloatArray) -> FloatArray:
-            return np.concatenate([np.full(self.horizon, np.nan), values])[: len(values)]
+            return np.concatenate([np.full(horizon, np.nan), values])[: len(values)]
 
         vy = later(self.out)
         channels = {"vy": vy, "sideslip": np.arctan2(vy, vx), **{name: later(values) for name, values in self.others.items()}}
@@ -202,10 +189,8 @@ class _Run:
             channels |= {"band_vy": later(bands[:, 0]), "band_sideslip": later(bands[:, 1])}
         channels |= {"health": verdict.status, "health_reason": verdict.reason}
         mode: Mode = "causal" if self.estimator.causal else "offline"
-        r = self.recording
-        clock = (self.estimator.settings.rate_hz, r.start_time)
-        covariance = (self.covariance, self.covariance_of) if self.covariance is not None and self.horizon == 0 else (None, ())
-        return Estimate(r.id, self.estimator.name, *clock, channels, mode, *covariance)
+        covariance = (self.covariance, self.covariance_of) if self.covariance is not None and horizon == 0 else (None, ())
+        return Estimate(r.id, self.estimator.name, self.estimator.settings.rate_hz, r.start_time, channels, mode, *covariance)
 
 
 def motion_of(channels: Sequence[str], cleaned: Cleaned) -> FloatArray:
@@ -216,12 +201,6 @@ def motion_of(channels: Sequence[str], cleaned: Cleaned) -> FloatArray:
             at = channels.index(name)
             motion[:, column] = np.where(cleaned.measured[:, at] | (cleaned.flow != WAIT), cleaned.rows[:, at], np.nan)
     return motion
-
-
-def held(values: FloatArray) -> FloatArray:
-    """The last value that is known, (T,); NaN before the first."""
-    last = np.maximum.accumulate(np.where(np.isnan(values), -1, np.arange(len(values))))
-    return np.where(last < 0, np.nan, values[last])
 
 
 class GuardedStepper(Stepper):
@@ -293,10 +272,14 @@ class GuardedStepper(Stepper):
 
     def _received(self, sample: Mapping[str, Any] | None) -> dict[str, float]:
         row: FloatArray | None = self._row
-        try:
-            self._row[0] = [sample[name] for name in self._channels] if sample is not None else math.nan
-        except (KeyError, TypeError, ValueError, OverflowError):
-            self._row[0] = [_number(sample.get(name)) if sample is not None else math.nan for name in self._channels]
+        self._row[0] = math.nan
+        if sample is not None:
+            try:
+                self._row[0] = [sample[name] for name in self._channels]
+            except NO_NUMBER:
+                for column, name in enumerate(self._channels):
+                    with suppress(*NO_NUMBER):
+                        self._row[0, column] = sample[name]
         if self._front is not None:
             row = self._front(self._row)
         if row is not None:
@@ -353,27 +336,16 @@ class _Clock:
     def skipped(self, time: float) -> int:
         """Samples that are missing before this one; -1 if it is a repeated one."""
         gap = time - self._last
-        if math.isnan(self._last):
-            self._last = time
-            return 0
-        self._note(gap)
+        if len(self._gaps) < RATE_INTERVALS and not math.isnan(gap):
+            self._note(gap)
         if -1.0 < gap <= 0.5 / self._rate:
             return -1
         self._last = time
-        return max(round(gap * self._rate) - 1, 0) if math.isfinite(gap) and gap > 0 else 0
+        return max(round(gap * self._rate) - 1, 0) if 0.0 < gap < math.inf else 0
 
     def _note(self, gap: float) -> None:
-        if len(self._gaps) == RATE_INTERVALS:
-            return
         self._gaps.append(gap)
         middle = float(np.median(self._gaps))
         if len(self._gaps) == RATE_INTERVALS and middle > 0 and abs(middle * self._rate - 1.0) > RATE_TOLERANCE:
             found = f"{1.0 / middle:.3g}"
             warnings.warn(f"samples come at {found} Hz instead of {self._rate:g} Hz; set bus_rate_hz={found}", stacklevel=4)
-
-
-def _number(value: Any) -> float:
-    try:
-        return float(value)
-    except (TypeError, ValueError, OverflowError):
-        return math.nan

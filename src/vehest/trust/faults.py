@@ -14,7 +14,7 @@ import math
 import zlib
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Literal, get_args
+from typing import Literal, NamedTuple, get_args
 
 import numpy as np
 from numpy.typing import NDArray
@@ -50,24 +50,6 @@ OFFSETS_OF_SPEED: Sizes = (0.02, 0.08, 0.25)
 OFFSETS_OF_RANGE: Sizes = (0.01, 0.05, 0.2)
 """Offsets of all other channels, as shares of the largest size that `CHANNELS` allows."""
 
-TIMES_OFFSET: dict[str, float] = {"bias": 1.0, "drift": 0.1, "spikes": 10.0, "noise": 1.0}
-"""Kind whose size goes by the channel's offsets -> multiple of them; a drift reaches the offset in 10 s."""
-
-SIZES: dict[str, Sizes] = {
-    "scale": (0.05, 0.2, 0.5),  # factor less 1
-    "frozen": (0.1, 0.5, 1.0),  # share of the duration, from its start on
-    "dropout": (0.1, 0.5, 1.0),  # share of the samples, in pieces
-    "delay": (0.05, 0.2, 0.5),  # s, at least one sample
-    "saturation": (0.8, 0.5, 0.2),  # share of the channel's largest size
-    "sign": (0.1, 0.5, 1.0),  # share of the duration, from its start on
-    "nan": (0.1, 0.5, 1.0),  # share of the samples, in pieces
-    "inf": (0.01, 0.1, 1.0),  # share of the samples, at least one
-    "huge": (10.0, 1e4, 1e200),  # times the channel's physical range
-    "held": (0.1, 0.25, 0.5),  # s, at least two samples
-    "lost_wheel": (math.nan, 1.5, 0.0),  # factor of the speed; NaN: drops out
-}
-"""Kind -> mild, medium and severe size, for every channel."""
-
 UNIT_FACTORS: dict[str, Sizes] = {
     "m/s": (2.236936, 1.0 / 3.6, 3.6),
     "m/s²": (1.0 / 0.3048, 1.0 / GRAVITY, GRAVITY),
@@ -81,9 +63,6 @@ converted once too often, degrees; kPa, bar, and bar converted once too often.""
 WHEEL_FACTORS: Sizes = (1.0 / math.tau, math.tau / 60.0, 60.0 / math.tau)
 """The same of wheels and motor: turns a second, turns a minute converted once too often, turns a minute."""
 
-SHARES = ("frozen", "dropout", "sign", "nan", "inf", "saturation")
-POSITIVE = ("noise", "delay", "huge", "held")
-
 
 @dataclass(frozen=True)
 class Fault:
@@ -94,56 +73,40 @@ class Fault:
     """
 
     kind: str  # one of `KINDS`
-    channel: str  # that it befalls; never a reference
+    channel: str  # never a reference
     severity: Severity = "medium"  # which of the sizes in this module
     onset: float = 0.0  # time of its start after the first sample [s]
-    duration: float = math.inf  # how long it lasts [s]; ``inf``: to the end
+    duration: float = math.inf  # [s]; ``inf``: to the end
     seed: int = 0  # of everything that is drawn
     size: float | None = None  # instead of the severity's, in the same unit; its sign is kept, that of a severity is drawn
 
     def __post_init__(self) -> None:
-        _check_choice("kind", self.kind, KINDS)
-        _check_choice("channel", self.channel, tuple(CHANNELS))
-        _check_choice("severity", self.severity, SEVERITIES)
+        for name, known in (("kind", KINDS), ("channel", CHANNELS), ("severity", SEVERITIES)):
+            value = getattr(self, name)
+            if value not in known:
+                close = difflib.get_close_matches(value, known, n=1)
+                hint = f"did you mean {close[0]}? " if close else ""
+                raise ConfigurationError(f"fault.{name} '{value}' is not there; {hint}there are: {', '.join(known)}")
         if CHANNELS[self.channel].is_reference:
             raise ConfigurationError(f"fault.channel '{self.channel}' is a reference, which no estimator sees; name a measured channel")
         if not applies(self.kind, self.channel):
             fitting = ", ".join(name for name in CHANNELS if applies(self.kind, name))
             raise ConfigurationError(f"a fault '{self.kind}' makes no sense for channel '{self.channel}'; it is for {fitting}")
-        if not (math.isfinite(self.onset) and self.onset >= 0):
-            raise ConfigurationError(f"fault.start must be a time from 0 s on, not {self.onset:g}")
-        if not self.duration > 0:
-            raise ConfigurationError(f"fault.duration must be positive, not {self.duration:g}")
-        if not 0 <= self.seed < 2**63:
-            raise ConfigurationError(f"fault.seed must be a whole number from 0 to 2^63 - 1, not {self.seed}")
-        if self.size is not None:
-            _check_size(self.kind, self.size)
+        own = KINDS[self.kind].own_size
+        for name, value, wanted, fits in (
+            ("start", self.onset, "a time from 0 s on", 0 <= self.onset < math.inf),
+            ("duration", self.duration, "positive", self.duration > 0),
+            ("seed", self.seed, "a whole number from 0 to 2^63 - 1", 0 <= self.seed < 2**63),
+            (f"size of a fault '{self.kind}'", self.size, own, self.size is None or OWN_SIZES[own](self.size)),
+        ):
+            if not fits:
+                raise ConfigurationError(f"fault.{name} must be {wanted}, not {value:g}")
 
     @property
     def condition(self) -> str:
         """``bias:ay:mild``; a given size stands for the severity, and a seed other than 0 behind it: ``bias:ay:0.5:3``."""
         level = self.severity if self.size is None else f"{self.size:.12g}"
         return f"{self.kind}:{self.channel}:{level}" + (f":{self.seed}" if self.seed else "")
-
-
-def parse_condition(condition: str, onset: float = 0.0, duration: float = math.inf) -> Fault:
-    """The fault that a condition names, as `Fault.condition` writes it.
-
-    Raises:
-        ConfigurationError: it names none.
-    """
-    parts = condition.split(":")
-    wanted = f"condition '{condition}' names no fault; write KIND:CHANNEL:SEVERITY, for example bias:ay:mild"
-    if len(parts) not in (3, 4):
-        raise ConfigurationError(wanted)
-    kind, channel, level = parts[:3]
-    try:
-        seed = int(parts[3]) if len(parts) == 4 else 0
-        size = None if level in SEVERITIES or level.isalpha() else float(level)
-    except ValueError:
-        raise ConfigurationError(wanted) from None
-    severity: Severity = level if size is None else "medium"  # type: ignore[assignment]
-    return Fault(kind, channel, severity, onset, duration, seed, size)
 
 
 def is_fault(condition: str) -> bool:
@@ -157,27 +120,24 @@ def applies(kind: str, channel: str) -> bool:
     A wrong unit is for units with `UNIT_FACTORS`, a lost wheel for wheel speeds and the forward velocity, which one wheel may measure.
     """
     own = CHANNELS[channel]
-    if own.is_reference:
-        return False
-    if kind == "sign":
-        return own.low == -own.high
-    if kind == "unit":
-        return own.unit in UNIT_FACTORS
-    if kind == "lost_wheel":
-        return channel == "vx" or channel.startswith("wheel_speed")
-    return True
+    special = {
+        "sign": own.low == -own.high,
+        "unit": own.unit in UNIT_FACTORS,
+        "lost_wheel": channel == "vx" or channel.startswith("wheel_speed"),
+    }
+    return not own.is_reference and special.get(kind, True)
 
 
 def size_of(kind: str, channel: str, severity: Severity) -> float:
-    """Size of a fault, as in the module's table; offsets of wheels and motor are shares of the largest speed."""
-    own, at = CHANNELS[channel], SEVERITIES.index(severity)
-    if kind in SIZES:
-        return SIZES[kind][at]
-    if kind == "unit":
+    """Size of a fault, as in the module's tables; offsets of wheels and motor are shares of the largest speed."""
+    own, at, sizes = CHANNELS[channel], SEVERITIES.index(severity), KINDS[kind].sizes
+    if sizes is None:
         return (WHEEL_FACTORS if _turns(channel) else UNIT_FACTORS[own.unit])[at]
+    if isinstance(sizes, tuple):
+        return sizes[at]
     if channel in OFFSETS:
-        return TIMES_OFFSET[kind] * OFFSETS[channel][at]
-    return TIMES_OFFSET[kind] * (OFFSETS_OF_SPEED[at] if _turns(channel) else OFFSETS_OF_RANGE[at] * _range(own))
+        return sizes * OFFSETS[channel][at]
+    return sizes * (OFFSETS_OF_SPEED[at] if _turns(channel) else OFFSETS_OF_RANGE[at] * _range(own))
 
 
 def inject(samples: Mapping[str, FloatArray], rate_hz: float, fault: Fault) -> dict[str, FloatArray]:
@@ -191,7 +151,7 @@ def inject(samples: Mapping[str, FloatArray], rate_hz: float, fault: Fault) -> d
     values = np.array(samples[fault.channel], dtype=np.float64)
     first, end = window(fault, len(values), rate_hz)
     if first < end:
-        values[first:end] = EFFECTS[fault.kind](FaultedChannel(fault, values.copy(), first, end, rate_hz))
+        values[first:end] = KINDS[fault.kind].effect(FaultedChannel(fault, values.copy(), first, end, rate_hz))
     return {**samples, fault.channel: values}
 
 
@@ -209,16 +169,13 @@ class FaultedChannel:
         self.values, self.first, self.end, self.rate_hz = values, first, end, rate_hz
         self.inside = values[first:end]
         self.seconds = np.arange(end - first) / rate_hz
-        self.reach = _reach(values)
         self.range = _range(CHANNELS[fault.channel])
         self.random = np.random.default_rng([fault.seed, zlib.crc32(f"{fault.kind}:{fault.channel}".encode())])
-        self.size = fault.size if fault.size is not None else self._drawn_size(fault)
-        if fault.kind in TIMES_OFFSET and _turns(fault.channel):
-            self.size *= self.reach
-
-    def _drawn_size(self, fault: Fault) -> float:
-        size = size_of(fault.kind, fault.channel, fault.severity)
-        return size * float(self.random.choice([-1.0, 1.0])) if fault.kind in ("bias", "drift", "scale") else size
+        self.size = size_of(fault.kind, fault.channel, fault.severity) if fault.size is None else fault.size
+        if fault.size is None and fault.kind in ("bias", "drift", "scale"):
+            self.size *= float(self.random.choice([-1.0, 1.0]))
+        if isinstance(KINDS[fault.kind].sizes, float) and _turns(fault.channel):
+            self.size *= _reach(values)
 
     def signs(self) -> FloatArray:
         """-1 or 1 for each sample."""
@@ -228,32 +185,29 @@ class FaultedChannel:
         """The first samples, a share of the size."""
         return np.arange(len(self.inside)) < max(round(self.size * len(self.inside)), 1)
 
-    def singles(self, share: float) -> NDArray[np.bool_]:
-        """Single samples, at least one."""
-        return self._drawn(len(self.inside), share)
+    def drawn(self, share: float, number: int | None = None) -> NDArray[np.bool_]:
+        """A share of single samples, or of a ``number`` of pieces, at least one."""
+        found = np.zeros(len(self.inside) if number is None else number, np.bool_)
+        found[self.random.permutation(len(found))[: max(round(share * len(found)), 1)]] = True
+        return found
 
     def pieces(self) -> NDArray[np.bool_]:
-        """Pieces of `PIECE_SECONDS`, at least one."""
+        """Samples in pieces of `PIECE_SECONDS`."""
         length = max(round(PIECE_SECONDS * self.rate_hz), 1)
-        return np.repeat(self._drawn(math.ceil(len(self.inside) / length), self.size), length)[: len(self.inside)]
-
-    def _drawn(self, number: int, share: float) -> NDArray[np.bool_]:
-        drawn = np.zeros(number, np.bool_)
-        drawn[self.random.permutation(number)[: max(round(share * number), 1)]] = True
-        return drawn
+        return np.repeat(self.drawn(self.size, math.ceil(len(self.inside) / length)), length)[: len(self.inside)]
 
     def earlier(self, samples: int) -> FloatArray:
         """The channel so many samples before; its first value before that."""
         return self.values[np.maximum(np.arange(self.first, self.end) - samples, 0)]
 
 
-def _frozen(at: FaultedChannel) -> FloatArray:
-    return np.where(at.share(), at.values[max(at.first - 1, 0)], at.inside)
-
-
 def _held(at: FaultedChannel) -> FloatArray:
     samples = max(round(at.size * at.rate_hz), 2)
     return at.inside[np.arange(len(at.inside)) // samples * samples]
+
+
+def _huge(at: FaultedChannel) -> FloatArray:
+    return np.where(at.drawn(HUGE_SHARE), at.signs() * at.size * at.range, at.inside)
 
 
 def _saturation(at: FaultedChannel) -> FloatArray:
@@ -267,25 +221,41 @@ def _lost_wheel(at: FaultedChannel) -> FloatArray:
     return at.inside * (1.0 + (at.size - 1.0) * np.minimum(at.seconds / LOSS_SECONDS, 1.0))
 
 
-EFFECTS: dict[str, Callable[[FaultedChannel], FloatArray]] = {
-    "bias": lambda at: at.inside + at.size,
-    "drift": lambda at: at.inside + at.size * at.seconds,
-    "scale": lambda at: at.inside * (1.0 + at.size),
-    "frozen": _frozen,
-    "dropout": lambda at: np.where(at.pieces(), 0.0, at.inside),
-    "spikes": lambda at: at.inside + at.size * at.signs() * at.singles(SPIKE_SHARE),
-    "noise": lambda at: at.inside + at.size * at.random.standard_normal(len(at.inside)),
-    "delay": lambda at: at.earlier(max(round(at.size * at.rate_hz), 1)),
-    "saturation": _saturation,
-    "sign": lambda at: np.where(at.share(), -at.inside, at.inside),
-    "unit": lambda at: at.inside * at.size,
-    "nan": lambda at: np.where(at.pieces(), np.nan, at.inside),
-    "inf": lambda at: np.where(at.singles(at.size), at.signs() * np.inf, at.inside),
-    "huge": lambda at: np.where(at.singles(HUGE_SHARE), at.signs() * at.size * at.range, at.inside),
-    "held": _held,
-    "lost_wheel": _lost_wheel,
+class Kind(NamedTuple):
+    """A kind of fault."""
+
+    sizes: Sizes | float | None  # mild, medium and severe; or the multiple of the channel's offsets; None: factors of a wrong unit
+    own_size: str  # what a size of one's own must be, a key of `OWN_SIZES`
+    effect: Callable[[FaultedChannel], FloatArray]
+
+
+ANY, SHARE, POSITIVE, FACTOR = "a number other than 0", "a share above 0, up to 1", "a positive number", "a factor from 0 on"
+OWN_SIZES: dict[str, Callable[[float], bool]] = {
+    ANY: lambda size: math.isfinite(size) and size != 0,
+    SHARE: lambda size: 0 < size <= 1,
+    POSITIVE: lambda size: 0 < size < math.inf,
+    FACTOR: lambda size: 0 <= size < math.inf,
 }
-KINDS = tuple(EFFECTS)
+
+KINDS: dict[str, Kind] = {
+    "bias": Kind(1.0, ANY, lambda at: at.inside + at.size),
+    "drift": Kind(0.1, ANY, lambda at: at.inside + at.size * at.seconds),  # reaches the offset in 10 s
+    "scale": Kind((0.05, 0.2, 0.5), ANY, lambda at: at.inside * (1.0 + at.size)),  # factor less 1
+    "frozen": Kind((0.1, 0.5, 1.0), SHARE, lambda at: np.where(at.share(), at.values[max(at.first - 1, 0)], at.inside)),  # of the duration
+    "dropout": Kind((0.1, 0.5, 1.0), SHARE, lambda at: np.where(at.pieces(), 0.0, at.inside)),  # share of the samples
+    "spikes": Kind(10.0, ANY, lambda at: at.inside + at.size * at.signs() * at.drawn(SPIKE_SHARE)),
+    "noise": Kind(1.0, POSITIVE, lambda at: at.inside + at.size * at.random.standard_normal(len(at.inside))),
+    "delay": Kind((0.05, 0.2, 0.5), POSITIVE, lambda at: at.earlier(max(round(at.size * at.rate_hz), 1))),  # s, at least one sample
+    "saturation": Kind((0.8, 0.5, 0.2), SHARE, _saturation),  # of the channel's largest size
+    "sign": Kind((0.1, 0.5, 1.0), SHARE, lambda at: np.where(at.share(), -at.inside, at.inside)),  # of the duration
+    "unit": Kind(None, ANY, lambda at: at.inside * at.size),
+    "nan": Kind((0.1, 0.5, 1.0), SHARE, lambda at: np.where(at.pieces(), np.nan, at.inside)),  # share of the samples
+    "inf": Kind((0.01, 0.1, 1.0), SHARE, lambda at: np.where(at.drawn(at.size), at.signs() * np.inf, at.inside)),  # at least one
+    "huge": Kind((10.0, 1e4, 1e200), POSITIVE, _huge),  # times the channel's physical range
+    "held": Kind((0.1, 0.25, 0.5), POSITIVE, _held),  # s, at least two samples
+    "lost_wheel": Kind((math.nan, 1.5, 0.0), FACTOR, _lost_wheel),  # factor of the speed; NaN: drops out
+}
+"""Kind -> sizes, limits of a size of one's own, effect on the channel while the fault lasts."""
 
 
 def _turns(channel: str) -> bool:
@@ -301,23 +271,3 @@ def _reach(values: FloatArray) -> float:
 def _range(channel: Channel) -> float:
     """Largest size that a channel can have."""
     return max(abs(channel.low), abs(channel.high))
-
-
-def _check_choice(what: str, value: str, known: tuple[str, ...]) -> None:
-    if value not in known:
-        close = difflib.get_close_matches(value, known, n=1)
-        hint = f"did you mean {close[0]}? " if close else ""
-        raise ConfigurationError(f"fault.{what} '{value}' is not there; {hint}there are: {', '.join(known)}")
-
-
-def _check_size(kind: str, size: float) -> None:
-    wanted = "a number other than 0"
-    fits = math.isfinite(size) and size != 0
-    if kind in SHARES:
-        wanted, fits = "a share above 0, up to 1", 0 < size <= 1
-    elif kind in POSITIVE:
-        wanted, fits = "a positive number", math.isfinite(size) and size > 0
-    elif kind == "lost_wheel":
-        wanted, fits = "a factor from 0 on", math.isfinite(size) and size >= 0
-    if not fits:
-        raise ConfigurationError(f"fault.size of a fault '{kind}' must be {wanted}, not {size:g}")

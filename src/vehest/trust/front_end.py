@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 from scipy import signal
@@ -57,13 +58,9 @@ class FrontEnd:
     def __init__(self, channels: Sequence[str], skippable: Sequence[str], limits: GuardLimits, bus_rate_hz: float, rate_hz: float) -> None:
         if not (math.isfinite(bus_rate_hz) and bus_rate_hz >= rate_hz * (1 - SLACK)):
             raise ConfigurationError(f"samples at {bus_rate_hz:g} Hz are too slow for an estimator that works at {rate_hz:g} Hz")
-        self.channels = tuple(channels)
-        usual = usual_limits(channels, bus_rate_hz)  # jumps are those of another rate; ranges are the same
-        merged = {
-            name: type(own)(own.low, own.high, max(usual.channels[name].jump, own.jump), own.run, own.stops)
-            for name, own in (limits.channels or usual.channels).items()
-        }
-        self._guard = Guard(channels, skippable, GuardLimits(merged, limits.top_speed, limits.largest_tan_sideslip), bus_rate_hz)
+        usual = usual_limits(channels, bus_rate_hz).channels  # jumps are those of another rate; ranges are the same
+        merged = {name: replace(own, jump=max(usual[name].jump, own.jump)) for name, own in (limits.channels or usual).items()}
+        self._guard = Guard(channels, skippable, replace(limits, channels=merged), bus_rate_hz)
         self._ratio = rate_hz / bus_rate_hz
         self._phase = 1.0 - self._ratio  # the first sample is passed on
         if bus_rate_hz > rate_hz * (1 + 1e-6):

@@ -31,14 +31,8 @@ LEAST_RUN = 0.3  # s
 STOP_TOLERANCE = 2e-3  # of the largest angle, within which a steering stays where it is
 NEAR_STOP = 0.9  # of the largest angle, from which on it may be at its stop
 
-REACHED = {"m/s²": 25.0, "rad/s": 4.0, "rad": 1.0, "m/s": 100.0}
-"""Unit -> size that some road car reaches; angular speeds of wheels and the angle of the steering wheel go by their own ranges."""
-
-FASTEST = {"m/s²": 200.0, "rad/s": 15.0, "rad": 15.0, "m/s": 25.0}
-"""Unit -> change a second that some road car reaches, the sensors' noise left aside."""
-
-NOISE = {"m/s²": 6.0, "rad/s": 0.5, "rad": 0.1, "m/s": 2.0}
-"""Unit -> change by the sensors' noise, where none was learnt."""
+REACHED = {"m/s²": (25.0, 200.0, 6.0), "rad/s": (4.0, 15.0, 0.5), "rad": (1.0, 15.0, 0.1), "m/s": (100.0, 25.0, 2.0)}
+"""Unit -> size and change a second that some road car reaches, and change by the sensors' noise, where none was learnt."""
 
 FREE = ("wheel_", "motor_", "handwheel", "brake_", "fx_", "fy_", "fz_")
 """Starts of names whose ranges and changes differ too much between cars; their limits have to be learnt."""
@@ -87,13 +81,10 @@ def learn_limits(recordings: Sequence[Recording], channels: Sequence[str], rate_
     """
     found = {}
     for name in channels:
-        usual = _usual(name, rate_hz)
+        usual, table = _usual(name, rate_hz), CHANNELS[name]
         having = [recording for recording in recordings if name in recording]
         own = [recording[name] for recording in having]
-        stops = stops_of(own, name)
-        size = max((float(np.nanmax(np.abs(part), initial=0.0)) for part in own), default=0.0)
-        jump = max((float(np.nanmax(np.abs(np.diff(part)), initial=0.0)) for part in own if len(part) > 1), default=0.0)
-        table = CHANNELS[name]
+        stops, size, jump = stops_of(own, name), _largest(own), _largest([np.diff(part) for part in own])
         found[name] = ChannelLimits(
             low=max(table.low, min(usual.low, -MARGIN * size)),
             high=min(table.high, max(usual.high, MARGIN * size)),
@@ -101,32 +92,36 @@ def learn_limits(recordings: Sequence[Recording], channels: Sequence[str], rate_
             run=_run_limit(having, name, stops),
             stops=stops,
         )
-    speeds = [np.abs(recording[name]) for recording in recordings for name in ("vx", "vx_ref") if name in recording]
-    top = max((float(np.nanmax(part, initial=0.0)) for part in speeds), default=0.0)
-    tangents = [_tan_sideslip(recording) for recording in recordings]
-    return GuardLimits(found, MARGIN * top if top > 0 else 140.0, max(1.0, 1.2 * max(tangents, default=0.0)))
+    top = _largest([recording[name] for recording in recordings for name in ("vx", "vx_ref") if name in recording])
+    tangents = _largest([_tan_sideslip(recording) for recording in recordings])
+    return GuardLimits(found, MARGIN * top if top > 0 else GuardLimits.top_speed, max(1.0, 1.2 * tangents))
+
+
+def _largest(parts: Sequence[FloatArray]) -> float:
+    """Largest size in all parts; 0 where there is none."""
+    return max((float(np.nanmax(np.abs(part), initial=0.0)) for part in parts), default=0.0)
 
 
 def _usual(name: str, rate_hz: float) -> ChannelLimits:
     table = CHANNELS[name]
+    size, _, noise = REACHED.get(table.unit, (max(abs(table.low), abs(table.high)), 0.0, 0.0))
     if name.startswith(FREE):
-        return ChannelLimits(table.low, table.high, table.high - table.low)
-    size = REACHED.get(table.unit, max(abs(table.low), abs(table.high)))
-    return ChannelLimits(max(table.low, -size), min(table.high, size), _fastest(name, rate_hz) + NOISE.get(table.unit, 0.0))
+        size, noise = math.inf, 0.0
+    return ChannelLimits(max(table.low, -size), min(table.high, size), _fastest(name, rate_hz) + noise)
 
 
 def _fastest(name: str, rate_hz: float) -> float:
     """Change from one sample to the next that a car reaches."""
     table = CHANNELS[name]
     span = table.high - table.low
-    return span if name.startswith(FREE) else FASTEST.get(table.unit, span) / rate_hz
+    return span if name.startswith(FREE) else REACHED.get(table.unit, (0.0, span, 0.0))[1] / rate_hz
 
 
-def _tan_sideslip(recording: Recording) -> float:
+def _tan_sideslip(recording: Recording) -> FloatArray:
     name = "vx_ref" if "vx_ref" in recording else "vx"
     if not ("vy_ref" in recording and name in recording):
-        return 0.0
-    return float(np.nanmax(np.abs(recording["vy_ref"]) / np.maximum(np.abs(recording[name]), 1.0), initial=0.0))
+        return np.zeros(0)
+    return np.abs(recording["vy_ref"]) / np.maximum(np.abs(recording[name]), 1.0)
 
 
 def _run_limit(recordings: Sequence[Recording], name: str, stops: tuple[float, float]) -> float:
@@ -196,12 +191,12 @@ class Guard:
     def __init__(
         self, channels: Sequence[str], skippable: Sequence[str], limits: GuardLimits, rate_hz: float, *, remembers: bool = False
     ) -> None:
-        self.channels, self.rate_hz = tuple(channels), rate_hz
+        self.rate_hz = rate_hz
         rows = [limits.channels.get(name) or _usual(name, rate_hz) for name in channels]
         runs = [row.run * rate_hz if row.run > 0 else math.inf for row in rows]
         self._limits = np.array([(row.low, row.high, row.jump, run, *row.stops) for row, run in zip(rows, runs, strict=True)])
         self._skippable = np.array([name in skippable for name in channels])
-        places = [self.channels.index(name) if name in self.channels else -1 for name in ("vx", "yaw_rate")]
+        places = [channels.index(name) if name in channels else -1 for name in ("vx", "yaw_rate")]
         persists = max(round(PERSISTS_SECONDS * rate_hz), 2)
         self._settings = np.array([*places, max(round(BRIDGED_SECONDS * rate_hz), 1), persists, int(remembers)], np.int64)
         self.state = np.zeros((len(channels) + 1, 6))

@@ -68,8 +68,11 @@ NUMBERS = {name: number for number, name in enumerate(CHANNELS, start=1)}
 """Number of a channel in a reason's code."""
 _NAMES = {number: name for name, number in NUMBERS.items()}
 
-_REASONS: dict[int, tuple[str, float]] = {
-    kernel.FREE: ("nothing found", 0.0),
+NO_ESTIMATE, BEYOND_SPEED = 30, 31
+"""Kinds of reasons that follow from an estimate and not from its channels (`vehest.trust.verdict`)."""
+
+REASONS: dict[int, tuple[str, float]] = {
+    kernel.FREE: ("", 0.0),
     kernel.MISSING: ("{channel} is not measured", 0.0),
     kernel.FROZEN: ("{channel} is frozen", 8.0),
     kernel.HELD: ("{channel} repeats its samples", 7.0),
@@ -86,19 +89,20 @@ _REASONS: dict[int, tuple[str, float]] = {
     kernel.LOCKED: ("locked wheel: {channel}", 9.0),
     kernel.DROPOUT: ("lost wheel: {channel}", 9.0),
     kernel.LATE: ("{channel} comes late", 4.0),
+    NO_ESTIMATE: ("there is no estimate", 0.0),
+    BEYOND_SPEED: ("the estimate exceeds what the speed allows", 0.0),
 }
 """Kind of a reason -> text, and priority over others: the most specific is given.
 
 A code is 10000 times the kind, 100 times the channel's number, and the partner's.
 """
-WORDS = {kind: text for kind, (text, _) in _REASONS.items()}
 
 
 def reason_in_words(code: float) -> str:
-    """Text of a reason's code."""
+    """Text of a reason's code; empty for 0."""
     kind, rest = divmod(round(code), 10_000)
     channel, partner = divmod(rest, 100)
-    return WORDS[kind].format(channel=_NAMES.get(channel, "?"), partner=_NAMES.get(partner, "the other channels"))
+    return REASONS[kind][0].format(channel=_NAMES.get(channel, "?"), partner=_NAMES.get(partner, "the other channels"))
 
 
 class Health(NamedTuple):
@@ -228,7 +232,7 @@ class HealthModel:
         for name in ("constant", "precision", "deviation", "usual", "speeds", "levels"):
             getattr(model, name)[:] = getattr(self, name)
         for k, statistic in enumerate(statistics):
-            model.kind[k], model.priority[k] = statistic.kind, _REASONS[statistic.kind][1]
+            model.kind[k], model.priority[k] = statistic.kind, REASONS[statistic.kind][1]
             model.accused[k] = names.index(statistic.channel)
             model.partner[k] = names.index(statistic.partner) if statistic.partner else -1
         return tables
@@ -277,15 +281,13 @@ def learn_health(train: Sequence[Recording], validation: Sequence[Recording], ch
     pieces = [residuals_of({name: recording[name] for name in usable}, usable, relations, least_speed) for recording in train]
     model = fit_autoregression(pieces, order)
     innovations = np.concatenate([model.innovations(piece) for piece in pieces])
-    noise = learn_noise_levels(innovations, model.covariance, joined[speed] if speed else np.zeros(len(innovations)), N_LEVELS)
+    driven = joined[speed] if speed else np.zeros(len(innovations))
+    speeds, factors = learn_noise_levels(innovations, model.covariance, driven, N_LEVELS)
     levels = np.ones((N_LEVELS, len(names)))
-    levels[:, [names.index(name) for name in usable]] = noise.factors
+    levels[:, [names.index(name) for name in usable]] = factors
     largest = {name: float(np.nanmax(np.abs(values), initial=0.0)) for name, values in joined.items()}
     turning = joined[speed] * joined["yaw_rate"] if speed and "yaw_rate" in names else np.full(1, np.inf)
-
-    def still_at(name: str) -> float:
-        return min(STILL[name], 0.1 * largest.get(name, np.inf))
-
+    still = [min(size, 0.1 * largest.get(name, np.inf)) for name, size in STILL.items()]
     found = HealthModel(
         channels=names,
         rate_hz=float(rate_hz),
@@ -294,23 +296,21 @@ def learn_health(train: Sequence[Recording], validation: Sequence[Recording], ch
         usual=tuple(float(np.nanmedian(joined[name])) if np.isfinite(joined[name]).any() else 0.0 for name in names),
         largest=tuple(largest.values()),
         longest_gap=tuple(max((longest_run(np.isnan(part[name])) for part in received), default=0) / rate_hz for name in names),
-        standstill=(least_speed, still_at("yaw_rate"), still_at("ay")),
+        standstill=(least_speed, still[0], still[1]),
         spin=(SPIN_MARGIN * largest.get("yaw_rate", 1e9), min(SPIN_MARGIN * float(np.nanmax(np.abs(turning))), 1e9)),
-        speeds=tuple(noise.speeds.tolist()),
+        speeds=tuple(speeds.tolist()),
         levels=_plain(levels),
         stops=tuple(stops_of([recording[name] for recording in train], name) for name in names),
     )
     found = _with_healthy(_with_healthy(found, train), train)
-    plain, statistics = block_maxima(found, [*train, *validation]), found.statistics
-    filtered = np.maximum(plain, block_maxima(found, [_filtered(recording, names) for recording in (*train, *validation)]))
-    limits, behind = (limits_from(maxima, statistics, 1.0 / rate_hz) for maxima in (plain, filtered))
-    return replace(found, limits=limits, limits_behind_front_end=behind)
-
-
-def _filtered(recording: Recording, names: Sequence[str]) -> Recording:
-    """A drive as it comes through the filter from a faster bus."""
-    rows = behind_front_end(recording.stack(names), recording.rate_hz)
-    return replace(recording.select(names), channels=dict(zip(names, rows.T, strict=True)))
+    filtered = [
+        replace(recording, channels=dict(zip(names, behind_front_end(recording.stack(names), recording.rate_hz).T, strict=True)))
+        for recording in (*train, *validation)
+    ]
+    plain, behind = (block_maxima(found, drives) for drives in ([*train, *validation], filtered))
+    statistics, step = found.statistics, 1.0 / rate_hz
+    limits, limits_behind = limits_from(plain, statistics, step), limits_from(np.maximum(plain, behind), statistics, step)
+    return replace(found, limits=limits, limits_behind_front_end=limits_behind)
 
 
 def _embedded(model: Autoregression, names: Sequence[str], usable: Sequence[str]) -> dict[str, Any]:

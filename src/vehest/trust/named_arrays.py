@@ -53,15 +53,6 @@ def views(kind: Any, flat: FloatArray, sizes: Any, begin: int = 0) -> tuple[Any,
     return kind(**found), begin
 
 
-def _plain_views(kind: Any, flat: FloatArray, sizes: Any) -> Any:
-    """`open_views` without compilation, scalars as numbers."""
-
-    def opened(own: Any) -> Any:
-        return type(own)(*(opened(of) if hasattr(of, "_fields") else of if of.ndim else of.item() for of in own))
-
-    return opened(views(kind, flat, sizes)[0])
-
-
 def allocated(kind: Any, sizes: Any) -> FloatArray:
     """A flat array of zeros for a named tuple."""
     return np.zeros(views(kind, np.broadcast_to(0.0, 1 << 40), sizes)[1])
@@ -116,4 +107,7 @@ def _compiled_type(kind: Any) -> Any:
 
 
 if config.DISABLE_JIT:
-    open_views = _plain_views
+
+    def open_views(kind: Any, flat: FloatArray, sizes: Any) -> Any:
+        """`views` from the first number on, in plain Python."""
+        return views(kind, flat, sizes)[0]

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
 
 import yaml
 
@@ -39,11 +39,6 @@ class Trust:
     health: HealthModel | None = None  # residuals and thresholds of the health flag
 
 
-@dataclass(frozen=True)
-class _File(Trust):
-    format: int = 0
-
-
 def is_other_vehicle(trust: Trust | None, recording: Recording) -> bool:
     """Whether a recording is of another vehicle than those that bands were calibrated on."""
     return trust is not None and trust.bands is not None and recording.vehicle not in trust.bands.vehicles
@@ -55,7 +50,7 @@ def write_trust(trust: Trust, folder: Path) -> None:
     Raises:
         OSError: it cannot be written.
     """
-    content = _plain({"format": FORMAT, **asdict(trust)})
+    content = json.loads(json.dumps({"format": FORMAT, **asdict(trust)}))  # tuples as lists
     (folder / TRUST).write_text(yaml.safe_dump(content, sort_keys=False, allow_unicode=True), encoding="utf-8")
 
 
@@ -70,13 +65,5 @@ def read_trust(folder: Path) -> Trust:
     content = read_yaml(path)
     if not isinstance(content, dict) or "format" not in content:
         raise DataError(f"'{path}' does not say how far a model can be trusted; calibrate it again")
-    check_format(content["format"], FORMAT, f"'{path}'")
-    found = validated(_File, content, f"'{path}'")
-    return Trust(found.about, found.bands, found.guard, found.health)
-
-
-def _plain(value: Any) -> Any:
-    """The same value with lists for tuples, as YAML has them."""
-    if isinstance(value, dict):
-        return {key: _plain(inner) for key, inner in value.items()}
-    return [_plain(inner) for inner in value] if isinstance(value, tuple | list) else value
+    check_format(content.pop("format"), FORMAT, f"'{path}'")
+    return validated(Trust, content, f"'{path}'")

@@ -13,18 +13,16 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
+from vehest.constants import FloatArray
 from vehest.estimators.base import Estimator
 from vehest.estimators.kernels.compiling import entry
 from vehest.trust import health_kernel as kernel
-from vehest.trust.guard import RESTART, USE, WAIT
-from vehest.trust.health import DEGRADED, INVALID, NUMBERS, VALID
-from vehest.trust.health import reason_in_words as health_in_words
-from vehest.trust.watch import CLIPPED, EXTRAPOLATED, SPINNING
-
-NO_ESTIMATE, BEYOND_SPEED = 30, 31
-"""Further kinds of reasons: there is no estimate; it was beyond what the speed allows."""
+from vehest.trust.bands import band_rows
+from vehest.trust.guard import RESTART, USE, WAIT, Cleaned
+from vehest.trust.health import BEYOND_SPEED, DEGRADED, INVALID, NO_ESTIMATE, NUMBERS, VALID, Health, health_rows
+from vehest.trust.record import Trust
+from vehest.trust.watch import CLIPPED, EXTRAPOLATED, SPINNING, Watched
 
 BAND_FACTORS = (1.0, 2.0, 4.0)
 """Factor of the band of a valid, a degraded, an invalid estimate."""
@@ -34,28 +32,55 @@ ROLLED_BACK_SECONDS = 1.0
 NO_FAULTS = np.array([kernel.FREE, kernel.MISSING, kernel.OUTSIDE, kernel.SPIN])
 """Kinds of reasons that accuse no sensor."""
 
-OWN_WORDS = {NO_ESTIMATE: "there is no estimate", BEYOND_SPEED: "the estimate exceeds what the speed allows"}
-
-
-def reason_in_words(code: float) -> str:
-    """Text of a reason's code; empty for 0."""
-    kind = round(code) // 10000
-    return OWN_WORDS[kind] if kind in OWN_WORDS else health_in_words(code) if code else ""
-
-
-def adapts(estimator: Estimator) -> bool:
-    """Whether an estimator has adapting states, such as tyres, friction or offsets, by its property ``adapts``."""
-    return bool(getattr(estimator, "adapts", False))
-
 
 def starts_anew(estimator: Estimator) -> bool:
     """Whether an estimator is better off without its memory after a fault: it has more than a window, and nothing in it adapts."""
-    return estimator.warm_up_steps == 0 and not adapts(estimator)
+    return estimator.warm_up_steps == 0 and not getattr(estimator, "adapts", False)
 
 
-def numbers_of(channels: tuple[str, ...]) -> NDArray[np.int64]:
-    """Numbers of channels in codes of reasons, (C,)."""
-    return np.array([NUMBERS[name] for name in channels], np.int64)
+class Monitor:
+    """Judges samples before and after they are estimated; keeps the state between calls. Parts of ``trust`` that are None are not judged.
+
+    ``elsewhere``: the car or its tyres are others than those that were calibrated on; ``behind_front_end``: rows come through the filter
+    from a faster bus.
+    """
+
+    def __init__(self, estimator: Estimator, trust: Trust | None, *, elsewhere: bool = False, behind_front_end: bool = False) -> None:
+        bands, health = (trust.bands, trust.health) if trust is not None else (None, None)
+        self._health = health.packed(behind_front_end=behind_front_end) if health is not None else None
+        self._state = health.start() if health is not None else np.empty(0)
+        self._bands = bands.packed(elsewhere=elsewhere) if bands is not None else None
+        self.has_bands = bands is not None
+        self._farthest = bands.largest.get("vy", 0.0) if bands is not None else 0.0
+        self._numbers = np.array([NUMBERS[name] for name in estimator.channels], np.int64)
+        self._skippable = np.array([name in estimator.skippable for name in estimator.channels])
+        self._needed = ~self._skippable
+        self._starts_anew = starts_anew(estimator)
+        self._rollback = max(round(ROLLED_BACK_SECONDS * estimator.settings.rate_hz), 1) if getattr(estimator, "adapts", False) else 0
+        self._fault = np.zeros(2)
+
+    def before(self, received: FloatArray, cleaned: Cleaned) -> Health:
+        """Health of rows (T, C) as received; in ``cleaned``, accused channels are taken out and restarts added, in place."""
+        if self._health is None:
+            return Health(*np.zeros((3, len(received))))
+        found = health_rows(self._health, received, cleaned.measured, self._state)
+        isolate_rows(found.status, found.reason, self._numbers, self._skippable, self._starts_anew, self._rollback, *cleaned, self._fault)
+        return found
+
+    def after(self, verdict: Health, watched: Watched, cleaned: Cleaned, vx: FloatArray, variance: FloatArray) -> FloatArray:
+        """Complete the verdict of `before`, in place, and give half widths of v [m/s] and β [rad], (T, 2); NaN where none are known.
+
+        Args:
+            verdict, watched, cleaned: of the same T rows.
+            vx: speed of the estimate, (T,) [m/s].
+            variance: of the error of v by the method, (T,) [m²/s²]; NaN where it gives none.
+        """
+        verdict_rows(watched.vy, watched.marks, cleaned.flow, cleaned.measured, self._needed, self._numbers, verdict.status, verdict.reason)
+        bands = np.full((len(watched.vy), 2), np.nan)
+        if self._bands is not None:
+            band_rows(cleaned.rows, watched.vy, variance, *self._bands, bands)
+            widen_rows(verdict.status, watched.marks, watched.vy, vx, self._farthest, bands)
+        return bands
 
 
 @entry(nogil=True)

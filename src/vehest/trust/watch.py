@@ -28,8 +28,7 @@ class Watched(NamedTuple):
 
     vy: FloatArray  # (T,) [m/s]; NaN before the first estimate only
     marks: NDArray[np.int8]  # sum of marks at each row, (T,)
-    done: int  # how many rows count; fewer than there are where the estimator was lost at the last of them
-    lost: bool  # whether it has to start anew with the next row
+    lost: bool  # whether the estimator diverged at the last row, behind which the others are left out
 
 
 class Watch:
@@ -50,7 +49,7 @@ class Watch:
         """
         out, marks = np.empty(len(vy)), np.zeros(len(vy), np.int8)
         done, lost = watch_rows(vy, motion, flow, self.state, self._settings, out, marks)
-        return Watched(out[:done], marks[:done], int(done), bool(lost))
+        return Watched(out[:done], marks[:done], bool(lost))
 
 
 @entry(nogil=True)

@@ -24,7 +24,7 @@ from scipy import signal
 
 from vehest.constants import FloatArray
 from vehest.data.recording import Recording
-from vehest.trust.autoregression import Autoregression, NoiseLevels, fit_autoregression, learn_noise_levels
+from vehest.trust.autoregression import Autoregression, fit_autoregression, learn_noise_levels
 from vehest.trust.health import margin
 from vehest.trust.relations import Relation, learn_relations, least_speed_of, residuals_of, speed_channel, without_glitches
 
@@ -61,7 +61,7 @@ class Oracle:
         least_speed: that goes with them.
         model: of what they leave.
         speed: channel that the noise goes by.
-        levels: of the noise at each speed.
+        levels: speeds, and the noise at each.
         healthy: innovations over their levels, of healthy drives on which the threshold is tried, (T, C) each.
         false_alarms_per_hour: that the test may have.
         reserve: how many times as large the innovations of healthy drives may be without an alarm, as with limits of the detector.
@@ -73,7 +73,7 @@ class Oracle:
     least_speed: float
     model: Autoregression
     speed: str | None
-    levels: NoiseLevels
+    levels: tuple[FloatArray, FloatArray]
     healthy: tuple[FloatArray, ...]
     false_alarms_per_hour: float
     reserve: float
@@ -217,6 +217,7 @@ def filtered(model: Autoregression, signature: FloatArray) -> FloatArray:
     return found
 
 
-def levels_at(levels: NoiseLevels, speed: FloatArray) -> FloatArray:
+def levels_at(levels: tuple[FloatArray, FloatArray], speed: FloatArray) -> FloatArray:
     """Factors at |speed|, (T, C)."""
-    return np.stack([np.interp(np.abs(speed), levels.speeds, column) for column in levels.factors.T], axis=1)
+    speeds, factors = levels
+    return np.stack([np.interp(np.abs(speed), speeds, column) for column in factors.T], axis=1)

@@ -26,7 +26,6 @@ from vehest.studies.artefacts import PartArtefacts, StudyArtefacts
 from vehest.studies.drive import appendix_of
 from vehest.studies.kit.runs import by_name
 from vehest.trust.bands import LEVELS, OTHER_VEHICLE
-from vehest.trust.faults import parse_condition
 from vehest_papers.trust.faults import FaultTrials, elsewhere, health_of, trials_of
 from vehest_papers.trust.shuffled import LEARNT, if_shuffled, in_words, over_parts, scores_learnt, shuffled_in_words
 
@@ -293,15 +292,15 @@ def bands_under_faults(parts: Mapping[str, PartArtefacts], trials: Sequence[Faul
         wide = wide[wide["rmse_sideslip"] != wide["rmse_sideslip_nominal"]]
         table = pd.concat([other.table for other in trials if other.part == key])
         for condition, found in wide.groupby("condition", sort=False):
-            fault = parse_condition(str(condition))
-            tried = table[(table["fault"] == fault.kind) & (table["channel"] == fault.channel) & (table["severity"] == fault.severity)]
+            kind, channel, severity = str(condition).split(":")[:3]
+            tried = table[(table["fault"] == kind) & (table["channel"] == channel) & (table["severity"] == severity)]
             unflagged = found["coverage_90_unflagged"].dropna() if "coverage_90_unflagged" in found else pd.Series(dtype=float)
             rows.append(
                 {
                     "part": as_text(part.title),
-                    "fault": fault.kind,
-                    "channel": fault.channel,
-                    "severity": fault.severity,
+                    "fault": kind,
+                    "channel": channel,
+                    "severity": severity,
                     "visible": "yes" if tried["visible"].any() else "no",
                     "estimators": len(found),
                     "nominal": float(found["rmse_sideslip_nominal"].median()),

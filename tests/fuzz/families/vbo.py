@@ -1,4 +1,4 @@
-"""Logs of a VBOX: bytes, sections, columns, units, clocks, cells, and comments with offsets."""
+"""Logs of a VBOX: bytes, sections, columns, units, clocks, and comments with offsets."""
 
 from __future__ import annotations
 
@@ -6,7 +6,6 @@ import yaml
 from vbo_log import UNITS, dataset, write_log
 
 from fuzz.case import Case, Command, generator
-from fuzz.families.tables import CELLS
 from fuzz.mutations import NAMES, spoil_bytes
 
 SWAPS = (
@@ -31,42 +30,15 @@ def _read(case: Case, name: str = "lap.vbo") -> Command:
     return Command(("ingest", "logs")) if how == 2 else Command(("data", "show", f"raw/{name}", "dataset=logs", "--json"))
 
 
-def _log(case: Case, **how: object) -> bytes:
-    file = case.place / "raw" / "lap.vbo"
-    file.parent.mkdir(parents=True, exist_ok=True)
-    write_log(file, case.rng.choice(CLOCKS), **how)  # type: ignore[arg-type]
-    return file.read_bytes()
-
-
-@generator(weight=2)
+@generator(weight=4)
 def logs(case: Case) -> Command:
     """Bytes anywhere in a log, and lines of its head."""
-    content = _log(case)
+    units = UNITS if case.honest or case.rng.random() < 0.8 else tuple(" ".join(case.rng.choice(NAMES[:20]).split())[:200] for _ in UNITS)
+    file = case.place / "raw" / "lap.vbo"
+    file.parent.mkdir(parents=True, exist_ok=True)
+    write_log(file, case.rng.choice(CLOCKS), units=units)
     if not case.honest:
-        if case.rng.random() < 0.5:
-            content = spoil_bytes(content, case.rng)
-        else:
-            old, new = case.rng.choice(SWAPS)
-            content = content.replace(old, new, case.rng.choice([1, 1, -1]))
-        case.write("raw/lap.vbo", content)
-    return _read(case)
-
-
-@generator(weight=2)
-def cells_of_a_log(case: Case) -> Command:
-    """Values of the rows, clock times among them, and units."""
-    units = UNITS if case.honest or case.rng.random() < 0.7 else tuple(case.rng.choice([*UNITS, *NAMES[:20]]) for _ in UNITS)
-    lines = _log(case, units=tuple(" ".join(unit.split())[:200] for unit in units)).split(b"\r\n") if not case.honest else []
-    if case.honest:
-        _log(case)
-        return _read(case)
-    first = lines.index(b"[data]") + 1
-    for _ in range(case.rng.choice([1, 1, 5, 200])):
-        row = case.rng.randrange(first, len(lines))
-        cells = lines[row].split(b" ")
-        cells[case.rng.randrange(len(cells))] = case.rng.choice(CELLS).encode("latin-1", "replace")
-        lines[row] = b" ".join(cells)
-    if case.rng.random() < 0.2:
-        case.rng.shuffle(lines)
-    case.write("raw/lap.vbo", b"\r\n".join(lines))
+        content, (old, new) = file.read_bytes(), case.rng.choice(SWAPS)
+        swapped = content.replace(old, new, case.rng.choice([1, 1, -1]))
+        file.write_bytes(case.rng.choice([spoil_bytes(content, case.rng), swapped]))
     return _read(case)

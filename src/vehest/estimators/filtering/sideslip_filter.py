@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vehest.constants import FloatArray
-from vehest.data.declared import setting
+from vehest.declared import setting
 from vehest.estimators.recursive import Recursive
 from vehest.filters.gating import Gate
 from vehest.filters.gaussian import Gaussian

@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from vehest.data.declared import setting
+from vehest.declared import setting
 from vehest.estimators.base import Trial
 from vehest.estimators.networks.windowed import StandardisedNetwork, WindowedEstimator
 

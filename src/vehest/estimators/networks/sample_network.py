@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from vehest.constants import FloatArray
-from vehest.data.declared import setting
 from vehest.data.errors import ConfigurationError, DataError
 from vehest.data.recording import Recording
+from vehest.declared import setting
 from vehest.estimators.kernels.sample_network import Criterion, losses_of, outputs_of
 from vehest.estimators.network import Network
 from vehest.estimators.references import reference_sideslip

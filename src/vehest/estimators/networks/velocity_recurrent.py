@@ -15,9 +15,9 @@ from torch import Tensor, nn
 
 from vehest.constants import FloatArray
 from vehest.data.channels import channel
-from vehest.data.declared import Group, setting
 from vehest.data.errors import ConfigurationError, DataError
 from vehest.data.recording import Recording
+from vehest.declared import Group, setting
 from vehest.estimators.base import FitData, FitRecord, Trial
 from vehest.estimators.network import Network
 from vehest.estimators.networks.windowed import StandardisedNetwork

@@ -13,11 +13,11 @@ import torch
 from torch import Tensor, nn
 
 from vehest.constants import FloatArray
-from vehest.data.declared import setting
 from vehest.data.errors import ConfigurationError
 from vehest.data.estimate import Estimate
 from vehest.data.recording import Recording
 from vehest.data.windows import window_starts, windows_of
+from vehest.declared import setting
 from vehest.estimators.base import Estimator, FitData, FitRecord, Stepper, rate
 from vehest.estimators.model_files import load_model
 from vehest.estimators.network import Network

@@ -5,6 +5,7 @@ Which signal is which channel, and in which unit and sign, is declared in conf/d
 
 from __future__ import annotations
 
+import math
 from array import array
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
@@ -13,15 +14,12 @@ from typing import Annotated, Any
 
 import numpy as np
 
-from vehest.constants import FloatArray
 from vehest.data.errors import ConfigurationError, DataError
 from vehest.sources.base import require_files
 from vehest.sources.can.database import Database, Message, read_database
 from vehest.sources.can.logs import Frames, read_frames
 from vehest.sources.clocks import require_clock
-from vehest.sources.signals import Signal, SignalOptions, SignalSource
-
-FEWEST = 2
+from vehest.sources.signals import Signal, SignalChannel, SignalOptions, SignalSource
 
 
 @dataclass(frozen=True)
@@ -34,32 +32,33 @@ class CanOptions(SignalOptions):
 
 
 @dataclass(frozen=True)
+class CanChannel(SignalChannel):
+    """A channel's signal, with raw values that mean that nothing was measured."""
+
+    invalid: Annotated[int | tuple[int, ...], "raw values that mean 'not measured'"] = ()
+
+
+@dataclass(frozen=True)
 class Wanted:
-    """The signal that becomes a channel.
+    """The signal that becomes a channel."""
 
-    Args:
-        message: that carries it.
-        signal: its name.
-        invalid: values that mean that nothing was measured, in the unit of the DBC.
-    """
-
-    message: Message
+    message: Message  # that carries it
     signal: str
-    invalid: frozenset[float] = frozenset()
+    invalid: frozenset[float] = frozenset()  # values that mean that nothing was measured, in the unit of the DBC
 
 
 class CanSource(SignalSource):
     """Logs, a recording each; their frames are decoded by the data set's ``dbc``, those of one ``bus`` where a log holds several."""
 
     options_type = CanOptions
-    own_keys = frozenset({"invalid"})
+    options: CanOptions
+    channel_type = CanChannel
 
     def __init__(self, dataset: Mapping[str, Any]) -> None:
         super().__init__(dataset)
-        if not dataset.get("dbc"):
+        if not self.options.dbc:
             raise ConfigurationError(f"{self.where}: dbc must name the DBC file that describes the bus, for example dbc: ${{root}}/car.dbc")
-        self.dbc = Path(str(dataset["dbc"])).expanduser()
-        self.invalid = {name: self._invalid(name, dataset["channels"][name].get("invalid")) for name in self.channels}
+        self.dbc = Path(self.options.dbc).expanduser()
 
     def inputs(self) -> dict[str, str | Path]:
         """The logs and the DBC.
@@ -68,7 +67,7 @@ class CanSource(SignalSource):
             MissingError: one of them is not there.
         """
         require_files([self.dbc], self.name)
-        return {**{file.name: file for file in self.files()}, self.dbc.name: self.dbc}
+        return {**super().inputs(), self.dbc.name: self.dbc}
 
     def wanted(self) -> tuple[Database, dict[str, Wanted]]:
         """The DBC, and the signal of each channel.
@@ -82,34 +81,35 @@ class CanSource(SignalSource):
         found = {}
         for name, declared in self.channels.items():
             message, signal = database.places[declared.column]
-            found[name] = Wanted(message, signal, frozenset(message.physical(signal, raw) for raw in self.invalid[name]))
+            invalid = (declared.invalid,) if isinstance(declared.invalid, int) else declared.invalid
+            found[name] = Wanted(message, signal, frozenset(message.physical(signal, raw) for raw in invalid))
         return database, found
 
     def _read_signals(self, file: Path) -> tuple[dict[str, Signal], dict[str, Any]]:
         database, wanted = self.wanted()
-        series = read_series(file, database, wanted, self.dataset.get("bus"))
-        signals = {}
-        for name, (stamps, values) in series.items():
-            message = wanted[name].message
-            where = f"'{file}': message '{message.name}', which carries '{wanted[name].signal}',"
-            require_clock(stamps, where, "where two buses carry it, say which by bus: …")
-            signals[name] = Signal(f"message '{message.name}'", stamps, values, message.units[wanted[name].signal])
-        rates = {signal.origin.removeprefix("message ").strip("'"): round(signal.rate_hz, 3) for signal in signals.values()}
+        bus = self.options.bus
+        stamps, values = ({name: array("d") for name in wanted} for _ in range(2))
+        for frame, found in decoded(read_frames(file, database.messages), database, wanted, bus):
+            for name, value in found.items():
+                stamps[name].append(frame.timestamp)
+                values[name].append(value)
+        signals, rates = {}, {}
+        for name, one in wanted.items():
+            if len(stamps[name]) < 2:
+                raise DataError(never_occurs(file, name, one, len(stamps[name]), bus))
+            times = np.array(stamps[name])
+            where = f"'{file}': message '{one.message.name}', which carries '{one.signal}',"
+            require_clock(times, where, "where two buses carry it, say which by bus: …")
+            origin = f"message '{one.message.name}'"
+            signals[name] = Signal(origin, times, np.array(values[name]), one.message.units[one.signal])
+            rates[one.message.name] = round(signals[name].rate_hz, 3)
         return signals, {"dbc": self.dbc.name, "messages": rates}
-
-    def _invalid(self, channel: str, entry: Any) -> tuple[int, ...]:
-        values = entry if isinstance(entry, list | tuple) else [] if entry is None else [entry]
-        if any(isinstance(value, bool) or not isinstance(value, int) for value in values) or len(values) > 100:
-            raise ConfigurationError(
-                f"{self.where}: channel '{channel}': invalid must list raw values that mean 'not measured', not {entry}"
-            )
-        return tuple(values)
 
 
 def decoded(
     frames: Frames, database: Database, wanted: Mapping[str, Wanted], bus: int | str | None = None
 ) -> Iterator[tuple[Any, dict[str, float]]]:
-    """Frames of a log that carry anything that is wanted, each with its values, channel -> value in the unit of the DBC; NaN: invalid.
+    """Frames of a log that carry a wanted message, each with its values, channel -> value in the unit of the DBC; NaN: invalid.
 
     Raises:
         DataError: a frame is shorter than the DBC says.
@@ -138,13 +138,8 @@ def channels_by_message(wanted: Mapping[str, Wanted]) -> dict[str, list[str]]:
 
 def channel_values(values: Mapping[str, float], channels: list[str], wanted: Mapping[str, Wanted]) -> dict[str, float]:
     """Values of the channels that a frame carries; NaN where it says that nothing was measured."""
-    found = {}
-    for name in channels:
-        one = wanted[name]
-        if one.signal in values:
-            value = values[one.signal]
-            found[name] = float("nan") if value in one.invalid else value
-    return found
+    found = {name: values[wanted[name].signal] for name in channels if wanted[name].signal in values}
+    return {name: math.nan if value in wanted[name].invalid else value for name, value in found.items()}
 
 
 def is_on(frame: Any, bus: int | str | None) -> bool:
@@ -152,36 +147,15 @@ def is_on(frame: Any, bus: int | str | None) -> bool:
     return bus is None or frame.channel == (bus - 1 if isinstance(bus, int) and not isinstance(bus, bool) else bus)
 
 
-def read_series(
-    file: Path, database: Database, wanted: Mapping[str, Wanted], bus: int | str | None = None
-) -> dict[str, tuple[FloatArray, FloatArray]]:
-    """Stamps [s] and values of each channel, in the unit of the DBC.
-
-    Raises:
-        MissingError: there is no such file, or a package is not installed.
-        DataError: the log cannot be used, or a signal never occurs.
-    """
-    stamps = {name: array("d") for name in wanted}
-    values = {name: array("d") for name in wanted}
-    for frame, found in decoded(read_frames(file, database.messages), database, wanted, bus):
-        for name, value in found.items():
-            stamps[name].append(frame.timestamp)
-            values[name].append(value)
-    for name, one in wanted.items():
-        if len(stamps[name]) < FEWEST:
-            raise DataError(never_occurs(file, name, one, len(stamps[name]), bus))
-    return {name: (np.array(stamps[name]), np.array(values[name])) for name in wanted}
-
-
 def never_occurs(file: Path, channel: str, wanted: Wanted, count: int, bus: int | str | None) -> str:
     """What is said of a signal that a log does not hold."""
     message = wanted.message
     often = "occurs once only" if count else "never occurs"
     on = "" if bus is None else f" on bus {bus}"
-    kind = "extended identifier" if message.extended else "identifier"
+    kind = "extended identifier" if message.described.is_extended_frame else "identifier"
     return (
         f"'{file}': signal '{wanted.signal}' for channel '{channel}' {often}{on}: message '{message.name}' carries it, with the {kind} "
-        f"{message.frame_id:#x}; leave the channel out, or correct dbc, bus or the map of channels"
+        f"{message.described.frame_id:#x}; leave the channel out, or correct dbc, bus or the map of channels"
     )
 
 

@@ -18,33 +18,23 @@ from vehest.data.limits import check_limit
 from vehest.data.text_files import first_line
 from vehest.sources.limited import require_package
 
-MOST_BYTES = 64  # of a frame of CAN FD
-MOST_BITS = 64  # of a number
-LONGEST = 1785  # bytes of a message that J1939 sends in several frames
 COMPARED = 10_000  # names that a misspelt one is compared with
 UNASSIGNED = "VECTOR__INDEPENDENT_SIG_MSG"
-_LENGTHS = re.compile(r"\b(?:BO_\s+\d+\s+\w+|SG_\s+\w+(?:\s+[mM]\w*)?)\s*:\s*(\d+)(?:\s*\|\s*(\d+))?")
+_TOO_LONG = re.compile(r"\b(?:BO_\s+\d+\s+\w+\s*:\s*\d{5,}|SG_\s+\w+(?:\s+[mM]\w*)?\s*:\s*(?:\d+\s*\|\s*)?\d{6,})")
 
 
 @dataclass(frozen=True)
 class Message:
-    """A message of which signals are wanted.
+    """A message of which signals are wanted."""
 
-    Args:
-        frame_id: identifier of its frames.
-        extended: whether that has 29 bits.
-        name: as the DBC says.
-        length: of its frames [bytes].
-        units: wanted signal -> its unit as the DBC writes it.
-        coders: of cantools: one for all signals that every frame carries, one for each that is multiplexed.
-    """
+    described: Any  # by cantools
+    units: Mapping[str, str]  # wanted signal -> its unit as the DBC writes it
+    coders: Sequence[Any]  # of cantools: one for all signals that every frame carries, one for each that is multiplexed
 
-    frame_id: int
-    extended: bool
-    name: str
-    length: int
-    units: Mapping[str, str]
-    coders: Sequence[Any]
+    @property
+    def name(self) -> str:
+        """Its name in the DBC."""
+        return str(self.described.name)
 
     def decode(self, data: bytes | bytearray) -> dict[str, float]:
         """Wanted signals that a frame carries, in the unit of the DBC; those that its multiplexer leaves out are not among them.
@@ -52,10 +42,11 @@ class Message:
         Raises:
             DataError: it is shorter than the message.
         """
-        if len(data) < self.length:
-            raise DataError(f"a frame of message '{self.name}' holds {len(data)} of the {self.length} bytes that the DBC says")
+        length = self.described.length
+        if len(data) < length:
+            raise DataError(f"a frame of message '{self.name}' holds {len(data)} of the {length} bytes that the DBC says")
         found: dict[str, float] = {}
-        frame = bytes(data[: self.length])
+        frame = bytes(data[:length])
         for coder in self.coders:
             try:
                 values = coder.decode(frame, decode_choices=False)
@@ -66,25 +57,17 @@ class Message:
 
     def physical(self, signal: str, raw: int) -> float:
         """A raw value of a signal in the unit of the DBC."""
-        (found,) = [known for coder in self.coders for known in coder.signals if known.name == signal]
-        return float(found.raw_to_scaled(raw, decode_choices=False))
+        return float(self.described.get_signal_by_name(signal).raw_to_scaled(raw, decode_choices=False))
 
 
 @dataclass(frozen=True)
 class Database:
-    """Messages that hold wanted signals.
-
-    Args:
-        file: the DBC.
-        messages: (identifier, whether it is extended) -> message.
-        places: wanted name -> its message and signal.
-        taken: identifiers of all messages in the file.
-    """
+    """Messages of a DBC that hold wanted signals."""
 
     file: Path
-    messages: Mapping[tuple[int, bool], Message]
-    places: Mapping[str, tuple[Message, str]]
-    taken: frozenset[tuple[int, bool]]
+    messages: Mapping[tuple[int, bool], Message]  # by identifier and whether it is extended
+    places: Mapping[str, tuple[Message, str]]  # wanted name -> its message and signal
+    taken: frozenset[tuple[int, bool]]  # identifiers of all messages in the file
 
 
 def read_dbc(file: Path) -> list[Any]:
@@ -100,13 +83,12 @@ def read_dbc(file: Path) -> list[Any]:
     from cantools.database import load_string
 
     text = file.read_bytes().decode("cp1252", errors="replace")
-    for found in _LENGTHS.finditer(text):
-        if any(len(number or "") > 5 or int(number or 0) > 8 * LONGEST for number in found.groups()):
-            raise DataError(f"'{file}' declares a message or signal of impossible length: {printable(' '.join(found[0].split())[:80])}")
+    if found := _TOO_LONG.search(text):
+        raise DataError(f"'{file}' declares a message or signal of impossible length: {printable(' '.join(found[0].split())[:80])}")
     try:
         messages = [message for message in load_string(text, "dbc", strict=False).messages if message.name != UNASSIGNED]
     except Exception as error:  # of cantools and its parser, of any kind
-        raise DataError(f"'{file}' cannot be read as a DBC ({printable(first_line(error)[:160])})") from None
+        raise DataError(f"'{file}' cannot be read as a DBC ({printable(first_line(error))})") from None
     if not messages:
         raise DataError(f"'{file}' declares no message; is it a DBC file?")
     return messages
@@ -121,34 +103,42 @@ def read_database(file: Path, wanted: Sequence[str]) -> Database:
 
     Raises:
         MissingError: there is no such file, or cantools is not installed.
-        DataError: it is too long, damaged, or a signal is not there, ambiguous, or longer than a frame.
+        DataError: it is too long, damaged, or a signal is not there, ambiguous, or without a scale.
     """
     described = read_dbc(file)
-    found = {name: _locate(described, name, file) for name in wanted}
+    known: dict[str, list[tuple[Any, str]]] = {}
+    for message in described:
+        for signal in message.signals:
+            for name in (f"{message.name}.{signal.name}", signal.name):
+                known.setdefault(name, []).append((message, signal.name))
+    found = {name: _only_one(known, name, file) for name in wanted}
     messages: dict[tuple[int, bool], Message] = {}
-    for message in {id(message): message for message, _ in found.values()}.values():
-        names = list(dict.fromkeys(signal for other, signal in found.values() if other is message))
-        key = (message.frame_id, message.is_extended_frame)
-        if key in messages:
+    for message, _ in found.values():
+        key = _identifier(message)
+        if key not in messages:
+            names = list(dict.fromkeys(signal for other, signal in found.values() if other is message))
+            messages[key] = _message(message, names, file)
+        elif messages[key].described is not message:
             raise DataError(f"'{file}': two messages have the identifier {message.frame_id:#x}; remove one")
-        messages[key] = _message(message, names, file)
-    places = {name: (messages[message.frame_id, message.is_extended_frame], signal) for name, (message, signal) in found.items()}
-    return Database(file, messages, places, frozenset((message.frame_id, message.is_extended_frame) for message in described))
+    places = {name: (messages[_identifier(message)], signal) for name, (message, signal) in found.items()}
+    return Database(file, messages, places, frozenset(map(_identifier, described)))
 
 
-def _locate(messages: Sequence[Any], wanted: str, file: Path) -> tuple[Any, str]:
+def _identifier(message: Any) -> tuple[int, bool]:
+    return message.frame_id, message.is_extended_frame
+
+
+def _only_one(known: Mapping[str, Sequence[tuple[Any, str]]], wanted: str, file: Path) -> tuple[Any, str]:
     """The message and the signal that a name stands for."""
-    name, _, signal = wanted.rpartition(".")
-    found = [message for message in messages if name in ("", message.name) and any(known.name == signal for known in message.signals)]
+    found = known.get(wanted, ())
     if len(found) > 1:
-        names = ", ".join(f"{message.name}.{signal}" for message in found[:8])
+        names = ", ".join(f"{message.name}.{signal}" for message, signal in found[:8])
         raise DataError(f"'{file}': signal '{wanted}' stands in several messages; write one of {names}")
     if not found:
-        known = [f"{message.name}.{one.name}" for message in messages for one in message.signals][:COMPARED]
-        lower = {(full if name else full.rpartition(".")[2]).lower(): full for full in known}
+        lower = {name.lower(): name for name in list(known)[:COMPARED]}
         near = ", ".join(lower[close] for close in difflib.get_close_matches(wanted.lower(), lower, n=3))
-        raise DataError(f"'{file}' has no signal '{wanted}' ({'near it: ' + near if near else f'it has {len(known)} signals'})")
-    return found[0], signal
+        raise DataError(f"'{file}' has no signal '{wanted}'{f' (near it: {near})' if near else ''}")
+    return found[0]
 
 
 def _message(message: Any, wanted: Sequence[str], file: Path) -> Message:
@@ -156,27 +146,20 @@ def _message(message: Any, wanted: Sequence[str], file: Path) -> Message:
     from cantools.database.can import Message as Coder
 
     where = f"'{file}': message '{message.name}'"
-    if not 0 < message.length <= MOST_BYTES:
-        raise DataError(f"{where} is {message.length} bytes long; frames of CAN hold 1 to {MOST_BYTES}")
     signals = {signal.name: signal for signal in message.signals}
-    chains = {name: _chain(signals, name, where) for name in wanted}
-    plain = [name for name in wanted if len(chains[name]) == 1]
+    chains = [_chain(signals, name, where) for name in wanted]
+    plain = [chain[0] for chain in chains if len(chain) == 1]
     coders = []
-    for names in ([plain] if plain else []) + [chains[name] for name in wanted if name not in plain]:
-        for one in (signals[name] for name in names):
-            if one.length > MOST_BITS:
-                raise DataError(f"{where}: signal '{one.name}' of {one.length} bits is no number")
-            if not 0.0 < abs(one.scale) < 1e30 or not abs(one.offset) < 1e30:
-                raise DataError(
-                    f"{where}: signal '{one.name}' has the scale {one.scale} and offset {one.offset}; finite numbers are needed"
-                )
+    for names in filter(None, [plain, *(chain for chain in chains if len(chain) > 1)]):
         parts = [signals[name] for name in names]
+        for one in parts:
+            if not 0.0 < abs(one.scale) < 1e30 or not abs(one.offset) < 1e30:
+                raise DataError(f"{where}: signal '{one.name}' has the scale {one.scale} and offset {one.offset}; correct the DBC")
         try:
             coders.append(Coder(message.frame_id, message.name, message.length, parts, is_extended_frame=message.is_extended_frame))
         except Exception as error:  # of cantools
-            raise DataError(f"{where} cannot be decoded ({printable(first_line(error)[:160])})") from None
-    units = {name: signals[name].unit or "" for name in wanted}
-    return Message(message.frame_id, message.is_extended_frame, message.name, message.length, units, coders)
+            raise DataError(f"{where} cannot be decoded ({printable(first_line(error))})") from None
+    return Message(message, {name: signals[name].unit or "" for name in wanted}, coders)
 
 
 def _chain(signals: Mapping[str, Any], wanted: str, where: str) -> list[str]:

@@ -16,34 +16,20 @@ SUFFIXES = (".asc", ".blf", ".log")
 
 @dataclass(frozen=True)
 class Frames:
-    """Frames of a log in their order, without error frames and remote frames; iterated over as messages of python-can.
-
-    Args:
-        file: the log.
-        arrays: as `vehest.sources.readers.can_logs.read_frames` returns them.
-        buses: names or numbers of the buses.
-    """
+    """Frames of a log in their order, without error frames and remote frames; iterated over as messages of python-can."""
 
     file: Path
-    arrays: Arrays
-    buses: list[Any]
+    arrays: Arrays  # as `vehest.sources.readers.can_logs.read_frames` returns them
+    buses: list[Any]  # names or numbers
 
     def __iter__(self) -> Iterator[Any]:
         from can import Message
 
-        arrays, at = self.arrays, 0
-        data = arrays["data"].tobytes()
-        rows = zip(*(arrays[name].tolist() for name in ("time", "identifier", "extended", "fd", "fast", "length", "bus")), strict=True)
-        for time, identifier, extended, fd, fast, length, bus in rows:
-            yield Message(
-                time,
-                identifier,
-                bool(extended),
-                channel=self.buses[bus],
-                data=data[at : at + length],
-                is_fd=bool(fd),
-                bitrate_switch=bool(fast),
-            )
+        data, at = self.arrays["data"].tobytes(), 0
+        names = ("time", "identifier", "extended", "fd", "fast", "length", "bus")
+        for time, identifier, extended, fd, fast, length, bus in zip(*(self.arrays[name].tolist() for name in names), strict=True):
+            kinds = {"is_fd": bool(fd), "bitrate_switch": bool(fast)}
+            yield Message(time, identifier, bool(extended), channel=self.buses[bus], data=data[at : at + length], **kinds)
             at += length
 
 
@@ -60,8 +46,6 @@ def read_frames(file: Path, wanted: Collection[tuple[int, bool]] | None = None) 
     """
     if regular_file(file).suffix.lower() not in SUFFIXES:
         raise DataError(f"'{file}' is no log of a bus: its name ends in none of {', '.join(SUFFIXES)}")
-    if file.stat().st_size == 0:
-        raise DataError(f"'{file}' is empty")
     require_package("can", "bus", "reading CAN")
     request = None if wanted is None else [list(one) for one in wanted]
     reading = read_limited("vehest.sources.readers.can_logs:read_frames", file, wanted=request)

@@ -8,6 +8,7 @@ from __future__ import annotations
 import os
 from array import array
 from collections.abc import Callable, Mapping, Sequence
+from functools import partial, reduce
 from operator import attrgetter
 from pathlib import Path
 from typing import Any
@@ -49,7 +50,13 @@ def read_topics(bag: Path, topics: Sequence[Topic], layouts: Mapping[str, str]) 
     """
     types = _types(layouts)
     with _opened(bag) as reader:
-        return _read(bag, reader, types, topics), {"start": _start(bag, reader)}
+        try:
+            arrays = _read(bag, reader, types, topics)
+        except KeyError as error:  # of rosbags' types
+            raise ConfigurationError(f"message type {error} is neither a standard one nor declared; give its layout in messages") from None
+        if not 0 <= reader.start_time < LATEST:
+            raise DataError(f"'{bag}' starts at {reader.start_time} ns, which is no time; make it again")
+        return arrays, {"start": reader.start_time}
 
 
 def survey_topics(bag: Path, ignored: Sequence[str], most_fields: int) -> tuple[Arrays, dict[str, Any]]:
@@ -104,13 +111,6 @@ def _opened(bag: Path) -> Reader:
     return Reader(_UriPath(bag))
 
 
-def _start(bag: Path, reader: Reader) -> int:
-    """When the first message was received [ns of unix time]."""
-    if not 0 <= reader.start_time < LATEST:
-        raise DataError(f"'{bag}' starts at {reader.start_time} ns, which is no time; make it again")
-    return reader.start_time
-
-
 def _types(layouts: Mapping[str, str]) -> Any:
     """Standard message types and the declared ones: rosbags makes code of these, never of a bag's own definitions."""
     types, declared = get_typestore(Stores.ROS2_HUMBLE), {}
@@ -119,11 +119,6 @@ def _types(layouts: Mapping[str, str]) -> Any:
             declared.update(get_types_from_msg(text, name))
         except Exception as error:  # of rosbags' parser, of any kind
             raise ConfigurationError(f"the layout of message type '{name}' cannot be read: {' '.join(str(error).split())[:160]}") from None
-    for name, (_, fields) in declared.items():
-        for field, kind in fields:
-            inner = kind[1][0] if kind[0] in ARRAYS else kind
-            if inner[0] == Nodetype.NAME and inner[1] not in declared and inner[1] not in types.fielddefs:
-                raise ConfigurationError(f"the layout of message type '{name}': type '{inner[1]}' of field '{field}' is not declared")
     try:
         types.register(declared)
     except TypesysError as error:
@@ -142,86 +137,72 @@ def _numbers(types: Any, kind: str, prefix: str = "") -> list[str]:
     return paths
 
 
+def _part(message: Any, part: str) -> Any:
+    return message[int(part)] if part.isdigit() else getattr(message, part)
+
+
 def _getter(types: Any, topic: str, kind: str, path: str) -> Callable[[Any], Any]:
     """What takes a number out of a message."""
-    node: Nodetype = Nodetype.NAME
-    detail: Any = kind
-    for part in path.split("."):
-        if node in ARRAYS and part.isdigit():
-            node, detail = detail[0]
-            continue
-        if node != Nodetype.NAME:
-            node = Nodetype.ARRAY
-            break
-        if detail not in types.fielddefs:
-            raise ConfigurationError(f"message type '{detail}' is neither a standard one nor declared; give its layout in messages")
-        fields = dict(types.fielddefs[detail][1])
-        if part not in fields:
-            raise ConfigurationError(f"topic '{topic}': message type '{detail}' has no field '{part}' (it has {', '.join(fields)})")
-        node, detail = fields[part]
+    node, detail, parts = Nodetype.NAME, kind, path.split(".")
+    for part in parts:
+        inner: dict[str, Any] = {}
+        if node == Nodetype.NAME:
+            inner = dict(types.fielddefs[detail][1])
+        elif node in ARRAYS and part.isdigit():
+            inner = {part: detail[0]}
+        if part not in inner:
+            raise ConfigurationError(f"topic '{topic}': '{kind}' has no field '{path}': '{part}' is none of: {', '.join(inner)}")
+        node, detail = inner[part]
     if node != Nodetype.BASE or detail[0] in TEXTS:
         raise ConfigurationError(f"topic '{topic}': field '{path}' of '{kind}' is not a number; name one inside it")
-    return (lambda message: _item(message, path)) if any(map(str.isdigit, path.split("."))) else attrgetter(path)
-
-
-def _item(message: Any, path: str) -> Any:
-    for part in path.split("."):
-        message = message[int(part)] if part.isdigit() else getattr(message, part)
-    return message
+    return partial(reduce, _part, parts) if any(map(str.isdigit, parts)) else attrgetter(path)
 
 
 def _read(bag: Path, reader: Reader, types: Any, topics: Sequence[Topic]) -> Arrays:
-    columns: dict[str, tuple[array[int], array[int] | None, list[tuple[array[float], Callable[[Any], Any]]]]] = {}
-    counts, wanted = {}, []
+    columns: dict[str, array[Any]] = {}
+    takers: dict[str, list[tuple[Callable[[Any], None], Callable[[Any], Any]]]] = {}
+    counts, keys, wanted = {}, {}, []
     for name, kind, paths in topics:
-        getters = [_getter(types, name, kind, path) for path in paths]
-        header = dict(types.fielddefs[kind][1]).get("header")
-        stamped = array("q") if header == (Nodetype.NAME, "std_msgs/msg/Header") else None
-        columns[name] = (array("q"), stamped, [(array("d"), getter) for getter in getters])
+        getters = {f"{name}.{path}": _getter(types, name, kind, path) for path in paths}
+        if dict(types.fielddefs[kind][1]).get("header") == (Nodetype.NAME, "std_msgs/msg/Header"):
+            getters[f"{name}@stamped"] = lambda message: message.header.stamp.sec * 10**9 + message.header.stamp.nanosec
+        keys[name] = [f"{name}@received", *getters]
+        columns |= {key: array("q" if key.endswith(("@received", "@stamped")) else "d") for key in keys[name]}
+        takers[name] = [(columns[key].append, getter) for key, getter in getters.items()]
         held = _connections(bag, reader, types, name, kind)
         counts[name] = sum(connection.msgcount for connection in held)
         check_limit("samples", counts[name], f"'{bag}': topic '{name}' holds {counts[name]} messages")
         wanted += held
     for connection, time, raw in reader.messages(wanted):
         message: Any = types.deserialize_cdr(raw, connection.msgtype)
-        received, stamped, fields = columns[connection.topic]
-        received.append(time)
-        if stamped is not None:
-            stamped.append(message.header.stamp.sec * 10**9 + message.header.stamp.nanosec)
-        for values, getter in fields:
-            values.append(getter(message))
-    arrays: Arrays = {}
-    for name, _, paths in topics:
-        received, stamped, fields = columns[name]
-        if len(received) != counts[name]:
-            raise DataError(f"'{bag}': topic '{name}' holds {len(received)} messages, the bag says {counts[name]}; it is truncated")
-        times = np.array(received, np.int64)
-        if times.min() < 0 or times.max() >= LATEST:
+        columns[f"{connection.topic}@received"].append(time)
+        for take, getter in takers[connection.topic]:
+            take(getter(message))
+    arrays: Arrays = {key: np.array(values) for key, values in columns.items()}
+    for name, count in counts.items():
+        received = arrays[f"{name}@received"]
+        if len(received) != count:
+            raise DataError(f"'{bag}': topic '{name}' holds {len(received)} messages, the bag says {count}; it is truncated")
+        if received.min() < 0 or received.max() >= LATEST:
             raise DataError(f"'{bag}': topic '{name}': a message was received at no time there is; the bag is damaged")
-        order = np.argsort(times, kind="stable")
-        arrays[f"{name}@received"] = times[order]
-        if stamped is not None:
-            arrays[f"{name}@stamped"] = np.array(stamped, np.int64)[order]
-        arrays |= {f"{name}.{path}": np.array(values)[order] for path, (values, _) in zip(paths, fields, strict=True)}
+        order = np.argsort(received, kind="stable")
+        arrays |= {key: arrays[key][order] for key in keys[name]}
     return arrays
 
 
 def _connections(bag: Path, reader: Reader, types: Any, name: str, kind: str) -> list[Connection]:
     """What the bag holds of a topic; its type and layout are those that are declared."""
     held = [connection for connection in reader.connections if connection.topic == name]
-    if not held:
-        names = sorted({connection.topic for connection in reader.connections})
-        topics = printable(", ".join(names[:30])) + (", …" if len(names) > 30 else "")
-        raise DataError(f"'{bag}' has no topic '{name}' (it has {topics or 'none'}); correct topics in the data set's configuration")
+    if not any(connection.msgcount for connection in held):
+        topics = printable(", ".join(sorted({connection.topic for connection in reader.connections if connection.msgcount})[:30]))
+        raise DataError(f"'{bag}' holds no messages of topic '{name}' (of {topics or 'none'}); correct topics in the configuration")
     for connection in held:
         if connection.msgtype != kind:
             raise DataError(f"'{bag}': topic '{name}' carries '{printable(connection.msgtype)}', not '{kind}' as declared")
         for found, (_, fields) in _definitions(connection).items():
-            declared = types.fielddefs.get(found)
-            if declared is not None and _lower(declared[1]) != _lower(fields):
+            declared = types.fielddefs.get(found, ((), fields))[1]
+            if [(field.lower(), node) for field, node in fields] != [(field.lower(), node) for field, node in declared]:
                 raise DataError(f"'{bag}': topic '{name}': the bag's own layout of '{found}' is not the declared one; correct messages")
-    if not any(connection.msgcount for connection in held):
-        raise DataError(f"'{bag}': topic '{name}' holds no messages")
     return held
 
 
@@ -235,7 +216,3 @@ def _definitions(connection: Connection) -> Mapping[str, Any]:
     rule = "=" * 80 + "\n"
     sections = [part.split("\n", 1)[1] for part in text.split(rule)[1:]] if text.startswith(f"{rule}IDL: ") else [text]
     return {name: kind for section in sections for name, kind in get_types_from_idl(section).items()}
-
-
-def _lower(fields: Sequence[tuple[str, Any]]) -> list[tuple[str, Any]]:
-    return [(name.lower(), kind) for name, kind in fields]

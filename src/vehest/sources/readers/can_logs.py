@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from array import array
 from collections.abc import Collection, Sequence
 from pathlib import Path
@@ -47,7 +46,7 @@ def read_frames(file: Path, wanted: Collection[Sequence[Any]] | None) -> tuple[A
             check_limit("samples", count, f"'{file}' holds {count} frames or more")
             if frame.is_error_frame or frame.is_remote_frame:
                 continue
-            if not (math.isfinite(frame.timestamp) and abs(frame.timestamp) < LATEST):
+            if not abs(frame.timestamp) < LATEST:
                 raise DataError(f"'{file}': frame {count} is stamped {frame.timestamp:.6g} s; the file is damaged")
             if kept is not None and (frame.arbitration_id, frame.is_extended_id) not in kept:
                 continue

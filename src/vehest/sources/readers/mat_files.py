@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -15,13 +15,12 @@ from vehest.data.limits import check_limit
 from vehest.sources.limited import Arrays
 
 
-def read_channels(file: Path, columns: Sequence[str], value: str, time: str) -> tuple[Arrays, dict[str, Any]]:
-    """Values and times of channels.
+def read_channels(file: Path, columns: Sequence[str], time: str) -> tuple[Arrays, dict[str, Any]]:
+    """Values and times of channels, structs with a field ``value`` and one of times.
 
     Args:
         file: of version 5 to 7.
-        columns: names, ``STRUCT.CHANNEL`` or ``CHANNEL`` where only one struct with times has it.
-        value: name of the field of values.
+        columns: names, ``STRUCT.CHANNEL`` or ``CHANNEL`` where only one struct has it.
         time: name of the field of times.
 
     Returns:
@@ -33,41 +32,25 @@ def read_channels(file: Path, columns: Sequence[str], value: str, time: str) -> 
     try:
         content = loadmat(file, simplify_cells=True)
     except NotImplementedError:
-        raise DataError(
-            f"'{file}' is a MAT file of version 7.3 (HDF5), which is not read; save it with -v7 in MATLAB, or set layout: csv"
-        ) from None
-    inside = {f"{outer}.{inner}": field for outer, fields in content.items() if isinstance(fields, dict) for inner, field in fields.items()}
+        raise DataError(f"'{file}' is of version 7.3 (HDF5), which is not read; save it with -v7 in MATLAB, or set layout: csv") from None
+    structs = {outer: fields for outer, fields in content.items() if isinstance(fields, dict)}
+    inside = {f"{outer}.{inner}": field for outer, fields in structs.items() for inner, field in fields.items()}
+    channels = {name: field for name, field in inside.items() if isinstance(field, dict) and time in field}
     arrays, names = Arrays(), {}
     for column in columns:
-        name, fields = _found(file, inside, column, time)
-        names[column] = name
-        for part in (value, time):
-            if part not in fields:
-                have = ", ".join(fields) or "none: it is no struct"
-                raise DataError(f"'{file}': '{name}' has no field '{part}' (it has {have}); correct the map in conf/dataset")
-            arrays[f"{column}.{part}"] = _numbers(fields[part], f"'{file}': '{name}.{part}'")
-        if len(arrays[f"{column}.{value}"]) != len(arrays[f"{column}.{time}"]):
-            counts = f"{len(arrays[f'{column}.{value}'])} values and {len(arrays[f'{column}.{time}'])} time stamps"
-            raise DataError(f"'{file}': '{name}' holds {counts}; fetch the file again")
+        found = [name for name in channels if column in (name, name.split(".", 1)[1])]
+        if len(found) > 1:
+            raise DataError(f"'{file}' has '{column}' more than once ({', '.join(found)}); name its struct too, as in '{found[0]}'")
+        if not found:
+            have = ", ".join(list(inside)[:12]) or "no structs"
+            raise DataError(f"'{file}' has no channel '{column}' with a field '{time}' (it has {have}); correct the map in conf/dataset")
+        names[column] = found[0]
+        for part, key in (("value", "value"), ("time", time)):
+            arrays[f"{column}.{part}"] = _numbers(channels[found[0]].get(key), f"'{file}': '{found[0]}.{key}'")
+        counts = [len(arrays[f"{column}.{part}"]) for part in ("value", "time")]
+        if counts[0] != counts[1]:
+            raise DataError(f"'{file}': '{found[0]}' holds {counts[0]} values and {counts[1]} time stamps; fetch the file again")
     return arrays, {"names": names}
-
-
-def _found(file: Path, inside: dict[str, Any], column: str, time: str) -> tuple[str, dict[str, Any]]:
-    """A column's name with its struct, and its fields; parameters of the same name, which have no time, do not count."""
-    found = dict(_matching(inside, column))
-    timed = {name: fields for name, fields in found.items() if time in fields} or found
-    if len(timed) > 1:
-        raise DataError(f"'{file}' has '{column}' more than once ({', '.join(timed)}); name its struct too, as in '{next(iter(timed))}'")
-    if not timed:
-        have = ", ".join(list(inside)[:12]) + (", …" if len(inside) > 12 else "") if inside else "no structs"
-        raise DataError(f"'{file}' has no channel '{column}' (it has {have}); correct the map in conf/dataset")
-    return next(iter(timed.items()))
-
-
-def _matching(inside: dict[str, Any], column: str) -> Iterator[tuple[str, dict[str, Any]]]:
-    for name, field in inside.items():
-        if column in (name, name.split(".", 1)[1]):
-            yield name, field if isinstance(field, dict) else {}
 
 
 def _numbers(values: Any, where: str) -> FloatArray:

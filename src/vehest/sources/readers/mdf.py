@@ -8,7 +8,8 @@ from __future__ import annotations
 import difflib
 import io
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, NoReturn
 
@@ -73,26 +74,27 @@ def read(file: Path, wanted: Mapping[str, tuple[str, int | str | None]] | None) 
         skipped: list[str] = []
         for group in dict.fromkeys(group for group, _ in places.values()):
             own = {key: index for key, (at, index) in places.items() if at == group}
-            try:
-                found = _group_of(measurement, group, own, file, None if wanted is not None else skipped)
-            except DataError as error:
-                if wanted is not None:
-                    raise
-                skipped.append(str(error).removeprefix(f"'{file}': "))
-                continue
-            arrays |= found
-            signals |= {
-                key: {
-                    "name": measurement.groups[group].channels[index].name,
-                    "group": group,
-                    "title": _title(measurement, group),
-                    "unit": _unit(measurement.groups[group].channels[index]),
-                }
-                for key, index in own.items()
-                if key in found
-            }
+            with _or_skip(skipped if wanted is None else None, file):
+                found = _group_of(measurement, group, own, file, skipped if wanted is None else None)
+                arrays |= found
+                for key in own.keys() & found.keys():
+                    channel = measurement.groups[group].channels[own[key]]
+                    unit = str((channel.conversion and channel.conversion.unit) or channel.unit or "")
+                    signals[key] = {"name": channel.name, "group": group, "title": _title(measurement, group), "unit": unit}
+        signals = {key: signals[key] for key in places if key in signals}
         start = measurement.header.start_time
         return arrays, {"version": measurement.version, "start": start.isoformat(), "signals": signals, "skipped": skipped}
+
+
+@contextmanager
+def _or_skip(skipped: list[str] | None, file: Path) -> Iterator[None]:
+    """Keep an error as a line of ``skipped``, where there is one."""
+    try:
+        yield
+    except DataError as error:
+        if skipped is None:
+            raise
+        skipped.append(str(error).removeprefix(f"'{file}': "))
 
 
 def forbid_evaluation() -> None:
@@ -165,10 +167,9 @@ def _located_one(
     groups = ", ".join(titles[:12]) + (", …" if len(titles) > 12 else "")
     if not kept:
         raise DataError(f"'{file}': signal '{name}' is not in group '{group}', but in {groups}; correct group")
-    if len(titles) > 1:
-        raise DataError(f"'{file}': signal '{name}' stands in several groups: {groups}; say which by number or name with group: …")
     if len(kept) > 1:
-        raise DataError(f"'{file}': signal '{name}' stands {len(kept)} times in group {groups}; rename all but one")
+        advice = "say which by number or name with group: …" if len(titles) > 1 else "rename all but one"
+        raise DataError(f"'{file}': signal '{name}' stands {len(kept)} times, in group {groups}; {advice}")
     return kept[0]
 
 
@@ -198,30 +199,20 @@ def _group_of(measurement: Any, group: int, own: Mapping[str, int], file: Path, 
         held = f"holds {present // record} samples, its header says {count}"
         raise DataError(f"'{file}': signal '{first}' of group {title} {held}; the file is truncated or damaged")
     read: dict[str, int] = {}
+    where = {
+        key: f"'{file}': signal '{_shown(described.channels[index].name)}' of group {title}" for key, index in {"": clock, **own}.items()
+    }
     for key, index in {"": clock, **own}.items():
-        try:
-            _require_number(measurement, group, index, f"'{file}': signal '{_shown(described.channels[index].name)}' of group {title}")
+        with _or_skip(skipped if key else None, file):
+            _require_number(measurement, group, index, where[key])
             read[key] = index
-        except DataError as error:
-            if skipped is None or index == clock:
-                raise
-            skipped.append(str(error).removeprefix(f"'{file}': "))
     arrays = {}
-    for key, raw in zip(read, _raw_of(measurement, group, list(read.values())), strict=True):
-        where = f"'{file}': signal '{_shown(described.channels[read[key]].name)}' of group {title}"
-        try:
-            arrays[key or f"stamps {group}"] = _physical(*raw, described.channels[read[key]].conversion, where)
-        except DataError as error:
-            if skipped is None or not key:
-                raise
-            skipped.append(str(error).removeprefix(f"'{file}': "))
+    found = measurement.select([(None, group, index) for index in read.values()], raw=True, copy_master=False)
+    for (key, index), raw in zip(read.items(), found, strict=True):
+        with _or_skip(skipped if key else None, file):
+            conversion = described.channels[index].conversion
+            arrays[key or f"stamps {group}"] = _physical(raw.samples, raw.invalidation_bits, conversion, where[key])
     return arrays
-
-
-def _raw_of(measurement: Any, group: int, indices: Sequence[int]) -> list[tuple[np.ndarray, np.ndarray | None]]:
-    """Raw samples of channels of a group, and which of them are marked invalid."""
-    signals = measurement.select([(None, group, index) for index in indices], raw=True, copy_master=False)
-    return [(signal.samples, signal.invalidation_bits) for signal in signals]
 
 
 def _require_number(measurement: Any, group: int, index: int, where: str) -> None:
@@ -274,10 +265,6 @@ def _of_ranges(raw: np.ndarray, conversion: Any) -> FloatArray:
     at = np.maximum(np.searchsorted(lower, raw, side="right") - 1, 0)
     inside = (lower[at] <= raw) & ((raw < upper[at]) if raw.dtype.kind == "f" else (raw <= upper[at]))
     return np.where(inside, physical[at], conversion.default)
-
-
-def _unit(channel: Any) -> str:
-    return str((channel.conversion and channel.conversion.unit) or channel.unit or "")
 
 
 def _group_name(measurement: Any, group: int) -> str:

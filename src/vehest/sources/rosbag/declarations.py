@@ -7,41 +7,23 @@ from typing import Annotated, Literal
 
 from pydantic import Field
 
-from vehest.constants import FloatArray
-from vehest.data.channels import channel
-from vehest.data.errors import VehestError
-from vehest.data.units import factor_to_si
-from vehest.sources.columns import Column
-from vehest.sources.pose import POSE_CHANNELS, UpAxis, require_filter, require_pose_channels
-
-Positive = Annotated[float, Field(gt=0.0)]
+from vehest.sources.columns import Positive
+from vehest.sources.pose import PoseOptions, UpAxis
 
 
 @dataclass(frozen=True)
 class Topic:
-    """How a topic's samples come by their times.
+    """How a topic's samples come by their times."""
 
-    Args:
-        topic: its name in the bag.
-        type: its message type.
-        stamps: ``header``, what the message says, or ``received``, what the bag says.
-        clock: ``stamps`` takes the stamps as times, ``uniform`` the even clock behind them.
-        rate_hz: nominal rate [Hz], for ``uniform``.
-        max_gap: longest time between two stamps that is interpolated [s].
-        delay: how much later than the sample its time says [s].
-        interpolation: ``linear``, or ``hold`` for commands that stand until the next one.
-        average: width of a centred moving average before interpolation [s]; 0 for none.
-    """
-
-    topic: str
-    type: str
-    stamps: Literal["header", "received"] = "header"
-    clock: Literal["stamps", "uniform"] = "stamps"
-    rate_hz: Positive | None = None
-    max_gap: Positive = 0.05
-    delay: float = 0.0
-    interpolation: Literal["linear", "hold"] = "linear"
-    average: Annotated[float, Field(ge=0.0)] = 0.0
+    topic: str  # its name in the bag
+    type: str  # of its messages
+    stamps: Literal["header", "received"] = "header"  # of the message or of the bag
+    clock: Literal["stamps", "uniform"] = "stamps"  # the stamps themselves, or the even clock behind them
+    rate_hz: Positive | None = None  # nominal rate of a uniform clock [Hz]
+    max_gap: Positive = 0.05  # longest time between two stamps that is interpolated [s]
+    delay: float = 0.0  # how much later than the sample its time says [s]
+    interpolation: Literal["linear", "hold"] = "linear"  # hold: for commands that stand until the next one
+    average: Annotated[float, Field(ge=0.0)] = 0.0  # width of a centred moving average before interpolation [s]; 0 for none
 
     def __post_init__(self) -> None:
         if self.clock == "uniform" and self.rate_hz is None:
@@ -52,59 +34,24 @@ class Topic:
 
 @dataclass(frozen=True)
 class BagChannel:
-    """Where a channel comes from: sign · factor · (field - offset).
+    """Where a channel comes from: sign · factor · (field - offset), in ``unit``."""
 
-    Args:
-        topic: the topic's name in the data set.
-        field: path of the field in the message.
-        unit: of the result.
-        sign: 1 or -1.
-        factor: other than 0.
-        offset: the field's value where the channel is zero.
-    """
-
-    topic: str
-    field: str
+    topic: str  # its name in the data set
+    field: str  # path in the message
     unit: str
     sign: Literal[1, -1] = 1
     factor: float = 1.0
     offset: float = 0.0
 
-    def to_si(self, values: FloatArray, si_unit: str) -> FloatArray:
-        """Values in SI units and ISO 8855 signs."""
-        column = Column(self.field, self.unit, self.sign, self.factor)
-        return column.to_si(values - self.offset if self.offset else values, si_unit)
-
 
 @dataclass(frozen=True)
-class Pose:
-    """How the reference is made of poses; see `vehest.sources.pose.planar_motion`.
+class Pose(PoseOptions):
+    """Where poses stand."""
 
-    Args:
-        topic: the topic's name in the data set.
-        field: path of a geometry_msgs/Pose in the message.
-        up: upward axis of the world and of the rigid body.
-        window: samples of the Savitzky-Golay filter.
-        order: of its polynomial.
-        yaw: from the rigid body's x axis to the car's forward axis [rad].
-        lever_x: from the rigid body's origin forward to the reference point [m].
-        lever_y: from the rigid body's origin left to the reference point [m].
-        channels: which of vx_ref, vy_ref, yaw_rate_ref, sideslip_ref.
-    """
-
-    topic: str
-    field: str = "pose"
-    up: UpAxis = "z"
-    window: int = 9
-    order: int = 2
-    yaw: float = 0.0
-    lever_x: float = 0.0
-    lever_y: float = 0.0
-    channels: tuple[str, ...] = POSE_CHANNELS
-
-    def __post_init__(self) -> None:
-        require_filter(self.window, self.order, "pose")
-        require_pose_channels(self.channels, "pose")
+    topic: str  # its name in the data set
+    field: str = "pose"  # path of a geometry_msgs/Pose in the message
+    up: UpAxis = "z"  # upward axis of the world and of the rigid body
+    yaw: float = 0.0  # from the rigid body's x axis to the car's forward axis [rad]
 
 
 @dataclass(frozen=True)
@@ -132,13 +79,6 @@ class RosbagOptions:
         for topic in [*(declared.topic for declared in channels.values()), *([self.pose.topic] if self.pose else [])]:
             if topic not in topics:
                 raise ValueError(f"topic '{topic}' is not one of topics: {', '.join(topics) or 'none'}")
-        for name, declared in channels.items():
-            try:
-                factor_to_si(declared.unit, channel(name).unit)
-            except VehestError as error:
-                raise ValueError(f"channel '{name}': {error}") from None
-            if declared.factor == 0:
-                raise ValueError(f"channel '{name}': factor must be a number other than 0")
         if self.pose and topics[self.pose.topic].average:
             raise ValueError(f"orientations cannot be averaged; leave average out of topic '{self.pose.topic}'")
         if doubled := sorted(set(channels) & set(self.pose.channels if self.pose else ())):

@@ -4,18 +4,13 @@ from __future__ import annotations
 
 import re
 import sys
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-from numpy.typing import NDArray
-
-from vehest.constants import FloatArray
 from vehest.data.errors import DataError, MissingError, VehestError
-from vehest.data.files import writing_error
+from vehest.data.files import regular_file, writing_error
 from vehest.data.text_files import first_line, read_text
 from vehest.sources.archive import MOST_BYTES, temporary_folder, unpacked
 from vehest.sources.limited import Reading, read_limited, require_package
@@ -25,56 +20,12 @@ STORAGES = (".db3", ".mcap")
 PACKED = ".zstd"  # a file that ROS has compressed as a whole
 
 
-@dataclass(frozen=True)
-class TopicData:
-    """All messages of one topic, in the order in which they were recorded.
-
-    Args:
-        received: when the bag received them [ns of unix time], shape (T,).
-        stamped: what their headers say [ns of unix time], shape (T,); None where they have none.
-        fields: path of a field in the message -> values, shape (T,).
-    """
-
-    received: NDArray[np.int64]
-    stamped: NDArray[np.int64] | None
-    fields: Mapping[str, FloatArray]
-
-
-@dataclass(frozen=True)
-class Wanted:
-    """What is read of one topic.
-
-    Args:
-        topic: its name in the bag.
-        type: its message type, such as ``sensor_msgs/msg/Imu``.
-        fields: paths of numeric fields, such as ``linear_acceleration.x`` or ``data.0``.
-    """
-
-    topic: str
-    type: str
-    fields: Sequence[str]
-
-
-@dataclass(frozen=True)
-class Bag:
-    """What was read of a bag.
-
-    Args:
-        start: when its first message was received [ns of unix time].
-        topics: by their names in the bag.
-    """
-
-    start: int
-    topics: Mapping[str, TopicData]
-
-
-def read_bag(path: Path, wanted: Sequence[Wanted], layouts: Mapping[str, str], most_bytes: int = MOST_BYTES) -> Bag:
-    """Read topics of a bag.
+def read_bag(path: Path, function: str, most_bytes: int = MOST_BYTES, **request: Any) -> Reading:
+    """Topics of a bag.
 
     Args:
         path: a bag's folder, one of its ``.db3`` or ``.mcap`` files, or a zip archive that holds one bag.
-        wanted: topics and fields.
-        layouts: message definitions that ROS 2 does not ship, by type, as text in the format of ``.msg`` files.
+        function: ``read_topics`` or ``survey_topics`` of `vehest.sources.readers.bags`, which describe ``request`` and the result.
         most_bytes: limit of what is unpacked [bytes].
 
     Raises:
@@ -82,50 +33,6 @@ def read_bag(path: Path, wanted: Sequence[Wanted], layouts: Mapping[str, str], m
         ConfigurationError: a layout cannot be read, or a type or a field that is not in the layouts.
         DataError: the bag is damaged, or does not hold the topics, types and layouts that are wanted.
     """
-    topics = [[one.topic, one.type, list(one.fields)] for one in wanted]
-    reading = _read(path, "read_topics", most_bytes, topics=topics, layouts=dict(layouts))
-    return Bag(reading.summary["start"], {one.topic: _topic_data(reading, one) for one in wanted})
-
-
-def survey_bag(path: Path, ignored: Sequence[str], most_fields: int) -> tuple[list[tuple[Wanted, TopicData]], list[str]]:
-    """All topics of ROS's own message types, and a sentence for each other one.
-
-    Args:
-        path: as for `read_bag`.
-        ignored: last parts of names of topics that are passed by.
-        most_fields: of a message.
-
-    Raises:
-        MissingError: rosbags is not installed, or the bag is not there.
-        DataError: the bag is damaged.
-    """
-    reading = _read(path, "survey_topics", MOST_BYTES, ignored=list(ignored), most_fields=most_fields)
-    found = [Wanted(*topic) for topic in reading.summary["topics"]]
-    return [(one, _topic_data(reading, one)) for one in found], reading.summary["skipped"]
-
-
-def bag_files(path: Path) -> list[Path]:
-    """The files that a bag is made of: the archive or file itself, or what its folder holds.
-
-    Raises:
-        MissingError: one is not there, is empty, or may not be read.
-    """
-    try:
-        inside = sorted(path.iterdir()) if path.is_dir() else [path]
-    except OSError as error:
-        raise MissingError(f"cannot read '{path}' ({error.strerror}); check its permissions") from None
-    files = [file for file in inside if file == path or file.name == METADATA or file.suffix.lower() in (*STORAGES, PACKED)]
-    if not files:
-        raise MissingError(f"'{path}' holds no bag: neither {METADATA} nor a file ending in {' or '.join(STORAGES)}")
-    for file in files:
-        if not file.is_file():
-            raise MissingError(f"there is no file '{file}'")
-        if file.stat().st_size == 0:
-            raise MissingError(f"file '{file}' is empty")
-    return files
-
-
-def _read(path: Path, function: str, most_bytes: int, **request: Any) -> Reading:
     require_package("rosbags", "ros", "reading ROS 2 bags")
     bag_files(path)
     with _unpacked_bag(path, most_bytes) as bag:
@@ -135,9 +42,21 @@ def _read(path: Path, function: str, most_bytes: int, **request: Any) -> Reading
             raise type(error)(str(error).replace(str(bag), str(path))) from None
 
 
-def _topic_data(reading: Reading, wanted: Wanted) -> TopicData:
-    arrays, name = reading.arrays, wanted.topic
-    return TopicData(arrays[f"{name}@received"], arrays.get(f"{name}@stamped"), {path: arrays[f"{name}.{path}"] for path in wanted.fields})
+def bag_files(path: Path) -> list[Path]:
+    """The files that a bag is made of: the archive or file itself, or what its folder holds.
+
+    Raises:
+        MissingError: there is none, or the folder may not be read.
+    """
+    if not path.is_dir():
+        return [regular_file(path)]
+    try:
+        files = sorted(file for file in path.iterdir() if file.name == METADATA or file.suffix.lower() in (*STORAGES, PACKED))
+    except OSError as error:
+        raise MissingError(f"cannot read '{path}' ({error.strerror}); check its permissions") from None
+    if not files:
+        raise MissingError(f"'{path}' holds no bag: neither {METADATA} nor a file ending in {' or '.join(STORAGES)}")
+    return files
 
 
 @contextmanager

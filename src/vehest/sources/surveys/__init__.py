@@ -11,12 +11,16 @@ from pathlib import Path
 from vehest.data.errors import DataError, MissingError
 from vehest.data.store import is_stored_recording
 from vehest.sources.clocks import clock_fault, span_fault
+from vehest.sources.surveys.bags import survey_bag
 from vehest.sources.surveys.log import Log, RawColumn, Stamps
+from vehest.sources.surveys.mdf import survey_mdf
 from vehest.sources.surveys.tables import survey_table
+from vehest.sources.vbo import read_log
 
 __all__ = ["Log", "RawColumn", "Stamps", "survey"]
 
-MDF, VBO, BAGS = (".mf4", ".mdf", ".dat"), (".vbo",), (".db3", ".mcap", ".zip", ".bag")
+MDF, BAGS = (".mf4", ".mdf", ".dat"), (".db3", ".mcap", ".zip")
+DEGREES = {"heading": "deg"}  # of a VBOX, which does not say so: a compass's, clockwise from north
 
 
 def survey(path: Path) -> Log:
@@ -28,27 +32,7 @@ def survey(path: Path) -> Log:
     """
     if not path.exists():
         raise MissingError(f"there is no file '{path}'")
-    ending = path.suffix.lower()
-    if path.is_dir() or ending in BAGS:
-        from vehest.sources.surveys.bags import survey_bag
-
-        if ending == ".bag":
-            raise DataError(f"'{path}' is a bag of ROS 1; convert it by 'rosbags-convert --src {path.name} --dst {path.stem}'")
-        log = survey_bag(path)
-    elif path.stat().st_size == 0:
-        raise MissingError(f"file '{path}' is empty")
-    elif ending in MDF and _begins_as_mdf(path):
-        from vehest.sources.surveys.mdf import survey_mdf
-
-        log = survey_mdf(path)
-    elif ending in VBO:
-        from vehest.sources.surveys.vbo import survey_vbo
-
-        log = survey_vbo(path)
-    elif is_stored_recording(path):
-        raise DataError(f"'{path}' is a recording of vehest's own already, with channels; try 'vehest data usable {path}'")
-    else:
-        log = survey_table(path)
+    log = _survey(path)
     for run in log.runs:
         if log.seconds is not None and run.stop - run.start > 1 and (fault := span_fault(log.seconds[run])):
             raise DataError(f"'{path}': {fault}")
@@ -58,6 +42,31 @@ def survey(path: Path) -> Log:
     if not log.columns:
         raise DataError(f"'{path}' holds no column of numbers{f' ({skipped[0]})' if skipped else ''}")
     return log
+
+
+def _survey(path: Path) -> Log:
+    ending = path.suffix.lower()
+    if ending == ".bag":
+        raise DataError(f"'{path}' is a bag of ROS 1; convert it by 'rosbags-convert --src {path.name} --dst {path.stem}'")
+    if path.is_dir() or ending in BAGS:
+        return survey_bag(path)
+    if path.stat().st_size == 0:
+        raise MissingError(f"file '{path}' is empty")
+    if ending in MDF and _begins_as_mdf(path):
+        return survey_mdf(path)
+    if ending == ".vbo":
+        return _survey_vbo(path)
+    if is_stored_recording(path):
+        raise DataError(f"'{path}' is a recording of vehest's own already, with channels; try 'vehest data usable {path}'")
+    return survey_table(path)
+
+
+def _survey_vbo(file: Path) -> Log:
+    log = read_log(file)
+    units = {**DEGREES, **log.units}
+    columns = tuple(RawColumn(name, units.get(name, ""), samples, {"column": name}) for name, samples in log.columns.items())
+    clock = Stamps("time", "s", "clock time of the format")
+    return Log(file, "vbo", columns, {}, clock, log.seconds - log.seconds[0], (slice(0, len(log.seconds)),))
 
 
 def _begins_as_mdf(path: Path) -> bool:

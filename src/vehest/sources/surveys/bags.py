@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
 from vehest.data.errors import DataError
-from vehest.sources.rosbag import topics
+from vehest.sources.rosbag.topics import read_bag
 from vehest.sources.surveys.log import Log, RawColumn
 
 IGNORED = ("rosout", "parameter_events", "tf", "tf_static", "diagnostics")
@@ -29,23 +30,17 @@ def survey_bag(path: Path) -> Log:
         MissingError: rosbags is not installed, or the bag is not there.
         DataError: it is damaged, or none of its topics can be read.
     """
-    found, skipped = topics.survey_bag(path, IGNORED, MOST_FIELDS)
-    columns = [column for wanted, data in found for column in _columns(wanted.topic, wanted.type, data)]
+    reading = read_bag(path, "survey_topics", ignored=IGNORED, most_fields=MOST_FIELDS)
+    columns, skipped = [], reading.summary["skipped"]
+    for topic, kind, fields in reading.summary["topics"]:
+        clock = "header" if f"{topic}@stamped" in reading.arrays else "received"
+        stamps = reading.arrays[f"{topic}@{'stamped' if clock == 'header' else 'received'}"].astype(np.float64) * 1e-9
+        for field in fields if len(stamps) > 1 else ():
+            unit = UNITS.get(kind, {}).get(field.rpartition(".")[0], "")
+            place = {"topic": topic, "type": kind, "stamps": clock, "field": field}
+            columns.append(RawColumn(f"{topic} {field}", unit, reading.arrays[f"{topic}.{field}"], place, stamps))
     if not columns:
         raise DataError(f"'{path}' holds no topic of plain numbers ({'; '.join(skipped[:3]) or 'it is empty'})")
     start = min(float(column.stamps[0]) for column in columns if column.stamps is not None)
-    shifted = [RawColumn(one.name, one.unit, one.values, one.place, None if one.stamps is None else one.stamps - start) for one in columns]
+    shifted = [replace(column, stamps=column.stamps - start) for column in columns if column.stamps is not None]
     return Log(path, "rosbag", tuple(shifted), skipped=tuple(skipped))
-
-
-def _columns(topic: str, kind: str, data: topics.TopicData) -> list[RawColumn]:
-    header = data.stamped is not None
-    stamps = np.asarray(data.stamped if data.stamped is not None else data.received, dtype=np.float64) * 1e-9
-    if len(stamps) < 2:
-        return []
-    place = {"topic": topic, "type": kind, "stamps": "header" if header else "received"}
-    units = UNITS.get(kind, {})
-    return [
-        RawColumn(f"{topic} {field}", units.get(field.rpartition(".")[0], ""), values, {**place, "field": field}, stamps)
-        for field, values in data.fields.items()
-    ]

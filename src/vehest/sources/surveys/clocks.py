@@ -10,7 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vehest.constants import FloatArray
-from vehest.sources.surveys.log import Stamps, runs_between
+from vehest.sources.surveys.log import Stamps
+from vehest.sources.table_rows import stretches
 
 NAMED = re.compile(
     r"^(t|ts|tm|time|zeit|timestamps?|stamp|sec|secs|seconds|sekunden|epoch|utc|clock|unix|temps|tiempo|tempo|elapsed|uhrzeit)\b"
@@ -31,19 +32,12 @@ MOST_RESTARTS = 0.01  # of the rows
 
 @dataclass(frozen=True)
 class Found:
-    """The clock of a table.
+    """The clock of a table."""
 
-    Args:
-        stamps: its column; None where none looks like a clock.
-        seconds: times of the rows [s], (N,).
-        runs: rows of each run, the longest first.
-        counted_by: column that counts the runs; empty where none does.
-    """
-
-    stamps: Stamps | None
-    seconds: FloatArray | None
-    runs: tuple[slice, ...]
-    counted_by: str = ""
+    stamps: Stamps | None  # its column; None where none looks like a clock
+    seconds: FloatArray | None  # times of the rows [s], (N,)
+    runs: tuple[slice, ...]  # rows of each run, the longest first
+    counted_by: str = ""  # column that counts the runs; empty where none does
 
 
 def find_clock(columns: Mapping[str, FloatArray], units: Mapping[str, str]) -> Found:
@@ -53,36 +47,28 @@ def find_clock(columns: Mapping[str, FloatArray], units: Mapping[str, str]) -> F
         columns: name -> values, (N,).
         units: name -> unit as the header writes it.
     """
-    n_rows = len(next(iter(columns.values())))
-    candidates = []
-    for place, (name, values) in enumerate(columns.items()):
-        step = _step(values)
+    best, likely, step = None, -1, 0.0
+    for name, values in columns.items():
+        own = _step(values)
         unit, named = SPELLINGS.get(units.get(name, "").strip().lower(), ""), bool(NAMED.match(plain_name(name)))
-        counts_rows = step == 1.0 and float(values[0]) in (0.0, 1.0) and not (unit or named)
-        stamps = None if step is None or counts_rows else _stamps(name, step, unit, named)
-        if step is not None and stamps is not None:
-            candidates.append((2 * bool(unit) + named, -place, step, stamps))
-    if not candidates:
+        counts_rows = own == 1.0 and float(values[0]) in (0.0, 1.0) and not (unit or named)
+        stamps = None if own is None or counts_rows else _stamps(name, own, unit, named)
+        if own is not None and stamps is not None and 2 * bool(unit) + named > likely:
+            best, likely, step = stamps, 2 * bool(unit) + named, own
+    n_rows = len(next(iter(columns.values())))
+    if best is None:
         return Found(None, None, (slice(0, n_rows),))
-    *_, step, stamps = max(candidates, key=lambda candidate: candidate[:2])
-    values = columns[stamps.column]
-    steps, seconds = np.diff(values), (values - values[0]) * UNITS[stamps.unit]
-    numbers = [name for name in columns if name != stamps.column and COUNTER.match(plain_name(name))]
-    for name, starts in _counters(columns, numbers):
-        if 0 < starts.sum() <= MOST_RESTARTS * n_rows:
-            return Found(stamps, seconds, runs_between(starts, n_rows), name)
-    breaks = (steps < 0) | (steps > LONG_GAP * step)
-    if breaks.any():
-        for name, starts in _counters(columns, columns):
-            if (starts == breaks).all():
-                return Found(stamps, seconds, runs_between(breaks, n_rows), name)
-    return Found(stamps, seconds, runs_between(steps < 0, n_rows))
+    values = columns[best.column]
+    steps, seconds = np.diff(values), (values - values[0]) * UNITS[best.unit]
+    starts, counted_by = _run_starts(columns, best.column, steps, step)
+    runs = sorted(stretches(starts, n_rows), key=lambda rows: rows.start - rows.stop)
+    return Found(best, seconds, tuple(runs), counted_by)
 
 
 def plain_name(name: str) -> str:
     """In lower case, without marks, words apart."""
     apart = re.sub(r"(?<=[a-z])(?=[A-Z])", " ", name)
-    return re.sub(r"[\W_]+", " ", apart.replace("#", " ")).strip().lower()
+    return re.sub(r"[\W_]+", " ", apart).strip().lower()
 
 
 def _step(values: FloatArray) -> float | None:
@@ -90,10 +76,8 @@ def _step(values: FloatArray) -> float | None:
     if len(values) < 10 or not np.isfinite(values).all():
         return None
     steps = np.diff(values)
-    if (steps < 0).mean() > MOST_RESTARTS:
-        return None
     grown = steps[steps > 0]
-    if len(grown) < 0.3 * len(steps):  # stamps of too coarse a resolution repeat
+    if (steps < 0).mean() > MOST_RESTARTS or len(grown) < 0.3 * len(steps):  # stamps of too coarse a resolution repeat
         return None
     step = float(np.median(steps)) or float(grown.sum() / len(steps))
     return step if step > 0 and np.mean(np.abs(steps - step) <= 0.5 * step) >= REGULAR else None
@@ -102,12 +86,24 @@ def _step(values: FloatArray) -> float | None:
 def _stamps(name: str, step: float, unit: str, named: bool) -> Stamps | None:
     """A column of time in the unit in which a step makes a rate that loggers have; None where no unit does."""
     fitting = [own for own, factor in UNITS.items() if RATES[0] <= 1.0 / (step * factor) <= RATES[1]]
-    chosen = unit or (fitting[0] if fitting else "s" if named else "")
+    chosen = unit or next(iter(fitting), "s" if named else "")
     if not chosen:
         return None
     rate = 1.0 / (step * UNITS[chosen])
     how = f"unit in the header, {rate:.6g} Hz" if unit else f"grows evenly by {step:.6g}: {rate:.6g} Hz if in {chosen}"
     return Stamps(name, chosen, how, asked=chosen not in fitting)
+
+
+def _run_starts(columns: Mapping[str, FloatArray], clock: str, steps: FloatArray, step: float) -> tuple[NDArray[np.bool_], str]:
+    """Where runs begin with the next row, (N - 1,), and the column that counts them, if one does."""
+    for name, starts in _counters(columns, [name for name in columns if name != clock and COUNTER.match(plain_name(name))]):
+        if 0 < starts.sum() <= MOST_RESTARTS * (len(steps) + 1):
+            return starts, name
+    breaks = (steps < 0) | (steps > LONG_GAP * step)
+    for name, starts in _counters(columns, columns) if breaks.any() else ():
+        if (starts == breaks).all():
+            return breaks, name
+    return steps < 0, ""
 
 
 def _counters(columns: Mapping[str, FloatArray], names: Iterable[str]) -> Iterator[tuple[str, NDArray[np.bool_]]]:

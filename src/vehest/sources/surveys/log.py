@@ -4,12 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from itertools import pairwise
 from pathlib import Path
 from typing import Any
-
-import numpy as np
-from numpy.typing import NDArray
 
 from vehest.constants import FloatArray
 
@@ -78,15 +74,3 @@ class Log:
     def has_clock(self) -> bool:
         """Whether its samples have times."""
         return self.seconds is not None or any(column.stamps is not None for column in self.columns)
-
-
-def runs_between(restarts: NDArray[np.bool_], n_rows: int) -> tuple[slice, ...]:
-    """Rows of uninterrupted runs, the longest first.
-
-    Args:
-        restarts: whether a run begins with the next row, (N - 1,).
-        n_rows: N.
-    """
-    edges = np.concatenate([[0], np.flatnonzero(restarts) + 1, [n_rows]]).tolist()
-    pieces = [slice(first, last) for first, last in pairwise(edges)]
-    return tuple(sorted(pieces, key=lambda piece: piece.start - piece.stop))

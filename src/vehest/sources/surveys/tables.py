@@ -1,15 +1,19 @@
-"""Tables of text and Parquet: delimiter, decimal mark, encoding, lines before the names, a row of units below them."""
+"""Tables of text and Parquet: delimiter, decimal mark, encoding, lines before the names, a row of units below them.
+
+file -> its first lines -> the `Shape` that explains most of them -> pyarrow -> columns of numbers and clock times -> `Log`
+"""
 
 from __future__ import annotations
 
+import codecs
 import csv
-import io
 import re
-from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, field, replace
 from functools import partial
 from itertools import pairwise
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pyarrow as pa
@@ -23,46 +27,31 @@ from vehest.data.parquet import DAMAGE, parquet_file, read_numbers
 from vehest.data.text_files import first_line
 from vehest.sources.clock_times import seconds_of_text
 from vehest.sources.surveys.clocks import NAMED, SPELLINGS, find_clock, plain_name
-from vehest.sources.surveys.log import Log, RawColumn, Stamps
-from vehest.sources.tables import TextLayout, is_parquet, parse_table, table_stream
+from vehest.sources.surveys.log import Log, RawColumn
+from vehest.sources.tables import TextLayout, is_parquet, parse_table, read_head, require_columns, table_stream
 from vehest.sources.text_log import CLOCK
 from vehest.sources.unit_spellings import plain_unit
 
 HEAD = 1 << 18  # bytes that are looked at
-MOST_LINES = 400
-MOST_BEFORE = 200  # lines before the names
+LONGEST_LINE = csv.field_size_limit()
+MOST_LINES = 600  # of them, those before the names included
 DELIMITERS = (";", "\t", ",", "|", " ")
 LEAST_NUMBERS = 0.5  # share of a row's cells that are numbers or empty
-MOST_CONTROLS = 0.01
+CONTROLS, MOST_CONTROLS = re.compile(rb"[\x00-\x08\x0b\x0e-\x1f]"), 0.01
 MARKS = frozenset({"-", "--", "---", "----", "–", "—", "*", "?", "n.a.", "none", "missing", "invalid", "inv", "void", "#value!", "#div/0!"})
 """What loggers and spreadsheets write where there is no sample, in lower case."""
 BRACKETED = re.compile(r"^(?P<name>.*?)[\s_]*[\[(<{](?P<unit>[^\])>}]*)[\])>}]\s*$")
+ABBREVIATED = {"radps": "rad/s", "degps": "deg/s", "degs": "deg/s", "rads": "rad/s", "ms2": "m/s2", "mss": "m/s2", "kmh": "km/h"}
 
 
 @dataclass(frozen=True)
 class Shape:
-    """How a table of text is laid out.
+    """A table of text as one delimiter and decimal mark explain it."""
 
-    Args:
-        encoding: of the text.
-        delimiter: between cells.
-        decimal: mark.
-        skip_rows: lines before the names.
-        names: of the columns.
-        units: below the names; empty where there is no such row.
-    """
-
-    encoding: str
-    delimiter: str
-    decimal: str
-    skip_rows: int
-    names: tuple[str, ...]
-    units: tuple[str, ...] = ()
-
-    @property
-    def layout(self) -> TextLayout:
-        """The same for reading."""
-        return TextLayout(self.delimiter, self.decimal, self.encoding, self.skip_rows, rows_below_names=1 if self.units else 0)
+    layout: TextLayout
+    names: tuple[str, ...] = ()  # of the columns; empty where no line above the numbers has them
+    units: Mapping[str, str] = field(default_factory=dict)  # name -> unit in the row below the names, if there is one
+    score: float = 0.0  # share of cells of numbers in rows of one length, and a hundredth a column; 0 where there is no such row
 
 
 def survey_table(file: Path) -> Log:
@@ -73,78 +62,53 @@ def survey_table(file: Path) -> Log:
     """
     if is_parquet(file):
         with parquet_file(file) as table:
-            schema = table.schema_arrow
-            names = [name for name in schema.names if pa.types.is_integer(kind := schema.field(name).type) or pa.types.is_floating(kind)]
+            names = [field.name for field in table.schema_arrow if _is_numeric(field.type)]
             check_limit("columns", len(names), f"'{file}' has {len(names)} columns")
-            values = read_numbers(file, table, names)
-        return _log(file, Read(values), {}, {})
+            return _log(file, read_numbers(file, table, names), {}, {}, {}, [])
     shape = shape_of(file)
-    check_limit("columns", len(shape.names), f"'{file}' has {len(shape.names)} columns")
-    read = _values(file, shape)
-    units = {name: unit for name, unit in zip(shape.names, shape.units, strict=True) if unit} if shape.units else {}
-    options: dict[str, object] = {"delimiter": shape.delimiter, "decimal": shape.decimal}
-    options |= {"encoding": shape.encoding} if shape.encoding != "utf8" else {}
-    options |= {"skip_rows": shape.skip_rows} if shape.skip_rows else {}
-    options |= {"rows_below_names": 1} if shape.units else {}
-    options |= {"missing": list(read.marks)} if read.marks else {}
-    return _log(file, read, units, options)
+    values, clocks, marks, skipped = _columns(file, shape)
+    always, plain = ("delimiter", "decimal"), asdict(TextLayout())
+    options = {name: option for name, option in asdict(shape.layout).items() if name in always or option != plain[name]}
+    options |= {"missing": sorted(marks)} if marks else {}
+    return _log(file, values, clocks, shape.units, options, skipped)
 
 
-@dataclass(frozen=True)
-class Read:
-    """What a table's columns hold.
-
-    Args:
-        values: name -> numbers, (N,).
-        clocks: name -> times that are written as a clock's [s], (N,).
-        marks: cells of columns of numbers that stand for a missing sample.
-        skipped: what was not read, and why.
-    """
-
-    values: dict[str, FloatArray]
-    clocks: dict[str, FloatArray] = field(default_factory=dict)
-    marks: tuple[str, ...] = ()
-    skipped: tuple[str, ...] = ()
-
-
-def _log(file: Path, read: Read, units: dict[str, str], options: dict[str, object]) -> Log:
-    values, skipped = read.values, read.skipped
+def _log(
+    file: Path,
+    values: dict[str, FloatArray],
+    clocks: dict[str, FloatArray],
+    units: Mapping[str, str],
+    options: dict[str, Any],
+    skipped: list[str],
+) -> Log:
+    """The log of columns of numbers and of clock times [s], (N,), units below the names, options of the source and what was not read."""
     if not values:
         raise DataError(f"'{file}' holds no column of numbers{f' ({skipped[0]})' if skipped else ''}")
     n_rows = len(next(iter(values.values())))
     if n_rows < 2:
         raise DataError(f"'{file}' has {n_rows or 'no'} row{'s' * (n_rows != 1)} of numbers below its names")
     written = {name: units.get(name) or unit_in_name(name) for name in values}
-    found = find_clock({**read.clocks, **values}, {**written, **dict.fromkeys(read.clocks, "s")})
+    found = find_clock({**clocks, **values}, {**written, **dict.fromkeys(clocks, "s")})
     stamps = found.stamps
-    if stamps is not None and stamps.column in read.clocks:
+    if stamps is not None and stamps.column in clocks:
         stamps = replace(stamps, unit=CLOCK, evidence=stamps.evidence.replace("unit in the header", "times of a clock"), asked=False)
-    skipped = (*skipped, *_no_clocks(values, read.clocks, stamps))
+    named = {name: times for name, times in values.items() if stamps is None and NAMED.match(plain_name(name))}
+    faults = [_fault(name, times) for name, times in {**clocks, **named}.items() if stamps is None or name != stamps.column]
     if len(found.runs) > 1:
         options = {**options, "runs": found.counted_by} if found.counted_by else {**options, "time_restarts": True}
-    columns = [
-        RawColumn(name, written[name], samples, {"column": name})
-        for name, samples in values.items()
-        if (stamps is None or name != stamps.column) and (name != found.counted_by or not name)
-    ]
+    beside = {stamps.column if stamps else None, found.counted_by or None}
+    columns = [RawColumn(name, written[name], samples, {"column": name}) for name, samples in values.items() if name not in beside]
     plain = not {"rows_below_names", "missing"} & set(options) and (stamps is None or stamps.unit != CLOCK)
-    return Log(file, "tabular" if plain else "text_log", tuple(columns), options, stamps, found.seconds, found.runs, skipped)
+    source = "tabular" if plain else "text_log"
+    return Log(file, source, tuple(columns), options, stamps, found.seconds, found.runs, (*skipped, *faults))
 
 
-def _no_clocks(values: dict[str, FloatArray], clocks: dict[str, FloatArray], stamps: Stamps | None) -> list[str]:
-    """Columns of times, or named so, that no clock can be made of."""
-    why = []
-    for name, times in {
-        **clocks,
-        **{name: own for name, own in values.items() if stamps is None and NAMED.match(plain_name(name))},
-    }.items():
-        if stamps is not None and stamps.column == name:
-            continue
-        steps = np.diff(times)
-        back, same = int((steps < 0).sum()), int((steps == 0).sum())
-        what = f"goes backwards {back} times" if back else f"repeats {same} times" if same else "does not grow evenly"
-        why.append(f"column '{printable(name)}' as the time: it {what}" + ("; sort the rows" if back > 1 else ""))
-    return why
+def _fault(name: str, times: FloatArray) -> str:
+    """Why no clock can be made of a column of times, or of one that is named so."""
+    steps = np.diff(times)
+    back, same = int((steps < 0).sum()), int((steps == 0).sum())
+    what = f"goes backwards {back} times" if back else f"repeats {same} times" if same else "does not grow evenly"
+    return f"column '{printable(name)}' as the time: it {what}" + ("; sort the rows" if back > 1 else "")
 
 
 def unit_in_name(name: str) -> str:
@@ -154,85 +118,54 @@ def unit_in_name(name: str) -> str:
         return bracketed["unit"].strip()
     words = re.split(r"[_\s]+", name.strip())
     last = words[-1].lower() if len(words) > 1 else ""
-    short = {"radps": "rad/s", "degps": "deg/s", "degs": "deg/s", "rads": "rad/s", "ms2": "m/s2", "mss": "m/s2", "kmh": "km/h"}
-    if last in short:
-        return short[last]
-    known = plain_unit(last) is not None or last in SPELLINGS
-    return last if known and len(last) > 1 else ""
+    return ABBREVIATED.get(last) or (last if _is_unit(last) and len(last) > 1 else "")
 
 
 def shape_of(file: Path) -> Shape:
-    """How a table of text is laid out, from its beginning.
+    """Layout of a table of text, by its beginning.
 
     Raises:
         DataError: it is no table of text, has one column only, or no line of names.
     """
-    head = _head(file)
+    head = read_head(file, HEAD)
     encoding, text = _decoded(head, file)
-    lines = re.split(r"\r\n|\n|\r", text)
-    lines = lines[: -1 if len(head) >= HEAD else None][: MOST_BEFORE + MOST_LINES]
-    if not any(line.strip() for line in lines):
-        raise DataError(f"'{file}' holds nothing but empty lines")
-    best = max((_layout(lines, delimiter) for delimiter in DELIMITERS), key=lambda layout: layout.score)
-    if best.score <= 0.0:
-        if _layout(lines, "\n").score > 0.0:
-            raise DataError(f"'{file}' has one column only; time and a motion are two at least")
-        raise DataError(f"'{file}' holds no rows of numbers; is it a table of text, with names in its first line and numbers below?")
-    if best.names is None:
-        row = lines[best.first][:60]
-        raise DataError(f"'{file}' has no line of names above its first numbers ({printable(row)}); write one there")
-    doubled = sorted({name for name in best.names if name and best.names.count(name) > 1})
-    if doubled:
-        raise DataError(f"'{file}' has {best.names.count(doubled[0])} columns called '{printable(doubled[0])}'; rename all but one")
-    return Shape(encoding, best.delimiter, best.decimal, best.header, best.names, best.units)
+    lines = [line[:LONGEST_LINE] for line in re.split(r"\r\n|\n|\r", text)[: -1 if len(head) >= HEAD else None][:MOST_LINES]]
+    tables = {delimiter: _rows(lines, delimiter) for delimiter in DELIMITERS}
+    marks = [(delimiter, decimal) for delimiter in DELIMITERS for decimal in (".", ",") if decimal != delimiter]
+    best = max((_shape(tables[pair[0]], *pair, encoding) for pair in marks), key=lambda shape: shape.score)
+    if not best.score:
+        raise DataError(f"'{file}' holds no rows of two numbers or more; is it a table of text, with names in a line above the numbers?")
+    if not best.names:
+        raise DataError(f"'{file}' has no line of names above its first numbers; write one there")
+    check_limit("columns", len(best.names), f"'{file}' has {len(best.names)} columns")
+    require_columns(file, best.names, filter(None, best.names))
+    return best
 
 
-@dataclass(frozen=True)
-class _Layout:
-    """How well a delimiter explains the lines: cells of numbers in rows of the same length."""
-
-    delimiter: str
-    score: float
-    decimal: str = "."
-    header: int = 0
-    first: int = 0
-    names: tuple[str, ...] | None = None
-    units: tuple[str, ...] = ()
+def _rows(lines: Sequence[str], delimiter: str) -> dict[int, list[str]]:
+    """Number of each line that holds something -> its cells."""
+    split = [next(csv.reader([line], delimiter=delimiter), []) for line in lines]
+    return {k: row for k, row in enumerate(split) if any(cell.strip() for cell in row)}
 
 
-def _layout(lines: Sequence[str], delimiter: str) -> _Layout:
-    rows = [_cells(line, delimiter) for line in lines]
-    filled = [k for k, row in enumerate(rows) if any(cell.strip() for cell in row)]
-    if not filled:
-        return _Layout(delimiter, 0.0)
-    tail = [len(rows[k]) for k in filled[len(filled) // 2 :]]
-    n_columns = max(set(tail), key=tail.count)
-    if n_columns < 2 and delimiter != "\n":
-        return _Layout(delimiter, 0.0)
-    decimals = [mark for mark in (".", ",") if mark != delimiter]
-    shares = {mark: [_share(rows[k], mark) for k in filled] for mark in decimals}
-    decimal = max(decimals, key=lambda mark: sum(shares[mark]))
-    data = [k for k, share in zip(filled, shares[decimal], strict=True) if share >= LEAST_NUMBERS and len(rows[k]) == n_columns]
+def _shape(rows: Mapping[int, list[str]], delimiter: str, decimal: str, encoding: str) -> Shape:
+    """The table that a decimal mark makes of rows: names and units stand right above the first two rows of numbers."""
+    lengths = [len(row) for row in rows.values()][len(rows) // 2 :]
+    n_columns = max(set(lengths), key=lengths.count, default=0)
+    shares = {k: _share(row, decimal) for k, row in rows.items() if len(row) == n_columns > 1}
+    data = [k for k, share in shares.items() if share >= LEAST_NUMBERS]
     if not data:
-        return _Layout(delimiter, 0.0)
-    first = next((k for k, after in pairwise([*data, len(lines)]) if after - k == 1 or k == data[-1]), data[0])
-    score = sum(shares[decimal][filled.index(k)] for k in data) / len(filled) + 0.01 * min(n_columns, 20)
-    above = [k for k in filled if k < first and len(rows[k]) == n_columns]
-    names: tuple[str, ...] | None = None
-    units: tuple[str, ...] = ()
-    header = above[-1] if above else 0
-    if above:
-        names = tuple(rows[above[-1]])
-        if len(above) > 1 and above[-2] == above[-1] - 1 and _are_units(names):
-            units, header = tuple(cell.strip() for cell in names), above[-2]
-            names = tuple(rows[header])
-    return _Layout(delimiter, score, decimal, header, first, names, units)
-
-
-def _cells(line: str, delimiter: str) -> list[str]:
-    if delimiter == "\n":
-        return [line]
-    return next(csv.reader(io.StringIO(line), delimiter=delimiter), [])
+        return Shape(TextLayout())
+    first = next((k for k, after in pairwise([*data, data[-1]]) if after - k == 1 or k == data[-1]), data[0])
+    score = sum(shares[k] for k in data) / len(rows) + 0.01 * min(n_columns, 20)
+    above = [k for k in shares if k < first]
+    if not above:
+        return Shape(TextLayout(), score=score)
+    below = int(len(above) > 1 and above[-2] == above[-1] - 1 and _are_units(rows[above[-1]]))
+    names = tuple(rows[above[-1] - below])
+    units = {name: cell.strip() for name, cell in zip(names, rows[above[-1]], strict=True)} if below else {}
+    layout = TextLayout(delimiter, decimal, encoding, skip_rows=above[-1] - below, rows_below_names=below)
+    return Shape(layout, names, units, score)
 
 
 def _share(row: Sequence[str], decimal: str) -> float:
@@ -243,15 +176,13 @@ def _share(row: Sequence[str], decimal: str) -> float:
 
 def _is_number(cell: str, decimal: str) -> bool:
     text = cell.strip().strip('"')
-    if decimal == ",":
-        if "." in text:
-            return False
-        text = text.replace(",", ".")
+    if "_" in text or (decimal == "," and "." in text):
+        return False
     try:
-        float(text)
+        float(text.replace(decimal, "."))
     except ValueError:
         return False
-    return "_" not in text
+    return True
 
 
 def _are_units(cells: Sequence[str]) -> bool:
@@ -259,96 +190,77 @@ def _are_units(cells: Sequence[str]) -> bool:
     filled = [cell.strip("[]() ") for cell in cells if cell.strip("[]() -")]
     if not filled:
         return any(cell.strip() for cell in cells)
-    known = sum(plain_unit(cell) is not None or cell.lower() in SPELLINGS for cell in filled)
-    return known >= max(1, 0.3 * len(filled)) and all(len(cell) <= 12 for cell in filled)
+    return sum(map(_is_unit, filled)) >= max(1, 0.3 * len(filled)) and all(len(cell) <= 12 for cell in filled)
 
 
-def _head(file: Path) -> bytes:
-    try:
-        with table_stream(file) as stream:
-            return bytes(stream.read(HEAD))
-    except (OSError, pa.ArrowException, MemoryError) as error:
-        raise DataError(f"'{file}' cannot be read ({first_line(error)})") from None
+def _is_unit(text: str) -> bool:
+    return plain_unit(text) is not None or text.lower() in SPELLINGS
 
 
 def _decoded(head: bytes, file: Path) -> tuple[str, str]:
     """Encoding and text."""
-    if head.startswith((b"\xff\xfe", b"\xfe\xff")):
-        return "utf-16", head[: len(head) // 2 * 2].decode("utf-16", errors="replace")
-    controls = sum(head.count(bytes([code])) for code in range(32) if code not in (9, 10, 12, 13))
-    if b"\0" in head or controls > MOST_CONTROLS * max(len(head), 1):
+    if head.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
+        return "utf-16", head.decode("utf-16", errors="replace")
+    if b"\0" in head or len(CONTROLS.findall(head)) > MOST_CONTROLS * len(head):
         raise DataError(f"'{file}' is no table of text (it holds control characters); is it of another format? its ending says which")
     try:
-        return "utf8", head.decode("utf-8-sig")
-    except UnicodeDecodeError as error:
-        if error.start >= len(head) - 4 and len(head) >= HEAD:
-            return "utf8", head[: error.start].decode("utf-8-sig")
-    western = any(0x80 <= byte < 0xA0 for byte in head)
-    return ("cp1252", head.decode("cp1252", errors="replace")) if western else ("latin-1", head.decode("latin-1"))
+        return "utf8", codecs.getincrementaldecoder("utf-8-sig")().decode(head, final=len(head) < HEAD)
+    except UnicodeDecodeError:
+        encoding = "cp1252" if re.search(rb"[\x80-\x9f]", head) else "latin-1"
+        return encoding, head.decode(encoding, errors="replace")
 
 
-def _values(file: Path, shape: Shape) -> Read:
-    layout, opened = shape.layout, partial(table_stream, file)
-    try:
-        table = parse_table(opened, layout, pc.ConvertOptions(decimal_point=shape.decimal))
-    except DAMAGE:
-        table = _as_text(file, shape)
+def _columns(file: Path, shape: Shape) -> tuple[dict[str, FloatArray], dict[str, FloatArray], set[str], list[str]]:
+    """Columns of numbers, columns of clock times [s], marks of missing samples, and what was not read, and why."""
+    table = _table(file, shape)
     check_limit("samples", table.num_rows, f"'{file}' has {table.num_rows} rows")
-    values, clocks, skipped = {}, {}, []
+    values: dict[str, FloatArray] = {}
+    clocks: dict[str, FloatArray] = {}
     marks: set[str] = set()
-    for place, name in enumerate(shape.names):
-        column = table.column(name) if name in table.column_names else None
-        if column is None or column.null_count == len(column):
+    skipped = []
+    for place, (name, column) in enumerate(zip(shape.names, table.columns, strict=False), start=1):
+        if column.null_count == len(column):
             skipped += [f"column '{printable(name)}' is empty"] if name else []
-            continue
-        samples, own = _numbers(column, shape.decimal)
-        seconds = _clock_of(column) if samples is None else None
-        if not name:
-            skipped.append(f"column {place + 1} has no name")
-        elif samples is not None:
-            values[name] = samples
-            marks |= own
-        elif seconds is not None:
+        elif not name:
+            skipped.append(f"column {place} has no name")
+        elif (numbers := _numbers(column, shape.layout.decimal)) is not None:
+            values[name] = numbers[0]
+            marks |= numbers[1]
+        elif (seconds := seconds_of_text(column.cast(pa.string(), safe=False))) is not None:
             clocks[name] = seconds
         else:
             skipped.append(f"column '{printable(name)}' holds text")
-    return Read(values, clocks, tuple(sorted(marks)), tuple(skipped))
+    return values, clocks, marks, skipped
 
 
-def _clock_of(column: pa.ChunkedArray) -> FloatArray | None:
-    """Times that are written as a clock's [s], (N,); None of other text."""
-    kind = column.type
-    if not (pa.types.is_string(kind) or pa.types.is_timestamp(kind) or pa.types.is_time(kind)):
-        return None
-    return seconds_of_text(column if pa.types.is_string(kind) else column.cast(pa.string()))
+def _table(file: Path, shape: Shape) -> pa.Table:
+    """All cells: converted by pyarrow or, where some columns hold numbers first and text later, as they stand."""
+    inferred = pc.ConvertOptions(decimal_point=shape.layout.decimal)
+    text = pc.ConvertOptions(column_types=dict.fromkeys(shape.names, pa.string()), strings_can_be_null=True)
+    problem = None
+    for convert in (inferred, text):
+        try:
+            return parse_table(partial(table_stream, file), shape.layout, convert)
+        except DAMAGE as error:
+            problem = printable(first_line(error))
+    raise DataError(f"'{file}' cannot be read as a table ({problem}); is it truncated, or are its columns aligned by blanks?")
 
 
-def _as_text(file: Path, shape: Shape) -> pa.Table:
-    """All cells as they stand, where some columns hold numbers first and text later."""
-    kinds = pc.ConvertOptions(column_types=dict.fromkeys(shape.names, pa.string()), strings_can_be_null=True)
-    try:
-        return parse_table(partial(table_stream, file), shape.layout, kinds)
-    except DAMAGE as error:
-        remedy = (
-            "its columns are aligned by blanks; write one delimiter between cells"
-            if shape.delimiter == " "
-            else "remove that row, or what lies behind it if the file is truncated"
-        )
-        raise DataError(f"'{file}' cannot be read as a table ({printable(first_line(error))}); {remedy}") from None
-
-
-def _numbers(column: pa.ChunkedArray, decimal: str) -> tuple[FloatArray | None, set[str]]:
-    """A column as numbers, None where it holds anything else, and the marks in it that stand for a missing sample."""
-    kind = column.type
-    if pa.types.is_integer(kind) or pa.types.is_floating(kind):
-        return np.asarray(column.cast(pa.float64(), safe=False).to_numpy(), dtype=np.float64), set()
-    if not pa.types.is_string(kind):
-        return None, set()
-    marks = {cell for cell in compute.unique(column).to_pylist() if cell is not None and cell.strip().lower() in MARKS}
-    try:
+def _numbers(column: pa.ChunkedArray, decimal: str) -> tuple[FloatArray, set[str]] | None:
+    """A column as numbers, and the marks in it that stand for a missing sample; None where it holds anything else."""
+    marks: set[str] = set()
+    if pa.types.is_string(column.type):
+        marks = {cell for cell in compute.unique(column).to_pylist() if cell is not None and cell.strip().lower() in MARKS}
         if marks:
             column = compute.if_else(compute.is_in(column, pa.array(sorted(marks))), pa.scalar(None, pa.string()), column)
-        plain = compute.replace_substring(compute.utf8_trim_whitespace(column), decimal, ".")
-        return np.asarray(compute.cast(plain, pa.float64()).to_numpy(), dtype=np.float64), marks
+        column = compute.replace_substring(compute.utf8_trim_whitespace(column), decimal, ".")
+    elif not _is_numeric(column.type):
+        return None
+    try:
+        return np.asarray(column.cast(pa.float64(), safe=False).to_numpy(), dtype=np.float64), marks
     except pa.ArrowException:
-        return None, set()
+        return None
+
+
+def _is_numeric(kind: pa.DataType) -> bool:
+    return bool(pa.types.is_integer(kind) or pa.types.is_floating(kind))

@@ -1,9 +1,9 @@
 /* vehest_health.c: statistics of each sample against their limits, status and reason.
  *
  * With features phi(x) of yaw rate and speed, channels x become y = x - W phi(x), of which an autoregression predicts the next sample; e is
- * what it errs by, in units of the noise at that speed, S its covariance. A fault that adds b to channel i moves y by J b, J = dy/dx_i, and
+ * its error, in units of the noise at that speed, S its covariance. A fault that adds b to channel i moves y by J b, J = dy/dx_i, and
  * the innovations by h b. Each form of fault is looked for by its likelihood ratio over exponentially forgotten samples,
- * z = sum(l^j h' S^-1 e) / sqrt(sum(l^2j h' S^-1 h)), which is N(0, 1) while all is well (Willsky & Jones, IEEE Trans. Automatic Control
+ * z = sum(l^j h' S^-1 e) / sqrt(sum(l^2j h' S^-1 h)), which is N(0, 1) without a fault (Willsky & Jones, IEEE Trans. Automatic Control
  * 21 (1), 1976; windows replaced by forgetting). The source of every line is vehest.trust.health_kernel.
  */
 #include "vehest_health.h"
@@ -57,10 +57,10 @@
 #define DEGRADED 1U
 #define INVALID 2U
 
-static const vehest_real BELIEVED = 1000.0f; /* times the largest size in training, beyond which a value counts as not measured */
+static const vehest_real PLAUSIBLE = 1000.0f; /* times the largest size in training, beyond which a value counts as not measured */
 static const vehest_real CLIP = 4.0f; /* standard deviations */
 static const vehest_real STEP_CLIP = 8.0f; /* the same for steps */
-static const vehest_real CALM = 0.300000012f; /* of the mean energy, that a calm stretch counts as at least */
+static const vehest_real CALM = 0.300000012f; /* of the mean energy: least energy of a calm stretch */
 static const vehest_real CAP = 2.0f; /* times its limit, beyond which a statistic remembers no more */
 static const vehest_real CLEARLY = 1.5f; /* times its limit, from which on an estimate is invalid */
 static const vehest_real CLEAR = 0.949999988f; /* times its limit, below which a statistic has to stay */
@@ -242,7 +242,7 @@ static int32_t receive(vehest_health *h, const vehest_real row[C], const bool me
     int32_t absent = NONE;
     for (int32_t i = 0; i < C; i++) {
         const vehest_real value = row[i];
-        const bool known = measured[i] && (VEHEST_ABS(value) <= (BELIEVED * LARGEST[i])); /* false for NaN */
+        const bool known = measured[i] && (VEHEST_ABS(value) <= (PLAUSIBLE * LARGEST[i])); /* false for NaN */
         if (first) {
             h->last[i] = known ? value : USUAL[i];
             h->low_passed[i] = h->last[i];
@@ -783,7 +783,7 @@ static uint8_t decide(vehest_health *h, int32_t absent, int32_t slow, int32_t *r
         level = h->status;
         *reason = h->reason;
     } else {
-        /* all is well */
+        /* no fault found */
     }
     return level;
 }
