@@ -158,22 +158,17 @@ class CnnUkf(NetworkUkf):
 
     def fit_network(self, data: FitData, training: EndToEndSettings, context: FitContext, index: int) -> FitRecord:
         """Pre-training, then training through the filter."""
-        slow = self.minimum_speed
-        raw, judged = (learnt_samples(part, self.network_inputs, self.name, slow) for part in (data.train, data.validation))
-        network = self.network = self.new_network().to(getattr(torch, training.dtype))
-        network.scale(*raw, self.normalisation)
-        network.reset([torch.Generator().manual_seed(self._seed)])
+        network, train, judged = self.begin_network(data, training, [self._seed], self.minimum_speed)
         levels = torch.tensor([self.levels["process_vy"], self.levels["process_yaw_rate"]], dtype=torch.float64)
         levels = levels.clamp(max=MOST_NOISE)  # a logistic function that is to say 1 or more saturates, and learns no more
         with torch.no_grad():  # logistic functions start where the filter alone has its levels, and as unsure as a network that says 0
             start = torch.cat([network.unit.double().reshape(1).clamp(max=MOST_NOISE), levels])
             network.get_parameter("bias_3")[0, 1:] = torch.logit(start).to(network.unit.dtype)
         handles = self._hold(network)
-        train = network.samples(*raw)
         driven = network.samples(*learnt_samples(data.train, self.network_inputs, self.name))  # sequences are cut from all that was driven
         end_to_end = EndToEnd(self, driven, data.train, training)
         phases = [
-            self._pre_training(train, network.samples(*judged), levels, training),
+            self._pre_training(train, judged, levels, training),
             Phase(
                 "end_to_end",
                 training.end_to_end,
