@@ -103,7 +103,7 @@ def phases_of(made: LearnedUkf, parts: list[Drive], training: ThroughFilterSetti
     from vehest.training.through_filter import Weights
 
     weights = Weights(*[torch.ones(5, dtype=torch.float64)] * 3)
-    return filter_phases(made.filter, made.filter, parts, parts, weights, training, training.through, lambda name: True, "through_filter")
+    return filter_phases(made.filter, parts, parts, weights, training, training.through, lambda name: True, "through_filter")
 
 
 def test_the_friction_starts_off_by_at_most_the_spread_and_the_other_states_true() -> None:

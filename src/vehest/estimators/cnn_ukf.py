@@ -20,8 +20,7 @@ from vehest.estimators.base import FitData, FitRecord, Trial
 from vehest.estimators.dugoff_ukf import PseudoMeasurement, with_variance
 from vehest.estimators.filtering.track_filter import TrackFilter
 from vehest.estimators.network_ukf import LEAST_VARIANCE, NetworkUkf
-from vehest.estimators.networks.sample_network import SampleNetwork, clip_sideslip, learnt_samples
-from vehest.estimators.references import reference_sideslip
+from vehest.estimators.networks.sample_network import SampleNetwork, clip_sideslip, learnt_samples, reference_sideslip
 from vehest.filters.gaussian import Gaussian
 from vehest.training.context import FitContext
 from vehest.training.identification import IdentificationSettings

@@ -33,7 +33,7 @@ from vehest.estimators.filtering.track_filter import (
     in_nonlinear_range,
     padded,
 )
-from vehest.estimators.references import reference_sideslip
+from vehest.estimators.networks.sample_network import reference_sideslip
 from vehest.filters.definiteness import MARGIN
 from vehest.filters.gating import Gate, gate_values, in_words, suffix
 from vehest.filters.gaussian import Filtered

@@ -222,9 +222,8 @@ class LearnedUkf(Network, SigmaPointEstimator):
         counted = Weights(torch.cat([weights, last]), torch.cat([weights, last + 1.0]), torch.cat([weights[:3], last, last]))
         learns_dynamics = self.through_filter
         phases = [
-            one_step_phase(self.filter, self.filter, train, validation, counted, training, lambda name: name.startswith("dynamics.")),
+            one_step_phase(self.filter, train, validation, counted, training, lambda name: name.startswith("dynamics.")),
             *filter_phases(
-                self.filter,
                 self.filter,
                 train,
                 validation,

@@ -18,7 +18,7 @@ from vehest.filters.noise_models import ConstantNoise, StateDependentNoise, with
 from vehest.filters.nonlinear import NonlinearFiltered
 from vehest.filters.sigma_points import symmetric_rule
 from vehest.filters.unscented_scan import Array, NoiseAt, PointModel, TorchModel, moved, unscented_scan
-from vehest.training.through_filter import Drive
+from vehest.training.through_filter import Drive, Filtering
 from vehest.vehicle.dynamics import STATES, Dynamics
 
 NoiseKind = Literal["constant", "state_dependent"]
@@ -32,7 +32,7 @@ OBSERVED_EXACTLY = (0.0, 0.0, 0.0, 1e-3)  # added to variances: the rim speed is
 LEAST_ENTROPY = -9.0  # [nat] of the process noise
 
 
-class CarFilter(nn.Module):
+class CarFilter(Filtering):
     """States vx, vy, yaw rate, rim speed and friction; measured are ax, ay, yaw rate and rim speed.
 
     Args:
@@ -46,7 +46,7 @@ class CarFilter(nn.Module):
     Source: Węgrzynowski et al. 2024, Section III-B; start values as in its authors' code.
     """
 
-    mirror: tuple[Sequence[float], Sequence[float], Sequence[float]] = (  # left for right
+    mirror = (  # left for right
         (1.0, -1.0, -1.0, 1.0, 1.0),
         (-1.0, 1.0),
         (1.0, -1.0, -1.0, 1.0),

@@ -18,7 +18,6 @@ from vehest.declared import setting
 from vehest.estimators.base import FitData, FitRecord
 from vehest.estimators.kernels.sample_network import Criterion, losses_of, outputs_of, squared_error
 from vehest.estimators.network import Network
-from vehest.estimators.references import reference_sideslip
 from vehest.training.context import FitContext
 from vehest.training.samples import Draw, Samples, SampleSettings, sample_phase
 from vehest.training.sequences import record_of_phases, train_phases
@@ -216,6 +215,11 @@ def learnt_samples(
         raise DataError(f"no sample that estimator '{estimator}' learns from is faster than {minimum_speed:g} m/s")
     inputs = np.concatenate([recording.stack(channels) for recording in recordings])
     return inputs[fast], np.concatenate([reference_sideslip(recording) for recording in recordings])[fast]
+
+
+def reference_sideslip(recording: Recording) -> FloatArray:
+    """What is learnt and scored: atan2(vy_ref, vx) with the measured vx, (T,) [rad]."""
+    return np.arctan2(recording["vy_ref"], recording["vx"])
 
 
 def clip_sideslip(sideslip: FloatArray) -> FloatArray:

@@ -18,7 +18,7 @@ from vehest.data.estimate import Estimate
 from vehest.data.recording import Recording
 from vehest.data.windows import window_starts, windows_of
 from vehest.declared import setting
-from vehest.estimators.base import Estimator, FitData, FitRecord, Stepper, rate
+from vehest.estimators.base import FitData, FitRecord, Stepper, rate
 from vehest.estimators.model_files import load_model
 from vehest.estimators.network import Network
 from vehest.training.context import FitContext
@@ -63,23 +63,22 @@ class WindowedEstimator(Network):
         return self.window - 1
 
     @classmethod
-    def fit_members(cls, members: Sequence[Estimator], data: FitData, training: Any, context: FitContext) -> list[FitRecord]:
+    def fit_members(cls, members: Sequence[Any], data: FitData, training: Any, context: FitContext) -> list[FitRecord]:
         """Train members together (`train_members`).
 
         Raises:
             DataError: recordings are too short or have gaps, or the loss is no longer finite.
             ConfigurationError: the network cannot be trained so.
         """
-        windowed = [member for member in members if isinstance(member, WindowedEstimator)]
-        first = windowed[0]
-        sets = [windows_of(part, first.channels, TARGET, first.window) for part in (data.train, data.validation)]
-        started = start_weights(first, Path(training.start_from)) if training.start_from is not None else None
-        for member in windowed:
-            member.network = member._seeded_network(list(data.train), getattr(torch, training.dtype))
-            if started is not None:
-                member.network.load_state_dict({name: tensor.to(getattr(torch, training.dtype)) for name, tensor in started.items()})
-        networks = [member.network for member in windowed]
-        return train_members(networks, [member._seed for member in windowed], sets[0], sets[1], training, context)
+        first, dtype = members[0], getattr(torch, training.dtype)
+        train, validation = (windows_of(part, first.channels, TARGET, first.window) for part in (data.train, data.validation))
+        started = start_weights(first, Path(training.start_from)) if training.start_from is not None else {}
+        for member in members:
+            member.network = member._seeded_network(list(data.train), dtype)
+            if started:
+                member.network.load_state_dict({name: tensor.to(dtype) for name, tensor in started.items()})
+        seeds = [member._seed for member in members]
+        return train_members([member.network for member in members], seeds, train, validation, training, context)
 
     def _seeded_network(self, train: list[Recording], dtype: torch.dtype) -> nn.Module:
         """A network to train, with initial weights from the member's seed."""
