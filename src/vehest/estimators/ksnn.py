@@ -172,19 +172,20 @@ class Ksnn(WindowedEstimator):
         return shades[bias], "solid" if bias else "dashed", "^" if nonlinear else "o"
 
     @property
+    def kind(self) -> str:
+        """Of the feedback functions."""
+        return "nonlinear" if self.n_hidden else "linear"
+
+    @property
     def variant(self) -> str:
         """Name of the structure as in Table III."""
-        kind = "nonlinear" if self.n_hidden else "linear"
-        bias = "bias" if self.bias else "no_bias"
-        neurons = f"_q{self.n_hidden}" if self.n_hidden else ""
-        return f"{kind}_{bias}_p{self.n_local}{neurons}"
+        return f"{self.kind}_{'bias' if self.bias else 'no_bias'}_p{self.n_local}" + (f"_q{self.n_hidden}" if self.n_hidden else "")
 
     @property
     def full_title(self) -> str:
         """Structure in words, for example ``KS-NN linear + bias, P = 2``."""
-        kind = "nonlinear" if self.n_hidden else "linear"
         neurons = f", Q = {self.n_hidden}" if self.n_hidden else ""
-        return f"{self.title} {kind} {'+ bias' if self.bias else 'no bias'}, P = {self.n_local}{neurons}"
+        return f"{self.title} {self.kind} {'+ bias' if self.bias else 'no bias'}, P = {self.n_local}{neurons}"
 
     def network_for(self, train: list[Recording]) -> KinematicsStructuredNetwork:
         """A network whose local models span the yaw rates of the training recordings."""

@@ -227,9 +227,8 @@ def placed(drives: Sequence[Drive], steps: int, generator: torch.Generator) -> D
     """As many sequences of each drive as fit into it, each at a random place."""
     starts = []
     for drive in drives:
-        room = len(drive.states) - steps + 1
-        for _ in range(len(drive.states) // steps):
-            starts.append((drive, int(torch.randint(room, (), generator=generator))))
+        count, room = len(drive.states) // steps, len(drive.states) - steps + 1
+        starts += [(drive, int(torch.randint(room, (), generator=generator))) for _ in range(count)]
     return _stacked(starts, steps)
 
 

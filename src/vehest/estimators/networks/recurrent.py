@@ -12,9 +12,31 @@ from torch import Tensor, nn
 
 from vehest.declared import setting
 from vehest.estimators.base import Trial
+from vehest.estimators.network import Network
 from vehest.estimators.networks.windowed import StandardisedNetwork, WindowedEstimator
 
 TRIAL = Trial(7, "recurrent networks; minutes", "estimator.n_states=5 training.max_epochs=100 seed=range(2)")
+
+
+class OfStates(Network):
+    """A family that is named by the size of its hidden state."""
+
+    n_states: int
+    network_type: ClassVar[Any]
+
+    def new_network(self) -> Any:
+        """A network of these sizes."""
+        return self.network_type(self.settings)
+
+    @property
+    def variant(self) -> str:
+        """Name of the structure."""
+        return f"states_{self.n_states}"
+
+    @property
+    def full_title(self) -> str:
+        """With the number of states."""
+        return f"{self.title}, {self.n_states} states"
 
 
 class RecurrentNetwork(StandardisedNetwork):
@@ -75,26 +97,11 @@ class RecurrentNetwork(StandardisedNetwork):
         return self._read_out(state, parameters["output_weight"].unsqueeze(1), parameters["output_bias"].unsqueeze(1))
 
 
-class RecurrentEstimator(WindowedEstimator):
+class RecurrentEstimator(OfStates, WindowedEstimator):
     """A recurrent benchmark as an estimator, with the inputs of the KS-NN."""
 
     n_states: int = setting(5, "size of the hidden state", least=1)
-    network_type: ClassVar[type[RecurrentNetwork]]
     template = "window_recurrent"
-
-    @property
-    def variant(self) -> str:
-        """Name of the structure."""
-        return f"states_{self.settings.n_states}"
-
-    @property
-    def full_title(self) -> str:
-        """With the number of states."""
-        return f"{self.title}, {self.settings.n_states} states"
-
-    def new_network(self) -> RecurrentNetwork:
-        """A network to load weights into."""
-        return self.network_type(self.settings)
 
     def c_values(self) -> dict[str, Any]:
         """Weights and sizes."""

@@ -19,7 +19,7 @@ from vehest.data.errors import ConfigurationError, DataError
 from vehest.data.recording import Recording
 from vehest.declared import Group, setting
 from vehest.estimators.base import FitData, FitRecord, Trial
-from vehest.estimators.network import Network
+from vehest.estimators.networks.recurrent import OfStates
 from vehest.estimators.networks.windowed import StandardisedNetwork
 from vehest.training.context import FitContext, record_of_epochs
 from vehest.training.sequences import Phase, PhaseSettings, drawn_starts, train_phases
@@ -121,7 +121,7 @@ class VelocityNetwork(StandardisedNetwork):
         """`forward` on standardised quantities."""
 
 
-class RecurrentVelocityEstimator(Network):
+class RecurrentVelocityEstimator(OfStates):
     """A recurrent network run over all samples of a drive, its hidden state starting from zero.
 
     The measured vx is read for sideslip = atan2(vy, vx), and to start networks that need a velocity to start from; the network sees it only
@@ -132,7 +132,6 @@ class RecurrentVelocityEstimator(Network):
     channels: tuple[str, ...]  # type: ignore[misc]  # depends on the settings
     training_type = SequenceSettings
     template = "velocity_recurrent"
-    network_type: ClassVar[type[VelocityNetwork]]
     network: VelocityNetwork
     inputs: tuple[str, ...] = setting(
         ("yaw_rate", "ax", "ay", "motor_speed", "motor_current", "steer"), "measured channels that the network sees"
@@ -163,20 +162,6 @@ class RecurrentVelocityEstimator(Network):
                 raise ConfigurationError(f"estimator.inputs: '{name}' comes from a reference sensor, which an estimator never sees")
         if "vy" not in self.outputs or not set(self.outputs) <= set(REFERENCES):
             raise ConfigurationError(f"estimator.outputs must be of {', '.join(REFERENCES)}, vy among them, not {', '.join(self.outputs)}")
-
-    def new_network(self) -> VelocityNetwork:
-        """A network of these sizes."""
-        return self.network_type(self.settings)
-
-    @property
-    def variant(self) -> str:
-        """Name of the structure."""
-        return f"states_{self.n_states}"
-
-    @property
-    def full_title(self) -> str:
-        """With the number of states."""
-        return f"{self.title}, {self.n_states} states"
 
     def fit_member(self, data: FitData, training: SequenceSettings, context: FitContext, index: int) -> FitRecord:
         """Train on sequences."""

@@ -67,16 +67,16 @@ class WindowedEstimator(Network):
         """Train members together (`train_members`).
 
         Raises:
-            DataError: recordings are too short or have gaps, or the loss is no longer finite.
-            ConfigurationError: the network cannot be trained so.
+            DataError: recordings are too short or have gaps, the loss is no longer finite, or a model to start from is damaged.
+            ConfigurationError: the network cannot be trained so, or a model to start from is of another family or has other settings.
         """
         first, dtype = members[0], getattr(torch, training.dtype)
         train, validation = (windows_of(part, first.channels, TARGET, first.window) for part in (data.train, data.validation))
-        started = start_weights(first, Path(training.start_from)) if training.start_from is not None else {}
+        started = first._weights_of(Path(training.start_from)) if training.start_from is not None else {}
         for member in members:
             member.network = member._seeded_network(list(data.train), dtype)
             if started:
-                member.network.load_state_dict({name: tensor.to(dtype) for name, tensor in started.items()})
+                member.network.load_state_dict({name: torch.as_tensor(values, dtype=dtype) for name, values in started.items()})
         seeds = [member._seed for member in members]
         return train_members([member.network for member in members], seeds, train, validation, training, context)
 
@@ -90,6 +90,16 @@ class WindowedEstimator(Network):
         if reset is not None:
             reset(torch.Generator().manual_seed(self._seed))
         return network
+
+    def _weights_of(self, folder: Path) -> dict[str, np.ndarray[Any, Any]]:
+        """Weights and ranges of another model of the same family and settings, to start a training from (fine-tuning)."""
+        other = load_model(folder)
+        if (other.name, other.settings) != (self.name, self.settings):
+            raise ConfigurationError(
+                f"training.start_from: '{folder.name}' is {other.full_title} with {asdict(other.settings)}; "
+                f"training starts from a model of the same family and settings, here {self.full_title} with {asdict(self.settings)}"
+            )
+        return other.weights()
 
     def _estimate_one(self, recording: Recording, initial_state: Mapping[str, float] | None) -> Estimate:
         if initial_state is not None:
@@ -134,33 +144,8 @@ class WindowStepper(Stepper):
         return {"vy": float(self._estimator._predict(np.array(self._window), np.zeros(1, dtype=np.int64))[0])}
 
 
-def start_weights(estimator: WindowedEstimator, folder: Path) -> dict[str, Tensor]:
-    """Weights and ranges of another model, to start a training from (fine-tuning).
-
-    Args:
-        estimator: that is to be trained.
-        folder: of a model of the same family and settings.
-
-    Raises:
-        ConfigurationError: it is of another family, or has other settings.
-        MissingError: there is no model.
-        DataError: its files are damaged.
-    """
-    other = load_model(folder)
-    if (other.name, other.settings) != (estimator.name, estimator.settings) or not isinstance(other, WindowedEstimator):
-        raise ConfigurationError(
-            f"training.start_from: '{folder.name}' is {other.full_title} with {asdict(other.settings)}; "
-            f"training starts from a model of the same family and settings, here {estimator.full_title} with {asdict(estimator.settings)}"
-        )
-    return {name: torch.from_numpy(values) for name, values in other.weights().items()}
-
-
 def _check_state(network: nn.Module) -> None:
-    """See that a network's state is what members can have and model files can hold.
-
-    Raises:
-        ConfigurationError: it has nothing to train, keeps running statistics, or holds other numbers than floating point.
-    """
+    """Refuse a network whose state members cannot have, or model files cannot hold."""
     kind = type(network).__name__
     if not any(parameter.requires_grad for parameter in network.parameters()):
         raise ConfigurationError(f"{kind} has no parameters to train")
@@ -199,10 +184,8 @@ class StandardisedNetwork(nn.Module):
 
     def standardise(self, train: Sequence[Recording], channels: Sequence[str], references: Sequence[str] = (TARGET,)) -> None:
         """Take means and standard deviations from recordings."""
-        for mean, scale, names in (
-            (self.input_mean, self.input_scale, channels),
-            (self.output_mean, self.output_scale, references),
-        ):
+        parts = ((self.input_mean, self.input_scale, channels), (self.output_mean, self.output_scale, references))
+        for mean, scale, names in parts:
             samples = np.concatenate([recording.stack(names) for recording in train])
             mean.copy_(torch.as_tensor(samples.mean(axis=0)).reshape(mean.shape))
             scale.copy_(torch.as_tensor(np.maximum(samples.std(axis=0), 1e-6)).reshape(scale.shape))
