@@ -77,10 +77,9 @@ class FlatParameters:
 
     def unpack(self, row: Tensor, module: nn.Module) -> None:
         """Copy one row, shape (K,), into a module."""
-        views = self.views(row.reshape(1, -1))
         with torch.no_grad():
-            for name, parameter in _trained(module):
-                parameter.copy_(views[name][0])
+            for (_, parameter), values in zip(_trained(module), self.views(row.unsqueeze(0)).values(), strict=True):
+                parameter.copy_(values[0])
 
 
 def _trained(module: nn.Module) -> list[tuple[str, nn.Parameter]]:

@@ -6,7 +6,7 @@ import itertools
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import ClassVar, NamedTuple
 
 import numpy as np
 from scipy import optimize
@@ -30,23 +30,14 @@ class DirectSearchSettings(Group):
     tolerance: float = setting(1e-4, "relative change of the parameters at which a search ends", positive=True)
 
 
-@dataclass(frozen=True)
-class SearchRecord:
-    """Outcome of a direct search.
+class SearchRecord(NamedTuple):
+    """Outcome of a direct search."""
 
-    Args:
-        best: parameters with the smallest cost, shape (K,).
-        cost: that cost.
-        starts: each start with the parameters and the cost it led to, shape (S, 2K + 1).
-        evaluations: cost evaluations in all.
-        interrupted: whether it was stopped before the last start.
-    """
-
-    best: FloatArray
-    cost: float
-    starts: FloatArray
-    evaluations: int
-    interrupted: bool
+    best: FloatArray  # parameters with the smallest cost, shape (K,)
+    cost: float  # that cost
+    starts: FloatArray  # each start with the parameters and the cost it led to, shape (S, 2K + 1)
+    evaluations: int  # of the cost, in all
+    interrupted: bool  # before the last start
 
 
 def nelder_mead_over_grid(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import ClassVar, Literal
 
@@ -80,41 +80,34 @@ def train_members(
     return run.finish()
 
 
+@dataclass
 class _Run:
     """State of one training; rows of ``flat``, of its average and of Adam's moments belong to the members in ``active``."""
 
-    def __init__(
-        self,
-        networks: Sequence[nn.Module],
-        seeds: Sequence[int],
-        train: WindowSet,
-        validation: WindowSet,
-        settings: SupervisedSettings,
-        context: FitContext,
-    ) -> None:
-        self.networks, self.settings, self.context = networks, settings, context
-        self.network = networks[0]
+    networks: Sequence[nn.Module]
+    seeds: Sequence[int]
+    train_windows: WindowSet
+    validation_windows: WindowSet
+    settings: SupervisedSettings
+    context: FitContext
+
+    def __post_init__(self) -> None:
+        members = len(self.networks)
+        self.network = self.networks[0]
         self.layout = FlatParameters(self.network)
-        self.fixed = fixed_state(networks) if is_plain(self.network) else {}
-        self.train, self.validation = _Prepared(self.network, train, settings), _Prepared(self.network, validation, settings)
-        flat = self.layout.pack(networks)
+        self.fixed = fixed_state(self.networks) if is_plain(self.network) else {}
+        self.train, self.validation = (_Prepared(self.network, own, self.settings) for own in (self.train_windows, self.validation_windows))
+        flat = self.layout.pack(self.networks)
         self.best = flat.clone()
-        self.best_loss = torch.full((len(networks),), math.inf, dtype=torch.float64)
-        self.best_epoch = torch.zeros(len(networks), dtype=torch.int64)
-        self.active = torch.arange(len(networks))
-        self.generators = [torch.Generator().manual_seed(_shuffle_seed(seed)) for seed in seeds]
-        self.history: list[tuple[list[float], list[float]]] = [([], []) for _ in networks]
+        self.best_loss = torch.full((members,), math.inf, dtype=torch.float64)
+        self.best_epoch = torch.zeros(members, dtype=torch.int64)
+        self.active = torch.arange(members)
+        self.generators = [torch.Generator().manual_seed(_shuffle_seed(seed)) for seed in self.seeds]
+        self.history: list[tuple[list[float], list[float]]] = [([], []) for _ in self.networks]
         self.epoch = 0  # of the members still active
         self.interrupted = False
         self.started = self.saved = time.monotonic()
-        self.average: Tensor | None = None  # of ``flat`` over the steps so far; none before the first, and without averaging
-        self._set_parameters(flat, {})
-
-    def _set_parameters(self, flat: Tensor, moments: Mapping[str, Tensor]) -> None:
-        self.flat = nn.Parameter(flat.clone())
-        self.adam = torch.optim.Adam([self.flat], lr=self.settings.learning_rate)
-        if moments:
-            self.adam.state[self.flat] = dict(moments)
+        self._go_on_with({"parameters": flat})
 
     def _rows(self, rows: Tensor | int) -> dict[str, Tensor]:
         """Copies of parameters, their average and Adam's moments of some active members; Adam's step is that of all."""
@@ -124,9 +117,12 @@ class _Run:
         return {name: (values[rows] if values.dim() else values).clone() for name, values in held.items()}
 
     def _go_on_with(self, rows: dict[str, Tensor]) -> None:
-        """Take back what `_rows` gave."""
+        """Take back what `_rows` gave; there is no average before the first step, and none without averaging."""
         self.average = rows.pop("average", None)
-        self._set_parameters(rows.pop("parameters"), rows)
+        self.flat = nn.Parameter(rows.pop("parameters").clone())
+        self.adam = torch.optim.Adam([self.flat], lr=self.settings.learning_rate)
+        if rows:
+            self.adam.state[self.flat] = rows
 
     def train_epoch(self) -> None:
         """One pass over the training windows, then the validation loss and the decisions that hang on it."""

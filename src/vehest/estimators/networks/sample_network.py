@@ -49,9 +49,7 @@ class OnSamples(Network):
     normalisation: Normalisation = setting("range", "range: inputs in [0, 1]; standard: a mean of 0 and a deviation of 1")
 
     def check(self) -> None:
-        """Raises:
-        ConfigurationError: a layer without neurons.
-        """
+        """Layers have neurons."""
         super().check()
         if min(self.hidden) < 1:
             raise ConfigurationError(f"estimator.hidden must be the widths of two layers, such as [250, 125], not {list(self.hidden)}")
@@ -122,10 +120,7 @@ class SampleNetwork(nn.Module):
             self.register_parameter(f"bias_{layer}", nn.Parameter(torch.zeros(members, after)))
 
     def reset(self, generators: Sequence[torch.Generator]) -> None:
-        """Draw initial weights of each member: Xavier's uniform ones; biases 0.
-
-        Source: Glorot & Bengio, Understanding the difficulty of training deep feedforward neural networks, 2010.
-        """
+        """Draw initial weights of each member: uniform ones of Glorot & Bengio 2010; biases 0."""
         with torch.no_grad():
             for name, parameter in self.named_parameters():
                 if name.startswith("bias"):
