@@ -94,7 +94,7 @@ def plain_epoch(config: dict[str, Any], seed: int, batches: int | None = None) -
 
     estimator = Ksnn.from_config(config)
     train, validation = drives()
-    network = estimator.new_network([train])
+    network = estimator.network_for([train])
     network.reset(torch.Generator().manual_seed(seed))
     optimiser = torch.optim.Adam(network.parameters(), lr=1e-3)
     learnt, held_out = (windows_of([part], estimator.channels, "vy_ref", WINDOW) for part in (train, validation))

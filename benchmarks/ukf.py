@@ -113,7 +113,7 @@ def pretrain(file: str) -> None:
     train = [task.estimator.drive(recording, torch.float32) for recording in recordings(TRAINED_ON[dataset()])]
     how = PhaseSettings(learning_rate=2e-3, max_epochs=40, validate_every=40, schedule="cosine")
     settings = ThroughFilterSettings(one_step=how)
-    phase = one_step_phase(model, model, train, train[:1], counted, settings, lambda name: name.startswith("dynamics."))
+    phase = one_step_phase(model, train, train[:1], counted, settings, lambda name: name.startswith("dynamics."))
     train_phases([phase], 0, FitContext())
     model.begin_noise(train, 0.0)
     torch.save(model.state_dict(), file)

@@ -18,7 +18,7 @@ from vehest.estimators.filtering.track_filter import groups_of, in_nonlinear_ran
 from vehest.filters.noise_levels import quiet_level
 from vehest.training.context import FitContext
 from vehest.training.identification import IdentificationSettings
-from vehest.training.search import staged_optuna_search
+from vehest.training.search import optuna_search
 
 LEVELS = {"ay": 0.06, "yaw_rate": 0.002, "process_vy": 1e-3, "process_yaw_rate": 1e-3}
 FORCES = {"force_factor": 1.5, "fy_front": 100.0, "fy_rear": 100.0}
@@ -169,7 +169,7 @@ def test_a_network_is_not_trained_behind_an_identification_that_was_stopped():
 
 def test_stages_search_wide_bounds_and_then_close_to_the_best():
     pytest.importorskip("optuna", reason="needs optuna: pip install 'vehest[tuning]'")
-    search = staged_optuna_search(lambda x: float(np.sum((x - 0.7) ** 2)), [(-5.0, 1.0)] * 2, 30, 0, FitContext(), stages=2, shrink=0.2)
+    search = optuna_search(lambda x: float(np.sum((x - 0.7) ** 2)), [(-5.0, 1.0)] * 2, 30, 0, FitContext(), stages=2, shrink=0.2)
     assert search.evaluations == len(search.starts) == 30
     assert np.ptp(search.starts[:15, 0]) > 2.0
     assert np.ptp(search.starts[15:, 0]) <= 1.2

@@ -44,6 +44,15 @@ def _weights(estimator) -> np.ndarray:
     return np.concatenate([values.ravel() for values in estimator.weights().values()])
 
 
+def _drives(estimator, recordings):
+    return velocity_recurrent._Drives(estimator, recordings, torch.float32)
+
+
+def _phase(estimator, training, train, validation):
+    drives = (_drives(estimator, recordings) for recordings in (train, validation))
+    return velocity_recurrent._phase(estimator.network, estimator.settings, training, *drives)
+
+
 @pytest.mark.parametrize("name", NAMES)
 def test_validation_loss_is_the_weighted_squared_error_of_the_estimate_without_dropped_samples(name: str) -> None:
     """Sequences of 100 samples from the start of the drive on, each estimated by itself through the public interface."""
@@ -114,10 +123,10 @@ def test_training_that_is_stopped_goes_on_to_the_same_weights_dropout_included(t
 
 def test_sequences_start_elsewhere_each_epoch_and_stay_within_their_recordings() -> None:
     estimator = _estimator("velocity_gru")
-    drives = [estimator._drive(recording) for recording in (_drive(1.7, 1), _drive(0.3, 2), _drive(0.9, 4))]
-    phase = velocity_recurrent._phase(estimator.network, estimator.settings, QUICK, drives, drives[:1])
+    recordings = [_drive(1.7, 1), _drive(0.3, 2), _drive(0.9, 4)]
+    phase = _phase(estimator, QUICK, recordings, recordings[:1])
     generator = torch.Generator().manual_seed(0)
-    known = [{tuple(row) for row in torch.as_tensor(drive.inputs, dtype=torch.float32).tolist()} for drive in drives]
+    known = [{tuple(row) for row in _drives(estimator, [recording]).inputs.tolist()} for recording in recordings]
     firsts = []
     for _ in range(3):
         sequences = [sequence for batch in phase.batches(generator) for sequence in batch.inputs]
@@ -132,8 +141,7 @@ def test_sequences_start_elsewhere_each_epoch_and_stay_within_their_recordings()
 
 def test_dropout_hides_its_share_of_the_hidden_state_and_keeps_the_mean() -> None:
     estimator = _estimator("velocity_gru", dropout=0.25, n_states=64)
-    drives = [estimator._drive(recording) for recording in DATA.train]
-    phase = velocity_recurrent._phase(estimator.network, estimator.settings, QUICK, drives, drives[:1])
+    phase = _phase(estimator, QUICK, DATA.train, DATA.train[:1])
     masks = torch.cat([batch.mask.reshape(-1) for batch in phase.batches(torch.Generator().manual_seed(0))])
     assert float((masks == 0).float().mean()) == pytest.approx(0.25, abs=0.02)
     assert float(masks.mean()) == pytest.approx(1.0, abs=0.03)
@@ -143,9 +151,9 @@ def test_truncated_training_takes_every_sample_of_every_drive_once_an_epoch() ->
     """Pieces of both drives, padded, their stretches in order: rows that count are the drives' rows, each once, in whatever order."""
     training = SequenceSettings(PhaseSettings(max_epochs=1), 60, 100, 0, validation_dropped_steps=20, truncate_steps=25, batch_size=3)
     estimator = _estimator("velocity_gru")
-    drives = [estimator._drive(recording) for recording in (_drive(1.7, 1), _drive(0.3, 2), _drive(0.9, 4))]
-    phase = velocity_recurrent._phase(estimator.network, estimator.settings, training, drives, drives[:1])
-    expected = sorted(tuple(row) for drive in drives for row in torch.as_tensor(drive.inputs, dtype=torch.float32).tolist())
+    recordings = [_drive(1.7, 1), _drive(0.3, 2), _drive(0.9, 4)]
+    phase = _phase(estimator, training, recordings, recordings[:1])
+    expected = sorted(tuple(row) for row in _drives(estimator, recordings).inputs.tolist())
     lengths = set()
     for seed in range(2):
         batches = list(phase.batches(torch.Generator().manual_seed(seed)))
@@ -162,10 +170,9 @@ def test_truncated_training_carries_the_state_and_stops_gradients_there(name: st
     """Losses of stretches are those of the sequence as a whole; the second stretch's gradient is that of a start that is a constant."""
     training = SequenceSettings(PhaseSettings(max_epochs=1), 60, 100, 0, truncate_steps=30, batch_size=1)
     estimator = _estimator(name)
-    drive = estimator._drive(_drive(0.6, 1))
-    network, settings = estimator.network, estimator.settings
-    phase = velocity_recurrent._phase(network, settings, training, [drive], [estimator._drive(DATA.validation[0])])
-    whole = velocity_recurrent._Cutter([drive], torch.float32).padded(torch.tensor([[0, 60]]), 0)
+    network, drive = estimator.network, _drive(0.6, 1)
+    phase = _phase(estimator, training, [drive], DATA.validation)
+    whole = _drives(estimator, [drive]).padded(torch.tensor([[0, 60]]), 0)
     parts = [whole.stretch(0, 30), whole.stretch(30, 60)]
     together, apart = phase.loss(whole).detach(), [phase.loss(part) for part in parts]
     assert float(together) == pytest.approx(float(sum(part.detach() for part in apart)) / 2.0, rel=1e-4)
@@ -182,17 +189,15 @@ def test_truncated_training_carries_the_state_and_stops_gradients_there(name: st
 def test_mirrored_sequences_change_the_sign_of_what_a_mirror_turns() -> None:
     training = SequenceSettings(PhaseSettings(max_epochs=1), 60, 100, 20, mirrored=1.0)
     estimator = _estimator("velocity_lstm")
-    drives = [estimator._drive(DATA.train[0])]
-    turned = next(
-        iter(velocity_recurrent._phase(estimator.network, estimator.settings, training, drives, drives).batches(torch.Generator()))
-    )
+    drives = _drives(estimator, DATA.train[:1])
+    turned = next(iter(_phase(estimator, training, DATA.train[:1], DATA.train[:1]).batches(torch.Generator())))
     signs = {"yaw_rate": -1.0, "ax": 1.0, "ay": -1.0}
-    known = {tuple(row) for row in torch.as_tensor(drives[0].inputs, dtype=torch.float32).tolist()}
+    known = {tuple(row) for row in drives.inputs.tolist()}
     own = (turned.inputs * torch.tensor([signs[name] for name in INPUTS])).reshape(-1, 3).tolist()
     assert {tuple(row) for row in own} <= known
     row = turned.inputs[0, 0] * torch.tensor([-1.0, 1.0, -1.0])
-    place = next(k for k, values in enumerate(torch.as_tensor(drives[0].inputs, dtype=torch.float32)) if torch.equal(values, row))
-    expected = torch.as_tensor(drives[0].targets[place], dtype=torch.float32) * torch.tensor([1.0, -1.0, -1.0])
+    place = next(k for k, values in enumerate(drives.inputs) if torch.equal(values, row))
+    expected = drives.targets[place] * torch.tensor([1.0, -1.0, -1.0])
     assert torch.equal(turned.targets[0, 0], expected)
 
 

@@ -19,7 +19,7 @@ from vehest.estimators.kernels.threads import over_members
 from vehest.estimators.ksnn import Ksnn
 from vehest.estimators.lstm import Lstm
 from vehest.run import group
-from vehest.training.members import FlatParameters, predict_members
+from vehest.training.members import FlatParameters, predict_members, prepare
 
 STRUCTURES = [
     Ksnn(Ksnn.settings_type(n_local=1, n_hidden=0, bias=True)),
@@ -43,7 +43,7 @@ def _problem(estimator, dtype, members=3, batch=70):
         rows.append(layout.pack([network])[0])
     flat = torch.stack(rows).requires_grad_()
     starts = torch.randint(0, len(windows), (members, batch), generator=torch.Generator().manual_seed(9))
-    series = network.prepared(torch.as_tensor(windows.series, dtype=dtype))
+    series = prepare(network, torch.as_tensor(windows.series, dtype=dtype))
     weights = torch.randn(members, batch, generator=torch.Generator().manual_seed(10), dtype=torch.float64).to(dtype)
 
     def value_and_gradient(compiled):

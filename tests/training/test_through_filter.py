@@ -11,6 +11,7 @@ from scipy import stats
 
 from small_car_drive import small_car_drive
 from vehest.data.errors import ConfigurationError, DataError
+from vehest.data.schema import settings_from_config
 from vehest.estimators.base import FitData
 from vehest.estimators.learned_ukf import LearnedUkf
 from vehest.training.context import FitContext
@@ -102,7 +103,7 @@ def phases_of(made: LearnedUkf, parts: list[Drive], training: ThroughFilterSetti
     from vehest.training.through_filter import Weights
 
     weights = Weights(*[torch.ones(5, dtype=torch.float64)] * 3)
-    return filter_phases(made.filter, made.filter, parts, parts, weights, training, training.through, lambda name: True, "through_filter")
+    return filter_phases(made.filter, parts, parts, weights, training, training.through, lambda name: True, "through_filter")
 
 
 def test_the_friction_starts_off_by_at_most_the_spread_and_the_other_states_true() -> None:
@@ -280,7 +281,7 @@ def test_killed_training_goes_on_to_the_same_weights(tmp_path: Path, stop: int) 
     ("changes", "message"),
     [
         ({"steps": 0}, "steps must be at least 1"),
-        ({"truncate_steps": -1}, "truncate_steps must not be negative"),
+        ({"truncate_steps": -1}, "truncate_steps must be at least 0"),
         ({"drop_steps": 40}, "more steps are dropped than a sequence has"),
         ({"placing": "everywhere"}, "placing 'everywhere' is not one of: fixed, random"),
         ({"start_noise": "guessed"}, "start_noise 'guessed' is not one of"),
@@ -290,4 +291,4 @@ def test_killed_training_goes_on_to_the_same_weights(tmp_path: Path, stop: int) 
 )
 def test_settings_that_make_no_sense_are_refused(changes: dict, message: str) -> None:
     with pytest.raises(ConfigurationError, match=message):
-        settings(**changes)
+        settings_from_config(ThroughFilterSettings, {"steps": 40} | changes, "training")

@@ -10,6 +10,7 @@ import torch
 from torch import nn
 
 from vehest.data.errors import ConfigurationError, DataError
+from vehest.data.schema import settings_from_config
 from vehest.training.checkpoints import load_checkpoint, resume_epoch
 from vehest.training.context import FitContext
 from vehest.training.sequences import Phase, PhaseSettings, train_phases
@@ -267,4 +268,4 @@ def test_phases_that_make_no_sense_are_refused() -> None:
         train_phases([_phase(network, trainable=lambda name: False)], 0, FitContext())
     for settings in ({"learning_rate": 0.0}, {"validate_every": 0}, {"clip": -1.0}, {"schedule": "linear"}):
         with pytest.raises(ConfigurationError, match=next(iter(settings))):
-            PhaseSettings(**settings)  # type: ignore[arg-type]
+            settings_from_config(PhaseSettings, settings, "training.phase")

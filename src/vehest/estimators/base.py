@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import Field, dataclass, field, make_dataclass
+from dataclasses import Field, dataclass, make_dataclass
 from operator import attrgetter
 from typing import Any, ClassVar, NamedTuple
 
@@ -18,6 +18,7 @@ from vehest.data.recording import Recording
 from vehest.data.schema import settings_from_config
 from vehest.declared import Group, setting
 from vehest.training.context import FitContext
+from vehest.training.context import FitRecord as FitRecord
 
 
 def rate(default: float) -> Any:
@@ -38,21 +39,6 @@ class FitData:
 
     train: Sequence[Recording]
     validation: Sequence[Recording]
-
-
-@dataclass(frozen=True)
-class FitRecord:
-    """How a fit went.
-
-    Args:
-        history: column -> values, one row an epoch or a search; empty where there is nothing to show.
-        metrics: figures such as ``epochs`` and ``train_seconds``.
-        interrupted: whether the fit was stopped before it was over.
-    """
-
-    history: Mapping[str, Sequence[float]] = field(default_factory=dict)
-    metrics: Mapping[str, float] = field(default_factory=dict)
-    interrupted: bool = False
 
 
 class Trial(NamedTuple):

@@ -20,14 +20,12 @@ from vehest.estimators.base import FitData, FitRecord, Trial
 from vehest.estimators.dugoff_ukf import PseudoMeasurement, with_variance
 from vehest.estimators.filtering.track_filter import TrackFilter
 from vehest.estimators.network_ukf import LEAST_VARIANCE, NetworkUkf
-from vehest.estimators.networks.sample_network import SampleNetwork, clip_sideslip, learnt_samples
-from vehest.estimators.phase_records import record_of_phases
-from vehest.estimators.references import reference_sideslip
+from vehest.estimators.networks.sample_network import SampleNetwork, clip_sideslip, learnt_samples, reference_sideslip
 from vehest.filters.gaussian import Gaussian
 from vehest.training.context import FitContext
 from vehest.training.identification import IdentificationSettings
 from vehest.training.samples import Draw, Samples, sample_phase
-from vehest.training.sequences import Phase, PhaseSettings, train_phases
+from vehest.training.sequences import Phase, PhaseSettings, drawn_starts, record_of_phases, train_phases
 
 START = (0.1, 0.02)  # m/s, rad/s: standard deviations of the true state that a training sequence starts from
 MOST_NOISE = 0.5  # m/s, rad/s, rad: middle of the logistic functions, beyond which no deviation starts or is pre-trained
@@ -159,22 +157,17 @@ class CnnUkf(NetworkUkf):
 
     def fit_network(self, data: FitData, training: EndToEndSettings, context: FitContext, index: int) -> FitRecord:
         """Pre-training, then training through the filter."""
-        slow = self.minimum_speed
-        raw, judged = (learnt_samples(part, self.network_inputs, self.name, slow) for part in (data.train, data.validation))
-        network = self.network = self.new_network().to(getattr(torch, training.dtype))
-        network.scale(*raw, self.normalisation)
-        network.reset([torch.Generator().manual_seed(self._seed)])
+        network, train, judged = self.begin_network(data, training, [self._seed], self.minimum_speed)
         levels = torch.tensor([self.levels["process_vy"], self.levels["process_yaw_rate"]], dtype=torch.float64)
         levels = levels.clamp(max=MOST_NOISE)  # a logistic function that is to say 1 or more saturates, and learns no more
         with torch.no_grad():  # logistic functions start where the filter alone has its levels, and as unsure as a network that says 0
             start = torch.cat([network.unit.double().reshape(1).clamp(max=MOST_NOISE), levels])
             network.get_parameter("bias_3")[0, 1:] = torch.logit(start).to(network.unit.dtype)
         handles = self._hold(network)
-        train = network.samples(*raw)
         driven = network.samples(*learnt_samples(data.train, self.network_inputs, self.name))  # sequences are cut from all that was driven
         end_to_end = EndToEnd(self, driven, data.train, training)
         phases = [
-            self._pre_training(train, network.samples(*judged), levels, training),
+            self._pre_training(train, judged, levels, training),
             Phase(
                 "end_to_end",
                 training.end_to_end,
@@ -259,14 +252,7 @@ class EndToEnd:
 
     def batches(self, generator: torch.Generator) -> Iterator[Cuts]:
         """As many sequences of each recording as fit into it, from an offset that is drawn, in random order."""
-        steps, firsts = self.training.steps, []
-        for length, offset in zip(self.lengths, self.offsets.tolist(), strict=False):
-            count = length // steps
-            if count:
-                shift = int(torch.randint(length - count * steps + 1, (), generator=generator))
-                firsts += [offset + shift + number * steps for number in range(count)]
-        order = torch.tensor(firsts)[torch.randperm(len(firsts), generator=generator)]
-        for chosen in order.split(self.training.batch_size):
+        for chosen in drawn_starts(self.lengths, self.training.steps, generator).split(self.training.batch_size):
             seeds = torch.randint(2**62, (1,), generator=generator)
             yield self.cut(chosen, seeds)
 

@@ -33,7 +33,7 @@ from vehest.estimators.filtering.track_filter import (
     in_nonlinear_range,
     padded,
 )
-from vehest.estimators.references import reference_sideslip
+from vehest.estimators.networks.sample_network import reference_sideslip
 from vehest.filters.gating import Gate
 from vehest.filters.gaussian import Filtered
 from vehest.filters.noise_levels import quiet_level
@@ -41,7 +41,7 @@ from vehest.filters.sigma_points import symmetric_rule
 from vehest.filters.unscented_scan import MARGIN, UnscentedStepper
 from vehest.training.context import FitContext
 from vehest.training.identification import LEAST_PROCESS_YAW_RATE, IdentificationSettings
-from vehest.training.search import SearchRecord, nelder_mead_over_grid, staged_optuna_search
+from vehest.training.search import SearchRecord, nelder_mead_over_grid, optuna_search
 from vehest.vehicle.dugoff import (
     BMW_545I,
     LARGEST_RATIO,
@@ -332,7 +332,7 @@ class DugoffUkf(SigmaPointEstimator):
         limits = BOXES | {"process_yaw_rate": (math.log10(LEAST_PROCESS_YAW_RATE), math.log10(training.most_process_yaw_rate))}
         boxes = [limits[name] for name in searched]
         if training.method == "optuna":
-            return staged_optuna_search(cost, boxes, training.trials, self._seed, context, stages=training.stages, shrink=training.shrink)
+            return optuna_search(cost, boxes, training.trials, self._seed, context, stages=training.stages, shrink=training.shrink)
         return nelder_mead_over_grid(cost, boxes, [STARTS[name] for name in searched], training.search, context)
 
     def mean_squared_error(

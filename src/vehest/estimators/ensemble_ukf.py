@@ -7,7 +7,6 @@ from dataclasses import dataclass
 from typing import Any, Literal
 
 import numpy as np
-import torch
 
 from vehest.constants import FloatArray
 from vehest.data.errors import ConfigurationError, DataError
@@ -17,13 +16,12 @@ from vehest.estimators.base import FitData, FitRecord, Trial
 from vehest.estimators.dugoff_ukf import PseudoMeasurement, finite
 from vehest.estimators.kernels.sample_network import gaussian_likelihood
 from vehest.estimators.network_ukf import LEAST_VARIANCE, NetworkUkf
-from vehest.estimators.networks.sample_network import SampleNetwork, clip_sideslip, learnt_samples
-from vehest.estimators.phase_records import record_of_phases
+from vehest.estimators.networks.sample_network import SampleNetwork, clip_sideslip
 from vehest.training.context import FitContext
 from vehest.training.identification import IdentificationSettings
-from vehest.training.samples import SampleSettings, sample_phase
-from vehest.training.search import SearchRecord, nelder_mead_over_grid, staged_optuna_search
-from vehest.training.sequences import PhaseSettings, train_phases
+from vehest.training.samples import SampleSettings
+from vehest.training.search import SearchRecord, nelder_mead_over_grid, optuna_search
+from vehest.training.sequences import PhaseSettings
 
 BOX = ((-6.0, 4.0), (0.2, 2.0))
 """Admissible p₁ and p₂ of Eq. 11; (0, 1) leaves the variance as it is."""
@@ -90,24 +88,8 @@ class EnsembleUkf(NetworkUkf):
 
     def fit_network(self, data: FitData, training: EnsembleSettings, context: FitContext, index: int) -> FitRecord:
         """Networks, then the scaling of their variance."""
-        slow = self.minimum_speed
-        raw, judged = (learnt_samples(part, self.network_inputs, self.name, slow) for part in (data.train, data.validation))
-        network = self.network = self.new_network().to(getattr(torch, training.dtype))
-        network.scale(*raw, self.normalisation)
         streams = np.random.SeedSequence([self._seed, 2]).generate_state(self.members, np.uint64) >> np.uint64(1)
-        network.reset([torch.Generator().manual_seed(int(stream)) for stream in streams])
-        train, validation = network.samples(*raw), network.samples(*judged)
-        phase = sample_phase(
-            "samples",
-            network,
-            training.phase,
-            training.batch_size,
-            len(train.targets),
-            self.members,
-            lambda draw: network.losses(train, draw, self.dropout, gaussian_likelihood),
-            lambda: network.validation_losses(validation, gaussian_likelihood),
-        )
-        record = record_of_phases(train_phases([phase], self._seed, context, index, training.checkpoint_seconds))
+        record = self.fit_samples(data, training, gaussian_likelihood, context, index, streams.tolist(), self.minimum_speed)
         if record.interrupted or training.identification.method == "data":
             return record
         search = self._search(data.validation, training, context)
@@ -130,7 +112,7 @@ class EnsembleUkf(NetworkUkf):
             return finite(self.mean_squared_error(recordings, how.skip_seconds, over=how.error, pseudo=pseudo))
 
         if how.method == "optuna":
-            return staged_optuna_search(cost, BOX, training.scaling_trials, self._seed, quiet, stages=how.stages, shrink=how.shrink)
+            return optuna_search(cost, BOX, training.scaling_trials, self._seed, quiet, stages=how.stages, shrink=how.shrink)
         return nelder_mead_over_grid(cost, BOX, STARTS, how.search, quiet)
 
     def _mean_and_variance(self, inputs: FloatArray) -> tuple[FloatArray, FloatArray]:

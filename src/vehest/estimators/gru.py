@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import torch
 from torch import Tensor
 
+from vehest.estimators.kernels import gru as kernel
 from vehest.estimators.networks.recurrent import TRIAL, RecurrentEstimator, RecurrentNetwork
 
 
@@ -19,8 +18,8 @@ class GruNetwork(RecurrentNetwork):
     Source: Cho et al. 2014; Gräber et al., IEEE T-IV 4 (1), 2019.
     """
 
-    def __init__(self, settings: Any) -> None:
-        super().__init__(settings, n_gates=3, n_channels=4)
+    n_gates = 3
+    compiled_last_state = staticmethod(kernel.last_state)
 
     def last_state(self, prepared_windows: Tensor) -> Tensor:
         """Hidden state after the window, from zero."""
@@ -35,17 +34,11 @@ class GruNetwork(RecurrentNetwork):
             state = candidate + update * (state - candidate)
         return state
 
-    def _kernel(self) -> Any:
-        from vehest.estimators.kernels import gru
-
-        return gru.last_state
-
 
 class Gru(RecurrentEstimator):
     """GRU benchmark."""
 
-    name = "gru"
-    title = "GRU"
+    name, title = "gru", "GRU"
     trials = (TRIAL,)
     network_type = GruNetwork
 

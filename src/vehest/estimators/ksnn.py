@@ -15,6 +15,7 @@ from torch import Tensor, nn
 from vehest.data.recording import Recording
 from vehest.declared import setting
 from vehest.estimators.base import Trial
+from vehest.estimators.kernels import ksnn as kernel
 from vehest.estimators.networks.windowed import WindowedEstimator
 
 GAMMA_START = 0.98
@@ -69,14 +70,12 @@ class KinematicsStructuredNetwork(nn.Module):
                     parameter.copy_(1.0 + SMALL * noise)
                 elif name == "hidden_weight":
                     parameter.copy_(noise)
-                elif name in ("linear_weight", "output_weight"):
-                    parameter.copy_(SMALL * noise.abs() if name == "linear_weight" else SMALL * noise)
+                elif name == "linear_weight":
+                    parameter.copy_(SMALL * noise.abs())
+                elif name == "output_weight":
+                    parameter.copy_(SMALL * noise)
                 else:
                     parameter.copy_(0.01 * noise)
-
-    def prepared(self, series: Tensor) -> Tensor:
-        """Measurements as they are."""
-        return series
 
     def constrain(self, parameters: Mapping[str, Tensor]) -> None:
         """Keep γ₁ in (0, 1] (Section IV-A2)."""
@@ -120,8 +119,6 @@ class KinematicsStructuredNetwork(nn.Module):
 
     def compiled_members(self, parameters: Mapping[str, Tensor], prepared: Tensor, starts: Tensor) -> Tensor:
         """The same for M members by the compiled recursion, (M, B)."""
-        from vehest.estimators.kernels import ksnn as kernel
-
         theta = self._packed(parameters)
         yaw_rate_max = float(self.yaw_rate_max)
         return kernel.predict(theta, prepared, starts, yaw_rate_max, self.step, self.settings.n_hidden, self.settings.window)
@@ -175,19 +172,20 @@ class Ksnn(WindowedEstimator):
         return shades[bias], "solid" if bias else "dashed", "^" if nonlinear else "o"
 
     @property
+    def kind(self) -> str:
+        """Of the feedback functions."""
+        return "nonlinear" if self.n_hidden else "linear"
+
+    @property
     def variant(self) -> str:
         """Name of the structure as in Table III."""
-        kind = "nonlinear" if self.n_hidden else "linear"
-        bias = "bias" if self.bias else "no_bias"
-        neurons = f"_q{self.n_hidden}" if self.n_hidden else ""
-        return f"{kind}_{bias}_p{self.n_local}{neurons}"
+        return f"{self.kind}_{'bias' if self.bias else 'no_bias'}_p{self.n_local}" + (f"_q{self.n_hidden}" if self.n_hidden else "")
 
     @property
     def full_title(self) -> str:
         """Structure in words, for example ``KS-NN linear + bias, P = 2``."""
-        kind = "nonlinear" if self.n_hidden else "linear"
         neurons = f", Q = {self.n_hidden}" if self.n_hidden else ""
-        return f"{self.title} {kind} {'+ bias' if self.bias else 'no bias'}, P = {self.n_local}{neurons}"
+        return f"{self.title} {self.kind} {'+ bias' if self.bias else 'no bias'}, P = {self.n_local}{neurons}"
 
     def network_for(self, train: list[Recording]) -> KinematicsStructuredNetwork:
         """A network whose local models span the yaw rates of the training recordings."""

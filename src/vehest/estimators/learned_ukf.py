@@ -21,12 +21,11 @@ from vehest.estimators.base import Estimator, FitData, FitRecord, Trial
 from vehest.estimators.filtering.car_filter import LEAST_ENTROPY, CarFilter
 from vehest.estimators.filtering.sigma_point_stepper import FilterStep, SigmaPointEstimator
 from vehest.estimators.network import Network
-from vehest.estimators.phase_records import record_of_phases
 from vehest.filters.gaussian import Gaussian
 from vehest.filters.noise_models import StateDependentNoise
 from vehest.filters.unscented_scan import MARGIN, UnscentedStepper
 from vehest.training.context import FitContext
-from vehest.training.sequences import PhaseRecord, train_phases
+from vehest.training.sequences import PhaseRecord, record_of_phases, train_phases
 from vehest.training.through_filter import Drive, ThroughFilterSettings, Weights, filter_phases, one_step_phase
 from vehest.vehicle.dynamics import (
     PACEJKA,
@@ -218,9 +217,8 @@ class LearnedUkf(Network, SigmaPointEstimator):
         counted = Weights(torch.cat([weights, last]), torch.cat([weights, last + 1.0]), torch.cat([weights[:3], last, last]))
         learns_dynamics = self.through_filter
         phases = [
-            one_step_phase(self.filter, self.filter, train, validation, counted, training, lambda name: name.startswith("dynamics.")),
+            one_step_phase(self.filter, train, validation, counted, training, lambda name: name.startswith("dynamics.")),
             *filter_phases(
-                self.filter,
                 self.filter,
                 train,
                 validation,

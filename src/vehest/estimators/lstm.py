@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import torch
 from torch import Tensor
 
+from vehest.estimators.kernels import lstm as kernel
 from vehest.estimators.networks.recurrent import TRIAL, RecurrentEstimator, RecurrentNetwork
 
 
@@ -19,8 +18,8 @@ class LstmNetwork(RecurrentNetwork):
     Source: Hochreiter & Schmidhuber 1997; Kong et al., World Electr. Veh. J. 13 (1), 2022.
     """
 
-    def __init__(self, settings: Any) -> None:
-        super().__init__(settings, n_gates=4, n_channels=4)
+    n_gates = 4
+    compiled_last_state = staticmethod(kernel.last_state)
 
     def last_state(self, prepared_windows: Tensor) -> Tensor:
         """Hidden state after the window, from zero."""
@@ -34,17 +33,11 @@ class LstmNetwork(RecurrentNetwork):
             state = show * torch.tanh(cell)
         return state
 
-    def _kernel(self) -> Any:
-        from vehest.estimators.kernels import lstm
-
-        return lstm.last_state
-
 
 class Lstm(RecurrentEstimator):
     """LSTM benchmark."""
 
-    name = "lstm"
-    title = "LSTM"
+    name, title = "lstm", "LSTM"
     trials = (TRIAL,)
     network_type = LstmNetwork
 

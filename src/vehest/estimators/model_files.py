@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
@@ -11,14 +10,13 @@ from typing import Any
 import numpy as np
 import torch
 import yaml
-from safetensors import SafetensorError
-from safetensors.numpy import load_file, save_file
+from safetensors import SafetensorError, safe_open
+from safetensors.numpy import save_file
 
 from vehest.data.errors import ConfigurationError, DataError, MissingError, VehestError
 from vehest.data.files import as_os_error, regular_file
-from vehest.data.limits import check_limit
 from vehest.data.schema import FURTHER_KEYS, check_format, validated
-from vehest.data.text_files import first_line, parse_json, read_yaml
+from vehest.data.text_files import first_line, read_yaml
 from vehest.data.transforms import Preparation
 from vehest.estimators.base import Estimator
 from vehest.estimators.registry import estimator_class
@@ -33,60 +31,34 @@ USUAL_SIZE = 4096
 
 @dataclass(frozen=True)
 class About:
-    """How a model came to be, as ``about`` of model.yaml says it; further keys are for people.
-
-    Args:
-        seed: of the fit.
-        datasets: names of the data sets that it learnt on.
-        trained_on: ranges that it learnt on.
-        validated_on: ranges that it was stopped on.
-        n_parameters: how many numbers the fit determined.
-        downsample: how recordings were brought to its rate.
-        interrupted: whether the fit was stopped before it was over.
-        note: what people should know of its estimates.
-    """
+    """How a model came to be, as ``about`` of model.yaml says it; further keys are for people."""
 
     __pydantic_config__ = FURTHER_KEYS
     seed: int = 0
-    datasets: tuple[str, ...] = ()
-    trained_on: tuple[str, ...] = ()
-    validated_on: tuple[str, ...] = ()
+    datasets: tuple[str, ...] = ()  # names of those that it learnt on
+    trained_on: tuple[str, ...] = ()  # ranges
+    validated_on: tuple[str, ...] = ()  # ranges that it was stopped on
     n_parameters: int | None = None
-    downsample: Preparation = field(default_factory=Preparation)
+    downsample: Preparation = field(default_factory=Preparation)  # how recordings were brought to its rate
     interrupted: bool = False
-    note: str = ""
+    note: str = ""  # what people should know of its estimates
 
 
 @dataclass(frozen=True)
 class Description:
-    """What model.yaml says.
+    """What model.yaml says."""
 
-    Args:
-        format: version of the layout.
-        estimator: name in the registry, never an import path.
-        settings: of the estimator, plain values.
-        variant: what the paper calls it.
-        channels: measured channels that it reads.
-        about: how it came to be.
-        version: of the estimator; folders older than this entry have "1".
-    """
-
-    format: int
-    estimator: str
-    settings: dict[str, Any]
-    variant: str = ""
-    channels: tuple[str, ...] = ()
+    format: int  # version of the layout
+    estimator: str  # name in the registry, never an import path
+    settings: dict[str, Any]  # of the estimator, plain values
+    variant: str = ""  # what the paper calls it
+    channels: tuple[str, ...] = ()  # that it reads
     about: About = field(default_factory=About)
-    version: str = "1"
+    version: str = "1"  # of the estimator; folders older than this entry have none
 
 
 def save_model(estimator: Estimator, folder: Path, about: Mapping[str, Any] | None = None) -> None:
-    """Write a fitted estimator into an existing folder.
-
-    Args:
-        estimator: fitted.
-        folder: where to.
-        about: plain values to keep beside it: those of `About`, and others for people.
+    """Write a fitted estimator into an existing folder; ``about`` are plain values of `About`, and others for people.
 
     Raises:
         OSError: it cannot be written.
@@ -125,9 +97,8 @@ def load_model(folder: Path) -> Estimator:
             f"'{folder}' holds version {description.version} of '{kind.name}', whose estimates differ from those of version {kind.version} "
             f"here; train it again, or use the vehest that trained it"
         )
-    weights = _read_weights(folder)
+    weights = _read_weights(folder, kind.open_weights)
     estimator = _built(kind, description.settings, sum(values.size for values in weights.values()), path)
-    _refuse_non_finite(weights, estimator.open_weights, folder / WEIGHTS)
     try:
         estimator.load_weights(weights)
     except VehestError as error:
@@ -167,7 +138,11 @@ def _built(kind: type[Estimator], settings: Mapping[str, Any], n_weights: int, p
             raise DataError(f"'{path}': {name} is {number:.4g}, and {WEIGHTS} holds {n_weights} numbers; the two do not belong together")
     try:
         own = validated(kind.settings_type, dict(settings), f"'{path}'", group="settings")
-        needed = _parameters_without_memory(kind, own)
+        try:
+            with torch.device("meta"):
+                needed = kind(own).n_parameters
+        except (RuntimeError, NotImplementedError, TypeError, ValueError, OverflowError):
+            needed = 0  # building it needs values
         if needed > n_weights:
             raise DataError(f"'{path.parent / WEIGHTS}' holds {n_weights} numbers, which do not fit its settings: they need {needed}")
         return kind(own)
@@ -175,81 +150,41 @@ def _built(kind: type[Estimator], settings: Mapping[str, Any], n_weights: int, p
         raise DataError(f"'{path}': {error}") from None
 
 
-def _parameters_without_memory(kind: type[Estimator], settings: Any) -> int:
-    """How many parameters an estimator of these settings has; 0 where building it needs values."""
-    try:
-        with torch.device("meta"):
-            return kind(settings).n_parameters
-    except (RuntimeError, NotImplementedError, TypeError, ValueError, OverflowError):
-        return 0
-
-
 def _whole_numbers(content: Any, name: str) -> Iterator[tuple[str, int]]:
     """Dotted names and values of the whole numbers in plain values."""
-    if isinstance(content, Mapping):
-        for key, inner in content.items():
-            yield from _whole_numbers(inner, f"{name}.{key}")
-    elif isinstance(content, list):
-        for position, inner in enumerate(content):
-            yield from _whole_numbers(inner, f"{name}.{position}")
-    elif isinstance(content, int) and not isinstance(content, bool):
+    if isinstance(content, int) and not isinstance(content, bool):
         yield name, content
+    elif isinstance(content, Mapping | list):
+        for key, inner in content.items() if isinstance(content, Mapping) else enumerate(content):
+            yield from _whole_numbers(inner, f"{name}.{key}")
 
 
-@dataclass(frozen=True)
-class _Tensor:
-    """A tensor as the header of a safetensors file declares it."""
-
-    dtype: str
-    shape: tuple[int, ...]
-    data_offsets: tuple[int, int]
-
-
-def _read_weights(folder: Path) -> dict[str, np.ndarray[Any, Any]]:
-    """Weights by name, of the lengths that the file itself has.
+def _read_weights(folder: Path, may_be_nan: tuple[str, ...]) -> dict[str, np.ndarray[Any, Any]]:
+    """Weights by name; what a tensor takes in memory is in the file.
 
     Raises:
         MissingError: there are none.
-        DataError: the file is damaged, or holds other numbers than float32 and float64.
+        DataError: the file is damaged, or holds other numbers than finite float32 and float64.
     """
     path = folder / WEIGHTS
     try:
-        size = regular_file(path).stat().st_size
+        regular_file(path)
     except MissingError:
         raise MissingError(f"'{folder}' has no {WEIGHTS}; train the model again") from None
+    weights = {}
     try:
-        with open(path, "rb") as stream:
-            length = int.from_bytes(stream.read(8), "little")
-            if not 0 < length <= size - 8:
-                raise DataError(f"'{path}' is truncated or damaged (a header of {length} bytes in a file of {size}); train the model again")
-            check_limit("text_bytes", length, f"'{path}' has a header of {length} bytes")
-            header = parse_json(stream.read(length), f"'{path}'")
-        if not isinstance(header, dict):
-            raise DataError(f"'{path}' is truncated or damaged (its header is no mapping); train the model again")
-        for name, entry in header.items():
-            if name != "__metadata__":
-                _check_tensor(validated(_Tensor, entry, f"'{path}': tensor '{name}'"), name, size - 8 - length, path)
-        return load_file(path)
+        with safe_open(path, framework="np") as file:
+            for name in file.keys():  # noqa: SIM118
+                kind = file.get_slice(name).get_dtype()
+                if kind not in DTYPES:
+                    raise DataError(f"'{path}': tensor '{name}' is of type {kind}, not one of: {', '.join(DTYPES)}")
+                weights[name] = file.get_tensor(name)
     except (SafetensorError, OSError, ValueError) as error:
         raise DataError(f"'{path}' is truncated or damaged ({first_line(error)}); train the model again") from error
-
-
-def _check_tensor(tensor: _Tensor, name: str, n_bytes: int, path: Path) -> None:
-    if tensor.dtype not in DTYPES:
-        raise DataError(f"'{path}': tensor '{name}' is of type {tensor.dtype[:20]}, not one of: {', '.join(DTYPES)}")
-    width = 4 if tensor.dtype == "F32" else 8
-    first, end = tensor.data_offsets
-    if min(tensor.shape, default=1) < 0 or end - first != width * math.prod(tensor.shape) or not 0 <= first <= end <= n_bytes:
-        raise DataError(
-            f"'{path}' is truncated or damaged (tensor '{name}' of shape {list(tensor.shape)} in bytes {first} to {end} of {n_bytes}); "
-            f"train the model again"
-        )
-
-
-def _refuse_non_finite(weights: Mapping[str, np.ndarray[Any, Any]], unset: tuple[str, ...], path: Path) -> None:
     for name, values in weights.items():
-        bad = np.isinf(values) if name in unset else ~np.isfinite(values)
+        bad = np.isinf(values) if name in may_be_nan else ~np.isfinite(values)
         if bad.any():
             raise DataError(
                 f"'{path}': {int(bad.sum())} of the {bad.size} numbers of tensor '{name}' are not finite; train the model again"
             )
+    return weights

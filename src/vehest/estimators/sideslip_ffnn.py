@@ -5,24 +5,14 @@ from __future__ import annotations
 from typing import Any, Literal
 
 import numpy as np
-import torch
 
 from vehest.constants import FloatArray
 from vehest.declared import setting
 from vehest.estimators.base import FitData, FitRecord, Trial
 from vehest.estimators.kernels.sample_network import squared_error
-from vehest.estimators.networks.sample_network import (
-    INPUTS,
-    NAMED,
-    OnSamples,
-    SampleNetwork,
-    clip_sideslip,
-    learnt_samples,
-)
-from vehest.estimators.phase_records import record_of_phases
+from vehest.estimators.networks.sample_network import INPUTS, NAMED, OnSamples, SampleNetwork, clip_sideslip
 from vehest.training.context import FitContext
-from vehest.training.samples import SampleSettings, sample_phase
-from vehest.training.sequences import train_phases
+from vehest.training.samples import SampleSettings
 
 
 class SideslipFfnn(OnSamples):
@@ -33,13 +23,7 @@ class SideslipFfnn(OnSamples):
     """
 
     name, title = "sideslip_ffnn", "Feed-forward network"
-    trials = (
-        Trial(
-            8,
-            "feed-forward network over single samples; a minute",
-            "estimator.inputs=imu training.phase.max_epochs=100",
-        ),
-    )
+    trials = (Trial(8, "feed-forward network over single samples; a minute", "estimator.inputs=imu training.phase.max_epochs=100"),)
     channels: tuple[str, ...]  # type: ignore[misc]  # depends on the settings
     training_type = SampleSettings
     ignores_initial_state = True
@@ -48,7 +32,7 @@ class SideslipFfnn(OnSamples):
 
     def __init__(self, settings: Any) -> None:
         super().__init__(settings)
-        self.channels = INPUTS[self.inputs]
+        self.channels = self.network_inputs = INPUTS[self.inputs]
         self.network = self.new_network()
 
     def new_network(self) -> SampleNetwork:
@@ -67,23 +51,7 @@ class SideslipFfnn(OnSamples):
 
     def fit_member(self, data: FitData, training: SampleSettings, context: FitContext, index: int) -> FitRecord:
         """Train on samples in random order."""
-        raw, judged = (learnt_samples(part, self.channels, self.name) for part in (data.train, data.validation))
-        network = self.network = self.new_network().to(getattr(torch, training.dtype))
-        network.scale(*raw, self.normalisation)
-        network.reset([torch.Generator().manual_seed(self._seed)])
-        train, validation = network.samples(*raw), network.samples(*judged)
-        phase = sample_phase(
-            "samples",
-            network,
-            training.phase,
-            training.batch_size,
-            len(train.targets),
-            1,
-            lambda draw: network.losses(train, draw, self.dropout, squared_error) * network.unit**2,
-            lambda: network.validation_losses(validation, squared_error) * network.unit**2,
-        )
-        (record,) = train_phases([phase], self._seed, context, index, training.checkpoint_seconds)
-        return record_of_phases([record])
+        return self.fit_samples(data, training, squared_error, context, index, [self._seed])
 
     def run(self, samples: FloatArray, state: Any) -> tuple[dict[str, Any], Any]:
         """v = u tan β, each sample by itself."""

@@ -39,15 +39,11 @@ class VelocityGruNetwork(VelocityNetwork):
 class VelocityGru(RecurrentVelocityEstimator):
     """GRU of Srinivasan et al. 2020; an ``initial_state`` that a protocol hands over is ignored: there is nothing to start from it."""
 
-    name = "velocity_gru"
-    title = "Velocity GRU"
+    name, title = "velocity_gru", "Velocity GRU"
     trials = (TRIAL,)
+    network_type = VelocityGruNetwork
     dropout: float = setting(0.075, "share of the hidden state that is hidden from the read-out in training", least=0.0, below=1.0)
     negative_slope: float = setting(0.3, "of the leaky rectifier after the read-out; assumed (the default of Keras)", above=0.0, most=1.0)
-
-    def new_network(self) -> VelocityGruNetwork:
-        """A network of these sizes."""
-        return VelocityGruNetwork(self.settings)
 
 
 ESTIMATOR = VelocityGru

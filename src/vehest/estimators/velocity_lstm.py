@@ -38,31 +38,22 @@ class VelocityLstmNetwork(VelocityNetwork):
         hidden, (last, cell) = self.recurrent(inputs, (state[0], state[1]))
         n_states = self.recurrent.hidden_size
         driven = nn.functional.linear(hidden if mask is None else hidden * mask, self.dense.weight[:, :n_states], self.dense.bias)
-        outputs = _feed_back(driven, state[2], self.dense.weight[:, n_states:].t(), self.read_out.weight.t(), self.read_out.bias)
-        return outputs, (last, cell, outputs[:, -1])
-
-
-def _feed_back(driven: Tensor, previous: Tensor, weight: Tensor, read_out: Tensor, bias: Tensor) -> Tensor:
-    """y⁺ = read_out relu(driven + weight y) + bias, sample after sample: (B, T, D), (B, O), (O, D), (D, O), (O,) -> (B, T, O)."""
-    outputs: list[Tensor] = []
-    for step in driven.unbind(1):
-        previous = torch.addmm(bias, torch.relu(torch.addmm(step, previous, weight)), read_out)
-        outputs.append(previous)
-    return torch.stack(outputs, dim=1)
+        by_previous, read_out = self.dense.weight[:, n_states:].t(), self.read_out.weight.t()
+        previous, outputs = state[2], []
+        for step in driven.unbind(1):
+            previous = torch.addmm(self.read_out.bias, torch.relu(torch.addmm(step, previous, by_previous)), read_out)
+            outputs.append(previous)
+        return torch.stack(outputs, dim=1), (last, cell, previous)
 
 
 class VelocityLstm(RecurrentVelocityEstimator):
     """Robust LSTM of Bou Ghosn et al. 2023; the previous estimate starts from ``initial_state``, else from measured velocities."""
 
-    name = "velocity_lstm"
-    title = "Velocity LSTM"
+    name, title = "velocity_lstm", "Velocity LSTM"
     trials = (TRIAL,)
+    network_type = VelocityLstmNetwork
     dropout: float = setting(0.075, "share of the hidden state that is hidden from the dense layers in training", least=0.0, below=1.0)
     n_dense: int = setting(64, "neurons of the hidden dense layer; assumed", least=1)
-
-    def new_network(self) -> VelocityLstmNetwork:
-        """A network of these sizes."""
-        return VelocityLstmNetwork(self.settings)
 
 
 ESTIMATOR = VelocityLstm

@@ -22,6 +22,7 @@ from vehest.estimators.networks.windowed import WindowedEstimator
 from vehest.estimators.sideslip_ffnn import SideslipFfnn
 from vehest.estimators.velocity_gru import VelocityGru
 from vehest.estimators.velocity_lstm import VelocityLstm
+from vehest.training.members import prepare
 
 OPSET = 18
 """Of the ai.onnx operators."""
@@ -108,7 +109,7 @@ class _WindowStep(_Step):
 
     def forward(self, sample: Tensor, window: Tensor) -> tuple[Tensor, ...]:
         window = torch.cat([window[1:], sample.unsqueeze(0)])
-        return self.network(self.network.prepared(window)) + 0.0 * window.sum(), window
+        return self.network(prepare(self.network, window)) + 0.0 * window.sum(), window
 
 
 class _VelocityStep(_Step):

@@ -5,9 +5,8 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Mapping
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
@@ -15,27 +14,17 @@ from torch import Tensor
 
 from vehest.data.errors import VehestError
 from vehest.data.files import as_os_error, regular_file, remove, written_aside
-from vehest.data.schema import FURTHER_KEYS, validated
 from vehest.data.text_files import parse_json
 
 _FILE = "checkpoint.safetensors"
+_LAYOUT = b"2"  # of what trainings keep; a checkpoint of another one is none
 
 
-@dataclass(frozen=True)
-class Checkpoint:
+class Checkpoint(NamedTuple):
     """Tensors and plain values of a training's state."""
 
     tensors: Mapping[str, Tensor]
     values: Mapping[str, Any]
-
-
-@dataclass(frozen=True)
-class _Progress:
-    """What every checkpoint says beside what its training keeps for itself."""
-
-    __pydantic_config__ = FURTHER_KEYS
-    epoch: int
-    finished: bool = False
 
 
 def save_checkpoint(folder: Path, checkpoint: Checkpoint) -> None:
@@ -64,15 +53,15 @@ def load_checkpoint(folder: Path) -> Checkpoint | None:
             if kept.get("digest") != _digest(kept.get("values", ""), tensors):
                 return None
             values = parse_json(kept["values"], f"'{path}'")
-            validated(_Progress, values, f"'{path}'")
-            return Checkpoint(tensors, values)
+            sound = isinstance(values.get("epoch"), int) and isinstance(values.setdefault("finished", False), bool)
+            return Checkpoint(tensors, values) if sound else None
     except (SafetensorError, VehestError, ValueError, OSError):
         return None
 
 
 def _digest(values: str, tensors: Mapping[str, Tensor]) -> str:
     """Hash of all that a checkpoint holds: one that has been damaged anywhere is none."""
-    digest = hashlib.sha256(values.encode())
+    digest = hashlib.sha256(_LAYOUT + values.encode())
     for name, tensor in sorted(tensors.items()):
         digest.update(f"{name} {tensor.dtype} {tuple(tensor.shape)}".encode())
         digest.update(tensor.numpy().tobytes())
@@ -87,8 +76,7 @@ def resume_epoch(folder: Path) -> int:
     checkpoint = load_checkpoint(folder)
     if checkpoint is None:
         return 0
-    progress = validated(_Progress, dict(checkpoint.values), f"'{folder / _FILE}'")
-    return -1 if progress.finished else progress.epoch
+    return -1 if checkpoint.values["finished"] else int(checkpoint.values["epoch"])
 
 
 def drop_checkpoint(folder: Path) -> None:

@@ -1,18 +1,10 @@
-"""Surroundings of a fit: checkpoints, stopping, progress; and the settings of one that learns nothing."""
+"""Surroundings of a fit: checkpoints, stopping, progress; its record; and the settings of one that learns nothing."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-
-
-def _never() -> bool:
-    return False
-
-
-def _silent(progress: Progress) -> None:
-    return None
 
 
 @dataclass(frozen=True)
@@ -45,8 +37,36 @@ class FitContext:
     """
 
     checkpoint_folders: Sequence[Path] = ()
-    should_stop: Callable[[], bool] = field(default=_never)
-    on_progress: Callable[[Progress], None] = field(default=_silent)
+    should_stop: Callable[[], bool] = lambda: False
+    on_progress: Callable[[Progress], None] = lambda progress: None
+
+
+@dataclass(frozen=True)
+class FitRecord:
+    """How a fit went.
+
+    Args:
+        history: column -> values, one row an epoch or a search; empty where there is nothing to show.
+        metrics: figures such as ``epochs`` and ``train_seconds``.
+        interrupted: whether the fit was stopped before it was over.
+    """
+
+    history: Mapping[str, Sequence[float]] = field(default_factory=dict)
+    metrics: Mapping[str, float] = field(default_factory=dict)
+    interrupted: bool = False
+
+
+def record_of_epochs(
+    train_loss: Sequence[float],
+    validation_loss: Sequence[float],
+    metrics: Mapping[str, float],
+    interrupted: bool,
+    **columns: Sequence[float],
+) -> FitRecord:
+    """The record of a fit with one row an epoch: ``columns``, then epoch and losses."""
+    epochs = len(train_loss)
+    history = {**columns, "epoch": range(1, epochs + 1), "train_loss": train_loss, "validation_loss": validation_loss}
+    return FitRecord({name: list(values) for name, values in history.items()}, {"epochs": epochs, **metrics}, interrupted)
 
 
 @dataclass(frozen=True)

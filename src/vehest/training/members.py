@@ -2,6 +2,14 @@
 
 Each member's parameters are one row of a matrix, so that everything elementwise (Adam, best weights, stopping) works on
 rows, and what happens in one row never touches another: a member trains exactly as it would alone.
+
+A network is any ``nn.Module`` whose forward maps prepared windows to the lateral velocity [m/s] one step after them, (B, N, C) -> (B,) or
+(B, 1). It may have besides:
+
+- ``prepared(series)``: the series as it consumes it (scaled, say), (T, C) -> (T, C), asked for once; else as it was measured, in SI;
+- ``reset(generator)``: draws initial weights; else they are those that torch draws when it is built, under the member's seed;
+- ``constrain(parameters)``: brings parameters (M, ...) back into their admissible range, in place; else all are admissible;
+- ``compiled_members(parameters, prepared, starts)``: forward of M members on their own windows, (M, B), by a compiled recursion.
 """
 
 from __future__ import annotations
@@ -9,7 +17,6 @@ from __future__ import annotations
 import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, nullcontext
-from typing import Protocol
 from weakref import WeakSet
 
 import torch
@@ -18,34 +25,6 @@ from torch import Tensor, nn
 from vehest.data.errors import ConfigurationError
 
 MOST_WINDOWS = 1024  # evaluated at once where no gradient is wanted: each is laid out by itself in memory
-
-
-class WindowNetwork(Protocol):
-    """A network that maps a window of measurements to the lateral velocity one step after it: any ``nn.Module`` with this forward."""
-
-    def forward(self, windows: Tensor) -> Tensor:
-        """Prediction from prepared windows, (B, N, C) -> (B,) or (B, 1), in m/s."""
-        ...
-
-
-class WindowNetworkHooks(Protocol):
-    """What a `WindowNetwork` may have besides; each does without."""
-
-    def prepared(self, series: Tensor) -> Tensor:
-        """Series as the network consumes it (scaled, say), (T, C) -> (T, C); once, before training. Without: as it was measured, in SI."""
-        ...
-
-    def reset(self, generator: torch.Generator) -> None:
-        """Draw initial weights. Without: those that torch draws when the network is built, under the member's seed."""
-        ...
-
-    def constrain(self, parameters: Mapping[str, Tensor]) -> None:
-        """Bring parameters of shape (M, ...) back into their admissible range, in place. Without: all are admissible."""
-        ...
-
-    def compiled_members(self, parameters: Mapping[str, Tensor], prepared: Tensor, starts: Tensor) -> Tensor:
-        """The same as forward for M members on their own windows by a compiled recursion, (M, B). Without: see `predict_members`."""
-        ...
 
 
 def prepare(network: nn.Module, series: Tensor) -> Tensor:
@@ -76,10 +55,8 @@ def random_numbers(seed: int) -> Iterator[None]:
 
 def fixed_state(modules: Sequence[nn.Module]) -> dict[str, Tensor]:
     """Buffers and parameters that no gradient is wanted of, by name, (M, ...)."""
-    own = [
-        {name: p.detach() for name, p in module.named_parameters() if not p.requires_grad} | dict(module.named_buffers())
-        for module in modules
-    ]
+    frozen = [{name: p.detach() for name, p in module.named_parameters() if not p.requires_grad} for module in modules]
+    own = [parameters | dict(module.named_buffers()) for parameters, module in zip(frozen, modules, strict=True)]
     return {name: torch.stack([state[name] for state in own]) for name in own[0]}
 
 
@@ -87,13 +64,7 @@ class FlatParameters:
     """Where each parameter of a module that is trained sits in a row of a (members, K) matrix."""
 
     def __init__(self, module: nn.Module) -> None:
-        self.shapes = {name: tuple(parameter.shape) for name, parameter in _trained(module)}
-        self.sizes = {name: parameter.numel() for name, parameter in _trained(module)}
-
-    @property
-    def n_parameters(self) -> int:
-        """Number K of parameters of one member."""
-        return sum(self.sizes.values())
+        self.shapes = {name: parameter.shape for name, parameter in _trained(module)}
 
     def pack(self, modules: Sequence[nn.Module]) -> Tensor:
         """Rows of parameters, shape (M, K)."""
@@ -101,16 +72,14 @@ class FlatParameters:
 
     def views(self, flat: Tensor) -> dict[str, Tensor]:
         """Parameters by name, each of shape (M, ...), as views of ``flat`` (M, K)."""
-        pieces = torch.split(flat, list(self.sizes.values()), dim=1)
-        members = flat.shape[0]
-        return {name: piece.view(members, *shape) for (name, shape), piece in zip(self.shapes.items(), pieces, strict=True)}
+        pieces = flat.split([shape.numel() for shape in self.shapes.values()], dim=1)
+        return {name: piece.view(len(flat), *shape) for (name, shape), piece in zip(self.shapes.items(), pieces, strict=True)}
 
     def unpack(self, row: Tensor, module: nn.Module) -> None:
         """Copy one row, shape (K,), into a module."""
-        views = self.views(row.reshape(1, -1))
         with torch.no_grad():
-            for name, parameter in _trained(module):
-                parameter.copy_(views[name][0])
+            for (_, parameter), values in zip(_trained(module), self.views(row.unsqueeze(0)).values(), strict=True):
+                parameter.copy_(values[0])
 
 
 def _trained(module: nn.Module) -> list[tuple[str, nn.Parameter]]:
@@ -133,7 +102,7 @@ def predict_members(
     computation a member where it cannot (``nn.LSTM``, ``nn.GRU``) or where a layer draws random numbers (dropout).
 
     Args:
-        network: a `WindowNetwork`, whose own parameters and buffers are used where ``parameters`` does not name them.
+        network: whose own parameters and buffers are used where ``parameters`` does not name them.
         parameters: name -> (M, ...).
         prepared: (T, C), what `prepare` returned.
         starts: first row of each window, (M, B), int64.

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import itertools
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import ClassVar, NamedTuple
 
 import numpy as np
 from scipy import optimize
@@ -29,23 +30,14 @@ class DirectSearchSettings(Group):
     tolerance: float = setting(1e-4, "relative change of the parameters at which a search ends", positive=True)
 
 
-@dataclass(frozen=True)
-class SearchRecord:
-    """Outcome of a direct search.
+class SearchRecord(NamedTuple):
+    """Outcome of a direct search."""
 
-    Args:
-        best: parameters with the smallest cost, shape (K,).
-        cost: that cost.
-        starts: each start with the parameters and the cost it led to, shape (S, 2K + 1).
-        evaluations: cost evaluations in all.
-        interrupted: whether it was stopped before the last start.
-    """
-
-    best: FloatArray
-    cost: float
-    starts: FloatArray
-    evaluations: int
-    interrupted: bool
+    best: FloatArray  # parameters with the smallest cost, shape (K,)
+    cost: float  # that cost
+    starts: FloatArray  # each start with the parameters and the cost it led to, shape (S, 2K + 1)
+    evaluations: int  # of the cost, in all
+    interrupted: bool  # before the last start
 
 
 def nelder_mead_over_grid(
@@ -67,35 +59,28 @@ def nelder_mead_over_grid(
     Source:
         Lagarias et al. 1998, as in Da Lio et al. 2023, Appendix A.
     """
-    axes = [np.linspace(low, high, settings.grid) for low, high in start_range]
     scale = np.array([high - low for low, high in box])
+    bounds = [(low / own, high / own) for (low, high), own in zip(box, scale, strict=True)]
+    limits = {"maxfev": settings.max_evaluations, "xatol": settings.tolerance, "fatol": 1e-12}
+    starts = list(itertools.product(*(np.linspace(low, high, settings.grid) for low, high in start_range)))
     rows: list[FloatArray] = []
-    evaluations, interrupted = 0, False
-    starts = list(itertools.product(*axes))
+    evaluations = 0
     for start in starts:
         if context.should_stop() and rows:
-            interrupted = True
             break
-        result = optimize.minimize(
-            lambda unit: cost(unit * scale),
-            np.array(start) / scale,
-            method="Nelder-Mead",
-            bounds=[(low / s, high / s) for (low, high), s in zip(box, scale, strict=True)],
-            options={
-                "maxfev": settings.max_evaluations,
-                "xatol": settings.tolerance,
-                "fatol": 1e-12,
-                "initial_simplex": _simplex(
-                    np.array(start) / scale, [(low / s, high / s) for (low, high), s in zip(box, scale, strict=True)]
-                ),
-            },
-        )
+        first = np.array(start) / scale
+        options = {**limits, "initial_simplex": _simplex(first, bounds)}
+        result = optimize.minimize(lambda unit: cost(unit * scale), first, method="Nelder-Mead", bounds=bounds, options=options)
         evaluations += result.nfev
         rows.append(np.concatenate([start, result.x * scale, [result.fun]]))
         context.on_progress(Progress(len(rows), len(starts), 1, 1, float(min(row[-1] for row in rows))))
+    return _record(rows, evaluations, len(rows) < len(starts))
+
+
+def _record(rows: Sequence[FloatArray], evaluations: int, interrupted: bool) -> SearchRecord:
     table = np.array(rows)
     best = table[np.argmin(table[:, -1])]
-    n = len(box)
+    n = len(best) // 2
     return SearchRecord(best[n : 2 * n], float(best[-1]), table, evaluations, interrupted)
 
 
@@ -109,21 +94,31 @@ def _simplex(start: FloatArray, box: Sequence[tuple[float, float]]) -> FloatArra
 
 
 def optuna_search(
-    cost: Callable[[FloatArray], float], box: Sequence[tuple[float, float]], trials: int, seed: int, context: FitContext
+    cost: Callable[[FloatArray], float],
+    box: Sequence[tuple[float, float]],
+    trials: int,
+    seed: int,
+    context: FitContext,
+    *,
+    stages: int = 1,
+    shrink: float = 0.3,
 ) -> SearchRecord:
-    """Minimise a cost inside a box by Optuna's tree-structured Parzen estimator.
+    """Minimise a cost by Optuna's tree-structured Parzen estimator: in the whole box, then perhaps in smaller ones around the best so far.
 
     Args:
         cost: function of the parameters, shape (K,).
-        box: admissible range of each parameter.
-        trials: evaluations.
-        seed: of the random numbers that are drawn.
+        box: admissible range of each parameter, which no stage leaves.
+        trials: evaluations of all stages together, shared out evenly.
+        seed: of the random numbers that the first stage draws; the others follow it.
         context: progress and the wish to stop.
+        stages: how many there are.
+        shrink: width of the box of a stage, relative to that of the stage before.
 
     Raises:
         MissingError: Optuna is not installed.
 
-    Source: Bergstra et al., Advances in Neural Information Processing Systems 24, 2011; Akiba et al., KDD 2019.
+    Source: Bergstra et al., Advances in Neural Information Processing Systems 24, 2011; Akiba et al., KDD 2019; stages as in Bertipaglia
+    et al., IEEE Intelligent Vehicles Symposium 2022.
     """
     try:
         import optuna
@@ -132,64 +127,26 @@ def optuna_search(
             "a search of method=optuna needs Optuna: pip install 'vehest[tuning]', or set method=nelder_mead in its settings"
         ) from None
     optuna.logging.set_verbosity(optuna.logging.WARNING)
-    study = optuna.create_study(sampler=optuna.samplers.TPESampler(seed=seed))
-    distributions = {str(k): optuna.distributions.FloatDistribution(low, high) for k, (low, high) in enumerate(box)}
     rows: list[FloatArray] = []
-    for number in range(trials):
-        if context.should_stop() and rows:
-            break
-        trial = study.ask(distributions)
-        values = np.array([trial.params[name] for name in distributions])
-        rows.append(np.concatenate([values, values, [cost(values)]]))
-        study.tell(trial, float(rows[-1][-1]))
-        context.on_progress(Progress(number + 1, trials, 1, 1, float(min(row[-1] for row in rows))))
-    table = np.array(rows)
-    best = table[np.argmin(table[:, -1])]
-    return SearchRecord(best[: len(box)], float(best[-1]), table, len(rows), len(rows) < trials)
-
-
-def staged_optuna_search(
-    cost: Callable[[FloatArray], float],
-    box: Sequence[tuple[float, float]],
-    trials: int,
-    seed: int,
-    context: FitContext,
-    *,
-    stages: int = 2,
-    shrink: float = 0.3,
-) -> SearchRecord:
-    """Minimise a cost by Optuna in stages: first in the whole box, then in smaller ones around the best so far.
-
-    Args:
-        cost: function of the parameters, shape (K,).
-        box: admissible range of each parameter, which no stage leaves.
-        trials: evaluations of all stages together, shared out evenly.
-        seed: of the first stage; the others follow it.
-        context: progress and the wish to stop.
-        stages: how many there are.
-        shrink: width of the box of a stage, relative to that of the stage before.
-
-    Raises:
-        MissingError: Optuna is not installed.
-
-    Source: Bertipaglia et al., IEEE Intelligent Vehicles Symposium 2022 (two-stage Bayesian optimisation).
-    """
-    records: list[SearchRecord] = []
-    width = 1.0
+    own, width = list(box), 1.0
     for stage in range(stages):
-        own = list(box)
-        if records:
-            best = min(records, key=lambda record: record.cost).best
-            width *= shrink
+        if rows:
+            best, width = _record(rows, len(rows), False).best, width * shrink
             own = [_around(value, low, high, width * (high - low)) for value, (low, high) in zip(best, box, strict=True)]
         share = trials * (stage + 1) // stages - trials * stage // stages
-        records.append(optuna_search(cost, own, share, seed + stage, context))
-        if records[-1].interrupted:
-            break
-    won = min(records, key=lambda record: record.cost)
-    evaluations = sum(record.evaluations for record in records)
-    starts = np.concatenate([record.starts for record in records])
-    return SearchRecord(won.best, won.cost, starts, evaluations, records[-1].interrupted)
+        study = optuna.create_study(sampler=optuna.samplers.TPESampler(seed=seed + stage))
+        distributions = {str(k): optuna.distributions.FloatDistribution(low, high) for k, (low, high) in enumerate(own)}
+        lowest = math.inf
+        for number in range(share):
+            if context.should_stop() and number:
+                return _record(rows, len(rows), True)
+            trial = study.ask(distributions)
+            values = np.array([trial.params[name] for name in distributions])
+            rows.append(np.concatenate([values, values, [cost(values)]]))
+            lowest = min(lowest, float(rows[-1][-1]))
+            study.tell(trial, float(rows[-1][-1]))
+            context.on_progress(Progress(number + 1, share, 1, 1, lowest))
+    return _record(rows, len(rows), False)
 
 
 def _around(value: float, low: float, high: float, width: float) -> tuple[float, float]:

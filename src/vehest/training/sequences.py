@@ -5,7 +5,8 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
@@ -15,10 +16,9 @@ from torch import Tensor, nn
 from vehest.data.errors import ConfigurationError, DataError
 from vehest.declared import Group, setting
 from vehest.training.checkpoints import Checkpoint, load_checkpoint, save_checkpoint
-from vehest.training.context import FitContext, Progress
+from vehest.training.context import FitContext, FitRecord, Progress, record_of_epochs
 
 SKIPS_ALLOWED = 20  # steps in a row without a finite loss and gradient after which training gives up
-_MOMENTS = ("step", "exp_avg", "exp_avg_sq")
 
 
 @dataclass(frozen=True)
@@ -63,13 +63,12 @@ class Phase:
     prepare: Callable[[], None] | None = None
 
 
-@dataclass(frozen=True)
+@dataclass
 class PhaseRecord:
-    """How a phase went.
+    """How a phase goes; plain values, which a checkpoint keeps as they are.
 
     Args:
         name: of the phase.
-        epochs: epochs finished.
         best_epoch: epoch (from 1) whose parameters were kept; 0 if none was better than the start.
         best_loss: validation loss of the parameters that were kept.
         start_loss: validation loss before the first epoch; NaN if it was stopped before.
@@ -77,19 +76,44 @@ class PhaseRecord:
         validation_loss: after each epoch; NaN where not validated.
         seconds: wall time, earlier runs that a checkpoint continues included [s].
         skipped_steps: batches whose loss or gradient was not finite.
+        skipped_in_a_row: the last of them.
+        validated: whether it was, before the first epoch.
         interrupted: whether it was stopped before it was over.
     """
 
     name: str
-    epochs: int
-    best_epoch: int
-    best_loss: float
-    start_loss: float
-    train_loss: tuple[float, ...]
-    validation_loss: tuple[float, ...]
-    seconds: float
-    skipped_steps: int
-    interrupted: bool
+    best_epoch: int = 0
+    best_loss: float = math.inf
+    start_loss: float = math.nan
+    train_loss: list[float] = field(default_factory=list)
+    validation_loss: list[float] = field(default_factory=list)
+    seconds: float = 0.0
+    skipped_steps: int = 0
+    skipped_in_a_row: int = 0
+    validated: bool = False
+    interrupted: bool = False
+
+    @property
+    def epochs(self) -> int:
+        """Epochs finished."""
+        return len(self.train_loss)
+
+
+def record_of_phases(phases: Sequence[PhaseRecord]) -> FitRecord:
+    """History over the epochs of all phases, and the last phase's figures; epochs, skipped steps and seconds are those of all."""
+    last = phases[-1]
+    metrics = {
+        "best_epoch": last.best_epoch,
+        "best_validation_loss": last.best_loss,
+        "start_validation_loss": last.start_loss,
+        "skipped_steps": sum(phase.skipped_steps for phase in phases),
+        "train_seconds": sum(phase.seconds for phase in phases),
+        **{f"{phase.name}_seconds": phase.seconds for phase in phases},
+    }
+    train_loss = [loss for phase in phases for loss in phase.train_loss]
+    validation_loss = [loss for phase in phases for loss in phase.validation_loss]
+    numbers = [number for number, phase in enumerate(phases) for _ in phase.train_loss]
+    return record_of_epochs(train_loss, validation_loss, metrics, last.interrupted, phase=numbers)
 
 
 def train_phases(
@@ -126,72 +150,45 @@ def train_phases(
     Source:
         Loshchilov & Hutter, Decoupled weight decay regularization, 2019 (AdamW); Węgrzynowski et al. 2024 train in such phases.
     """
-    run = _Run(phases, seed, context, folder_index, checkpoint_seconds, twins)
+    if len({phase.name for phase in phases}) != len(phases):
+        raise ConfigurationError(f"training: phases must have different names, not {', '.join(phase.name for phase in phases)}")
+    folders = [context.checkpoint_folders[i] for i in (folder_index, *twins) if i < len(context.checkpoint_folders)]
+    run = _Run(phases, seed, context, folder_index, checkpoint_seconds, folders)
     run.resume()
-    while run.position < len(phases) and not run.interrupted:
+    while run.position < len(phases) and not run.now.interrupted:
         run.train_phase()
     return run.records
 
 
 @dataclass
-class _Progressing:
-    """What a phase under way has come to; plain values, which a checkpoint keeps as they are."""
-
-    name: str
-    epoch: int = 0
-    best_epoch: int = 0
-    best_loss: float = math.inf
-    start_loss: float = math.nan
-    train_loss: list[float] = field(default_factory=list)
-    validation_loss: list[float] = field(default_factory=list)
-    seconds: float = 0.0
-    skipped: int = 0
-    skipped_in_a_row: int = 0
-    validated: bool = False  # before its first epoch
-
-    def record(self, interrupted: bool) -> PhaseRecord:
-        losses = (tuple(self.train_loss), tuple(self.validation_loss))
-        best = (self.best_epoch, self.best_loss, self.start_loss)
-        return PhaseRecord(self.name, self.epoch, *best, *losses, self.seconds, self.skipped, interrupted)
-
-
 class _Run:
-    """State of a training: phases done, the phase under way, parameters, best ones, moments, generator."""
+    """State of a training: records of the phases begun; of the phase under way its parameters, the best of them, moments and generator."""
 
-    def __init__(
-        self,
-        phases: Sequence[Phase],
-        seed: int,
-        context: FitContext,
-        folder_index: int,
-        checkpoint_seconds: float,
-        twins: Sequence[int],
-    ) -> None:
-        if len({phase.name for phase in phases}) != len(phases):
-            raise ConfigurationError(f"training: phases must have different names, not {', '.join(phase.name for phase in phases)}")
-        self.phases, self.seed, self.context = phases, seed, context
-        self.folder_index, self.checkpoint_seconds = folder_index, checkpoint_seconds
-        self.folders = [context.checkpoint_folders[i] for i in (folder_index, *twins) if i < len(context.checkpoint_folders)]
-        self.state = _shared_state(phases)
+    phases: Sequence[Phase]
+    seed: int
+    context: FitContext
+    folder_index: int
+    checkpoint_seconds: float
+    folders: Sequence[Path]
+
+    def __post_init__(self) -> None:
+        self.state = _shared_state(self.phases)
         self.records: list[PhaseRecord] = []
-        self.interrupted = False
         self.saved = time.monotonic()
         self._begin(0)
 
     @property
-    def position(self) -> int:
-        """Number of the phase under way; how many there are once all are over."""
-        return self._position
+    def now(self) -> PhaseRecord:
+        """The record of the phase under way."""
+        return self.records[-1]
 
     def _begin(self, position: int) -> None:
-        """Stand at the start of a phase."""
-        self._position = position
+        """Stand at the start of a phase, or at the end of all."""
+        self.position, self.best = position, _copies(self.state)
         if position == len(self.phases):
-            self.best = _copies(self.state)
             return
-        phase = self.phases[position]
-        self.now = _Progressing(phase.name)
-        self.best = _copies(self.state)
+        phase = self.phase = self.phases[position]
+        self.records.append(PhaseRecord(phase.name))
         self.generator = torch.Generator().manual_seed(_stream(self.seed, position))
         named = phase.module.named_parameters()
         self.learning = {name: value for name, value in named if phase.trainable is None or phase.trainable(name)}
@@ -202,132 +199,121 @@ class _Run:
 
     def train_phase(self) -> None:
         """Train the phase under way from where it stands to its end, or until a stop."""
-        phase = self.phases[self.position]
+        phase = self.phase
         asked = {name: value.requires_grad for name, value in phase.module.named_parameters()}
         started = time.monotonic() - self.now.seconds
         try:
             for name, value in phase.module.named_parameters():
                 value.requires_grad_(name in self.learning)
-            while not self._is_over(phase) and not self.interrupted:
-                self._train_epoch(phase, started)
+            while not self._is_over() and not self.now.interrupted:
+                self._train_epoch(started)
         finally:
             for name, value in phase.module.named_parameters():
                 value.requires_grad_(asked[name])
                 value.grad = None
-        if self.now.epoch and not math.isfinite(self.now.best_loss) and not self.interrupted:
+        now = self.now
+        if now.epochs and not math.isfinite(now.best_loss) and not now.interrupted:
             raise DataError(
-                f"training: phase '{phase.name}' had no finite validation loss in {self.now.epoch} epochs; "
+                f"training: phase '{phase.name}' had no finite validation loss in {now.epochs} epochs; "
                 f"lower its learning_rate or check the data with 'vehest data check'"
             )
         _put_back(self.state, self.best)
-        self.records.append(self.now.record(self.interrupted))
-        if not self.interrupted:
+        if not now.interrupted:
             self._begin(self.position + 1)
-            if self.position == len(self.phases) or time.monotonic() - self.saved > self.checkpoint_seconds:
-                self._save(self._checkpoint())
+            self._save_now_and_then(self.position == len(self.phases))
 
-    def _is_over(self, phase: Phase) -> bool:
-        epoch, settings = self.now.epoch, phase.settings
-        waited = epoch - self.now.best_epoch if epoch % settings.validate_every == 0 else 0
-        return epoch >= settings.max_epochs or 0 < settings.patience <= waited
+    def _is_over(self) -> bool:
+        epochs, settings = self.now.epochs, self.phase.settings
+        waited = epochs - self.now.best_epoch if epochs % settings.validate_every == 0 else 0
+        return epochs >= settings.max_epochs or 0 < settings.patience <= waited
 
-    def _train_epoch(self, phase: Phase, started: float) -> None:
+    def _train_epoch(self, started: float) -> None:
         """One pass over the batches, then the validation; an epoch that is stopped leaves no trace but the checkpoint before it."""
-        settings, now = phase.settings, self.now
-        before = self._checkpoint()
+        phase, settings, now = self.phase, self.phase.settings, self.now
         if not now.validated:
             if self.context.should_stop():
-                self._stop(before)
+                self._stop(self._checkpoint())
                 return
             if phase.prepare is not None:
                 with torch.no_grad():
                     phase.prepare()
-            now.start_loss = self._validate(phase)
-            now.validated = True
-            before = self._checkpoint()
+            now.start_loss, now.validated = self._validate(), True
+        before = self._checkpoint()
         if settings.schedule == "cosine":
             for group in self.adam.param_groups:
-                group["lr"] = settings.learning_rate * 0.5 * (1.0 + math.cos(math.pi * now.epoch / settings.max_epochs))
+                group["lr"] = settings.learning_rate * 0.5 * (1.0 + math.cos(math.pi * now.epochs / settings.max_epochs))
         total, taken = 0.0, 0
         for number, batch in enumerate(phase.batches(self.generator), start=1):
             if self.context.should_stop():
                 self._stop(before)
                 return
-            loss = self._step(phase, batch, f"epoch {now.epoch + 1}, step {number}")
+            loss = self._step(batch, f"epoch {now.epochs + 1}, step {number}")
             if loss is not None:
                 total, taken = total + loss, taken + 1
-        now.epoch += 1
         now.train_loss.append(total / taken if taken else math.nan)
-        judged = now.epoch % settings.validate_every == 0 or now.epoch == settings.max_epochs
-        now.validation_loss.append(self._validate(phase) if judged else math.nan)
+        judged = now.epochs % settings.validate_every == 0 or now.epochs == settings.max_epochs
+        now.validation_loss.append(self._validate() if judged else math.nan)
         now.seconds = time.monotonic() - started
-        self._tell()
-        if time.monotonic() - self.saved > self.checkpoint_seconds:
-            self._save(self._checkpoint())
+        done = sum(record.epochs for record in self.records)
+        allowed = done - now.epochs + sum(phase.settings.max_epochs for phase in self.phases[self.position :])
+        members = max(len(self.context.checkpoint_folders), self.folder_index + 1)
+        self.context.on_progress(Progress(done, allowed, members - self.folder_index, members, now.best_loss))
+        self._save_now_and_then()
 
     def _stop(self, before: Checkpoint) -> None:
         """End here, as if what came after ``before`` had not been."""
-        self.interrupted = True
-        self.now = _Progressing(**before.values["phase"])
         self._save(before)
+        self.records[-1] = PhaseRecord(**before.values["phases"][-1])
+        self.now.interrupted = True
 
-    def _step(self, phase: Phase, batch: Any, where: str) -> float | None:
+    def _step(self, batch: Any, where: str) -> float | None:
         """One step of AdamW; returns the loss, or none if it or its gradient is not finite, in which case nothing is changed."""
         self.adam.zero_grad(set_to_none=True)
-        loss = phase.loss(batch)
+        loss, now = self.phase.loss(batch), self.now
         value = float(loss.detach())
         if math.isfinite(value):
             loss.backward()
             gradients = [parameter.grad for parameter in self.learning.values() if parameter.grad is not None]
             if all(bool(torch.isfinite(gradient).all()) for gradient in gradients):
-                if phase.settings.clip:
-                    nn.utils.clip_grad_value_(self.learning.values(), phase.settings.clip)
+                if self.phase.settings.clip:
+                    nn.utils.clip_grad_value_(self.learning.values(), self.phase.settings.clip)
                 self.adam.step()
-                self.now.skipped_in_a_row = 0
+                now.skipped_in_a_row = 0
                 return value
-        self.now.skipped += 1
-        self.now.skipped_in_a_row += 1
-        if self.now.skipped_in_a_row >= SKIPS_ALLOWED:
+        now.skipped_steps += 1
+        now.skipped_in_a_row += 1
+        if now.skipped_in_a_row >= SKIPS_ALLOWED:
             raise DataError(
-                f"training: phase '{phase.name}', {where}: loss ({value:g}) or gradient not finite {SKIPS_ALLOWED} times in a row; "
+                f"training: phase '{now.name}', {where}: loss ({value:g}) or gradient not finite {SKIPS_ALLOWED} times in a row; "
                 f"lower its learning_rate or check the data with 'vehest data check'"
             )
         return None
 
-    def _validate(self, phase: Phase) -> float:
+    def _validate(self) -> float:
         """The validation loss; the parameters are kept if it is the lowest so far."""
         with torch.no_grad():
-            loss = float(phase.validation())
+            loss = float(self.phase.validation())
         if loss < self.now.best_loss:
-            self.now.best_loss, self.now.best_epoch = loss, self.now.epoch
+            self.now.best_loss, self.now.best_epoch = loss, self.now.epochs
             self.best = _copies(self.state)
         return loss
-
-    def _tell(self) -> None:
-        done = sum(record.epochs for record in self.records) + self.now.epoch
-        left = sum(phase.settings.max_epochs for phase in self.phases[self.position :])
-        members = max(len(self.context.checkpoint_folders), self.folder_index + 1)
-        allowed = sum(record.epochs for record in self.records) + left
-        self.context.on_progress(Progress(done, allowed, members - self.folder_index, members, self.now.best_loss))
 
     def _checkpoint(self) -> Checkpoint:
         """The state as it stands, copied."""
         finished = self.position == len(self.phases)
+        epoch = sum(record.epochs for record in self.records)
+        values = {"finished": finished, "epoch": epoch, "phases": [asdict(record) for record in self.records]}
         tensors = {f"best.{name}": value for name, value in self.best.items()}
-        values: dict[str, Any] = {
-            "finished": finished,
-            "epoch": sum(record.epochs for record in self.records) + (0 if finished else self.now.epoch),
-            "records": [vars(record) for record in self.records],
-        }
         if not finished:
             tensors |= {f"now.{name}": value for name, value in _copies(self.state).items()}
             tensors["generator"] = self.generator.get_state()
-            for name, parameter in self.learning.items():
-                moments = self.adam.state.get(parameter, {})
-                tensors |= {f"adam.{moment}.{name}": moments[moment].clone() for moment in _MOMENTS if moment in moments}
-            lists = {"train_loss": list(self.now.train_loss), "validation_loss": list(self.now.validation_loss)}
-            values["phase"] = vars(self.now) | lists
+            for number, parameter in enumerate(self.learning.values()):
+                tensors |= {f"adam.{number}.{name}": value.clone() for name, value in self.adam.state.get(parameter, {}).items()}
         return Checkpoint(tensors, values)
+
+    def _save_now_and_then(self, in_any_case: bool = False) -> None:
+        if in_any_case or time.monotonic() - self.saved > self.checkpoint_seconds:
+            self._save(self._checkpoint())
 
     def _save(self, checkpoint: Checkpoint) -> None:
         self.saved = time.monotonic()
@@ -339,32 +325,39 @@ class _Run:
         checkpoint = load_checkpoint(self.folders[0]) if self.folders else None
         if checkpoint is None or not self._fits(checkpoint):
             return
-        for record in checkpoint.values["records"]:
-            losses = {name: tuple(record[name]) for name in ("train_loss", "validation_loss")}
-            self.records.append(PhaseRecord(**{**record, **losses}))
-        if checkpoint.values["finished"]:
-            _put_back(self.state, _named(checkpoint, "best."))
-            self._begin(len(self.phases))
-            return
-        _put_back(self.state, _named(checkpoint, "now."))
-        self._begin(len(self.records))
-        self.best = {name: value.to(self.state[name].device) for name, value in _named(checkpoint, "best.").items()}
-        self.now = _Progressing(**checkpoint.values["phase"])
-        self.generator.set_state(checkpoint.tensors["generator"])
-        kept = {moment: _named(checkpoint, f"adam.{moment}.") for moment in _MOMENTS}
-        for name, parameter in self.learning.items():
-            if name in kept["step"]:
-                averages = {moment: kept[moment][name].to(parameter.device) for moment in _MOMENTS[1:]}
-                self.adam.state[parameter] = {"step": kept["step"][name], **averages}
+        finished, records = checkpoint.values["finished"], [PhaseRecord(**record) for record in checkpoint.values["phases"]]
+        best = _named(checkpoint, "best.")
+        _put_back(self.state, best if finished else _named(checkpoint, "now."))
+        self._begin(len(records) if finished else len(records) - 1)
+        self.records = records
+        if not finished:
+            self.best = best
+            self.generator.set_state(checkpoint.tensors["generator"])
+            for number, parameter in enumerate(self.learning.values()):
+                self.adam.state[parameter] = _named(checkpoint, f"adam.{number}.")
 
     def _fits(self, checkpoint: Checkpoint) -> bool:
-        names = [record["name"] for record in checkpoint.values["records"]]
-        if not checkpoint.values["finished"]:
-            names.append(checkpoint.values["phase"]["name"])
-        shapes = {name: value.shape for name, value in _named(checkpoint, "best.").items()}
+        names = [record["name"] for record in checkpoint.values.get("phases", ())]
         known = [phase.name for phase in self.phases]
-        enough = len(names) == len(known) or not checkpoint.values["finished"]
+        shapes = {name: value.shape for name, value in _named(checkpoint, "best.").items()}
+        enough = len(names) == len(known) if checkpoint.values["finished"] else bool(names)
         return enough and names == known[: len(names)] and shapes == {name: value.shape for name, value in self.state.items()}
+
+
+def drawn_starts(lengths: Sequence[int], steps: int, generator: torch.Generator) -> Tensor:
+    """First rows of as many sequences of ``steps`` samples as fit into each of drives that lie one after another, in random order.
+
+    Those of a drive follow one another from an offset that is drawn.
+    """
+    firsts: list[int] = []
+    offset = 0
+    for length in lengths:
+        used = length // steps * steps
+        if used:
+            shift = offset + int(torch.randint(length - used + 1, (), generator=generator))
+            firsts += range(shift, shift + used, steps)
+        offset += length
+    return torch.tensor(firsts)[torch.randperm(len(firsts), generator=generator)]
 
 
 def _shared_state(phases: Sequence[Phase]) -> dict[str, Tensor]:

@@ -16,7 +16,7 @@ from vehest.data.errors import DataError
 from vehest.data.windows import WindowSet
 from vehest.declared import Group, setting
 from vehest.training.checkpoints import Checkpoint, load_checkpoint, save_checkpoint
-from vehest.training.context import FitContext, Progress
+from vehest.training.context import FitContext, FitRecord, Progress, record_of_epochs
 from vehest.training.members import FlatParameters, constrain, fixed_state, is_plain, predict_members, prepare
 
 
@@ -42,35 +42,6 @@ class SupervisedSettings(Group):
     checkpoint_seconds: float = setting(15.0, "time between two checkpoints", unit="s")
 
 
-@dataclass(frozen=True)
-class TrainingRecord:
-    """How the training of one member went.
-
-    Args:
-        train_loss: mean squared error over the batches of each epoch [m²/s²].
-        validation_loss: mean squared error on the validation windows after each epoch [m²/s²].
-        best_epoch: epoch (from 1) whose weights were kept; 0 if none was finished.
-        interrupted: whether training was stopped before it was over.
-        seconds: wall time of the whole batch of members, not counting earlier runs that a checkpoint continues [s].
-    """
-
-    train_loss: tuple[float, ...]
-    validation_loss: tuple[float, ...]
-    best_epoch: int
-    interrupted: bool
-    seconds: float
-
-    @property
-    def epochs(self) -> int:
-        """Epochs trained."""
-        return len(self.validation_loss)
-
-    @property
-    def best_validation_loss(self) -> float:
-        """Validation loss of the weights that were kept [m²/s²]."""
-        return min(self.validation_loss, default=math.nan)
-
-
 def train_members(
     networks: Sequence[nn.Module],
     seeds: Sequence[int],
@@ -78,13 +49,13 @@ def train_members(
     validation: WindowSet,
     settings: SupervisedSettings,
     context: FitContext,
-) -> list[TrainingRecord]:
+) -> list[FitRecord]:
     """Train networks of one shape together; each ends with its own best weights, as if it had been trained alone.
 
     Every member draws its own order of the windows from its own seed, stops on its own, and leaves the batch then.
 
     Args:
-        networks: M networks (`WindowNetwork`) of one shape and preparation; changed in place, and in evaluation mode afterwards.
+        networks: M networks of one shape and preparation; changed in place, and in evaluation mode afterwards.
         seeds: their seeds.
         train: windows to learn from.
         validation: windows that decide when to stop and which weights to keep.
@@ -92,7 +63,8 @@ def train_members(
         context: checkpoints, progress and the wish to stop.
 
     Returns:
-        M records.
+        M records, with mean squared errors [m²/s²] over the batches of each epoch and on the validation windows after it. A best epoch of
+        0: none was finished. Seconds are wall time by member, not counting earlier runs that a checkpoint continues.
 
     Raises:
         DataError: the loss is no longer finite.
@@ -108,46 +80,49 @@ def train_members(
     return run.finish()
 
 
+@dataclass
 class _Run:
     """State of one training; rows of ``flat``, of its average and of Adam's moments belong to the members in ``active``."""
 
-    def __init__(
-        self,
-        networks: Sequence[nn.Module],
-        seeds: Sequence[int],
-        train: WindowSet,
-        validation: WindowSet,
-        settings: SupervisedSettings,
-        context: FitContext,
-    ) -> None:
-        self.networks, self.settings, self.context = networks, settings, context
-        self.network = networks[0]
+    networks: Sequence[nn.Module]
+    seeds: Sequence[int]
+    train_windows: WindowSet
+    validation_windows: WindowSet
+    settings: SupervisedSettings
+    context: FitContext
+
+    def __post_init__(self) -> None:
+        members = len(self.networks)
+        self.network = self.networks[0]
         self.layout = FlatParameters(self.network)
-        self.fixed = fixed_state(networks) if is_plain(self.network) else {}
-        self.train, self.validation = _Prepared(self.network, train, settings), _Prepared(self.network, validation, settings)
-        flat = self.layout.pack(networks)
+        self.fixed = fixed_state(self.networks) if is_plain(self.network) else {}
+        self.train, self.validation = (_Prepared(self.network, own, self.settings) for own in (self.train_windows, self.validation_windows))
+        flat = self.layout.pack(self.networks)
         self.best = flat.clone()
-        self.best_loss = torch.full((len(networks),), math.inf, dtype=torch.float64)
-        self.best_epoch = torch.zeros(len(networks), dtype=torch.int64)
-        self.active = torch.arange(len(networks))
-        self.generators = [torch.Generator().manual_seed(_shuffle_seed(seed)) for seed in seeds]
-        self.history: list[tuple[list[float], list[float]]] = [([], []) for _ in networks]
+        self.best_loss = torch.full((members,), math.inf, dtype=torch.float64)
+        self.best_epoch = torch.zeros(members, dtype=torch.int64)
+        self.active = torch.arange(members)
+        self.generators = [torch.Generator().manual_seed(_shuffle_seed(seed)) for seed in self.seeds]
+        self.history: list[tuple[list[float], list[float]]] = [([], []) for _ in self.networks]
         self.epoch = 0  # of the members still active
         self.interrupted = False
         self.started = self.saved = time.monotonic()
-        self.average: Tensor | None = None  # of ``flat`` over the steps so far; none before the first, and without averaging
-        self._set_parameters(flat, None)
+        self._go_on_with({"parameters": flat})
 
-    def _set_parameters(self, flat: Tensor, moments: tuple[Tensor, Tensor, Tensor] | None) -> None:
-        self.flat = nn.Parameter(flat.clone())
+    def _rows(self, rows: Tensor | int) -> dict[str, Tensor]:
+        """Copies of parameters, their average and Adam's moments of some active members; Adam's step is that of all."""
+        held = {"parameters": self.flat.detach(), **self.adam.state.get(self.flat, {})}
+        if self.average is not None:
+            held["average"] = self.average
+        return {name: (values[rows] if values.dim() else values).clone() for name, values in held.items()}
+
+    def _go_on_with(self, rows: dict[str, Tensor]) -> None:
+        """Take back what `_rows` gave; there is no average before the first step, and none without averaging."""
+        self.average = rows.pop("average", None)
+        self.flat = nn.Parameter(rows.pop("parameters").clone())
         self.adam = torch.optim.Adam([self.flat], lr=self.settings.learning_rate)
-        if moments is not None:
-            step, mean, square = moments
-            self.adam.state[self.flat] = {"step": step, "exp_avg": mean.clone(), "exp_avg_sq": square.clone()}
-
-    def _moments(self) -> tuple[Tensor, Tensor, Tensor] | None:
-        state = self.adam.state.get(self.flat)
-        return (state["step"], state["exp_avg"], state["exp_avg_sq"]) if state else None
+        if rows:
+            self.adam.state[self.flat] = rows
 
     def train_epoch(self) -> None:
         """One pass over the training windows, then the validation loss and the decisions that hang on it."""
@@ -185,10 +160,6 @@ class _Run:
         decay, step = self.settings.averaging, float(self.adam.state[self.flat]["step"])
         self.average.lerp_(self.flat.detach(), (1.0 - decay) / (1.0 - decay**step))
 
-    def _judged(self) -> Tensor:
-        """The weights that are validated and kept: the average where there is one."""
-        return self.flat.detach() if self.average is None else self.average
-
     def _batch_seeds(self) -> list[int]:
         """What plain networks draw from for one batch (dropout), one seed an active member; compiled ones draw nothing."""
         if not is_plain(self.network):
@@ -201,58 +172,46 @@ class _Run:
         return predict_members(self.network, state, data.series, starts, data.n_window, compiled=compiled, seeds=seeds)
 
     def _judge(self, train_loss: Tensor) -> None:
+        """Validate the weights, or their average where there is one; keep the best, and let members leave whose patience is over."""
+        judged = self.flat.detach() if self.average is None else self.average
         self.network.eval()
         with torch.no_grad():
             starts = self.validation.starts.expand(len(self.active), -1)
-            prediction = self._predict(self.layout.views(self._judged()), self.validation, starts)
+            prediction = self._predict(self.layout.views(judged), self.validation, starts)
             loss = (prediction.double() - self.validation.targets.double()).square().mean(dim=1)
-        for row, member in enumerate(self.active.tolist()):
-            self.history[member][0].append(float(train_loss[row]))
-            self.history[member][1].append(float(loss[row]))
-            if not math.isfinite(float(loss[row])):
+        for member, *losses in zip(self.active.tolist(), train_loss.tolist(), loss.tolist(), strict=True):
+            for values, value in zip(self.history[member], losses, strict=True):
+                values.append(value)
+            if not math.isfinite(losses[1]):
                 raise DataError(
-                    f"training: the validation loss of member {member} is {float(loss[row])} after epoch {self.epoch}; "
+                    f"training: the validation loss of member {member} is {losses[1]} after epoch {self.epoch}; "
                     f"lower training.learning_rate or check the data with 'vehest data check'"
                 )
         better = loss < self.best_loss[self.active]
         improved = self.active[better]
-        self.best[improved] = self._judged()[better]
+        self.best[improved] = judged[better]
         self.best_loss[improved] = loss[better]
         self.best_epoch[improved] = self.epoch
         going_on = self.epoch - self.best_epoch[self.active] < self.settings.patience
         if not bool(going_on.all()):
-            self._keep(going_on)
+            self.active = self.active[going_on]
+            self._go_on_with(self._rows(going_on))
         self.context.on_progress(
             Progress(self.epoch, self.settings.max_epochs, len(self.active), len(self.networks), float(self.best_loss.min()))
         )
         if time.monotonic() - self.saved > self.settings.checkpoint_seconds:
             self._save(self._checkpoints())
 
-    def _keep(self, rows: Tensor) -> None:
-        """Let the other rows leave the batch."""
-        moments = self._moments()
-        assert moments is not None
-        self.active = self.active[rows]
-        self.average = None if self.average is None else self.average[rows]
-        self._set_parameters(self.flat.detach()[rows], (moments[0], moments[1][rows], moments[2][rows]))
-
     def _checkpoints(self) -> list[Checkpoint]:
         """The state of every member, each by itself, so that any of them can go on without the others."""
-        moments = self._moments()
         row_of = {member: row for row, member in enumerate(self.active.tolist())}
         checkpoints = []
-        for member, generator in enumerate(self.generators):
+        for member, (train_loss, validation_loss) in enumerate(self.history):
             tensors = {"best": self.best[member].clone()}
-            row = row_of.get(member)
-            if row is not None:
-                tensors |= {"generator": generator.get_state(), "parameters": self.flat.detach()[row].clone()}
-                if moments is not None:
-                    tensors |= {"step": moments[0].clone(), "mean": moments[1][row].clone(), "square": moments[2][row].clone()}
-                if self.average is not None:
-                    tensors["average"] = self.average[row].clone()
-            train_loss, validation_loss = self.history[member]
+            if member in row_of:
+                tensors |= {"generator": self.generators[member].get_state(), **self._rows(row_of[member])}
             values = {
-                "finished": row is None,
+                "finished": member not in row_of,
                 "epoch": len(validation_loss),
                 "best_epoch": int(self.best_epoch[member]),
                 "best_loss": float(self.best_loss[member]),
@@ -277,33 +236,29 @@ class _Run:
         epochs = {checkpoints[member].values["epoch"] for member in unfinished}
         if len(epochs) > 1:
             return
-        for member, checkpoint in enumerate(checkpoints):
-            self.best[member] = checkpoint.tensors["best"]
-            self.best_loss[member] = checkpoint.values["best_loss"]
-            self.best_epoch[member] = checkpoint.values["best_epoch"]
-            self.history[member] = (list(checkpoint.values["train_loss"]), list(checkpoint.values["validation_loss"]))
+        for member, (tensors, values) in enumerate(checkpoints):
+            self.best[member] = tensors["best"]
+            self.best_loss[member], self.best_epoch[member] = values["best_loss"], values["best_epoch"]
+            self.history[member] = (values["train_loss"], values["validation_loss"])
         self.active = torch.tensor(unfinished, dtype=torch.int64)
         self.epoch = epochs.pop() if epochs else max(checkpoint.values["epoch"] for checkpoint in checkpoints)
-        if unfinished:
-            states = [checkpoints[member].tensors for member in unfinished]
-            for member in unfinished:
-                self.generators[member].set_state(checkpoints[member].tensors["generator"])
-            moments = None
-            if "step" in states[0]:
-                moments = (states[0]["step"], torch.stack([s["mean"] for s in states]), torch.stack([s["square"] for s in states]))
-            if "average" in states[0]:
-                self.average = torch.stack([s["average"] for s in states])
-            self._set_parameters(torch.stack([s["parameters"] for s in states]), moments)
+        states = [dict(checkpoints[member].tensors) for member in unfinished]
+        for member, state in zip(unfinished, states, strict=True):
+            self.generators[member].set_state(state.pop("generator"))
+            del state["best"]
+        if states:
+            together = {name: torch.stack([state[name] for state in states]) for name in states[0]}
+            self._go_on_with(together | ({"step": states[0]["step"]} if "step" in together else {}))
 
-    def finish(self) -> list[TrainingRecord]:
+    def finish(self) -> list[FitRecord]:
         """Put the best weights into the networks."""
-        seconds = time.monotonic() - self.started
+        seconds = (time.monotonic() - self.started) / len(self.networks)
         records = []
-        for member, network in enumerate(self.networks):
+        for member, (network, losses) in enumerate(zip(self.networks, self.history, strict=True)):
             self.layout.unpack(self.best[member], network.eval())
-            train_loss, validation_loss = self.history[member]
-            unfinished = self.interrupted and bool((self.active == member).any())
-            records.append(TrainingRecord(tuple(train_loss), tuple(validation_loss), int(self.best_epoch[member]), unfinished, seconds))
+            figures = {"best_epoch": int(self.best_epoch[member]), "best_validation_loss": min(losses[1], default=math.nan)}
+            unfinished = self.interrupted and member in self.active.tolist()
+            records.append(record_of_epochs(*losses, {**figures, "train_seconds": seconds}, unfinished))
         return records
 
 

@@ -8,12 +8,13 @@ Source: Węgrzynowski et al. 2024, Section III-B.4.
 from __future__ import annotations
 
 import math
+from abc import abstractmethod
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
-from typing import ClassVar, Literal, NamedTuple, Protocol
+from typing import ClassVar, Literal, NamedTuple
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from vehest.data.errors import ConfigurationError, DataError
 from vehest.declared import Group, setting
@@ -34,34 +35,34 @@ class Drive(NamedTuple):
     measurements: Tensor
 
 
-class Filtering(Protocol):
+class Filtering(nn.Module):
     """A filter that can be trained.
 
     Attributes:
         mirror: signs of states (n,), inputs (p,) and measurements (m,) in a mirror, in which what is filtered obeys the same laws.
     """
 
-    mirror: tuple[Sequence[float], Sequence[float], Sequence[float]]
+    mirror: ClassVar[tuple[Sequence[float], Sequence[float], Sequence[float]]]
 
+    @abstractmethod
     def moved(self, states: Tensor, inputs: Tensor) -> Tensor:
         """States one sample later, (..., n)."""
-        ...
 
+    @abstractmethod
     def begin_noise(self, drives: Sequence[Drive], start_spread: float) -> None:
         """Start noise from what the model, as it is, leaves unexplained in drives, and from how far off the last state may start."""
-        ...
 
+    @abstractmethod
     def estimated(self, drives: Drive, start: Tensor, steps: int | None) -> Tensor:
         """Estimated states, (B, T, n), of sequences that start at ``start``, (B, n); gradients reach ``steps`` samples back (none: all)."""
-        ...
 
+    @abstractmethod
     def estimate_with_covariance(self, drives: Drive, start: Tensor, steps: int | None) -> tuple[Tensor, Tensor]:
         """The same with their covariances, (B, T, n, n), both differentiable."""
-        ...
 
+    @abstractmethod
     def estimate_for_validation(self, drives: Drive) -> Tensor:
         """Estimated states, (B, T, n), as in use: without gradients, and without knowing any true state but the first."""
-        ...
 
 
 @dataclass(frozen=True)
@@ -115,15 +116,8 @@ class ThroughFilterSettings(Group):
             raise ConfigurationError(f"training.curriculum must hold lengths above drop_steps ({self.drop_steps}), not {self.curriculum}")
 
 
-@dataclass(frozen=True)
-class Weights:
-    """What counts how much.
-
-    Args:
-        one_step: weight of each state's squared error of the one-step prediction, (n,).
-        training: the same through the filter, (n,).
-        validation: the same when judging epochs, (n,).
-    """
+class Weights(NamedTuple):
+    """Weight of each state's squared error, (n,): of the one-step prediction, through the filter, and when judging epochs."""
 
     one_step: Tensor
     training: Tensor
@@ -131,7 +125,6 @@ class Weights:
 
 
 def one_step_phase(
-    module: torch.nn.Module,
     filtering: Filtering,
     train: Sequence[Drive],
     validation: Sequence[Drive],
@@ -140,9 +133,8 @@ def one_step_phase(
     trainable: Callable[[str], bool],
 ) -> Phase:
     """The model as a predictor of the next sample."""
-    before, inputs, after = (torch.cat(parts) for parts in zip(*(_pairs(drive) for drive in train), strict=True))
-    judged = [torch.cat(parts) for parts in zip(*(_pairs(drive) for drive in validation), strict=True)]
-
+    before, inputs, after = _pairs(train)
+    judged = _pairs(validation)
     signs = [before.new_tensor(list(filtering.mirror[part])) for part in (0, 1)]
 
     def batches(generator: torch.Generator) -> Iterable[tuple[Tensor, Tensor]]:
@@ -157,11 +149,10 @@ def one_step_phase(
     def judge() -> float:
         return float(_weighted(filtering.moved(judged[0], judged[1]) - judged[2], weights.one_step))
 
-    return Phase("one_step", settings.one_step, module, batches, loss, judge, trainable)
+    return Phase("one_step", settings.one_step, filtering, batches, loss, judge, trainable)
 
 
 def filter_phases(
-    module: torch.nn.Module,
     filtering: Filtering,
     train: Sequence[Drive],
     validation: Sequence[Drive],
@@ -196,12 +187,8 @@ def filter_phases(
             order = torch.randperm(len(drives.states), generator=generator)
             for rows in order.split(settings.batch_size):
                 turned = _chosen(len(rows), settings.mirrored, generator).unsqueeze(-1)
-                own = Drive(
-                    *(
-                        part[rows] * torch.where(turned, part.new_tensor(list(s)), 1.0)
-                        for part, s in zip(drives, filtering.mirror, strict=True)
-                    )
-                )
+                signs = [torch.where(turned, part.new_tensor(list(own)), 1.0) for part, own in zip(drives, filtering.mirror, strict=True)]
+                own = Drive(*(part[rows] * own for part, own in zip(drives, signs, strict=True)))
                 start = own.states[:, 0].clone()
                 if settings.start_spread:
                     off = 2.0 * torch.rand(len(rows), generator=generator, dtype=start.dtype) - 1.0
@@ -219,7 +206,7 @@ def filter_phases(
             return _weighted(error, weights.training) + settings.likelihood * surprise
 
         own = PhaseSettings(**{**vars(how), "max_epochs": epochs})
-        return Phase(label, own, module, batches, loss, judge, trainable, prepare if first else None)
+        return Phase(label, own, filtering, batches, loss, judge, trainable, prepare if first else None)
 
     lengths = [(steps, settings.curriculum_epochs, f"{name}_{steps}") for steps in settings.curriculum]
     lengths.append((settings.steps, how.max_epochs, name))
@@ -240,9 +227,8 @@ def placed(drives: Sequence[Drive], steps: int, generator: torch.Generator) -> D
     """As many sequences of each drive as fit into it, each at a random place."""
     starts = []
     for drive in drives:
-        room = len(drive.states) - steps + 1
-        for _ in range(len(drive.states) // steps):
-            starts.append((drive, int(torch.randint(room, (), generator=generator))))
+        count, room = len(drive.states) // steps, len(drive.states) - steps + 1
+        starts += [(drive, int(torch.randint(room, (), generator=generator))) for _ in range(count)]
     return _stacked(starts, steps)
 
 
@@ -257,8 +243,10 @@ def _chosen(count: int, share: float, generator: torch.Generator) -> Tensor:
     return torch.rand(count, 1, generator=generator) < share
 
 
-def _pairs(drive: Drive) -> tuple[Tensor, Tensor, Tensor]:
-    return drive.states[:-1], drive.inputs[:-1], drive.states[1:]
+def _pairs(drives: Sequence[Drive]) -> list[Tensor]:
+    """States, inputs, and states one sample later."""
+    pairs = [(drive.states[:-1], drive.inputs[:-1], drive.states[1:]) for drive in drives]
+    return [torch.cat(parts) for parts in zip(*pairs, strict=True)]
 
 
 def gaussian_surprise(error: Tensor, covariance: Tensor) -> Tensor:

@@ -21,7 +21,7 @@ from vehest.estimators.network_ukf import LEAST_VARIANCE
 from vehest.report.document import Column, Figure, Table
 from vehest.report.style import DOUBLE_COLUMN, legend_above, new_figure, paper_style
 from vehest.training.context import FitContext
-from vehest.training.search import staged_optuna_search
+from vehest.training.search import optuna_search
 from vehest.vehicle.dugoff import DugoffAxle
 from vehest_papers.cnn_ukf import paper
 from vehest_papers.cnn_ukf.manoeuvres import manoeuvres_of
@@ -94,7 +94,7 @@ def tuned_anew(fitted: EnsembleUkf, recordings: Sequence[Recording], seed: int) 
         scaled = [own._replace(variance=scaled_variance(own.variance - LEAST_VARIANCE, powers)) for own in pseudo]
         return finite(changed.mean_squared_error(recordings, over="recordings", pseudo=scaled))
 
-    changed.scaling = staged_optuna_search(cost, BOX, TRIALS, seed, FitContext(), stages=STAGES, shrink=SHRINK).best
+    changed.scaling = optuna_search(cost, BOX, TRIALS, seed, FitContext(), stages=STAGES, shrink=SHRINK).best
     return changed
 
 

@@ -38,7 +38,6 @@ def train_on(estimator: LearnedUkf, drives: Drive, skip: int, training: ThroughF
     judged = torch.cat([weights[:3], nothing, nothing])
     phases = filter_phases(
         estimator.filter,
-        estimator.filter,
         own,
         own,
         Weights(every, every, judged),

@@ -7,7 +7,7 @@ from functools import partial
 from typing import Any, Literal
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from vehest.estimators.kernels.planar_car import CompiledPlanarCar, is_compilable
 from vehest.estimators.kernels.threads import over_members
@@ -17,7 +17,7 @@ from vehest.filters.gaussian import Gaussian
 from vehest.filters.noise_models import ConstantNoise, StateDependentNoise, with_entropy
 from vehest.filters.sigma_points import symmetric_rule
 from vehest.filters.unscented_scan import NoiseAt, NonlinearFiltered, PointModel, TorchModel, moved, unscented_scan
-from vehest.training.through_filter import Drive
+from vehest.training.through_filter import Drive, Filtering
 from vehest.vehicle.dynamics import STATES, Dynamics
 
 NoiseKind = Literal["constant", "state_dependent"]
@@ -32,7 +32,7 @@ KAPPA = -2.0  # of the symmetric sigma points
 LEAST_ENTROPY = -9.0  # [nat] of the process noise
 
 
-class CarFilter(nn.Module):
+class CarFilter(Filtering):
     """States vx, vy, yaw rate, rim speed and friction; measured are ax, ay, yaw rate and rim speed.
 
     Args:
@@ -48,7 +48,7 @@ class CarFilter(nn.Module):
 
     process_noise: Any
     observation_noise: Any
-    mirror: tuple[Sequence[float], Sequence[float], Sequence[float]] = (  # left for right
+    mirror = (  # left for right
         (1.0, -1.0, -1.0, 1.0, 1.0),
         (-1.0, 1.0),
         (1.0, -1.0, -1.0, 1.0),

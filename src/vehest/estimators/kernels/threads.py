@@ -13,14 +13,9 @@ PIECES = 4  # for each thread, so that one that is held up leaves its share to t
 
 
 def over_members(work: Callable[[int, int], None], members: int, pieces: int = PIECES) -> None:
-    """Call ``work(first, end)`` on stretches of the members, side by side on as many threads as torch is allowed.
+    """Call ``work(first, end)`` on stretches of the members (or whatever else can be worked on one by one), ``pieces`` for each thread.
 
-    A worker of the launcher, which is allowed one, stays on its own thread. What is computed does not depend on the number.
-
-    Args:
-        work: takes the first member and the end of a stretch.
-        members: how many there are; or whatever else can be worked on one by one.
-        pieces: stretches for each thread.
+    They run side by side on as many threads as torch is allowed; what is computed does not depend on the number.
     """
     threads = max(min(torch.get_num_threads(), members), 1)
     if threads == 1:

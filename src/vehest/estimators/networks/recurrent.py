@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import abstractmethod
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any, ClassVar
 
 import numpy as np
@@ -12,9 +12,31 @@ from torch import Tensor, nn
 
 from vehest.declared import setting
 from vehest.estimators.base import Trial
+from vehest.estimators.network import Network
 from vehest.estimators.networks.windowed import StandardisedNetwork, WindowedEstimator
 
 TRIAL = Trial(7, "recurrent networks; minutes", "estimator.n_states=5 training.max_epochs=100 seed=range(2)")
+
+
+class OfStates(Network):
+    """A family that is named by the size of its hidden state."""
+
+    n_states: int
+    network_type: ClassVar[Any]
+
+    def new_network(self) -> Any:
+        """A network of these sizes."""
+        return self.network_type(self.settings)
+
+    @property
+    def variant(self) -> str:
+        """Name of the structure."""
+        return f"states_{self.n_states}"
+
+    @property
+    def full_title(self) -> str:
+        """With the number of states."""
+        return f"{self.title}, {self.n_states} states"
 
 
 class RecurrentNetwork(StandardisedNetwork):
@@ -22,21 +44,26 @@ class RecurrentNetwork(StandardisedNetwork):
 
     Args:
         settings: sizes.
+
+    Attributes:
         n_gates: gates of the cell.
-        n_channels: measured channels.
+        compiled_last_state: `last_state` as a compiled recursion, see `vehest.estimators.kernels.lanes.last_state`.
 
     Shapes:
         prepared windows: (..., N, C), standardised.
         returns: (...) lateral velocity [m/s] one step after the window.
     """
 
-    def __init__(self, settings: Any, n_gates: int, n_channels: int) -> None:
-        super().__init__(n_channels)
-        states = settings.n_states
+    n_gates: ClassVar[int]
+    compiled_last_state: ClassVar[Callable[..., Tensor]]
+
+    def __init__(self, settings: Any) -> None:
+        channels, states = len(RecurrentEstimator.channels), settings.n_states
+        super().__init__(channels)
         self.settings = settings
-        self.input_weight = nn.Parameter(torch.empty(n_gates, states, n_channels))
-        self.state_weight = nn.Parameter(torch.empty(n_gates, states, states))
-        self.gate_bias = nn.Parameter(torch.empty(n_gates, states))
+        self.input_weight = nn.Parameter(torch.empty(self.n_gates, states, channels))
+        self.state_weight = nn.Parameter(torch.empty(self.n_gates, states, states))
+        self.gate_bias = nn.Parameter(torch.empty(self.n_gates, states))
         self.output_weight = nn.Parameter(torch.empty(states))
         self.output_bias = nn.Parameter(torch.empty(()))
 
@@ -65,41 +92,16 @@ class RecurrentNetwork(StandardisedNetwork):
 
     def compiled_members(self, parameters: Mapping[str, Tensor], prepared: Tensor, starts: Tensor) -> Tensor:
         """The same for M members by the compiled recursion, (M, B)."""
-        state = self._kernel()(
-            parameters["input_weight"],
-            parameters["state_weight"],
-            parameters["gate_bias"],
-            prepared,
-            starts,
-            self.settings.window,
-        )
+        weights = [parameters[name] for name in ("input_weight", "state_weight", "gate_bias")]
+        state = self.compiled_last_state(*weights, prepared, starts, self.settings.window)
         return self._read_out(state, parameters["output_weight"].unsqueeze(1), parameters["output_bias"].unsqueeze(1))
 
-    @abstractmethod
-    def _kernel(self) -> Any:
-        """The compiled recursion, ``last_state`` of its module in estimators/kernels."""
 
-
-class RecurrentEstimator(WindowedEstimator):
+class RecurrentEstimator(OfStates, WindowedEstimator):
     """A recurrent benchmark as an estimator, with the inputs of the KS-NN."""
 
     n_states: int = setting(5, "size of the hidden state", least=1)
-    network_type: ClassVar[type[RecurrentNetwork]]
     template = "window_recurrent"
-
-    @property
-    def variant(self) -> str:
-        """Name of the structure."""
-        return f"states_{self.settings.n_states}"
-
-    @property
-    def full_title(self) -> str:
-        """With the number of states."""
-        return f"{self.title}, {self.settings.n_states} states"
-
-    def new_network(self) -> RecurrentNetwork:
-        """A network to load weights into."""
-        return self.network_type(self.settings)  # type: ignore[call-arg]
 
     def c_values(self) -> dict[str, Any]:
         """Weights and sizes."""

@@ -15,10 +15,12 @@ from vehest.constants import FloatArray
 from vehest.data.errors import ConfigurationError, DataError
 from vehest.data.recording import Recording
 from vehest.declared import setting
-from vehest.estimators.kernels.sample_network import Criterion, losses_of, outputs_of
+from vehest.estimators.base import FitData, FitRecord
+from vehest.estimators.kernels.sample_network import Criterion, losses_of, outputs_of, squared_error
 from vehest.estimators.network import Network
-from vehest.estimators.references import reference_sideslip
-from vehest.training.samples import Draw, Samples
+from vehest.training.context import FitContext
+from vehest.training.samples import Draw, Samples, SampleSettings, sample_phase
+from vehest.training.sequences import record_of_phases, train_phases
 
 CORNERS = ("fl", "fr", "rl", "rr")
 IMU = ("ax", "ay", "vx", "steer", "yaw_rate")
@@ -34,20 +36,58 @@ STEEPEST = 1.5  # rad, beyond which sideslip angles of a network are clipped
 
 
 class OnSamples(Network):
-    """Settings of estimators with a `SampleNetwork`."""
+    """An estimator with a `SampleNetwork`.
+
+    Attributes:
+        network_inputs: measured channels that the network sees.
+    """
 
     network: SampleNetwork
+    network_inputs: tuple[str, ...]
     hidden: tuple[int, int] = setting((250, 125), "widths of the network's hidden layers")
     dropout: float = setting(0.2, "share of hidden values that are hidden in training", least=0.0, below=1.0)
     normalisation: Normalisation = setting("range", "range: inputs in [0, 1]; standard: a mean of 0 and a deviation of 1")
 
     def check(self) -> None:
-        """Raises:
-        ConfigurationError: a layer without neurons.
-        """
+        """Layers have neurons."""
         super().check()
         if min(self.hidden) < 1:
             raise ConfigurationError(f"estimator.hidden must be the widths of two layers, such as [250, 125], not {list(self.hidden)}")
+
+    def begin_network(
+        self, data: FitData, training: Any, seeds: Sequence[int], minimum_speed: float = -np.inf
+    ) -> tuple[SampleNetwork, Samples, Samples]:
+        """A new network with initial weights, a seed a member, and samples of training and validation as it takes them."""
+        raw, judged = (learnt_samples(part, self.network_inputs, self.name, minimum_speed) for part in (data.train, data.validation))
+        network = self.network = self.new_network().to(getattr(torch, training.dtype))
+        network.scale(*raw, self.normalisation)
+        network.reset([torch.Generator().manual_seed(seed) for seed in seeds])
+        return network, network.samples(*raw), network.samples(*judged)
+
+    def fit_samples(
+        self,
+        data: FitData,
+        training: SampleSettings,
+        criterion: Criterion,
+        context: FitContext,
+        index: int,
+        seeds: Sequence[int],
+        minimum_speed: float = -np.inf,
+    ) -> FitRecord:
+        """Train members, each of a seed, on samples in random order; squared errors are in rad², other losses in the network's units."""
+        network, train, validation = self.begin_network(data, training, seeds, minimum_speed)
+        unit = network.unit**2 if criterion is squared_error else 1.0
+        phase = sample_phase(
+            "samples",
+            network,
+            training.phase,
+            training.batch_size,
+            len(train.targets),
+            len(seeds),
+            lambda draw: network.losses(train, draw, self.dropout, criterion) * unit,
+            lambda: network.validation_losses(validation, criterion) * unit,
+        )
+        return record_of_phases(train_phases([phase], self._seed, context, index, training.checkpoint_seconds))
 
 
 class SampleNetwork(nn.Module):
@@ -75,16 +115,12 @@ class SampleNetwork(nn.Module):
         self.register_buffer("input_low", torch.zeros(n_inputs))
         self.register_buffer("input_span", torch.ones(n_inputs))
         self.register_buffer("unit", torch.ones(()))
-        sizes = (n_inputs, *hidden, n_outputs)
-        for layer, (before, after) in enumerate(pairwise(sizes), start=1):
+        for layer, (before, after) in enumerate(pairwise((n_inputs, *hidden, n_outputs)), start=1):
             self.register_parameter(f"weight_{layer}", nn.Parameter(torch.zeros(members, before, after)))
             self.register_parameter(f"bias_{layer}", nn.Parameter(torch.zeros(members, after)))
 
     def reset(self, generators: Sequence[torch.Generator]) -> None:
-        """Draw initial weights of each member: Xavier's uniform ones; biases 0.
-
-        Source: Glorot & Bengio, Understanding the difficulty of training deep feedforward neural networks, 2010.
-        """
+        """Draw initial weights of each member: uniform ones of Glorot & Bengio 2010; biases 0."""
         with torch.no_grad():
             for name, parameter in self.named_parameters():
                 if name.startswith("bias"):
@@ -162,9 +198,8 @@ def learnt_samples(
     for recording in recordings:
         for name in (*channels, "vy_ref"):
             if name not in recording:
-                raise DataError(
-                    f"recording '{recording.id}' has no channel '{name}', which estimator '{estimator}' learns from{_hint(name)}"
-                )
+                hint = "; set estimator.inputs=imu for cars without measured tyre forces" if name.startswith("f") else ""
+                raise DataError(f"recording '{recording.id}' has no channel '{name}', which estimator '{estimator}' learns from{hint}")
             if np.isnan(recording[name]).any():
                 raise DataError(
                     f"recording '{recording.id}': channel '{name}' has gaps, which estimator '{estimator}' cannot learn from; "
@@ -177,10 +212,11 @@ def learnt_samples(
     return inputs[fast], np.concatenate([reference_sideslip(recording) for recording in recordings])[fast]
 
 
+def reference_sideslip(recording: Recording) -> FloatArray:
+    """What is learnt and scored: atan2(vy_ref, vx) with the measured vx, (T,) [rad]."""
+    return np.arctan2(recording["vy_ref"], recording["vx"])
+
+
 def clip_sideslip(sideslip: FloatArray) -> FloatArray:
     """Sideslip angles within `STEEPEST`, since the lateral velocity is vx tan β."""
     return np.clip(sideslip, -STEEPEST, STEEPEST)
-
-
-def _hint(name: str) -> str:
-    return "; set estimator.inputs=imu for cars without measured tyre forces" if name.startswith("f") else ""

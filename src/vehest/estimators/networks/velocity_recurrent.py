@@ -6,8 +6,8 @@ import itertools
 import math
 from abc import abstractmethod
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
-from typing import Any, ClassVar, Literal
+from dataclasses import dataclass
+from typing import Any, ClassVar, Literal, NamedTuple
 
 import numpy as np
 import torch
@@ -19,9 +19,10 @@ from vehest.data.errors import ConfigurationError, DataError
 from vehest.data.recording import Recording
 from vehest.declared import Group, setting
 from vehest.estimators.base import FitData, FitRecord, Trial
-from vehest.estimators.network import Network
-from vehest.training.context import FitContext
-from vehest.training.sequences import Phase, PhaseRecord, PhaseSettings, train_phases
+from vehest.estimators.networks.recurrent import OfStates
+from vehest.estimators.networks.windowed import StandardisedNetwork
+from vehest.training.context import FitContext, record_of_epochs
+from vehest.training.sequences import Phase, PhaseSettings, drawn_starts, train_phases
 
 REFERENCES = {"vx": "vx_ref", "vy": "vy_ref", "yaw_rate": "yaw_rate_ref"}
 ODD = ("vy", "yaw_rate", "ay", "steer", "roll_rate", "roll")
@@ -74,31 +75,15 @@ class SequenceSettings(Group):
         return self.dropped_steps if self.validation_dropped_steps is None else self.validation_dropped_steps
 
 
-class VelocityNetwork(nn.Module):
+class VelocityNetwork(StandardisedNetwork):
     """Base of recurrent networks from standardised measurements to standardised velocities.
-
-    Means and standard deviations are those of the training recordings; they are kept with the weights and are not parameters.
 
     Args:
         settings: channels and sizes.
     """
 
-    input_mean: Tensor
-    input_scale: Tensor
-    output_mean: Tensor
-    output_scale: Tensor
-
     def __init__(self, settings: Any) -> None:
-        super().__init__()
-        for name, size in (("input", len(settings.inputs)), ("output", len(settings.outputs))):
-            self.register_buffer(f"{name}_mean", torch.zeros(size))
-            self.register_buffer(f"{name}_scale", torch.ones(size))
-
-    def standardise(self, inputs: FloatArray, outputs: FloatArray) -> None:
-        """Take means and standard deviations from samples, (T, C) and (T, O)."""
-        for mean, scale, samples in ((self.input_mean, self.input_scale, inputs), (self.output_mean, self.output_scale, outputs)):
-            mean.copy_(torch.as_tensor(samples.mean(axis=0)))
-            scale.copy_(torch.as_tensor(np.maximum(samples.std(axis=0), 1e-6)))
+        super().__init__(len(settings.inputs), (len(settings.outputs),))
 
     def reset(self, generator: torch.Generator) -> None:
         """Draw initial weights: uniform within 1/√n, n the size of what feeds a layer, the hidden state for gates; biases alike."""
@@ -120,7 +105,7 @@ class VelocityNetwork(nn.Module):
         Returns:
             Velocities (B, T, O) [m/s, rad/s] and the state after the last sample.
         """
-        outputs, state = self.advance((measured - self.input_mean) / self.input_scale, state, mask)
+        outputs, state = self.advance(self.prepared(measured), state, mask)
         return outputs * self.output_scale + self.output_mean, state
 
     @abstractmethod
@@ -136,7 +121,7 @@ class VelocityNetwork(nn.Module):
         """`forward` on standardised quantities."""
 
 
-class RecurrentVelocityEstimator(Network):
+class RecurrentVelocityEstimator(OfStates):
     """A recurrent network run over all samples of a drive, its hidden state starting from zero.
 
     The measured vx is read for sideslip = atan2(vy, vx), and to start networks that need a velocity to start from; the network sees it only
@@ -179,40 +164,21 @@ class RecurrentVelocityEstimator(Network):
         if "vy" not in self.outputs or not set(self.outputs) <= set(REFERENCES):
             raise ConfigurationError(f"estimator.outputs must be of {', '.join(REFERENCES)}, vy among them, not {', '.join(self.outputs)}")
 
-    @property
-    def variant(self) -> str:
-        """Name of the structure."""
-        return f"states_{self.n_states}"
-
-    @property
-    def full_title(self) -> str:
-        """With the number of states."""
-        return f"{self.title}, {self.n_states} states"
-
     def fit_member(self, data: FitData, training: SequenceSettings, context: FitContext, index: int) -> FitRecord:
         """Train on sequences."""
-        drives = [self._drive(recording) for recording in data.train]
-        network: Any = self.new_network().to(getattr(torch, training.dtype))
-        network.standardise(np.concatenate([drive.inputs for drive in drives]), np.concatenate([drive.targets for drive in drives]))
+        train, validation = (_Drives(self, part, getattr(torch, training.dtype)) for part in (data.train, data.validation))
+        network = self.network = self.new_network().to(getattr(torch, training.dtype))
+        network.standardise(data.train, self.inputs, self.learns_from)
         network.reset(torch.Generator().manual_seed(self._seed))
-        self.network = network
-        phase = _phase(network, self.settings, training, drives, [self._drive(recording) for recording in data.validation])
+        phase = _phase(network, self.settings, training, train, validation)
         (record,) = train_phases([phase], self._seed, context, index, training.checkpoint_seconds)
-        return _fit_record(record)
-
-    def _drive(self, recording: Recording) -> _Drive:
-        for name in (*self.channels, *self.learns_from):
-            if np.isnan(recording[name]).any():
-                raise DataError(
-                    f"recording '{recording.id}': channel '{name}' has gaps, which estimator '{self.name}' cannot learn from; "
-                    f"cut them out in conf/split"
-                )
-        return _Drive(
-            recording.id,
-            recording.stack(self.inputs),
-            recording.stack(self.learns_from),
-            self._measured_velocities(recording.channels),
-        )
+        metrics = {
+            "best_epoch": record.best_epoch,
+            "best_validation_loss": record.best_loss,
+            "skipped_steps": record.skipped_steps,
+            "train_seconds": record.seconds,
+        }
+        return record_of_epochs(record.train_loss, record.validation_loss, metrics, record.interrupted)
 
     def _measured_velocities(self, channels: Mapping[str, FloatArray]) -> FloatArray:
         """What measurements alone say of the outputs, (T, O): vx, the yaw rate where it is read, and 0 for the lateral velocity."""
@@ -252,114 +218,96 @@ class RecurrentVelocityEstimator(Network):
         }
 
 
-@dataclass(frozen=True)
-class _Drive:
-    """What is learnt from a recording: measurements (T, C), references (T, O), measured velocities to start from (T, O)."""
-
-    name: str
-    inputs: FloatArray
-    targets: FloatArray
-    starts: FloatArray
-
-    def __len__(self) -> int:
-        return len(self.inputs)
-
-
-@dataclass(frozen=True)
-class _Batch:
+class _Batch(NamedTuple):
     """Sequences side by side.
 
     Attributes:
+        starts: velocities to start from, (B, O).
         inputs: measurements, (B, T, C).
         targets: references, (B, T, O).
-        starts: velocities to start from, (B, O).
         mask: of dropout, (B, T, H).
         counted: which samples the loss is taken of, (B, T), 0 or 1; none: all but the dropped ones.
         goes_on: whether the batch continues the one before, whose hidden state it starts from.
     """
 
+    starts: Tensor
     inputs: Tensor
     targets: Tensor
-    starts: Tensor
     mask: Tensor | None = None
     counted: Tensor | None = None
     goes_on: bool = False
 
     def stretch(self, first: int, end: int) -> _Batch:
         """Its samples from ``first`` to ``end``."""
-        counted = None if self.counted is None else self.counted[:, first:end]
-        mask = None if self.mask is None else self.mask[:, first:end]
-        return _Batch(self.inputs[:, first:end], self.targets[:, first:end], self.starts, mask, counted, first > 0)
+        parts = {name: getattr(self, name) for name in ("inputs", "targets", "mask", "counted")}
+        return self._replace(goes_on=first > 0, **{name: part[:, first:end] for name, part in parts.items() if part is not None})
 
 
-class _Cutter:
-    """Recordings one after another as tensors, from which sequences are cut by their first samples."""
+class _Drives:
+    """Recordings one after another as tensors, (N, …), from which sequences are cut by their first samples."""
 
-    def __init__(self, drives: Sequence[_Drive], dtype: torch.dtype) -> None:
-        self.lengths = [len(drive) for drive in drives]
-        self.offsets = np.concatenate([[0], np.cumsum(self.lengths)[:-1]]).tolist()
-        stacked = [np.concatenate([getattr(drive, name) for drive in drives]) for name in ("inputs", "targets", "starts")]
-        self.inputs, self.targets, self.starts = (torch.as_tensor(values, dtype=dtype) for values in stacked)
+    def __init__(self, estimator: RecurrentVelocityEstimator, recordings: Sequence[Recording], dtype: torch.dtype) -> None:
+        for recording in recordings:
+            for name in (*estimator.channels, *estimator.learns_from):
+                if np.isnan(recording[name]).any():
+                    raise DataError(
+                        f"recording '{recording.id}': channel '{name}' has gaps, which estimator '{estimator.name}' cannot learn from; "
+                        f"cut them out in conf/split"
+                    )
+        self.names, self.lengths = [recording.id for recording in recordings], [len(recording) for recording in recordings]
+        parts = (
+            [estimator._measured_velocities(recording.channels) for recording in recordings],
+            [recording.stack(estimator.inputs) for recording in recordings],
+            [recording.stack(estimator.learns_from) for recording in recordings],
+        )
+        self.starts, self.inputs, self.targets = (torch.as_tensor(np.concatenate(part), dtype=dtype) for part in parts)
 
-    def cut(self, firsts: Tensor, steps: int, mask: Tensor | None = None) -> _Batch:
-        """Sequences of ``steps`` samples from the rows ``firsts`` (B,) on."""
-        rows = firsts.unsqueeze(1) + torch.arange(steps)
-        return _Batch(self.inputs[rows], self.targets[rows], self.starts[firsts], mask)
+    def cut(self, firsts: Tensor, places: Tensor, mask: Tensor | None = None, counted: Tensor | None = None) -> _Batch:
+        """Sequences of the samples at ``places``, (T,) or (B, T), after the rows ``firsts`` (B,)."""
+        rows = firsts.unsqueeze(1) + places
+        return _Batch(self.starts[firsts], self.inputs[rows], self.targets[rows], mask, counted)
 
     def pieces(self, steps: int, generator: torch.Generator) -> Tensor:
         """All drives, cut whole at random places into pieces of ``steps`` samples and less: first row and length of each, (N, 2)."""
-        found = []
-        for length, offset in zip(self.lengths, self.offsets, strict=True):
+        found, offset = [], 0
+        for length in self.lengths:
             shift = int(torch.randint(steps, (), generator=generator))
             edges = sorted({0, *range(shift, length, steps), length})
             found += [(offset + first, end - first) for first, end in itertools.pairwise(edges)]
+            offset += length
         return torch.tensor(found)
 
     def padded(self, pieces: Tensor, dropped: int, mask: Tensor | None = None) -> _Batch:
         """Pieces of different lengths side by side, as long as the longest; what is beyond a piece's end does not count."""
         firsts, lengths = pieces.unbind(1)
-        places = torch.arange(int(lengths.max()))
-        rows = firsts.unsqueeze(1) + torch.minimum(places, lengths.unsqueeze(1) - 1)
-        counted = ((places >= dropped) & (places < lengths.unsqueeze(1))).to(self.inputs.dtype)
-        return _Batch(self.inputs[rows], self.targets[rows], self.starts[firsts], mask, counted)
+        places, ends = torch.arange(int(lengths.max())), lengths.unsqueeze(1)
+        counted = ((places >= dropped) & (places < ends)).to(self.inputs.dtype)
+        return self.cut(firsts, torch.minimum(places, ends - 1), mask, counted)
+
+    def for_validation(self, training: SequenceSettings) -> list[_Batch]:
+        """Sequences without overlap from the start of each recording; of one that is too short, all of it."""
+        batches, offset = [], 0
+        for name, length in zip(self.names, self.lengths, strict=True):
+            steps = min(length, training.validation_steps)
+            if steps <= training.settling_steps:
+                raise DataError(
+                    f"recording '{name}' is {length} samples long: too short to validate on with training.dropped_steps "
+                    f"{training.settling_steps}; choose a longer range in conf/split"
+                )
+            batches.append(self.cut(offset + steps * torch.arange(length // steps), torch.arange(steps)))
+            offset += length
+        return batches
 
 
-class _Mirror:
-    """Signs of measurements and outputs, left for right."""
-
-    def __init__(self, settings: Any, dtype: torch.dtype) -> None:
-        signs = [[-1.0 if name in ODD else 1.0 for name in names] for names in (settings.inputs, settings.outputs)]
-        self._inputs, self._outputs = (torch.tensor(own, dtype=dtype) for own in signs)
-
-    def some(self, batch: _Batch, share: float, generator: torch.Generator) -> _Batch:
-        """The batch with a share of its sequences mirrored; nothing is drawn where the share is 0."""
-        if not share:
-            return batch
-        turned = torch.rand(len(batch.starts), 1, generator=generator) < share
-        inputs, outputs = (torch.where(turned, signs, 1.0) for signs in (self._inputs, self._outputs))
-        return replace(
-            batch,
-            inputs=batch.inputs * inputs.unsqueeze(1),
-            targets=batch.targets * outputs.unsqueeze(1),
-            starts=batch.starts * outputs,
-        )
-
-
-def _phase(
-    network: VelocityNetwork,
-    settings: Any,
-    training: SequenceSettings,
-    train: Sequence[_Drive],
-    validation: Sequence[_Drive],
-) -> Phase:
-    """The one phase of a recurrent network."""
-    dtype, steps, truncated = getattr(torch, training.dtype), training.sequence_steps, training.truncate_steps
-    cutter, mirror = _Cutter(train, dtype), _Mirror(settings, dtype)
-    if max(cutter.lengths) < steps:
-        lengths = ", ".join(f"'{drive.name}' {len(drive)}" for drive in train)
+def _phase(network: VelocityNetwork, settings: Any, training: SequenceSettings, train: _Drives, validation: _Drives) -> Phase:
+    """Squared errors, each output with its weight, over sequences at random places of the drives."""
+    steps, truncated, dtype = training.sequence_steps, training.truncate_steps, train.inputs.dtype
+    if max(train.lengths) < steps:
+        lengths = ", ".join(f"'{name}' {length}" for name, length in zip(train.names, train.lengths, strict=True))
         raise DataError(f"training.sequence_steps is {steps}, but no training recording is as long: {lengths}; lower it")
-    judged = _validation_batches(validation, training, dtype)
+    judged = validation.for_validation(training)
     weights = torch.tensor([getattr(training, f"weight_{name}") for name in settings.outputs], dtype=dtype)
+    signs = [torch.tensor([-1.0 if name in ODD else 1.0 for name in names], dtype=dtype) for names in (settings.inputs, settings.outputs)]
     carried: list[State] = []
 
     def errors(batch: _Batch, dropped: int) -> Tensor:
@@ -374,24 +322,24 @@ def _phase(
         kept = torch.rand(sequences, length, settings.n_states, generator=generator) >= settings.dropout
         return kept.to(dtype) / (1.0 - settings.dropout)
 
+    def mirrored(batch: _Batch, generator: torch.Generator) -> _Batch:
+        if not training.mirrored:
+            return batch
+        turned = torch.rand(len(batch.starts), 1, generator=generator) < training.mirrored
+        inputs, outputs = (torch.where(turned, own, 1.0) for own in signs)
+        return batch._replace(
+            inputs=batch.inputs * inputs.unsqueeze(1), targets=batch.targets * outputs.unsqueeze(1), starts=batch.starts * outputs
+        )
+
     def batches(generator: torch.Generator) -> Iterator[_Batch]:
-        firsts = []
-        for length, offset in zip(cutter.lengths, cutter.offsets, strict=True):
-            count = length // steps
-            if count:
-                shift = int(torch.randint(length - count * steps + 1, (), generator=generator))
-                firsts += [offset + shift + number * steps for number in range(count)]
-        order = torch.tensor(firsts)[torch.randperm(len(firsts), generator=generator)]
-        for chosen in order.split(training.batch_size):
-            batch = cutter.cut(chosen, steps, mask_of(len(chosen), steps, generator))
-            yield mirror.some(batch, training.mirrored, generator)
+        for chosen in drawn_starts(train.lengths, steps, generator).split(training.batch_size):
+            yield mirrored(train.cut(chosen, torch.arange(steps), mask_of(len(chosen), steps, generator)), generator)
 
     def stretches(generator: torch.Generator) -> Iterator[_Batch]:
-        pieces = cutter.pieces(steps, generator)
+        pieces = train.pieces(steps, generator)
         for chosen in pieces[torch.randperm(len(pieces), generator=generator)].split(training.batch_size):
             longest = int(chosen[:, 1].max())
-            batch = cutter.padded(chosen, training.dropped_steps, mask_of(len(chosen), longest, generator))
-            batch = mirror.some(batch, training.mirrored, generator)
+            batch = mirrored(train.padded(chosen, training.dropped_steps, mask_of(len(chosen), longest, generator)), generator)
             for first in range(0, longest, truncated):
                 yield batch.stretch(first, first + truncated)
 
@@ -405,37 +353,3 @@ def _phase(
         return float(samples.double().mean())
 
     return Phase("sequences", training.phase, network, stretches if truncated else batches, loss, validate)
-
-
-def _validation_batches(drives: Sequence[_Drive], training: SequenceSettings, dtype: torch.dtype) -> list[_Batch]:
-    """Sequences without overlap from the start of each recording; of one that is too short, all of it."""
-    cutter = _Cutter(drives, dtype)
-    batches = []
-    for drive, length, offset in zip(drives, cutter.lengths, cutter.offsets, strict=True):
-        steps = min(length, training.validation_steps)
-        if steps <= training.settling_steps:
-            raise DataError(
-                f"recording '{drive.name}' is {length} samples long: too short to validate on with training.dropped_steps "
-                f"{training.settling_steps}; choose a longer range in conf/split"
-            )
-        firsts = offset + steps * torch.arange(length // steps)
-        batches.append(cutter.cut(firsts, steps))
-    return batches
-
-
-def _fit_record(record: PhaseRecord) -> FitRecord:
-    return FitRecord(
-        history={
-            "epoch": list(range(1, record.epochs + 1)),
-            "train_loss": record.train_loss,
-            "validation_loss": record.validation_loss,
-        },
-        metrics={
-            "epochs": record.epochs,
-            "best_epoch": record.best_epoch,
-            "best_validation_loss": record.best_loss,
-            "skipped_steps": record.skipped_steps,
-            "train_seconds": record.seconds,
-        },
-        interrupted=record.interrupted,
-    )

@@ -18,7 +18,7 @@ from vehest.data.estimate import Estimate
 from vehest.data.recording import Recording
 from vehest.data.windows import window_starts, windows_of
 from vehest.declared import setting
-from vehest.estimators.base import Estimator, FitData, FitRecord, Stepper, rate
+from vehest.estimators.base import FitData, FitRecord, Stepper, rate
 from vehest.estimators.model_files import load_model
 from vehest.estimators.network import Network
 from vehest.training.context import FitContext
@@ -32,7 +32,7 @@ class WindowedEstimator(Network):
     """A memoryless network: N measurements r[k-N+1 … k] to the lateral velocity at k+1 (Da Lio et al. 2023, Fig. 1).
 
     The network is any ``nn.Module`` that maps windows (B, N, C) to (B,), in plain PyTorch; what it may have besides, a compiled recursion
-    for example, is in `vehest.training.members.WindowNetworkHooks`.
+    for example, is in `vehest.training.members`.
     """
 
     channels = ("yaw_rate", "vx", "ay", "ax")
@@ -63,40 +63,22 @@ class WindowedEstimator(Network):
         return self.window - 1
 
     @classmethod
-    def fit_members(cls, members: Sequence[Estimator], data: FitData, training: Any, context: FitContext) -> list[FitRecord]:
+    def fit_members(cls, members: Sequence[Any], data: FitData, training: Any, context: FitContext) -> list[FitRecord]:
         """Train members together (`train_members`).
 
         Raises:
-            DataError: recordings are too short or have gaps, or the loss is no longer finite.
-            ConfigurationError: the network cannot be trained so.
+            DataError: recordings are too short or have gaps, the loss is no longer finite, or a model to start from is damaged.
+            ConfigurationError: the network cannot be trained so, or a model to start from is of another family or has other settings.
         """
-        windowed = [member for member in members if isinstance(member, WindowedEstimator)]
-        first = windowed[0]
-        sets = [windows_of(part, first.channels, TARGET, first.window) for part in (data.train, data.validation)]
-        started = start_weights(first, Path(training.start_from)) if training.start_from is not None else None
-        for member in windowed:
-            member.network = member._seeded_network(list(data.train), getattr(torch, training.dtype))
-            if started is not None:
-                member.network.load_state_dict({name: tensor.to(getattr(torch, training.dtype)) for name, tensor in started.items()})
-        networks = [member.network for member in windowed]
-        records = train_members(networks, [member._seed for member in windowed], sets[0], sets[1], training, context)
-        return [
-            FitRecord(
-                history={
-                    "epoch": list(range(1, record.epochs + 1)),
-                    "train_loss": record.train_loss,
-                    "validation_loss": record.validation_loss,
-                },
-                metrics={
-                    "epochs": record.epochs,
-                    "best_epoch": record.best_epoch,
-                    "best_validation_loss": record.best_validation_loss,
-                    "train_seconds": record.seconds / len(records),
-                },
-                interrupted=record.interrupted,
-            )
-            for record in records
-        ]
+        first, dtype = members[0], getattr(torch, training.dtype)
+        train, validation = (windows_of(part, first.channels, TARGET, first.window) for part in (data.train, data.validation))
+        started = first._weights_of(Path(training.start_from)) if training.start_from is not None else {}
+        for member in members:
+            member.network = member._seeded_network(list(data.train), dtype)
+            if started:
+                member.network.load_state_dict({name: torch.as_tensor(values, dtype=dtype) for name, values in started.items()})
+        seeds = [member._seed for member in members]
+        return train_members([member.network for member in members], seeds, train, validation, training, context)
 
     def _seeded_network(self, train: list[Recording], dtype: torch.dtype) -> nn.Module:
         """A network to train, with initial weights from the member's seed."""
@@ -108,6 +90,16 @@ class WindowedEstimator(Network):
         if reset is not None:
             reset(torch.Generator().manual_seed(self._seed))
         return network
+
+    def _weights_of(self, folder: Path) -> dict[str, np.ndarray[Any, Any]]:
+        """Weights and ranges of another model of the same family and settings, to start a training from (fine-tuning)."""
+        other = load_model(folder)
+        if (other.name, other.settings) != (self.name, self.settings):
+            raise ConfigurationError(
+                f"training.start_from: '{folder.name}' is {other.full_title} with {asdict(other.settings)}; "
+                f"training starts from a model of the same family and settings, here {self.full_title} with {asdict(self.settings)}"
+            )
+        return other.weights()
 
     def _estimate_one(self, recording: Recording, initial_state: Mapping[str, float] | None) -> Estimate:
         if initial_state is not None:
@@ -152,33 +144,8 @@ class WindowStepper(Stepper):
         return {"vy": float(self._estimator._predict(np.array(self._window), np.zeros(1, dtype=np.int64))[0])}
 
 
-def start_weights(estimator: WindowedEstimator, folder: Path) -> dict[str, Tensor]:
-    """Weights and ranges of another model, to start a training from (fine-tuning).
-
-    Args:
-        estimator: that is to be trained.
-        folder: of a model of the same family and settings.
-
-    Raises:
-        ConfigurationError: it is of another family, or has other settings.
-        MissingError: there is no model.
-        DataError: its files are damaged.
-    """
-    other = load_model(folder)
-    if (other.name, other.settings) != (estimator.name, estimator.settings) or not isinstance(other, WindowedEstimator):
-        raise ConfigurationError(
-            f"training.start_from: '{folder.name}' is {other.full_title} with {asdict(other.settings)}; "
-            f"training starts from a model of the same family and settings, here {estimator.full_title} with {asdict(estimator.settings)}"
-        )
-    return {name: torch.from_numpy(values) for name, values in other.weights().items()}
-
-
 def _check_state(network: nn.Module) -> None:
-    """See that a network's state is what members can have and model files can hold.
-
-    Raises:
-        ConfigurationError: it has nothing to train, keeps running statistics, or holds other numbers than floating point.
-    """
+    """Refuse a network whose state members cannot have, or model files cannot hold."""
     kind = type(network).__name__
     if not any(parameter.requires_grad for parameter in network.parameters()):
         raise ConfigurationError(f"{kind} has no parameters to train")
@@ -194,10 +161,14 @@ def _check_state(network: nn.Module) -> None:
 
 
 class StandardisedNetwork(nn.Module):
-    """Base of networks that see standardised measurements and predict a standardised lateral velocity.
+    """Base of networks that see standardised measurements and predict standardised velocities.
 
-    Means and standard deviations are those of the training recordings; they are not parameters. `prepared` standardises what ``forward``
-    sees; what it predicts goes back to m/s by ``output * self.output_scale + self.output_mean``.
+    Means and standard deviations are those of the training recordings; they are kept with the weights and are not parameters. `prepared`
+    standardises what ``forward`` sees; what it predicts goes back to SI units by ``output * self.output_scale + self.output_mean``.
+
+    Args:
+        n_channels: measured channels.
+        outputs: shape of what is predicted of one instant.
     """
 
     input_mean: Tensor
@@ -205,28 +176,20 @@ class StandardisedNetwork(nn.Module):
     output_mean: Tensor
     output_scale: Tensor
 
-    def __init__(self, n_channels: int) -> None:
+    def __init__(self, n_channels: int, outputs: tuple[int, ...] = ()) -> None:
         super().__init__()
-        self.register_buffer("input_mean", torch.zeros(n_channels))
-        self.register_buffer("input_scale", torch.ones(n_channels))
-        self.register_buffer("output_mean", torch.zeros(()))
-        self.register_buffer("output_scale", torch.ones(()))
+        for name, shape in (("input", (n_channels,)), ("output", outputs)):
+            self.register_buffer(f"{name}_mean", torch.zeros(shape))
+            self.register_buffer(f"{name}_scale", torch.ones(shape))
 
-    def standardise(self, train: Sequence[Recording], channels: Sequence[str]) -> None:
+    def standardise(self, train: Sequence[Recording], channels: Sequence[str], references: Sequence[str] = (TARGET,)) -> None:
         """Take means and standard deviations from recordings."""
-        inputs = np.concatenate([recording.stack(channels) for recording in train])
-        outputs = np.concatenate([recording[TARGET] for recording in train])
-        for buffer, value in (
-            (self.input_mean, inputs.mean(axis=0)),
-            (self.input_scale, np.maximum(inputs.std(axis=0), 1e-6)),
-            (self.output_mean, outputs.mean()),
-            (self.output_scale, max(float(outputs.std()), 1e-6)),
-        ):
-            buffer.copy_(torch.as_tensor(value))
+        parts = ((self.input_mean, self.input_scale, channels), (self.output_mean, self.output_scale, references))
+        for mean, scale, names in parts:
+            samples = np.concatenate([recording.stack(names) for recording in train])
+            mean.copy_(torch.as_tensor(samples.mean(axis=0)).reshape(mean.shape))
+            scale.copy_(torch.as_tensor(np.maximum(samples.std(axis=0), 1e-6)).reshape(scale.shape))
 
     def prepared(self, series: Tensor) -> Tensor:
         """Standardised measurements."""
         return (series - self.input_mean) / self.input_scale
-
-    def constrain(self, parameters: Mapping[str, Tensor]) -> None:
-        """Any weights are admissible."""
