@@ -155,7 +155,9 @@ def aside_of(path: Path, name: str = "") -> Path:
 def sha256_of(path: Path) -> str:
     """Hex digest of a file's bytes; raises a `DataError` where it cannot be read."""
     try:
-        with open(regular_file(path), "rb") as stream:
+        if not stat.S_ISREG(os.stat(path).st_mode):
+            regular_file(path)  # which names what it is
+        with open(path, "rb") as stream:
             return hashlib.file_digest(stream, "sha256").hexdigest()
     except OSError as error:
         raise DataError(f"cannot read '{path}': {error.strerror}") from error
