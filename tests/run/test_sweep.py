@@ -210,7 +210,7 @@ def test_failing_combinations_are_named_and_the_others_go_on(place):
     last = err.splitlines()[-1]
     assert last.startswith("error: 10 of 12 jobs failed, the others are kept; ")
     assert "n_hidden=-1, learning_rate=0.001" in last
-    assert "estimator.n_hidden must not be negative, not -1" in last
+    assert "estimator.n_hidden must be at least 0, not -1" in last
     assert "Traceback" not in err
     outcome = json.loads(out)
     named = {entry["jobs"]: entry["message"] for entry in outcome["failed"]}
