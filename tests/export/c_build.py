@@ -11,7 +11,8 @@ from pathlib import Path
 import numpy as np
 
 from vehest.estimators.base import Estimator
-from vehest.export.method import method_source, types_header
+from vehest.export.method import _common, method_source
+from vehest.export.rendering import render
 
 COMPILERS = [name for name in ("gcc", "clang") if shutil.which(name)]
 FLAGS = ["-std=c99", "-O2", "-Wall", "-Wextra", "-Werror", "-pedantic", "-Wconversion"]
@@ -67,7 +68,7 @@ class Library:
 def write(estimator: Estimator, precision: str, folder: Path) -> None:
     folder.mkdir(parents=True, exist_ok=True)
     source = method_source(estimator, precision)
-    (folder / "vehest_types.h").write_text(types_header(estimator, precision), encoding="ascii")
+    (folder / "vehest_types.h").write_text(render("types.h.j2", precision, **_common(estimator)), encoding="ascii")
     (folder / "vehest_method.h").write_text(source.header, encoding="ascii")
     (folder / "vehest_method.c").write_text(source.source, encoding="ascii")
 

@@ -13,8 +13,9 @@ import numpy as np
 from exports import FAMILIES, LARGEST, WEIGHTS, model
 
 from vehest.estimators.base import Estimator
-from vehest.export.method import method_source, types_header
+from vehest.export.method import _common, method_source
 from vehest.export.program import program_files
+from vehest.export.rendering import render
 from vehest.trust.bands import Bands, Quantity
 from vehest.trust.contract import GuardedStepper
 from vehest.trust.guard import ChannelLimits, GuardLimits
@@ -73,7 +74,7 @@ def sources() -> dict[str, str]:
     for name in FAMILIES:
         own = by_hand(name)
         method = method_source(own, "double")
-        found[f"{name}/vehest_types.h"] = types_header(own, "double")
+        found[f"{name}/vehest_types.h"] = render("types.h.j2", "double", **_common(own))
         found |= {f"{name}/vehest_method.h": method.header, f"{name}/vehest_method.c": method.source}
     stepper = GuardedStepper(by_hand("kinematic"), trust_by_hand(), 500.0)
     files = program_files(stepper, "float", "Kinematic integration, weights set by hand")

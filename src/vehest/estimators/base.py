@@ -90,7 +90,7 @@ class Estimator(ABC):
         learns_from: reference channels that its fit reads.
         skippable: channels of ``channels`` that may have gaps, because the method does without a sample.
         refuses: which measurements of a sample are errors: ``NaN`` where it is not skippable, ``infinite``.
-        open_weights: weights that may stay NaN, because each recording tells them.
+        may_be_nan: weights that may stay NaN, because each recording tells them.
         covariance_of: quantities that the covariances of `run` are of.
         ignores_initial_state: whether an initial state is left aside; else it is used, or refused as an error.
         slow_kernel: module of a compiled function ``_transition`` that takes tens of seconds to compile; empty: none.
@@ -109,7 +109,7 @@ class Estimator(ABC):
     learns_from: tuple[str, ...] = ("vy_ref",)
     skippable: ClassVar[tuple[str, ...]] = ()
     refuses: ClassVar[tuple[str, ...]] = ()
-    open_weights: ClassVar[tuple[str, ...]] = ()
+    may_be_nan: ClassVar[tuple[str, ...]] = ()
     covariance_of: ClassVar[tuple[str, ...]] = ()
     ignores_initial_state: ClassVar[bool] = False
     slow_kernel: ClassVar[str] = ""
@@ -189,7 +189,7 @@ class Estimator(ABC):
         return self.title
 
     @classmethod
-    def drawn(cls, variant: str) -> tuple[str, str, str] | None:
+    def line_style(cls, variant: str) -> tuple[str, str, str] | None:
         """Colour, dash and marker of its lines in figures; none: a colour that follows from its name."""
         return None
 
@@ -202,7 +202,7 @@ class Estimator(ABC):
         """Reference channels that a fit with these settings reads, of recordings with these channels."""
         return self.learns_from
 
-    def unmatched(self, training: Any, recordings: Collection[str]) -> tuple[str, ...]:
+    def unmatched_patterns(self, training: Any, recordings: Collection[str]) -> tuple[str, ...]:
         """Overrides that a fit needs because its settings name recordings by a pattern that none of these matches."""
         return ()
 

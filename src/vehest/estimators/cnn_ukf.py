@@ -157,7 +157,7 @@ class CnnUkf(NetworkUkf):
 
     def fit_network(self, data: FitData, training: EndToEndSettings, context: FitContext, index: int) -> FitRecord:
         """Pre-training, then training through the filter."""
-        network, train, judged = self.begin_network(data, training, [self._seed], self.minimum_speed)
+        network, train, judged = self.prepare_network(data, training, [self._seed], self.minimum_speed)
         levels = torch.tensor([self.levels["process_vy"], self.levels["process_yaw_rate"]], dtype=torch.float64)
         levels = levels.clamp(max=MOST_NOISE)  # a logistic function that is to say 1 or more saturates, and learns no more
         with torch.no_grad():  # logistic functions start where the filter alone has its levels, and as unsure as a network that says 0

@@ -471,7 +471,7 @@ class DugoffUkf(SigmaPointEstimator):
             return ("vy_ref",)
         return () if self._tyres_given or "sideslip_ref" in channels else ("vy_ref",)
 
-    def unmatched(self, training: Any, recordings: Collection[str]) -> tuple[str, ...]:
+    def unmatched_patterns(self, training: Any, recordings: Collection[str]) -> tuple[str, ...]:
         """Where no recording matches the pattern that names those to identify tyres on."""
         if self._tyres_given or any(fnmatch.fnmatchcase(name, training.tyres_from) for name in recordings):
             return ()

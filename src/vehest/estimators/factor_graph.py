@@ -13,14 +13,11 @@ from vehest.constants import FloatArray
 from vehest.data.errors import ConfigurationError
 from vehest.declared import Group, setting
 from vehest.estimators.base import Stepper, Trial
-from vehest.estimators.filtering.sideslip_filter import SideslipFilter
+from vehest.estimators.filtering.sideslip_filter import MEASURED, SideslipFilter
 from vehest.filters.gating import refuses
 from vehest.filters.gaussian import Gaussian
 from vehest.filters.kalman import LinearModel, smoothed_means
 from vehest.filters.kalman_scan import kalman_scan
-
-MEASURED = [0, 2]
-"""Yaw rate and a_y among the channels."""
 
 
 @dataclass(frozen=True)

@@ -43,7 +43,7 @@ class Gru(RecurrentEstimator):
     network_type = GruNetwork
 
     @classmethod
-    def drawn(cls, variant: str) -> tuple[str, str, str]:
+    def line_style(cls, variant: str) -> tuple[str, str, str]:
         """Purple."""
         return "#8e24aa", "solid", "D"
 

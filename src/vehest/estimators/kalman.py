@@ -74,15 +74,9 @@ class KalmanFilter(SideslipFilter):
     """
 
     name, title = "kalman", "Kalman filter"
-    trials = (
-        Trial(
-            5,
-            "Kalman filter over a single track; only noise levels are learnt",
-            "{car}",
-        ),
-    )
+    trials = (Trial(5, "Kalman filter over a single track; only noise levels are learnt", "{car}"),)
     learns_from = ()
-    open_weights = LEVELS
+    may_be_nan = LEVELS
     template = "kalman"
     noise: SensorNoise = setting(SensorNoise(), "standard deviations of the sensors' noise")
     offsets: SensorOffsets = setting(SensorOffsets(), "standard deviations of offsets that are states")
@@ -90,7 +84,7 @@ class KalmanFilter(SideslipFilter):
 
     def __init__(self, settings: Any) -> None:
         super().__init__(settings)
-        self.values = {name: math.nan if level is None else level for name in LEVELS for level in (getattr(self.noise, name),)}
+        self.values = {name: math.nan if name in self.noise.unknown else getattr(self.noise, name) for name in LEVELS}
         self.unknown = self.noise.unknown if self.noise.read_from == "training" else ()
 
     @property

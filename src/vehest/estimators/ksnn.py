@@ -165,7 +165,7 @@ class Ksnn(WindowedEstimator):
     bias: bool = setting(False, "whether feedback functions may learn sensor offsets")
 
     @classmethod
-    def drawn(cls, variant: str) -> tuple[str, str, str]:
+    def line_style(cls, variant: str) -> tuple[str, str, str]:
         """Blue with linear feedback, orange with nonlinear; darker and solid with biases (Da Lio et al. 2023, Fig. 6)."""
         nonlinear, bias = "nonlinear" in variant, "bias" in variant and "no_bias" not in variant
         shades = ("#f59a23", "#b8480b") if nonlinear else ("#4aa5e0", "#0b4f9c")

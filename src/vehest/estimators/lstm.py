@@ -42,7 +42,7 @@ class Lstm(RecurrentEstimator):
     network_type = LstmNetwork
 
     @classmethod
-    def drawn(cls, variant: str) -> tuple[str, str, str]:
+    def line_style(cls, variant: str) -> tuple[str, str, str]:
         """Light purple."""
         return "#c792dd", "dashed", "v"
 

@@ -36,7 +36,7 @@ class Luenberger(Recursive):
     )
 
     @classmethod
-    def drawn(cls, variant: str) -> tuple[str, str, str]:
+    def line_style(cls, variant: str) -> tuple[str, str, str]:
         """Grey."""
         return "#767676", "solid", "s"
 

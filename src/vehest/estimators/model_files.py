@@ -97,7 +97,7 @@ def load_model(folder: Path) -> Estimator:
             f"'{folder}' holds version {description.version} of '{kind.name}', whose estimates differ from those of version {kind.version} "
             f"here; train it again, or use the vehest that trained it"
         )
-    weights = _read_weights(folder, kind.open_weights)
+    weights = _read_weights(folder, kind.may_be_nan)
     estimator = _built(kind, description.settings, sum(values.size for values in weights.values()), path)
     try:
         estimator.load_weights(weights)

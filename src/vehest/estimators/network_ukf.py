@@ -13,14 +13,14 @@ from vehest.data.errors import DataError
 from vehest.data.recording import Recording
 from vehest.estimators.base import FitData, FitRecord
 from vehest.estimators.dugoff_ukf import CHANNELS, DugoffUkf, PseudoMeasurement
-from vehest.estimators.networks.sample_network import INPUTS, NAMED, OnSamples
+from vehest.estimators.networks.sample_network import INPUTS, NAMED, SampleNetworkEstimator
 from vehest.training.context import FitContext
 
 LEAST_VARIANCE = 1e-6
 """Added to the variance of a network's angle [rad²], so that no filter takes it for exact; ε of Bertipaglia et al. 2024, Eq. 6."""
 
 
-class NetworkUkf(OnSamples, DugoffUkf):
+class NetworkUkf(SampleNetworkEstimator, DugoffUkf):
     """A `DugoffUkf` that also measures the sideslip angle that a network derives from the same sample (Bertipaglia et al. 2024, Eq. 4).
 
     Filter and network are fitted in one training: the filter first, as it would be alone with the same seed. A network needs every sample,
@@ -89,7 +89,7 @@ class NetworkUkf(OnSamples, DugoffUkf):
 
     def weights(self) -> dict[str, np.ndarray[Any, Any]]:
         """Those of the filter and of the network."""
-        parts = {"filter": DugoffUkf.weights(self), "network": OnSamples.weights(self)}
+        parts = {"filter": DugoffUkf.weights(self), "network": SampleNetworkEstimator.weights(self)}
         return {f"{part}.{name}": values for part, own in parts.items() for name, values in own.items()}
 
     def load_weights(self, weights: Mapping[str, np.ndarray[Any, Any]]) -> None:
@@ -101,15 +101,15 @@ class NetworkUkf(OnSamples, DugoffUkf):
                 raise DataError(f"weights of '{self.name}' do not fit its settings: '{name}' is unknown")
             parts[part][own] = values
         DugoffUkf.load_weights(self, parts["filter"])
-        OnSamples.load_weights(self, parts["network"])
+        SampleNetworkEstimator.load_weights(self, parts["network"])
 
     def references(self, training: Any, channels: Collection[str]) -> tuple[str, ...]:
         """The network learns from ``vy_ref``."""
         return self.learns_from
 
-    def unmatched(self, training: Any, recordings: Collection[str]) -> tuple[str, ...]:
+    def unmatched_patterns(self, training: Any, recordings: Collection[str]) -> tuple[str, ...]:
         """Those of the filter's identification."""
-        found = super().unmatched(training.identification, recordings)
+        found = super().unmatched_patterns(training.identification, recordings)
         return tuple(one.replace("training.", "training.identification.", 1) for one in found)
 
     def c_values(self) -> dict[str, Any]:

@@ -267,7 +267,7 @@ class RationalFilter(SideslipFilter):
         rows = [1, 3] if linear else [0, 1, 2, 3]
         self.axle_curves[rows] = [*fit.front, *fit.rear]
         self.curve_covariance = np.zeros((len(CURVES), len(CURVES)))
-        for axle, covariance in enumerate(_doubts(motion, kind, fit)):
+        for axle, covariance in enumerate(_covariances_of_logarithms(motion, kind, fit)):
             own = rows[axle * len(covariance) : (axle + 1) * len(covariance)]
             self.curve_covariance[np.ix_(own, own)] = covariance
         found = {CURVES[row]: float(self.axle_curves[row]) for row in rows}
@@ -567,7 +567,7 @@ def _named_like(recordings: Sequence[Recording], pattern: str) -> list[Recording
     return found
 
 
-def _doubts(motion: AxleMotion, kind: Literal["linear", "rational"], fit: TyreFit) -> list[FloatArray]:
+def _covariances_of_logarithms(motion: AxleMotion, kind: Literal["linear", "rational"], fit: TyreFit) -> list[FloatArray]:
     """Covariance of the logarithms of each axle's parameters, least squares' own and what they cannot see: the scale of all forces, and an
     offset of all slip angles, whose effect is that of a fit to shifted ones."""
     shifted = fit_motion(motion._replace(slip=motion.slip + SLIP_OFFSET), kind)

@@ -7,7 +7,7 @@ import time
 from collections import namedtuple
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
-from functools import cached_property
+from functools import cache
 from typing import Any, ClassVar
 
 import numba
@@ -73,14 +73,9 @@ class Recursive(Estimator):
         return dict(zip(self.states, found.T.copy(), strict=True)), state
 
     def numbers(self) -> Any:
-        """Numeric settings, fitted numbers and the sampling time ``dt`` [s], as ``step`` takes them."""
-        numbers = {name: value for name, value in vars(self.settings).items() if isinstance(value, float)} | self.values
-        return self._numbers_type(**numbers, dt=1.0 / self.rate_hz)
-
-    @cached_property
-    def _numbers_type(self) -> Any:
-        names = [name for name, value in vars(self.settings).items() if isinstance(value, float) and name not in self.values]
-        return namedtuple("Numbers", [*names, *self.values, "dt"])
+        """Numeric settings, fitted numbers and the sampling time ``dt`` [s], as ``step`` takes them: a named tuple."""
+        numbers = {name: value for name, value in vars(self.settings).items() if isinstance(value, int | float)} | self.values
+        return _numbers_type((*numbers, "dt"))(*numbers.values(), 1.0 / self.rate_hz)
 
     def closed_form(self, recordings: Sequence[Recording]) -> dict[str, float] | None:
         """Numbers of the smallest mean squared error of vy, where the family has them in closed form.
@@ -207,6 +202,12 @@ class _FittedNumber:
 
     def __set__(self, owner: Recursive, value: float) -> None:
         owner.values[self.name] = float(value)
+
+
+@cache
+def _numbers_type(names: tuple[str, ...]) -> Any:
+    """One type a family, so that numba compiles its ``step`` once."""
+    return namedtuple("Numbers", names)
 
 
 @numba.njit(error_model="numpy")

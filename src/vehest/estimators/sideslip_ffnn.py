@@ -10,12 +10,12 @@ from vehest.constants import FloatArray
 from vehest.declared import setting
 from vehest.estimators.base import FitData, FitRecord, Trial
 from vehest.estimators.kernels.sample_network import squared_error
-from vehest.estimators.networks.sample_network import INPUTS, NAMED, OnSamples, SampleNetwork, clip_sideslip
+from vehest.estimators.networks.sample_network import INPUTS, NAMED, SampleNetwork, SampleNetworkEstimator, clip_sideslip
 from vehest.training.context import FitContext
 from vehest.training.samples import SampleSettings
 
 
-class SideslipFfnn(OnSamples):
+class SideslipFfnn(SampleNetworkEstimator):
     """Two hidden layers with rectifiers and dropout, trained on the mean squared error of the sideslip angle with early stopping.
 
     Source: Bertipaglia, Alirezaei, Happee & Shyrokau, An unscented Kalman filter-informed neural network for vehicle sideslip angle

@@ -50,10 +50,6 @@ class Segments:
     def __len__(self) -> int:
         return len(self.piece)
 
-    def same_grid(self, other: Segments) -> bool:
-        """Whether both are over the same samples."""
-        return all(np.array_equal(getattr(self, name), getattr(other, name)) for name in ("piece", "start", "samples"))
-
 
 COLUMNS = tuple(field.name for field in fields(Segments))
 

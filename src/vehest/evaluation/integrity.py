@@ -25,7 +25,6 @@ ALERT_LIMIT = 2.0  # deg of sideslip
 CONFIDENCE = 0.95
 
 NOMINAL, MISLEADING, HAZARDOUS, UNAVAILABLE = "nominal", "misleading", "hazardously misleading", "unavailable"
-REGIONS = (NOMINAL, MISLEADING, HAZARDOUS, UNAVAILABLE)
 
 
 @dataclass(frozen=True, eq=False)

@@ -42,11 +42,6 @@ def method_source(estimator: Estimator, precision: Precision) -> MethodSource:
     return MethodSource(header, render(path, precision, beside, **values))
 
 
-def types_header(estimator: Estimator, precision: Precision) -> str:
-    """vehest_types.h: the type of numbers, and the channels with their units."""
-    return render("types.h.j2", precision, **_common(estimator))
-
-
 def exportable() -> tuple[str, ...]:
     """Names of families that have C."""
     return tuple(name for name in estimator_names() if estimator_class(name).template)

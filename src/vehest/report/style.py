@@ -90,8 +90,8 @@ def colour_of(estimator: str, variant: str = "") -> str:
 
 
 def line_of(estimator: str, variant: str = "") -> Line:
-    """Line of an estimator as its family declares it (`Estimator.drawn`), else one of a colour that depends on the name only."""
-    drawn = estimator_class(estimator).drawn(variant) if estimator in estimator_names() else None
+    """Line of an estimator as its family declares it (`Estimator.line_style`), else one of a colour that depends on the name only."""
+    drawn = estimator_class(estimator).line_style(variant) if estimator in estimator_names() else None
     if drawn is not None:
         return Line(*drawn)
     return Line(OTHER_COLOURS[zlib.crc32(f"{estimator}/{variant}".encode()) % len(OTHER_COLOURS)], "solid", "P")

@@ -126,7 +126,7 @@ def usability(
         return Usability(name, None, config["estimator"].get("rate_hz"), absent, to_give=str(error))
     missing = _missing(estimator, training, recordings, to_estimate)
     settings, without = _settings_without(config, missing.unsupplied, recordings, to_estimate)
-    patterns = estimator.unmatched(training, [one.id for one in recordings]) if recordings else ()
+    patterns = estimator.unmatched_patterns(training, [one.id for one in recordings]) if recordings else ()
     own_rate = estimator.settings.rate_hz
     rate, gaps = min([own_rate, *(one.rate_hz for one in both)]), gaps_that_matter(estimator, _gappy(both))
     return Usability(name, rate, own_rate, missing, gaps, settings, without, patterns, car=car_parameters(own))
@@ -204,7 +204,7 @@ def lack(config: Config, split: Split, contents: Mapping[str, Sequence[Recording
         without = [found.without] if found.settings else []
         return f"recording '{lacking[0]}'{others} what estimator '{estimator.name}' needs: {'; '.join([*reasons, *without])}"
     trained = [own.id for own in _recordings(split.train, contents)]
-    patterns = estimator.unmatched(training, trained) if trained else ()
+    patterns = estimator.unmatched_patterns(training, trained) if trained else ()
     return f"no training recording is called as estimator '{estimator.name}' expects; give {', '.join(patterns)}" if patterns else ""
 
 

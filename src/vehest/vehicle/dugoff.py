@@ -26,7 +26,6 @@ from torch import Tensor
 from vehest.constants import GRAVITY
 
 TRACK_STATES = ("vy", "yaw_rate")
-TRACK_INPUTS = ("vx", "steer", "ax")
 TRACK_MEASUREMENTS = ("ay", "yaw_rate", "fy_front", "fy_rear", "sideslip")
 LARGEST_RATIO = {"plain": 1.0, "smooth": 10.0}  # of λ, beyond which f is 1
 LEAST_SHARE = 0.2  # of the friction that sliding leaves

@@ -9,7 +9,7 @@ from vehest.estimators.base import Estimator
 from vehest.filters.gating import Gate
 
 
-class Gated(Estimator):
+class GatedFilter(Estimator):
     """A filter that may refuse measurements in use; it learns without, because noise that is too small would close the gate."""
 
     gate: float | None = setting(

@@ -14,7 +14,7 @@ from vehest.constants import FloatArray
 from vehest.data.errors import DataError
 from vehest.data.recording import Recording
 from vehest.declared import setting
-from vehest.estimators.filtering.gated import Gated
+from vehest.estimators.filtering.gated import GatedFilter
 from vehest.estimators.recursive import Recursive
 from vehest.filters.gating import Gate
 from vehest.filters.gaussian import Gaussian
@@ -69,7 +69,7 @@ class FilterState(NamedTuple):
     refused: NDArray[np.int64]
 
 
-class SideslipFilter(Gated, Recursive):
+class SideslipFilter(GatedFilter, Recursive):
     """A filter whose state begins with sideslip angle β and yaw rate r of a single track; v = u tan β."""
 
     channels = ("yaw_rate", "vx", "ay", "steer")

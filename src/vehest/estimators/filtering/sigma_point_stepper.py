@@ -8,7 +8,7 @@ from typing import Any, ClassVar, NamedTuple
 
 from vehest.constants import FloatArray
 from vehest.estimators.base import Stepper
-from vehest.estimators.filtering.gated import Gated
+from vehest.estimators.filtering.gated import GatedFilter
 from vehest.filters.unscented_scan import NoiseAt, UnscentedStepper
 
 
@@ -28,7 +28,7 @@ class FilterStep(NamedTuple):
     observation_noise: FloatArray | NoiseAt
 
 
-class SigmaPointEstimator(Gated):
+class SigmaPointEstimator(GatedFilter):
     """An estimator by an unscented filter.
 
     Attributes:

@@ -18,7 +18,7 @@ from vehest.estimators.networks.windowed import StandardisedNetwork, WindowedEst
 TRIAL = Trial(7, "recurrent networks; minutes", "estimator.n_states=5 training.max_epochs=100 seed=range(2)")
 
 
-class OfStates(Network):
+class HiddenStateEstimator(Network):
     """A family that is named by the size of its hidden state."""
 
     n_states: int
@@ -97,7 +97,7 @@ class RecurrentNetwork(StandardisedNetwork):
         return self._read_out(state, parameters["output_weight"].unsqueeze(1), parameters["output_bias"].unsqueeze(1))
 
 
-class RecurrentEstimator(OfStates, WindowedEstimator):
+class RecurrentEstimator(HiddenStateEstimator, WindowedEstimator):
     """A recurrent benchmark as an estimator, with the inputs of the KS-NN."""
 
     n_states: int = setting(5, "size of the hidden state", least=1)

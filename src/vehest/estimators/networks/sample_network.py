@@ -35,7 +35,7 @@ CHUNK = 50_000  # samples that are estimated at a time
 STEEPEST = 1.5  # rad, beyond which sideslip angles of a network are clipped
 
 
-class OnSamples(Network):
+class SampleNetworkEstimator(Network):
     """An estimator with a `SampleNetwork`.
 
     Attributes:
@@ -54,7 +54,7 @@ class OnSamples(Network):
         if min(self.hidden) < 1:
             raise ConfigurationError(f"estimator.hidden must be the widths of two layers, such as [250, 125], not {list(self.hidden)}")
 
-    def begin_network(
+    def prepare_network(
         self, data: FitData, training: Any, seeds: Sequence[int], minimum_speed: float = -np.inf
     ) -> tuple[SampleNetwork, Samples, Samples]:
         """A new network with initial weights, a seed a member, and samples of training and validation as it takes them."""
@@ -75,7 +75,7 @@ class OnSamples(Network):
         minimum_speed: float = -np.inf,
     ) -> FitRecord:
         """Train members, each of a seed, on samples in random order; squared errors are in rad², other losses in the network's units."""
-        network, train, validation = self.begin_network(data, training, seeds, minimum_speed)
+        network, train, validation = self.prepare_network(data, training, seeds, minimum_speed)
         unit = network.unit**2 if criterion is squared_error else 1.0
         phase = sample_phase(
             "samples",

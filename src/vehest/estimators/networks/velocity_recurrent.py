@@ -19,7 +19,7 @@ from vehest.data.errors import ConfigurationError, DataError
 from vehest.data.recording import Recording
 from vehest.declared import Group, setting
 from vehest.estimators.base import FitData, FitRecord, Trial
-from vehest.estimators.networks.recurrent import OfStates
+from vehest.estimators.networks.recurrent import HiddenStateEstimator
 from vehest.estimators.networks.windowed import StandardisedNetwork
 from vehest.training.context import FitContext, record_of_epochs
 from vehest.training.sequences import Phase, PhaseSettings, drawn_starts, train_phases
@@ -121,7 +121,7 @@ class VelocityNetwork(StandardisedNetwork):
         """`forward` on standardised quantities."""
 
 
-class RecurrentVelocityEstimator(OfStates):
+class RecurrentVelocityEstimator(HiddenStateEstimator):
     """A recurrent network run over all samples of a drive, its hidden state starting from zero.
 
     The measured vx is read for sideslip = atan2(vy, vx), and to start networks that need a velocity to start from; the network sees it only
