@@ -26,9 +26,10 @@ from vehest.training.through_filter import ThroughFilterSettings
 VELOCITIES = {"inputs": ["vx", "yaw_rate", "ay", "ax"], "outputs": ["vx", "vy"], "n_states": 8}
 SMALL = {"inputs": "imu", "hidden": [8, 4]}
 DUGOFF = {"tyres": TYRES, "noise": {"process_vy": 0.01, "process_yaw_rate": 0.003}}
-CONFIGS = {  # those that are offline by default run online with these; recurrent ones see what the drives below have
+CONFIGS = {  # offline ones run online with these, baselines at 100 Hz, recurrent ones see what the drives below have
     "factor_graph": {"window": 0.05},
-    "data_sheet": {"wheelbase": 2.7},
+    **{name: {"rate_hz": 100.0} for name in ("zero", "static_map", "kinematic")},
+    "data_sheet": {"rate_hz": 100.0, "wheelbase": 2.7},
     "velocity_gru": VELOCITIES,
     "velocity_lstm": VELOCITIES,
     "learned_ukf": {"width": 8},

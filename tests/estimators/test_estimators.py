@@ -14,6 +14,7 @@ from vehest.data.transforms import Resample
 from vehest.estimators.base import FitData
 from vehest.estimators.model_files import load_model, save_model
 from vehest.estimators.registry import estimator_class, estimator_names
+from vehest.run.config import compose_config
 from vehest.training.search import DirectSearchSettings
 
 
@@ -34,6 +35,14 @@ def test_parameter_counts_are_those_of_the_paper():
     assert [count("gru", n_states=n) for n in (2, 5, 6)] == [45, 156, 205]
     assert [count("lstm", n_states=n) for n in (2, 5, 6)] == [59, 206, 271]
     assert count("luenberger") == 2
+
+
+@pytest.mark.parametrize("name", estimator_names())
+def test_configuration_file_states_the_defaults(name):
+    """What the pages' tables of settings say, from the class, is what `vehest train` takes."""
+    needed = {"wheelbase": 2.7} if name == "data_sheet" else {}
+    family, given = estimator_class(name), compose_config("train", [f"estimator={name}"])["estimator"]
+    assert family.from_config({**given, **needed}).settings == family.from_config(needed).settings
 
 
 @pytest.mark.parametrize("name", estimator_names())

@@ -18,7 +18,6 @@ from vehest.estimators.registry import estimator_class
 from vehest.filters.gating import Gate
 from vehest.filters.gaussian import Filtered, Gaussian
 from vehest.filters.kalman_scan import kalman_scan
-from vehest.run.config import compose_config
 from vehest.training.context import NoTraining
 
 GAPS = {"ay": slice(40, 60), "yaw_rate": slice(50, 70)}
@@ -130,12 +129,6 @@ def test_it_learns_nothing():
 def test_variants_say_how_it_is_solved():
     assert (factor_graph().variant, factor_graph().causal) == ("factor_graph_batch", False)
     assert (factor_graph(window=0.05).variant, factor_graph(window=0.05).causal) == ("factor_graph_lag_0.05s", True)
-
-
-def test_configuration_file_states_the_defaults():
-    config = compose_config("train", ["estimator=factor_graph"])
-    assert config["training"] == {"name": "none"}
-    assert factor_graph(**config["estimator"]).settings == FactorGraph.settings_type()
 
 
 @pytest.mark.parametrize(

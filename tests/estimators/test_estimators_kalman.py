@@ -17,7 +17,6 @@ from vehest.estimators.base import FitData
 from vehest.estimators.kalman import KalmanFilter
 from vehest.estimators.registry import estimator_class
 from vehest.filters.noise_levels import high_passed_level
-from vehest.run.config import compose_config
 from vehest.training.context import NoTraining
 from vehest.vehicle.parameters import FERRARI_250LM
 
@@ -161,12 +160,6 @@ def test_levels_that_cannot_be_read_are_one_clear_error(name, samples, message):
 def test_settings_that_make_no_sense_are_refused(config, message):
     with pytest.raises(ConfigurationError, match=message):
         kalman(**config)
-
-
-def test_configuration_file_states_the_defaults():
-    config = compose_config("train", ["estimator=kalman"])
-    assert config["training"] == {"name": "none"}
-    assert kalman(**config["estimator"]).settings == KalmanFilter.settings_type()
 
 
 def test_a_long_recording_takes_well_under_a_second():

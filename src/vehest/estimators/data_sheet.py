@@ -9,7 +9,7 @@ import numpy as np
 from vehest.constants import GRAVITY, FloatArray
 from vehest.data.errors import ConfigurationError
 from vehest.declared import setting
-from vehest.estimators.base import Trial
+from vehest.estimators.base import Trial, rate
 from vehest.estimators.recursive import Recursive
 
 
@@ -32,6 +32,7 @@ class DataSheet(Recursive):
     channels = ("vx", "yaw_rate")
     ignores_initial_state = True
     template = "static"
+    rate_hz: float = rate(20.0)
     wheelbase: float = setting(None, "wheelbase; has to be given", unit="m", positive=True)
     cg_to_rear_axle: float = setting(None, "distance of the centre of gravity from the rear axle; null: half the wheelbase", unit="m")
     cornering_coefficient: float = setting(10.0, "cornering stiffness of the rear axle over its load", unit="1/rad", positive=True)

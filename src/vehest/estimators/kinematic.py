@@ -13,7 +13,7 @@ from scipy.signal import lfilter
 from vehest.constants import FloatArray
 from vehest.data.recording import Recording
 from vehest.declared import fitted
-from vehest.estimators.base import Trial
+from vehest.estimators.base import Trial, rate
 from vehest.estimators.recursive import Recursive
 
 SHORTEST, LONGEST = 0.02, 200.0  # s, time constants that are looked at
@@ -32,6 +32,7 @@ class Kinematic(Recursive):
     channels = ("vx", "yaw_rate", "ay")
     ignores_initial_state = True
     template = "kinematic"
+    rate_hz: float = rate(20.0)
     time_constant: float = fitted("time constant of the leak", unit="s", positive=True)
 
     def closed_form(self, recordings: Sequence[Recording]) -> dict[str, float]:

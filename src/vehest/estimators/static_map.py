@@ -11,7 +11,7 @@ from vehest.constants import FloatArray
 from vehest.data.errors import DataError
 from vehest.data.recording import Recording
 from vehest.declared import fitted
-from vehest.estimators.base import Trial
+from vehest.estimators.base import Trial, rate
 from vehest.estimators.recursive import Recursive
 
 CONDITION = 1e8  # of the least squares; beyond it, speed hardly changes and the two numbers cannot be told apart
@@ -30,6 +30,7 @@ class StaticMap(Recursive):
     channels = ("vx", "yaw_rate")
     ignores_initial_state = True
     template = "static"
+    rate_hz: float = rate(20.0)
     b: float = fitted("distance of the rear axle from the point where v holds", unit="m")
     k: float = fitted("slip of the rear axle per lateral acceleration", unit="s²/m")
 

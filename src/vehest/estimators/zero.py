@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from vehest.constants import FloatArray
-from vehest.estimators.base import Trial
+from vehest.estimators.base import Trial, rate
 from vehest.estimators.recursive import Recursive
 
 
@@ -19,6 +19,7 @@ class Zero(Recursive):
     channels = ("vx",)
     ignores_initial_state = True
     template = "static"
+    rate_hz: float = rate(20.0)
 
     def run(self, samples: FloatArray, state: Any) -> tuple[dict[str, FloatArray], Any]:
         """Zeros [m/s]."""

@@ -19,7 +19,7 @@ static const vehest_real MASS = 5.1; /* [kg] */
 static const vehest_real REAR_ARM = 1.6487212707001282; /* centre of gravity to rear axle [m] */
 static const vehest_real FRONT_ARM = -1.3187212707001281; /* to front axle [m] */
 static const vehest_real INERTIA = 1.3498588075760032; /* about the vertical axis [kg m^2] */
-static const vehest_real DRAG[3] = {1.4918246976412703, 1.3498588075760032, 1.568312185490169}; /* [N, N s/m, N s^2/m^2] */
+static const vehest_real DRAG[3] = {1.4918246976412703, 1.3498588075760032, 1.5683121854901687}; /* [N, N s/m, N s^2/m^2] */
 static const vehest_real POWERTRAIN = 1.1051709180756477; /* inertia [kg m^2] */
 static const vehest_real TORQUE = 1.6487212707001282; /* [N m/A] */
 static const vehest_real VISCOUS = 1.7332530178673953; /* [N s] */
@@ -499,7 +499,7 @@ static void process_noise(vehest_real out[N][N])
     {0.008662500000000002, 0.0324626, 0.0064312499999999995, 0.058625000000000003, 0.0168},
     {0.00041250000000000005, 0.0064312499999999995, 0.00455635, 0.0148125, 0.0065249999999999996},
     {0.015125000000000003, 0.058625000000000003, 0.0148125, 0.1743751, 0.058875},
-    {0.00495, 0.0168, 0.0065249999999999996, 0.058875000000000004, 0.0330751}
+    {0.00495, 0.0168, 0.0065249999999999996, 0.058875, 0.03307510000000001}
 };
 
     for (int i = 0; i < N; i++) {
@@ -546,7 +546,7 @@ bool vehest_method_step(vehest_method *m, const vehest_real sample[VEHEST_CHANNE
     {0.008662500000000002, 0.1224626, 0.0064312499999999995, 0.058625000000000003, 0.0168},
     {0.00041250000000000005, 0.0064312499999999995, 0.014556350000000003, 0.0148125, 0.0065249999999999996},
     {0.015125000000000003, 0.058625000000000003, 0.0148125, 0.18437510000000001, 0.058875},
-    {0.00495, 0.0168, 0.0065249999999999996, 0.058875000000000004, 0.0330751}
+    {0.00495, 0.0168, 0.0065249999999999996, 0.058875, 0.03307510000000001}
 }; /* of a start that nobody hands over */
     const vehest_real y[M] = {sample[VEHEST_AX], sample[VEHEST_AY], sample[VEHEST_YAW_RATE], RADIUS * sample[VEHEST_MOTOR_SPEED]};
     vehest_real points[POINTS][N], expected[POINTS][M], process[N][N], noise[M][M];
@@ -556,23 +556,10 @@ bool vehest_method_step(vehest_method *m, const vehest_real sample[VEHEST_CHANNE
     output->vx = VEHEST_NAN;
     output->yaw_rate = VEHEST_NAN;
     output->vy_variance = VEHEST_NAN;
-    if (!VEHEST_IS_NAN(sample[VEHEST_AX]) && !VEHEST_IS_FINITE(sample[VEHEST_AX])) {
-        return false; /* an infinite value is no measurement */
-    }
-    if (!VEHEST_IS_NAN(sample[VEHEST_AY]) && !VEHEST_IS_FINITE(sample[VEHEST_AY])) {
-        return false; /* an infinite value is no measurement */
-    }
-    if (!VEHEST_IS_NAN(sample[VEHEST_YAW_RATE]) && !VEHEST_IS_FINITE(sample[VEHEST_YAW_RATE])) {
-        return false; /* an infinite value is no measurement */
-    }
-    if (!VEHEST_IS_NAN(sample[VEHEST_MOTOR_SPEED]) && !VEHEST_IS_FINITE(sample[VEHEST_MOTOR_SPEED])) {
-        return false; /* an infinite value is no measurement */
-    }
-    if (!VEHEST_IS_NAN(sample[VEHEST_STEER]) && !VEHEST_IS_FINITE(sample[VEHEST_STEER])) {
-        return false; /* an infinite value is no measurement */
-    }
-    if (!VEHEST_IS_NAN(sample[VEHEST_MOTOR_CURRENT]) && !VEHEST_IS_FINITE(sample[VEHEST_MOTOR_CURRENT])) {
-        return false; /* an infinite value is no measurement */
+    for (int i = 0; i < VEHEST_CHANNELS; i++) { /* infinite values are no measurements */
+        if (!VEHEST_IS_NAN(sample[i]) && !VEHEST_IS_FINITE(sample[i])) {
+            return false;
+        }
     }
     if (m->started) { /* from the last sample to this one */
         process_noise(process);

@@ -23,6 +23,18 @@ bool vehest_method_step(vehest_method *m, const vehest_real sample[VEHEST_CHANNE
     output->vx = VEHEST_NAN;
     output->yaw_rate = VEHEST_NAN;
     output->vy_variance = VEHEST_NAN;
+    if (VEHEST_IS_NAN(sample[VEHEST_YAW_RATE])) {
+        return false; /* cannot do without this channel */
+    }
+    if (VEHEST_IS_NAN(sample[VEHEST_VX])) {
+        return false; /* cannot do without this channel */
+    }
+    if (VEHEST_IS_NAN(sample[VEHEST_AY])) {
+        return false; /* cannot do without this channel */
+    }
+    if (VEHEST_IS_NAN(sample[VEHEST_AX])) {
+        return false; /* cannot do without this channel */
+    }
     if (VEHEST_IS_NAN(m->u)) {
         m->u = speed;
     }
