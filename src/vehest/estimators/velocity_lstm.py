@@ -38,10 +38,10 @@ class VelocityLstmNetwork(VelocityNetwork):
         hidden, (last, cell) = self.recurrent(inputs, (state[0], state[1]))
         n_states = self.recurrent.hidden_size
         driven = nn.functional.linear(hidden if mask is None else hidden * mask, self.dense.weight[:, :n_states], self.dense.bias)
-        by_previous, read_out = self.dense.weight[:, n_states:].t(), self.read_out.weight.t()
+        by_previous, read_out, bias = self.dense.weight[:, n_states:].t(), self.read_out.weight.t(), self.read_out.bias
         previous, outputs = state[2], []
         for step in driven.unbind(1):
-            previous = torch.addmm(self.read_out.bias, torch.relu(torch.addmm(step, previous, by_previous)), read_out)
+            previous = torch.addmm(bias, torch.relu(torch.addmm(step, previous, by_previous)), read_out)
             outputs.append(previous)
         return torch.stack(outputs, dim=1), (last, cell, previous)
 

@@ -145,7 +145,7 @@ class RecurrentVelocityEstimator(HiddenStateEstimator):
         self.channels = tuple(dict.fromkeys(("vx", *self.inputs)))
         self.learns_from = tuple(REFERENCES[name] for name in self.outputs)
         self.network = self.new_network()
-        self._columns = [self.channels.index(name) for name in self.inputs]
+        self._columns = np.array([self.channels.index(name) for name in self.inputs])
 
     def check(self) -> None:
         """Raises:
@@ -195,13 +195,13 @@ class RecurrentVelocityEstimator(HiddenStateEstimator):
 
     def run(self, samples: FloatArray, state: State) -> tuple[dict[str, Any], State]:
         """Velocities [m/s, rad/s]."""
-        inputs = torch.as_tensor(samples[:, self._columns], dtype=self.network.input_mean.dtype)
+        inputs = torch.from_numpy(samples.take(self._columns, 1)).to(self.network.input_mean.dtype)[None]
         pieces = []
         with torch.no_grad():
-            for piece in inputs.split(CHUNK):
-                values, state = self.network(piece.unsqueeze(0), state)
-                pieces.append(values[0].double().numpy())
-        return dict(zip(self.outputs, np.concatenate(pieces).T, strict=True)), state
+            for first in range(0, len(samples), CHUNK):
+                values, state = self.network(inputs[:, first : first + CHUNK], state)
+                pieces.append(values[0].numpy())
+        return dict(zip(self.outputs, np.concatenate(pieces, dtype=float).T, strict=True)), state
 
     def c_values(self) -> dict[str, Any]:
         """Weights, sizes, and what estimates start from."""
