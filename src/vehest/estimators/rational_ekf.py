@@ -364,6 +364,7 @@ class RationalFilter(SideslipFilter):
         gate: Gate | None = None,
         refused: NDArray[np.int64] | None = None,
         levels: Mapping[str, float] | None = None,
+        crossfall: float = 0.0,
     ) -> FilteredStates:
         """Filter samples of ``channels``, (T, 4), from a state at the first one before its measurement.
 
@@ -373,6 +374,7 @@ class RationalFilter(SideslipFilter):
             levels: of noise; none: `values`.
             gate: levels are found without.
             refused: see `Gate`.
+            crossfall: deviation by which the last state drifts where ``first`` has one more, the pull of a crossfall [m/s² √s⁻¹].
 
         Raises:
             ConfigurationError: curves or levels are neither given nor fitted.
@@ -386,13 +388,15 @@ class RationalFilter(SideslipFilter):
 
         car, adapted, bound = self.car, self.adapted, self.bounds()
         mean, covariance = first.mean.copy(), first.covariance.copy()
+        pull = [crossfall] * (len(mean) - len(bound))
+        bound = np.append(bound, [math.inf] * len(pull))
         out = _empty(len(samples), len(mean))
         scan(
             np.ascontiguousarray(samples),
             np.array([car.mass, car.yaw_inertia, car.cg_to_front_axle, car.cg_to_rear_axle]),
             np.array([*self.axle_curves, 1.0]),
             np.array([TYRE_PARAMETERS.index(name) for name in adapted], dtype=np.int64),
-            np.square([levels["yaw_rate"], levels["ay"], levels["steer"], *[levels["tyres"]] * len(adapted)]),
+            np.square([levels["yaw_rate"], levels["ay"], levels["steer"], *[levels["tyres"]] * len(adapted), *pull]),
             -bound,
             bound,
             np.square(ROLLING),

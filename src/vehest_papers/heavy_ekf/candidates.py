@@ -86,12 +86,11 @@ def mistaken(mismatch: float) -> FloatArray:
 
 
 def states_of(name: str, levels: Levels, own: Drive, curves: FloatArray, car: SingleTrackParameters = TRUCK) -> FloatArray:
-    """States along a drive: β first, tyre parameters last, (T, n)."""
+    """States along a drive: β first, tyre parameters from the fifth on, the pull of a crossfall last, (T, n)."""
     estimator = estimator_of(name, levels, curves, car)
     if name.endswith(WITH_STATE):
         return crossfall_filter.filtered(estimator, own.samples)
-    states = crossfall_filter.filtered(estimator, own.samples, deviation=0.0, wander=0.0)
-    return np.delete(states, crossfall_filter.FIRST_TYRE - 1, axis=1)
+    return estimator.filter_samples(own.samples).mean
 
 
 def oracle(levels: Levels, own: Drive) -> FloatArray:

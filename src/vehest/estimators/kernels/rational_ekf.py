@@ -48,23 +48,26 @@ def scan(  # type: ignore[no-untyped-def]
     """Filter samples of yaw_rate, vx, ay, steer, (T, 4); NaN in yaw_rate and ay is skipped.
 
     Below the minimum speed wheels roll without slip: β = a_R δ/L, r = u δ/L, with variances ``rolling``, and tyre parameters are held.
+    States are β, r, β', r', the logarithms of the adapted tyre parameters and, optionally, the pull of a crossfall b = g sin φ [m/s²]:
+
+        β'⁺ = (F_F + F_R)/(M u) - r + b/u,   a_y = u (β' + r) - b,   b⁺ = b
 
     Args:
         samples: (T, 4).
         car: mass, yaw inertia, a_F, a_R.
         nominal: tyre parameters in the order of `TYRE_PARAMETERS`, (5,).
-        adapted: which of them are states, (n - 4,).
-        variances: of yaw rate, ay, steering angle · √s, and the adapted parameters a second, (3 + n - 4,).
+        adapted: which of them are states, (p,), p = n - 4, or n - 5 where the last state is b.
+        variances: of yaw rate, ay, steering angle · √s, and the states from the fifth on a second, (3 + n - 4,).
         lower: of states, (n,).
         upper: of states, (n,).
         rolling: variances of the first four states of a car that rolls, (4,).
-        start_tyres: covariance of the logarithms of the adapted parameters at the start, (n - 4, n - 4).
+        start_tyres: covariance of the logarithms of the adapted parameters at the start, (p, p).
         largest: sideslip angle [rad] from which on the motion is guessed anew, that of a car that rolls, and tyres start anew as well: they
             are taken to be the reason.
         lost: variance of β [rad²] from which on the motion alone is guessed anew; without measurements the model may be unstable.
         step: Δt [s].
         minimum_speed: [m/s].
-        adapt_above: lateral acceleration |u r| below which tyre parameters are held [m/s²].
+        adapt_above: lateral acceleration |u r| below which the states from the fifth on are held [m/s²].
         limit: square of the gate's deviations, inf: no gate; see `Gate`.
         patience: of the gate, in samples.
         refused: how often on end yaw rate and ay were refused before the first sample, (2,); after the last one on return.
@@ -77,7 +80,7 @@ def scan(  # type: ignore[no-untyped-def]
         innovation_cov: out, (T, 2, 2).
         measured: out, (T, 2).
     """
-    n = len(mean)
+    n, tyres = len(mean), 4 + len(adapted)
     left, gain, cross = np.empty((n, n)), np.empty((n, 2)), np.empty((n, 2))
     per_rate, per_turn = np.zeros(n), np.zeros(n)
     parameters = nominal.copy()
@@ -99,16 +102,18 @@ def scan(  # type: ignore[no-untyped-def]
             _clip(mean, lower, upper)
             if not abs(mean[0]) < largest:
                 _roll(mean, cov, rolling, car, vx, steer)
-                mean[4:], cov[4:, 4:] = 0.0, start_tyres
+                mean[4:tyres], cov[4:tyres, 4:tyres] = 0.0, start_tyres
             elif not cov[0, 0] < lost:
                 _roll(mean, cov, rolling, car, vx, steer)
         held = abs(vx * mean[1]) < adapt_above
-        _innovate(mean, cov, samples[k], variances, limit, patience, refused, cross, innovation[k], innovation_cov[k], measured[k])
+        _innovate(
+            mean, cov, samples[k], tyres < n, variances, limit, patience, refused, cross, innovation[k], innovation_cov[k], measured[k]
+        )
         _gain(cross, innovation_cov[k], held, gain)
         for i in range(n):
             mean[i] += gain[i, 0] * innovation[k, 0] + gain[i, 1] * innovation[k, 1]
         _clip(mean, lower, upper)
-        _reduce(cov, gain, cross, vx, variances, measured[k], left)
+        _reduce(cov, gain, cross, vx, tyres < n, variances, measured[k], left)
         _note(k, mean, cov, means, deviations, sideslip_cov)
 
 
@@ -139,6 +144,9 @@ def _move(mean, car, parameters, adapted, speed, steer, step, per_rate, per_turn
         per_rate[4 + i] = (by_front + by_rear) * along
         per_turn[4 + i] = (front_arm * by_front - rear_arm * by_rear) / inertia
     rate = (front.force + rear.force) * along - mean[1]
+    if len(mean) > 4 + len(adapted):
+        per_rate[-1] = 1.0 / speed
+        rate += mean[-1] / speed
     acceleration = (front_arm * front.force - rear_arm * rear.force) / inertia
     mean[0] += step * mean[2]
     mean[1] += step * mean[3]
@@ -188,8 +196,8 @@ def _add_noise(cov, front, car, speed, step, variances, wandering):  # type: ign
 
 
 @numba.njit(inline="always")
-def _innovate(mean, cov, sample, variances, limit, patience, refused, cross, innovation, S, measured):  # type: ignore[no-untyped-def]
-    """Innovations of yaw rate and ay = u (β' + r), their covariance S and P Hᵀ; of what was not measured 0, the identity's rows and 0.
+def _innovate(mean, cov, sample, crossfall, variances, limit, patience, refused, cross, innovation, S, measured):  # type: ignore[no-untyped-def]
+    """Innovations of yaw rate and ay, their covariance S and P Hᵀ; of what was not measured 0, the identity's rows and 0.
 
     What is refused counts as not measured.
     """
@@ -197,25 +205,30 @@ def _innovate(mean, cov, sample, variances, limit, patience, refused, cross, inn
     for i in range(len(mean)):
         cross[i, 0] = cov[i, 1]
         cross[i, 1] = vx * (cov[i, 2] + cov[i, 1])
+        if crossfall:
+            cross[i, 1] -= cov[i, -1]
+    ay, spread_of_ay = vx * (mean[2] + mean[1]), vx * (cross[2, 1] + cross[1, 1])
+    if crossfall:
+        ay, spread_of_ay = ay - mean[-1], spread_of_ay - cross[-1, 1]
     for j in range(2):
         value = sample[0] if j == 0 else sample[2]
         measured[j] = not math.isnan(value)
-        expected = mean[1] if j == 0 else vx * (mean[2] + mean[1])
+        expected = mean[1] if j == 0 else ay
         if measured[j] and limit < math.inf:
-            spread = cross[1, 0] if j == 0 else vx * (cross[2, 1] + cross[1, 1])
+            spread = cross[1, 0] if j == 0 else spread_of_ay
             measured[j] = not refuses(value - expected, spread + variances[j], limit, patience, refused, j)
         innovation[j] = value - expected if measured[j] else 0.0
         if not measured[j]:
             cross[:, j] = 0.0
     S[0, 0] = cross[1, 0] + variances[0] if measured[0] else 1.0
-    S[1, 1] = vx * (cross[2, 1] + cross[1, 1]) + variances[1] if measured[1] else 1.0
+    S[1, 1] = spread_of_ay + variances[1] if measured[1] else 1.0
     S[0, 1] = cross[1, 1] if measured[0] and measured[1] else 0.0
     S[1, 0] = S[0, 1]
 
 
 @numba.njit(inline="always")
 def _gain(cross, S, held, gain):  # type: ignore[no-untyped-def]
-    """K = P Hᵀ S⁻¹, the rows of tyre parameters that are held 0."""
+    """K = P Hᵀ S⁻¹, the rows of states that are held 0."""
     determinant = S[0, 0] * S[1, 1] - S[0, 1] * S[0, 1]
     for i in range(len(gain)):
         gain[i, 0] = (cross[i, 0] * S[1, 1] - cross[i, 1] * S[0, 1]) / determinant
@@ -225,7 +238,7 @@ def _gain(cross, S, held, gain):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(inline="always")
-def _reduce(cov, gain, cross, vx, variances, measured, left):  # type: ignore[no-untyped-def]
+def _reduce(cov, gain, cross, vx, crossfall, variances, measured, left):  # type: ignore[no-untyped-def]
     """(I - K H) P (I - K H)ᵀ + K R Kᵀ, in place and row by row: Joseph's form, which holds for any gain."""
     n = len(cov)
     for i in range(n):
@@ -233,6 +246,8 @@ def _reduce(cov, gain, cross, vx, variances, measured, left):  # type: ignore[no
             left[i, j] = cov[i, j] - gain[i, 0] * cross[j, 0] - gain[i, 1] * cross[j, 1]
     for i in range(n):
         seen_rate, seen_ay = left[i, 1], vx * (left[i, 2] + left[i, 1])
+        if crossfall:
+            seen_ay -= left[i, -1]
         for j in range(n):
             total = left[i, j]
             if measured[0]:
