@@ -390,7 +390,7 @@ class RunStepper(Stepper):
         found, self._state = estimator.run(row[None], state)
         self._started = True
         covariance, _ = found.pop("covariance", None), found.pop("innovations", None)
-        values = {name: float(quantity[0]) for name, quantity in found.items()}
+        values = {name: quantity.item(0) for name, quantity in found.items()}
         if covariance is not None:
             row_of_vy = estimator.covariance_of.index("vy")
             values["vy_variance"] = float(covariance[0, row_of_vy, row_of_vy])

@@ -9,6 +9,7 @@ from typing import Any
 from vehest.constants import FloatArray
 from vehest.declared import fitted
 from vehest.estimators.base import Trial
+from vehest.estimators.kernels.luenberger import observe
 from vehest.estimators.recursive import Recursive
 from vehest.training.search import DirectSearchSettings
 
@@ -46,8 +47,6 @@ class Luenberger(Recursive):
 
     def run(self, samples: FloatArray, state: Any) -> tuple[dict[str, FloatArray], Any]:
         """Lateral and forward velocity [m/s]."""
-        from vehest.estimators.kernels.luenberger import observe
-
         vy, vx = observe(samples, self.gain, self.threshold, 1.0 / self.rate_hz, *state)
         return {"vy": vy, "vx": vx}, (float(vy[-1]), float(vx[-1]))
 

@@ -21,6 +21,7 @@ from vehest.declared import Group, setting
 from vehest.estimators.base import FitData, FitRecord, Trial, rate
 from vehest.estimators.filtering.sideslip_filter import FilteredStates, SideslipFilter, read_levels
 from vehest.estimators.filtering.tyre_fit import NORMAL_95, AxleMotion, TyreFit, axle_motion, fit_motion
+from vehest.estimators.kernels.rational_ekf import _roll, scan
 from vehest.filters.gating import Gate
 from vehest.filters.gaussian import Gaussian
 from vehest.filters.sigma_points import cubature_rule
@@ -384,8 +385,6 @@ class RationalFilter(SideslipFilter):
         first = self.first_gaussian(samples[0], {}) if first is None else first
         if self.filter == "unscented":
             return self._unscented(samples, first, levels)
-        from vehest.estimators.kernels.rational_ekf import scan
-
         car, adapted, bound = self.car, self.adapted, self.bounds()
         mean, covariance = first.mean.copy(), first.covariance.copy()
         pull = [crossfall] * (len(mean) - len(bound))
@@ -418,8 +417,6 @@ class RationalFilter(SideslipFilter):
 
     def _unscented(self, samples: FloatArray, first: Gaussian[FloatArray], levels: Mapping[str, float]) -> FilteredStates:
         """The same by sigma points; what is held keeps its variance (Schmidt's consider state)."""
-        from vehest.estimators.kernels.rational_ekf import _roll
-
         car, track, bound = self.car, self.track(), self.bounds()
         limit = torch.as_tensor(bound)  # points are drawn again each time, so they may be kept within it in place
         model = TorchModel(
