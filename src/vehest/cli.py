@@ -495,18 +495,21 @@ def run(
         float | None,
         typer.Option(help="Stop after this time, report included; unfinished jobs are listed, and the same command goes on with them."),
     ] = None,
+    retrain: Annotated[bool, typer.Option("--retrain", help="Train also what is published with weights.")] = False,
     launcher: LauncherName = "local",
     address: Address = None,
     slurm: Slurm = None,
 ) -> None:
     """Run a whole study: ingest, downsample, train, evaluate, report: `vehest run pipelines/quickstart.yaml`.
 
-    Existing artefacts are skipped. Overrides apply to every sweep that has their key. Sweeps are worked off in the order of the file.
+    Existing artefacts are skipped, and trained weights that the study has published are taken where their keys are the same. Overrides
+    apply to every sweep that has their key. Sweeps are worked off in the order of the file.
     """
     from vehest.run.run_cache import RunCache, RunOptions
 
     words = overrides or []
-    options = RunOptions(force, dry_run, quiet, jobs, minutes=minutes, launcher=LauncherOptions(launcher, address, tuple(slurm or ())))
+    chosen = LauncherOptions(launcher, address, tuple(slurm or ()))
+    options = RunOptions(force, dry_run, quiet, jobs, minutes=minutes, launcher=chosen, retrain=retrain)
     cache = RunCache("run", pipeline, words)
     ran = cache.repeat(options)
     if ran is None:

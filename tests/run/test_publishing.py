@@ -88,7 +88,11 @@ def test_times_are_in_no_published_file_but_beside_the_page_and_on_it(published:
     page = (report / "report.html").read_text(encoding="utf-8")
     assert "<h2>Times</h2>" in page
     assert "online step [ms]" in page
-    texts = {name: content.decode() for name, content in contents(published / "results" / "small").items() if not name.endswith(".png")}
+    texts = {
+        name: content.decode(errors="replace")
+        for name, content in contents(published / "results" / "small").items()
+        if not name.endswith(".png")
+    }
     assert TIMINGS not in texts
     for name, text in texts.items():
         words = [word for word in TIME_NAMES if word in text]
@@ -224,3 +228,45 @@ def test_where_nothing_is_published_there_is_nothing_to_check(place: Place) -> N
     code, line = place.refused(*CHECK)
     assert code == 4
     assert "no study is published in 'results'" in line
+
+
+# Published weights
+
+
+def models(folder: Path) -> dict[str, dict[str, bytes]]:
+    """Files of every model in an output root, but those with times."""
+    found = {model.name: contents(model) for model in (folder / "outputs" / "train").iterdir() if not model.name.startswith(".")}
+    return {name: {file: own for file, own in files.items() if file not in (TIMINGS, "manifest.json")} for name, files in found.items()}
+
+
+def test_a_run_elsewhere_takes_the_published_weights_and_comes_to_the_same_results(published: Path, checked: Place) -> None:
+    before = contents(checked.folder / "results")
+    code, _, said = checked(*RUN)
+    assert code == 0
+    assert "3 of 3 taken from results/small/weights.safetensors" in " ".join(said.split())
+    assert models(checked.folder) == models(published)
+    assert contents(checked.folder / "results") == before
+
+
+def test_weights_of_another_key_are_not_taken(checked: Place) -> None:
+    changed(checked.folder / "pipelines" / "small.yaml", sweeps=[QUICK["sweeps"][0], [*QUICK["sweeps"][1][:-1], "training.max_epochs=1"]])
+    code, _, said = checked(*RUN)
+    assert code == 0
+    assert "1 of 3 taken from" in " ".join(said.split())
+    assert said.count("1 epochs") == 2
+
+
+def test_trainings_are_repeated_on_demand(checked: Place) -> None:
+    code, _, said = checked(*RUN, "--retrain")
+    assert code == 0
+    assert "taken from" not in said
+    assert said.count("2 epochs") == 2
+
+
+def test_damaged_weights_are_refused_in_one_line(checked: Place) -> None:
+    file = checked.folder / "results" / "small" / "weights.safetensors"
+    file.write_bytes(file.read_bytes()[:100])
+    code, _, err = checked(*RUN)
+    assert code == 3
+    assert "weights.safetensors' is damaged" in " ".join(err.split())
+    assert "--retrain" in " ".join(err.split())

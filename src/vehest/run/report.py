@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -30,6 +30,7 @@ from vehest.run.publishing import PROVENANCE
 from vehest.run.runner import Runner
 from vehest.run.study import Study
 from vehest.run.train import new_estimator, read_fit_metrics, recording_file
+from vehest.run.weights import PUBLISHED_WEIGHTS, write_weights
 from vehest.studies.artefacts import (
     METRIC_COLUMNS,
     AbsentDataset,
@@ -74,7 +75,16 @@ def draw_report(
     )
     ingested = [artefact for artefact in runner.artefacts.values() if study.datasets and artefact.stage == INGEST]
     plan = _plan(artefacts, study.report, shown, ingested, runner.output)
-    report = runner.ensure(plan, lambda folder: _write(artefacts, study.report, _recordings(shown, ingested), folder))
+    if study.publish:
+        plan = replace(plan, config={**plan.config, "weights": True})
+    models = [member.model for part in shown.values() for member in part.members if member.model is not None]
+
+    def write(folder: Path) -> None:
+        _write(artefacts, study.report, _recordings(shown, ingested), folder)
+        if study.publish and models:
+            write_weights(models, folder / PUBLISHED_WEIGHTS)
+
+    report = runner.ensure(plan, write)
     module = study_module(study.report)
     if not hasattr(module, "leaderboard"):
         return report, summary_of_overview(read_frame(report.folder / OVERVIEW), left_out)

@@ -51,6 +51,7 @@ class RunOptions:
     track: bool = False
     minutes: float | None = None
     launcher: LauncherOptions | None = None
+    retrain: bool = False
 
 
 @dataclass(frozen=True)

@@ -32,7 +32,9 @@ from vehest.run.launchers.local import LocalLauncher
 from vehest.run.locks import Waiting
 from vehest.run.signals import DryRunStop, StopSignals, TimeLimit
 from vehest.run.tracking import Tracker, log_member, rmse_of_tests
+from vehest.run.train import STAGE as TRAIN
 from vehest.run.train import has_to_compile, read_fit_metrics
+from vehest.run.weights import PublishedWeights
 from vehest.sources.base import kind_of, open_source
 from vehest.training.context import Progress
 from vehest.trust.record import read_trust
@@ -53,6 +55,7 @@ class Runner:
     tracker: Tracker | None = None
     launcher: Launcher = field(default_factory=LocalLauncher)
     until: float | None = None  # reading of ``time.monotonic`` at which trainings have to end
+    weights: PublishedWeights | None = None  # of a published study, which are taken instead of training
     train_first: str = ""  # command to run first where a training is missing; empty to train here
     artefacts: dict[Path, Artefact] = field(default_factory=dict)  # those found or made so far, by folder
     _known: dict[tuple[str, str], Any] = field(default_factory=dict)
@@ -164,6 +167,8 @@ class Runner:
             MissingError: a command has to be run first, and not one member is there.
             Stopped: a signal came; finished artefacts stay.
         """
+        if self.weights is not None and TRAIN not in self.force and not self.dry_run:
+            self._take_published([job.plan for group in groups for job in group.jobs], self.weights)
         members: dict[str, Member] = {}
         waiting: list[Group] = []
         for group in groups:
@@ -202,6 +207,15 @@ class Runner:
             self.stop.raise_if_requested()
             waiting = alone
         return members, failures
+
+    def _take_published(self, plans: Sequence[StagePlan], weights: PublishedWeights) -> None:
+        """Take models that are published under the key of a training and are not there."""
+        wanted = [plan for plan in plans if plan.key in weights and find(plan) is None]
+        for plan in wanted:
+            ensured(plan, partial(weights.write, plan.key), False, self.stop.requested, self._print_waiting)
+            self.stop.raise_if_requested()
+        if wanted:
+            self.messages.line("note", TRAIN, f"{len(wanted)} of {len(plans)}", f"taken from {weights.path}; --retrain trains them")
 
     def _announce(self, waiting: Sequence[Group], n_there: int) -> None:
         """Print what groups are going to do; a dry run ends here."""

@@ -30,7 +30,7 @@ from vehest.run.ingest import plan_ingest
 from vehest.run.launchers.base import LauncherOptions, chosen_launcher
 from vehest.run.launchers.local import default_jobs
 from vehest.run.published import keys_of_study
-from vehest.run.publishing import Publication, publish_study
+from vehest.run.publishing import RESULTS, Publication, publish_study
 from vehest.run.report import STAGE as REPORT
 from vehest.run.report import SWEEP, draw_report, draw_sweep
 from vehest.run.run_cache import Ran, RunCache, RunOptions, stamps_of
@@ -39,6 +39,7 @@ from vehest.run.signals import DryRunStop, StopSignals
 from vehest.run.study import Job, Jobs, Study, content_overrides, jobs_of, read_study, sweep_of
 from vehest.run.tracking import Tracker, log_scores, test_figures
 from vehest.run.train import learnt_spans, read_fit_metrics, trained_rate
+from vehest.run.weights import PUBLISHED_WEIGHTS, PublishedWeights
 from vehest.sources.base import kind_of
 from vehest.studies.artefacts import AbsentDataset, StoredDataset
 
@@ -84,6 +85,8 @@ def run_study(
     stages = {"train", "calibrate", "evaluate", *((SWEEP,) if sweep else ("ingest", "downsample", REPORT))}
     with open_runner(first, options, {REPORT} if only_report else stages, study.study if study.parts else "") as runner:
         runner.until = _until(options.minutes, begun)
+        if study.publish and not options.retrain:
+            runner.weights = PublishedWeights(RESULTS / study.study / PUBLISHED_WEIGHTS)
         runner.train_first = f"vehest run {study.file}" if only_report else ""
         shown = [job.config for job in jobs[""]] if study.datasets else []
         configs = {str(config["dataset"]["name"]): config["dataset"] for config in shown}
