@@ -8,6 +8,8 @@ from typing import Any, ClassVar
 
 from vehest.data.errors import ConfigurationError
 
+LARGEST = 1e12  # of a setting, in SI units: far beyond what any of them means, far below what overflows
+
 
 @dataclass(frozen=True)
 class Declaration:
@@ -43,6 +45,8 @@ class Declaration:
         """What is wrong with a value, in words that follow its name; empty where nothing is."""
         if value is None:
             return ""
+        if isinstance(value, int | float) and not abs(value) <= LARGEST:
+            return f"must be a number of at most {LARGEST:g}, not {value}"
         if self.positive and not value > 0:
             return f"must be positive, not {value}"
         low, high = (one if one is not None else other for one, other in ((self.least, self.above), (self.most, self.below)))

@@ -15,7 +15,7 @@ from vehest.data.errors import DataError
 
 Kind = Literal["real", "simulated"]
 
-LOWEST_RATE, HIGHEST_RATE = 1e-6, 1e9  # between which a sampling rate lies [Hz]
+LOWEST_RATE, HIGHEST_RATE = 1e-6, 1e5  # between which a sampling rate lies [Hz]
 
 
 @dataclass(frozen=True, eq=False)

@@ -14,7 +14,7 @@ import numpy as np
 from vehest.constants import FloatArray
 from vehest.data.errors import DataError
 from vehest.data.estimate import Estimate
-from vehest.data.recording import Recording
+from vehest.data.recording import HIGHEST_RATE, Recording
 from vehest.data.schema import settings_from_config
 from vehest.declared import Group, setting
 from vehest.training.context import FitContext
@@ -23,7 +23,7 @@ from vehest.training.context import FitRecord as FitRecord
 
 def rate(default: float) -> Any:
     """The setting ``rate_hz`` with another default [Hz]."""
-    return setting(default, "sampling rate it works at", unit="Hz", positive=True)
+    return setting(default, "sampling rate it works at", unit="Hz", above=0.0, most=HIGHEST_RATE)
 
 
 @dataclass(frozen=True)

@@ -32,6 +32,7 @@ REPORT = "report"
 LONGEST_AXIS = 6.0  # times the median error, beyond which a bar is cut
 PNG_DPI = 150
 PNG_COLOURS = 256
+_FORMULA = re.compile(r"[=@\t\r]|[+-].*[A-Za-z|!(]", re.DOTALL)
 _PATH = re.compile(r'\bd="[^"]*"')
 _LONG_NUMBER = re.compile(r"-?\d+\.\d{3,}")
 _NAME = re.compile(r"[a-z0-9][a-z0-9_.-]*")
@@ -387,9 +388,14 @@ def _markdown_parser() -> MarkdownIt:
     return MarkdownIt("commonmark", {"html": False}).enable("table").disable("image")
 
 
+def _no_formula(cell: Any) -> Any:
+    """A cell that spreadsheets show as text: an apostrophe before what they would read as a formula."""
+    return f"'{cell}" if isinstance(cell, str) and _FORMULA.match(cell) else cell
+
+
 def _page_table(table: Table) -> dict[str, Any]:
     headers, rows, numeric = formatted(table)
-    csv = table.frame.to_csv(index=False, lineterminator="\n").encode("utf-8", "backslashreplace")
+    csv = table.frame.map(_no_formula).to_csv(index=False, lineterminator="\n").encode("utf-8", "backslashreplace")
     barred = {i: column.bar for i, column in enumerate(table.columns.values()) if column.bar}
     bars = {i: bars_of(*(table.frame[name].tolist() for name in names)) for i, names in barred.items()}
     cells = [[{"text": text, "bar": bars[i][k] if i in bars else None} for i, text in enumerate(row)] for k, row in enumerate(rows)]

@@ -45,6 +45,7 @@ SPELLINGS = {
 """Time, or channel that a quantity is read as -> how a table may call it, spaces and underscores aside."""
 USUAL_UNITS = {"time": "s", "vy_ref": "m/s", "sideslip_ref": "rad"}
 LEAST_SECONDS = 5.0
+LOWEST_RATE = 1.0  # Hz
 RATE_HZ = 20.0  # at which estimates are scored, unless the recording has less
 
 
@@ -168,6 +169,8 @@ def _in_common(reference: Recording, estimates: Mapping[str, Estimate]) -> tuple
     if stop - start < LEAST_SECONDS:
         ranges = ", ".join(f"{name} goes from {own[0]:.6g} to {own[-1]:.6g} s" for name, own in times.items())
         raise DataError(f"{ranges}: less than {LEAST_SECONDS:g} s in common; are the clocks the same?")
+    if reference.rate_hz < LOWEST_RATE:
+        raise DataError(f"'{reference.id}' is sampled at {reference.rate_hz:.3g} Hz; scores need {LOWEST_RATE:g} Hz or more")
     return start, stop
 
 

@@ -15,10 +15,10 @@ import numpy as np
 from vehest.constants import FloatArray
 from vehest.data.errors import DataError
 from vehest.data.limits import check_limit
+from vehest.data.recording import HIGHEST_RATE
 
 ClockPolicy = Literal["strict", "interpolate", "uniform"]
 
-HIGHEST_RATE = 1e5  # Hz
 LONGEST_STEP = 86_400.0  # s
 MOST_STEPS = 1e8  # median steps from the first to the last stamp
 LATEST_TIME = 1e11  # s; beyond it a double tells no two samples of 1e5 Hz apart

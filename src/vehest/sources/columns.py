@@ -11,9 +11,9 @@ from pydantic import BeforeValidator, Field
 from vehest.constants import FloatArray
 from vehest.data.channels import channel
 from vehest.data.errors import ConfigurationError, DataError
+from vehest.data.recording import HIGHEST_RATE
 from vehest.data.schema import validated
 from vehest.data.units import factor_to_si
-from vehest.sources.clocks import HIGHEST_RATE
 
 ChannelMap = Annotated[dict[str, Any], "a mapping from a channel to its column and unit"]
 ChannelNames = Annotated[tuple[str, ...], "a list of channels"]

@@ -17,6 +17,7 @@ import math
 import warnings
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
+from numbers import Real
 from typing import Any
 
 import numpy as np
@@ -256,13 +257,13 @@ class GuardedStepper(Stepper):
 
         Args:
             sample: channel -> value [SI]; a channel that is missing, None or no number counts as not measured; None: all.
-            time: of the sample [s], if known: repeated samples are skipped, missing ones bridged.
+            time: of the sample [s], if known: repeated samples are skipped, missing ones bridged; what is no number counts as unknown.
 
         Returns:
             ``vy`` [m/s] and ``sideslip`` [rad], NaN only before the first estimate; ``health`` (0 valid, 1 degraded, 2 invalid) and
             ``health_reason`` of the sample; with calibrated bands their half widths at 90 %, ``band_vy`` and ``band_sideslip``.
         """
-        if time is not None:
+        if isinstance(time, Real):
             skipped = self._clock.skipped(time)
             if skipped < 0:
                 return self.last

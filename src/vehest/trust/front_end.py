@@ -11,6 +11,7 @@ from scipy import signal
 
 from vehest.constants import FloatArray
 from vehest.data.errors import ConfigurationError
+from vehest.data.recording import HIGHEST_RATE
 from vehest.estimators.kernels.compiling import entry
 from vehest.trust.guard import WAIT, Guard, GuardLimits, usual_limits
 
@@ -52,12 +53,14 @@ class FrontEnd:
     ``limits`` of the guard are those learnt at the estimator's rate; ``channels`` are in the order of the columns.
 
     Raises:
-        ConfigurationError: the bus is slower than the estimator.
+        ConfigurationError: the bus is slower than the estimator, or faster than any.
     """
 
     def __init__(self, channels: Sequence[str], skippable: Sequence[str], limits: GuardLimits, bus_rate_hz: float, rate_hz: float) -> None:
-        if not (math.isfinite(bus_rate_hz) and bus_rate_hz >= rate_hz * (1 - SLACK)):
+        if not bus_rate_hz >= rate_hz * (1 - SLACK):
             raise ConfigurationError(f"samples at {bus_rate_hz:g} Hz are too slow for an estimator that works at {rate_hz:g} Hz")
+        if not bus_rate_hz <= HIGHEST_RATE:
+            raise ConfigurationError(f"samples at {bus_rate_hz:g} Hz are beyond any bus; rates go up to {HIGHEST_RATE:g} Hz")
         usual = usual_limits(channels, bus_rate_hz).channels  # jumps are those of another rate; ranges are the same
         merged = {name: replace(own, jump=max(usual[name].jump, own.jump)) for name, own in (limits.channels or usual).items()}
         self._guard = Guard(channels, skippable, replace(limits, channels=merged), bus_rate_hz)

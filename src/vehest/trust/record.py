@@ -66,4 +66,7 @@ def read_trust(folder: Path) -> Trust:
     if not isinstance(content, dict) or "format" not in content:
         raise DataError(f"'{path}' does not say how far a model can be trusted; calibrate it again")
     check_format(content.pop("format"), FORMAT, f"'{path}'")
-    return validated(Trust, content, f"'{path}'")
+    try:
+        return validated(Trust, content, f"'{path}'")
+    except DataError as error:
+        raise DataError(str(error) if str(path) in str(error) else f"'{path}': {error}") from None

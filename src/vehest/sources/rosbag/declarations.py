@@ -23,7 +23,7 @@ class Topic:
     max_gap: Positive = 0.05  # longest time between two stamps that is interpolated [s]
     delay: float = 0.0  # how much later than the sample its time says [s]
     interpolation: Literal["linear", "hold"] = "linear"  # hold: for commands that stand until the next one
-    average: Annotated[float, Field(ge=0.0)] = 0.0  # width of a centred moving average before interpolation [s]; 0 for none
+    average: Annotated[float, Field(ge=0.0, le=10.0)] = 0.0  # width of a centred moving average before interpolation [s]; 0 for none
 
     def __post_init__(self) -> None:
         if self.clock == "uniform" and self.rate_hz is None:

@@ -1,0 +1,66 @@
+"""Numbers without physical sense are refused in one line before anything is computed, and text is no formula."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from every_estimator import drive_for, fitted
+from vehest.data.errors import ConfigurationError, DataError
+from vehest.data.recording import Recording
+from vehest.estimators.luenberger import Luenberger
+from vehest.report.document import _no_formula
+from vehest.run.compare_files import compare_estimates
+from vehest.training.supervised import SupervisedSettings
+from vehest.trust.contract import GuardedStepper
+from vehest.trust.record import read_trust
+
+
+def test_settings_and_rates_have_upper_limits() -> None:
+    with pytest.raises(ConfigurationError, match=r"training\.learning_rate must be a number of at most 1e\+12, not 1e\+300"):
+        SupervisedSettings(learning_rate=1e300)
+    with pytest.raises(ConfigurationError, match=r"estimator\.rate_hz must lie between 0 and 100000 Hz, not at 1000000\.0"):
+        Luenberger.from_config({"rate_hz": 1e6})
+    for rate, reason in ((1e9, "beyond any bus"), (float("inf"), "beyond any bus"), (float("nan"), "too slow")):
+        with pytest.raises(ConfigurationError, match=reason):
+            GuardedStepper(fitted("luenberger"), None, rate)
+
+
+def test_a_time_that_is_no_number_counts_as_unknown() -> None:
+    model = fitted("luenberger")
+    drive = drive_for(model)
+    rows = [{name: float(drive[name][k]) for name in model.channels} for k in range(5)]
+    timed, untimed = GuardedStepper(model), GuardedStepper(model)
+    for row in rows:
+        assert timed.step(row, time="x") == untimed.step(row)  # type: ignore[arg-type]
+
+
+def test_two_rows_a_minute_apart_are_no_drive() -> None:
+    channels = {"vx": np.full(2, 20.0), "vy_ref": np.zeros(2)}
+    recording = Recording("two", "a car", 1.0 / 60.0, 0.0, channels)
+    with pytest.raises(DataError, match=r"'two' is sampled at 0\.0167 Hz; scores need 1 Hz or more"):
+        compare_estimates(recording, {"mine": Luenberger.from_config({})._wrapped(recording, np.zeros(2))})
+
+
+def test_a_damaged_calibration_names_its_file(tmp_path: Path) -> None:
+    text = (Path(read_trust.__code__.co_filename).parents[1] / "pretrained" / "trust.yaml").read_text(encoding="utf-8")
+    (tmp_path / "trust.yaml").write_text(text.replace("yaw_rate", "foreign"), encoding="utf-8")
+    with pytest.raises(DataError, match=r"trust\.yaml'"):
+        read_trust(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("cell", "written"),
+    [
+        ('=HYPERLINK("x")', '\'=HYPERLINK("x")'),
+        ("+1|cmd", "'+1|cmd"),
+        ("@SUM(A1)", "'@SUM(A1)"),
+        ("+0.280 [0.039, 0.521]", "+0.280 [0.039, 0.521]"),
+        ("lap 3", "lap 3"),
+        (-0.5, -0.5),
+    ],
+)
+def test_tables_to_download_start_no_formula(cell: object, written: object) -> None:
+    assert _no_formula(cell) == written
