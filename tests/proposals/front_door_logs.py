@@ -1,0 +1,141 @@
+"""Ten logs as users bring them, made of the real Ferrari and Volvo recordings; ``front_door.yaml`` holds what is expected of each.
+
+Each goes from ``vehest new NAME FILES --yes`` to ``vehest run NAME --minutes 5``: to a verdict, or to one sentence that says what to record.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+from dressed_logs import G, RATIO, Columns, ferrari, later, write
+
+RADIUS = 0.33  # m
+MPS = 3.6  # km/h
+
+
+def usual(d: Columns) -> Columns:
+    """The columns that most logs have."""
+    return {
+        "Time [s]": d["t"],
+        "VehSpd [km/h]": MPS * d["vx"],
+        "YawRate [deg/s]": np.degrees(d["r"]),
+        "AccY [m/s2]": d["ay"],
+        "AccX [m/s2]": d["ax"],
+        "SteerWheel [deg]": np.degrees(RATIO * d["delta"]),
+        "ADMA_VelLat [m/s]": d["vy"],
+    }
+
+
+def part(d: Columns, start: float, seconds: float) -> Columns:
+    """A part of a drive, its time from 0."""
+    rows = (d["t"] >= start) & (d["t"] < start + seconds)
+    return {name: own[rows] - (start if name == "t" else 0.0) for name, own in d.items()}
+
+
+def six_seconds(data: Path, folder: Path) -> None:
+    """Fifteen manoeuvres of six seconds, a file each."""
+    for number in range(15):
+        write(folder / f"turn_{number:02d}.csv", usual(part(ferrari(data), 10.0 + 18.0 * number, 6.0)))
+
+
+def standstill_first(data: Path, folder: Path) -> None:
+    """A minute at standstill before the drive."""
+    d, waits = ferrari(data), 6000
+    random = np.random.default_rng(2)
+    noise = {"vx": 0.0003, "vy": 0.0003, "r": 0.001, "ax": 0.02, "ay": 0.02, "delta": 0.0, "beta": 0.0}
+    before = {name: size * random.standard_normal(waits) for name, size in noise.items()}
+    joined = {name: np.concatenate([before[name], d[name]]) for name in before} | {"t": np.arange(waits + len(d["t"])) / 100.0}
+    write(folder / "cold_start.csv", usual(joined))
+
+
+def two_speeds(data: Path, folder: Path) -> None:
+    """The speed of antennas and that of the car's bus; the antenna's comes first and is the smoother one."""
+    d, random = ferrari(data), np.random.default_rng(3)
+    own = np.round(MPS * later(d["t"], d["vx"], 0.03) * 1.01 / 0.05) * 0.05 + 0.02 * random.standard_normal(len(d["t"]))
+    columns = {"Time [s]": d["t"], "Velocity [km/h]": MPS * d["vx"], **usual(d), "VehSpdLgt_CAN [km/h]": own}
+    del columns["VehSpd [km/h]"]
+    write(folder / "antenna.csv", columns)
+
+
+def misnamed_lateral(data: Path, folder: Path) -> None:
+    """A lateral velocity called like an acceleration, before the acceleration itself, neither with a unit."""
+    d = ferrari(data)
+    columns = {
+        "t": d["t"],
+        "speed": d["vx"],
+        "gyro_z": d["r"],
+        "lat_a": d["vy"],
+        "imu_1": d["ay"],
+        "imu_0": d["ax"],
+        "wheel_angle": RATIO * d["delta"],
+    }
+    write(folder / "misnamed.csv", columns, 5)
+
+
+def two_yaw_rates(data: Path, folder: Path) -> None:
+    """The yaw rate of the car's ESP, 40 ms late and rough, and that of the reference."""
+    d, random = ferrari(data), np.random.default_rng(5)
+    rough = np.round(np.degrees(later(d["t"], d["r"], 0.04)) / 0.1) * 0.1 + 0.05 * random.standard_normal(len(d["t"]))
+    columns = usual(d) | {"ESP_YawRate [deg/s]": rough, "ADMA_YawRate [deg/s]": np.degrees(d["r"])}
+    del columns["YawRate [deg/s]"]
+    write(folder / "two_yaw_rates.csv", columns)
+
+
+def fast_speedometer(data: Path, folder: Path) -> None:
+    """A speedometer 6 % high, wheels that are right, in rad/s by their header."""
+    d = ferrari(data)
+    columns = usual(d) | {"VehSpd [km/h]": 1.06 * MPS * d["vx"]}
+    columns |= {f"WheelSpeed{corner} [rad/s]": d["vx"] / RADIUS for corner in ("FL", "FR", "RL", "RR")}
+    write(folder / "speedometer.csv", columns)
+
+
+def wheels_in_kmh(data: Path, folder: Path) -> None:
+    """Wheel speeds in km/h without a unit, beside a speedometer 5 % high."""
+    d = ferrari(data)
+    columns = usual(d) | {"VehSpd [km/h]": 1.05 * MPS * d["vx"]}
+    columns |= {f"WheelSpeed{corner}": MPS * d["vx"] for corner in ("FL", "FR", "RL", "RR")}
+    write(folder / "wheels_kmh.csv", columns)
+
+
+def vbox(data: Path, folder: Path) -> None:
+    """Three drives of a Volvo S90 as its VBOX wrote them: offsets of the Slip_* points changed places."""
+    for number in ("038", "040", "041"):
+        (folder / f"S90__{number}.VBO").write_bytes((data / "vbox" / f"S90__{number}.VBO").read_bytes())
+
+
+def twenty_seconds(data: Path, folder: Path) -> None:
+    """One file of 20 s."""
+    write(folder / "short.csv", usual(part(ferrari(data), 60.0, 20.0)))
+
+
+def no_reference(data: Path, folder: Path) -> None:
+    """No lateral velocity, sideslip angle or position; accelerations in g."""
+    d = ferrari(data)
+    columns = usual(d) | {"AccY [g]": d["ay"] / G, "AccX [g]": d["ax"] / G}
+    for name in ("ADMA_VelLat [m/s]", "AccY [m/s2]", "AccX [m/s2]"):
+        del columns[name]
+    write(folder / "no_reference.csv", columns)
+
+
+LOGS: dict[str, Callable[[Path, Path], None]] = {
+    "six_seconds": six_seconds,
+    "standstill_first": standstill_first,
+    "two_speeds": two_speeds,
+    "misnamed_lateral": misnamed_lateral,
+    "two_yaw_rates": two_yaw_rates,
+    "fast_speedometer": fast_speedometer,
+    "wheels_in_kmh": wheels_in_kmh,
+    "vbox": vbox,
+    "twenty_seconds": twenty_seconds,
+    "no_reference": no_reference,
+}
+
+
+def write_log(name: str, data: Path, folder: Path) -> list[Path]:
+    """Write one log into a folder of its own; returns its files."""
+    own = folder / name
+    own.mkdir(parents=True)
+    LOGS[name](data, own)
+    return sorted(own.iterdir())
