@@ -1,6 +1,6 @@
 """Ten logs as users bring them, made of the real Ferrari and Volvo recordings; ``front_door.yaml`` holds what is expected of each.
 
-Each goes from ``vehest new NAME FILES --yes`` to ``vehest run NAME --minutes 5``: to a verdict, or to one sentence that says what to record.
+Each goes from ``vehest new NAME FILES --yes`` to ``vehest run NAME --minutes 5``: to a verdict, or to a sentence that says what to record.
 """
 
 from __future__ import annotations
@@ -9,7 +9,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
-from dressed_logs import G, RATIO, Columns, ferrari, later, write
+from dressed_logs import RATIO, Columns, G, ferrari, later, write
 
 RADIUS = 0.33  # m
 MPS = 3.6  # km/h

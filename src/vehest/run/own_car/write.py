@@ -131,6 +131,7 @@ def _plain(made: Draft, plan: Plan, left: Sequence[Question]) -> dict[str, Any]:
         "has_reference": "vy_ref" in made.channels,
         "estimators": plan.estimators,
         "lacking": plan.lacking,
+        "limits": _limits(made),
         "findings": made.remarks,
         "notes": made.notes,
     }

@@ -1,0 +1,78 @@
+"""`vehest new --yes`, then `vehest run --minutes 5`, on the ten logs of front_door_logs.py, held against front_door.yaml, a line each."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import subprocess
+import sys
+import tempfile
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import yaml
+from front_door_logs import LOGS, write_log
+
+EXPECTED = Path(__file__).parent / "front_door.yaml"
+
+
+def vehest(folder: Path, *words: str) -> tuple[int, str, str]:
+    """Exit code, standard output and error of a command in a folder."""
+    ran = subprocess.run(
+        [sys.executable, "-m", "vehest", *words], cwd=folder, capture_output=True, text=True, check=False, env=dict(os.environ)
+    )
+    return ran.returncode, ran.stdout, ran.stderr
+
+
+def differences(told: Mapping[str, Any], code: int, plain: Mapping[str, Any], words: str) -> list[str]:
+    """What `vehest new` did otherwise than expected."""
+    if code:
+        return [] if told["end"] == "stop" else [f"exit {code}: {words.strip().splitlines()[-1]}"]
+    found = {one["channel"]: one["column"] for one in plain["channels"]}
+    asked = {question["key"] for question in plain["open"]}
+    wrong = [
+        f"{channel} is {found.get(channel)}, not {column}" for channel, column in told["channels"].items() if found.get(channel) != column
+    ]
+    wrong += [f"nothing is asked about {column}" for column in told.get("asked", ()) if column not in asked]
+    said = " ".join([words, *plain["notes"], *plain["limits"], *plain["findings"], *(text for one in plain["channels"] for text in one["evidence"])])
+    return wrong + ([f"'{told['note']}' is not said"] if told.get("note", "") not in said else [])
+
+
+def tried(name: str, data: Path, folder: Path, minutes: float) -> tuple[list[str], str]:
+    """Differences from what is expected, and how the way ended."""
+    told = yaml.safe_load(EXPECTED.read_text(encoding="utf-8"))[name]
+    files = [str(file) for file in write_log(name, data, folder)]
+    code, out, err = vehest(folder, "new", name, *files, "--yes", "--json")
+    plain = json.loads(out) if out.strip().startswith("{") else {}
+    wrong = differences(told, code, plain, err)
+    if code or not plain.get("estimators"):
+        end = err.strip().splitlines()[-1] if code else "; ".join(plain["limits"])
+        return wrong + ([f"ended with: {end}"] if told["end"] == "verdict" else []), end
+    if not minutes:
+        return wrong, "not run"
+    code, out, err = vehest(folder, "run", name, "--minutes", f"{minutes:g}", "tracking=none", "--quiet")
+    lines = [line for line in out.splitlines() if line.strip()]
+    end = " ".join(lines[-6:]) if code == 0 else (err.strip().splitlines() or ["nothing"])[-1]
+    return wrong + ([f"exit {code}"] if (code != 0) == (told["end"] == "verdict") else []), end
+
+
+def main(words: Sequence[str] | None = None) -> int:
+    """Try the logs that are named, or all; 1 where one came out otherwise than expected."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("names", nargs="*", default=list(LOGS))
+    parser.add_argument("--minutes", type=float, default=5.0, help="of vehest run; 0: not run")
+    parser.add_argument("--data", type=Path, default=os.environ.get("VEHEST_DATA"))
+    own = parser.parse_args(words)
+    failed = 0
+    for name in own.names:
+        with tempfile.TemporaryDirectory() as folder:
+            wrong, end = tried(name, own.data, Path(folder), own.minutes)
+        failed += bool(wrong)
+        print(f"{name}: {'; '.join(wrong) or 'as expected'}\n    {end[:600]}", flush=True)
+    return 1 if failed else 0
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())
