@@ -13,6 +13,7 @@ from vbo_log import COLUMNS, UNITS, dataset, drive, write_log
 from vehest.data.errors import DataError
 from vehest.data.recording import Recording
 from vehest.sources.base import open_source
+from vehest.sources.surveys import survey
 from vehest.sources.vbo import read_log
 
 
@@ -58,12 +59,27 @@ def test_units_belong_to_the_last_columns_and_must_not_contradict_the_declaratio
 
 def test_slip_whose_offsets_changed_places_is_found_and_right_slip_is_not(tmp_path: Path) -> None:
     write_log(tmp_path / "lap.vbo", swapped=True)
+    channels = dataset(tmp_path)["channels"] | {"sideslip_ref": {"column": "Slip_FL", "unit": "deg"}}  # type: ignore[operator]
     with pytest.raises(DataError, match=r"slip at the front and the rear left wheel differs by .* changed places") as refused:
-        read(tmp_path)
+        read(tmp_path, channels=channels)
     assert "accept: [slip_offsets]" in str(refused.value)
-    assert "vy_ref" in read(tmp_path, accept=["slip_offsets"])
-    without = {name: entry for name, entry in dataset(tmp_path)["channels"].items() if name != "vy_ref"}  # type: ignore[attr-defined]
-    assert "vx" in read(tmp_path, channels=without)
+    assert "sideslip_ref" in read(tmp_path, channels=channels, accept=["slip_offsets"])
+    assert "vy_ref" in read(tmp_path)  # Lat._Vel. holds at the antenna
+    log = survey(tmp_path / "lap.vbo")
+    assert not any(column.name.startswith("Slip_F") for column in log.columns)
+    assert "changed places" in log.skipped[0]
+
+
+def test_columns_of_a_bus_are_the_car_s_own(tmp_path: Path) -> None:
+    write_log(tmp_path / "lap.vbo")
+    assert {column.device for column in survey(tmp_path / "lap.vbo").columns} == {""}
+    content = (tmp_path / "lap.vbo").read_bytes()
+    modules = ["026524 - CAN02 - 1 3", *["030003 - Internal Slip Module - 1 1"] * 6]
+    section = "\r\n".join(["[module Information]", *modules, "", "", "[column names]"]).encode()
+    (tmp_path / "lap.vbo").write_bytes(content.replace(b"[column names]", section))
+    devices = {column.name: column.device for column in survey(tmp_path / "lap.vbo").columns}
+    own = COLUMNS.split()[-7]
+    assert devices == {name: "car" if name == own else "reference" for name in devices}
 
 
 @pytest.mark.parametrize(

@@ -7,7 +7,7 @@ The format as its files have it: ``[header]`` and ``[column names]`` name the co
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -36,6 +36,7 @@ FASTEST_STILL, LEAST_TURN = 5.0, 0.05  # m/s, rad/s: below, slip at two wheels s
 FEWEST = 100  # samples that turn
 LEAST_DIFFERENCE = 0.25  # of the slip angles' difference that the yaw rate makes between the axles
 SLIP_CHECK = "slip_offsets"
+SLIP_AT_A_POINT = re.compile(r"Slip_(COG|[FR][LR])")  # Slip_Angle, Lat._Vel. and Lng._Vel. are those at the antenna
 OFFSETS = re.compile(r"Offsets Slip \((\w+)\)\s*:\s*\{\s*([-+]?\d+(?:\.\d*)?)\s+([-+]?\d+(?:\.\d*)?)\s*\}")
 
 
@@ -57,6 +58,7 @@ class Log:
     columns: Mapping[str, FloatArray]  # name -> values in the file's unit, (T,)
     units: Mapping[str, str]  # name -> unit as the file writes it; only of columns that have one
     seconds: FloatArray  # clock time since midnight, going on past it [s], (T,)
+    modules: Mapping[str, str]  # name -> module of the logger that it comes from; only of columns that have one
     offsets: Mapping[str, tuple[float, float]]  # point, such as FL -> lateral and longitudinal distance from the antenna [m]
     provenance: Mapping[str, Any]  # first line, offsets, and rows at the end that were cut off or came late
 
@@ -86,7 +88,7 @@ class VboSource(FileSource):
         log = read_log(file)
         used = [column.column for column in self.columns.values()]
         require_columns(file, list(log.columns), used)
-        if any(name.startswith(("Slip_", "Lat._Vel")) for name in used) and SLIP_CHECK not in (self.dataset.get("accept") or []):
+        if any(map(SLIP_AT_A_POINT.fullmatch, used)) and SLIP_CHECK not in (self.dataset.get("accept") or []):
             require_slip_offsets(log, f"'{file}'")
         clock, channels = uniform_clock(log.seconds, f"'{file}'", self.options.clock), {}
         for name, column in self.columns.items():
@@ -122,10 +124,7 @@ def read_log(file: Path) -> Log:
     if late:
         columns, seconds = {name: own[:-1] for name, own in columns.items()}, seconds[:-1]
 
-    units = [line.strip() for line in sections.get("channel units", "").splitlines()[1:]]  # of the last columns, an empty line for none
-    if units and not units[-1]:
-        units.pop()
-    own = dict(zip(names[len(names) - len(units) :], units, strict=True)) if len(units) <= len(names) else {}
+    own, modules = (_of_last_columns(names, sections.get(title, "")) for title in ("channel units", "module information"))
     found = OFFSETS.findall(sections.get("comments", ""))
     offsets = {point: (float(lateral), float(longitudinal)) for point, lateral, longitudinal in found}
     provenance = {
@@ -133,7 +132,15 @@ def read_log(file: Path) -> Log:
         "slip_offsets_lateral_longitudinal_m": {point: list(pair) for point, pair in offsets.items()},
         "rows_dropped_at_the_end": cut_off + late,
     }
-    return Log(columns, {name: unit for name, unit in {**UNITS, **own}.items() if unit}, seconds, offsets, provenance)
+    return Log(columns, {name: unit for name, unit in {**UNITS, **own}.items() if unit}, seconds, modules, offsets, provenance)
+
+
+def _of_last_columns(names: Sequence[str], section: str) -> dict[str, str]:
+    """The lines of a section, each of one of the last columns, by its name; an empty line for none."""
+    lines = [line.strip() for line in section.splitlines()[1:]]
+    while lines and not lines[-1]:
+        lines.pop()
+    return dict(zip(names[len(names) - len(lines) :], lines, strict=True)) if len(lines) <= len(names) else {}
 
 
 def require_slip_offsets(log: Log, where: str) -> None:
@@ -159,8 +166,8 @@ def require_slip_offsets(log: Log, where: str) -> None:
     if found < LEAST_DIFFERENCE * expected:
         raise DataError(
             f"{where}: slip at the front and the rear left wheel differs by {found:.2g}° (rms) where the yaw rate makes {expected:.2g}°: "
-            "the offsets of the logger, {lateral, longitudinal}, changed places, and its slip and lateral velocity hold for other points "
-            f"than it says; leave them out, or accept: [{SLIP_CHECK}]"
+            "the offsets of the logger, {lateral, longitudinal}, changed places, and Slip_COG, Slip_FL … hold for other points than it "
+            f"says; take Slip_Angle or Lat._Vel., which hold at the antenna, or accept: [{SLIP_CHECK}]"
         )
 
 

@@ -11,17 +11,30 @@ import numpy as np
 from vehest.alignment.motion import Motion
 from vehest.alignment.proposals.columns import UNITS, Candidate, candidates, correlation, largest, si_factor, slow_of
 from vehest.alignment.proposals.fitting import CLEAR, REFERENCES, Agreement, fitting_channels, longitudinal, may_be_ax
-from vehest.alignment.proposals.names import STRONG, WEAK, is_filtered, is_reference
+from vehest.alignment.proposals.names import STRONG, WEAK, is_filtered
 from vehest.alignment.proposals.poses import find_pose, named_pose, turning_of
 from vehest.alignment.proposals.proposal import LATERAL, Proposal, Proposals
-from vehest.alignment.proposals.turning import CLOSE, FAR, RARE, Search, Turning, find_turning, reference_speed, repeated, turning_by_names
-from vehest.alignment.proposals.wheels import Wheels, find_wheels, speed_of_wheels, turning_left, wheel_proposals
+from vehest.alignment.proposals.turning import (
+    CLOSE,
+    FAR,
+    RARE,
+    Search,
+    Turning,
+    find_turning,
+    is_evident,
+    reference_speed,
+    repeated,
+    turning_by_names,
+)
+from vehest.alignment.proposals.wheels import Wheels, find_wheels, speed_of_wheels, turning_left, wheel_proposals, wheels_over_speed
 from vehest.constants import FloatArray
 from vehest.data.channels import CHANNELS
 
 STANDING = 0.5  # m/s; the car did not move
 NEAR_SCORE = 4.0  # of the best triple, within which others are compared with it
 MOST_COMPARED = 40  # columns
+TOO_FAST = (0.9, 0.97)  # of ay over vx·yaw_rate, where a speed reads too much
+WHEELS_AGREE = 0.02
 DECIDING = 0.5  # correlation by which wheels or a compass decide which way is left
 RATES = (5.0, 10.0, 20.0, 25.0, 40.0, 50.0, 60.0, 100.0, 125.0, 200.0, 250.0, 400.0, 500.0, 1000.0, 2000.0)
 NOMINAL_RATE = 50.0  # Hz, where there are no times
@@ -42,25 +55,31 @@ BY_NAME_ALONE = ("motor_current", "brake_pressure_front", "brake_pressure_rear",
 
 
 def propose(
-    columns: Sequence[tuple[str, str, FloatArray]], rate_hz: float | None, *, compass: str = "", west_positive: bool = False
+    columns: Sequence[tuple[str, str, FloatArray]],
+    rate_hz: float | None,
+    *,
+    devices: Mapping[str, str] | None = None,
+    compass: str = "",
+    west_positive: bool = False,
 ) -> Proposals:
     """Propose channels for the columns of a log.
 
     Args:
         columns: name, unit as vehest spells it (empty where the file has none), values on an even clock, (T,) each.
         rate_hz: of that clock; None where it is unknown.
+        devices: column -> ``car`` or ``reference``, where the file says which of them measured it.
         compass: column that counts the heading clockwise by its file's format; empty where there is none.
         west_positive: whether longitudes count to the west.
     """
     rate = rate_hz or NOMINAL_RATE
-    found = candidates(columns, rate)
+    found = candidates(columns, rate, devices or {})
     wheels = find_wheels(found)
     found += speed_of_wheels(found, wheels, rate)
     stands = _stands(found)
     turning = [] if stands else find_turning(found)
     guessed = _rate_by_ax(_of(found, turning[0], rate)) if turning and rate_hz is None else None
     if guessed is not None:
-        return replace(propose(columns, guessed, compass=compass, west_positive=west_positive), rate_hz=guessed)
+        return replace(propose(columns, guessed, devices=devices, compass=compass, west_positive=west_positive), rate_hz=guessed)
     search = None if stands else _search(found, turning, rate)
     proposals = _assigned(found, search, wheels)
     notes = [*proposals.notes]
@@ -72,6 +91,9 @@ def propose(
             notes.append(f"no reference is made of {', '.join(named)}: their derivatives are not the speed and the yaw rate")
     if stands:
         notes.append("the car stands all the time, by its speed; names alone suggest channels")
+    if search is not None:
+        proposals, said = _speedometer(proposals, search.turning, wheels)
+        notes += said
     clues = () if known is None else _clues(found, wheels, known, compass, west_positive)
     proposals = _left_and_right(replace(proposals, notes=tuple(notes)), found, known, clues)
     proposals = possible(proposals, {column.name: column.values for column in found})
@@ -96,6 +118,25 @@ def possible(proposals: Proposals, columns: Mapping[str, FloatArray]) -> Proposa
         else:
             kept.append(one)
     return replace(proposals, channels=tuple(kept), notes=tuple(notes))
+
+
+def _speedometer(proposals: Proposals, turning: Turning, wheels: Wheels) -> tuple[Proposals, list[str]]:
+    """The speed asked where ay over the yaw rate and the wheels agree that it reads too much; a note where ay alone says so."""
+    own = proposals.by_channel.get("vx")
+    if "ay" not in turning.columns or own is None or not TOO_FAST[0] < turning.scale < TOO_FAST[1]:
+        return proposals, []
+    by_wheels = wheels_over_speed(wheels, proposals, turning.columns["vx"].slow * si_factor(own.unit, "vx"))
+    if by_wheels is None or abs(by_wheels - turning.scale) > WHEELS_AGREE:
+        text = f"'{own.column}' reads {_excess(turning.scale)} by ay over yaw_rate, or ay too little; a factor in the data set corrects it"
+        return proposals, [text]
+    scaled = f"vx {own.unit} {own.sign:+d} {own.factor * by_wheels:.3f}"
+    doubt = own.asked or f"it reads {_excess(by_wheels)} by the wheels and by ay over yaw_rate, as speedometers do; '{scaled}' corrects it"
+    changed = replace(own, asked=doubt, others=(*own.others, scaled))
+    return replace(proposals, channels=tuple(changed if one is own else one for one in proposals.channels)), []
+
+
+def _excess(scale: float) -> str:
+    return f"{100.0 * (1.0 / scale - 1.0):.0f} % too much"
 
 
 def _stands(columns: Sequence[Candidate]) -> bool:
@@ -186,7 +227,7 @@ def _named_channels(columns: Sequence[Candidate], held: Collection[str], *, move
         needless = (channel == "steer" and "handwheel" in {*held, *found}) or (channel == "vx" and has_wheels and moves)
         if not named or channel in held or needless:
             continue
-        best = max(named, key=lambda one: (one.hints[channel], not is_filtered(one.name), not is_reference(one.name)))
+        best = max(named, key=lambda one: (one.hints[channel], not is_filtered(one.name), not one.is_reference))
         if best.name not in {one.column for one in found.values()}:
             found[channel] = _by_name(best, channel)
     for column in columns:
@@ -225,6 +266,10 @@ def _turning_proposals(turning: Turning) -> Iterator[Proposal]:
     for channel, column in turning.columns.items():
         if not column.is_made:
             doubt = "" if column.unit and "ay" in turning.columns and is_close else asked
+            if channel == "ay" and not is_evident(column, turning.scale):
+                doubt = (
+                    doubt or f"it is {turning.scale:.2g} times vx·yaw_rate and has no unit: it may be another quantity, such as a velocity"
+                )
             if column.hint(channel) <= -STRONG:
                 doubt = doubt or "the motion contradicts its name"
             yield Proposal(column.name, channel, turning.units[channel], turning.signs[channel], (evidence,), doubt)

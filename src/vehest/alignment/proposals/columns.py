@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import signal
 
-from vehest.alignment.proposals.names import hints
+from vehest.alignment.proposals.names import hints, is_of_bus, is_reference
 from vehest.constants import FloatArray
 from vehest.data.channels import CHANNELS
 from vehest.data.errors import DataError
@@ -47,11 +47,22 @@ class Candidate:
     hints: Mapping[str, float]  # role -> strength with which the name suggests it
     gappy: bool = False  # whether samples were missing
     is_made: bool = False  # whether it is the mean of wheels, and no column of the log
+    device: str = ""  # ``car`` or ``reference`` where the file says which of them measured it
 
     @property
     def is_wheel(self) -> bool:
         """Whether its name suggests the speed of a wheel."""
         return any(role.startswith("wheel_speed") for role in self.hints)
+
+    @property
+    def is_reference(self) -> bool:
+        """Whether the reference measured it, by the file or else by its name."""
+        return self.device == "reference" or (not self.device and is_reference(self.name))
+
+    @property
+    def is_of_bus(self) -> bool:
+        """Whether it comes from the car's own bus, by the file or else by its name."""
+        return self.device == "car" or (not self.device and is_of_bus(self.name) and not is_reference(self.name))
 
     def hint(self, role: str) -> float:
         """Strength with which the name suggests a role; negative where it suggests others only."""
@@ -74,7 +85,7 @@ def si_factor(unit: str, channel: str) -> float:
     return factor_to_si(unit, CHANNELS[channel].unit)
 
 
-def candidates(columns: Sequence[tuple[str, str, FloatArray]], rate_hz: float) -> list[Candidate]:
+def candidates(columns: Sequence[tuple[str, str, FloatArray]], rate_hz: float, devices: Mapping[str, str]) -> list[Candidate]:
     """Columns that change, are mostly there, and are neither clocks nor distances; see `vehest.alignment.proposals.assign.propose`."""
     found = []
     for name, unit, values in columns:
@@ -87,7 +98,7 @@ def candidates(columns: Sequence[tuple[str, str, FloatArray]], rate_hz: float) -
         gappy = not known.all()
         known[known] = ~_stray(values[known])
         whole = values if known.all() else np.interp(np.arange(len(values)), np.flatnonzero(known), values[known])
-        found.append(Candidate(name, unit, whole, slow_of(whole, rate_hz), hints(name), gappy))
+        found.append(Candidate(name, unit, whole, slow_of(whole, rate_hz), hints(name), gappy, device=devices.get(name, "")))
     return found
 
 

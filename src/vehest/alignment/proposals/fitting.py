@@ -24,6 +24,7 @@ CLEAR = 0.6  # correlation that decides where nothing else comes near
 CLEAR_LATERAL = 0.45  # of relations with derivatives of noisy channels
 LEAST = 0.3
 NEAR = 2.0  # score within which another column comes near
+OF_REFERENCE = 2.5  # of score, for what the car is to measure itself
 SECOND = 3.0 + STRONG  # score of a sideslip angle beside a lateral velocity
 CENTRED = 0.1  # of a command's range, by which straight ahead may lie beside nil
 HARDLY = "the motion hardly decides it"
@@ -32,6 +33,7 @@ REFERENCES = ("vy_ref", "sideslip_ref")
 LARGEST = {"steer": 0.8, "handwheel": 16.0}  # rad
 STRAIGHT_AHEAD = 0.1  # rad that a road wheel may show there, of an angle
 LENGTHS = {"steer": (1.2, 7.0), "handwheel": (12.0, 130.0)}  # m, wheelbase, and that times the ratio, of cars
+SHOWN = {"steer": (1.8, 5.0), "handwheel": (25.0, 80.0)}  # m, of cars; others are an error of the estimate
 USUAL_LENGTH = {"steer": 2.7, "handwheel": 43.0}  # m
 SMALL = 0.08  # m, wheelbase of the smallest model
 FASTEST_MODEL = 20.0  # m/s
@@ -132,7 +134,8 @@ def _as_ax(search: Search, column: Candidate) -> Offer | None:
     is_clear = best.strength >= CLEAR and (best.mismatch < 1.1 or bool(column.unit))
     asked = "" if is_clear or (column.hint("ax") == STRONG and column.unit) else HARDLY
     evidence = (best.in_words or "its name alone", *_name_evidence(column, "ax"))
-    return Offer(_score(best.strength, CLEAR, column.hint("ax")), column, Proposal(column.name, "ax", unit, best.sign, evidence, asked))
+    score = _score(best.strength, CLEAR, column.hint("ax")) - OF_REFERENCE * column.is_reference
+    return Offer(score, column, Proposal(column.name, "ax", unit, best.sign, evidence, asked))
 
 
 def _as_steering(search: Search, column: Candidate) -> Offer | None:
@@ -151,6 +154,8 @@ def _as_steering(search: Search, column: Candidate) -> Offer | None:
     found = angles(search.known, column)
     if "handwheel" in column.hints:
         found = [one for one in found if one.channel == "handwheel"] or found
+    if not found and column.hints.get("handwheel") == STRONG and column.unit:
+        return Offer(score, column, Proposal(column.name, "handwheel", column.unit, sign, evidence))
     if not found:
         spread = float(np.quantile(np.abs(column.values - straight), 0.995))
         unit = next((unit for unit in column.units("steer") if spread * si_factor(unit, "steer") <= CHANNELS["steer"].high), "rad")
@@ -162,8 +167,9 @@ def _as_steering(search: Search, column: Candidate) -> Offer | None:
     asked = "" if best.strength >= CLEAR or hint == STRONG else HARDLY
     if others:
         asked = f"could be {' or '.join(f'{other} in {of_other}' for other, of_other in others)} as well"
-    kind = "a wheelbase" if channel == "steer" else "wheelbase times ratio"
-    text = f"up to {math.degrees(reach):.3g}°, and {kind} of {length:.3g} m by slow corners"
+    text = f"up to {math.degrees(reach):.3g}°"
+    if SHOWN[channel][0] <= length <= SHOWN[channel][1] or float(np.quantile(search.known.vx, 0.99)) < FASTEST_MODEL:
+        text += f", and {'a wheelbase' if channel == 'steer' else 'wheelbase times ratio'} of {length:.3g} m by slow corners"
     alternatives = tuple(" ".join(other) for other in others)
     return Offer(score, column, Proposal(column.name, channel, unit, sign, (*evidence, text), asked, others=alternatives))
 
@@ -189,6 +195,8 @@ def _as_lateral(search: Search, column: Candidate) -> Offer | None:
     asked = f"could be {rivals[0].channel} in {rivals[0].unit} as well" if rivals else "" if is_clear else HARDLY
     if not best.strength and not column.unit:
         asked = f"sign and unit: {HARDLY}"
+    if not asked and column.hint(best.channel) < 0.0:
+        asked = "the motion contradicts its name"
     evidence = (best.in_words or "its name alone", *_name_evidence(column, *REFERENCES))
     others = tuple(dict.fromkeys(f"{one.channel} {one.unit}" for one in found if one is not best)) if asked else ()
     proposal = Proposal(column.name, best.channel, best.unit, best.sign, evidence, asked, others=others)

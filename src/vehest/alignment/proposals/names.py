@@ -51,6 +51,7 @@ _REFERENCE = re.compile(
     r"kistler|vbox|satell|rigid|vehicle velocity|racelogic|novatel|\bimar\b|genesys|"
     r"from (yaw|pose|positions?)\b"
 )
+_BUS = re.compile(r"\bcan\d?\b|\besp\b|\babs\b|\besc\b|\bobd|^veh(icle)?(spd|speed|sp)|^tacho|spdlgt|^alat\d|^algt\d")
 _STEERING_RATE = re.compile(r"deltadelta|steer(ing)?(wheel)?(angle)?(rate|speed|vel)|lenk\w*geschw|swarate|anglerate|deltadot|ddelta")
 _FILTERED = re.compile(r"filt|smooth|\blp\b|avg|mittel|gemittelt")
 _CORNERS = {
@@ -136,6 +137,11 @@ def is_pair(longitudinal: str, lateral: str) -> bool:
 def is_reference(name: str) -> bool:
     """Whether a name suggests a reference sensor."""
     return bool(_REFERENCE.search(bare(name)) or re.search(r"gps|gnss|mocap|vicon", bare(name).replace(" ", "")))
+
+
+def is_of_bus(name: str) -> bool:
+    """Whether a name suggests a signal on the car's own bus."""
+    return bool(_BUS.search(bare(name)) or _BUS.search(bare(name).replace(" ", "")))
 
 
 def is_filtered(name: str) -> bool:

@@ -8,7 +8,6 @@ import numpy as np
 
 from vehest.alignment.motion import Motion, rms
 from vehest.alignment.proposals.columns import Candidate, correlation, slow_of
-from vehest.alignment.proposals.names import is_reference
 from vehest.data.units import factor_to_si
 
 PARTS = {"x": "position_x", "y": "position_y", "yaw": "heading"}
@@ -24,7 +23,7 @@ def named_pose(columns: Sequence[Candidate]) -> list[Candidate]:
     found = []
     for role in PARTS.values():
         named = [one for one in columns if role in one.hints]
-        found += sorted(named, key=lambda one: (-one.hints[role], not is_reference(one.name)))[:1]
+        found += sorted(named, key=lambda one: (-one.hints[role], not one.is_reference))[:1]
     return found
 
 

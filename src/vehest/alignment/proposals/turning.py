@@ -19,6 +19,7 @@ from vehest.constants import FloatArray
 LEAST_CORRELATION = 0.75
 RARE = {"mph": 0.1, "knots": 0.2}  # units of speed, with a penalty on their mismatch
 CLOSE, FAR = 0.3, 0.6  # logarithms of a scale: within, units explain it; beyond, they do not
+EVIDENT = 0.1  # likewise: within, the scale alone speaks for an acceleration
 APART = 0.2  # by which the next best units must be worse
 RANGES = {"vx": (0.5, 110.0), "yaw_rate": (0.02, 8.0), "ay": (0.3, 60.0)}  # of the 99th percentile, SI
 MOST_COLUMNS = 60
@@ -122,6 +123,11 @@ def _is_forward(slow: FloatArray) -> bool:
     return bound > 0.0 and min(float(np.mean(slow < -bound)), float(np.mean(slow > bound))) < 0.02
 
 
+def is_evident(ay: Candidate, scale: float) -> bool:
+    """Whether unit, or a scale near 1 over vx·yaw_rate, speaks for a lateral acceleration: names of velocities read alike."""
+    return bool(ay.unit) or abs(math.log(scale)) < EVIDENT
+
+
 def _is_plausible(column: Candidate, channel: str, unit: str) -> bool:
     low, high = RANGES[channel]
     return low <= largest(column.slow) * si_factor(unit, channel) <= high
@@ -142,13 +148,14 @@ def _scored(columns: Sequence[Candidate], named: Mapping[str, Candidate], agreei
     score = 12.0 * (abs(agreeing) - LEAST_CORRELATION) / (1.0 - LEAST_CORRELATION)
     for channel, one in named.items():
         score += one.hint(channel) + (1.5 if one.unit else 0.0) - 0.5 * is_filtered(one.name)
-        if channel not in one.hints and any(channel in other.hints for other in columns):
-            score -= UNNAMED
-    score -= 0.5 * is_reference(named["ay"].name) + 5.0 * implausible
+        if channel not in one.hints:
+            score -= UNNAMED * max((other.hints.get(channel, 0.0) for other in columns), default=0.0) / STRONG
+    score -= (3.0 if any(one.is_of_bus and "ay" in one.hints for one in columns) else 0.5) * named["ay"].is_reference + 5.0 * implausible
     level = np.abs(named["vx"].slow)
     if float(np.std(level)) < 0.05 * float(np.mean(level)) and "vx" not in named["vx"].hints:
         score -= 2.0
     score += 3.0 if mismatch < CLOSE else 1.0 if mismatch < FAR else -5.0
+    score -= UNNAMED * (not is_evident(named["ay"], left))
     return Turning(named, dict(zip(named, units, strict=True)), decided, agreeing, left, score)
 
 
@@ -227,8 +234,8 @@ def _scaled_speed(column: Candidate, first: Repeat) -> Iterator[Proposal]:
 def _separated(family: Sequence[Repeat], channel: str) -> list[Proposal]:
     """The car's own and the reference's of columns that measure the same; more than these two are left out."""
     plain = [one for one in family if not is_filtered(one.column.name)] or list(family)
-    own = [one for one in plain if not is_reference(one.column.name)]
-    references = [one for one in plain if is_reference(one.column.name)]
+    own = [one for one in plain if one.column.is_of_bus] or [one for one in plain if not one.column.is_reference]
+    references = [one for one in plain if one.column.is_reference] or [one for one in plain if one not in own]
     text = f"agrees {min(abs(correlation(one.column.slow, family[0].column.slow)) for one in plain):.2f} with the other {channel}"
 
     def proposal(one: Repeat, name: str, *more: str, asked: str = "", others: tuple[str, ...] = ()) -> Proposal:
@@ -239,9 +246,10 @@ def _separated(family: Sequence[Repeat], channel: str) -> list[Proposal]:
         own.sort(key=lambda one: -max(one.column.hints.values(), default=0.0))
         asked = f"{len(own)} columns could be the car's own {channel}" if len(own) > 1 else ""
         first = proposal(own[0], channel, asked=asked, others=tuple(one.column.name for one in own[1:]))
-        return [first, proposal(references[0], reference, "named as a reference")]
+        why = "named as a reference" if is_reference(references[0].column.name) else "the other one is of the car's own bus"
+        return [first, proposal(references[0], reference, why)]
     if len(plain) < 2:
-        return [Proposal(one.column.name, channel, one.unit, one.sign) for one in plain]
+        return [Proposal(one.column.name, channel, one.unit, one.sign, ("the others are filtered",)) for one in plain]
     asked = f"which is the car's own {channel}, and which the reference's: no name decides"
     roughness = {id(one): float(np.std(np.diff(one.column.values, 2))) / max(float(np.std(one.column.values)), 1e-12) for one in plain}
     rough, smooth = sorted(plain, key=lambda one: roughness[id(one)], reverse=True)[:2]

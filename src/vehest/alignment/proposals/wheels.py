@@ -11,7 +11,7 @@ import numpy as np
 from vehest.alignment.motion import Motion, rms
 from vehest.alignment.proposals.columns import Candidate, correlation, largest, si_factor, slow_of
 from vehest.alignment.proposals.names import WEAK
-from vehest.alignment.proposals.proposal import Proposal
+from vehest.alignment.proposals.proposal import Proposal, Proposals
 from vehest.alignment.proposals.turning import RANGES
 from vehest.constants import FloatArray
 
@@ -24,6 +24,7 @@ SLOWEST = 1.0
 AT_RIM = ("km/h", "m/s")
 UNITS = (*AT_RIM, "rpm", "rad/s")
 APART = 0.25
+SAME = (0.98, 1.08)  # a speedometer over the wheels' speed at the rim: none reads too little, many too much
 
 Wheels = Mapping[str, Candidate]  # corner -> the column that is named as its speed
 
@@ -94,6 +95,13 @@ def wheel_proposals(wheels: Wheels, known: Motion | None, *, has_speed: bool, is
     return found, None if has_speed else float(f"{radius:.3g}")
 
 
+def wheels_over_speed(wheels: Wheels, proposals: Proposals, speed: FloatArray) -> float | None:
+    """Speed of the wheels at the rim over a speed [m/s]; None where they are in no unit of a speed at the rim."""
+    found = [(one.slow, proposals.by_channel.get(f"wheel_speed_{corner}")) for corner, one in wheels.items()]
+    at_rim = [slow * NOMINAL_RADIUS * own.factor for slow, own in found if own is not None and own.factor != 1.0]
+    return rms(np.mean(at_rim, axis=0)) / rms(speed) if at_rim else None
+
+
 def _mean(wheels: Wheels) -> FloatArray:
     return np.asarray(np.mean([column.values for column in wheels.values()], axis=0), dtype=np.float64)
 
@@ -114,6 +122,8 @@ def _cost(unit: str, scale: float | None, mean: FloatArray) -> tuple[float, floa
     if unit in AT_RIM:
         factor = si_factor(unit, "vx")
         mismatch = 0.5 if scale is None else abs(math.log(scale / factor))
+        if scale is not None and SAME[0] < scale / factor < SAME[1]:
+            mismatch = 0.0
         return mismatch + 3.0 * (not SLOWEST <= top * factor <= FASTEST), NOMINAL_RADIUS
     factor = si_factor(unit, "wheel_speed_fl")
     radius = USUAL_RADIUS if scale is None else scale / factor

@@ -106,7 +106,8 @@ def inspect(name: str, files: Sequence[Path], vehicle: Mapping[str, float | None
     others = [log for log in logs if log.file != longest.file]
     columns, rate = _evidence(longest)
     is_vbo = longest.source == "vbo"  # whose headings count clockwise, and longitudes to the west
-    proposals = propose(columns, rate, compass="heading" if is_vbo else "", west_positive=is_vbo)
+    devices = {column.name: column.device for column in longest.columns}
+    proposals = propose(columns, rate, devices=devices, compass="heading" if is_vbo else "", west_positive=is_vbo)
     if longest.source not in TABLES:  # other sources make no reference of positions
         proposals = replace(proposals, pose=())
     used = {one.column for one in proposals.channels}

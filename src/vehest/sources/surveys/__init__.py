@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Literal
 
 from vehest.data.errors import DataError, MissingError
 from vehest.data.store import is_stored_recording
@@ -15,7 +16,7 @@ from vehest.sources.surveys.bags import survey_bag
 from vehest.sources.surveys.log import Log, RawColumn, Stamps
 from vehest.sources.surveys.mdf import survey_mdf
 from vehest.sources.surveys.tables import survey_table
-from vehest.sources.vbo import read_log
+from vehest.sources.vbo import SLIP_AT_A_POINT, read_log, require_slip_offsets
 
 __all__ = ["Log", "RawColumn", "Stamps", "survey"]
 
@@ -64,9 +65,24 @@ def _survey(path: Path) -> Log:
 def _survey_vbo(file: Path) -> Log:
     log = read_log(file)
     units = {**DEGREES, **log.units}
-    columns = tuple(RawColumn(name, units.get(name, ""), samples, {"column": name}) for name, samples in log.columns.items())
+    skipped: tuple[str, ...] = ()
+    try:
+        require_slip_offsets(log, "Slip_COG, Slip_FL …")
+        wanted = log.columns
+    except DataError as error:
+        wanted = {name: samples for name, samples in log.columns.items() if not SLIP_AT_A_POINT.fullmatch(name)}
+        skipped = (str(error),)
+    by_bus = any("CAN" in module for module in log.modules.values())
+    columns = tuple(
+        RawColumn(name, units.get(name, ""), samples, {"column": name}, None, _device(log.modules.get(name, "")) if by_bus else "")
+        for name, samples in wanted.items()
+    )
     clock = Stamps("time", "s", "clock time of the format")
-    return Log(file, "vbo", columns, {}, clock, log.seconds - log.seconds[0], (slice(0, len(log.seconds)),))
+    return Log(file, "vbo", columns, {}, clock, log.seconds - log.seconds[0], (slice(0, len(log.seconds)),), skipped)
+
+
+def _device(module: str) -> Literal["car", "reference"]:
+    return "car" if "CAN" in module else "reference"
 
 
 def _begins_as_mdf(path: Path) -> bool:

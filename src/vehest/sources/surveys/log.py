@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 from vehest.constants import FloatArray
 
@@ -20,6 +20,7 @@ class RawColumn:
         values: in that unit, NaN where there is none, (N,).
         place: how a data set's entry of a channel names it, such as ``{"column": "Gyro"}``.
         stamps: its own times [s], (N,); None where the log has one clock for all.
+        device: whether the file says that the car measured it, on its bus, or the reference did; empty where it does not.
     """
 
     name: str
@@ -27,6 +28,7 @@ class RawColumn:
     values: FloatArray
     place: Mapping[str, Any]
     stamps: FloatArray | None = None
+    device: Literal["", "car", "reference"] = ""
 
 
 @dataclass(frozen=True)
