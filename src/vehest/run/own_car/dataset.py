@@ -50,7 +50,7 @@ class Draft:
         remarks: findings of the checks that concern the proposals.
         ratio: estimated steering ratio and its uncertainty; None where it is given or not needed.
         notes: further remarks.
-        seconds: duration of all recordings [s].
+        durations: of the recordings [s].
     """
 
     examined: Examined
@@ -60,7 +60,12 @@ class Draft:
     remarks: list[str]
     ratio: tuple[float, float] | None
     notes: list[str]
-    seconds: float
+    durations: list[float]
+
+    @property
+    def seconds(self) -> float:
+        """Of all recordings."""
+        return sum(self.durations)
 
     @property
     def channels(self) -> frozenset[str]:
@@ -105,7 +110,7 @@ def draft(examined: Examined) -> Draft:
         _remarks(longest, recordings),
         ratio,
         notes,
-        sum(own.duration for own in recordings),
+        [own.duration for own in recordings],
     )
 
 

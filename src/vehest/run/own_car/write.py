@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import asdict, dataclass, field
@@ -24,6 +25,10 @@ from vehest.run.own_car.questions import Question
 from vehest.run.usable import SCORED, car_parameters, usability
 
 LEARNT = 0.7  # of the recordings: training and validation
+LEAST_BLOCK = 4.0  # s of a recording for validation; shorter ones are not cut
+LEAST_SECONDS = 30.0  # of all recordings, to train at all
+ROLES_OF_THREE = ("train", "validation", "test")
+ROLES = ("train", "test", "train", "validation", "train", "test", "train", "train", "validation", "test")  # of whole recordings, in turn
 SHORT = 120.0  # s of recordings; below, hardly any comparison separates estimators
 PRETRAINED_CHANNELS = ("vx", "yaw_rate", "ax", "ay")
 STIFFNESS = 10.0  # cornering stiffness of an axle over its load [1/rad], as the baseline data_sheet assumes
@@ -46,6 +51,8 @@ DATASET_COMMENTS = {
 SPLIT_HEAD = """of each recording, 50 % for training, then 20 % for validation, then 30 % as test. They are blocks, since neighbouring
 samples are nearly the same, and would reveal the answer. Of several laps the last: tests: {test: last lap}. A few minutes only:
 cross-validate, by report: folds in the pipeline and folds: {number: 5, of: seconds, gap_seconds: 2} here, for the last three keys."""
+WHOLE_HEAD = """whole recordings, since they are too short to be cut: in turn half of them for training, a fifth for
+validation and three tenths as test."""
 PIPELINE_HEAD = """every family that its channels allow, the most promising first, with small budgets. Run it by
   vehest run {name} --minutes 15
 which does as much as fits, and goes on when it is run again. Lines may go, budgets may grow (training.max_epochs=1000 is what
@@ -81,11 +88,10 @@ def write(examined: Examined, left: Sequence[Question] = (), *, dry_run: bool = 
     name = examined.name
     with use_limits(limits_from_config(compose_config("estimate")["limits"])):
         made = draft(examined)
-    plan = _plan_of(made.contents, examined.vehicle) if "vy_ref" in made.channels else Plan()
+    plan = _plan_of(made.contents, examined.vehicle) if "vy_ref" in made.channels and not _is_too_short(made) else Plan()
     texts = [_dataset_text(made, left)]
     if plan.sweeps:
-        split = {"name": name, "dataset": name, "train": "50 %", "validation": "20 %", "tests": {"test": "30 %"}}
-        texts += [_yaml(split, [f"{name}: {SPLIT_HEAD}"]), _pipeline_text(name, plan, LEARNT * made.seconds / 60.0)]
+        texts += [_split_text(made), _pipeline_text(name, plan, LEARNT * made.seconds / 60.0)]
     files = dict(zip(paths_of(name), texts, strict=False))
     if not dry_run:
         with ExitStack() as stack:
@@ -98,6 +104,30 @@ def write(examined: Examined, left: Sequence[Question] = (), *, dry_run: bool = 
     for file, purpose in zip(files, (*purposes, f"estimators: {', '.join(plan.estimators)}"), strict=False):
         lines.append(f"{'would write' if dry_run else 'wrote'} {file}: {purpose}")
     return plain, [*lines, "next:", *(f"  {command}" for command in following)]
+
+
+def _are_short(made: Draft) -> bool:
+    """Whether some recording is too short to be cut into blocks."""
+    return 0.2 * min(made.durations) < LEAST_BLOCK
+
+
+def _is_too_short(made: Draft) -> bool:
+    """Whether there is too little to train, stop and test on."""
+    return made.seconds < LEAST_SECONDS or (_are_short(made) and len(made.durations) < len(ROLES_OF_THREE))
+
+
+def _split_text(made: Draft) -> str:
+    """Blocks of each recording, or whole recordings where they are short."""
+    name, ids = made.examined.name, [one.id for one in made.contents]
+    if not _are_short(made):
+        blocks = {"name": name, "dataset": name, "train": "50 %", "validation": "20 %", "tests": {"test": "30 %"}}
+        return _yaml(blocks, [f"{name}: {SPLIT_HEAD}"])
+    cycle = ROLES_OF_THREE if len(ids) == len(ROLES_OF_THREE) else ROLES
+    train, validation, test = (
+        [{"recording": own} for own, role in zip(ids, itertools.cycle(cycle), strict=False) if role == wanted] for wanted in ROLES_OF_THREE
+    )
+    split: dict[str, Any] = {"name": name, "dataset": name, "train": train, "validation": validation, "tests": {"test": test}}
+    return _yaml(split, [f"{name}: {WHOLE_HEAD}"])
 
 
 def _next_commands(made: Draft, plan: Plan) -> list[str]:
@@ -215,6 +245,14 @@ def _limits(own: Draft) -> list[str]:
     """Comparisons that the recordings do not allow."""
     made = {"vy_ref"} if "sideslip_ref" in own.channels else set()  # with vx
     missing = [name for name in SCORED if name not in own.channels | made]
+    if not missing and _is_too_short(own):
+        lengths = f"{own.seconds:.0f} s in {len(own.durations)} recording{'s' if len(own.durations) > 1 else ''}"
+        return [
+            f"{lengths} are too short to train, stop and test on: record two minutes or more with bends, or three drives or more, "
+            "with the reference; until then vehest estimate pretrained runs the model that comes with vehest"
+        ]
+    if not missing and _are_short(own):
+        return [f"the recordings are short, so the split takes whole recordings ({len(own.durations)}, {own.seconds:.0f} s in all)"]
     if not missing:
         text = f"{own.seconds:.0f} s in all, a third of it for tests, hardly rank estimators; record some minutes more"
         return [text] if own.seconds < SHORT else []
