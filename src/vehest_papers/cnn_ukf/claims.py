@@ -12,7 +12,6 @@ from scipy import stats
 
 from vehest.constants import FloatArray
 from vehest.report.style import fixed
-from vehest.studies.kit.claims import Claim, Verdict
 from vehest_papers.cnn_ukf import paper
 from vehest_papers.cnn_ukf.limited import AS_TUNED, OF_THE_FULL_SET, Limited
 from vehest_papers.cnn_ukf.manoeuvres import GROUPS, is_nonlinear
@@ -20,6 +19,7 @@ from vehest_papers.cnn_ukf.measures import ME, ME_NL, MSE, MSE_NL, Comparison, w
 from vehest_papers.cnn_ukf.networks import Outputs
 from vehest_papers.cnn_ukf.perturbed import NOMINAL, Perturbed
 from vehest_papers.cnn_ukf.subjects import Run
+from vehest_papers.kit.claims import Claim, Verdict
 from vehest_papers.kit.statements import Change, Compared, Expected, Measured, Statement, short
 
 LEVEL = 0.10

@@ -14,7 +14,6 @@ from vehest.estimators.network_ukf import LEAST_VARIANCE
 from vehest.report.document import REPORT, Block, Column, Document, Table, as_code
 from vehest.report.style import fixed, listed
 from vehest.studies.artefacts import StudyArtefacts
-from vehest.studies.kit.claims import Claim, claims_table
 from vehest_papers.cnn_ukf import claims, distributions, observability, paper, perturbed, search, tables, traces
 from vehest_papers.cnn_ukf.limited import Limited, limited
 from vehest_papers.cnn_ukf.measures import MSE, MSE_NL, Comparison
@@ -35,6 +34,7 @@ from vehest_papers.cnn_ukf.subjects import (
     kpi_table,
     runs_of,
 )
+from vehest_papers.kit.claims import Claim, claims_table
 from vehest_papers.kit.reading import spans_in_words, words_of_kinds
 from vehest_papers.kit.statements import decided
 

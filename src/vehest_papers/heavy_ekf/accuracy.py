@@ -14,8 +14,8 @@ from vehest.data.recording import Recording
 from vehest.evaluation.significance import root_interval
 from vehest.report.document import Column, Table
 from vehest.report.style import MISSING, fixed
-from vehest.studies.kit.claims import Claim, Verdict
 from vehest_papers.heavy_ekf import paper
+from vehest_papers.kit.claims import Claim, Verdict
 
 LAPS = 3
 SKIP_SECONDS = 1.5

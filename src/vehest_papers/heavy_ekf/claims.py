@@ -7,10 +7,10 @@ from collections.abc import Mapping, Sequence
 from vehest.evaluation.ranking import Name, Ranking
 from vehest.report.document import Table, as_text
 from vehest.studies.artefacts import PartArtefacts
-from vehest.studies.kit.claims import Claim, bound_claim, claims_table, order_claim
 from vehest.studies.kit.standing import ranking_of, verdict_sentences
 from vehest.studies.kit.warnings import warnings_of
 from vehest_papers.heavy_ekf import paper
+from vehest_papers.kit.claims import Claim, bound_claim, claims_table, order_claim
 from vehest_papers.kit.reading import words_of_kinds
 
 FAMILY = "rational_ekf"

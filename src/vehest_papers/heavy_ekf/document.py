@@ -12,10 +12,10 @@ from vehest.data.estimate import Estimate
 from vehest.data.recording import Recording
 from vehest.report.document import REPORT, Block, Column, Document, Figure, Table, as_code
 from vehest.studies.artefacts import PartArtefacts, StudyArtefacts
-from vehest.studies.kit.claims import Claim
 from vehest_papers.heavy_ekf import accuracy, claims, draws, laps, paper, tables, twin_report, tyres, vehicle, watching
 from vehest_papers.heavy_ekf.factorial import every_cell, factorial
 from vehest_papers.heavy_ekf.subjects import TYRES, Filter, curves_of, filters_of, rmse_of, validation_drives, whole_drive
+from vehest_papers.kit.claims import Claim
 from vehest_papers.kit.reading import spans_in_words, words_of_kinds
 
 TRUCK, DRAWS, FERRARI, WHEELED = "truck", "seeds", "ferrari", "av21"

@@ -16,11 +16,11 @@ from vehest.evaluation.significance import Interval, difference_of_blocks, root_
 from vehest.report.document import Block, Column, Table
 from vehest.report.style import fixed
 from vehest.studies.artefacts import EvaluatedModel, PartArtefacts
-from vehest.studies.kit.claims import Claim, Verdict
 from vehest_papers.heavy_ekf import paper
 from vehest_papers.heavy_ekf.claims import titles_of
 from vehest_papers.heavy_ekf.factorial import corrected
 from vehest_papers.heavy_ekf.subjects import TYRES
+from vehest_papers.kit.claims import Claim, Verdict
 from vehest_papers.kit.reading import words_of_kinds
 
 

@@ -12,7 +12,6 @@ import pandas as pd
 from vehest.constants import FloatArray
 from vehest.report.document import Block, Column, Figure, Table
 from vehest.report.style import DOUBLE_COLUMN, fixed, new_figure, paper_style
-from vehest.studies.kit.claims import Claim
 from vehest_papers.heavy_ekf import paper
 from vehest_papers.heavy_ekf.candidates import DATA_SHEET, DRAWN, FILTERS, ORACLE, REFINED, STATIC_MAP, WITH_STATE, ZERO, table_of
 from vehest_papers.heavy_ekf.factorial import (
@@ -33,6 +32,7 @@ from vehest_papers.heavy_ekf.factorial import (
     interval,
 )
 from vehest_papers.heavy_ekf.twin import CG_HEIGHT, NOISE, SECONDS, TRACK, Plant
+from vehest_papers.kit.claims import Claim
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure as MatplotlibFigure

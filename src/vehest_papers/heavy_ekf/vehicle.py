@@ -14,10 +14,10 @@ from vehest.evaluation.significance import difference_of_blocks
 from vehest.report.document import Block, Column, Table
 from vehest.report.style import fixed
 from vehest.studies.artefacts import PartArtefacts
-from vehest.studies.kit.claims import Claim, Verdict
 from vehest.vehicle.parameters import SingleTrackParameters
 from vehest.vehicle.single_track import lateral_model
 from vehest_papers.heavy_ekf import paper
+from vehest_papers.kit.claims import Claim, Verdict
 from vehest_papers.kit.reading import recordings_of
 
 SPEEDS = (2.0, 3.0, 4.0, 5.0, 6.0, 8.0, 10.0, 20.0, 30.0)

@@ -14,7 +14,7 @@ from vehest.constants import FloatArray
 from vehest.evaluation.blocks import LEAST_BLOCKS
 from vehest.evaluation.significance import CONFIDENCE, holm
 from vehest.report.style import fixed
-from vehest.studies.kit.claims import Claim, Verdict
+from vehest_papers.kit.claims import Claim, Verdict
 
 Outcome = Literal["as claimed", "the other way round", "not told apart"]
 Expected = Literal["lower", "higher"]

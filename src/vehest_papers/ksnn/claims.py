@@ -9,7 +9,7 @@ import numpy as np
 from scipy import stats
 
 from vehest.report.style import fixed
-from vehest.studies.kit.claims import Claim
+from vehest_papers.kit.claims import Claim
 from vehest_papers.kit.statements import Change, Compared, Expected, Statement, counted, outcomes, short
 from vehest_papers.ksnn import paper
 from vehest_papers.ksnn.comparing import Errors

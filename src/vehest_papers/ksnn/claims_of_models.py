@@ -16,7 +16,7 @@ from vehest.estimators.model_files import load_model
 from vehest.report.document import Column, Table
 from vehest.report.style import fixed
 from vehest.studies.artefacts import EvaluatedModel
-from vehest.studies.kit.claims import Claim
+from vehest_papers.kit.claims import Claim
 from vehest_papers.kit.reading import median_and_range
 from vehest_papers.kit.spectra import SEGMENT_SECONDS, THIRD_OCTAVE
 from vehest_papers.kit.statements import Change, Compared, Measured, Statement, counted, outcomes, short

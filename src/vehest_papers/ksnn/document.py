@@ -11,8 +11,8 @@ from vehest.data.splits import Span
 from vehest.report.document import PATENT_NOTE, REPORT, Block, Column, Document, Table, as_code, as_text
 from vehest.report.style import fixed, listed
 from vehest.studies.artefacts import PartArtefacts, StudyArtefacts
-from vehest.studies.kit.claims import Claim, claims_table
 from vehest.studies.kit.warnings import warnings_of
+from vehest_papers.kit.claims import Claim, claims_table
 from vehest_papers.kit.reading import spans_in_words, words_of_kinds
 from vehest_papers.kit.statements import Statement, decided
 from vehest_papers.ksnn import analyses, claims, claims_of_models, cost, paper, scatter, tables

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field, replace
 
 from vehest.report.document import Block, Table
 from vehest.studies.artefacts import PartArtefacts
-from vehest.studies.kit.claims import Claim, claims_table
+from vehest_papers.kit.claims import Claim, claims_table
 from vehest_papers.learned_ukf import paper
 from vehest_papers.learned_ukf.additions import (
     Comparison,

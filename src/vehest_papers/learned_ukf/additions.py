@@ -23,7 +23,7 @@ from vehest.evaluation.significance import CONFIDENCE, Interval, holm
 from vehest.report.document import Column, Table
 from vehest.report.style import fixed
 from vehest.studies.artefacts import EvaluatedModel, PartArtefacts
-from vehest.studies.kit.claims import Claim, Verdict
+from vehest_papers.kit.claims import Claim, Verdict
 from vehest_papers.kit.reading import median_and_range, metric_values
 from vehest_papers.learned_ukf.candidates import SETS, losses, models_by_candidate
 from vehest_papers.learned_ukf.errors import Errors, in_words

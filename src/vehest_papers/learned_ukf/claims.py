@@ -24,7 +24,7 @@ from scipy import stats
 
 from vehest.evaluation.significance import CONFIDENCE, Interval, holm
 from vehest.report.style import fixed
-from vehest.studies.kit.claims import Claim, Verdict
+from vehest_papers.kit.claims import Claim, Verdict
 from vehest_papers.learned_ukf import paper
 from vehest_papers.learned_ukf.candidates import SETS
 from vehest_papers.learned_ukf.errors import Errors, in_words

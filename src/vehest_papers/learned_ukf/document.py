@@ -12,7 +12,7 @@ from vehest.evaluation.significance import CONFIDENCE, holm
 from vehest.report.document import REPORT, Block, Document, as_text
 from vehest.report.style import fixed, listed
 from vehest.studies.artefacts import EvaluatedModel, PartArtefacts, StudyArtefacts
-from vehest.studies.kit.claims import Claim, claims_table
+from vehest_papers.kit.claims import Claim, claims_table
 from vehest_papers.kit.reading import words_of_kinds
 from vehest_papers.learned_ukf import ablations, claims, coverage, friction, paper, prediction, tables, traces
 from vehest_papers.learned_ukf.ablations import CURVATURE, DIAGONAL, LENGTH, SCRATCH

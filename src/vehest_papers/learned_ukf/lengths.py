@@ -13,7 +13,7 @@ from vehest.data.errors import DataError
 from vehest.report.document import Column, Figure, Table
 from vehest.report.style import DOUBLE_COLUMN, OTHER_COLOURS, legend_above, listed, new_figure, paper_style
 from vehest.studies.artefacts import PartArtefacts
-from vehest.studies.kit.claims import Claim
+from vehest_papers.kit.claims import Claim
 from vehest_papers.learned_ukf.additions import Comparison, Subject, drive_lengths
 from vehest_papers.learned_ukf.candidates import SETS, models_by_candidate
 from vehest_papers.learned_ukf.errors import in_words

@@ -16,10 +16,8 @@ import pandas as pd
 
 from vehest.data.store import read_recording
 from vehest.estimators.registry import estimator_class
-from vehest.evaluation.integrity import Integrity, false_alarms_per_hour, integrity_of
 from vehest.evaluation.under_fault import FAULTED
 from vehest.report.document import PATENT_NOTE, REPORT, Block, Column, Document, Figure, Table, as_text
-from vehest.report.integrity_figures import stanford_figure
 from vehest.report.reliability import Reliability, reliability_figure
 from vehest.report.style import lines_of, listed
 from vehest.studies.artefacts import PartArtefacts, StudyArtefacts
@@ -27,6 +25,8 @@ from vehest.studies.drive import appendix_of
 from vehest.studies.kit.runs import by_name
 from vehest.trust.bands import LEVELS, OTHER_VEHICLE
 from vehest_papers.trust.faults import FaultTrials, elsewhere, health_of, trials_of
+from vehest_papers.trust.integrity import Integrity, false_alarms_per_hour, integrity_of
+from vehest_papers.trust.integrity_figures import stanford_figure
 from vehest_papers.trust.shuffled import LEARNT, if_shuffled, in_words, over_parts, scores_learnt, shuffled_in_words
 
 TAKES = "parts"
