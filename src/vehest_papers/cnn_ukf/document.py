@@ -159,9 +159,8 @@ def _asked(
     kind = words_of_kinds(artefacts.parts[FULL]).upper()
     count = len(main.manoeuvres)
     words = (
-        f"**{kind} data**, {count} test manoeuvres that chose nothing, scored until |β| exceeds 12°; the paper's recordings "
-        "are real, of a BMW 545i, and not public. "
-        f"{artefacts.about}"
+        f"**{kind} data**, {count} test manoeuvres that chose nothing, scored until |β| exceeds 12°; the paper's recordings are real, of a "
+        f"BMW 545i, and not public. {artefacts.about}"
     )
     if artefacts.absent:
         words += f" Not in this report: {'; '.join(artefacts.titles[name] for name in artefacts.absent)}."

@@ -95,9 +95,8 @@ def underestimation_table(gains: Mapping[tuple[str, str], tuple[float, float, fl
         rows.append(row | {name: "{} [{}, {}]".format(*(fixed(value, 2) for value in gains[test, name])) for name in names})
     columns = {"test": Column("drive"), **{name: Column(name) for name in names}}
     caption = (
-        f"Whether sideslip is underestimated: gain from β to its estimate, both about their means, while |a_y| exceeds {CORNERING:g} "
-        "m/s², SIMULATED, with 95 % "
-        "intervals over blocks of 10 s. Below 1: too small, as the paper says of LINT and RATT."
+        f"Whether sideslip is underestimated: gain from β to its estimate, both about their means, while |a_y| exceeds {CORNERING:g} m/s², "
+        "SIMULATED, with 95 % intervals over blocks of 10 s. Below 1: too small, as the paper says of LINT and RATT."
     )
     return Table("underestimation", caption, pd.DataFrame(rows), columns)
 
@@ -140,8 +139,7 @@ def stop_table(drives: Mapping[str, Recording], estimates: Estimates, names: Seq
     columns["measured"] = Column("largest |β| of the reference [deg]", decimals=2)
     caption = (
         "RMSE(β) before the stop that ends the three laps, SIMULATED; the paper finds its filters satisfactory until about 0.4 s before "
-        "it, where its optical sensor "
-        "diverges too. Ours take the wheels to roll below 2 m/s."
+        "it, where its optical sensor diverges too. Ours take the wheels to roll below 2 m/s."
     )
     return Table("stop", caption, pd.DataFrame(rows), columns)
 

@@ -143,12 +143,11 @@ def _how_it_was_made(artefacts: StudyArtefacts) -> list[Block]:
     columns["tests"] = Column("tests")
     departures = (
         "Where we differ from the paper: tyre parameters are states as logarithms over their fitted values, so that they stay positive and "
-        "the filter is well conditioned, and are kept within a factor of three, or three of their deviations at the start; beyond 0.5 "
-        "rad of sideslip the filter begins "
-        "anew, tyres included; axle forces for the fit come from accelerations instead of "
-        "TRICK, and where they leave c1 open, a largest force at slip angles of about 9° (6 to 13°) is taken as known; levels of noise are "
-        f"tuned, since no data sheet is at hand; vertical loads are those at rest. {paper.HELD}, {paper.UNSCENTED} and RATT with friction "
-        "are not in the paper; the unscented filter takes the levels that were found through the extended one."
+        "the filter is well conditioned, and are kept within a factor of three, or three of their deviations at the start; beyond 0.5 rad "
+        "of sideslip the filter begins anew, tyres included; axle forces for the fit come from accelerations instead of TRICK, and where "
+        "they leave c1 open, a largest force at slip angles of about 9° (6 to 13°) is taken as known; levels of noise are tuned, since no "
+        f"data sheet is at hand; vertical loads are those at rest. {paper.HELD}, {paper.UNSCENTED} and RATT with friction are not in the "
+        "paper; the unscented filter takes the levels that were found through the extended one."
     )
     return [
         "## Appendix: how it was made\n\n" + "\n".join(f"- {line}" for line in lines),

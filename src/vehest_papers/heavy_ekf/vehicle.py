@@ -125,10 +125,9 @@ def wheels_blocks(part: PartArtefacts) -> tuple[list[Block], list[Claim]]:
         "mean_change": Column("change [m/s]"),
     }
     caption = (
-        f"Equations 61 to 64 on real wheel speeds, REAL, the AV-21 race car at more than {SLOWEST:g} m/s: spread of the four wheels "
-        "about their mean, and their mean against "
-        "the reference's speed; 95 % intervals over blocks of 10 s. Tracks from the training range by least squares, "
-        f"{fixed(float(tracks[0]), 2)} and {fixed(float(tracks[1]), 2)} m; rolling radius {RADIUS:g} m. "
+        f"Equations 61 to 64 on real wheel speeds, REAL, the AV-21 race car at more than {SLOWEST:g} m/s: spread of the four wheels about "
+        "their mean, and their mean against the reference's speed; 95 % intervals over blocks of 10 s. Tracks from the training range by "
+        f"least squares, {fixed(float(tracks[0]), 2)} and {fixed(float(tracks[1]), 2)} m; rolling radius {RADIUS:g} m. "
         f"{_locked_in_words(tracks)}Its yaw rate is low-passed by 0.4 s."
     )
     return [Table("wheels_av21", caption, pd.DataFrame(rows), columns)], claims

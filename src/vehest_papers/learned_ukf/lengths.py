@@ -107,9 +107,8 @@ def figure_7(found: Sequence[Length], data: str) -> tuple[Figure, Table]:
     seeds = sorted({len(own.subject.seeds) for own in found})
     caption = (
         f"Length of training sequences against MSE (weighted), Figure 7 of the paper: {found[0].subject.candidate}, "
-        f"{listed([str(own) for own in seeds])} seeds, "
-        f"{found[0].epochs} epochs through the filter. An epoch goes once through the drives, so a smaller batch takes more steps. "
-        f"Bars: 95 % intervals over sequences and seeds. Data: {data}."
+        f"{listed([str(own) for own in seeds])} seeds, {found[0].epochs} epochs through the filter. An epoch goes once through the drives, "
+        f"so a smaller batch takes more steps. Bars: 95 % intervals over sequences and seeds. Data: {data}."
     )
     columns = {"way": Column("held constant"), "steps": Column("samples", decimals=0), "batch": Column("sequences in a batch", decimals=0)}
     columns |= {"epochs": Column("epochs", decimals=0), "batches": Column("batches an epoch", decimals=0)}
