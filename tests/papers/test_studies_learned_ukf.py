@@ -35,7 +35,7 @@ from vehest_papers.learned_ukf.additions import (
 )
 from vehest_papers.learned_ukf.candidates import candidate_of, chosen, models_by_candidate, runs_of, scored_of
 from vehest_papers.learned_ukf.departures import departures, settings_table
-from vehest_papers.learned_ukf.errors import Errors
+from vehest_papers.learned_ukf.errors import Losses
 from vehest_papers.learned_ukf.filtering import definiteness, drives_of, filtered, loaded, one_step_squares, squares_of, swapped, weighted
 from vehest_papers.learned_ukf.lengths import lengths
 from vehest_papers.learned_ukf.oracle import TRAINING, train_on
@@ -198,7 +198,7 @@ def test_report_shows_every_table_and_figure_of_the_paper_and_says_what_its_data
     assert "Not run here, for their budget: the E terms of Equation 3." in text
     assert set(document.data) >= {f"{name}_simulated" for name in ("slip_density", "traces", "figure_5", "figure_6", "pairs_tyre_a")}
     assert "Simulated tyre sets: SIMULATED data" in text
-    assert "Not in this report, since the recordings were not at hand: Real tyre sets" in text
+    assert "Not in this report, since the recordings are missing: Real tyre sets" in text
     assert "authors' public code" not in text
     assert "learned_ukf: through_filter" not in text
     assert "Recordings are made" in text
@@ -289,12 +289,12 @@ def test_a_metric_that_is_missing_is_said(part):
         runs_of(PartArtefacts(**{**vars(part), "metrics": metrics}))
 
 
-def errors_of(**levels: float) -> Errors:
+def errors_of(**levels: float) -> Losses:
     """Twelve sequences of 50 samples, three seeds; losses around a level, in sequences of different difficulty."""
     generator = np.random.default_rng(0)
     hard = np.repeat(generator.uniform(1.0, 3.0, 12), 50)
     squared = {name: np.stack([hard * level * generator.uniform(0.98, 1.02, 600) for _ in range(3)]) for name, level in levels.items()}
-    return Errors(squared, {name: np.sqrt(own) for name, own in squared.items()}, np.repeat(np.arange(12), 50), 100.0)
+    return Losses(squared, {name: np.sqrt(own) for name, own in squared.items()}, np.repeat(np.arange(12), 50), 100.0)
 
 
 def test_tables_show_means_with_intervals_beside_the_paper():
@@ -519,7 +519,7 @@ def subject_of(squared: dict[str, np.ndarray], title: str = "own", validation: t
     metrics = pd.DataFrame([(*row, "1", None, None) for row in rows], columns=list(METRIC_COLUMNS))
     part = PartArtefacts("s", "t", "a", "c", SPLIT, PROTOCOL, {}, {}, metrics, models, {}, [])
     sequence = np.repeat(np.arange(12), 50)
-    errors = {test: Errors({title: own}, {title: np.sqrt(own)}, sequence, 100.0) for test, own in squared.items()}
+    errors = {test: Losses({title: own}, {title: np.sqrt(own)}, sequence, 100.0) for test, own in squared.items()}
     return Subject(title, part, models, errors, title)
 
 
