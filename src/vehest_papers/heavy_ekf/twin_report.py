@@ -33,6 +33,7 @@ from vehest_papers.heavy_ekf.factorial import (
 )
 from vehest_papers.heavy_ekf.twin import CG_HEIGHT, NOISE, SECONDS, TRACK, Plant
 from vehest_papers.kit.claims import Claim
+from vehest_papers.kit.reading import with_interval
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure as MatplotlibFigure
@@ -60,7 +61,7 @@ def claims_of(own: Factorial, found: Changes) -> list[Claim]:
         at = MISMATCHES.index(mismatch) * len(SLIPS) + SLIPS.index(slip)
         for pair in CLAIMED:
             change = found[at, pair]
-            words = f"{fixed(change.percent, 0)} % [{fixed(change.low, 0)}, {fixed(change.high, 0)}]"
+            words = with_interval(change.percent, change.low, change.high, 0, " %")
             verdict: Any = "undecided"
             if change.told_apart:
                 verdict = "reproduced" if change.percent < 0.0 else "not reproduced"
@@ -203,8 +204,7 @@ def _rows(own: Factorial) -> Table:
     for name in ROWS:
         row: dict[str, object] = {"candidate": name}
         for at, cell in enumerate(cells):
-            low, high = interval(cell, name)
-            row[f"cell_{at}"] = f"{fixed(cell.rmse(name), 2)} [{fixed(low, 2)}, {fixed(high, 2)}]"
+            row[f"cell_{at}"] = with_interval(cell.rmse(name), *interval(cell, name), 2)
         rows.append(row)
     columns = {"candidate": Column("candidate")}
     columns |= {f"cell_{at}": Column(f"{slip:g}°, {100 * mismatch:+.0f} % [deg]") for at, (slip, mismatch) in enumerate(SHOWN)}
@@ -287,7 +287,7 @@ def _crossfall_in_words(own: Factorial) -> str:
 def _absorbed_blocks(own: Factorial) -> tuple[Table, str]:
     levels = {name: tuned.levels for name, tuned in own.tuned[ONCE].items()}
     frame = absorbed(levels)
-    frame["interval"] = [f"{fixed(row['change'], 0)} [{fixed(row['low'], 0)}, {fixed(row['high'], 0)}]" for row in frame.to_dict("records")]
+    frame["interval"] = [with_interval(row["change"], row["low"], row["high"], 0) for row in frame.to_dict("records")]
     columns = {
         "mistake": Column("what is wrong"),
         paper.LINT: Column("LINT [deg]", decimals=3),

@@ -17,8 +17,8 @@ from vehest.studies.artefacts import PartArtefacts
 from vehest.vehicle.parameters import SingleTrackParameters
 from vehest.vehicle.single_track import lateral_model
 from vehest_papers.heavy_ekf import paper
-from vehest_papers.kit.claims import Claim, Verdict
-from vehest_papers.kit.reading import recordings_of
+from vehest_papers.kit.claims import Claim, verdict_below
+from vehest_papers.kit.reading import recordings_of, with_interval
 
 SPEEDS = (2.0, 3.0, 4.0, 5.0, 6.0, 8.0, 10.0, 20.0, 30.0)
 WHEELS = ("fl", "fr", "rl", "rr")
@@ -108,9 +108,9 @@ def wheels_blocks(part: PartArtefacts) -> tuple[list[Block], list[Claim]]:
         row: dict[str, object] = {"test": test.replace("_", " "), "blocks": len(sizes)}
         for name, before, after, own in (("spread", raw_spread, spread, spreads), ("mean", raw, corrected, means)):
             row[f"{name}_raw"], row[name] = (float(np.sqrt(values.sum() / sizes.sum())) for values in (before, after))
-            row[f"{name}_change"] = f"{fixed(own.value, 3)} [{fixed(own.low, 3)}, {fixed(own.high, 3)}]"
+            row[f"{name}_change"] = with_interval(own.value, own.low, own.high, 3)
         rows.append(row)
-        verdict: Verdict = "reproduced" if spreads.high < 0.0 else "not reproduced" if spreads.low > 0.0 else "undecided"
+        verdict = verdict_below(spreads.low, spreads.high)
         why = "interval of the change" if turning.all() else "interval of the change; one axle alone"
         words = f"{fixed(row['spread_raw'], 3)} to {fixed(row['spread'], 3)} m/s; change {row['spread_change']}"  # type: ignore[arg-type]
         claims.append(Claim("Eqs. 61 to 64 bring wheels together", "Figure 5", words, f"real, AV-21, {row['test']}", verdict, why))
