@@ -9,6 +9,7 @@ import pandas as pd
 from vehest.evaluation.metrics import Protocol
 from vehest.report.document import Column, Table
 from vehest.studies.artefacts import PartArtefacts, StudyArtefacts
+from vehest.studies.kit.warnings import warnings_of
 from vehest_papers.kit.reading import spans_in_words, words_of_kinds
 
 
@@ -29,6 +30,12 @@ def scoring(protocol: Protocol, reading: str = "") -> str:
         f"Evaluation: every estimate is read at {protocol.rate_hz:g} Hz{reading}; the first {protocol.skip_seconds:g} s of each "
         f"{protocol.piece} are not scored.{protocol.start_in_words}"
     )
+
+
+def warnings_in_words(parts: Mapping[str, PartArtefacts]) -> str:
+    """Warnings on parts, by title; empty where there is none."""
+    lines = dict.fromkeys(f"{title}: {line}" for title, part in parts.items() for line in warnings_of(part))
+    return bullets("**Mind:**", lines) if lines else ""
 
 
 def facts_of(parts: Iterable[PartArtefacts]) -> list[str]:

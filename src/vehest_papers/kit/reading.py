@@ -12,6 +12,7 @@ from vehest.data.errors import DataError
 from vehest.data.recording import Recording
 from vehest.data.splits import Span
 from vehest.data.store import read_recording
+from vehest.evaluation.metrics import Scored
 from vehest.report.document import as_text
 from vehest.report.style import MISSING, fixed
 from vehest.studies.artefacts import EvaluatedModel, PartArtefacts
@@ -67,6 +68,11 @@ def _times(span: Span) -> str:
     if span.start == -math.inf:
         return f"up to {span.stop:g} s"
     return f"from {span.start:g} s" if span.stop == math.inf else f"{span.start:g} to {span.stop:g} s"
+
+
+def sideslip_error(part: Scored) -> FloatArray:
+    """Estimate - reference, (K,) [deg], within a half turn."""
+    return np.degrees(np.remainder(part.sideslip - part.sideslip_ref + np.pi, 2.0 * np.pi) - np.pi)
 
 
 def metric_values(part: PartArtefacts) -> dict[tuple[str, str, int, str, str], float]:

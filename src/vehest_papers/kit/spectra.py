@@ -9,6 +9,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy import signal
 
 from vehest.constants import FloatArray
@@ -49,9 +50,14 @@ class Periodogram:
             raise DataError(
                 f"a periodogram with lines from {self.frequency[1]:.3g} to {self.frequency[-1]:.3g} Hz says nothing of {hz:g} Hz"
             )
-        inside = (self.frequency >= hz / THIRD_OCTAVE) & (self.frequency <= hz * THIRD_OCTAVE)
-        inside[np.argmin(np.abs(self.frequency - hz))] = True
-        return float(self.density[inside].mean())
+        return float(self.density[third_octave(self.frequency, hz)].mean())
+
+
+def third_octave(frequency: FloatArray, hz: float) -> NDArray[np.bool_]:
+    """Which lines lie in the third of an octave around a frequency; the nearest one does, (F,)."""
+    inside = (frequency >= hz / THIRD_OCTAVE) & (frequency <= hz * THIRD_OCTAVE)
+    inside[np.argmin(np.abs(frequency - hz))] = True
+    return inside
 
 
 def periodogram(series: Sequence[FloatArray], rate_hz: float, segment_seconds: float = SEGMENT_SECONDS) -> Periodogram:

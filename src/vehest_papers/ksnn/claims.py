@@ -12,7 +12,7 @@ from vehest.report.style import fixed
 from vehest_papers.kit.claims import Claim
 from vehest_papers.kit.statements import Change, Compared, Expected, Statement, counted, outcomes, short
 from vehest_papers.ksnn import paper
-from vehest_papers.ksnn.comparing import Errors
+from vehest_papers.ksnn.comparing import SegmentErrors
 from vehest_papers.ksnn.schemes import THIRD, Scheme, segments_on
 
 ABOUT_A_QUARTER = (0.20, 0.30)
@@ -237,14 +237,14 @@ def _third_car(schemes: Sequence[Scheme]) -> Statement:
 
 def on_regularisation(with_it: Scheme, without: Scheme) -> list[Statement]:
     """Section VIII-H and Table VII: the same two structures stopped on the other car, and on the own one."""
-    shared: dict[str, Errors] = {}
+    shared: dict[str, SegmentErrors] = {}
     for test in (with_it.own, with_it.other):
         segments = {}
         for word, scheme in (("with", with_it), ("without", without)):
             for category in (paper.LSTM, paper.NONLINEAR):
                 models = [own for own in scheme.part.models if f"{own.estimator}/{own.variant}" == without.name_of(category)]
                 segments[f"{category}, {word}"] = [segments_on(model, test) for model in models]
-        shared[test] = Errors(segments, test)
+        shared[test] = SegmentErrors(segments, test)
 
     def change(category: str, test: str) -> Change | None:
         return shared[test].change(f"{category}, without", f"{category}, with", "fvu")
@@ -293,7 +293,7 @@ def _short(category: str) -> str:
     return {paper.FACTOR_GRAPH: "FG", paper.KALMAN: "KF", paper.STATIC_MAP: "static map"}.get(category, category)
 
 
-def on_minutes(curve: Errors | None, least: str, scheme: Scheme, where: str) -> Statement:
+def on_minutes(curve: SegmentErrors | None, least: str, scheme: Scheme, where: str) -> Statement:
     """Sample efficiency: the smallest amount that was learnt from."""
     tests = []
     if curve is not None:
@@ -311,7 +311,7 @@ def on_steering(pairs: Sequence[tuple[Scheme, Scheme]]) -> list[Statement]:
                 name: [segments_on(model, test) for model in scheme.part.models if model.estimator == "velocity_gru"]
                 for name, scheme in (("with", with_it), ("without", without))
             }
-            change = Errors(segments, test).change("with", "without", "fvu")
+            change = SegmentErrors(segments, test).change("with", "without", "fvu")
             found[word].append(Compared(_label(with_it), change, "lower" if word == "own" else "higher"))
     data = pairs[0][0].kind if pairs else "–"
     missing = "no parts with and without steering"

@@ -18,7 +18,7 @@ from vehest.report.style import fixed
 from vehest.studies.artefacts import EvaluatedModel
 from vehest_papers.kit.claims import Claim
 from vehest_papers.kit.reading import median_and_range
-from vehest_papers.kit.spectra import SEGMENT_SECONDS, THIRD_OCTAVE
+from vehest_papers.kit.spectra import SEGMENT_SECONDS, third_octave
 from vehest_papers.kit.statements import Change, Compared, Measured, Statement, counted, outcomes, short
 from vehest_papers.ksnn import behaviour, cost, paper
 from vehest_papers.ksnn.comparing import N_RESAMPLES
@@ -225,9 +225,7 @@ def band_levels(scheme: Scheme, models: Mapping[str, EvaluatedModel], test: str)
     levels = {}
     for category, own in power.items():
         for hz in BANDS_HZ:
-            inside = (frequency >= hz / THIRD_OCTAVE) & (frequency <= hz * THIRD_OCTAVE)
-            inside[np.argmin(np.abs(frequency - hz))] = True
-            band = own[:, inside].mean(axis=1)
+            band = own[:, third_octave(frequency, hz)].mean(axis=1)
             levels[category, hz] = Measured(float(band.mean()), np.log(counts @ band / (number - 1)), np.zeros(1), number)
     return levels
 
