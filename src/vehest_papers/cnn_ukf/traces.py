@@ -17,9 +17,10 @@ from vehest.report.document import Figure, as_code
 from vehest.report.style import DOUBLE_COLUMN, REFERENCE, fixed, legend_above, new_figure, paper_style
 from vehest.studies.artefacts import PartArtefacts
 from vehest_papers.cnn_ukf import paper
-from vehest_papers.cnn_ukf.manoeuvres import group_of, sideslip_error
+from vehest_papers.cnn_ukf.manoeuvres import group_of
 from vehest_papers.cnn_ukf.networks import pseudo_measurements_of
 from vehest_papers.cnn_ukf.subjects import TEST, Prepared, Run, line_of, plain_name
+from vehest_papers.kit.reading import sideslip_error
 
 WIDE = 5.0  # ratio from which deviations stand on a logarithmic axis
 LAP_SECONDS = 32.0  # what Fig. 10 shows of a lap
