@@ -24,7 +24,8 @@ from vehest.studies.artefacts import PartArtefacts, StudyArtefacts
 from vehest.studies.drive import appendix_of
 from vehest.studies.kit.runs import by_name
 from vehest.trust.bands import LEVELS, OTHER_VEHICLE
-from vehest_papers.trust.faults import FaultTrials, elsewhere, health_of, trials_of
+from vehest_papers.kit.reading import sideslip_error
+from vehest_papers.trust.faults import FaultTrials, health_of, other_vehicle, trials_of
 from vehest_papers.trust.integrity import Integrity, false_alarms_per_hour, integrity_of
 from vehest_papers.trust.integrity_figures import stanford_figure
 from vehest_papers.trust.shuffled import LEARNT, if_shuffled, in_words, over_parts, scores_learnt, shuffled_in_words
@@ -78,7 +79,7 @@ def coverage_board(parts: Mapping[str, PartArtefacts]) -> pd.DataFrame:
                     continue
                 row: dict[str, Any] = {"part": key, "title": as_text(part.title), "test_set": test_set, "estimator": name[0]}
                 row |= {"variant": name[1], "estimator_title": as_text(models[0].title)}
-                row |= {"car": OTHER if elsewhere(part, test_set) else LEARNT}
+                row |= {"car": OTHER if other_vehicle(part, test_set) else LEARNT}
                 row |= {figure: float(own["value"][figure]) for figure in (*COVERAGES, *FIGURES) if figure in own.index}
                 row |= {end: float(own[end]["coverage_90"]) for end in ("low", "high")}
                 row |= {"inside": in_words(row["low"], row["high"])}
@@ -92,8 +93,7 @@ def _without_widening(part: PartArtefacts, model: Any, test_set: str) -> float:
     inside = []
     for position, scored in enumerate(part.scored(model, test_set)):
         band = model.estimate(test_set, position).held_at(scored.time, "band_sideslip") / OTHER_VEHICLE
-        turned = np.remainder(scored.sideslip - scored.sideslip_ref + np.pi, 2.0 * np.pi) - np.pi
-        inside.append(np.abs(turned) <= band)
+        inside.append(np.abs(sideslip_error(scored)) <= np.degrees(band))
     return float(np.concatenate(inside).mean())
 
 
@@ -203,7 +203,7 @@ def _range_in_words(regime: str) -> str:
 
 def _tries_faults(part: PartArtefacts) -> bool:
     """Whether a part's tests are of the car that was learnt on, so that its channels can be held against what is normal for it."""
-    return any(not elsewhere(part, test_set) for test_set in part.split.tests)
+    return any(not other_vehicle(part, test_set) for test_set in part.split.tests)
 
 
 def _faults_in_words(trials: Sequence[FaultTrials]) -> str:
@@ -359,9 +359,8 @@ def _stanford(parts: Mapping[str, PartArtefacts]) -> Figure | None:
             for test_set in part.split.tests:
                 for position, scored in enumerate(part.scored(models[0], test_set)):
                     band = models[0].estimate(test_set, position).held_at(scored.time, "band_sideslip")
-                    turned = np.remainder(scored.sideslip - scored.sideslip_ref + np.pi, 2.0 * np.pi) - np.pi
                     invalid = status[test_set, position][-len(scored.time) :] == 2
-                    own = integrity_of(np.degrees(turned), np.degrees(band), invalid)
+                    own = integrity_of(sideslip_error(scored), np.degrees(band), invalid)
                     found.setdefault(as_text(models[0].title), []).append(own)
     if not found:
         return None
