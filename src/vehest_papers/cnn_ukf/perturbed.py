@@ -102,7 +102,6 @@ def perturbed(runs: Runs, prepared: Prepared) -> Perturbed:
     own = {candidate: [chosen(runs[candidate])] for candidate in WITH_FILTER if candidate in runs}
     fitted = {candidate: [load_model(run.model.model_folder) for run in seeds] for candidate, seeds in own.items()}
 
-
     def changed(change: Callable[[Estimator], Estimator]) -> dict[str, list[Run]]:
         pairs = {candidate: zip(seeds, fitted[candidate], strict=True) for candidate, seeds in own.items()}
         return {candidate: [prepared.estimated_by(change(model), run) for run, model in both] for candidate, both in pairs.items()}
