@@ -2,7 +2,7 @@
 
 Used by the pipeline ``sim_to_real``. Each of its parts is a fleet to learn from, each estimator in it a step. All steps stop on the same
 simulated cars, which make the first choice among them. A second choice, by simulated race cars on a circuit, and a third, by a car of
-another simulation, came after the real recording had been looked at, and the report says so. The real recording itself chooses nothing.
+another simulation, came after the real recording had been looked at, as the report states. The real recording itself chooses nothing.
 """
 
 from __future__ import annotations
@@ -112,7 +112,7 @@ class Step:
 
 @dataclass(frozen=True)
 class Choice:
-    """A step, and a seed of it, by what simulated cars say.
+    """A step, and a seed of it, by its errors on simulated cars.
 
     Args:
         step: with the lowest median error.
@@ -226,7 +226,7 @@ def _headline(steps: Sequence[Step], choices: Mapping[str, Choice]) -> str:
         f"the simulator that it came from, chooses {_named(choices['third'])} among the steps that have not learnt on it. "
         f"{_result(choices['third'])}\n\n"
         "Only the first figure is a clean test. The other two rules use simulated cars alone, but were made up knowing how every step does "
-        "on the real car, and the last one knowing that two had failed; whether it is the right rule takes another real car to say.\n\n"
+        "on the real car, and the last one knowing that two had failed; whether it is the right rule needs another real car to decide.\n\n"
         f"The model that comes with vehest for cars without a model of their own is seed {shipped.model.seed} of the {SHIPPED} choice: on "
         f"the real car FVU {error['fvu']}, RMSE(v) {error['rmse_vy']} m/s, RMSE(β) {error['rmse_sideslip']}°."
     )
@@ -307,7 +307,7 @@ def _overview(steps: Sequence[Step], choices: Mapping[str, Choice]) -> Table:
     rows += [{"part": "paper", "step": f"paper: {title}", "chosen": "", "fvu_median": fvu} for title, fvu in PUBLISHED]
     return Table(
         "overview",
-        "Steps, what simulated cars say of them, and what they do on the whole recording of the real Ferrari: medians over the seeds, for "
+        "Steps, their errors on simulated cars, and on the whole recording of the real Ferrari: medians over the seeds, for "
         "FVU also the smallest and largest. β₁(0) is what the network makes of an acceleration without yaw rate (Eq. 7a). Below: Da Lio et "
         "al. 2023, real cars, two recordings of which ours is one.",
         pd.DataFrame(rows),
@@ -352,7 +352,7 @@ def _spread(steps: Sequence[Step], choices: Mapping[str, Choice]) -> Figure:
 
 
 def _why(steps: Sequence[Step]) -> str:
-    """What the steps say about the reason, where those that it takes are all there."""
+    """Differences between steps that explain the choice, where all of these steps are there."""
     size = steps[0].models[0].variant
     of = {step.part: step for step in steps if step.models[0].variant == size}
     if not {"wide", "fast", "rough", "more", "level"} <= set(of):
@@ -372,7 +372,7 @@ def _why(steps: Sequence[Step]) -> str:
         "The most likely reason: besides the kinematics, which hold for every car, a network learns how much simulated cars usually slide "
         "and how much their sensors err. The closer the fleet comes to the validation cars, and the more local models a network has, the "
         "more of that it can learn; it pays on cars from the same simulator and costs on a real one. The weight β₁(0), which the "
-        "kinematics put at 1, says how far a network has gone from them."
+        "kinematics put at 1, shows how far a network has gone from them."
     )
 
 

@@ -1,4 +1,4 @@
-"""What the paper says of its methods, one entry a statement, with the comparisons that decide it; rules: docs/cnn_ukf.md."""
+"""The paper's statements on its methods, one entry each, with the comparisons that decide it; rules: docs/cnn_ukf.md."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ WEAK = ("braking in the turn", "J-turn", "skidpad")
 AROUND_PEAK = 10  # samples before and after
 HIGH, LOW = 5.0, 1.0  # deg of |β|
 OutputsOf = Mapping[str, Sequence[Sequence[Outputs]]]
-"""Hybrid -> what its networks say, seed by seed, manoeuvre by manoeuvre."""
+"""Hybrid -> outputs of its networks, seed by seed, manoeuvre by manoeuvre."""
 
 
 def on_accuracy(main: ManoeuvreErrors, data: str) -> list[Statement | Claim]:

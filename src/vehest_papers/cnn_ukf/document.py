@@ -123,7 +123,7 @@ def _report(artefacts: StudyArtefacts, parts: Mapping[str, Runs], runs: Runs, pr
         overview(artefacts, parts, main, titles),
         "## Appendix: networks and process noise",
         tables.networks_alone(
-            main, outputs, "networks_full", f"What hybrids' networks say, and what filters make of it. Data: {kind.upper()}."
+            main, outputs, "networks_full", f"Outputs of the hybrids' networks, and of their filters. Data: {kind.upper()}."
         ),
     ]
     if learnt is not None:
@@ -202,8 +202,8 @@ def _in_paper(name: str) -> float:
 
 def _claims(verdicts: Sequence[Claim]) -> Table:
     note = (
-        "Changes are CNN-UKF's to the other's unless said. Seeds 3 and 4 of the hybrids and the limited set were added after the test had "
-        "been seen, by rules fixed before they were trained. Rules, and an amendment: docs/cnn_ukf.md."
+        "Changes are CNN-UKF's to the other's unless stated. Seeds 3 and 4 of the hybrids and the limited set were added after the test "
+        "had been seen, by rules fixed before they were trained. Rules, and an amendment: docs/cnn_ukf.md."
     )
     return claims_table(verdicts, note)
 
@@ -322,7 +322,7 @@ def _limited(artefacts: StudyArtefacts, learnt: Limited, prepared: Prepared, kin
         f"and its errors of validation, are those of the full set. Data: {words}."
     )
     training = {name: tables.training_error(chosen(seeds), prepared) for name, seeds in learnt.runs.items()}
-    of_networks = "What hybrids' networks say, and what filters make of it, learnt on the limited set"
+    of_networks = "Outputs of the hybrids' networks, and of their filters, learnt on the limited set"
     return [
         "## Appendix: limited set",
         tables.accuracy(learnt.comparison, paper.TABLE_III, training, "table_3", caption),
@@ -387,7 +387,7 @@ def _filters_and_budget(artefacts: StudyArtefacts, parts: Mapping[str, Runs], ru
         tables.filters(
             {name: own for name, own in titled.items() if name in (FULL, FREE)},
             "filters",
-            "Tyres and levels of noise of the filters; the paper does not give its tyres. A network that says the process noise takes the "
+            "Tyres and levels of noise of the filters; the paper does not give its tyres. A network that gives the process noise takes the "
             f"filter's for its start alone. Variances of the sensors are 10 times those of these levels. Data: {kind}.",
         ),
         tables.scaling(
@@ -409,7 +409,7 @@ def departures(trainings: Mapping[str, Mapping[str, object]]) -> list[str]:
     lines = [
         "Data: simulated manoeuvres in the place of recorded ones, in the mix of the paper's test set, by a car with the paper's mass, "
         "inertia and wheelbase; its tyres, springs and sensors are assumed, each drive has sensors' offsets of its own.",
-        "The filter of the CNN-UKF has the smooth tyres (Eq. 10) in use as well, identified with that curve; the paper says smooth tyres "
+        "The filter of the CNN-UKF has the smooth tyres (Eq. 10) in use as well, identified with that curve; the paper has smooth tyres "
         "of the training only. The same filter alone stands beside it.",
         f"σ_DD is a standard deviation everywhere, R = σ_DD² + {LEAST_VARIANCE:g} rad², where Eq. 6 has a variance; Eq. 11 scales the "
         "variance of the networks' angles, in rad², and R is its result.",
@@ -431,7 +431,7 @@ def departures(trainings: Mapping[str, Mapping[str, object]]) -> list[str]:
     return [
         *lines,
         "What the paper leaves open (epochs, patience, hysteresis and factor of the forces' noise): docs/estimators.md. It optimises "
-        "further settings of its networks by Bayesian optimisation and does not say which; here none are.",
+        "further settings of its networks by Bayesian optimisation which it does not name; here none are.",
     ]
 
 

@@ -22,7 +22,7 @@ class Limited:
     Args:
         comparison: with the filters alone, which are those of the full set, as in the paper.
         runs: candidate -> its seeds, of what learnt.
-        outputs: hybrid -> what its networks say, seed by seed, manoeuvre by manoeuvre.
+        outputs: hybrid -> outputs of its networks, seed by seed, manoeuvre by manoeuvre.
         scaling: DE-UKF as tuned, and with p₁ and p₂ of the full set's, on the same seeds.
     """
 

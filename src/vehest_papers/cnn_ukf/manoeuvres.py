@@ -27,7 +27,7 @@ GROUPS = {
     "spiral": "spiral",
     "lap": "lap",
 }
-"""Part of a recording's name -> the group of manoeuvres that it says the recording is of."""
+"""Part of a recording's name -> the group of manoeuvres of the recording."""
 
 BIN = 0.25  # deg, of Figs. 5 and 11
 

@@ -30,7 +30,7 @@ IDENTIFICATION = IdentificationSettings(trials=20, restarts=1, error="recordings
 
 @dataclass(frozen=True, eq=False)
 class Outputs:
-    """What a network says of the scored samples of one manoeuvre.
+    """Outputs of a network at the scored samples of one manoeuvre.
 
     Args:
         error: β_DD - β [deg], (K,).
@@ -70,7 +70,7 @@ def rows_of(part: Scored, drive: Recording) -> NDArray[np.int64]:
 
 
 def outputs_of(run: Run, prepared: Prepared) -> list[Outputs]:
-    """What the network of a hybrid says of each test manoeuvre."""
+    """Outputs of a hybrid's network on each test manoeuvre."""
     drives, spans = prepared.seen(TEST), prepared.spans(TEST)
     found = []
     for drive, span, own in zip(drives, spans, pseudo_measurements_of(run, drives), strict=True):
@@ -89,7 +89,7 @@ def outputs_of(run: Run, prepared: Prepared) -> list[Outputs]:
 
 
 def filtered_with(fitted: NetworkUkf, drives: Sequence[Recording], pseudo: Sequence[PseudoMeasurement]) -> list[FloatArray]:
-    """β of a hybrid's filter given what its network is made to say, drive by drive [rad]."""
+    """β of a hybrid's filter given other outputs of its network, drive by drive [rad]."""
     found: dict[int, FloatArray] = {}
     for rows, steps in fitted.filtered(drives, pseudo=pseudo):
         mean = steps.filtered.mean.numpy()
@@ -113,7 +113,7 @@ def shift_of(run: Run, prepared: Prepared) -> float:
 
 
 def with_perfect_distrust(run: Run, prepared: Prepared, candidate: str) -> Run:
-    """A hybrid whose filter is told at each sample how wrong its network's angle is; no estimator, since nobody knows that."""
+    """A hybrid whose filter knows the error of its network's angle at each sample; an oracle, no estimator."""
     fitted, drives, spans = hybrid_of(run), prepared.seen(TEST), prepared.spans(TEST)
     pseudo = []
     for drive, span, own in zip(drives, spans, fitted.pseudo_measurements(drives), strict=True):

@@ -80,7 +80,7 @@ PARTS_AWAY = {
     "_no_adaptive_process": "process noise constant",
     "_plain": paper.PLAIN,
 }
-"""What a variant's name says is taken away -> in words."""
+"""Part of a variant's name -> what is taken away, in words."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -141,7 +141,7 @@ def consistency(part: PartArtefacts, runs: Runs, name: str, caption: str) -> Tab
 
 
 def networks_alone(comparison: ManoeuvreErrors, outputs: OutputsOf, name: str, caption: str) -> Table:
-    """Squared errors of what hybrids' networks say, beside those of the filters that listen, and how sure the networks are."""
+    """Squared errors of the hybrids' networks, beside those of their filters, and the networks' deviations."""
     rows = []
     for candidate, seeds in outputs.items():
         sizes = np.array([float(len(own.error)) for own in seeds[0]])

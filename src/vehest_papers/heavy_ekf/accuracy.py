@@ -1,4 +1,4 @@
-"""What the paper says of its errors beside Table 3: lap by lap, whether |β| is underestimated, and until when before a stop they hold."""
+"""The paper's statements on errors beside Table 3: lap by lap, whether |β| is underestimated, and until when before a stop they hold."""
 
 from __future__ import annotations
 
@@ -96,7 +96,7 @@ def underestimation_table(gains: Mapping[tuple[str, str], tuple[float, float, fl
     columns = {"test": Column("drive"), **{name: Column(name) for name in names}}
     caption = (
         f"Whether sideslip is underestimated: gain from β to its estimate, both about their means, while |a_y| exceeds {CORNERING:g} m/s², "
-        "SIMULATED, with 95 % intervals over blocks of 10 s. Below 1: too small, as the paper says of LINT and RATT."
+        "SIMULATED, with 95 % intervals over blocks of 10 s. Below 1: too small, as the paper finds of LINT and RATT."
     )
     return Table("underestimation", caption, pd.DataFrame(rows), columns)
 
@@ -159,7 +159,7 @@ def stop_of(drive: Recording) -> float:
 
 
 def not_testable() -> list[Claim]:
-    """Claims of the paper that no data at hand can test."""
+    """Claims of the paper that these data cannot test."""
     missing: Verdict = "not testable on this data"
     laps = "the recordings are not public"
     return [

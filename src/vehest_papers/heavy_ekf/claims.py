@@ -33,7 +33,7 @@ def rankings_of(part: PartArtefacts) -> dict[str, Ranking]:
 
 
 def claims_blocks(truck: PartArtefacts, ferrari: PartArtefacts | None, others: Sequence[Claim]) -> tuple[Table, str]:
-    """The table of claims, those of the tests before ``others``, and a sentence a test on who may be called best."""
+    """The table of claims, those of the tests before ``others``, and a sentence a test on the best filter."""
     variant_of = {title: (FAMILY, variant) for variant, title in paper.VARIANTS.items()}
     titles, found = titles_of(truck), rankings_of(truck)
     data = words_of_kinds(truck)

@@ -65,7 +65,7 @@ def documents(artefacts: StudyArtefacts) -> dict[str, Document]:
         *[block for block in of_ferrari if _is_real_trace(block)],
         tables.overview(errors, real_errors, [*filters, *(title for title, test in claims.baseline_errors(truck) if test == NOMINAL)]),
         *twin_front,
-        f"## Appendix: who may be called best\n\n{best}",
+        f"## Appendix: the best filter\n\n{best}",
         *([f"## Appendix: what to mind\n\n{warned}"] if warned else []),
         *twin_appendix,
         *drawn,
@@ -125,8 +125,8 @@ def _how_it_was_made(artefacts: StudyArtefacts) -> list[Block]:
         "Where we differ from the paper: tyre parameters are states as logarithms over their fitted values, so that they stay positive and "
         "the filter is well conditioned, and are kept within a factor of three, or three of their deviations at the start; beyond 0.5 rad "
         "of sideslip the filter begins anew, tyres included; axle forces for the fit come from accelerations instead of TRICK, and where "
-        "they leave c1 open, a largest force at slip angles of about 9° (6 to 13°) is taken as known; levels of noise are tuned, since no "
-        f"data sheet is at hand; vertical loads are those at rest. {paper.HELD}, {paper.UNSCENTED} and RATT with friction are not in the "
+        "they leave c1 open, a largest force at slip angles of about 9° (6 to 13°) is taken as known; levels of noise are tuned, since "
+        f"there is no data sheet; vertical loads are those at rest. {paper.HELD}, {paper.UNSCENTED} and RATT with friction are not in the "
         "paper; the unscented filter takes the levels that were found through the extended one."
     )
     ranges = methods.ranges_table(artefacts, "ranges", "What was used for what.", {})
@@ -219,8 +219,8 @@ def _ferrari(part: PartArtefacts, filters: Mapping[str, Filter], rmse: tables.Rm
     wander = f"Rational tyre model parameters, RATTE filter, on the same range, {data}; what is true of these tyres is not known."
     return [
         "## Appendix: the same filters on a real car",
-        "The filters need steering, yaw rate, lateral acceleration and speed only, so they run on a car as well; who may be called best is "
-        "said on the first page, which also shows the sideslip angle.",
+        "The filters need steering, yaw rate, lateral acceleration and speed only, so they run on a car as well; the first page "
+        "compares them and shows the sideslip angle.",
         Table("ferrari", caption, rows, columns),
         tyres.figure_3(fit, None, "figure_3_ferrari", data),
         tyres.table_1(fit, None, "table_1_ferrari", data),

@@ -1,6 +1,6 @@
 """The truck's fast lap over several draws of sensors and driver: errors, and differences that are paired over draws.
 
-A lap's errors come from where it leads, and blocks of one lap say how they vary over the course; draws say what another day would do.
+A lap's errors come from where it leads, and blocks of one lap show how they vary over the course; draws show the variation from day to day.
 """
 
 from __future__ import annotations

@@ -151,9 +151,9 @@ def _drawn(values: dict[tuple[str, str], FloatArray], apart: dict[tuple[str, str
         for axes, pair in zip(panels, CLAIMED, strict=True):
             for (row, column), value in np.ndenumerate(values[pair]):
                 colour = colours.to_rgba(float(np.clip(value, -LIMIT, LIMIT)))
-                told = bool(apart[pair][row, column])
+                significant = bool(apart[pair][row, column])
                 box = Rectangle((column - 0.5, row - 0.5), 1.0, 1.0, facecolor=colour, edgecolor="white", linewidth=0.8)
-                if not told:
+                if not significant:
                     box.set(hatch="////", edgecolor="#333333", linewidth=0.0)
                 axes.add_patch(box)
                 ink = "white" if abs(value) > 65.0 else "#111111"
@@ -177,7 +177,7 @@ def _drawn(values: dict[tuple[str, str], FloatArray], apart: dict[tuple[str, str
 
 
 def _counts(cells: Sequence[Cell], found: Changes, pair: tuple[str, str]) -> tuple[int, int, int]:
-    """Cells in which the first is better, worse, and better by as much as the paper says; each by more than chance."""
+    """Cells in which the first is better, worse, and better by as much as in the paper; each by more than chance."""
     own = [found[at, pair] for at in range(len(cells))]
     better, worse = (sum(change.told_apart and sign * change.percent > 0.0 for change in own) for sign in (-1.0, 1.0))
     return better, worse, sum(change.told_apart and change.percent <= -paper.GAINS.get(pair, math.inf) for change in own)
@@ -247,7 +247,7 @@ def _regions(own: Factorial) -> Table:
     }
     caption = (
         f"In how many of {len(SLIPS) * len(MISMATCHES)} cells RATTE lies below or above the others by more than chance (Holm within each "
-        f"row), {DATA}. No filter knows of the payload; the oracle is told the tyres under it and the friction, not the mass."
+        f"row), {DATA}. No filter knows of the payload; the oracle knows the tyres under it and the friction, not the mass."
     )
     return Table("twin_regions", caption, pd.DataFrame(rows), columns)
 

@@ -29,7 +29,7 @@ LOCKED = 0.5  # m of track by the wheels' difference, below which an axle turns 
 
 
 def table_2(car: SingleTrackParameters) -> Table:
-    """Vehicle parameters: the paper's table did not survive in the text at hand."""
+    """Vehicle parameters: the paper's table is not legible."""
     rows = [
         ("mass M", "kg", car.mass, "the axle curves' largest forces, 39.0 + 38.6 kN, taken as the weight"),
         ("front semi-wheelbase a_F", "m", car.cg_to_front_axle, "share of those forces; wheelbase 3.5 m, for the eigenvalue ratio"),
@@ -45,7 +45,7 @@ def table_2(car: SingleTrackParameters) -> Table:
         "value": Column("value", each=True, digits=5),
         "from": Column("from"),
     }
-    return Table("table_2", "Vehicle parameters (Table 2 of the paper, whose values are not at hand): all assumed.", frame, columns)
+    return Table("table_2", "Vehicle parameters (Table 2 of the paper, whose values are not legible): all assumed.", frame, columns)
 
 
 def eigenvalues_table(car: SingleTrackParameters) -> Table:

@@ -1,4 +1,4 @@
-"""What the reports of papers say of their data and methods: headers, and the appendix on how a report was made."""
+"""Data and methods in the reports of papers: kinds of data, missing parts, warnings, scoring, and the ranges that were used."""
 
 from __future__ import annotations
 

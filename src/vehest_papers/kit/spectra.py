@@ -48,7 +48,7 @@ class Periodogram:
         """
         if not self.frequency[1] <= hz <= self.frequency[-1]:
             raise DataError(
-                f"a periodogram with lines from {self.frequency[1]:.3g} to {self.frequency[-1]:.3g} Hz says nothing of {hz:g} Hz"
+                f"a periodogram with lines from {self.frequency[1]:.3g} to {self.frequency[-1]:.3g} Hz has no line at {hz:g} Hz"
             )
         return float(self.density[third_octave(self.frequency, hz)].mean())
 
@@ -64,7 +64,7 @@ def periodogram(series: Sequence[FloatArray], rate_hz: float, segment_seconds: f
     """Welch's method over several series: Hann windows that overlap by half, each segment without its mean.
 
     Series count by their number of segments; what is left over at the end of each counts nowhere. The line at 0 Hz and, because the
-    window spreads what slowly varies, the one beside it say little.
+    window spreads what slowly varies, the one beside it are not reliable.
 
     Args:
         series: uniformly sampled, finite, each of shape (T,).

@@ -112,7 +112,7 @@ class Change:
 
 
 def percent(ratio: float) -> str:
-    """A ratio as a change in per cent, with its sign: ``−24``, ``+3``; below a half a decimal says on which side of zero it lies."""
+    """A ratio as a change in per cent, with its sign: ``−24``, ``+3``; below a half with a decimal, which shows the side of zero."""
     change = 100.0 * (ratio - 1.0)
     decimals = 0 if round(change) else 1
     rounded = round(change, decimals)

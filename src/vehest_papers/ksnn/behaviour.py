@@ -1,4 +1,4 @@
-"""What trained candidates do where the paper says something beside their errors: little yaw rate, the start of a window, biases removed."""
+"""Behaviour of trained candidates beside their errors: at little yaw rate, after the start of a window, with biases removed."""
 
 from __future__ import annotations
 

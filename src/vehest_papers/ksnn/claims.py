@@ -1,4 +1,4 @@
-"""What the paper says of errors, one entry a statement: Sections VIII-A to VIII-D and VIII-H."""
+"""The paper's statements on errors, one entry each: Sections VIII-A to VIII-D and VIII-H."""
 
 from __future__ import annotations
 
@@ -164,17 +164,17 @@ def _diagonal(scheme: Scheme) -> Claim:
     tests = [Compared(name, change, "higher") for name in scheme.structures() if (change := scheme.ratio(name)) is not None]
     found = outcomes(tests)
     above = sum(own.change is not None and own.change.log_ratio > 0 for own in tests)
-    surely = sum(outcome == "as claimed" for outcome, _ in found)
+    significant = sum(outcome == "as claimed" for outcome, _ in found)
     below = sum(outcome == "the other way round" for outcome, _ in found)
     easier = scheme.ratio(scheme.name_of(paper.STATIC_MAP))
-    ours = f"{above} of {len(tests)} above; by more than chance {surely} above, {below} below"
+    ours = f"{above} of {len(tests)} above; by more than chance {significant} above, {below} below"
     if easier is not None:
         ours += f"; static map's FVU other over own {easier.as_ratio()}"
     claim = f"all dots above the diagonal, {scheme.title.lower()}"
     if not tests or all(own.change is None or not own.change.error > 0 for own in tests):
         return Claim(claim, "39 of 39", "–", scheme.kind, "not testable on this data", "tests too short")
     verdict = "not reproduced" if below else "reproduced" if above == len(tests) else "undecided"
-    why = "some surely below" if below else "all above" if above == len(tests) else "some below, by chance or not"
+    why = "some significantly below" if below else "all above" if above == len(tests) else "some below, by chance or not"
     return Claim(claim, "all" if scheme.name.endswith("1") else "all of Table V", ours, scheme.kind, verdict, why)  # type: ignore[arg-type]
 
 

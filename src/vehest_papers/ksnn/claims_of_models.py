@@ -1,4 +1,4 @@
-"""What the paper says of how estimators behave: low yaw rates, convergence, biases, noise, spectra, cost, learnt parameters."""
+"""The paper's statements on the behaviour of estimators: low yaw rates, convergence, biases, noise, spectra, cost, learnt parameters."""
 
 from __future__ import annotations
 
@@ -190,8 +190,8 @@ def on_spectra(schemes: Sequence[Scheme]) -> list[Claim | Statement]:
         tests = [Compared("", Change.of(levels[paper.NONLINEAR, hz], levels[other, hz])) for hz, other in pairs]
         found = [outcome for outcome, _ in outcomes(tests)]
         lower = sum(own.change is not None and own.change.log_ratio < 0 for own in tests)
-        turned, surely = found.count("the other way round"), found.count("as claimed")
-        ours = f"lower in {lower} of {len(tests)} bands; by more than chance {surely} lower, {turned} higher"
+        turned, significant = found.count("the other way round"), found.count("as claimed")
+        ours = f"lower in {lower} of {len(tests)} bands; by more than chance {significant} lower, {turned} higher"
         verdict = "not reproduced" if turned else "reproduced" if lower == len(tests) else "undecided"
         entries.append(Claim(claim, "yes", ours, scheme.kind, verdict, "against Luenberger and LSTM, 0.1 to 6.3 Hz"))  # type: ignore[arg-type]
         if scheme is schemes[-1]:

@@ -210,7 +210,7 @@ def _how_it_was_made(artefacts: StudyArtefacts) -> list[Block]:
 
 
 def _averaging(artefacts: StudyArtefacts) -> str:
-    """What is kept of the weights, where trainings say it."""
+    """Averaging of weights over training steps, where a training is configured with it."""
     decays = sorted(
         {
             float(model.training.get("averaging") or 0.0)

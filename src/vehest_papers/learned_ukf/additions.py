@@ -148,7 +148,7 @@ def minima_claim(scratch: Subject, trained: Subject, data: str, share: float) ->
         scratch: those that ended.
         trained: with pre-training.
         data: real or simulated.
-        share: samples learnt from, of those of the pre-trained; below 1 a minimum cannot be told from a training that is not over.
+        share: samples learnt from, of those of the pre-trained; below 1 a minimum cannot be distinguished from a training that is not over.
     """
     limit = float(trained.validation().max())
     k, n = int((scratch.validation() > limit).sum()), len(scratch.seeds)

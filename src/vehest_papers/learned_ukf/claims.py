@@ -179,8 +179,12 @@ def states_claim(claim: str, words: str, expected: Mapping[str, tuple[Interval, 
         low, value, high = (100.0 * end / before for end in (own.low, own.value, own.high))
         shown.append(f"{state.replace('_', ' ')} {with_interval(value, low, high, 0)} %")
     verdict = verdict_of_all(verdicts)
-    why = {"reproduced": "all as claimed", "not reproduced": "one is the other way round", "undecided": "not all are told apart"}[verdict]
-    return Claim(claim, words, "; ".join(shown), data, verdict, why)
+    words_of = {
+        "reproduced": "all as claimed",
+        "not reproduced": "one interval contradicts the claim",
+        "undecided": "not all are told apart",
+    }
+    return Claim(claim, words, "; ".join(shown), data, verdict, words_of[verdict])
 
 
 def difference_claim(claim: str, words: str, own: Interval, values: tuple[float, float], data: str) -> Claim:
@@ -194,9 +198,9 @@ def not_testable(*, timed: bool = False) -> list[Claim]:
     """Claims that these files cannot test; ``timed``: the length of training sequences has a row of its own."""
     untestable: Verdict = "not testable on this data"
     rows = (
-        ("every figure of Table II itself", "tyre C", "recordings of tyre C are not at hand; tyre D stands in"),
+        ("every figure of Table II itself", "tyre C", "no recordings of tyre C; tyre D stands in"),
         ("RMS errors 0.062 and 0.070 m/s on tyre A", "0.062; 0.070 m/s", "the test is another part of tyre A's recordings"),
-        ("99th percentile of rear slip beyond 40°", "40°", "3 of the data set's files are at hand"),
+        ("99th percentile of rear slip beyond 40°", "40°", "only 3 of the data set's files"),
         *(() if timed else (("longer training sequences take longer an epoch", "Figure 7", "times are in no published file"),)),
     )
     return [Claim(claim, words, "–", "none", untestable, why) for claim, words, why in rows]

@@ -110,9 +110,7 @@ def _budgets_in_words(main: Mapping[str, PartArtefacts]) -> str:
         if paper.NN in groups and groups[paper.NN][0].training:
             words.append(f"{paper.NN} {groups[paper.NN][0].training['one_step']['max_epochs']} one-step, too few for it")
         if words:
-            sentences.append(
-                f"**Budgets are small** ({words_of_kinds(part)}): {', '.join(words)}; what more of them does, docs/learned_ukf.md says."
-            )
+            sentences.append(f"**Budgets are small** ({words_of_kinds(part)}): {', '.join(words)}; larger ones: docs/learned_ukf.md.")
     return " ".join(sentences)
 
 
@@ -159,7 +157,7 @@ def _add_oracle(part: PartArtefacts, runs: pd.DataFrame, errors: Mapping[str, Lo
 
 
 def _accuracy(own: Outcome, name: str, errors: Mapping[str, Losses], kind: str, *, summary: bool) -> None:
-    """Who may be called best, the summary, and Tables I and II."""
+    """The best method, the summary, and Tables I and II."""
     own.front.append("## Tables I and II\n\n" + "\n\n".join(_standing(of_test, SETS[test]) for test, of_test in errors.items()))
     if summary:
         own.front.append(tables.overview(errors, kind))
@@ -175,7 +173,7 @@ def _accuracy(own: Outcome, name: str, errors: Mapping[str, Losses], kind: str, 
 
 
 def _standing(errors: Losses, tyre: str) -> str:
-    """Who has the lowest error, whether that is more than chance, and who is below the baselines."""
+    """Method with the lowest error, whether the difference is significant, and methods below the baselines."""
     means = {name: float(own.mean()) for name, own in errors.squared.items() if name != paper.ORACLE}
     order = sorted(means, key=means.__getitem__)
     best = order[0]

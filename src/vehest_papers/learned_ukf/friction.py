@@ -99,7 +99,7 @@ def mean(values: FloatArray) -> float:
 
 
 def convergence_table(tracks: Mapping[str, Mapping[float, Tracks]], skip_seconds: float, name: str, data: str) -> Table:
-    """A row a tyre and start: time to converge, final value, and what the filter itself says of it."""
+    """A row a tyre and start: time to converge, final value, and and the filter's own deviation."""
     rows = []
     for test, by_start in tracks.items():
         for start, own in by_start.items():
@@ -135,7 +135,7 @@ def convergence_table(tracks: Mapping[str, Mapping[float, Tracks]], skip_seconds
     caption = (
         f"The friction of {paper.NNTF_UH} from three starts, {data}: 95 % intervals over sequences and seeds. Converged: stays within "
         f"{TOLERANCE:g} of its mean over the last {LAST_SECONDS:g} s. Time to the track from {TRAINED_FROM:g}: until it stays within "
-        f"{TOLERANCE:g} of it, which says how long a wrong start lasts; added after the tests had been seen, so it decides no claim."
+        f"{TOLERANCE:g} of it, the effect of a wrong start; added after the tests had been seen, so it decides no claim."
     )
     return Table(f"friction_{name}", caption, pd.DataFrame(rows), columns)
 

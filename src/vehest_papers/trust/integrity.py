@@ -34,7 +34,7 @@ class Integrity:
     Args:
         error: size of the error [deg, or the unit of the levels].
         level: protection level.
-        flagged: whether the estimate was said to be invalid.
+        flagged: whether the estimate was flagged as invalid.
         alert_limit: the same for all.
     """
 
@@ -61,7 +61,7 @@ def integrity_of(error: FloatArray, level: FloatArray, flagged: NDArray[np.bool_
     Args:
         error: estimate less reference, (T,).
         level: protection level in the same unit, (T,).
-        flagged: whether the estimate was said to be invalid, (T,).
+        flagged: whether the estimate was flagged as invalid, (T,).
         alert_limit: in the same unit.
     """
     known = ~np.isnan(error) & ~np.isnan(level)

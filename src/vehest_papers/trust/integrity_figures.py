@@ -1,4 +1,4 @@
-"""The Stanford diagram: error against protection level, and what an estimate that says so is worth."""
+"""The Stanford diagram: error against protection level, with the share of samples in each region."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The study of trust: do bands hold what they say, on cars learnt on and on others, and which faults of sensors are flagged in time.
+"""The study of trust: coverage of bands, on cars learnt on and on others, and which faults of sensors are flagged in time.
 
 A part of the pipeline is a comparison on one car, or a lap of it. Test sets of cars and tyres that bands were calibrated on stand apart
 from those of others. Faults are tried on each part's test ranges at the evaluation rate, with health learnt on its training and
@@ -41,7 +41,7 @@ SHOWN = ("ksnn", "gru", "kalman", "rational_ekf", "static_map")
 
 
 def documents(artefacts: StudyArtefacts) -> dict[str, Document]:
-    """The report: bands on cars learnt on, bands elsewhere, faults against what could be seen, integrity, then how it was made."""
+    """The report: bands on cars learnt on, bands on other vehicles, faults against what could be seen, integrity, then how it was made."""
     parts = artefacts.parts
     board = coverage_board(parts)
     scores = scores_learnt(parts, board)
@@ -172,7 +172,7 @@ def _reliability(board: pd.DataFrame) -> Figure:
         rows.append(Reliability(estimator_class(family).title, lines[family, ""], values.mean(axis=0), low, high))
     caption = (
         "Reliability of the bands of β on cars learnt on: errors inside over the nominal level, mean over test sets and variants of a "
-        "family, bars from the 10 to the 90 % quantile over them. On the diagonal bands hold what they say."
+        "family, bars from the 10 to the 90 % quantile over them. On the diagonal the coverage is the nominal one."
     )
     return Figure("reliability", caption, reliability_figure(LEVELS, rows))
 
@@ -279,7 +279,7 @@ def _faults(trials: Sequence[FaultTrials]) -> list[Block]:
 def bands_under_faults(parts: Mapping[str, PartArtefacts], trials: Sequence[FaultTrials]) -> pd.DataFrame:
     """One row a part and fault: whether the oracle sees such a fault there, and what bands of β hold while it lasts.
 
-    Estimators count whose error it changes; ``lowest`` is that of the worst of them, ``unflagged`` is over samples said to be valid.
+    Estimators count whose error it changes; ``lowest`` is that of the worst of them, ``unflagged`` is over samples that are not flagged.
     """
     rows = []
     for key, part in parts.items():
