@@ -1,12 +1,14 @@
-"""The study of a car that nobody has trained on: estimators learn on simulated cars alone and are tested on a real one.
+"""The study of a car that is in no training set: estimators learn on simulated cars alone and are tested on a real one.
 
 Used by the pipeline ``sim_to_real``. Each of its parts is a fleet to learn from, each estimator in it a step. All steps stop on the same
 simulated cars, which make the first choice among them. A second choice, by simulated race cars on a circuit, and a third, by a car of
-another simulation, came after the real recording had been looked at, and the report says so. The real recording itself chooses nothing.
+another simulation, came after the real recording had been looked at, as the report states. The real recording itself chooses nothing.
 """
 
 from __future__ import annotations
 
+import math
+from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
@@ -22,6 +24,8 @@ from vehest.report import figures
 from vehest.report.document import PATENT_NOTE, REPORT, Block, Column, Document, Figure, Table, as_code
 from vehest.report.style import REFERENCE, fixed, line_of
 from vehest.studies.artefacts import EvaluatedModel, PartArtefacts, StudyArtefacts
+from vehest_papers.kit.methods import bullets, scoring
+from vehest_papers.kit.reading import metric_values
 
 TAKES = "parts"
 RACE_CARS = "race_cars"
@@ -108,7 +112,7 @@ class Step:
 
 @dataclass(frozen=True)
 class Choice:
-    """A step, and a seed of it, by what simulated cars say.
+    """A step, and a seed of it, by its errors on simulated cars.
 
     Args:
         step: with the lowest median error.
@@ -195,18 +199,12 @@ def _weights_at_zero(models: Sequence[EvaluatedModel]) -> FloatArray:
 
 
 def _values(part: PartArtefacts, models: tuple[EvaluatedModel, ...], test_set: str) -> dict[str, FloatArray]:
-    metrics = ("fvu", "rmse_vy", "rmse_sideslip")
-    if test_set not in (VALIDATION, *part.split.tests):
-        return {metric: np.full(len(models), np.nan) for metric in metrics}
-    table = part.metrics
-    own = table[
-        (table["estimator"] == models[0].estimator)
-        & (table["variant"] == models[0].variant)
-        & (table["test_set"] == test_set)
-        & (table["subset"] == "all")
-        & (table["condition"] == "nominal")
-    ].pivot(index="seed", columns="metric", values="value")
-    return {metric: own.loc[[model.seed for model in models], metric].to_numpy() for metric in metrics}
+    """Metric -> values, one a seed; NaN where the part has no such test set."""
+    known = metric_values(part) if test_set in (VALIDATION, *part.split.tests) else defaultdict(lambda: math.nan)
+    return {
+        metric: np.array([known[own.estimator, own.variant, own.seed, test_set, metric] for own in models])
+        for metric in ("fvu", "rmse_vy", "rmse_sideslip")
+    }
 
 
 def _headline(steps: Sequence[Step], choices: Mapping[str, Choice]) -> str:
@@ -228,8 +226,8 @@ def _headline(steps: Sequence[Step], choices: Mapping[str, Choice]) -> str:
         f"the simulator that it came from, chooses {_named(choices['third'])} among the steps that have not learnt on it. "
         f"{_result(choices['third'])}\n\n"
         "Only the first figure is a clean test. The other two rules use simulated cars alone, but were made up knowing how every step does "
-        "on the real car, and the last one knowing that two had failed; whether it is the right rule takes another real car to say.\n\n"
-        f"The model that comes with vehest for cars that nobody has trained on is seed {shipped.model.seed} of the {SHIPPED} choice: on "
+        "on the real car, and the last one knowing that two had failed; whether it is the right rule needs another real car to decide.\n\n"
+        f"The model that comes with vehest for cars without a model of their own is seed {shipped.model.seed} of the {SHIPPED} choice: on "
         f"the real car FVU {error['fvu']}, RMSE(v) {error['rmse_vy']} m/s, RMSE(β) {error['rmse_sideslip']}°."
     )
 
@@ -254,7 +252,6 @@ def _verdict(step: Step) -> str:
 
 
 def _how_it_was_made(artefacts: StudyArtefacts) -> list[Block]:
-    protocol = next(iter(artefacts.parts.values())).protocol
     lines = [
         f"Command: {as_code(artefacts.command)}",
         "Rule: fleets, settings and reasons were laid down before any step was tested on the real recording, and all steps are shown, each "
@@ -267,11 +264,10 @@ def _how_it_was_made(artefacts: StudyArtefacts) -> list[Block]:
         "lateral velocity.",
         "Ranges of training and validation are those with a yaw rate up to 1 rad/s, at 5 m/s or more, for 5 s or longer: a spin would move "
         "the last of a KS-NN's local models to where no car drives.",
-        f"Evaluation: every estimate is read at {protocol.rate_hz:g} Hz; the first {protocol.skip_seconds:g} s of each {protocol.piece} "
-        f"are not scored.{protocol.start_in_words} FVU = var(v − v̂)/var(v).",
+        f"{scoring(next(iter(artefacts.parts.values())).protocol)} FVU = var(v − v̂)/var(v).",
         *_facts(artefacts),
     ]
-    return ["## How it was made\n\n" + "\n".join(f"- {line}" for line in lines)]
+    return [bullets("## How it was made", lines)]
 
 
 def _facts(artefacts: StudyArtefacts) -> list[str]:
@@ -311,7 +307,7 @@ def _overview(steps: Sequence[Step], choices: Mapping[str, Choice]) -> Table:
     rows += [{"part": "paper", "step": f"paper: {title}", "chosen": "", "fvu_median": fvu} for title, fvu in PUBLISHED]
     return Table(
         "overview",
-        "Steps, what simulated cars say of them, and what they do on the whole recording of the real Ferrari: medians over the seeds, for "
+        "Steps, their errors on simulated cars, and on the whole recording of the real Ferrari: medians over the seeds, for "
         "FVU also the smallest and largest. β₁(0) is what the network makes of an acceleration without yaw rate (Eq. 7a). Below: Da Lio et "
         "al. 2023, real cars, two recordings of which ours is one.",
         pd.DataFrame(rows),
@@ -356,7 +352,7 @@ def _spread(steps: Sequence[Step], choices: Mapping[str, Choice]) -> Figure:
 
 
 def _why(steps: Sequence[Step]) -> str:
-    """What the steps say about the reason, where those that it takes are all there."""
+    """Differences between steps that explain the choice, where all of these steps are there."""
     size = steps[0].models[0].variant
     of = {step.part: step for step in steps if step.models[0].variant == size}
     if not {"wide", "fast", "rough", "more", "level"} <= set(of):
@@ -376,7 +372,7 @@ def _why(steps: Sequence[Step]) -> str:
         "The most likely reason: besides the kinematics, which hold for every car, a network learns how much simulated cars usually slide "
         "and how much their sensors err. The closer the fleet comes to the validation cars, and the more local models a network has, the "
         "more of that it can learn; it pays on cars from the same simulator and costs on a real one. The weight β₁(0), which the "
-        "kinematics put at 1, says how far a network has gone from them."
+        "kinematics put at 1, shows how far a network has gone from them."
     )
 
 

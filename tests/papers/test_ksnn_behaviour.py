@@ -7,19 +7,19 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-import pandas as pd
 import pytest
+from study_parts import metric_rows, part_of, stored
+from trained_ksnn import ksnn_with_weights
 
 from conftest import planar_drive
-from trained_ksnn import ksnn_with_weights
 from vehest.data.recording import Recording
 from vehest.data.splits import Span, Split
-from vehest.data.store import write_estimate, write_recording
+from vehest.data.store import write_estimate
 from vehest.estimators.model_files import save_model
 from vehest.estimators.registry import estimator_class
 from vehest.evaluation.blocks import segments_of, write_segments
 from vehest.evaluation.metrics import Protocol
-from vehest.studies.artefacts import METRIC_COLUMNS, EvaluatedModel, PartArtefacts
+from vehest.studies.artefacts import EvaluatedModel
 from vehest_papers.ksnn import behaviour, claims_of_models, paper
 from vehest_papers.ksnn.schemes import Scheme
 
@@ -35,10 +35,6 @@ def scheme(folder: Path, *, bias: bool = False) -> Scheme:
     """A linear KS-NN and v = 0 on a car measured as it is, and on another whose a_y shows too little."""
     drives = {name: planar_drive(SECONDS, seed=seed, name=name) for seed, name in enumerate(("c1", "c2"))}
     drives |= {name: without_ay(planar_drive(SECONDS, seed=seed, name=name), OFFSET) for seed, name in ((5, "f1"), (6, "f2"))}
-    references = {}
-    for name, recording in drives.items():
-        references["cars", name] = folder / f"{name}.parquet"
-        write_recording(recording, references["cars", name])
     network, zero = ksnn_with_weights(n_local=2, bias=bias), estimator_class("zero").from_config({"rate_hz": 20.0})
     spans = {name: (Span("cars", name),) for name in drives}
     split = Split("scheme", spans["c1"], spans["f1"], {"c2": spans["c2"], "f2": spans["f2"]})
@@ -51,13 +47,9 @@ def scheme(folder: Path, *, bias: bool = False) -> Scheme:
         for test in ("c2", "f2"):
             (at / test).mkdir()
             write_estimate(estimator.estimate([drives[test].without_references()])[0], at / test / "0.parquet")
-        for test in ("validation", "c2", "f2"):
-            for metric in ("rmse_vy", "fvu", "r2", "rmse_sideslip", "n_parameters", "epochs"):
-                own = ("ksnn", estimator.name, estimator.variant, "cars", "cars", "simulated", test, "all", "nominal", 20.0, "causal", 0)
-                rows.append((*own, metric, 1.0, "1", None, None))
-    protocol = Protocol()
-    titles, kinds, metrics = {"cars": "Cars"}, {"cars": "simulated"}, pd.DataFrame(rows, columns=list(METRIC_COLUMNS))
-    part = PartArtefacts("ksnn", "t", "a", "c", split, protocol, kinds, titles, metrics, models, references, [])
+        figures = dict.fromkeys(("rmse_vy", "fvu", "r2", "rmse_sideslip", "n_parameters", "epochs"), 1.0)
+        rows += [row for test in ("validation", "c2", "f2") for row in metric_rows(models[-1], test, figures)]
+    part = part_of(split, Protocol(), models, rows, kinds={"cars": "simulated"}, references=stored(folder, "cars", drives))
     for model in models:
         write_segments(model.evaluation_folder / "blocks.csv", {test: segments_of(part.scored(model, test), 20.0) for test in ("c2", "f2")})
     return Scheme("scheme_1", "Scheme 1", part, "c2", "f2")

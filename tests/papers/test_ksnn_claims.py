@@ -16,7 +16,7 @@ from vehest.evaluation.metrics import Scored
 from vehest_papers.kit.statements import Change, Compared, Statement, counted, decided, outcomes
 from vehest_papers.ksnn import claims, cost, paper, tables
 from vehest_papers.ksnn.causes import CAUSES, causes_in_words, causes_table, headline, orders
-from vehest_papers.ksnn.comparing import Errors, masked_segments
+from vehest_papers.ksnn.comparing import SegmentErrors, masked_segments
 from vehest_papers.ksnn.schemes import Scheme
 
 PUBLISHED = {"scheme_1": (paper.TABLE_IV, "c", "c2", "f2"), "scheme_2": (paper.TABLE_V, "f", "f2", "c2")}
@@ -145,7 +145,7 @@ def test_an_order_is_not_read_where_a_candidate_failed_on_its_own_car(tmp_path):
 
 def test_figures_are_those_of_the_samples():
     segments = planted_segments(0.2, "c2", 3)
-    errors = Errors({"one": [segments, segments]}, "c2")
+    errors = SegmentErrors({"one": [segments, segments]}, "c2")
     assert errors.value("one", "fvu") == pytest.approx(0.2)
     assert errors.value("one", "rmse_vy") == pytest.approx(math.sqrt(0.2) * DEVIATION["c2"])
     low, high = errors.get("one", "fvu").interval
@@ -160,7 +160,7 @@ def test_intervals_hold_the_true_ratio_as_often_as_they_say():
         for name, level in (("first", 0.8), ("second", 1.0)):
             squares = [level * scale * generator.lognormal(0.0, 0.3, 40) * math.exp(0.1 * generator.standard_normal()) for _ in range(4)]
             parts[name] = [_of_pieces(own) for own in squares]
-        change = Errors(parts, f"trial {trial}").change("first", "second", "rmse_vy")
+        change = SegmentErrors(parts, f"trial {trial}").change("first", "second", "rmse_vy")
         low, high = change.ends()
         inside += low < math.sqrt(0.8) < high
     assert stats.binomtest(inside, 150, 0.95).pvalue > 0.01, inside
@@ -175,15 +175,15 @@ def _of_pieces(squares):
 
 def test_the_same_networks_under_two_conditions_are_compared_seed_by_seed():
     parts = {name: [planted_segments(level * fvu, "c2", 3) for fvu in (0.1, 0.2, 0.4)] for name, level in (("a", 0.9), ("b", 1.0))}
-    together = Errors(parts, "c2", same_models=True).change("a", "b", "fvu")
-    apart = Errors(parts, "c2").change("a", "b", "fvu")
+    together = SegmentErrors(parts, "c2", same_models=True).change("a", "b", "fvu")
+    apart = SegmentErrors(parts, "c2").change("a", "b", "fvu")
     assert together.ends() == pytest.approx((0.9, 0.9), rel=1e-6)
     assert apart.ends()[0] < 0.5
 
 
 def test_candidates_with_infinite_errors_are_left_out():
     broken = planted_segments(math.inf, "c2", 0)
-    errors = Errors({"good": [planted_segments(0.1, "c2", 0)], "broken": [broken]}, "c2")
+    errors = SegmentErrors({"good": [planted_segments(0.1, "c2", 0)], "broken": [broken]}, "c2")
     assert "broken" not in errors
     assert errors.change("good", "broken", "fvu") is None
     assert errors.in_words("broken", "fvu") == "–"

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 import pytest
+from study_parts import metric_rows, part_of
 
 from conftest import planar_drive
 from vehest.data.errors import DataError
@@ -25,7 +26,7 @@ from vehest.run.config_files import choices
 from vehest.simulation.fleet import variations_from_config, varied
 from vehest.simulation.plant.parameters import compiled_parameters, vehicle_from_configuration
 from vehest.sources.base import kind_of, open_source
-from vehest.studies.artefacts import METRIC_COLUMNS, EvaluatedModel, PartArtefacts, StudyArtefacts
+from vehest.studies.artefacts import EvaluatedModel, PartArtefacts, StudyArtefacts
 from vehest_papers.sim_to_real import documents
 
 PROTOCOL = Protocol(rate_hz=20.0)
@@ -121,27 +122,11 @@ def part(folder: Path, name: str) -> PartArtefacts:
             estimate = Estimate(recording.id, "ksnn", 20.0, recording.start_time, {"vy": vy, "sideslip": np.arctan2(vy, recording["vx"])})
             write_estimate(estimate, home / where / "0.parquet")
             found = accuracy([score(estimate, recording, span, PROTOCOL)])
-            head = ("toy", "ksnn", model.variant, "sim", span.dataset, "", where, "all", "nominal", 20.0, "causal", seed)
-            rows += [(*head, metric, value, "", None, None) for metric, value in found.items()]
-    return PartArtefacts(
-        study="toy",
-        title="Toy",
-        about="",
-        command="vehest run toy",
-        split=Split(
-            name,
-            (Span("sim", f"{name}_lap"),),
-            (spans["validation"],),
-            {test: (span,) for test, span in spans.items() if test != "validation" and (name, test) != ("one", "other_simulator")},
-        ),
-        protocol=PROTOCOL,
-        kinds={"sim": "simulated", "ferrari": "real"},
-        data_titles={},
-        metrics=pd.DataFrame(rows, columns=list(METRIC_COLUMNS)),
-        models=models,
-        references={("sim", recording.id): file, ("ferrari", recording.id): file},
-        facts=["the same for all"],
-    )
+            rows += metric_rows(model, where, found, dataset=span.dataset)
+    tests = {test: (span,) for test, span in spans.items() if test != "validation" and (name, test) != ("one", "other_simulator")}
+    split = Split(name, (Span("sim", f"{name}_lap"),), (spans["validation"],), tests)
+    kinds, references = {"sim": "simulated", "ferrari": "real"}, {(dataset, recording.id): file for dataset in ("sim", "ferrari")}
+    return part_of(split, PROTOCOL, models, rows, kinds=kinds, references=references, facts=["the same for all"])
 
 
 @pytest.fixture(scope="module")

@@ -12,6 +12,7 @@ import numpy as np
 import pandas as pd
 import pytest
 import yaml
+from study_parts import metric_rows, part_of, stored
 from test_network_ukf import LEVELS, TRAININGS, estimator_of
 from test_sample_network import loaded_drive
 
@@ -29,12 +30,12 @@ from vehest.estimators.networks.velocity_recurrent import SequenceSettings
 from vehest.estimators.registry import estimator_class
 from vehest.evaluation.metrics import Protocol, Scored, accuracy, score_all
 from vehest.report.document import Document, Figure, Table
-from vehest.studies.artefacts import METRIC_COLUMNS, EvaluatedModel, PartArtefacts, StudyArtefacts
+from vehest.studies.artefacts import EvaluatedModel, PartArtefacts, StudyArtefacts
 from vehest.training.samples import SampleSettings
 from vehest.training.sequences import PhaseSettings
 from vehest_papers.cnn_ukf import claims, document, documents, networks, observability, paper, perturbed, search, tables, traces
 from vehest_papers.cnn_ukf.limited import AS_TUNED, OF_THE_FULL_SET, limited
-from vehest_papers.cnn_ukf.measures import MSE, Comparison
+from vehest_papers.cnn_ukf.measures import MSE, ManoeuvreErrors
 from vehest_papers.cnn_ukf.subjects import OFFLINE, OWN, Prepared, Run, candidate_of, chosen, line_of, runs_of, until
 
 ROOT = Path(__file__).parents[2]
@@ -83,10 +84,6 @@ def everything(tmp_path_factory: pytest.TempPathFactory) -> PartArtefacts:
     """The four methods, the smooth filter, baselines and further networks on four test manoeuvres of six seconds."""
     folder = tmp_path_factory.mktemp("study")
     recordings = {name: loaded_drive(6.0, seed=number, name=name) for number, name in enumerate(NAMES)}
-    references = {}
-    for name, own in recordings.items():
-        references["car", name] = folder / f"{name}.parquet"
-        write_recording(own, references["car", name])
     models, rows = [], []
     fitted = fitted_models(FitData([recordings["train_1"]], [recordings["validation_1"]]))
     for number, (candidate, (estimator, seeds)) in enumerate(fitted.items()):
@@ -105,42 +102,15 @@ def everything(tmp_path_factory: pytest.TempPathFactory) -> PartArtefacts:
                 for position, estimate in enumerate(own):
                     write_estimate(estimate, home / test / f"{position}.parquet")
                 figures = accuracy(score_all(own.__getitem__, spans, lambda span: recordings[span.recording], PROTOCOL))
-                figures |= {"n_parameters": 9.0, "epochs": 2.0}
-                head = (
-                    "cnn_ukf",
-                    estimator.name,
-                    estimator.variant,
-                    "car",
-                    "car",
-                    "simulated",
-                    test,
-                    "all",
-                    "nominal",
-                    100.0,
-                    "causal",
-                    seed,
-                )
-                rows += [(*head, metric, value, "1", None, None) for metric, value in figures.items()]
-    return PartArtefacts(
-        study="cnn_ukf",
-        title="t",
-        about="a",
-        command="c",
-        split=SPLIT,
-        protocol=PROTOCOL,
-        kinds={"car": "simulated"},
-        data_titles={"car": "A car"},
-        metrics=pd.DataFrame(rows, columns=list(METRIC_COLUMNS)),
-        models=models,
-        references=references,
-        facts=["Recordings are made"],
-    )
+                rows += metric_rows(models[-1], test, figures | {"n_parameters": 9.0, "epochs": 2.0})
+    kinds, titles, references = {"car": "simulated"}, {"car": "A car"}, stored(folder, "car", recordings)
+    return part_of(SPLIT, PROTOCOL, models, rows, kinds=kinds, data_titles=titles, references=references, facts=["Recordings are made"])
 
 
 @pytest.fixture(scope="module")
 def part(everything: PartArtefacts) -> PartArtefacts:
     """What Table II needs."""
-    return PartArtefacts(**{**vars(everything), "models": [own for own in everything.models if not is_further(own)]})
+    return replace(everything, models=[own for own in everything.models if not is_further(own)])
 
 
 def is_further(own: EvaluatedModel) -> bool:
@@ -165,7 +135,7 @@ def report(part: PartArtefacts, everything: PartArtefacts) -> Document:
         "recurrent": [own for own in everything.models if own.estimator == "velocity_gru"],
         "search_5_6": [own for own in everything.models if own.model_folder.name.startswith(POINT)],
     }
-    parts = {name: PartArtefacts(**{**vars(part), "models": models.get(name, part.models)}) for name in names}
+    parts = {name: replace(part, models=models.get(name, part.models)) for name in names}
     return documents(StudyArtefacts("cnn_ukf", "t", "a", "c", {name: f"Part {name}" for name in names}, parts, []))["report"]
 
 
@@ -213,7 +183,7 @@ def test_candidates_have_the_papers_names(part: PartArtefacts) -> None:
     assert set(map(candidate_of, part.models)) == {*paper.OF_FOUR, paper.SMOOTH, paper.ZERO}
     away = replace(part.models[-2], estimator="cnn_ukf", variant="full_no_adaptive_process")
     assert candidate_of(away) == "process noise constant"
-    twice = PartArtefacts(**{**vars(part), "models": [part.models[0], part.models[0]]})
+    twice = replace(part, models=[part.models[0], part.models[0]])
     with pytest.raises(DataError, match="Model-based was trained twice with one seed"):
         runs_of(twice, Prepared(twice))
 
@@ -243,7 +213,7 @@ def noisy(level: float, generator: np.random.Generator, count: int = 12) -> list
 
 
 def test_indicators_are_those_of_the_paper(runs: dict[str, list[Run]]) -> None:
-    own = Comparison(runs, "t")
+    own = ManoeuvreErrors(runs, "t")
     for candidate, seeds in runs.items():
         for indicator in ("mse", "mse_nonlinear", "max_error", "max_error_nonlinear"):
             expected = np.mean([getattr(run.kpis, indicator) for run in seeds])
@@ -254,7 +224,7 @@ def test_a_real_difference_is_told_and_none_is_not() -> None:
     generator = np.random.default_rng(0)
     levels = {"a": 1.0, "b": 1.5, "c": 1.0}
     made = {name: [made_run(name, noisy(level, generator), seed) for seed in range(3)] for name, level in levels.items()}
-    own = Comparison(made, "t")
+    own = ManoeuvreErrors(made, "t")
     low, high = own.change("a", "b", MSE).ends()
     assert low < 1.0 / 2.25 < high < 0.7
     assert own.change("a", "c", MSE).p_value() > 0.01
@@ -264,15 +234,15 @@ def test_a_real_difference_is_told_and_none_is_not() -> None:
 def test_a_filter_that_does_not_listen_is_called_its_own() -> None:
     errors = noisy(1.0, np.random.default_rng(0), 40)
     same, other = [made_run(paper.SMOOTH, errors)], [made_run(paper.CNN, [0.5 * own for own in errors])]
-    assert claims.is_own_filter(Comparison({paper.SMOOTH: same, paper.CNN: same}, "t"), paper.CNN, 0.9)
-    assert not claims.is_own_filter(Comparison({paper.SMOOTH: same, paper.CNN: other}, "t"), paper.CNN, 0.9)
-    assert claims.is_own_filter(Comparison({paper.SMOOTH: same, paper.CNN: other}, "t"), paper.CNN, 0.01)
+    assert claims.is_own_filter(ManoeuvreErrors({paper.SMOOTH: same, paper.CNN: same}, "t"), paper.CNN, 0.9)
+    assert not claims.is_own_filter(ManoeuvreErrors({paper.SMOOTH: same, paper.CNN: other}, "t"), paper.CNN, 0.9)
+    assert claims.is_own_filter(ManoeuvreErrors({paper.SMOOTH: same, paper.CNN: other}, "t"), paper.CNN, 0.01)
 
 
 def test_groups_in_which_a_candidate_is_best_are_counted() -> None:
     generator = np.random.default_rng(0)
     levels = {paper.MODEL: 3.0, paper.DATA: 2.0, paper.DEEP: 2.0, paper.CNN: 1.0}
-    own = Comparison({name: [made_run(name, noisy(level, generator))] for name, level in levels.items()}, "t")
+    own = ManoeuvreErrors({name: [made_run(name, noisy(level, generator))] for name, level in levels.items()}, "t")
     (found,) = [entry for entry in claims.on_accuracy(own, "d") if getattr(entry, "claim", "").startswith("Fig. 6")]
     assert found.ours.startswith("2 [")  # type: ignore[union-attr]
     assert found.verdict == "not reproduced"  # type: ignore[union-attr]  # of two groups there are not five
@@ -385,7 +355,7 @@ def test_scaling_of_the_full_set_changes_the_filter_and_nothing_else(
 
 
 def test_the_search_compares_validation_with_the_papers_widths(everything: PartArtefacts, runs: dict[str, list[Run]]) -> None:
-    point = PartArtefacts(**{**vars(everything), "models": [own for own in everything.models if own.model_folder.name.startswith(POINT)]})
+    point = replace(everything, models=[own for own in everything.models if own.model_folder.name.startswith(POINT)])
     parts = {"search_5_6": runs_of(point, Prepared(point)), "standard": {paper.DATA: runs[paper.DATA]}}
     assert list(search.points_of(parts, runs)) == [(5, 6), (10, 6)]
     table = search.search_table(parts, runs, "D")
@@ -427,7 +397,7 @@ def test_the_manoeuvre_drawn_is_the_one_with_the_largest_angle_whose_car_did_not
         write_recording(flagged, references["car", name])
         spans.append(Span("car", name, 1.5))
     split = Split("made", SPLIT.train, SPLIT.validation, {"test": tuple(spans)})
-    more = PartArtefacts(**{**vars(part), "references": references, "split": split})
+    more = replace(part, references=references, split=split)
     assert traces.manoeuvre_of(more, Prepared(more), "J-turn").recording == "test_j_turn_2"
     with pytest.raises(DataError, match="no test manoeuvre is a skidpad"):
         traces.manoeuvre_of(part, Prepared(part), "skidpad")
@@ -435,7 +405,7 @@ def test_the_manoeuvre_drawn_is_the_one_with_the_largest_angle_whose_car_did_not
 
 def test_manoeuvres_in_two_ranges_are_refused(part: PartArtefacts) -> None:
     spans = (*SPLIT.tests["test"], Span("car", "test_lap_1", 4.0))
-    twice = PartArtefacts(**{**vars(part), "split": Split("made", SPLIT.train, SPLIT.validation, {"test": spans})})
+    twice = replace(part, split=Split("made", SPLIT.train, SPLIT.validation, {"test": spans}))
     with pytest.raises(DataError, match="has several ranges, but a manoeuvre is one"):
         runs_of(twice, Prepared(twice))
 

@@ -6,15 +6,16 @@ import math
 from pathlib import Path
 
 import numpy as np
-import pandas as pd
 import pytest
+from study_parts import metric_rows, part_of
 
 from vehest.data.errors import DataError
 from vehest.data.splits import Span, Split
 from vehest.evaluation.metrics import Protocol
-from vehest.studies.artefacts import METRIC_COLUMNS, EvaluatedModel, PartArtefacts
+from vehest.studies.artefacts import EvaluatedModel, PartArtefacts
 from vehest_papers.ksnn import paper, scatter, tables
 from vehest_papers.ksnn.candidates import category_of, chosen, chosen_by_category, runs_of, structure_of
+from vehest_papers.ksnn.schemes import Scheme
 
 SPLIT = Split(
     "scheme",
@@ -45,25 +46,11 @@ def part(figures=FIGURES, drop: str = "") -> PartArtefacts:
             values |= {(test, "n_parameters"): 2 + seed * 0, (test, "epochs"): 10 * (seed + 1) * (estimator != "luenberger")}
         for test in ("validation", "c2", "f2"):
             values |= {(test, "r2"): 1 - values[test, "fvu"], (test, "rmse_sideslip"): 2.0 * values[test, "rmse_vy"]}
-        for (test, metric), value in values.items():
-            if metric != drop:
-                own = ("ksnn", estimator, variant, "cars", "cars", "simulated", test, "all", "nominal", 20.0, "causal", seed, metric, value)
-                rows.append((*own, "1", None, None))
         models.append(EvaluatedModel(estimator, variant, f"{estimator} {variant}", seed, Path("m"), Path("e")))
-    return PartArtefacts(
-        study="ksnn",
-        title="t",
-        about="a",
-        command="c",
-        split=SPLIT,
-        protocol=Protocol(),
-        kinds={"cars": "simulated"},
-        data_titles={"cars": "Cars"},
-        metrics=pd.DataFrame(rows, columns=list(METRIC_COLUMNS)),
-        models=models,
-        references={},
-        facts=[],
-    )
+        rows += [
+            row for (test, metric), value in values.items() if metric != drop for row in metric_rows(models[-1], test, {metric: value})
+        ]
+    return part_of(SPLIT, Protocol(), models, rows, kinds={"cars": "simulated"}, data_titles={"cars": "Cars"})
 
 
 def test_runs_have_a_row_a_model_with_all_metrics():
@@ -146,8 +133,8 @@ def test_every_candidate_is_in_the_file_of_its_scheme():
 
 
 def test_the_scatter_shows_ours_filled_and_the_papers_hollow():
-    runs = runs_of(part())
-    schemes = [scatter.Scheme("One", runs, paper.TABLE_IV, "c2", "f2"), scatter.Scheme("Two", runs, paper.TABLE_V, "f2", "c2")]
+    one, two = (("c2", "f2", paper.TABLE_IV), ("f2", "c2", paper.TABLE_V))
+    schemes = [Scheme("scheme_1", "One", part(), *one), Scheme("scheme_2", "Two", part(), *two)]
     figure = scatter.two_tests(schemes, "caption").static
     assert len(figure.axes) == 4
     upper_left = figure.axes[0]

@@ -10,18 +10,19 @@ import numpy as np
 import pandas as pd
 import pytest
 import torch
+from study_parts import metric_rows, part_of, stored
 
 from vehest.data.errors import ConfigurationError, DataError
 from vehest.data.estimate import Estimate
 from vehest.data.recording import Recording
 from vehest.data.splits import VALIDATION, Span, Split
-from vehest.data.store import read_estimate, write_estimate, write_recording
+from vehest.data.store import read_estimate, write_estimate
 from vehest.estimators.learned_ukf import LearnedUkf
 from vehest.estimators.model_files import save_model
 from vehest.evaluation.metrics import Protocol, accuracy, reference_state, score_all, sequences
 from vehest.evaluation.significance import Interval
 from vehest.report.document import Figure, Table, write_document
-from vehest.studies.artefacts import METRIC_COLUMNS, EvaluatedModel, PartArtefacts, StudyArtefacts
+from vehest.studies.artefacts import EvaluatedModel, PartArtefacts, StudyArtefacts
 from vehest.training.through_filter import Drive
 from vehest_papers.learned_ukf import claims, documents, friction, paper, tables
 from vehest_papers.learned_ukf.additions import (
@@ -35,7 +36,7 @@ from vehest_papers.learned_ukf.additions import (
 )
 from vehest_papers.learned_ukf.candidates import candidate_of, chosen, models_by_candidate, runs_of, scored_of
 from vehest_papers.learned_ukf.departures import departures, settings_table
-from vehest_papers.learned_ukf.errors import Errors
+from vehest_papers.learned_ukf.errors import Losses
 from vehest_papers.learned_ukf.filtering import definiteness, drives_of, filtered, loaded, one_step_squares, squares_of, swapped, weighted
 from vehest_papers.learned_ukf.lengths import lengths
 from vehest_papers.learned_ukf.oracle import TRAINING, train_on
@@ -91,10 +92,6 @@ def part(tmp_path_factory: pytest.TempPathFactory) -> PartArtefacts:
     """Five filters and a network, two seeds each, on two sets of three sequences."""
     folder = tmp_path_factory.mktemp("study")
     recordings = {name: recording(name, seed=number) for number, name in enumerate(SPANS)}
-    references = {}
-    for name, own in recordings.items():
-        references["car", name] = folder / f"{name}.parquet"
-        write_recording(own, references["car", name])
     models, rows = [], []
     for candidate in (*CANDIDATES, "GRU"):
         for seed in (0, 1):
@@ -102,7 +99,7 @@ def part(tmp_path_factory: pytest.TempPathFactory) -> PartArtefacts:
             home.mkdir()
             estimator = filter_of(seed, **CANDIDATES[candidate]) if candidate in CANDIDATES else None
             name, variant = (estimator.name, estimator.variant) if estimator else ("velocity_gru", "states_64")
-            figures: dict[tuple[str, str], float] = {}
+            models.append(EvaluatedModel(name, variant, candidate, seed, home, home, AS_THE_PAPER if estimator else {}))
             for test, span in {"validation": SPANS["judged"], "tyre_a": SPANS["a"], "tyre_d": SPANS["d"]}.items():
                 pieces = sequences([span], lambda span: recordings[span.recording], PROTOCOL)
                 cut = [recordings[span.recording].cut(piece.start, piece.stop) for piece in pieces]
@@ -111,31 +108,16 @@ def part(tmp_path_factory: pytest.TempPathFactory) -> PartArtefacts:
                 for position, estimate in enumerate(own):
                     write_estimate(estimate, home / test / f"{position}.parquet")
                 scored = score_all(own.__getitem__, [span], lambda span: recordings[span.recording], PROTOCOL)
-                figures |= {(test, metric): value for metric, value in accuracy(scored).items()}
-                figures |= {(test, "n_parameters"): 100, (test, "epochs"): 4, (test, "n_sequences"): 3}
+                figures = accuracy(scored) | {"n_parameters": 100, "epochs": 4, "n_sequences": 3}
+                rows += metric_rows(models[-1], test, figures)
             if estimator:
                 save_model(estimator, home)
                 pd.DataFrame({"metric": ["skipped_steps", "best_epoch"], "value": [1.0, 2.0]}).to_csv(home / "fit.csv", index=False)
                 history = pd.DataFrame({"phase": [0.0, 1.0, 1.0], "epoch": [1, 1, 2], "train_loss": 1.0, "validation_loss": 1.0})
                 history.to_csv(home / "history.csv", index=False)
-            models.append(EvaluatedModel(name, variant, candidate, seed, home, home, AS_THE_PAPER if estimator else {}))
-            head = ("learned_ukf", name, variant, "car", "car", "simulated")
-            tail = ("all", "nominal", 100.0, "causal", seed)
-            rows += [(*head, test, *tail, metric, value, "1", None, None) for (test, metric), value in figures.items()]
-    return PartArtefacts(
-        study="learned_ukf",
-        title="t",
-        about="a",
-        command="c",
-        split=SPLIT,
-        protocol=PROTOCOL,
-        kinds={"car": "simulated"},
-        data_titles={"car": "A car"},
-        metrics=pd.DataFrame(rows, columns=list(METRIC_COLUMNS)),
-        models=models,
-        references=references,
-        facts=["Recordings are made", "learned_ukf: through_filter"],
-    )
+    facts = ["Recordings are made", "learned_ukf: through_filter"]
+    kinds, titles, references = {"car": "simulated"}, {"car": "A car"}, stored(folder, "car", recordings)
+    return part_of(SPLIT, PROTOCOL, models, rows, kinds=kinds, data_titles=titles, references=references, facts=facts)
 
 
 def constant(own: Recording) -> Estimate:
@@ -161,7 +143,7 @@ def test_candidates_have_the_papers_names(settings, candidate):
 
 
 def test_two_variants_under_one_name_are_refused(part):
-    twice = PartArtefacts(**{**vars(part), "models": [part.models[0], part.models[0]]})
+    twice = replace(part, models=[part.models[0], part.models[0]])
     with pytest.raises(DataError, match="NNT was trained twice with one seed"):
         models_by_candidate(twice)
 
@@ -198,7 +180,7 @@ def test_report_shows_every_table_and_figure_of_the_paper_and_says_what_its_data
     assert "Not run here, for their budget: the E terms of Equation 3." in text
     assert set(document.data) >= {f"{name}_simulated" for name in ("slip_density", "traces", "figure_5", "figure_6", "pairs_tyre_a")}
     assert "Simulated tyre sets: SIMULATED data" in text
-    assert "Not in this report, since the recordings were not at hand: Real tyre sets" in text
+    assert "Not in this report, since the recordings are missing: Real tyre sets" in text
     assert "authors' public code" not in text
     assert "learned_ukf: through_filter" not in text
     assert "Recordings are made" in text
@@ -207,7 +189,7 @@ def test_report_shows_every_table_and_figure_of_the_paper_and_says_what_its_data
 def only(part: PartArtefacts, candidate: str, training: dict[str, object] | None = None) -> PartArtefacts:
     """The part with one candidate, trained in another way."""
     own = [replace(one, training={**one.training, **(training or {})}) for one in models_by_candidate(part)[candidate]]
-    return PartArtefacts(**{**vars(part), "models": own})
+    return replace(part, models=own)
 
 
 def of_length(part: PartArtefacts, steps: int) -> PartArtefacts:
@@ -217,7 +199,7 @@ def of_length(part: PartArtefacts, steps: int) -> PartArtefacts:
 def test_study_without_its_parts_or_test_sets_is_refused(part):
     with pytest.raises(DataError, match="needs one of the parts: real, simulated"):
         documents(StudyArtefacts("s", "t", "a", "c", {}, {}, []))
-    other = PartArtefacts(**{**vars(part), "split": Split("s", SPLIT.train, SPLIT.validation, {"wet": SPLIT.tests["tyre_a"]})})
+    other = replace(part, split=Split("s", SPLIT.train, SPLIT.validation, {"wet": SPLIT.tests["tyre_a"]}))
     with pytest.raises(DataError, match="must be called tyre_a and tyre_d"):
         documents(StudyArtefacts("s", "t", "a", "c", {}, {"real": other}, []))
 
@@ -270,7 +252,7 @@ def test_one_step_error_of_a_model_on_its_own_motion_is_nothing(part):
 
 
 def test_protocol_without_sequences_is_refused(part):
-    whole = PartArtefacts(**{**vars(part), "protocol": Protocol(100.0, 0.0, 0.2)})
+    whole = replace(part, protocol=Protocol(100.0, 0.0, 0.2))
     with pytest.raises(ConfigurationError, match=r"needs evaluation\.sequence_seconds"):
         drives_of(whole, loaded(model(part, "NNTF")), "tyre_a")
 
@@ -286,15 +268,15 @@ def test_validation_chooses_the_seed_and_tests_do_not(part):
 def test_a_metric_that_is_missing_is_said(part):
     metrics = part.metrics[~((part.metrics["metric"] == "mae_weighted") & (part.metrics["seed"] == 1))]
     with pytest.raises(DataError, match=r"seed1 has no mae_weighted\.tyre_a; evaluate it again"):
-        runs_of(PartArtefacts(**{**vars(part), "metrics": metrics}))
+        runs_of(replace(part, metrics=metrics))
 
 
-def errors_of(**levels: float) -> Errors:
+def errors_of(**levels: float) -> Losses:
     """Twelve sequences of 50 samples, three seeds; losses around a level, in sequences of different difficulty."""
     generator = np.random.default_rng(0)
     hard = np.repeat(generator.uniform(1.0, 3.0, 12), 50)
     squared = {name: np.stack([hard * level * generator.uniform(0.98, 1.02, 600) for _ in range(3)]) for name, level in levels.items()}
-    return Errors(squared, {name: np.sqrt(own) for name, own in squared.items()}, np.repeat(np.arange(12), 50), 100.0)
+    return Losses(squared, {name: np.sqrt(own) for name, own in squared.items()}, np.repeat(np.arange(12), 50), 100.0)
 
 
 def test_tables_show_means_with_intervals_beside_the_paper():
@@ -429,7 +411,7 @@ def test_trials_show_what_validation_chose_and_what_the_tables_use_instead(part)
         own = replace(model(part, "NNTF_UH"), training={"through": {"learning_rate": size}})
         metrics = part.metrics.copy()
         metrics.loc[(metrics["test_set"] == "validation") & (metrics["metric"] == "mse_weighted"), "value"] = validation
-        return PartArtefacts(**{**vars(part), "models": [own], "metrics": metrics})
+        return replace(part, models=[own], metrics=metrics)
 
     table, other = trials_table({"trial_1": trial(1e-3, 0.2), "trial_2": trial(2e-3, 0.1)}, {"NNTF_UH": 1e-3})
     assert table.frame["chosen"].tolist() == ["", "chosen"]
@@ -488,22 +470,22 @@ def test_only_what_departs_from_the_paper_is_said(part):
     ]
     training = {**AS_THE_PAPER, "batch_size": 6, "through": {**PHASE, "max_epochs": 300, "schedule": "cosine"}, "mirrored": 0.5}
     changed = [EvaluatedModel(**{**vars(own), "training": training}) for own in part.models if own.estimator == "learned_ukf"]
-    text = "\n".join(departures({"real": PartArtefacts(**{**vars(part), "models": changed})}))
+    text = "\n".join(departures({"real": replace(part, models=changed)}))
     assert "Batches of 6 sequences" in text
     assert "300 epochs (paper: 1000, of one batch each); a step size of 0.0005 that falls to zero along a cosine" in text
     assert "mirror" in text
-    table = settings_table({"real": PartArtefacts(**{**vars(part), "models": changed})})
+    table = settings_table({"real": replace(part, models=changed)})
     assert table[(table["candidate"] == "NNT") & (table["setting"] == "through.max_epochs")]["value"].tolist() == [300]
 
 
 def test_lengths_are_those_of_trainings_through_the_filter(part):
-    own = PartArtefacts(**{**vars(part), "models": [model(part, "NNTF_U")]})
+    own = replace(part, models=[model(part, "NNTF_U")])
     (row,) = lengths({"length_500": own})
     assert (row.steps, row.epochs) == (500, 1000)
     (row,) = lengths({"length_50": of_length(part, 50)})
     assert (row.sequences, row.batches) == (6, 3), "a drive of 3.2 s"
     with pytest.raises(DataError, match="was not trained through the filter"):
-        lengths({"length_500": PartArtefacts(**{**vars(part), "models": [model(part, "GRU")]})})
+        lengths({"length_500": replace(part, models=[model(part, "GRU")])})
 
 
 # Comparisons that were added
@@ -512,14 +494,11 @@ def test_lengths_are_those_of_trainings_through_the_filter(part):
 def subject_of(squared: dict[str, np.ndarray], title: str = "own", validation: tuple[float, ...] = ()) -> Subject:
     """A candidate with planted losses, three seeds."""
     models = [EvaluatedModel("learned_ukf", "nntf_uh", title, seed, Path(), Path()) for seed in (0, 1, 2)]
-    rows = [
-        ("s", "learned_ukf", "nntf_uh", "c", "c", "real", VALIDATION, "all", "nominal", 100.0, "causal", seed, "mse_weighted", value)
-        for seed, value in enumerate(validation)
-    ]
-    metrics = pd.DataFrame([(*row, "1", None, None) for row in rows], columns=list(METRIC_COLUMNS))
-    part = PartArtefacts("s", "t", "a", "c", SPLIT, PROTOCOL, {}, {}, metrics, models, {}, [])
+    values = zip(models, validation, strict=False)
+    rows = [row for own, value in values for row in metric_rows(own, VALIDATION, {"mse_weighted": value})]
+    part = part_of(SPLIT, PROTOCOL, models, rows)
     sequence = np.repeat(np.arange(12), 50)
-    errors = {test: Errors({title: own}, {title: np.sqrt(own)}, sequence, 100.0) for test, own in squared.items()}
+    errors = {test: Losses({title: own}, {title: np.sqrt(own)}, sequence, 100.0) for test, own in squared.items()}
     return Subject(title, part, models, errors, title)
 
 

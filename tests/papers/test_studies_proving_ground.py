@@ -24,10 +24,10 @@ from vehest.report.document import Document, write_document
 from vehest.simulation.plant.parameters import Vehicle
 from vehest.studies.artefacts import AbsentDataset, StoredDataset, StudyArtefacts
 from vehest_papers.proving_ground import documents, gates
+from vehest_papers.proving_ground.drawing import Distribution, beyond
 from vehest_papers.proving_ground.handling import HandlingPoints, characteristic, single_track_gradient
 from vehest_papers.proving_ground.noise import spectra
 from vehest_papers.proving_ground.papers import PROFILES, page_of
-from vehest_papers.proving_ground.recording_figures import Distribution, beyond
 from vehest_papers.proving_ground.tally import FINE, Grid, Tally
 from vehest_papers.proving_ground.vehicles import CHANNELS, busiest_stretch, set_of, survey
 

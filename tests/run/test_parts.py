@@ -73,7 +73,7 @@ def test_parts_run_as_one_study_and_the_next_run_skips_all(parts_place):
     assert (about["parts"], about["absent"]) == (["scheme_1", "scheme_2"], ["ferrari_drive"])
     report = (results / "report.md").read_text(encoding="utf-8")
     assert report.startswith("# Both ways\n\n**SIMULATED:**")
-    assert "Not in this report, since the recordings were not at hand: Elsewhere" in report
+    assert "Not in this report, since the recordings are missing: Elsewhere" in report
     for target in re.findall(r"\]\(([^)]+)\)", report):
         assert (results / target).is_file(), target
 

@@ -10,10 +10,16 @@ from measured_drive import CHANNELS, RATE, measured_drive
 
 from vehest.data.errors import DataError
 from vehest.trust.autoregression import Autoregression, fit_autoregression, learn_noise_levels
-from vehest_papers.trust.oracle import Oracle, filtered, learn_oracle, levels_at, likelihood_ratio_delay, motion_of
+from vehest_papers.trust.oracle import Oracle, filtered, known_test, learn_oracle, levels_at, motion_of
 
 COEFFICIENTS = np.array([[[0.6, 0.2], [-0.1, 0.5]], [[0.2, 0.0], [0.1, 0.3]]])
 COVARIANCE = np.array([[1.0, 0.3], [0.3, 0.5]])
+
+
+def likelihood_ratio_delay(signature, innovations, covariance, threshold) -> int | None:
+    """Samples from the onset of a known fault to its alarm; None if there is none."""
+    above = np.flatnonzero(np.cumsum(known_test(signature, covariance)(innovations + signature)) > threshold)
+    return int(above[0]) + 1 if len(above) else None
 
 
 def planted(samples: int, seed: int = 0) -> np.ndarray:

@@ -5,8 +5,11 @@ report -> `publish_study` -> results/STUDY, provenance.json with keys -> `publis
 
 from __future__ import annotations
 
+import csv
+import hashlib
+import io
 import json
-import shutil
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -22,6 +25,7 @@ from vehest.run.locks import Lock, held
 RESULTS = Path("results")
 PAGE_ENDING = ".html"
 PROVENANCE = "provenance.json"
+DIGITS = 6
 
 
 @dataclass(frozen=True)
@@ -55,6 +59,8 @@ def published_in(folder: Path) -> Published | None:
 def publish_study(publication: Publication | None, report: Artefact, messages: Messages) -> Path | None:
     """Copy a study's report without pages and times to results/STUDY, with keys in its provenance; returns the folder, if it is published.
 
+    CSV files are published with six significant digits (`published_content`).
+
     A published report that shows data which this run could not read stays. Where keys and all other files are the same, the provenance
     stays that of the first run with these results.
 
@@ -80,18 +86,40 @@ def _publish(report: Artefact, folder: Path, keys: Mapping[str, Mapping[str, str
     """Publish a report, unless that changes nothing."""
     if any(part.is_symlink() for part in (folder, folder.parent)):
         raise ConfigurationError(f"'{folder}' leads elsewhere through a link; remove the link or set publish: false")
-    wanted = {name: digest for name, digest in report.outputs.items() if name != TIMINGS and not name.endswith(PAGE_ENDING)}
+    names = [name for name in report.outputs if name != TIMINGS and not name.endswith(PAGE_ENDING)]
+    contents = {name: published_content(report.folder / name) for name in names}
     if folder.is_dir():
         present = {file.relative_to(folder).as_posix(): sha256_of(file) for file in folder.rglob("*") if file.is_file()}
         former = published_in(folder)
+        wanted = {name: hashlib.sha256(content).hexdigest() for name, content in contents.items()}
         if former is not None and former.keys == keys and {**present, PROVENANCE: ""} == {**wanted, PROVENANCE: ""}:
             return False
         if present and PROVENANCE not in present:
             raise ConfigurationError(f"'{folder}' holds files that vehest did not publish; move them away or set publish: false")
     with written_aside(folder, replace_folder=True) as aside:
-        for name in wanted:
+        for name, content in contents.items():
             (aside / name).parent.mkdir(parents=True, exist_ok=True)
-            shutil.copyfile(report.folder / name, aside / name)
+            (aside / name).write_bytes(content)
         about = {**read_json(report.folder / PROVENANCE), "keys": keys}
         (aside / PROVENANCE).write_text(json.dumps(about, indent=1, ensure_ascii=False) + "\n", encoding="utf-8", errors="backslashreplace")
     return True
+
+
+def published_content(file: Path) -> bytes:
+    """Content of a file as it is published: numbers of a CSV file with `DIGITS` significant digits, which other machines reproduce."""
+    if file.suffix != ".csv":
+        return file.read_bytes()
+    text = io.StringIO(newline="")
+    with file.open(encoding="utf-8", newline="") as lines:
+        csv.writer(text, lineterminator="\n").writerows([_rounded(cell) for cell in row] for row in csv.reader(lines))
+    return text.getvalue().encode("utf-8")
+
+
+def _rounded(cell: str) -> str:
+    """A number with more digits than `DIGITS` rounded; whole numbers and text as they are."""
+    try:
+        value = float(cell)
+    except ValueError:
+        return cell
+    kept = "." not in cell or len(cell) <= DIGITS or not math.isfinite(value) or value.is_integer()
+    return cell if kept else repr(float(f"{value:.{DIGITS}g}"))

@@ -1,4 +1,4 @@
-"""What the paper says of its methods, one entry a statement, with the comparisons that decide it; rules: docs/cnn_ukf.md."""
+"""The paper's statements on its methods, one entry each, with the comparisons that decide it; rules: docs/cnn_ukf.md."""
 
 from __future__ import annotations
 
@@ -7,19 +7,19 @@ from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
 import pandas as pd
-from numpy.typing import NDArray
 from scipy import stats
 
 from vehest.constants import FloatArray
 from vehest.report.style import fixed
-from vehest.studies.kit.claims import Claim, Verdict
 from vehest_papers.cnn_ukf import paper
 from vehest_papers.cnn_ukf.limited import AS_TUNED, OF_THE_FULL_SET, Limited
 from vehest_papers.cnn_ukf.manoeuvres import GROUPS, is_nonlinear
-from vehest_papers.cnn_ukf.measures import ME, ME_NL, MSE, MSE_NL, Comparison, whole
+from vehest_papers.cnn_ukf.measures import ME, ME_NL, MSE, MSE_NL, ManoeuvreErrors, whole
 from vehest_papers.cnn_ukf.networks import Outputs
 from vehest_papers.cnn_ukf.perturbed import NOMINAL, Perturbed
 from vehest_papers.cnn_ukf.subjects import Run
+from vehest_papers.kit.claims import Claim, Verdict, verdict_below, verdict_of_all
+from vehest_papers.kit.reading import with_interval
 from vehest_papers.kit.statements import Change, Compared, Expected, Measured, Statement, short
 
 LEVEL = 0.10
@@ -30,10 +30,10 @@ WEAK = ("braking in the turn", "J-turn", "skidpad")
 AROUND_PEAK = 10  # samples before and after
 HIGH, LOW = 5.0, 1.0  # deg of |β|
 OutputsOf = Mapping[str, Sequence[Sequence[Outputs]]]
-"""Hybrid -> what its networks say, seed by seed, manoeuvre by manoeuvre."""
+"""Hybrid -> outputs of its networks, seed by seed, manoeuvre by manoeuvre."""
 
 
-def on_accuracy(main: Comparison, data: str) -> list[Statement | Claim]:
+def on_accuracy(main: ManoeuvreErrors, data: str) -> list[Statement | Claim]:
     """Table II, Figures 5 to 7."""
     found: list[Statement | Claim] = []
     for indicator, header in HEADERS.items():
@@ -59,7 +59,7 @@ def on_accuracy(main: Comparison, data: str) -> list[Statement | Claim]:
     return found
 
 
-def on_parts(main: Comparison, data: str) -> list[Statement | Claim]:
+def on_parts(main: ManoeuvreErrors, data: str) -> list[Statement | Claim]:
     """Why: training through the filter, adaptive noise, the pseudo-measurement; and what the paper does not compare with."""
 
     def without(name: str, words: str, known: str, indicators: Sequence[str] = (MSE_NL,)) -> Statement:
@@ -95,18 +95,18 @@ def on_parts(main: Comparison, data: str) -> list[Statement | Claim]:
     return list(entries)
 
 
-def on_networks(main: Comparison, outputs: OutputsOf, data: str) -> list[Statement | Claim]:
+def on_networks(main: ManoeuvreErrors, outputs: OutputsOf, data: str) -> list[Statement | Claim]:
     """Figure 8: distrust and process noise."""
     found: list[Statement | Claim] = []
     correlations, words = [], []
     for hybrid in paper.HYBRIDS:
         value, low, high = _over_samples(main, outputs[hybrid], _rank_correlation)
         correlations.append((low, high))
-        words.append(f"{hybrid} {fixed(value, 2)} [{fixed(low, 2)}, {fixed(high, 2)}]")
+        words.append(f"{hybrid} {with_interval(value, low, high, 2)}")
     found.append(_of_ends("σ_DD rises with the network's error (rank correlation)", "Fig. 8c", "; ".join(words), data, correlations, 0.0))
     value, low, high = _over_samples(main, outputs[paper.CNN], _decades)
     other, other_low, other_high = _over_samples(main, outputs[paper.DEEP], _decades)
-    ours = f"{fixed(value, 1)} [{fixed(low, 1)}, {fixed(high, 1)}] and {fixed(other, 1)} [{fixed(other_low, 1)}, {fixed(other_high, 1)}]"
+    ours = f"{with_interval(value, low, high, 1)} and {with_interval(other, other_low, other_high, 1)}"
     apart: Verdict = "reproduced" if low > other_high else "not reproduced" if high < other_low else "undecided"
     found.append(Claim("CNN-UKF's σ_DD spans more decades than DE-UKF's (1 to 99 %)", "3 and 1", ours, data, apart, "intervals"))
     for words_of_claim, known, statistic, limit in (
@@ -121,7 +121,7 @@ def on_networks(main: Comparison, outputs: OutputsOf, data: str) -> list[Stateme
 
 def on_robustness(found: Perturbed, data: str) -> list[Statement | Claim]:
     """Figure 14."""
-    comparisons = [Comparison(runs, "test", paired=True) for runs in found.stiffness]
+    comparisons = [ManoeuvreErrors(runs, "test", paired=True) for runs in found.stiffness]
     rises = {}
     for candidate in (paper.MODEL, *paper.HYBRIDS):
         worst = max(comparisons, key=lambda own, candidate=candidate: own.get(candidate, MSE).value)  # type: ignore[misc]
@@ -135,16 +135,18 @@ def on_robustness(found: Perturbed, data: str) -> list[Statement | Claim]:
         ),
         Statement("DE-UKF's rises less than CNN-UKF's", "Fig. 14", data, [Compared("", Change.of(rises[paper.DEEP], rises[paper.CNN]))]),
     ]
-    unpaired = [Comparison(runs, "test") for runs in found.stiffness]
+    unpaired = [ManoeuvreErrors(runs, "test") for runs in found.stiffness]
     changes = [own.change(paper.CNN, paper.DEEP, MSE_NL) for own in unpaired]
-    below, above = sum(own.ends()[1] < 1.0 for own in changes), sum(own.ends()[0] > 1.0 for own in changes)
-    verdict: Verdict = "reproduced" if below == len(changes) else "not reproduced" if above else "undecided"
+    verdicts = [verdict_below(*own.ends(), 1.0) for own in changes]
+    below, above = verdicts.count("reproduced"), verdicts.count("not reproduced")
     low, high = min(own.ends()[0] for own in changes), max(own.ends()[1] for own in changes)
     ours = f"below in {below}, above in {above} of {len(changes)}; −{short(100 * (1 - low))} to {short(100 * (high - 1))} %"
-    entries.append(Claim("CNN-UKF below DE-UKF in MSE_nl in all nine combinations", "all", ours, data, verdict, "intervals"))
+    entries.append(
+        Claim("CNN-UKF below DE-UKF in MSE_nl in all nine combinations", "all", ours, data, verdict_of_all(verdicts), "intervals")
+    )
     if found.tuned:
         from_there = next(runs for runs in found.stiffness if runs is found.stiffness[0])
-        own = Comparison({"tuned": found.tuned, "as trained": from_there[paper.DEEP]}, "test")
+        own = ManoeuvreErrors({"tuned": found.tuned, "as trained": from_there[paper.DEEP]}, "test")
         entries.append(
             Statement(
                 "MSE_nl lower with p₁, p₂ tuned anew where stiffness is off by −10 %",
@@ -213,7 +215,7 @@ def _level(change: Change) -> Verdict:
     return "reproduced" if within else "not reproduced" if without else "undecided"
 
 
-def is_own_filter(main: Comparison, hybrid: str, shift: float) -> bool:
+def is_own_filter(main: ManoeuvreErrors, hybrid: str, shift: float) -> bool:
     """Whether a hybrid is to be called its own filter: it hardly listens, or its errors are level with its filter's."""
     if shift < 0.05:
         return True
@@ -227,15 +229,14 @@ def _known(first: str, second: str, indicator: str) -> str:
     return fixed(change, 0 if abs(change) >= 1 else 1)
 
 
-def _to_limit(main: Comparison, candidate: str, indicator: str, limit: float) -> Compared:
+def _to_limit(main: ManoeuvreErrors, candidate: str, indicator: str, limit: float) -> Compared:
     change = Change.of(main.get(candidate, indicator), None, limit)
     return Compared(HEADERS[indicator], change, "lower", shown="ratio", limit=limit)
 
 
 def _of_ends(words: str, known: str, ours: str, data: str, ends: Sequence[tuple[float, float]], limit: float) -> Claim:
     """The claim that all of some figures lie above a limit, by their intervals."""
-    above, below = all(low > limit for low, _ in ends), any(high < limit for _, high in ends)
-    verdict: Verdict = "reproduced" if above else "not reproduced" if below else "undecided"
+    verdict = verdict_of_all([verdict_below(-high, -low, -limit) for low, high in ends])
     return Claim(words, known, ours, data, verdict, f"against {limit:g}")
 
 
@@ -249,7 +250,7 @@ def _nonlinear_moments(run: Run) -> tuple[FloatArray, FloatArray, FloatArray]:
     return first, second, count
 
 
-def _narrowest(main: Comparison, data: str) -> Statement:
+def _narrowest(main: ManoeuvreErrors, data: str) -> Statement:
     """Standard deviations of the error where non-linear, over all manoeuvres (Figure 5)."""
     spread = {}
     for name in paper.OF_FOUR:
@@ -262,15 +263,15 @@ def _narrowest(main: Comparison, data: str) -> Statement:
     return Statement("Fig. 5: CNN-UKF's errors spread least (variance, non-linear)", "lowest s.d.", data, tests)
 
 
-def _nearest_zero(main: Comparison, data: str) -> Claim:
+def _nearest_zero(main: ManoeuvreErrors, data: str) -> Claim:
     """Means of the error where non-linear (Figure 5)."""
 
-    def statistic(runs: Sequence[Run], counts: NDArray[np.int64]) -> float:
+    def statistic(runs: Sequence[Run], counts: FloatArray) -> float:
         moments = [_nonlinear_moments(run) for run in runs]
         return float(np.mean([float(counts @ first) / max(float(counts @ count), 1.0) for first, _, count in moments]))
 
     means = {name: main.of_statistic(name, statistic) for name in paper.OF_FOUR}
-    ours = "; ".join(f"{name} {fixed(value, 3)} [{fixed(low, 3)}, {fixed(high, 3)}]°" for name, (value, low, high) in means.items())
+    ours = "; ".join(f"{name} {with_interval(*own, 3)}°" for name, own in means.items())
     _, low, high = means[paper.CNN]
     largest = max(abs(low), abs(high))
     others = [(0.0 if low <= 0.0 <= high else min(abs(low), abs(high))) for name, (_, low, high) in means.items() if name != paper.CNN]
@@ -280,7 +281,7 @@ def _nearest_zero(main: Comparison, data: str) -> Claim:
     return Claim("Fig. 5: CNN-UKF's mean error nearest zero (non-linear)", "yes", ours, data, verdict, "intervals")
 
 
-def _groups(main: Comparison, data: str) -> Claim:
+def _groups(main: ManoeuvreErrors, data: str) -> Claim:
     """In how many groups of manoeuvres CNN-UKF has the lowest MSE_nl of the four (Figure 6)."""
     groups = [group for group in GROUPS.values() if group in main.groups]
     values = np.array(
@@ -295,11 +296,11 @@ def _groups(main: Comparison, data: str) -> Claim:
     return Claim("Fig. 6: CNN-UKF best in MSE_nl in five groups or more", "5 of 7", ours, data, verdict, "against 5")
 
 
-def _of_group(main: Comparison, group: str) -> list[Measured]:
+def _of_group(main: ManoeuvreErrors, group: str) -> list[Measured]:
     return [main.get(name, MSE_NL, group) for name in paper.OF_FOUR]
 
 
-def _peaks(main: Comparison, data: str) -> Statement:
+def _peaks(main: ManoeuvreErrors, data: str) -> Statement:
     """Absolute errors about the largest |β| of each slalom (Figure 7)."""
     kept = np.array([float(group == "slalom") for group in main.groups])
     measured = {}
@@ -316,7 +317,7 @@ def _peaks(main: Comparison, data: str) -> Statement:
     return Statement(f"Fig. 7: CNN-UKF errs least at the slaloms' peaks ({int(kept.sum())} peaks)", "yes", data, tests)
 
 
-def _difference(worst: Comparison, nominal: Comparison, candidate: str) -> Measured:
+def _difference(worst: ManoeuvreErrors, nominal: ManoeuvreErrors, candidate: str) -> Measured:
     """By how much a candidate's worst MSE exceeds its MSE as identified, drawn together."""
     one, other = worst.get(candidate, MSE), nominal.get(candidate, MSE)
     draws = np.log(np.maximum(np.exp(one.draws) - np.exp(other.draws), 1e-9))
@@ -331,7 +332,7 @@ def _squares(outputs: Sequence[Sequence[Outputs]]) -> tuple[FloatArray, FloatArr
 
 
 def _over_samples(
-    main: Comparison, outputs: Sequence[Sequence[Outputs]], statistic: Callable[[Sequence[Outputs]], float]
+    main: ManoeuvreErrors, outputs: Sequence[Sequence[Outputs]], statistic: Callable[[Sequence[Outputs]], float]
 ) -> tuple[float, float, float]:
     """A figure of all samples, mean over seeds, with its interval over 200 resamples of manoeuvres and seeds."""
     generator, count = np.random.default_rng(0), len(main.manoeuvres)

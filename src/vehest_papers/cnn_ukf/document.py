@@ -14,12 +14,10 @@ from vehest.estimators.network_ukf import LEAST_VARIANCE
 from vehest.report.document import REPORT, Block, Column, Document, Table, as_code
 from vehest.report.style import fixed, listed
 from vehest.studies.artefacts import StudyArtefacts
-from vehest.studies.kit.claims import Claim, claims_table
 from vehest_papers.cnn_ukf import claims, distributions, observability, paper, perturbed, search, tables, traces
 from vehest_papers.cnn_ukf.limited import Limited, limited
-from vehest_papers.cnn_ukf.measures import MSE, MSE_NL, Comparison
-from vehest_papers.cnn_ukf.networks import outputs_of, shift_of
-from vehest_papers.cnn_ukf.oracles import oracles
+from vehest_papers.cnn_ukf.measures import MSE, MSE_NL, ManoeuvreErrors
+from vehest_papers.cnn_ukf.networks import oracles, outputs_of, shift_of
 from vehest_papers.cnn_ukf.subjects import (
     CUTOFF_HZ,
     KPIS,
@@ -35,10 +33,12 @@ from vehest_papers.cnn_ukf.subjects import (
     kpi_table,
     runs_of,
 )
+from vehest_papers.kit import methods
+from vehest_papers.kit.claims import Claim, claims_table
 from vehest_papers.kit.reading import spans_in_words, words_of_kinds
 from vehest_papers.kit.statements import decided
 
-FULL, BEFORE, FREE, ABLATION, STANDARD, LIMITED = "full", "before", "free", "ablation", "standard", "limited"
+FULL, BEFORE, FREE, STANDARD, LIMITED = "full", "before", "free", "standard", "limited"
 RENAMED = {
     BEFORE: {paper.CNN: paper.BEFORE},
     FREE: {paper.SMOOTH: paper.FREE, paper.CNN: paper.CNN_FREE},
@@ -88,7 +88,7 @@ def _together(parts: Mapping[str, Runs]) -> dict[str, Sequence[Run]]:
 
 def _report(artefacts: StudyArtefacts, parts: Mapping[str, Runs], runs: Runs, prepared: Mapping[str, Prepared]) -> Document:
     kind = words_of_kinds(artefacts.parts[FULL])
-    main, own = Comparison(runs, "test"), prepared[FULL]
+    main, own = ManoeuvreErrors(runs, "test"), prepared[FULL]
     hybrids = [name for name in runs if _is_hybrid(runs[name][0]) and name != paper.ORACLE_DISTRUST]
     outputs = {name: [outputs_of(run, own) for run in runs[name]] for name in hybrids}
     shifts = {name: [shift_of(run, own) for run in runs[name]] for name in hybrids}
@@ -123,7 +123,7 @@ def _report(artefacts: StudyArtefacts, parts: Mapping[str, Runs], runs: Runs, pr
         overview(artefacts, parts, main, titles),
         "## Appendix: networks and process noise",
         tables.networks_alone(
-            main, outputs, "networks_full", f"What hybrids' networks say, and what filters make of it. Data: {kind.upper()}."
+            main, outputs, "networks_full", f"Outputs of the hybrids' networks, and of their filters. Data: {kind.upper()}."
         ),
     ]
     if learnt is not None:
@@ -154,17 +154,20 @@ def _filter(run: Run) -> DugoffUkf:
 
 
 def _asked(
-    artefacts: StudyArtefacts, main: Comparison, driven: Comparison, titles: Mapping[str, str], active: pd.DataFrame, learnt: Limited | None
+    artefacts: StudyArtefacts,
+    main: ManoeuvreErrors,
+    driven: ManoeuvreErrors,
+    titles: Mapping[str, str],
+    active: pd.DataFrame,
+    learnt: Limited | None,
 ) -> list[Block]:
     kind = words_of_kinds(artefacts.parts[FULL]).upper()
     count = len(main.manoeuvres)
     words = (
-        f"**{kind} data**, {count} test manoeuvres that chose nothing, scored until |β| exceeds 12°; the paper's recordings "
-        "are real, of a BMW 545i, and not public. "
-        f"{artefacts.about}"
+        f"**{kind} data**, {count} held-out test manoeuvres, scored until |β| exceeds 12°; the paper's recordings are real, of a "
+        f"BMW 545i, and not public. {artefacts.about}"
     )
-    if artefacts.absent:
-        words += f" Not in this report: {'; '.join(artefacts.titles[name] for name in artefacts.absent)}."
+    words += methods.absent_parts(artefacts)
     four = sorted(paper.OF_FOUR, key=lambda name: main.get(name, MSE_NL).value)
     order = ", ".join(f"{titles[name]} {main.in_words(name, MSE_NL)}" for name in four)
     paper_order = ", ".join(f"{name} {fixed(paper.TABLE_II[name].mse_nonlinear, 3)}" for name in sorted(paper.OF_FOUR, key=_in_paper))
@@ -185,9 +188,11 @@ def _asked(
         )
         sentences.append(f"**Learnt without the limit of handling** (|ay| ≤ 7 m/s²): {order}.")
     shown = ", ".join(f"{name} {driven.in_words(name, MSE_NL)}" for name in (paper.CNN, paper.SMOOTH, paper.FREE) if name in driven)
-    sentences.append(f"**Mind:** {_cut_in_words(driven)} cut at 12°; scored whole, where networks have learnt nothing: {shown} deg².")
+    sentences.append(f"**Mind:** {_cut_in_words(driven)} cut at 12°; scored whole, beyond what networks learnt from: {shown} deg².")
     row = active[active["candidate"] == paper.CNN].iloc[0]
-    sentences.append(f"**Is the network heard?** 1° of β_DD moves β by {fixed(row['shift'], 2)}°; σ_DD, 5/50/95 %: {row['distrust']}°.")
+    sentences.append(
+        f"**Influence of the network on the filter:** 1° of β_DD moves β by {fixed(row['shift'], 2)}°; σ_DD, 5/50/95 %: {row['distrust']}°."
+    )
     return [words, " ".join(sentences)]
 
 
@@ -197,15 +202,15 @@ def _in_paper(name: str) -> float:
 
 def _claims(verdicts: Sequence[Claim]) -> Table:
     note = (
-        "Changes are CNN-UKF's to the other's unless said. Seeds 3 and 4 of the hybrids and the limited set were added after the test had "
-        "been seen, by rules fixed before they were trained. Rules, and an amendment: docs/cnn_ukf.md."
+        "Changes are CNN-UKF's to the other's unless stated. Seeds 3 and 4 of the hybrids and the limited set were added after the test "
+        "had been seen, by rules fixed before they were trained. Rules, and an amendment: docs/cnn_ukf.md."
     )
     return claims_table(verdicts, note)
 
 
 def _results(
     artefacts: StudyArtefacts,
-    main: Comparison,
+    main: ManoeuvreErrors,
     parts: Mapping[str, Runs],
     prepared: Mapping[str, Prepared],
     active: pd.DataFrame,
@@ -224,11 +229,11 @@ def _results(
     )
     published = {titles[name]: known for name, known in paper.TABLE_II.items()}
     shown = {titles.get(name, name): value for name, value in learnt.items()}
-    variants = Comparison({name: main.runs[name] for name in active["candidate"]}, "test")
+    variants = ManoeuvreErrors({name: main.runs[name] for name in active["candidate"]}, "test")
     return [
         traces.compared(four, slalom, "figure_7", 7, "Slalom with the largest sideslip angle of those without a spin", kind),
         "## Full set",
-        tables.accuracy(Comparison(in_table, "test"), published, shown, "table_2", caption),
+        tables.accuracy(ManoeuvreErrors(in_table, "test"), published, shown, "table_2", caption),
         "## Why: what each part of CNN-UKF does",
         tables.ablation(
             variants,
@@ -239,7 +244,7 @@ def _results(
     ]
 
 
-def overview(artefacts: StudyArtefacts, parts: Mapping[str, Runs], main: Comparison, titles: Mapping[str, str]) -> Table:
+def overview(artefacts: StudyArtefacts, parts: Mapping[str, Runs], main: ManoeuvreErrors, titles: Mapping[str, str]) -> Table:
     """What the terminal shows: both errors of both sets, beside the paper's."""
     rows = []
     for name in (FULL, LIMITED):
@@ -268,7 +273,7 @@ def overview(artefacts: StudyArtefacts, parts: Mapping[str, Runs], main: Compari
 
 def _appendices(
     artefacts: StudyArtefacts,
-    main: Comparison,
+    main: ManoeuvreErrors,
     runs: Runs,
     prepared: Mapping[str, Prepared],
     titles: Mapping[str, str],
@@ -317,7 +322,7 @@ def _limited(artefacts: StudyArtefacts, learnt: Limited, prepared: Prepared, kin
         f"and its errors of validation, are those of the full set. Data: {words}."
     )
     training = {name: tables.training_error(chosen(seeds), prepared) for name, seeds in learnt.runs.items()}
-    of_networks = "What hybrids' networks say, and what filters make of it, learnt on the limited set"
+    of_networks = "Outputs of the hybrids' networks, and of their filters, learnt on the limited set"
     return [
         "## Appendix: limited set",
         tables.accuracy(learnt.comparison, paper.TABLE_III, training, "table_3", caption),
@@ -328,8 +333,8 @@ def _limited(artefacts: StudyArtefacts, learnt: Limited, prepared: Prepared, kin
     ]
 
 
-def _networks_and_oracles(parts: Mapping[str, Runs], prepared: Mapping[str, Prepared], main: Comparison, kind: str) -> list[Block]:
-    """Networks without a filter and their search; what nobody can have."""
+def _networks_and_oracles(parts: Mapping[str, Runs], prepared: Mapping[str, Prepared], main: ManoeuvreErrors, kind: str) -> list[Block]:
+    """Networks without a filter and their search; oracles."""
     words, blocks = kind.upper(), list[Block]()
     if len(known := {name: main.runs[name] for name in NETWORKS if name in main}) > 1 or any(map(search.is_point, parts)):
         blocks.append("## Appendix: networks without a filter")
@@ -338,22 +343,22 @@ def _networks_and_oracles(parts: Mapping[str, Runs], prepared: Mapping[str, Prep
         training = {name: tables.training_error(chosen(seeds), own) for name, seeds in known.items()}
         also = {name: main.runs[name] for name in (paper.STATIC_MAP, paper.ZERO) if name in main}
         caption = f"Networks without a filter on the full set: inputs in [0, 1], as z-scores, and a recurrent network. Data: {words}."
-        blocks.append(tables.accuracy(Comparison(known | also, "test"), {}, training, "networks_alone", caption))
+        blocks.append(tables.accuracy(ManoeuvreErrors(known | also, "test"), {}, training, "networks_alone", caption))
     if any(map(search.is_point, parts)):
         blocks.append(search.search_table(parts, parts[FULL], words))
-    oracles_alone = Comparison({name: main.runs[name] for name in (*ORACLES, paper.CNN) if name in main}, "test")
+    oracles_alone = ManoeuvreErrors({name: main.runs[name] for name in (*ORACLES, paper.CNN) if name in main}, "test")
     caption = f"Oracles, which know the test: what better constants and a perfect distrust would be worth. Data: {words}."
     return [*blocks, "## Appendix: oracles", tables.accuracy(oracles_alone, {}, {}, "oracles", caption)]
 
 
-def _whole_drives(artefacts: StudyArtefacts) -> Comparison:
+def _whole_drives(artefacts: StudyArtefacts) -> ManoeuvreErrors:
     """Candidates on all that was driven, without the limit of 12° of the amendment."""
     parts = {name: part for name, part in artefacts.parts.items() if name in (FULL, FREE)}
     runs = _together({name: runs_of(part, Prepared(part, whole=True)) for name, part in parts.items()})
-    return Comparison(runs, "whole")
+    return ManoeuvreErrors(runs, "whole")
 
 
-def _cut_in_words(driven: Comparison) -> str:
+def _cut_in_words(driven: ManoeuvreErrors) -> str:
     """Which of the drives slide beyond the limit of the amendment, by their largest sideslip angles."""
     run = next(iter(driven.runs.values()))[0]
     largest = [max(float(np.abs(part.sideslip_ref).max()) for part in parts) for parts in run.test.values()]
@@ -362,7 +367,7 @@ def _cut_in_words(driven: Comparison) -> str:
     return f"{len(cut)} of {len(largest)} drives, with up to {angles}, {'is' if len(cut) == 1 else 'are'}" if cut else "no drive is"
 
 
-def _all_that_was_driven(own: Comparison, kind: str) -> list[Block]:
+def _all_that_was_driven(own: ManoeuvreErrors, kind: str) -> list[Block]:
     """Indicators without the limit of 12°."""
     rows = [{"candidate": name, **{kpi: own.in_words(name, kpi) for kpi in KPIS}} for name in own.runs]
     columns = {"candidate": Column("method")} | {kpi: Column(header) for kpi, header in KPIS.items()}
@@ -382,7 +387,7 @@ def _filters_and_budget(artefacts: StudyArtefacts, parts: Mapping[str, Runs], ru
         tables.filters(
             {name: own for name, own in titled.items() if name in (FULL, FREE)},
             "filters",
-            "Tyres and levels of noise of the filters; the paper does not give its tyres. A network that says the process noise takes the "
+            "Tyres and levels of noise of the filters; the paper does not give its tyres. A network that gives the process noise takes the "
             f"filter's for its start alone. Variances of the sensors are 10 times those of these levels. Data: {kind}.",
         ),
         tables.scaling(
@@ -404,7 +409,7 @@ def departures(trainings: Mapping[str, Mapping[str, object]]) -> list[str]:
     lines = [
         "Data: simulated manoeuvres in the place of recorded ones, in the mix of the paper's test set, by a car with the paper's mass, "
         "inertia and wheelbase; its tyres, springs and sensors are assumed, each drive has sensors' offsets of its own.",
-        "The filter of the CNN-UKF has the smooth tyres (Eq. 10) in use as well, identified with that curve; the paper says smooth tyres "
+        "The filter of the CNN-UKF has the smooth tyres (Eq. 10) in use as well, identified with that curve; the paper has smooth tyres "
         "of the training only. The same filter alone stands beside it.",
         f"σ_DD is a standard deviation everywhere, R = σ_DD² + {LEAST_VARIANCE:g} rad², where Eq. 6 has a variance; Eq. 11 scales the "
         "variance of the networks' angles, in rad², and R is its result.",
@@ -426,24 +431,22 @@ def departures(trainings: Mapping[str, Mapping[str, object]]) -> list[str]:
     return [
         *lines,
         "What the paper leaves open (epochs, patience, hysteresis and factor of the forces' noise): docs/estimators.md. It optimises "
-        "further settings of its networks by Bayesian optimisation and does not say which; here none are.",
+        "further settings of its networks by Bayesian optimisation which it does not name; here none are.",
     ]
 
 
 def _how_it_was_made(artefacts: StudyArtefacts) -> list[Block]:
     part = artefacts.parts[FULL]
-    protocol = part.protocol
-    facts = list(dict.fromkeys(fact for own in artefacts.parts.values() for fact in own.facts))
+    warm_up = f"; estimators may start up to {part.protocol.warm_up_seconds:g} s before a {part.protocol.piece}"
     lines = [
         f"Command: {as_code(artefacts.command)}, with Optuna installed",
-        f"Evaluation: every estimate is read at {protocol.rate_hz:g} Hz; estimators may start up to {protocol.warm_up_seconds:g} s before "
-        f"a {protocol.piece}, of which the first {protocol.skip_seconds:g} s are not scored, for anyone.{protocol.start_in_words}",
+        methods.scoring(part.protocol, warm_up),
         f"Preprocessing as in the paper: outliers removed, then a zero-phase low-pass of {CUTOFF_HZ:g} Hz on measurements and reference; "
         "both look ahead. Indicators are against the low-passed reference.",
         "MSE over all samples; MSE_nl over those with |ay| ≥ 4 m/s²; ME and ME_nl are the largest absolute error of each manoeuvre, "
         "averaged over manoeuvres. Drives are scored until |β| first exceeds 12°.",
         "Figures that show one seed show the one with the lowest mean RMSE of a validation manoeuvre.",
-        *facts,
+        *methods.facts_of(artefacts.parts.values()),
     ]
     rows = pd.DataFrame(
         [
@@ -461,7 +464,7 @@ def _how_it_was_made(artefacts: StudyArtefacts) -> list[Block]:
     columns = {"part": Column("part"), "kind": Column("data"), "train": Column("training"), "validation": Column("validation")}
     trainings = {candidate_of(model): model.training for model in part.models}
     return [
-        "## Appendix: how it was made\n\n" + "\n".join(f"- {line}" for line in lines),
+        methods.how_it_was_made(lines),
         Table("data", "What was used for what; points of a search as the full set.", rows, columns | {"test": Column("test")}),
-        "### What departs from the paper\n\n" + "\n".join(f"- {line}" for line in departures(trainings)),
+        methods.bullets("### What departs from the paper", departures(trainings)),
     ]

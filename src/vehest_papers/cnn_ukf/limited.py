@@ -10,10 +10,9 @@ from vehest.data.errors import DataError
 from vehest.estimators.ensemble_ukf import EnsembleUkf
 from vehest.estimators.model_files import load_model
 from vehest_papers.cnn_ukf import paper
-from vehest_papers.cnn_ukf.manoeuvres import manoeuvres_of
-from vehest_papers.cnn_ukf.measures import Comparison
+from vehest_papers.cnn_ukf.measures import ManoeuvreErrors
 from vehest_papers.cnn_ukf.networks import Outputs, outputs_of
-from vehest_papers.cnn_ukf.subjects import TEST, Prepared, Run, Runs
+from vehest_papers.cnn_ukf.subjects import Prepared, Run, Runs
 
 
 @dataclass(frozen=True, eq=False)
@@ -23,14 +22,14 @@ class Limited:
     Args:
         comparison: with the filters alone, which are those of the full set, as in the paper.
         runs: candidate -> its seeds, of what learnt.
-        outputs: hybrid -> what its networks say, seed by seed, manoeuvre by manoeuvre.
+        outputs: hybrid -> outputs of its networks, seed by seed, manoeuvre by manoeuvre.
         scaling: DE-UKF as tuned, and with p₁ and p₂ of the full set's, on the same seeds.
     """
 
-    comparison: Comparison
+    comparison: ManoeuvreErrors
     runs: Runs
     outputs: Mapping[str, Sequence[Sequence[Outputs]]]
-    scaling: Comparison
+    scaling: ManoeuvreErrors
 
 
 AS_TUNED, OF_THE_FULL_SET = "tuned on the limited set", "p₁, p₂ of the full set"
@@ -58,10 +57,10 @@ def limited(full: Runs, learnt: Runs, prepared: Prepared) -> Limited:
         OF_THE_FULL_SET: [_with_scaling_of(other, run, prepared) for run, other in pairs],
     }
     return Limited(
-        Comparison({**filters, **learnt}, "test"),
+        ManoeuvreErrors({**filters, **learnt}, "test"),
         learnt,
         {name: [outputs_of(run, prepared) for run in learnt[name]] for name in paper.HYBRIDS},
-        Comparison(scaling, "test", paired=True),
+        ManoeuvreErrors(scaling, "test", paired=True),
     )
 
 
@@ -71,5 +70,4 @@ def _with_scaling_of(other: Run, run: Run, prepared: Prepared) -> Run:
     assert isinstance(changed, EnsembleUkf)
     assert isinstance(known, EnsembleUkf)
     changed.scaling = known.scaling.copy()
-    parts = prepared.score(changed.estimate(prepared.seen(TEST)), TEST)
-    return Run(run.candidate, run.model, run.validation, manoeuvres_of(prepared.spans(TEST), parts))
+    return prepared.estimated_by(changed, run)

@@ -15,6 +15,7 @@ from vehest.constants import FloatArray
 from vehest.data.errors import DataError
 from vehest.data.splits import Span
 from vehest.evaluation.metrics import NONLINEAR_AY, Scored
+from vehest_papers.kit.reading import sideslip_error
 
 GROUPS = {
     "braking": "braking in the turn",
@@ -26,7 +27,7 @@ GROUPS = {
     "spiral": "spiral",
     "lap": "lap",
 }
-"""Part of a recording's name -> the group of manoeuvres that it says the recording is of."""
+"""Part of a recording's name -> the group of manoeuvres of the recording."""
 
 BIN = 0.25  # deg, of Figs. 5 and 11
 
@@ -127,11 +128,6 @@ def error_distribution(parts: Sequence[Scored], width: float = BIN, nonlinear_on
     edges = width * np.arange(first, last + 1)
     counts = np.bincount((np.floor(errors / width) - first).astype(np.int64), minlength=len(edges) - 1)
     return ErrorDistribution(edges, counts, float(errors.mean()), float(errors.std()))
-
-
-def sideslip_error(part: Scored) -> FloatArray:
-    """Estimate - reference, (K,) [deg], within a half turn."""
-    return np.degrees(np.remainder(part.sideslip - part.sideslip_ref + np.pi, 2.0 * np.pi) - np.pi)
 
 
 def is_nonlinear(part: Scored) -> NDArray[np.bool_]:

@@ -6,18 +6,18 @@ import zlib
 from collections.abc import Callable, Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
 from vehest.constants import FloatArray
 from vehest.evaluation.metrics import Scored
 from vehest.evaluation.significance import CONFIDENCE
-from vehest_papers.cnn_ukf.manoeuvres import group_of, is_nonlinear, sideslip_error
+from vehest_papers.cnn_ukf.manoeuvres import group_of, is_nonlinear
 from vehest_papers.cnn_ukf.subjects import Manoeuvres, Run, Runs
+from vehest_papers.kit.reading import sideslip_error
+from vehest_papers.kit.sampled import SampledErrors, resampled
 from vehest_papers.kit.statements import Change, Measured, short
 
 N_RESAMPLES = 4000
 MSE, MSE_NL, ME, ME_NL = "mse", "mse_nonlinear", "max_error", "max_error_nonlinear"
-INDICATORS = (MSE, MSE_NL, ME, ME_NL)
 BALANCED = "balanced"
 """Mean over manoeuvres of their RMSE, by which seeds and settings are chosen."""
 
@@ -45,7 +45,7 @@ def value_of(manoeuvres: Manoeuvres, indicator: str) -> float:
     return float(sums.sum() / sizes.sum())
 
 
-class Comparison:
+class ManoeuvreErrors(SampledErrors):
     """Candidates on one test, all on the same resamples of whole manoeuvres; seeds of each candidate are drawn on their own.
 
     Args:
@@ -55,18 +55,14 @@ class Comparison:
     """
 
     def __init__(self, runs: Runs, name: str, *, paired: bool = False) -> None:
-        self.runs, self.paired = runs, paired
+        super().__init__(runs, paired=paired)
+        self.runs = runs
         self.manoeuvres = list(next(iter(runs.values()))[0].test)
         self.groups = [group_of(manoeuvre) for manoeuvre in self.manoeuvres]
         generator = np.random.default_rng(zlib.crc32(name.encode()))
-        count = len(self.manoeuvres)
-        drawn = generator.multinomial(count - 1, np.full(count, 1.0 / count), size=N_RESAMPLES)  # Rao & Wu 1988
-        self._counts = np.concatenate([np.ones((1, count), dtype=np.int64), drawn])
+        self._counts = resampled(len(self.manoeuvres), N_RESAMPLES, generator)
         self._seed = int(generator.integers(2**31))
         self._known: dict[tuple[str, str, str], Measured] = {}
-
-    def __contains__(self, candidate: object) -> bool:
-        return candidate in self.runs
 
     def get(self, candidate: str, indicator: str, group: str = "") -> Measured:
         """An indicator of a candidate, over all manoeuvres or those of a group."""
@@ -82,13 +78,8 @@ class Comparison:
         """A mean, of sums by seed and manoeuvre (S, M) over sizes (M,)."""
         total = np.maximum(self._counts @ sizes, 1e-12)
         values = self._counts @ sums.T / total[:, None]
-        drawn = values
-        if len(sums) > 1:
-            generator = np.random.default_rng(self._seed if self.paired else zlib.crc32(sums.tobytes()))
-            drawn = np.take_along_axis(values, generator.integers(len(sums), size=(len(values), len(sums) - 1)), axis=1)
-        logs = np.log(np.maximum(drawn[1:].mean(axis=1), 1e-300))
-        own = np.log(np.maximum(values[0], 1e-300))
-        return Measured(float(values[0].mean()), logs, own, len(sizes) if count is None else count, self.paired)
+        generator = np.random.default_rng(self._seed if self.paired else zlib.crc32(sums.tobytes()))
+        return self.figure(values, len(sizes) if count is None else count, generator)
 
     def change(self, first: str, second: str, indicator: str, group: str = "") -> Change:
         """From the second candidate to the first."""
@@ -100,7 +91,7 @@ class Comparison:
         low, high = own.interval
         return f"{short(own.value)} [{short(low)}, {short(high)}]"
 
-    def of_statistic(self, candidate: str, statistic: Callable[[Sequence[Run], NDArray[np.int64]], float]) -> tuple[float, float, float]:
+    def of_statistic(self, candidate: str, statistic: Callable[[Sequence[Run], FloatArray], float]) -> tuple[float, float, float]:
         """Any figure of a candidate's seeds and how often each manoeuvre counts, with the 2.5 and 97.5 % of 500 resamples."""
         runs, generator = self.runs[candidate], np.random.default_rng(self._seed)
         found = []

@@ -1,4 +1,4 @@
-"""What hybrids' networks say on the test, how far filters listen, and what a perfect distrust would be worth."""
+"""Outputs of the hybrids' networks on the test, their influence on the filters, and oracles that know the test."""
 
 from __future__ import annotations
 
@@ -12,17 +12,25 @@ from numpy.typing import NDArray
 from vehest.constants import FloatArray
 from vehest.data.errors import DataError
 from vehest.data.recording import Recording
-from vehest.estimators.dugoff_ukf import PseudoMeasurement
+from vehest.estimators.base import FitData
+from vehest.estimators.dugoff_ukf import DugoffUkf, PseudoMeasurement
 from vehest.estimators.model_files import load_model
 from vehest.estimators.network_ukf import LEAST_VARIANCE, NetworkUkf
 from vehest.evaluation.metrics import Scored
-from vehest_papers.cnn_ukf.manoeuvres import is_nonlinear, sideslip_error
-from vehest_papers.cnn_ukf.subjects import TEST, Prepared, Run
+from vehest.training.context import FitContext
+from vehest.training.identification import IdentificationSettings
+from vehest_papers.cnn_ukf import paper
+from vehest_papers.cnn_ukf.manoeuvres import is_nonlinear
+from vehest_papers.cnn_ukf.subjects import TEST, Prepared, Run, Runs
+from vehest_papers.kit.reading import sideslip_error
+
+IDENTIFICATION = IdentificationSettings(trials=20, restarts=1, error="recordings")
+"""Of the oracle filter."""
 
 
 @dataclass(frozen=True, eq=False)
 class Outputs:
-    """What a network says of the scored samples of one manoeuvre.
+    """Outputs of a network at the scored samples of one manoeuvre.
 
     Args:
         error: β_DD - β [deg], (K,).
@@ -62,7 +70,7 @@ def rows_of(part: Scored, drive: Recording) -> NDArray[np.int64]:
 
 
 def outputs_of(run: Run, prepared: Prepared) -> list[Outputs]:
-    """What the network of a hybrid says of each test manoeuvre."""
+    """Outputs of a hybrid's network on each test manoeuvre."""
     drives, spans = prepared.seen(TEST), prepared.spans(TEST)
     found = []
     for drive, span, own in zip(drives, spans, pseudo_measurements_of(run, drives), strict=True):
@@ -81,7 +89,7 @@ def outputs_of(run: Run, prepared: Prepared) -> list[Outputs]:
 
 
 def filtered_with(fitted: NetworkUkf, drives: Sequence[Recording], pseudo: Sequence[PseudoMeasurement]) -> list[FloatArray]:
-    """β of a hybrid's filter given what its network is made to say, drive by drive [rad]."""
+    """β of a hybrid's filter given other outputs of its network, drive by drive [rad]."""
     found: dict[int, FloatArray] = {}
     for rows, steps in fitted.filtered(drives, pseudo=pseudo):
         mean = steps.filtered.mean.numpy()
@@ -105,7 +113,7 @@ def shift_of(run: Run, prepared: Prepared) -> float:
 
 
 def with_perfect_distrust(run: Run, prepared: Prepared, candidate: str) -> Run:
-    """A hybrid whose filter is told at each sample how wrong its network's angle is; no estimator, since nobody knows that."""
+    """A hybrid whose filter knows the error of its network's angle at each sample; an oracle, no estimator."""
     fitted, drives, spans = hybrid_of(run), prepared.seen(TEST), prepared.spans(TEST)
     pseudo = []
     for drive, span, own in zip(drives, spans, fitted.pseudo_measurements(drives), strict=True):
@@ -117,3 +125,22 @@ def with_perfect_distrust(run: Run, prepared: Prepared, candidate: str) -> Run:
         (part,) = run.test[span.recording]
         test[span.recording] = [replace(part, sideslip=sideslip[rows_of(part, drive)])]
     return Run(candidate, run.model, run.validation, test)
+
+
+def oracles(runs: Runs, prepared: Prepared) -> dict[str, list[Run]]:
+    """Candidate -> its runs: a filter whose tyres and free noise are identified on the test; CNN-UKF with a perfect distrust."""
+    found: dict[str, list[Run]] = {}
+    if paper.FREE in runs:
+        found[paper.ORACLE_FILTER] = [_fitted_to_the_test(runs[paper.FREE][0], prepared)]
+    found[paper.ORACLE_DISTRUST] = [with_perfect_distrust(run, prepared, paper.ORACLE_DISTRUST) for run in runs[paper.CNN]]
+    return found
+
+
+def _fitted_to_the_test(run: Run, prepared: Prepared) -> Run:
+    model = load_model(run.model.model_folder)
+    assert isinstance(model, DugoffUkf)
+    estimator = DugoffUkf(model.settings)
+    estimator.seed(run.model.seed)
+    drives = prepared.tested()
+    estimator.fit(FitData(drives, []), IDENTIFICATION, FitContext())
+    return prepared.estimated_by(estimator, run, paper.ORACLE_FILTER)

@@ -13,8 +13,8 @@ from torch import Tensor
 from vehest.estimators.dugoff_ukf import SENSORS, DugoffUkf
 from vehest.report.document import Column, Table
 from vehest.report.style import fixed
-from vehest.studies.kit.claims import Claim
 from vehest.vehicle.dugoff import DugoffTrack
+from vehest_papers.kit.claims import Claim
 from vehest_papers.kit.observability import observability_along
 
 SPEEDS = (5.0, 10.0, 20.0, 30.0)

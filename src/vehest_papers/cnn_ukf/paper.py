@@ -82,8 +82,5 @@ MEMBER_EPOCHS = 30
 BATCH = 256
 """Of both phases of the CNN-UKF's training (Section III-C)."""
 
-PROCESS_RANGE = (2e-3, 2e-1)
-"""σ_ψ̇ of the constant filter, and two orders of magnitude above it, as which Fig. 8(d) is described [rad/s]."""
-
 STIFFNESS_STEP = 0.1
 """By which share both axles' cornering stiffnesses are off in Fig. 14."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import copy
 import itertools
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -24,9 +24,8 @@ from vehest.training.context import FitContext
 from vehest.training.search import optuna_search
 from vehest.vehicle.dugoff import DugoffAxle
 from vehest_papers.cnn_ukf import paper
-from vehest_papers.cnn_ukf.manoeuvres import manoeuvres_of
-from vehest_papers.cnn_ukf.measures import MSE, MSE_NL, Comparison
-from vehest_papers.cnn_ukf.subjects import TEST, Prepared, Run, Runs, chosen, filter_of, line_of
+from vehest_papers.cnn_ukf.measures import MSE, MSE_NL, ManoeuvreErrors
+from vehest_papers.cnn_ukf.subjects import Prepared, Run, Runs, chosen, filter_of, line_of
 
 STEPS = (-paper.STIFFNESS_STEP, 0.0, paper.STIFFNESS_STEP)
 COMBINATIONS = tuple(itertools.product(STEPS, STEPS))
@@ -100,28 +99,19 @@ def tuned_anew(fitted: EnsembleUkf, recordings: Sequence[Recording], seed: int) 
 
 def perturbed(runs: Runs, prepared: Prepared) -> Perturbed:
     """The filters of the study, of each the seed that validation chooses, under all perturbations; only p₁ and p₂ are ever tuned anew."""
-    drives = prepared.seen(TEST)
     own = {candidate: [chosen(runs[candidate])] for candidate in WITH_FILTER if candidate in runs}
     fitted = {candidate: [load_model(run.model.model_folder) for run in seeds] for candidate, seeds in own.items()}
 
-    def scored(run: Run, estimator: Estimator) -> Run:
-        parts = prepared.score(estimator.estimate(list(drives)), TEST)
-        return Run(run.candidate, run.model, run.validation, manoeuvres_of(prepared.spans(TEST), parts))
+    def changed(change: Callable[[Estimator], Estimator]) -> dict[str, list[Run]]:
+        pairs = {candidate: zip(seeds, fitted[candidate], strict=True) for candidate, seeds in own.items()}
+        return {candidate: [prepared.estimated_by(change(model), run) for run, model in both] for candidate, both in pairs.items()}
 
     stiffness = [
-        dict(own)
-        if (front, rear) == (0.0, 0.0)
-        else {
-            candidate: [scored(run, with_stiffness(model, front, rear)) for run, model in zip(seeds, fitted[candidate], strict=True)]
-            for candidate, seeds in own.items()
-        }
-        for front, rear in COMBINATIONS
+        dict(own) if axles == (0.0, 0.0) else changed(lambda model, axles=axles: with_stiffness(model, *axles))  # type: ignore[misc]
+        for axles in COMBINATIONS
     ]
     bodies = {
-        words: {
-            candidate: [scored(run, with_body(model, *factors)) for run, model in zip(seeds, fitted[candidate], strict=True)]
-            for candidate, seeds in own.items()
-        }
+        words: changed(lambda model, factors=factors: with_body(model, *factors))  # type: ignore[misc]
         for words, factors in BODIES.items()
     }
     tuned = []
@@ -130,13 +120,13 @@ def perturbed(runs: Runs, prepared: Prepared) -> Perturbed:
         assert isinstance(model, EnsembleUkf)
         softer = with_stiffness(model, *COMBINATIONS[SOFTEST])
         assert isinstance(softer, EnsembleUkf)
-        tuned.append(scored(run, tuned_anew(softer, judged, run.model.seed)))
+        tuned.append(prepared.estimated_by(tuned_anew(softer, judged, run.model.seed), run))
     return Perturbed(stiffness, bodies, tuned)
 
 
 def figure_14(found: Perturbed, data: str) -> Figure:
     """MSE and MSE_nl over the combinations, with 95 % intervals over manoeuvres."""
-    comparisons = [Comparison(runs, "test") for runs in found.stiffness]
+    comparisons = [ManoeuvreErrors(runs, "test") for runs in found.stiffness]
     with paper_style():
         figure = new_figure(DOUBLE_COLUMN, 3.0)
         panels = figure.subplots(1, 2)
@@ -172,7 +162,7 @@ def perturbed_table(found: Perturbed, data: str) -> Table:
         conditions[f"stiffness {LABELS[SOFTEST]}, p₁ and p₂ tuned anew"] = {paper.DEEP: found.tuned}
     rows: list[dict[str, object]] = []
     for words, runs in conditions.items():
-        own = Comparison(runs, "test")
+        own = ManoeuvreErrors(runs, "test")
         rows.append({"condition": words, **{candidate: own.in_words(candidate, MSE_NL) for candidate in runs}})
     columns = {"condition": Column("the filter takes")} | {candidate: Column(candidate) for candidate in found.stiffness[NOMINAL]}
     caption = (

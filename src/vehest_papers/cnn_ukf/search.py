@@ -12,7 +12,7 @@ from vehest.estimators.sideslip_ffnn import SideslipFfnn
 from vehest.report.document import Column, Table
 from vehest.report.style import MISSING, fixed
 from vehest_papers.cnn_ukf import paper
-from vehest_papers.cnn_ukf.measures import BALANCED, Comparison
+from vehest_papers.cnn_ukf.measures import BALANCED, ManoeuvreErrors
 from vehest_papers.cnn_ukf.subjects import Run, Runs, balanced
 
 PREFIX = "search_"
@@ -36,7 +36,7 @@ def search_table(parts: Mapping[str, Runs], full: Runs, data: str) -> Table:
     points = points_of(parts, full)
     given = _network(full[paper.DATA][0]).settings.hidden
     judged = {_words(widths): [replace(run, test=run.validation)] for widths, run in points.items()}
-    own = Comparison(judged, "validation")
+    own = ManoeuvreErrors(judged, "validation")
     rows = []
     for widths, run in points.items():
         fit = run.model.fit_metrics()

@@ -20,7 +20,8 @@ from vehest.evaluation.metrics import Scored, score_all
 from vehest.report.style import Line
 from vehest.studies.artefacts import EvaluatedModel, PartArtefacts
 from vehest_papers.cnn_ukf import paper
-from vehest_papers.cnn_ukf.manoeuvres import Kpis, kpis, manoeuvres_of, sideslip_error
+from vehest_papers.cnn_ukf.manoeuvres import Kpis, kpis, manoeuvres_of
+from vehest_papers.kit.reading import models_by_candidate, sideslip_error
 
 TEST = "test"
 CUTOFF_HZ = 5.0
@@ -79,7 +80,7 @@ PARTS_AWAY = {
     "_no_adaptive_process": "process noise constant",
     "_plain": paper.PLAIN,
 }
-"""What a variant's name says is taken away -> in words."""
+"""Part of a variant's name -> what is taken away, in words."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -142,15 +143,14 @@ def runs_of(part: PartArtefacts, prepared: Prepared) -> dict[str, list[Run]]:
     recordings = [span.recording for span in prepared.spans(TEST)]
     if len(set(recordings)) != len(recordings):
         raise DataError(f"study '{part.study}': a recording of the test set has several ranges, but a manoeuvre is one; correct the split")
-    groups: dict[str, list[Run]] = {}
-    for model in part.models:
-        validation, test = (manoeuvres_of(prepared.spans(name), prepared.scored(model, name)) for name in (VALIDATION, TEST))
-        groups.setdefault(candidate_of(model), []).append(Run(candidate_of(model), model, validation, test))
-    for name, runs in groups.items():
-        if len({run.model.seed for run in runs}) != len(runs):
-            raise DataError(f"study '{part.study}': candidate {name} was trained twice with one seed; give each variant a part of its own")
-    order = [*(name for name in paper.CANDIDATES if name in groups), *(name for name in groups if name not in paper.CANDIDATES)]
-    return {name: sorted(groups[name], key=lambda run: run.model.seed) for name in order}
+    groups = models_by_candidate(part, candidate_of, paper.CANDIDATES)
+    return {
+        name: [
+            Run(name, own, *(manoeuvres_of(prepared.spans(test), prepared.scored(own, test)) for test in (VALIDATION, TEST)))
+            for own in models
+        ]
+        for name, models in groups.items()
+    }
 
 
 def chosen(runs: Sequence[Run]) -> Run:
@@ -223,15 +223,23 @@ class Prepared:
 
     def learnt(self) -> list[Recording]:
         """The ranges of the training, references included."""
-        return [self.recording(span.dataset, span.recording).cut(span.start, span.stop) for span in self._part.split.train]
+        return self._ranges(self._part.split.train)
 
     def judged(self) -> list[Recording]:
         """The ranges of the validation, references included."""
-        return [self.recording(span.dataset, span.recording).cut(span.start, span.stop) for span in self._part.split.validation]
+        return self._ranges(self._part.split.validation)
 
     def tested(self) -> list[Recording]:
         """The ranges of the test, references included, for oracles."""
-        return [self.recording(span.dataset, span.recording).cut(span.start, span.stop) for span in self._part.split.tests[TEST]]
+        return self._ranges(self._part.split.tests[TEST])
+
+    def _ranges(self, spans: Sequence[Span]) -> list[Recording]:
+        return [self.recording(span.dataset, span.recording).cut(span.start, span.stop) for span in spans]
+
+    def estimated_by(self, estimator: Estimator, run: Run, candidate: str = "") -> Run:
+        """A run whose test is estimated anew by a changed estimator."""
+        parts = self.score(estimator.estimate(self.seen(TEST)), TEST)
+        return Run(candidate or run.candidate, run.model, run.validation, manoeuvres_of(self.spans(TEST), parts))
 
     def scored(self, model: EvaluatedModel, test: str) -> list[Scored]:
         """Estimates of a model and prepared references, range by range."""

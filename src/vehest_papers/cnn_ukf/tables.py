@@ -19,9 +19,9 @@ from vehest.report.style import MISSING, fixed, significant
 from vehest.studies.artefacts import PartArtefacts
 from vehest_papers.cnn_ukf import paper
 from vehest_papers.cnn_ukf.claims import OutputsOf
-from vehest_papers.cnn_ukf.measures import Comparison
+from vehest_papers.cnn_ukf.measures import ManoeuvreErrors
 from vehest_papers.cnn_ukf.subjects import KPIS, TEST, Prepared, Run, Runs, balanced, chosen, filter_of
-from vehest_papers.kit.reading import median_and_range, metric_values
+from vehest_papers.kit.reading import median_and_range, metric_values, with_interval
 
 ORACLES = (paper.ORACLE_FILTER, paper.ORACLE_DISTRUST)
 SAME = 0.01  # difference up to which given tyres and levels are those that were found
@@ -48,7 +48,7 @@ def medians(runs: Runs, name: str) -> dict[str, float]:
 
 
 def accuracy(
-    comparison: Comparison, published: Mapping[str, paper.Published], training: Mapping[str, float], name: str, caption: str
+    comparison: ManoeuvreErrors, published: Mapping[str, paper.Published], training: Mapping[str, float], name: str, caption: str
 ) -> Table:
     """Table II or III: our figures with their intervals, the paper's in brackets, errors of validation and of training.
 
@@ -91,7 +91,7 @@ def training_error(run: Run, prepared: Prepared) -> float:
     return float(np.mean([np.sqrt(np.mean(np.square(error))) for error in errors]))
 
 
-def ablation(comparison: Comparison, active: pd.DataFrame, caption: str) -> Table:
+def ablation(comparison: ManoeuvreErrors, active: pd.DataFrame, caption: str) -> Table:
     """CNN-UKF with one thing taken away: errors, how CNN-UKF stands to each, and what is active in it.
 
     Args:
@@ -140,8 +140,8 @@ def consistency(part: PartArtefacts, runs: Runs, name: str, caption: str) -> Tab
     return Table(name, caption, pd.DataFrame(rows), columns | {"nis": Column("NIS")})
 
 
-def networks_alone(comparison: Comparison, outputs: OutputsOf, name: str, caption: str) -> Table:
-    """Squared errors of what hybrids' networks say, beside those of the filters that listen, and how sure the networks are."""
+def networks_alone(comparison: ManoeuvreErrors, outputs: OutputsOf, name: str, caption: str) -> Table:
+    """Squared errors of the hybrids' networks, beside those of their filters, and the networks' deviations."""
     rows = []
     for candidate, seeds in outputs.items():
         sizes = np.array([float(len(own.error)) for own in seeds[0]])
@@ -152,7 +152,7 @@ def networks_alone(comparison: Comparison, outputs: OutputsOf, name: str, captio
         rows.append(
             {
                 "candidate": candidate,
-                "network": f"{fixed(measured.value, 3)} [{fixed(measured.interval[0], 3)}, {fixed(measured.interval[1], 3)}]",
+                "network": with_interval(measured.value, *measured.interval, 3),
                 "filter": comparison.in_words(candidate, "mse"),
                 "rms": float(np.sqrt(np.mean(np.square(error[beyond])))),
                 "sigma": float(np.median(distrust[beyond])),

@@ -1,4 +1,4 @@
-"""Figures 7 to 10, 12 and 13: single manoeuvres, as estimated, and what the hybrids' networks say meanwhile."""
+"""Figures 7 to 10, 12 and 13: single manoeuvres, as estimated, with the outputs of the hybrids' networks."""
 
 from __future__ import annotations
 
@@ -17,9 +17,10 @@ from vehest.report.document import Figure, as_code
 from vehest.report.style import DOUBLE_COLUMN, REFERENCE, fixed, legend_above, new_figure, paper_style
 from vehest.studies.artefacts import PartArtefacts
 from vehest_papers.cnn_ukf import paper
-from vehest_papers.cnn_ukf.manoeuvres import group_of, sideslip_error
+from vehest_papers.cnn_ukf.manoeuvres import group_of
 from vehest_papers.cnn_ukf.networks import pseudo_measurements_of
 from vehest_papers.cnn_ukf.subjects import TEST, Prepared, Run, line_of, plain_name
+from vehest_papers.kit.reading import sideslip_error
 
 WIDE = 5.0  # ratio from which deviations stand on a logarithmic axis
 LAP_SECONDS = 32.0  # what Fig. 10 shows of a lap
@@ -81,7 +82,7 @@ def inner_life(
     constant: FloatArray,
     data: str,
 ) -> Figure:
-    """What hybrids' networks say in one manoeuvre: β_DD beside β, both deviations of the process noise, distrust (Figure 8).
+    """Outputs of the hybrids' networks in one manoeuvre: β_DD beside β, both deviations of the process noise, distrust (Figure 8).
 
     Args:
         runs: candidate -> the seed that validation chooses.
@@ -91,23 +92,23 @@ def inner_life(
         name: of the file.
         number: of the paper's figure.
         what: title of it.
-        constant: deviations of the filter's process noise where no network says them, (2,).
+        constant: deviations of the filter's process noise where no network gives them, (2,).
         data: real or simulated.
     """
     hybrids = {candidate: run for candidate, run in runs.items() if plain_name(candidate) in paper.HYBRIDS}
-    said = _said(hybrids, prepared, warm_up, span)
+    outputs = _network_outputs(hybrids, prepared, warm_up, span)
     parts = {candidate: run.test[span.recording][0] for candidate, run in hybrids.items()}
     with paper_style():
         figure = new_figure(DOUBLE_COLUMN, 4.4)
         grid = figure.subplots(2, 2, sharex=True)
         _angles(grid[0, 0], parts)
-        for candidate, (time, word) in said.items():
+        for candidate, (time, output) in outputs.items():
             line = line_of(candidate)
             label = f"{candidate}, its network's"
-            grid[0, 0].plot(time, np.degrees(word.sideslip), color=line.colour, linewidth=0.7, alpha=0.55, label=label)
-            grid[1, 0].plot(time, np.degrees(np.sqrt(word.variance)), color=line.colour, linestyle=line.dash, linewidth=1.0)
-            if word.process is not None:
-                for axes, deviation in zip(grid[:, 1], np.sqrt(word.process).T, strict=True):
+            grid[0, 0].plot(time, np.degrees(output.sideslip), color=line.colour, linewidth=0.7, alpha=0.55, label=label)
+            grid[1, 0].plot(time, np.degrees(np.sqrt(output.variance)), color=line.colour, linestyle=line.dash, linewidth=1.0)
+            if output.process is not None:
+                for axes, deviation in zip(grid[:, 1], np.sqrt(output.process).T, strict=True):
                     axes.plot(time, deviation, color=line.colour, linestyle=line.dash, linewidth=1.0)
         for axes, level in zip(grid[:, 1], constant.tolist(), strict=True):
             axes.axhline(level, color=line_of(paper.DEEP).colour, linestyle=line_of(paper.DEEP).dash, linewidth=1.0)
@@ -139,9 +140,9 @@ def angles_of_networks(
         figure = new_figure(DOUBLE_COLUMN, 2.7)
         axes = figure.subplots()
         _angles(axes, parts)
-        for candidate, (time, word) in _said(hybrids, prepared, warm_up, span).items():
+        for candidate, (time, output) in _network_outputs(hybrids, prepared, warm_up, span).items():
             label = f"{candidate}, its network's"
-            axes.plot(time, np.degrees(word.sideslip), color=line_of(candidate).colour, linewidth=0.8, alpha=0.6, label=label)
+            axes.plot(time, np.degrees(output.sideslip), color=line_of(candidate).colour, linewidth=0.8, alpha=0.6, label=label)
         axes.set_xlabel("time [s]")
         axes.margins(x=0.0)
         legend_above(figure, axes, columns=5)
@@ -165,9 +166,9 @@ def lap(runs: Mapping[str, Run], prepared: Prepared, warm_up: float, span: Span,
         grid[1].plot(time, drive["ay"], color="#444444", label="$a_y$")
         grid[1].plot(time, drive["ax"], color="#999999", linestyle="dashed", label="$a_x$")
         grid[1].set_ylabel("acceleration [m/s²]")
-        for candidate, (at, word) in _said(hybrids, prepared, warm_up, span, window).items():
+        for candidate, (at, output) in _network_outputs(hybrids, prepared, warm_up, span, window).items():
             line = line_of(candidate)
-            grid[2].plot(at, np.degrees(np.sqrt(word.variance)), color=line.colour, linestyle=line.dash, linewidth=1.0)
+            grid[2].plot(at, np.degrees(np.sqrt(output.variance)), color=line.colour, linestyle=line.dash, linewidth=1.0)
         _deviations(grid[2])
         grid[2].set_ylabel(r"$\sigma_{DD}$ [deg]")
         grid[2].set_xlabel("time [s]")
@@ -182,18 +183,18 @@ def lap(runs: Mapping[str, Run], prepared: Prepared, warm_up: float, span: Span,
     return Figure("figure_10", caption, figure)
 
 
-def _said(
+def _network_outputs(
     hybrids: Mapping[str, Run], prepared: Prepared, warm_up: float, span: Span, window: tuple[float, float] | None = None
 ) -> dict[str, tuple[FloatArray, PseudoMeasurement]]:
-    """Candidate -> times from the start of what is scored [s], and what its network says there."""
+    """Candidate -> times from the start of what is scored [s], and its network's outputs there."""
     drive = prepared.recording(span.dataset, span.recording).cut(span.start - warm_up, span.stop).without_references()
     found = {}
     for candidate, run in hybrids.items():
         scored = _within(run.test[span.recording][0], window)
-        (word,) = pseudo_measurements_of(run, [drive])
+        (output,) = pseudo_measurements_of(run, [drive])
         kept = (drive.time >= scored.time[0] - 1e-9) & (drive.time <= scored.time[-1] + 1e-9)
-        process = None if word.process is None else word.process[kept]
-        found[candidate] = drive.time[kept] - scored.time[0], PseudoMeasurement(word.sideslip[kept], word.variance[kept], process)
+        process = None if output.process is None else output.process[kept]
+        found[candidate] = drive.time[kept] - scored.time[0], PseudoMeasurement(output.sideslip[kept], output.variance[kept], process)
     return found
 
 

@@ -1,4 +1,4 @@
-"""What the paper says of its errors beside Table 3: lap by lap, whether |β| is underestimated, and until when before a stop they hold."""
+"""The paper's statements on errors beside Table 3: lap by lap, whether |β| is underestimated, and until when before a stop they hold."""
 
 from __future__ import annotations
 
@@ -14,8 +14,9 @@ from vehest.data.recording import Recording
 from vehest.evaluation.significance import root_interval
 from vehest.report.document import Column, Table
 from vehest.report.style import MISSING, fixed
-from vehest.studies.kit.claims import Claim, Verdict
 from vehest_papers.heavy_ekf import paper
+from vehest_papers.kit.claims import Claim, Verdict, verdict_below
+from vehest_papers.kit.reading import with_interval
 
 LAPS = 3
 SKIP_SECONDS = 1.5
@@ -46,8 +47,7 @@ def per_lap_table(drives: Mapping[str, Recording], estimates: Estimates, names: 
             row: dict[str, object] = {"test": test.replace("_", ", "), "lap": number, "speed": speed}
             for name in names:
                 error = np.degrees(estimates[test][name]["sideslip"] - drive["sideslip_ref"])
-                value, low, high = _rmse(error[scored], drive.rate_hz)
-                row[name] = f"{fixed(value, 3)} [{fixed(low, 3)}, {fixed(high, 3)}]"
+                row[name] = with_interval(*_rmse(error[scored], drive.rate_hz), 3)
             rows.append(row)
     columns = {"test": Column("drive"), "lap": Column("lap", decimals=0), "speed": Column("mean speed [km/h]", decimals=0)}
     columns |= {name: Column(f"{name} [deg]") for name in names}
@@ -62,9 +62,9 @@ def faster_is_better_claim(drive: Recording, estimate: Estimate, minimum_speed: 
     first, _, last = (_drawn_rmse(error[lap & scored], drive.rate_hz) for lap in laps_of(drive))
     low, high = np.quantile(last[1:] - first[1:], [0.025, 0.975])
     value = last[0] - first[0]
-    verdict: Verdict = "reproduced" if high < 0.0 else "not reproduced" if low > 0.0 else "undecided"
     why = "interval of the difference between laps 3 and 1"
-    words = f"{fixed(first[0], 3)}° and {fixed(last[0], 3)}°; difference {fixed(value, 3)}° [{fixed(low, 3)}, {fixed(high, 3)}]"
+    words = f"{fixed(first[0], 3)}° and {fixed(last[0], 3)}°; difference {with_interval(value, low, high, 3, '°')}"
+    verdict = verdict_below(low, high)
     return Claim("RATTE better on faster laps", "improves from 30 to 45 km/h", words, "simulated, nominal laps", verdict, why)
 
 
@@ -92,12 +92,11 @@ def underestimation_table(gains: Mapping[tuple[str, str], tuple[float, float, fl
     rows = []
     for test in dict.fromkeys(test for test, _ in gains):
         row: dict[str, object] = {"test": test.replace("_", ", ")}
-        rows.append(row | {name: "{} [{}, {}]".format(*(fixed(value, 2) for value in gains[test, name])) for name in names})
+        rows.append(row | {name: with_interval(*gains[test, name], 2) for name in names})
     columns = {"test": Column("drive"), **{name: Column(name) for name in names}}
     caption = (
-        f"Whether sideslip is underestimated: gain from β to its estimate, both about their means, while |a_y| exceeds {CORNERING:g} "
-        "m/s², SIMULATED, with 95 % "
-        "intervals over blocks of 10 s. Below 1: too small, as the paper says of LINT and RATT."
+        f"Whether sideslip is underestimated: gain from β to its estimate, both about their means, while |a_y| exceeds {CORNERING:g} m/s², "
+        "SIMULATED, with 95 % intervals over blocks of 10 s. Below 1: too small, as the paper finds of LINT and RATT."
     )
     return Table("underestimation", caption, pd.DataFrame(rows), columns)
 
@@ -108,8 +107,7 @@ def underestimation_claims(gains: Mapping[tuple[str, str], tuple[float, float, f
     for test in ("nominal_laps", "worn_laps"):
         for name in (paper.LINT, paper.RATT):
             value, low, high = gains[test, name]
-            verdict: Verdict = "reproduced" if high < 1.0 else "not reproduced" if low > 1.0 else "undecided"
-            words = f"gain {fixed(value, 2)} [{fixed(low, 2)}, {fixed(high, 2)}]"
+            verdict, words = verdict_below(low, high, 1.0), f"gain {with_interval(value, low, high, 2)}"
             why = {"reproduced": "the interval lies below 1", "not reproduced": "the interval lies above 1"}
             data = f"simulated, {test.replace('_', ' ')}"
             claims.append(Claim(f"{name} underestimates |β|", "in bends", words, data, verdict, why.get(verdict, "the interval holds 1")))
@@ -140,8 +138,7 @@ def stop_table(drives: Mapping[str, Recording], estimates: Estimates, names: Seq
     columns["measured"] = Column("largest |β| of the reference [deg]", decimals=2)
     caption = (
         "RMSE(β) before the stop that ends the three laps, SIMULATED; the paper finds its filters satisfactory until about 0.4 s before "
-        "it, where its optical sensor "
-        "diverges too. Ours take the wheels to roll below 2 m/s."
+        "it, where its optical sensor diverges too. Ours take the wheels to roll below 2 m/s."
     )
     return Table("stop", caption, pd.DataFrame(rows), columns)
 
@@ -162,7 +159,7 @@ def stop_of(drive: Recording) -> float:
 
 
 def not_testable() -> list[Claim]:
-    """Claims of the paper that no data at hand can test."""
+    """Claims of the paper that these data cannot test."""
     missing: Verdict = "not testable on this data"
     laps = "the recordings are not public"
     return [

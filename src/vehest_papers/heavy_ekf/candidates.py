@@ -1,4 +1,4 @@
-"""Who runs on the twin: the paper's three filters, each with and without a state of crossfall, oracle tyres and three baselines."""
+"""Candidates on the twin: the paper's three filters, each with and without a state of crossfall, oracle tyres and three baselines."""
 
 from __future__ import annotations
 
@@ -94,7 +94,7 @@ def states_of(name: str, levels: Levels, own: Drive, curves: FloatArray, car: Si
 
 
 def oracle(levels: Levels, own: Drive) -> FloatArray:
-    """β of RATT that is told the plant's tyres, their loads and the friction at each sample, (T,), but not the payload's mass."""
+    """β of RATT that knows the plant's tyres, their loads and the friction at each sample, (T,), but not the payload's mass."""
     changes = np.flatnonzero(np.diff(own.friction)) + 1
     found, state = np.empty(len(own.friction)), None
     for begin, end in itertools.pairwise([0, *changes.tolist(), len(own.friction)]):

@@ -5,13 +5,12 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 
 from vehest.evaluation.ranking import Name, Ranking
-from vehest.report.document import Table, as_text
+from vehest.report.document import Table
 from vehest.studies.artefacts import PartArtefacts
-from vehest.studies.kit.claims import Claim, bound_claim, claims_table, order_claim
 from vehest.studies.kit.standing import ranking_of, verdict_sentences
-from vehest.studies.kit.warnings import warnings_of
 from vehest_papers.heavy_ekf import paper
-from vehest_papers.kit.reading import words_of_kinds
+from vehest_papers.kit.claims import Claim, bound_claim, claims_table, order_claim
+from vehest_papers.kit.reading import metric_values, words_of_kinds
 
 FAMILY = "rational_ekf"
 BASELINE_TITLES = {"zero": "zero", "static_map": "static map", "kinematic": "kinematic", "data_sheet": "data sheet"}
@@ -34,7 +33,7 @@ def rankings_of(part: PartArtefacts) -> dict[str, Ranking]:
 
 
 def claims_blocks(truck: PartArtefacts, ferrari: PartArtefacts | None, others: Sequence[Claim]) -> tuple[Table, str]:
-    """The table of claims, those of the tests before ``others``, and a sentence a test on who may be called best."""
+    """The table of claims, those of the tests before ``others``, and a sentence a test on the best filter."""
     variant_of = {title: (FAMILY, variant) for variant, title in paper.VARIANTS.items()}
     titles, found = titles_of(truck), rankings_of(truck)
     data = words_of_kinds(truck)
@@ -58,20 +57,15 @@ def claims_blocks(truck: PartArtefacts, ferrari: PartArtefacts | None, others: S
     return claims_table([*claims, *others], note), "\n\n".join(sentences)
 
 
-def warnings_in_words(parts: Sequence[tuple[str, PartArtefacts]]) -> str:
-    """What to mind, of parts with their titles; nothing to mind is no text."""
-    warned = [f"{as_text(title)}: {line}" for title, part in parts for line in warnings_of(part)]
-    return "**Mind:**\n\n" + "\n".join(f"- {line}" for line in warned) if warned else ""
-
-
 def _on_the_fast_lap(better: str, worse: str) -> str:
     return f"{paper.FAST[better]}° and {paper.FAST[worse]}°"
 
 
 def baseline_errors(part: PartArtefacts) -> Mapping[tuple[str, str], float]:
     """(baseline's title, test set) -> RMSE(β) [deg], as evaluated."""
-    metrics = part.metrics
-    chosen = metrics[
-        (metrics["metric"] == "rmse_sideslip") & (metrics["subset"] == "all") & metrics["estimator"].isin(list(BASELINE_TITLES))
-    ]
-    return {(BASELINE_TITLES[str(row["estimator"])], str(row["test_set"])): float(row["value"]) for row in chosen.to_dict("records")}
+    known = metric_values(part).items()
+    return {
+        (BASELINE_TITLES[own], test): value
+        for (own, _, _, test, metric), value in known
+        if metric == "rmse_sideslip" and own in BASELINE_TITLES
+    }

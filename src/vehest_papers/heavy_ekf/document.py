@@ -10,12 +10,13 @@ from vehest.data.derived import SpeedFromWheels
 from vehest.data.errors import DataError
 from vehest.data.estimate import Estimate
 from vehest.data.recording import Recording
-from vehest.report.document import REPORT, Block, Column, Document, Figure, Table, as_code
+from vehest.report.document import REPORT, Block, Column, Document, Figure, Table, as_code, as_text
 from vehest.studies.artefacts import PartArtefacts, StudyArtefacts
-from vehest.studies.kit.claims import Claim
 from vehest_papers.heavy_ekf import accuracy, claims, draws, laps, paper, tables, twin_report, tyres, vehicle, watching
 from vehest_papers.heavy_ekf.factorial import every_cell, factorial
 from vehest_papers.heavy_ekf.subjects import TYRES, Filter, curves_of, filters_of, rmse_of, validation_drives, whole_drive
+from vehest_papers.kit import methods
+from vehest_papers.kit.claims import Claim
 from vehest_papers.kit.reading import spans_in_words, words_of_kinds
 
 TRUCK, DRAWS, FERRARI, WHEELED = "truck", "seeds", "ferrari", "av21"
@@ -54,8 +55,8 @@ def documents(artefacts: StudyArtefacts) -> dict[str, Document]:
     rear = float(filters[paper.RATTE].fitted.settings.car.cg_to_rear_axle)
     drawn, drawn_claims = draws.draws_blocks(artefacts.parts[DRAWS], rear) if DRAWS in artefacts.parts else ([], [])
     others = [*drawn_claims, *twin_claims, *lap_claims, *wheel_claims, *accuracy.not_testable()]
-    warned = claims.warnings_in_words(
-        [(artefacts.titles[name], part) for name, part in artefacts.parts.items() if name not in (WHEELED, DRAWS)]
+    warned = methods.warnings_in_words(
+        {as_text(artefacts.titles[name]): part for name, part in artefacts.parts.items() if name not in (WHEELED, DRAWS)}
     )
     claimed, best = claims.claims_blocks(truck, real, others)
     blocks: list[Block] = [
@@ -64,7 +65,7 @@ def documents(artefacts: StudyArtefacts) -> dict[str, Document]:
         *[block for block in of_ferrari if _is_real_trace(block)],
         tables.overview(errors, real_errors, [*filters, *(title for title, test in claims.baseline_errors(truck) if test == NOMINAL)]),
         *twin_front,
-        f"## Appendix: who may be called best\n\n{best}",
+        f"## Appendix: the best filter\n\n{best}",
         *([f"## Appendix: what to mind\n\n{warned}"] if warned else []),
         *twin_appendix,
         *drawn,
@@ -104,57 +105,32 @@ def _is_real_trace(block: Block) -> bool:
 
 
 def _asked(artefacts: StudyArtefacts) -> list[Block]:
-    kinds = [f"**{artefacts.titles[name]}: {words_of_kinds(part).upper()} data**" for name, part in artefacts.parts.items()]
-    words = "; ".join(kinds) + ". The paper's recordings are real, of another vehicle, and not public."
-    if artefacts.absent:
-        absent = "; ".join(artefacts.titles[name] for name in artefacts.absent)
-        words += f" Not in this report, since the recordings were not at hand: {absent}."
-    return [words, artefacts.about]
+    kinds, absent = methods.kinds_of_parts(artefacts, artefacts.parts), methods.absent_parts(artefacts)
+    return [f"{kinds}. The paper's recordings are real, of another vehicle, and not public.{absent}", artefacts.about]
 
 
 def _how_it_was_made(artefacts: StudyArtefacts) -> list[Block]:
-    first = artefacts.parts[TRUCK]
-    facts = list(dict.fromkeys(fact for part in artefacts.parts.values() for fact in part.facts))
     lines = [
         f"Command: {as_code(artefacts.command)}",
-        f"Evaluation: every estimate is read at {first.protocol.rate_hz:g} Hz; the first {first.protocol.skip_seconds:g} s of each "
-        f"{first.protocol.piece} are not scored, for anyone.{first.protocol.start_in_words}",
+        methods.scoring(artefacts.parts[TRUCK].protocol),
         "RMSE(β) is over β = atan2(v, u) with the measured u, Equation 65; of the truck at 2 m/s and more, since below "
         "β means little and the paper's sensor diverges as well.",
         "Axle curves are fitted by least squares to training drives, the truck's to those on nominal tyres; levels of noise are those with "
         "the smallest error on all training drives, the truck's on nominal and on worn tyres, since a filter that is to adapt has to be "
         "tuned where there is something to adapt to. The tests are other drives, and choose nothing.",
         _limits_in_words(artefacts),
-        *facts,
+        *methods.facts_of(artefacts.parts.values()),
     ]
-    rows = pd.DataFrame(
-        [
-            {
-                "part": artefacts.titles[name],
-                "kind": words_of_kinds(part),
-                "train": spans_in_words(part.split.train),
-                "validation": spans_in_words(part.split.validation),
-                "tests": "; ".join(f"{test}: {spans_in_words(spans)}" for test, spans in part.split.tests.items()),
-            }
-            for name, part in artefacts.parts.items()
-        ]
-    )
-    columns = {"part": Column("part"), "kind": Column("data"), "train": Column("training"), "validation": Column("validation")}
-    columns["tests"] = Column("tests")
     departures = (
         "Where we differ from the paper: tyre parameters are states as logarithms over their fitted values, so that they stay positive and "
-        "the filter is well conditioned, and are kept within a factor of three, or three of their deviations at the start; beyond 0.5 "
-        "rad of sideslip the filter begins "
-        "anew, tyres included; axle forces for the fit come from accelerations instead of "
-        "TRICK, and where they leave c1 open, a largest force at slip angles of about 9° (6 to 13°) is taken as known; levels of noise are "
-        f"tuned, since no data sheet is at hand; vertical loads are those at rest. {paper.HELD}, {paper.UNSCENTED} and RATT with friction "
-        "are not in the paper; the unscented filter takes the levels that were found through the extended one."
+        "the filter is well conditioned, and are kept within a factor of three, or three of their deviations at the start; beyond 0.5 rad "
+        "of sideslip the filter begins anew, tyres included; axle forces for the fit come from accelerations instead of TRICK, and where "
+        "they leave c1 open, a largest force at slip angles of about 9° (6 to 13°) is taken as known; levels of noise are tuned, since "
+        f"there is no data sheet; vertical loads are those at rest. {paper.HELD}, {paper.UNSCENTED} and RATT with friction are not in the "
+        "paper; the unscented filter takes the levels that were found through the extended one."
     )
-    return [
-        "## Appendix: how it was made\n\n" + "\n".join(f"- {line}" for line in lines),
-        departures,
-        Table("ranges", "What was used for what.", rows, columns),
-    ]
+    ranges = methods.ranges_table(artefacts, "ranges", "What was used for what.", {})
+    return [methods.how_it_was_made(lines), departures, ranges]
 
 
 def _limits_in_words(artefacts: StudyArtefacts) -> str:
@@ -243,8 +219,8 @@ def _ferrari(part: PartArtefacts, filters: Mapping[str, Filter], rmse: tables.Rm
     wander = f"Rational tyre model parameters, RATTE filter, on the same range, {data}; what is true of these tyres is not known."
     return [
         "## Appendix: the same filters on a real car",
-        "The filters need steering, yaw rate, lateral acceleration and speed only, so they run on a car as well; who may be called best is "
-        "said on the first page, which also shows the sideslip angle.",
+        "The filters need steering, yaw rate, lateral acceleration and speed only, so they run on a car as well; the first page "
+        "compares them and shows the sideslip angle.",
         Table("ferrari", caption, rows, columns),
         tyres.figure_3(fit, None, "figure_3_ferrari", data),
         tyres.table_1(fit, None, "table_1_ferrari", data),

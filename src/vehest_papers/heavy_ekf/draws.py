@@ -1,6 +1,6 @@
 """The truck's fast lap over several draws of sensors and driver: errors, and differences that are paired over draws.
 
-A lap's errors come from where it leads, and blocks of one lap say how they vary over the course; draws say what another day would do.
+A lap's errors come from where it leads, and blocks of one lap show how they vary over the course; draws show the variation from day to day.
 """
 
 from __future__ import annotations
@@ -16,12 +16,12 @@ from vehest.evaluation.significance import Interval, difference_of_blocks, root_
 from vehest.report.document import Block, Column, Table
 from vehest.report.style import fixed
 from vehest.studies.artefacts import EvaluatedModel, PartArtefacts
-from vehest.studies.kit.claims import Claim, Verdict
 from vehest_papers.heavy_ekf import paper
 from vehest_papers.heavy_ekf.claims import titles_of
-from vehest_papers.heavy_ekf.factorial import corrected
 from vehest_papers.heavy_ekf.subjects import TYRES
-from vehest_papers.kit.reading import words_of_kinds
+from vehest_papers.kit.claims import Claim, Verdict
+from vehest_papers.kit.reading import with_interval, words_of_kinds
+from vehest_papers.kit.statements import corrected
 
 
 def draws_blocks(part: PartArtefacts, cg_to_rear_axle: float) -> tuple[list[Block], list[Claim]]:
@@ -40,7 +40,7 @@ def draws_blocks(part: PartArtefacts, cg_to_rear_axle: float) -> tuple[list[Bloc
         row: dict[str, object] = {"test": _named(test), "slip": rear_slip(part, test, cg_to_rear_axle)}
         for title, (squared, samples) in own.items():
             interval = root_interval(squared[None], samples)
-            row[title] = f"{fixed(interval.value, 3)} [{fixed(interval.low, 3)}, {fixed(interval.high, 3)}]"
+            row[title] = with_interval(interval.value, interval.low, interval.high, 3)
         rows.append(row)
     n = min(len(samples) for own in sums.values() for _, samples in own.values())
     columns = {"test": Column("fast lap"), "slip": Column("rear slip, 99 % [deg]", decimals=1)}
@@ -95,9 +95,7 @@ def _claim(pair: tuple[str, str], test: str, sums: Sums, own: Interval, excludes
     lower, higher = pair
     means = [np.sqrt(squared.sum() / samples.sum()) for squared, samples in (sums[lower], sums[higher])]
     verdict: Verdict = "undecided" if not excludes_zero else "reproduced" if own.value < 0.0 else "not reproduced"
-    words = (
-        f"{fixed(means[0], 3)}° and {fixed(means[1], 3)}°; difference {fixed(own.value, 3)}° [{fixed(own.low, 3)}, {fixed(own.high, 3)}]"
-    )
+    words = f"{fixed(means[0], 3)}° and {fixed(means[1], 3)}°; difference {with_interval(own.value, own.low, own.high, 3, '°')}"
     why = {"undecided": "holds zero", "reproduced": "lies below zero", "not reproduced": "lies above zero"}[verdict]
     known = f"{paper.FAST[lower]}° and {paper.FAST[higher]}°"
     return Claim(f"{lower} below {higher}", known, words, f"{data}, {_named(test)}, {n} draws", verdict, f"the corrected interval {why}")

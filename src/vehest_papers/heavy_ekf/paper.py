@@ -1,4 +1,4 @@
-"""What Di Biase, Lenzo & Timpone 2020 report; their Table 3 did not survive in the text at hand, so its figures are those of the prose."""
+"""Figures of Di Biase, Lenzo & Timpone 2020; their Table 3 is not legible, so its figures are those of the prose."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ VARIANTS = {
 """Variant of the estimator -> what it is called in the report; the first three are the paper's."""
 
 LAPS = {RATTE: "below 0.5", RATT: "below 0.89", LINT: "below 1.43"}
-"""RMSE(β) of three laps at 30, 40 and 45 km/h [deg]: of the first it says so, the others follow from `GAINS`."""
+"""RMSE(β) of three laps at 30, 40 and 45 km/h [deg]: the first is in the text, the others follow from `GAINS`."""
 FAST = {RATTE: "0.62", RATT: "slightly above 1", LINT: "slightly above 1"}
 """RMSE(β) of the fast lap [deg]."""
 GAINS = {(RATT, LINT): 37.0, (RATTE, RATT): 44.0, (RATTE, LINT): 65.0}

@@ -18,7 +18,7 @@ from vehest.estimators.rational_ekf import RationalFilter
 from vehest.report.style import REFERENCE, Line
 from vehest.studies.artefacts import EvaluatedModel, PartArtefacts
 from vehest_papers.heavy_ekf import paper
-from vehest_papers.kit.reading import recordings_of
+from vehest_papers.kit.reading import metric_values, recordings_of
 
 LINES = {
     paper.LINT: Line("#0b4f9c", "dashed", "s"),
@@ -101,13 +101,9 @@ def moving(drive: Recording, minimum_speed: float) -> FloatArray:
 
 def rmse_of(part: PartArtefacts, filters: Mapping[str, Filter]) -> dict[tuple[str, str], float]:
     """(name, test set) -> RMSE(β) [deg], as evaluated."""
-    metrics = part.metrics[
-        (part.metrics["metric"] == "rmse_sideslip") & (part.metrics["subset"] == "all") & (part.metrics["condition"] == "nominal")
-    ]
     names = {(own.model.variant, own.model.seed): name for name, own in filters.items()}
-    found = {}
-    for row in metrics.to_dict("records"):
-        name = names.get((str(row["variant"]), int(row["seed"])))
-        if name is not None:
-            found[name, str(row["test_set"])] = float(row["value"])
-    return found
+    return {
+        (names[variant, seed], test): value
+        for (_, variant, seed, test, metric), value in metric_values(part).items()
+        if metric == "rmse_sideslip" and (variant, seed) in names
+    }

@@ -159,10 +159,8 @@ def order_in_words(
     pulls = [f"{test.replace('_', ' ')} {fixed(_pull(drive), 2)}" for test, drive in drives.items()]
     reasons.append(
         f"- **Crossfall.** The mean of a_y - u r - dv/dt is, in m/s²: {'; '.join(pulls)}. The course falls by 1° to one side all along, "
-        "which makes "
-        f"{fixed(GRAVITY * math.sin(math.radians(1.0)), 2)}; the rest is the accelerometer's. A filter without a state for it turns it "
-        "into β, and one whose tyres "
-        "adapt into tyres."
+        f"which makes {fixed(GRAVITY * math.sin(math.radians(1.0)), 2)}; the rest is the accelerometer's. A filter without a state for it "
+        "turns it into β, and one whose tyres adapt into tyres."
     )
     return "\n\n".join([" ".join(sentences), "\n".join(reasons)])
 
@@ -205,9 +203,8 @@ def _held(rmse: Rmse, errors: pd.DataFrame) -> str:
             errors_of = [fixed(rmse[name, test], 2) for name in (paper.HELD, paper.RATTE, paper.RATT)]
             words.append(f"{tyres} {drive} {', '.join(errors_of)}° (standard deviations {', '.join(spread)}°)")
     return (
-        "There a filter lays the crossfall, and offsets of yaw rate and steering, upon its tyres, which it then brings into the next "
-        "bend. RMSE(β) of "
-        f"{paper.HELD}, whose parameters are held there, of RATTE and of RATT: {'; '.join(words)}."
+        "There a filter lays the crossfall, and offsets of yaw rate and steering, upon its tyres, which it then brings into the next bend. "
+        f"RMSE(β) of {paper.HELD}, whose parameters are held there, of RATTE and of RATT: {'; '.join(words)}."
     )
 
 

@@ -12,7 +12,6 @@ import pandas as pd
 from vehest.constants import FloatArray
 from vehest.report.document import Block, Column, Figure, Table
 from vehest.report.style import DOUBLE_COLUMN, fixed, new_figure, paper_style
-from vehest.studies.kit.claims import Claim
 from vehest_papers.heavy_ekf import paper
 from vehest_papers.heavy_ekf.candidates import DATA_SHEET, DRAWN, FILTERS, ORACLE, REFINED, STATIC_MAP, WITH_STATE, ZERO, table_of
 from vehest_papers.heavy_ekf.factorial import (
@@ -33,6 +32,8 @@ from vehest_papers.heavy_ekf.factorial import (
     interval,
 )
 from vehest_papers.heavy_ekf.twin import CG_HEIGHT, NOISE, SECONDS, TRACK, Plant
+from vehest_papers.kit.claims import Claim
+from vehest_papers.kit.reading import with_interval
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure as MatplotlibFigure
@@ -46,13 +47,10 @@ ROWS = (ZERO, STATIC_MAP, DATA_SHEET, *FILTERS, ORACLE)
 Changes = dict[tuple[int, tuple[str, str]], Change]
 
 ASKED_BEFOREHAND = (
-    "**Asked before the twin was run: could it come out the other way?** Yes. At small slip a rational tyre is a linear one, and RATTE "
-    "has two more "
-    "parameters that nothing shows: it may lose to LINT. With the right stiffness RATT is the oracle, and RATTE can only lose to it. "
-    "With levels of noise "
-    "that let LINT's stiffness follow the secant of the curve, LINT may do without the curve. A crossfall, which no filter of the paper "
-    "knows, looks like "
-    "tyres. Each of these would show as a cell that is not blue."
+    "**Asked before the twin was run: could it come out the other way?** Yes. At small slip a rational tyre is a linear one, and RATTE has "
+    "two more parameters that nothing shows: it may lose to LINT. With the right stiffness RATT is the oracle, and RATTE can only lose to "
+    "it. With levels of noise that let LINT's stiffness follow the secant of the curve, LINT may do without the curve. A crossfall, which "
+    "no filter of the paper knows, looks like tyres. Each of these would show as a cell that is not blue."
 )
 
 
@@ -63,7 +61,7 @@ def claims_of(own: Factorial, found: Changes) -> list[Claim]:
         at = MISMATCHES.index(mismatch) * len(SLIPS) + SLIPS.index(slip)
         for pair in CLAIMED:
             change = found[at, pair]
-            words = f"{fixed(change.percent, 0)} % [{fixed(change.low, 0)}, {fixed(change.high, 0)}]"
+            words = with_interval(change.percent, change.low, change.high, 0, " %")
             verdict: Any = "undecided"
             if change.told_apart:
                 verdict = "reproduced" if change.percent < 0.0 else "not reproduced"
@@ -133,12 +131,10 @@ def _map(cells: Sequence[Cell], found: Changes, name: str, tuned_on: str) -> Fig
     figure = _drawn(values, apart)
     caption = (
         f"Change of RATTE's RMSE(β) against RATT (left) and LINT (right), {DATA}, {SEEDS} seeds a cell; dry, flat, without payload. "
-        "Horizontal: largest rear "
-        "slip; vertical: by how much the filters' cornering stiffnesses differ from the plant's at the start. Blue: RATTE is better. "
-        "Hatched: not told apart "
-        "(paired over seeds, Holm over all cells and pairs of the map). Lines: the paper's −44 % and −65 %; where there is none, no "
-        "cell reaches it. "
-        f"Colours end at ±{LIMIT:.0f} %. Levels of noise tuned once on: {tuned_on}."
+        "Horizontal: largest rear slip; vertical: by how much the filters' cornering stiffnesses differ from the plant's at the start. "
+        "Blue: RATTE is better. Hatched: not told apart (paired over seeds, Holm over all cells and pairs of the map). Lines: the paper's "
+        f"−44 % and −65 %; where there is none, no cell reaches it. Colours end at ±{LIMIT:.0f} %. Levels of noise tuned once on: "
+        f"{tuned_on}."
     )
     return Figure(name, caption, figure)
 
@@ -155,9 +151,9 @@ def _drawn(values: dict[tuple[str, str], FloatArray], apart: dict[tuple[str, str
         for axes, pair in zip(panels, CLAIMED, strict=True):
             for (row, column), value in np.ndenumerate(values[pair]):
                 colour = colours.to_rgba(float(np.clip(value, -LIMIT, LIMIT)))
-                told = bool(apart[pair][row, column])
+                significant = bool(apart[pair][row, column])
                 box = Rectangle((column - 0.5, row - 0.5), 1.0, 1.0, facecolor=colour, edgecolor="white", linewidth=0.8)
-                if not told:
+                if not significant:
                     box.set(hatch="////", edgecolor="#333333", linewidth=0.0)
                 axes.add_patch(box)
                 ink = "white" if abs(value) > 65.0 else "#111111"
@@ -181,7 +177,7 @@ def _drawn(values: dict[tuple[str, str], FloatArray], apart: dict[tuple[str, str
 
 
 def _counts(cells: Sequence[Cell], found: Changes, pair: tuple[str, str]) -> tuple[int, int, int]:
-    """Cells in which the first is better, worse, and better by as much as the paper says; each by more than chance."""
+    """Cells in which the first is better, worse, and better by as much as in the paper; each by more than chance."""
     own = [found[at, pair] for at in range(len(cells))]
     better, worse = (sum(change.told_apart and sign * change.percent > 0.0 for change in own) for sign in (-1.0, 1.0))
     return better, worse, sum(change.told_apart and change.percent <= -paper.GAINS.get(pair, math.inf) for change in own)
@@ -195,8 +191,7 @@ def _in_words(found: Changes) -> str:
         low, high = min(change.percent for change in own), max(change.percent for change in own)
         sentences.append(
             f"**{pair[0]} lies below {pair[1]} in {better} of {len(own)} cells and above it in {worse}**, by more than chance; in "
-            f"{claimed} by the paper's "
-            f"{paper.GAINS[pair]:.0f} % or more (changes from {fixed(low, 0)} to {fixed(high, 0)} %)."
+            f"{claimed} by the paper's {paper.GAINS[pair]:.0f} % or more (changes from {fixed(low, 0)} to {fixed(high, 0)} %)."
         )
     return " ".join(sentences) + " All figures of the map: [CSV](tables/twin_map_cells.csv)."
 
@@ -209,16 +204,14 @@ def _rows(own: Factorial) -> Table:
     for name in ROWS:
         row: dict[str, object] = {"candidate": name}
         for at, cell in enumerate(cells):
-            low, high = interval(cell, name)
-            row[f"cell_{at}"] = f"{fixed(cell.rmse(name), 2)} [{fixed(low, 2)}, {fixed(high, 2)}]"
+            row[f"cell_{at}"] = with_interval(cell.rmse(name), *interval(cell, name), 2)
         rows.append(row)
     columns = {"candidate": Column("candidate")}
     columns |= {f"cell_{at}": Column(f"{slip:g}°, {100 * mismatch:+.0f} % [deg]") for at, (slip, mismatch) in enumerate(SHOWN)}
     caption = (
         f"RMSE(β) with 95 % intervals over {SEEDS} seeds in four cells of the map, {DATA}. {ORACLE.capitalize()}: RATT with the plant's "
-        "own curves; "
-        f"static map: fitted on the tuning drives; data sheet: wheelbase and centre of gravity; `{WITH_STATE.removeprefix(', ')}`: one "
-        "more state, beyond the paper."
+        "own curves; static map: fitted on the tuning drives; data sheet: wheelbase and centre of gravity; "
+        f"`{WITH_STATE.removeprefix(', ')}`: one more state, beyond the paper."
     )
     return Table("twin_rows", caption, pd.DataFrame(rows), columns)
 
@@ -254,8 +247,7 @@ def _regions(own: Factorial) -> Table:
     }
     caption = (
         f"In how many of {len(SLIPS) * len(MISMATCHES)} cells RATTE lies below or above the others by more than chance (Holm within each "
-        f"row), {DATA}. No filter "
-        "knows of the payload; the oracle is told the tyres under it and the friction, not the mass."
+        f"row), {DATA}. No filter knows of the payload; the oracle knows the tyres under it and the friction, not the mass."
     )
     return Table("twin_regions", caption, pd.DataFrame(rows), columns)
 
@@ -295,7 +287,7 @@ def _crossfall_in_words(own: Factorial) -> str:
 def _absorbed_blocks(own: Factorial) -> tuple[Table, str]:
     levels = {name: tuned.levels for name, tuned in own.tuned[ONCE].items()}
     frame = absorbed(levels)
-    frame["interval"] = [f"{fixed(row['change'], 0)} [{fixed(row['low'], 0)}, {fixed(row['high'], 0)}]" for row in frame.to_dict("records")]
+    frame["interval"] = [with_interval(row["change"], row["low"], row["high"], 0) for row in frame.to_dict("records")]
     columns = {
         "mistake": Column("what is wrong"),
         paper.LINT: Column("LINT [deg]", decimals=3),
@@ -338,20 +330,15 @@ def _plant_in_words(own: Factorial) -> str:
     reached = sorted({(cell.conditions.slip, round(cell.reached[0], 1)) for cell in _flat(own.grid())})
     return (
         f"The plant is Equations 1, 2, 4 to 6 with Table 1's curves, by Runge and Kutta at 400 Hz; drives of {SECONDS:g} s at 10.5 to 28 "
-        "m/s, sampled at 20 Hz; white noise of "
-        f"{noise} on yaw rate, a_y, steering and speed, assumed. A driver holds the rear slip of bends to either side, drawn by the "
-        "seed, by countersteering where it "
-        f"must; reached are {', '.join(f'{value:g}° for {slip:g}°' for slip, value in reached)} (means over seeds). **No cell rolls "
-        "over**: inner wheels lift at "
-        f"a_y = g t/(2h) = {empty.roll_over:.1f} m/s² (track {TRACK:g} m, centre of gravity at {CG_HEIGHT:g} m, both assumed) and "
-        f"{laden.roll_over:.1f} with the payload "
-        f"(h {laden.cg_height:.2f} m), while the axles cannot make more than (39.0 + 38.6) kN over 7.9 t, {empty.slides_at:.1f} m/s²: it "
-        "slides first. The largest a_y of all "
-        f"drives is {largest:.1f} m/s², so the bound holds for a centre of gravity below {lifts:.2f} m; a higher one rolls before the "
-        "rear slip of the steeper cells. Payload: "
-        "a quarter of the mass, 1 m behind the centre of gravity and 1.4 m above the road; axle curves grow with the load (Eq. 4). Wet "
-        "patches: friction 0.6 for 12 to 25 s "
-        "at a time. Every cell of the twin, with and without a crossfall state: [CSV](tables/twin_cells.csv)."
+        f"m/s, sampled at 20 Hz; white noise of {noise} on yaw rate, a_y, steering and speed, assumed. A driver holds the rear slip of "
+        "bends to either side, drawn by the seed, by countersteering where it must; reached are "
+        f"{', '.join(f'{value:g}° for {slip:g}°' for slip, value in reached)} (means over seeds). **No cell rolls over**: inner wheels "
+        f"lift at a_y = g t/(2h) = {empty.roll_over:.1f} m/s² (track {TRACK:g} m, centre of gravity at {CG_HEIGHT:g} m, both assumed) and "
+        f"{laden.roll_over:.1f} with the payload (h {laden.cg_height:.2f} m), while the axles cannot make more than (39.0 + 38.6) kN over "
+        f"7.9 t, {empty.slides_at:.1f} m/s²: it slides first. The largest a_y of all drives is {largest:.1f} m/s², so the bound holds for "
+        f"a centre of gravity below {lifts:.2f} m; a higher one rolls before the rear slip of the steeper cells. Payload: a quarter of the "
+        "mass, 1 m behind the centre of gravity and 1.4 m above the road; axle curves grow with the load (Eq. 4). Wet patches: friction "
+        "0.6 for 12 to 25 s at a time. Every cell of the twin, with and without a crossfall state: [CSV](tables/twin_cells.csv)."
     )
 
 
@@ -369,9 +356,8 @@ def _tuning(own: Factorial) -> Table:
     }
     caption = (
         "Levels of noise, tuned once for all cells: smallest geometric mean of RMSE(β) over 18 drives of 60 s whose slips (2.5, 4.5, "
-        "6.5°), stiffnesses (−25, −5, +15 %) and seeds no scored "
-        f"cell has; {DRAWN} points of a box of 8 to 10 decades a level, the best {REFINED} refined by Nelder and Mead. The gyroscope's "
-        "level is its data sheet's. Logarithms of tyre parameters start with a "
+        f"6.5°), stiffnesses (−25, −5, +15 %) and seeds no scored cell has; {DRAWN} points of a box of 8 to 10 decades a level, the best "
+        f"{REFINED} refined by Nelder and Mead. The gyroscope's level is its data sheet's. Logarithms of tyre parameters start with a "
         "deviation of 0.26, the spread of the cells. A level that ended on a limit is given with what a decade inwards changes: nothing "
         "where it is switched off."
     )

@@ -168,7 +168,7 @@ def parameters_figure(
     Args:
         drives: kind of tyre -> drive.
         estimates: kind of tyre -> what the filter made of it.
-        own: kind of tyre -> the plant's own curves; empty where nobody knows them.
+        own: kind of tyre -> the plant's own curves; empty where they are not known.
         filter_name: of the filter.
         name: of the figure.
         caption: of it.

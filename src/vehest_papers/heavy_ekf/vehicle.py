@@ -14,11 +14,11 @@ from vehest.evaluation.significance import difference_of_blocks
 from vehest.report.document import Block, Column, Table
 from vehest.report.style import fixed
 from vehest.studies.artefacts import PartArtefacts
-from vehest.studies.kit.claims import Claim, Verdict
 from vehest.vehicle.parameters import SingleTrackParameters
 from vehest.vehicle.single_track import lateral_model
 from vehest_papers.heavy_ekf import paper
-from vehest_papers.kit.reading import recordings_of
+from vehest_papers.kit.claims import Claim, verdict_below
+from vehest_papers.kit.reading import recordings_of, with_interval
 
 SPEEDS = (2.0, 3.0, 4.0, 5.0, 6.0, 8.0, 10.0, 20.0, 30.0)
 WHEELS = ("fl", "fr", "rl", "rr")
@@ -29,7 +29,7 @@ LOCKED = 0.5  # m of track by the wheels' difference, below which an axle turns 
 
 
 def table_2(car: SingleTrackParameters) -> Table:
-    """Vehicle parameters: the paper's table did not survive in the text at hand."""
+    """Vehicle parameters: the paper's table is not legible."""
     rows = [
         ("mass M", "kg", car.mass, "the axle curves' largest forces, 39.0 + 38.6 kN, taken as the weight"),
         ("front semi-wheelbase a_F", "m", car.cg_to_front_axle, "share of those forces; wheelbase 3.5 m, for the eigenvalue ratio"),
@@ -45,7 +45,7 @@ def table_2(car: SingleTrackParameters) -> Table:
         "value": Column("value", each=True, digits=5),
         "from": Column("from"),
     }
-    return Table("table_2", "Vehicle parameters (Table 2 of the paper, whose values are not at hand): all assumed.", frame, columns)
+    return Table("table_2", "Vehicle parameters (Table 2 of the paper, whose values are not legible): all assumed.", frame, columns)
 
 
 def eigenvalues_table(car: SingleTrackParameters) -> Table:
@@ -108,9 +108,9 @@ def wheels_blocks(part: PartArtefacts) -> tuple[list[Block], list[Claim]]:
         row: dict[str, object] = {"test": test.replace("_", " "), "blocks": len(sizes)}
         for name, before, after, own in (("spread", raw_spread, spread, spreads), ("mean", raw, corrected, means)):
             row[f"{name}_raw"], row[name] = (float(np.sqrt(values.sum() / sizes.sum())) for values in (before, after))
-            row[f"{name}_change"] = f"{fixed(own.value, 3)} [{fixed(own.low, 3)}, {fixed(own.high, 3)}]"
+            row[f"{name}_change"] = with_interval(own.value, own.low, own.high, 3)
         rows.append(row)
-        verdict: Verdict = "reproduced" if spreads.high < 0.0 else "not reproduced" if spreads.low > 0.0 else "undecided"
+        verdict = verdict_below(spreads.low, spreads.high)
         why = "interval of the change" if turning.all() else "interval of the change; one axle alone"
         words = f"{fixed(row['spread_raw'], 3)} to {fixed(row['spread'], 3)} m/s; change {row['spread_change']}"  # type: ignore[arg-type]
         claims.append(Claim("Eqs. 61 to 64 bring wheels together", "Figure 5", words, f"real, AV-21, {row['test']}", verdict, why))
@@ -125,10 +125,9 @@ def wheels_blocks(part: PartArtefacts) -> tuple[list[Block], list[Claim]]:
         "mean_change": Column("change [m/s]"),
     }
     caption = (
-        f"Equations 61 to 64 on real wheel speeds, REAL, the AV-21 race car at more than {SLOWEST:g} m/s: spread of the four wheels "
-        "about their mean, and their mean against "
-        "the reference's speed; 95 % intervals over blocks of 10 s. Tracks from the training range by least squares, "
-        f"{fixed(float(tracks[0]), 2)} and {fixed(float(tracks[1]), 2)} m; rolling radius {RADIUS:g} m. "
+        f"Equations 61 to 64 on real wheel speeds, REAL, the AV-21 race car at more than {SLOWEST:g} m/s: spread of the four wheels about "
+        "their mean, and their mean against the reference's speed; 95 % intervals over blocks of 10 s. Tracks from the training range by "
+        f"least squares, {fixed(float(tracks[0]), 2)} and {fixed(float(tracks[1]), 2)} m; rolling radius {RADIUS:g} m. "
         f"{_locked_in_words(tracks)}Its yaw rate is low-passed by 0.4 s."
     )
     return [Table("wheels_av21", caption, pd.DataFrame(rows), columns)], claims

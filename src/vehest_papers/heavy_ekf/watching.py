@@ -69,7 +69,7 @@ def observability_blocks(filters: Mapping[str, Filter], drive: Recording, minimu
         f"Where the states show in {WINDOW_SECONDS:g} s of measurements: smallest singular value of the local observability "
         f"matrix along '{drive.id}', {data}, about each filter's own estimates. Units: motion ({SIZES[0]:g} rad, {SIZES[1]:g} rad/s, "
         f"{SIZES[2]:g} rad/s, {SIZES[3]:g} rad/s²), {100 * PARAMETER_SIZE:.0f} % of each tyre parameter, and the filter's levels of noise. "
-        "Below the grey line, one, a second of measurements says less of the least observable combination than these sizes."
+        "Below the grey line, one, a second of measurements determines the least observable combination worse than these sizes."
     )
     sentences = []
     for name, values in found.items():
@@ -143,7 +143,7 @@ def monitor(nis: FloatArray, dof: FloatArray, rate_hz: float) -> FloatArray:
 def bad_input_table(
     filters: Mapping[str, Filter], drive: Recording, sound: list[Recording], wheels: SpeedFromWheels, minimum_speed: float, data: str
 ) -> list[Block]:
-    """What each fault does to each filter, and who says so."""
+    """Effect of each fault on each filter, and which check detects it."""
     limits = {}
     for name, own in filters.items():
         means = [monitor(*_nis(own, other), other.rate_hz) for other in sound]
@@ -153,12 +153,12 @@ def bad_input_table(
     for fault, apply in faults(wheels).items():
         damaged = apply(drive)
         scored = (np.abs(damaged["vx_ref"]) >= minimum_speed) & (damaged["vx_ref"] > 0)
-        said = [
+        found = [
             f"{finding.check}: {finding.channel}"
             for finding in checks_of_recording(damaged)
             if (finding.level != "note" or finding.check in ("nan", "reverse")) and (finding.check, finding.channel) not in clean
         ]
-        row: dict[str, object] = {"fault": fault, "check": "; ".join(dict.fromkeys(said)) or MISSING}
+        row: dict[str, object] = {"fault": fault, "check": "; ".join(dict.fromkeys(found)) or MISSING}
         alarmed = False
         for name, own in filters.items():
             estimate = own.of(damaged)
@@ -169,7 +169,7 @@ def bad_input_table(
             alarmed |= over > 0.0
             row["finite"] = bool(row.get("finite", True)) and all(np.isfinite(values).all() for values in estimate.channels.values())
         row["finite"] = "yes" if row["finite"] else "NO"
-        if fault != "nothing" and not alarmed and not said:
+        if fault != "nothing" and not alarmed and not found:
             silent.append(fault)
         rows.append(row)
     columns = {"fault": Column("what is wrong"), "finite": Column("estimates finite")}
@@ -183,7 +183,7 @@ def bad_input_table(
         f"validation drives: {listed_limits}. RMSE(β) against the true reference at {minimum_speed:g} m/s and more, forwards. Backwards, "
         "at a standstill and below that speed the filters take the car to roll without slip and measure nothing."
     )
-    words = "Neither the monitor nor the check says anything of: " + "; ".join(silent) + "." if silent else ""
+    words = "Neither the monitor nor the check detects: " + "; ".join(silent) + "." if silent else ""
     return [Table("bad_input", caption, pd.DataFrame(rows), columns), *([words] if words else [])]
 
 

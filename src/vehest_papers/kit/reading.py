@@ -1,19 +1,21 @@
-"""Recordings and metrics of a part of a study, and what its data are."""
+"""Recordings and metrics of a part of a study, and figures in words."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 
 import numpy as np
 
 from vehest.constants import FloatArray
+from vehest.data.errors import DataError
 from vehest.data.recording import Recording
 from vehest.data.splits import Span
 from vehest.data.store import read_recording
+from vehest.evaluation.metrics import Scored
 from vehest.report.document import as_text
 from vehest.report.style import MISSING, fixed
-from vehest.studies.artefacts import PartArtefacts
+from vehest.studies.artefacts import EvaluatedModel, PartArtefacts
 
 MOST_NAMED = 12
 
@@ -21,6 +23,29 @@ MOST_NAMED = 12
 def recordings_of(part: PartArtefacts, spans: Iterable[Span]) -> list[Recording]:
     """Scored ranges at the evaluation rate, references included."""
     return [read_recording(part.references[span.dataset, span.recording]).cut(span.start, span.stop) for span in spans]
+
+
+def lengths_of(part: PartArtefacts, spans: Iterable[Span]) -> list[int]:
+    """Samples of each range at the evaluation rate."""
+    return [len(recording) for recording in recordings_of(part, spans)]
+
+
+def models_by_candidate(
+    part: PartArtefacts, candidate_of: Callable[[EvaluatedModel], str], order: Sequence[str]
+) -> dict[str, list[EvaluatedModel]]:
+    """Candidate -> its seeds, candidates in a given order; others come last.
+
+    Raises:
+        DataError: two models of one candidate have the same seed.
+    """
+    groups: dict[str, list[EvaluatedModel]] = {}
+    for model in part.models:
+        groups.setdefault(candidate_of(model), []).append(model)
+    for name, models in groups.items():
+        if len({model.seed for model in models}) != len(models):
+            raise DataError(f"study '{part.study}': candidate {name} was trained twice with one seed; give each variant a part of its own")
+    names = [*(name for name in order if name in groups), *(name for name in groups if name not in order)]
+    return {name: sorted(groups[name], key=lambda model: model.seed) for name in names}
 
 
 def words_of_kinds(part: PartArtefacts) -> str:
@@ -45,6 +70,11 @@ def _times(span: Span) -> str:
     return f"from {span.start:g} s" if span.stop == math.inf else f"{span.start:g} to {span.stop:g} s"
 
 
+def sideslip_error(part: Scored) -> FloatArray:
+    """Estimate - reference, (K,) [deg], within a half turn."""
+    return np.degrees(np.remainder(part.sideslip - part.sideslip_ref + np.pi, 2.0 * np.pi) - np.pi)
+
+
 def metric_values(part: PartArtefacts) -> dict[tuple[str, str, int, str, str], float]:
     """(estimator, variant, seed, test set, metric) -> value, over all samples under nominal conditions."""
     metrics = part.metrics[(part.metrics["subset"] == "all") & (part.metrics["condition"] == "nominal")]
@@ -61,3 +91,8 @@ def median_and_range(values: FloatArray, decimals: int) -> str:
         return MISSING
     words = fixed(float(np.median(finite)), decimals)
     return words if len(finite) == 1 else f"{words} [{fixed(float(finite.min()), decimals)}, {fixed(float(finite.max()), decimals)}]"
+
+
+def with_interval(value: float, low: float, high: float, decimals: int, unit: str = "") -> str:
+    """A figure with its interval: ``0.0086 [0.0071, 0.0101]``, or with a unit ``0.12° [0.10, 0.15]``."""
+    return f"{fixed(value, decimals)}{unit} [{fixed(low, decimals)}, {fixed(high, decimals)}]"

@@ -9,6 +9,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy import signal
 
 from vehest.constants import FloatArray
@@ -47,18 +48,23 @@ class Periodogram:
         """
         if not self.frequency[1] <= hz <= self.frequency[-1]:
             raise DataError(
-                f"a periodogram with lines from {self.frequency[1]:.3g} to {self.frequency[-1]:.3g} Hz says nothing of {hz:g} Hz"
+                f"a periodogram with lines from {self.frequency[1]:.3g} to {self.frequency[-1]:.3g} Hz has no line at {hz:g} Hz"
             )
-        inside = (self.frequency >= hz / THIRD_OCTAVE) & (self.frequency <= hz * THIRD_OCTAVE)
-        inside[np.argmin(np.abs(self.frequency - hz))] = True
-        return float(self.density[inside].mean())
+        return float(self.density[third_octave(self.frequency, hz)].mean())
+
+
+def third_octave(frequency: FloatArray, hz: float) -> NDArray[np.bool_]:
+    """Which lines lie in the third of an octave around a frequency; the nearest one does, (F,)."""
+    inside = (frequency >= hz / THIRD_OCTAVE) & (frequency <= hz * THIRD_OCTAVE)
+    inside[np.argmin(np.abs(frequency - hz))] = True
+    return inside
 
 
 def periodogram(series: Sequence[FloatArray], rate_hz: float, segment_seconds: float = SEGMENT_SECONDS) -> Periodogram:
     """Welch's method over several series: Hann windows that overlap by half, each segment without its mean.
 
     Series count by their number of segments; what is left over at the end of each counts nowhere. The line at 0 Hz and, because the
-    window spreads what slowly varies, the one beside it say little.
+    window spreads what slowly varies, the one beside it are not reliable.
 
     Args:
         series: uniformly sampled, finite, each of shape (T,).

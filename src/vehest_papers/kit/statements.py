@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
@@ -12,9 +12,9 @@ from scipy import stats
 
 from vehest.constants import FloatArray
 from vehest.evaluation.blocks import LEAST_BLOCKS
-from vehest.evaluation.significance import CONFIDENCE, holm
+from vehest.evaluation.significance import CONFIDENCE, Interval, holm
 from vehest.report.style import fixed
-from vehest.studies.kit.claims import Claim, Verdict
+from vehest_papers.kit.claims import Claim, Verdict
 
 Outcome = Literal["as claimed", "the other way round", "not told apart"]
 Expected = Literal["lower", "higher"]
@@ -112,7 +112,7 @@ class Change:
 
 
 def percent(ratio: float) -> str:
-    """A ratio as a change in per cent, with its sign: ``−24``, ``+3``; below a half a decimal says on which side of zero it lies."""
+    """A ratio as a change in per cent, with its sign: ``−24``, ``+3``; below a half with a decimal, which shows the side of zero."""
     change = 100.0 * (ratio - 1.0)
     decimals = 0 if round(change) else 1
     rounded = round(change, decimals)
@@ -196,6 +196,16 @@ def outcomes(tests: Sequence[Compared]) -> list[tuple[Outcome, float]]:
             below = own.change.log_ratio < math.log1p(own.beyond)
             outcome = "as claimed" if below == (own.expected == "lower") else "the other way round"
         found.append((outcome, 1.0 - (1.0 - CONFIDENCE) / factor))
+    return found
+
+
+def corrected(differences: Sequence[Interval]) -> list[tuple[Interval, bool]]:
+    """Differences of one table with intervals at the level that Holm asks of each, and whether that excludes zero."""
+    found = []
+    for own, p_value in zip(differences, holm([own.p_value for own in differences]), strict=True):
+        factor = max(p_value / own.p_value, 1.0) if own.p_value > 0 else float(len(differences))
+        low, high = own.at(1.0 - (1.0 - CONFIDENCE) / factor)
+        found.append((replace(own, low=low, high=high), p_value < 1.0 - CONFIDENCE))
     return found
 
 

@@ -27,7 +27,7 @@ TESTED_ON = {"scheme_1": "Ferrari F-2", "scheme_2": "Corvette C-2"}
 
 
 def of_the_data(artefacts: StudyArtefacts) -> list[Block]:
-    """Table I, Figures 4 and 5: the four sets, a third car and the real drive where they are at hand."""
+    """Table I, Figures 4 and 5: the four sets, a third car and the real drive where they are there."""
     first, second = artefacts.parts["scheme_1"], artefacts.parts["scheme_2"]
     sets: dict[str, list[Recording]] = {
         "C-1": recordings_of(second, second.split.validation),

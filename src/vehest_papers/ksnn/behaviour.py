@@ -1,4 +1,4 @@
-"""What trained candidates do where the paper says something beside their errors: little yaw rate, the start of a window, biases removed."""
+"""Behaviour of trained candidates beside their errors: at little yaw rate, after the start of a window, with biases removed."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from vehest.training.members import prepare
 from vehest_papers.kit.reading import recordings_of
 from vehest_papers.kit.spectra import mean_bias
 from vehest_papers.ksnn import paper
-from vehest_papers.ksnn.comparing import Errors, masked_segments, yaw_rates
+from vehest_papers.ksnn.comparing import SegmentErrors, masked_segments, yaw_rates
 from vehest_papers.ksnn.schemes import Scheme, segments_on
 
 WINDOWS = (5, 10, 15, 20, 30, 45, 60, 90)
@@ -47,8 +47,8 @@ def luenberger_of(scheme: Scheme) -> Luenberger | None:
     return estimator if isinstance(estimator, Luenberger) else None
 
 
-def at_low_yaw_rate(scheme: Scheme, threshold: float, categories: Sequence[str], test: str) -> tuple[Errors, float]:
-    """Errors where |ω| lies below a threshold, and the share of such samples.
+def at_low_yaw_rate(scheme: Scheme, threshold: float, categories: Sequence[str], test: str) -> tuple[SegmentErrors, float]:
+    """SegmentErrors where |ω| lies below a threshold, and the share of such samples.
 
     Args:
         scheme: a comparison.
@@ -66,14 +66,14 @@ def at_low_yaw_rate(scheme: Scheme, threshold: float, categories: Sequence[str],
             masks: list[FloatArray] = [(np.abs(own) < threshold).astype(float) for own in yaw_rates(scored, recordings)]
             share = float(np.concatenate(masks).mean())
             segments.setdefault(category, []).append(masked_segments(scored, masks, rate))
-    return Errors(segments if 0.0 < share < HIGHEST_SHARE else {}, f"{test} at little yaw rate"), share
+    return SegmentErrors(segments if 0.0 < share < HIGHEST_SHARE else {}, f"{test} at little yaw rate"), share
 
 
 def _reference(scheme: Scheme, span: Span) -> Recording:
     return read_recording(scheme.part.references[span.dataset, span.recording])
 
 
-def after_start(scheme: Scheme, category: str, test: str) -> Errors:
+def after_start(scheme: Scheme, category: str, test: str) -> SegmentErrors:
     """Errors of a network by the length of its window: how far it has come so long after it started at v = 0, û = u_m.
 
     All windows end at the same samples. Candidates are called by the length, in samples.
@@ -83,12 +83,12 @@ def after_start(scheme: Scheme, category: str, test: str) -> Errors:
     for model in scheme.models(category)[:MOST_SEEDS]:
         estimator = load_model(model.model_folder)
         if not isinstance(estimator, WindowedEstimator) or abs(estimator.settings.rate_hz - recordings[0].rate_hz) > 1e-9:
-            return Errors({}, test)
+            return SegmentErrors({}, test)
         for length in WINDOWS:
             parts = [own for recording in recordings if (own := _with_window(estimator, recording, length)) is not None]
             if parts:
                 segments.setdefault(str(length), []).append(segments_of(parts, recordings[0].rate_hz / STRIDE))
-    return Errors(segments, f"{test} after the start", same_models=True)
+    return SegmentErrors(segments, f"{test} after the start", same_models=True)
 
 
 def _with_window(estimator: WindowedEstimator, recording: Recording, length: int) -> Scored | None:
@@ -111,7 +111,7 @@ def _scored(recording: Recording, ends: NDArray[np.int64], vy: FloatArray) -> Sc
     return Scored(recording.time[ends], vy, reference, np.arctan2(vy, speed), np.arctan2(reference, speed), ay)
 
 
-def without_biases(scheme: Scheme, categories: Sequence[str], test: str) -> tuple[Errors, dict[str, float]]:
+def without_biases(scheme: Scheme, categories: Sequence[str], test: str) -> tuple[SegmentErrors, dict[str, float]]:
     """Errors with the measured a_y and with each car's mean bias taken off (Section IX-A), and the biases of both cars [m/s²].
 
     The mean of v̇ - (a_y - ωu_m) over a car's training set, which takes the reference, is added to its a_y. Nothing is trained again: a
@@ -135,7 +135,7 @@ def without_biases(scheme: Scheme, categories: Sequence[str], test: str) -> tupl
         for model in scheme.models(category)[:MOST_SEEDS]:
             segments.setdefault(f"{category}, as measured", []).append(segments_on(model, test))
             segments.setdefault(f"{category}, corrected", []).append(_corrected(scheme, model, biases, test))
-    return Errors(segments, f"{test} with and without biases", same_models=True), biases
+    return SegmentErrors(segments, f"{test} with and without biases", same_models=True), biases
 
 
 def _corrected(scheme: Scheme, model: EvaluatedModel, biases: dict[str, float], test: str) -> Segments:

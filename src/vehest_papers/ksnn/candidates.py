@@ -96,8 +96,3 @@ def chosen_by_category(runs: pd.DataFrame) -> dict[str, pd.Series]:
     present, known = dict.fromkeys(runs["category"]), (*paper.BASELINES, *paper.CATEGORIES)
     order = [*(name for name in known if name in present), *(name for name in present if name not in known)]
     return {name: chosen(runs[runs["category"] == name]) for name in order}
-
-
-def seeds_like(runs: pd.DataFrame, run: pd.Series) -> pd.DataFrame:
-    """All seeds of a run's structure."""
-    return runs[(runs["estimator"] == run["estimator"]) & (runs["variant"] == run["variant"])]

@@ -30,7 +30,7 @@ def order_tests(scheme: Scheme) -> list[Compared]:
 
 
 def order_of(found: Sequence[Outcome]) -> Order:
-    """What four outcomes say together."""
+    """Order of families that four outcomes make."""
     if "the other way round" in found:
         return "does not come out"
     return "comes out" if found and all(own == "as claimed" for own in found) else "is open"
@@ -85,7 +85,7 @@ def _against_the_map(schemes: Sequence[Scheme]) -> list[str]:
 def causes_in_words(schemes: Sequence[Scheme], found: Mapping[str, Order], ablations: Mapping[str, Sequence[Scheme]]) -> str:
     """Which of the differences between the cars the order depends on, as far as one at a time can tell."""
     if not ablations:
-        return "No difference between the cars was taken away here, so nothing is said of causes."
+        return "No difference between the cars was taken away here, so causes are not tested."
     without = {cause: orders(own) for cause, own in ablations.items()}
     numbered = {scheme.name[-1]: scheme for scheme in schemes}
     sentences = []

@@ -1,4 +1,4 @@
-"""What the paper says of errors, one entry a statement: Sections VIII-A to VIII-D and VIII-H."""
+"""The paper's statements on errors, one entry each: Sections VIII-A to VIII-D and VIII-H."""
 
 from __future__ import annotations
 
@@ -9,10 +9,10 @@ import numpy as np
 from scipy import stats
 
 from vehest.report.style import fixed
-from vehest.studies.kit.claims import Claim
+from vehest_papers.kit.claims import Claim
 from vehest_papers.kit.statements import Change, Compared, Expected, Statement, counted, outcomes, short
 from vehest_papers.ksnn import paper
-from vehest_papers.ksnn.comparing import Errors
+from vehest_papers.ksnn.comparing import SegmentErrors
 from vehest_papers.ksnn.schemes import THIRD, Scheme, segments_on
 
 ABOUT_A_QUARTER = (0.20, 0.30)
@@ -164,17 +164,17 @@ def _diagonal(scheme: Scheme) -> Claim:
     tests = [Compared(name, change, "higher") for name in scheme.structures() if (change := scheme.ratio(name)) is not None]
     found = outcomes(tests)
     above = sum(own.change is not None and own.change.log_ratio > 0 for own in tests)
-    surely = sum(outcome == "as claimed" for outcome, _ in found)
+    significant = sum(outcome == "as claimed" for outcome, _ in found)
     below = sum(outcome == "the other way round" for outcome, _ in found)
     easier = scheme.ratio(scheme.name_of(paper.STATIC_MAP))
-    ours = f"{above} of {len(tests)} above; by more than chance {surely} above, {below} below"
+    ours = f"{above} of {len(tests)} above; by more than chance {significant} above, {below} below"
     if easier is not None:
         ours += f"; static map's FVU other over own {easier.as_ratio()}"
     claim = f"all dots above the diagonal, {scheme.title.lower()}"
     if not tests or all(own.change is None or not own.change.error > 0 for own in tests):
         return Claim(claim, "39 of 39", "–", scheme.kind, "not testable on this data", "tests too short")
     verdict = "not reproduced" if below else "reproduced" if above == len(tests) else "undecided"
-    why = "some surely below" if below else "all above" if above == len(tests) else "some below, by chance or not"
+    why = "some significantly below" if below else "all above" if above == len(tests) else "some below, by chance or not"
     return Claim(claim, "all" if scheme.name.endswith("1") else "all of Table V", ours, scheme.kind, verdict, why)  # type: ignore[arg-type]
 
 
@@ -237,14 +237,14 @@ def _third_car(schemes: Sequence[Scheme]) -> Statement:
 
 def on_regularisation(with_it: Scheme, without: Scheme) -> list[Statement]:
     """Section VIII-H and Table VII: the same two structures stopped on the other car, and on the own one."""
-    shared: dict[str, Errors] = {}
+    shared: dict[str, SegmentErrors] = {}
     for test in (with_it.own, with_it.other):
         segments = {}
         for word, scheme in (("with", with_it), ("without", without)):
             for category in (paper.LSTM, paper.NONLINEAR):
                 models = [own for own in scheme.part.models if f"{own.estimator}/{own.variant}" == without.name_of(category)]
                 segments[f"{category}, {word}"] = [segments_on(model, test) for model in models]
-        shared[test] = Errors(segments, test)
+        shared[test] = SegmentErrors(segments, test)
 
     def change(category: str, test: str) -> Change | None:
         return shared[test].change(f"{category}, without", f"{category}, with", "fvu")
@@ -293,7 +293,7 @@ def _short(category: str) -> str:
     return {paper.FACTOR_GRAPH: "FG", paper.KALMAN: "KF", paper.STATIC_MAP: "static map"}.get(category, category)
 
 
-def on_minutes(curve: Errors | None, least: str, scheme: Scheme, where: str) -> Statement:
+def on_minutes(curve: SegmentErrors | None, least: str, scheme: Scheme, where: str) -> Statement:
     """Sample efficiency: the smallest amount that was learnt from."""
     tests = []
     if curve is not None:
@@ -311,7 +311,7 @@ def on_steering(pairs: Sequence[tuple[Scheme, Scheme]]) -> list[Statement]:
                 name: [segments_on(model, test) for model in scheme.part.models if model.estimator == "velocity_gru"]
                 for name, scheme in (("with", with_it), ("without", without))
             }
-            change = Errors(segments, test).change("with", "without", "fvu")
+            change = SegmentErrors(segments, test).change("with", "without", "fvu")
             found[word].append(Compared(_label(with_it), change, "lower" if word == "own" else "higher"))
     data = pairs[0][0].kind if pairs else "–"
     missing = "no parts with and without steering"

@@ -1,4 +1,4 @@
-"""What the paper says of how estimators behave: low yaw rates, convergence, biases, noise, spectra, cost, learnt parameters."""
+"""The paper's statements on the behaviour of estimators: low yaw rates, convergence, biases, noise, spectra, cost, learnt parameters."""
 
 from __future__ import annotations
 
@@ -16,9 +16,9 @@ from vehest.estimators.model_files import load_model
 from vehest.report.document import Column, Table
 from vehest.report.style import fixed
 from vehest.studies.artefacts import EvaluatedModel
-from vehest.studies.kit.claims import Claim
+from vehest_papers.kit.claims import Claim
 from vehest_papers.kit.reading import median_and_range
-from vehest_papers.kit.spectra import SEGMENT_SECONDS, THIRD_OCTAVE
+from vehest_papers.kit.spectra import SEGMENT_SECONDS, third_octave
 from vehest_papers.kit.statements import Change, Compared, Measured, Statement, counted, outcomes, short
 from vehest_papers.ksnn import behaviour, cost, paper
 from vehest_papers.ksnn.comparing import N_RESAMPLES
@@ -190,8 +190,8 @@ def on_spectra(schemes: Sequence[Scheme]) -> list[Claim | Statement]:
         tests = [Compared("", Change.of(levels[paper.NONLINEAR, hz], levels[other, hz])) for hz, other in pairs]
         found = [outcome for outcome, _ in outcomes(tests)]
         lower = sum(own.change is not None and own.change.log_ratio < 0 for own in tests)
-        turned, surely = found.count("the other way round"), found.count("as claimed")
-        ours = f"lower in {lower} of {len(tests)} bands; by more than chance {surely} lower, {turned} higher"
+        turned, significant = found.count("the other way round"), found.count("as claimed")
+        ours = f"lower in {lower} of {len(tests)} bands; by more than chance {significant} lower, {turned} higher"
         verdict = "not reproduced" if turned else "reproduced" if lower == len(tests) else "undecided"
         entries.append(Claim(claim, "yes", ours, scheme.kind, verdict, "against Luenberger and LSTM, 0.1 to 6.3 Hz"))  # type: ignore[arg-type]
         if scheme is schemes[-1]:
@@ -225,9 +225,7 @@ def band_levels(scheme: Scheme, models: Mapping[str, EvaluatedModel], test: str)
     levels = {}
     for category, own in power.items():
         for hz in BANDS_HZ:
-            inside = (frequency >= hz / THIRD_OCTAVE) & (frequency <= hz * THIRD_OCTAVE)
-            inside[np.argmin(np.abs(frequency - hz))] = True
-            band = own[:, inside].mean(axis=1)
+            band = own[:, third_octave(frequency, hz)].mean(axis=1)
             levels[category, hz] = Measured(float(band.mean()), np.log(counts @ band / (number - 1)), np.zeros(1), number)
     return levels
 

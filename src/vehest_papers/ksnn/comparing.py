@@ -14,13 +14,15 @@ from vehest.data.recording import Recording
 from vehest.evaluation.blocks import Segments, block_labels, block_sums, segments_of
 from vehest.evaluation.metrics import Scored
 from vehest.report.style import fixed
+from vehest_papers.kit.reading import with_interval
+from vehest_papers.kit.sampled import SampledErrors, resampled
 from vehest_papers.kit.statements import Change, Measured
 
 N_RESAMPLES = 2000
 METRICS = ("fvu", "rmse_vy", "rmse_sideslip")
 
 
-class Errors:
+class SegmentErrors(SampledErrors):
     """Candidates on one test set, all on the same blocks and resamples.
 
     Args:
@@ -31,8 +33,8 @@ class Errors:
     """
 
     def __init__(self, segments: Mapping[str, Sequence[Segments]], name: str, *, same_models: bool = False) -> None:
-        self.same_models = same_models
         self.segments = {own: parts for own, parts in segments.items() if parts and all(_is_finite(part) for part in parts)}
+        super().__init__(self.segments, paired=same_models)
         self.measured: dict[tuple[str, str], Measured] = {}
         self.n_blocks = 0
         if self.segments:
@@ -45,10 +47,8 @@ class Errors:
         sizes = block_sums(first.samples, labels)
         self.n_blocks = len(sizes)
         generator = np.random.default_rng(zlib.crc32(name.encode()))
-        counts, of_seeds = np.ones((1, len(sizes))), int(generator.integers(2**31))
-        if self.n_blocks > 1:
-            drawn = generator.multinomial(len(sizes) - 1, np.full(len(sizes), 1.0 / len(sizes)), size=N_RESAMPLES)
-            counts = np.concatenate([counts, drawn])  # the first row is the drive as it was
+        of_seeds = int(generator.integers(2**31))
+        counts = resampled(self.n_blocks, N_RESAMPLES if self.n_blocks > 1 else 0, generator)
         total = np.maximum(counts @ sizes, 1.0)
         mean, square = (counts @ block_sums(getattr(first, own), labels) / total for own in ("vy_ref", "squared_vy_ref"))
         variance = square - np.square(mean)
@@ -59,12 +59,8 @@ class Errors:
             )
             fvu = (vy - np.square(error)) / np.maximum(variance, 1e-12)[:, None]
             for metric, values in zip(METRICS, (fvu, vy, sideslip), strict=True):
-                drawing = np.random.default_rng(of_seeds) if self.same_models else generator
-                found = _measured(values, len(sizes), drawing, root=metric != "fvu")
-                self.measured[candidate, metric] = replace(found, paired=self.same_models)
-
-    def __contains__(self, candidate: object) -> bool:
-        return candidate in self.segments
+                drawing = np.random.default_rng(of_seeds) if self.paired else generator
+                self.measured[candidate, metric] = self.figure(values, len(sizes), drawing, root=metric != "fvu")
 
     def get(self, candidate: str, metric: str) -> Measured | None:
         """A figure; none where the candidate is not there."""
@@ -86,21 +82,7 @@ class Errors:
         if own is None:
             return "–"
         low, high = own.interval
-        return f"{fixed(own.value, 3)} [{fixed(low, 3)}, {fixed(high, 3)}]" if math.isfinite(low) else fixed(own.value, 3)
-
-
-def _measured(values: FloatArray, n_blocks: int, generator: np.random.Generator, *, root: bool) -> Measured:
-    """Of values by resample and seed (n, S), the first resample being the drive itself."""
-    n_seeds = values.shape[1]
-    drawn = values
-    if n_seeds > 1:
-        picks = generator.integers(n_seeds, size=(len(values), n_seeds - 1))
-        drawn = np.take_along_axis(values, picks, axis=1)
-    power = 0.5 if root else 1.0
-    floor = 1e-300
-    means = np.log(np.maximum(drawn[1:].mean(axis=1), floor)) * power
-    value = float(max(values[0].mean(), floor)) ** power
-    return Measured(value, means, np.log(np.maximum(values[0], floor)) * power, n_blocks)
+        return with_interval(own.value, low, high, 3) if math.isfinite(low) else fixed(own.value, 3)
 
 
 def _is_finite(part: Segments) -> bool:

@@ -11,11 +11,10 @@ import pandas as pd
 from vehest.evaluation.blocks import Segments
 from vehest.report.document import Column, Figure, Table
 from vehest.report.style import DOUBLE_COLUMN, Line, legend_above, line_of, new_figure, paper_style
-from vehest.studies.artefacts import EvaluatedModel
 from vehest.studies.kit.reference_minutes import minutes_of
 from vehest_papers.ksnn import paper
 from vehest_papers.ksnn.candidates import category_of
-from vehest_papers.ksnn.comparing import Errors
+from vehest_papers.ksnn.comparing import SegmentErrors
 from vehest_papers.ksnn.schemes import Scheme, segments_on
 
 NAMED = re.compile(r"minutes_([\d.]+)(?:_[a-z])?")
@@ -33,7 +32,7 @@ class Curve:
         lines: category -> estimator and variant.
     """
 
-    errors: Mapping[str, Errors]
+    errors: Mapping[str, SegmentErrors]
     minutes: Sequence[str]
     lines: Mapping[str, tuple[str, str]]
 
@@ -53,14 +52,10 @@ def curve_of(whole: Scheme, shorter: Mapping[str, Scheme]) -> Curve | None:
             if (model.estimator, model.variant) in structures:
                 key = f"{category_of(model.estimator, model.variant)}@{minutes}"
                 for word in TESTS:
-                    segments[word].setdefault(key, []).append(_segments(model, scheme, word))
+                    segments[word].setdefault(key, []).append(segments_on(model, getattr(scheme, word)))
     lines = {category_of(*name): name for name in sorted(structures)}
-    errors = {word: Errors(own, f"{getattr(whole, word)} by minutes") for word, own in segments.items()}
+    errors = {word: SegmentErrors(own, f"{getattr(whole, word)} by minutes") for word, own in segments.items()}
     return Curve(errors, [*amounts, everything], lines)
-
-
-def _segments(model: EvaluatedModel, scheme: Scheme, word: str) -> Segments:
-    return segments_on(model, getattr(scheme, word))
 
 
 def curve_table(curve: Curve) -> Table:

@@ -8,12 +8,12 @@ import pandas as pd
 
 from vehest.data.errors import DataError
 from vehest.data.splits import Span
-from vehest.report.document import PATENT_NOTE, REPORT, Block, Column, Document, Table, as_code, as_text
+from vehest.report.document import PATENT_NOTE, REPORT, Block, Document, Table, as_code, as_text
 from vehest.report.style import fixed, listed
-from vehest.studies.artefacts import PartArtefacts, StudyArtefacts
-from vehest.studies.kit.claims import Claim, claims_table
-from vehest.studies.kit.warnings import warnings_of
-from vehest_papers.kit.reading import spans_in_words, words_of_kinds
+from vehest.studies.artefacts import StudyArtefacts
+from vehest_papers.kit import methods
+from vehest_papers.kit.claims import Claim, claims_table
+from vehest_papers.kit.reading import words_of_kinds
 from vehest_papers.kit.statements import Statement, decided
 from vehest_papers.ksnn import analyses, claims, claims_of_models, cost, paper, scatter, tables
 from vehest_papers.ksnn.causes import CAUSES, causes_table, headline
@@ -22,8 +22,6 @@ from vehest_papers.ksnn.schemes import SET_TITLES, Scheme
 
 SCHEMES = {"scheme_1": (paper.TABLE_IV, "c2", "f2"), "scheme_2": (paper.TABLE_V, "f2", "c2")}
 """Part -> the paper's table, test set of the car that is learnt on, test set of the other."""
-SAME_CARS = ("scheme", "steering", "no_steering", *CAUSES)
-"""Starts of the names of parts whose cars are those of the scheme that their number names."""
 OTHER_CARS = ("devbot_ferrari", "ferrari_devbot")
 SMALL = ("f1tenth", "dart", "roboracer")
 
@@ -125,10 +123,7 @@ def _asked(artefacts: StudyArtefacts) -> list[Block]:
     if others:
         counts = listed([f"{len(titles)} are {kind}" for kind, titles in others.items()])
         words += f" Of the other parts {counts}: see the appendix."
-    if artefacts.absent:
-        absent = "; ".join(artefacts.titles[name] for name in artefacts.absent)
-        words += f" Not in this report, since the recordings were not at hand: {absent}."
-    return [f"{words} {artefacts.about}".strip()]
+    return [f"{words}{methods.absent_parts(artefacts)} {artefacts.about}".strip()]
 
 
 def _note(schemes: Sequence[Scheme]) -> str:
@@ -145,8 +140,7 @@ def _figure_6(schemes: Sequence[Scheme]) -> Block:
         f"that validation chooses of each structure; faint ones, the other seeds; hollow ones, the paper's most general models. Above the "
         f"dashed line the own car is estimated better."
     )
-    columns = [scatter.Scheme(own.title, own.runs, own.published, own.own, own.other) for own in schemes]
-    return scatter.two_tests(columns, caption)
+    return scatter.two_tests(schemes, caption)
 
 
 def _overview_caption(schemes: Sequence[Scheme]) -> str:
@@ -190,56 +184,33 @@ def _appendices(
     blocks += ["## Appendix: noise of the accelerations", *analyses.of_sensitivities(schemes)]
     blocks += ["## Appendix: spectra of the residuals", *analyses.of_residuals(schemes)]
     blocks += ["## Appendix: what the networks have learnt", *analyses.of_interpretation(schemes)]
-    blocks += ["## Appendix: the data", *analyses.of_the_data(artefacts), *_warned(schemes)]
+    warned = methods.warnings_in_words({scheme.title: scheme.part for scheme in schemes})
+    blocks += ["## Appendix: the data", *analyses.of_the_data(artefacts), *([warned] if warned else [])]
     blocks += _how_it_was_made(artefacts)
     whole = pd.concat([scheme.runs for scheme in schemes], ignore_index=True)
     blocks += [tables.instances(whole), *analyses.of_activation(schemes), tables.stopping(runs, artefacts.titles), PATENT_NOTE]
     return blocks
 
 
-def _warned(schemes: Sequence[Scheme]) -> list[Block]:
-    lines = list(dict.fromkeys(f"{scheme.title}: {line}" for scheme in schemes for line in warnings_of(scheme.part)))
-    return ["**Mind:**\n\n" + "\n".join(f"- {line}" for line in lines)] if lines else []
-
-
 def _how_it_was_made(artefacts: StudyArtefacts) -> list[Block]:
-    first = artefacts.parts["scheme_1"]
-    protocol = first.protocol
-    facts = list(dict.fromkeys(fact for part in artefacts.parts.values() for fact in part.facts))
     fits = sum(len(part.models) for part in artefacts.parts.values())
     lines = [
         f"Command: {as_code(artefacts.command)}; {fits} fits",
-        f"Evaluation: every estimate is read at {protocol.rate_hz:g} Hz, held and never interpolated from later values; the first "
-        f"{protocol.skip_seconds:g} s of each {protocol.piece} are not scored, for anyone.{protocol.start_in_words}",
+        methods.scoring(artefacts.parts["scheme_1"].protocol, ", held and never interpolated from later values"),
         "Metrics: FVU = var(v − v̂)/var(v), R² = 1 − FVU, RMSE(v) = √E[(v − v̂)²]; sideslip β = atan2(v, u) with the measured u.",
         "Of several structures the one that holds the seed with the lowest RMSE(v) on the validation set is taken, which in both schemes "
         "is of the other car. Test data choose nothing.",
         _averaging(artefacts),
         "Intervals: paired block bootstrap over stretches of the drives and over seeds, on a logarithmic axis; Holm's correction within "
         "each statement. Spectra: segments of 25.6 s in the place of blocks.",
-        *facts,
+        *methods.facts_of(artefacts.parts.values()),
     ]
-    ranges = pd.DataFrame([_ranges(artefacts.titles[name], part) for name, part in artefacts.parts.items()])
-    columns = {"part": Column("part"), "kind": Column("data"), "train": Column("training"), "validation": Column("validation")}
     caption = "What was used for what (the first two rows are Table II of the paper)."
-    return [
-        "## Appendix: how it was made\n\n" + "\n".join(f"- {line}" for line in lines if line),
-        Table("table_2", caption, ranges, columns | {"tests": Column("tests")}),
-    ]
-
-
-def _ranges(title: str, part: PartArtefacts) -> dict[str, str]:
-    return {
-        "part": title,
-        "kind": words_of_kinds(part),
-        "train": spans_in_words(part.split.train),
-        "validation": spans_in_words(part.split.validation),
-        "tests": "; ".join(f"{SET_TITLES.get(test, test)}: {spans_in_words(spans)}" for test, spans in part.split.tests.items()),
-    }
+    return [methods.how_it_was_made(lines), methods.ranges_table(artefacts, "table_2", caption, SET_TITLES)]
 
 
 def _averaging(artefacts: StudyArtefacts) -> str:
-    """What is kept of the weights, where trainings say it."""
+    """Averaging of weights over training steps, where a training is configured with it."""
     decays = sorted(
         {
             float(model.training.get("averaging") or 0.0)

@@ -46,7 +46,7 @@ PART_WORDS = {
     "bias": "third (learned offsets)",
 }
 SPEED = 25.0
-"""Forward speed for which the third sub-model's steady value is told [m/s]."""
+"""Forward speed for which the third sub-model's steady value is given [m/s]."""
 STEADY_YAW_RATE = 0.4
 """Yaw rate for it where the last centre is at zero [rad/s]."""
 

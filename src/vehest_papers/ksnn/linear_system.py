@@ -181,30 +181,6 @@ class LpvModel:
         below = np.stack([own.beta[..., 1] * self.step * omega, own.gamma[..., 1] - own.weight[..., 1]], axis=-1)
         return np.stack([above, below], axis=-2)
 
-    def simulate(self, measurements: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Run Eq. 14 from v = 0, û = u_m.
-
-        Args:
-            measurements: yaw_rate, vx, ay, ax, shape (..., N, 4).
-
-        Returns:
-            v̂ and û one interval after each sample, each of shape (..., N) [m/s]; the network returns the last v̂.
-        """
-        omega, speed, ay, ax = np.moveaxis(np.asarray(measurements, dtype=np.float64), -1, 0)
-        own = self.gains(omega)
-        v, u = np.zeros_like(speed[..., 0]), speed[..., 0]
-        lateral, forward = np.empty_like(speed), np.empty_like(speed)
-        for k in range(speed.shape[-1]):
-            now = np.s_[..., k]
-            feedback = own.weight[..., k, :] * (u - speed[now])[..., None] + own.bias[..., k, :]
-            slip, thrust = self.step * (ay[now] - omega[now] * speed[now]), self.step * (ax[now] + omega[now] * v)
-            v, u = (
-                own.gamma[..., k, 0] * v + own.beta[..., k, 0] * slip - omega[now] * feedback[..., 0],
-                own.gamma[..., k, 1] * u + own.beta[..., k, 1] * thrust - feedback[..., 1],
-            )
-            lateral[now], forward[now] = v, u
-        return lateral, forward
-
 
 @dataclass(frozen=True, eq=False)
 class SubModels:

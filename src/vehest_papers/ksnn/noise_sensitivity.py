@@ -62,7 +62,7 @@ class NoiseSensitivity:
         return replace(self, memory=n_window)
 
     def endless(self) -> NoiseSensitivity:
-        """The recursion's own, whatever window an estimator sees."""
+        """The recursion's own, for a window of any length."""
         return replace(self, memory=None)
 
     @property

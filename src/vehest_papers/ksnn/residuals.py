@@ -169,7 +169,7 @@ def _in_words(panels: Sequence[Panel], spectra: Sequence[Sequence[Periodogram]])
 
 
 def _beside(panel: Panel, own: Residuals, error: Periodogram, first: Periodogram) -> str:
-    """How far one error lies above the first, and above the paper's where it says so."""
+    """How far one error lies above the first, and above the paper's where it is given."""
     levels = [decibels(error.level(hz), first.level(hz)) for hz in READ_AT_HZ]
     sides = [
         f"{fixed(abs(level), 1)} dB {'above' if level >= 0 else 'below'} at {hz:g} Hz" for level, hz in zip(levels, READ_AT_HZ, strict=True)

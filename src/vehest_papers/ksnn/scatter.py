@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Sequence
 from typing import Any
 
 import pandas as pd
@@ -12,33 +11,14 @@ from vehest.report.document import Figure
 from vehest.report.style import DOUBLE_COLUMN, Line, line_of, new_figure, paper_style
 from vehest_papers.ksnn import paper
 from vehest_papers.ksnn.candidates import chosen
-from vehest_papers.ksnn.paper import Published
+from vehest_papers.ksnn.schemes import Scheme
 from vehest_papers.ksnn.tables import SETS
 
 METRICS = {"r2": "R²", "rmse_vy": "RMSE(v) [m/s]"}
 
 
-@dataclass(frozen=True, eq=False)
-class Scheme:
-    """One column of the figure.
-
-    Args:
-        title: above it.
-        runs: from `candidates.runs_of`.
-        published: the paper's table for this scheme.
-        own: test set of the car that candidates learnt on, on the y axis.
-        other: test set of the other car, on the x axis.
-    """
-
-    title: str
-    runs: pd.DataFrame
-    published: Mapping[str, Published]
-    own: str
-    other: str
-
-
 def two_tests(schemes: Sequence[Scheme], caption: str) -> Figure:
-    """R² above, RMSE of v below; one column a scheme."""
+    """R² above, RMSE of v below; one column a scheme, the car that was learnt on over the other one."""
     with paper_style():
         figure = new_figure(DOUBLE_COLUMN, 6.4)
         axes = figure.subplots(2, len(schemes), squeeze=False)

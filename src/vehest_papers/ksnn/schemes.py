@@ -16,7 +16,7 @@ from vehest_papers.kit.reading import words_of_kinds
 from vehest_papers.kit.statements import Change, Measured
 from vehest_papers.ksnn import paper
 from vehest_papers.ksnn.candidates import chosen_by_category, runs_of
-from vehest_papers.ksnn.comparing import Errors
+from vehest_papers.ksnn.comparing import SegmentErrors
 from vehest_papers.ksnn.paper import Published
 
 THIRD = "j1"
@@ -92,15 +92,15 @@ class Scheme:
         return next((model for model in self.models(category) if run is not None and model.seed == run["seed"]), None)
 
     @cached_property
-    def _errors(self) -> dict[str, Errors]:
+    def _errors(self) -> dict[str, SegmentErrors]:
         return {}
 
-    def errors(self, test: str) -> Errors:
+    def errors(self, test: str) -> SegmentErrors:
         """Of all structures on a test set, named as `name_of` names them."""
         if test not in self._errors:
             groups = by_name(self.part.models)
             segments = {"/".join(name): [segments_on(model, test) for model in models] for name, models in groups.items()}
-            self._errors[test] = Errors(segments, test)
+            self._errors[test] = SegmentErrors(segments, test)
         return self._errors[test]
 
     def name_of(self, category: str) -> str:

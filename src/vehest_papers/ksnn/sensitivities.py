@@ -180,7 +180,7 @@ def _figure(columns: Sequence[tuple[Trained, Trained]], error: float) -> Figure:
         if not _settles(sensitivity_of(own.estimator, yaw_rate, error))
     ]
     growing = "".join(
-        f" The recursion of {own.described} does not settle at {yaw_rate:g} rad/s, where Appendix B says nothing: its window is shown."
+        f" The recursion of {own.described} does not settle at {yaw_rate:g} rad/s, which Appendix B does not cover: its window is shown."
         for own, yaw_rate in unstable
     )
     models = "; ".join(own.described for pair in columns for own in pair)

@@ -28,7 +28,7 @@ CAR_TITLES = {
 
 @dataclass(frozen=True, eq=False)
 class Trained:
-    """A fitted estimator with what a caption has to say of it.
+    """A fitted estimator, and its description for captions.
 
     Args:
         estimator: fitted.

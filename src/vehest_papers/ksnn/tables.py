@@ -247,8 +247,8 @@ def _range(limits: tuple[int, int]) -> str:
 def whether_an_order_means_anything(scheme: Scheme) -> str:
     """The order on the car that was stopped on, unless a candidate fails there or on the very car that it learnt on.
 
-    A candidate that leaves more of its own training car than v = 0 or the static map has not learnt that car; where it stands on another
-    says nothing of structure.
+    A candidate that leaves more of its own training car than v = 0 or the static map has not learnt that car; its error on another
+    does not depend on structure alone.
     """
     own, other = scheme.errors(scheme.own), scheme.errors(scheme.other)
     names = {category: scheme.name_of(category) for category in scheme.chosen if category not in paper.BASELINES}

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field, replace
 
 from vehest.report.document import Block, Table
 from vehest.studies.artefacts import PartArtefacts
-from vehest.studies.kit.claims import Claim, claims_table
+from vehest_papers.kit.claims import Claim, claims_table
 from vehest_papers.learned_ukf import paper
 from vehest_papers.learned_ukf.additions import (
     Comparison,
@@ -20,7 +20,7 @@ from vehest_papers.learned_ukf.additions import (
     samples_seen,
 )
 from vehest_papers.learned_ukf.candidates import models_by_candidate
-from vehest_papers.learned_ukf.errors import Errors
+from vehest_papers.learned_ukf.errors import Losses
 from vehest_papers.learned_ukf.lengths import epoch_claim, figure_7, length_comparisons, lengths
 
 DIAGONAL, CURVATURE, SCRATCH, LENGTH = "diagonal", "curvature", "scratch", "length_"
@@ -46,7 +46,7 @@ class Additions:
         return [replace(table, name="claims_added", caption=f"{SHOWN} {counts.capitalize()}. {CELLS}")] if self.claims else []
 
 
-def additions(name: str, part: PartArtefacts, beside: Mapping[str, PartArtefacts], errors: Mapping[str, Errors], kind: str) -> Additions:
+def additions(name: str, part: PartArtefacts, beside: Mapping[str, PartArtefacts], errors: Mapping[str, Losses], kind: str) -> Additions:
     """All comparisons of the parts that are there.
 
     Args:

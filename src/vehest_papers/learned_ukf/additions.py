@@ -18,15 +18,15 @@ from scipy import stats
 
 from vehest.constants import FloatArray
 from vehest.data.splits import VALIDATION
-from vehest.data.store import read_recording
-from vehest.evaluation.significance import CONFIDENCE, Interval, holm
+from vehest.evaluation.significance import CONFIDENCE, Interval
 from vehest.report.document import Column, Table
 from vehest.report.style import fixed
 from vehest.studies.artefacts import EvaluatedModel, PartArtefacts
-from vehest.studies.kit.claims import Claim, Verdict
-from vehest_papers.kit.reading import median_and_range, metric_values
+from vehest_papers.kit import statements
+from vehest_papers.kit.claims import Claim, Verdict, verdict_below, verdict_of_all
+from vehest_papers.kit.reading import lengths_of, median_and_range, metric_values, with_interval
 from vehest_papers.learned_ukf.candidates import SETS, losses, models_by_candidate
-from vehest_papers.learned_ukf.errors import Errors, in_words
+from vehest_papers.learned_ukf.errors import Losses
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,11 +44,11 @@ class Subject:
     title: str
     part: PartArtefacts
     models: Sequence[EvaluatedModel]
-    errors: Mapping[str, Errors]
+    errors: Mapping[str, Losses]
     candidate: str
 
     @classmethod
-    def of(cls, part: PartArtefacts, candidate: str, title: str = "", errors: Mapping[str, Errors] | None = None) -> Subject:
+    def of(cls, part: PartArtefacts, candidate: str, title: str = "", errors: Mapping[str, Losses] | None = None) -> Subject:
         """A candidate of a part, whose losses are read unless they are given."""
         found = errors or {test: losses(part, test) for test in SETS}
         return cls(title or candidate, part, models_by_candidate(part)[candidate], found, candidate)
@@ -117,10 +117,8 @@ def corrected(comparisons: Sequence[Comparison]) -> Corrected:
     found: Corrected = {}
     for test in SETS:
         places = [place for place, own in enumerate(comparisons) if test in own.tests]
-        intervals = [comparisons[place].difference(test) for place in places]
-        for place, own, adjusted in zip(places, intervals, holm([one.p_value for one in intervals]), strict=True):
-            factor = max(adjusted / own.p_value, 1.0) if own.p_value > 0 else float(len(places))
-            found[place, test] = (own.value, *own.at(1.0 - (1.0 - CONFIDENCE) / factor))
+        intervals = statements.corrected([comparisons[place].difference(test) for place in places])
+        found |= {(place, test): (own.value, own.low, own.high) for place, (own, _) in zip(places, intervals, strict=True)}
     return found
 
 
@@ -130,13 +128,13 @@ def comparison_claims(comparisons: Sequence[Comparison], found: Corrected, data:
     for place, own in enumerate(comparisons):
         if not own.claim:
             continue
-        words, signs = [], []
+        words, verdicts = [], []
         for test in own.tests:
             value, low, high = found[place, test]
-            signs.append(-1 if high < 0 else 1 if low > 0 else 0)
+            verdicts.append(verdict_below(low, high))
             tyre = f"{SETS[test]}: " if len(own.tests) > 1 else ""
-            words.append(f"{tyre}{' and '.join(fixed(mean, 4) for mean in own.means(test))}, {in_words(value, low, high, 4)}")
-        verdict: Verdict = "reproduced" if max(signs) < 0 else "not reproduced" if max(signs) > 0 else "undecided"
+            words.append(f"{tyre}{' and '.join(fixed(mean, 4) for mean in own.means(test))}, {with_interval(value, low, high, 4)}")
+        verdict = verdict_of_all(verdicts)
         why = {"reproduced": "below zero", "not reproduced": "above zero", "undecided": "holds zero"}[verdict]
         where = f"{data}, {SETS[own.tests[0]]}" if len(own.tests) == 1 else data
         claims.append(Claim(own.claim, own.paper, "; ".join(words), where, verdict, why))
@@ -150,7 +148,7 @@ def minima_claim(scratch: Subject, trained: Subject, data: str, share: float) ->
         scratch: those that ended.
         trained: with pre-training.
         data: real or simulated.
-        share: samples learnt from, of those of the pre-trained; below 1 a minimum cannot be told from a training that is not over.
+        share: samples learnt from, of those of the pre-trained; below 1 a minimum cannot be distinguished from a training that is not over.
     """
     limit = float(trained.validation().max())
     k, n = int((scratch.validation() > limit).sum()), len(scratch.seeds)
@@ -171,7 +169,7 @@ def differences_table(comparisons: Sequence[Comparison], found: Corrected, name:
             one, other = own.means(test)
             row: dict[str, object] = {"lower": own.lower.title, "higher": own.higher.title, "tyre": SETS[test]}
             row |= {"mse_lower": one, "mse_higher": other, "difference": value, "low": low, "high": high}
-            row["words"] = in_words(value, low, high, 4)
+            row["words"] = with_interval(value, low, high, 4)
             row["change"] = 100.0 * value / other
             row["seeds"] = f"{len(own.common)}, paired" if own.shared else f"{len(own.lower.seeds)} and {len(own.higher.seeds)}"
             rows.append(row)
@@ -228,17 +226,8 @@ def budgets_table(subjects: Sequence[Subject], name: str, data: str) -> Table:
 def samples_seen(own: Subject) -> int:
     """Samples that a seed learns from, each counted as often as it is seen: pairs one-step, sequences through the filter."""
     training = own.models[0].training
-    drives = drive_lengths(own.part)
+    drives = lengths_of(own.part, own.part.split.train)
     through = training["through" if own.models[0].variant.find("_u") >= 0 else "noise"]
     steps = int(training["steps"])
     pairs, samples = sum(length - 1 for length in drives), sum(length // steps * steps for length in drives)
     return int(training["one_step"]["max_epochs"]) * pairs + int(through["max_epochs"]) * samples
-
-
-def drive_lengths(part: PartArtefacts) -> list[int]:
-    """Samples of each drive that is learnt from."""
-    found = []
-    for span in part.split.train:
-        first, end = read_recording(part.references[span.dataset, span.recording]).index_range(span.start, span.stop)
-        found.append(end - first)
-    return found

@@ -8,16 +8,16 @@ from collections.abc import Mapping, Sequence
 import pandas as pd
 
 from vehest.data.splits import Span
-from vehest.data.store import read_recording
 from vehest.report.document import Block, Column, Table, as_code
 from vehest.report.style import fixed
 from vehest.studies.artefacts import PartArtefacts, StudyArtefacts
-from vehest_papers.kit.reading import recordings_of, spans_in_words, words_of_kinds
+from vehest_papers.kit import methods
+from vehest_papers.kit.reading import lengths_of, recordings_of, spans_in_words, words_of_kinds
 from vehest_papers.learned_ukf import paper, slips, tables
 from vehest_papers.learned_ukf.ablations import SCRATCH
 from vehest_papers.learned_ukf.candidates import SETS, models_by_candidate
 from vehest_papers.learned_ukf.departures import departures, settings_table
-from vehest_papers.learned_ukf.errors import Errors
+from vehest_papers.learned_ukf.errors import Losses
 from vehest_papers.learned_ukf.filtering import loaded
 from vehest_papers.learned_ukf.order import differences, order_in_words, pairs_table
 from vehest_papers.learned_ukf.trials import step_size, trials_table
@@ -28,7 +28,7 @@ def appendix_of_part(
     name: str,
     part: PartArtefacts,
     runs: pd.DataFrame,
-    errors: Mapping[str, Errors],
+    errors: Mapping[str, Losses],
     where: str,
     data: dict[str, pd.DataFrame],
 ) -> list[Block]:
@@ -79,12 +79,10 @@ def how_it_was_made(
     """Trials, the protocol, what was used for what with its minutes, and what departs from the paper."""
     protocol = next(iter(main.values())).protocol
     trained = {model.estimator for part in artefacts.parts.values() for model in part.models}
-    facts = dict.fromkeys(fact for part in main.values() for fact in part.facts if not fact.startswith(tuple(trained)))
     data["training_settings"] = settings_table(main)
     lines = [
         f"Command: {as_code(artefacts.command)}",
-        f"Evaluation: every estimate is read at {protocol.rate_hz:g} Hz; the first {protocol.skip_seconds:g} s of each {protocol.piece} "
-        f"are not scored, for anyone.{protocol.start_in_words}",
+        methods.scoring(protocol),
         "Metrics: squared and absolute errors of vx, vy [m/s] and yaw rate [rad/s], weighted 0.2225, 0.5064 and 0.1566 and summed at each "
         "sample; their means are MSE (weighted) and MAE, the 99th percentile of the absolute ones is 99%-AE. Units are mixed, as in the "
         "paper. NEES and NIS are divided by their dimension; coverage is that of the bands of vy.",
@@ -92,7 +90,7 @@ def how_it_was_made(
         "oracle, which learns from them.",
         "Intervals: block bootstrap over whole sequences and over seeds, paired by sequence, 95 % by Student's t.",
         *_authors_code(main),
-        *facts,
+        *(fact for fact in methods.facts_of(main.values()) if not fact.startswith(tuple(trained))),
         "Every setting of every training: [CSV](tables/training_settings.csv).",
     ]
     blocks: list[Block] = []
@@ -110,9 +108,9 @@ def how_it_was_made(
         blocks += ["## Appendix: trials", *([words] if words else []), table]
     return [
         *blocks,
-        "## Appendix: how it was made\n\n" + "\n".join(f"- {line}" for line in lines),
+        methods.how_it_was_made(lines),
         _ranges(artefacts, main),
-        "## Appendix: what departs from the paper\n\n" + "\n".join(f"- {line}" for line in departures(main)),
+        methods.bullets("## Appendix: what departs from the paper", departures(main)),
     ]
 
 
@@ -145,12 +143,7 @@ def _ranges(artefacts: StudyArtefacts, main: Mapping[str, PartArtefacts]) -> Tab
 
 def minutes(part: PartArtefacts, spans: Sequence[Span]) -> float:
     """Of driving in ranges."""
-    total = 0.0
-    for span in spans:
-        recording = read_recording(part.references[span.dataset, span.recording])
-        first, end = recording.index_range(span.start, span.stop)
-        total += (end - first) / recording.rate_hz
-    return total / 60.0
+    return sum(lengths_of(part, spans)) / part.protocol.rate_hz / 60.0
 
 
 def _sequences(part: PartArtefacts, test: str) -> str:

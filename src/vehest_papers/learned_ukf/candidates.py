@@ -24,9 +24,10 @@ from vehest.evaluation.metrics import (
 )
 from vehest.evaluation.significance import sequence_labels
 from vehest.studies.artefacts import EvaluatedModel, PartArtefacts
+from vehest_papers.kit import reading
 from vehest_papers.kit.reading import metric_values
 from vehest_papers.learned_ukf import paper
-from vehest_papers.learned_ukf.errors import Errors
+from vehest_papers.learned_ukf.errors import Losses
 
 SETS: Mapping[str, str] = {"tyre_a": "tyre A", "tyre_d": "tyre D"}
 """Test set -> tyre."""
@@ -62,20 +63,8 @@ def candidate_of(model: EvaluatedModel) -> str:
 
 
 def models_by_candidate(part: PartArtefacts) -> dict[str, list[EvaluatedModel]]:
-    """Candidate -> its seeds, in the order of Table II; others come last.
-
-    Raises:
-        DataError: two models of one candidate have the same seed.
-    """
-    groups: dict[str, list[EvaluatedModel]] = {}
-    for model in part.models:
-        groups.setdefault(candidate_of(model), []).append(model)
-    for name, models in groups.items():
-        if len({model.seed for model in models}) != len(models):
-            raise DataError(f"study '{part.study}': candidate {name} was trained twice with one seed; give each variant a part of its own")
-    known = (*paper.CANDIDATES, *paper.BASELINES)
-    order = [*(name for name in known if name in groups), *(name for name in groups if name not in known)]
-    return {name: sorted(groups[name], key=lambda model: model.seed) for name in order}
+    """Candidate -> its seeds, in the order of Table II; others come last."""
+    return reading.models_by_candidate(part, candidate_of, (*paper.CANDIDATES, *paper.BASELINES))
 
 
 def runs_of(part: PartArtefacts) -> pd.DataFrame:
@@ -138,7 +127,7 @@ def chosen(part: PartArtefacts, runs: pd.DataFrame, candidate: str) -> Evaluated
     return models_by_candidate(part)[candidate][int(np.argmin(np.where(np.isfinite(own), own, np.inf)))]
 
 
-def losses(part: PartArtefacts, test: str) -> Errors:
+def losses(part: PartArtefacts, test: str) -> Losses:
     """Weighted squared and absolute errors of every seed at every scored sample, and the sequence that each sample belongs to."""
     squared: dict[str, FloatArray] = {}
     absolute: dict[str, FloatArray] = {}
@@ -148,4 +137,4 @@ def losses(part: PartArtefacts, test: str) -> Errors:
         lengths = [len(piece.vy) for piece in scored[0]]
         squared[candidate] = np.stack([np.concatenate([weighted_squared_errors(piece) for piece in own]) for own in scored])
         absolute[candidate] = np.stack([np.concatenate([weighted_absolute_errors(piece) for piece in own]) for own in scored])
-    return Errors(squared, absolute, sequence_labels(lengths), part.protocol.rate_hz)
+    return Losses(squared, absolute, sequence_labels(lengths), part.protocol.rate_hz)

@@ -22,12 +22,14 @@ from collections.abc import Mapping, Sequence
 
 from scipy import stats
 
-from vehest.evaluation.significance import CONFIDENCE, Interval, holm
+from vehest.evaluation.significance import CONFIDENCE, Interval
 from vehest.report.style import fixed
-from vehest.studies.kit.claims import Claim, Verdict
+from vehest_papers.kit.claims import Claim, Verdict, verdict_below, verdict_of_all
+from vehest_papers.kit.reading import with_interval
+from vehest_papers.kit.statements import corrected
 from vehest_papers.learned_ukf import paper
 from vehest_papers.learned_ukf.candidates import SETS
-from vehest_papers.learned_ukf.errors import Errors, in_words
+from vehest_papers.learned_ukf.errors import Losses
 
 TOLERANCE = 0.05  # of the friction
 NEAR = 0.1  # of the paper's nominal friction
@@ -72,31 +74,27 @@ PERCENTILES: Sequence[tuple[str, str, str]] = ((A, paper.NNTF_UH, paper.GRU), (A
 
 def verdict_of(low: float, high: float, limit: float = 0.0) -> tuple[Verdict, str]:
     """Of a figure that the paper has below a limit."""
-    if high < limit:
-        return "reproduced", "interval below" + (" zero" if not limit else "")
-    if low > limit:
-        return "not reproduced", "interval above" + (" zero" if not limit else "")
-    return "undecided", "interval holds " + ("zero" if not limit else "the limit")
+    verdict = verdict_below(low, high, limit)
+    words = {"reproduced": "below", "not reproduced": "above", "undecided": "holds" if not limit else "holds the limit"}[verdict]
+    return verdict, f"interval {words}{'' if limit else ' zero'}"
 
 
-def pair_claims(errors: Errors, test: str, data: str) -> list[Claim]:
+def pair_claims(errors: Losses, test: str, data: str) -> list[Claim]:
     """Those of `PAIRS` on a test, corrected by Holm among themselves."""
     pairs = [pair for pair in PAIRS[test] if all(name in errors.squared for name in pair)]
-    found = [errors.of_pair(first, second) for first, second in pairs]
+    found = corrected([errors.of_pair(first, second) for first, second in pairs])
     claims = []
-    for (first, second), own, adjusted in zip(pairs, found, holm([one.p_value for one in found]), strict=True):
-        factor = max(adjusted / own.p_value, 1.0) if own.p_value > 0 else float(len(pairs))
-        low, high = own.at(1.0 - (1.0 - CONFIDENCE) / factor)
-        verdict, why = verdict_of(low, high)
+    for (first, second), (own, _) in zip(pairs, found, strict=True):
+        verdict, why = verdict_of(own.low, own.high)
         known = paper.TABLES[test]
         words = f"{fixed(known[first].mse, 4)} and {fixed(known[second].mse, 4)}" if first in known and second in known else "–"
         values = " and ".join(fixed(float(errors.squared[name].mean()), 4) for name in (first, second))
-        ours = f"{values}; difference {in_words(own.value, low, high, 4)}"
+        ours = f"{values}; difference {with_interval(own.value, own.low, own.high, 4)}"
         claims.append(Claim(f"{first} below {second}", words + _tyre_c(test), ours, f"{data}, {SETS[test]}", verdict, why))
     return claims
 
 
-def factor_claims(errors: Mapping[str, Errors], data: str) -> list[Claim]:
+def factor_claims(errors: Mapping[str, Losses], data: str) -> list[Claim]:
     """Those of `FACTORS`."""
     claims = []
     for test, first, second, limit, words in FACTORS:
@@ -105,11 +103,11 @@ def factor_claims(errors: Mapping[str, Errors], data: str) -> list[Claim]:
         value, low, high = errors[test].ratio(first, second)
         verdict, why = verdict_of(low, high, limit)
         claim = f"{first}'s MSE at most {fixed(limit, 2)} of {second}'s"
-        claims.append(Claim(claim, words + _tyre_c(test), in_words(value, low, high, 2), f"{data}, {SETS[test]}", verdict, why))
+        claims.append(Claim(claim, words + _tyre_c(test), with_interval(value, low, high, 2), f"{data}, {SETS[test]}", verdict, why))
     return claims
 
 
-def percentile_claims(errors: Mapping[str, Errors], data: str) -> list[Claim]:
+def percentile_claims(errors: Mapping[str, Losses], data: str) -> list[Claim]:
     """Those of `PERCENTILES`."""
     claims = []
     for test, first, second in PERCENTILES:
@@ -119,7 +117,7 @@ def percentile_claims(errors: Mapping[str, Errors], data: str) -> list[Claim]:
         verdict, why = verdict_of(own.low, own.high)
         known = [paper.TABLES[test][name].ae99 for name in (first, second)]
         words = " and ".join(fixed(value, 3) for value in known)
-        ours = f"difference {in_words(own.value, own.low, own.high, 3)}"
+        ours = f"difference {with_interval(own.value, own.low, own.high, 3)}"
         claims.append(Claim(f"99%-AE of {first} below {second}'s", words, ours, f"{data}, {SETS[test]}", verdict, why))
     return claims
 
@@ -139,8 +137,8 @@ def friction_claims(median: Interval, final: Interval, data: str) -> list[Claim]
         "not reproduced": "interval beyond",
         "undecided": "interval holds a limit",
     }
-    time = f"{in_words(median.value, median.low, median.high, 2)} s"
-    end = in_words(final.value, final.low, final.high, 2)
+    time = f"{with_interval(median.value, median.low, median.high, 2)} s"
+    end = with_interval(final.value, final.low, final.high, 2)
     where = f"{data}, tyre D"
     return [
         Claim("friction converges rapidly: median time below 2 s", "Figure 4, tyre C", time, where, fast, why),
@@ -175,31 +173,34 @@ def states_claim(claim: str, words: str, expected: Mapping[str, tuple[Interval, 
         expected: state -> difference of mean squares NNTF_U - NNTF, the error of NNTF, and whether the paper has it lower.
         data: test.
     """
-    signs, shown = [], []
+    verdicts, shown = [], []
     for state, (own, before, lower) in expected.items():
-        away = -1 if own.high < 0 else 1 if own.low > 0 else 0
-        signs.append(away if lower else -away)
+        verdicts.append(verdict_below(own.low, own.high) if lower else verdict_below(-own.high, -own.low))
         low, value, high = (100.0 * end / before for end in (own.low, own.value, own.high))
-        shown.append(f"{state.replace('_', ' ')} {in_words(value, low, high, 0)} %")
-    verdict: Verdict = "reproduced" if all(own < 0 for own in signs) else "not reproduced" if any(own > 0 for own in signs) else "undecided"
-    why = {"reproduced": "all as claimed", "not reproduced": "one is the other way round", "undecided": "not all are told apart"}[verdict]
-    return Claim(claim, words, "; ".join(shown), data, verdict, why)
+        shown.append(f"{state.replace('_', ' ')} {with_interval(value, low, high, 0)} %")
+    verdict = verdict_of_all(verdicts)
+    words_of = {
+        "reproduced": "all as claimed",
+        "not reproduced": "one interval contradicts the claim",
+        "undecided": "not all are told apart",
+    }
+    return Claim(claim, words, "; ".join(shown), data, verdict, words_of[verdict])
 
 
 def difference_claim(claim: str, words: str, own: Interval, values: tuple[float, float], data: str) -> Claim:
     """That the first of two mean losses is the lower one, by the 95 % interval of the difference."""
     verdict, why = verdict_of(own.low, own.high)
     shown = " and ".join(fixed(value, 4) for value in values)
-    return Claim(claim, words, f"{shown}; difference {in_words(own.value, own.low, own.high, 4)}", data, verdict, why)
+    return Claim(claim, words, f"{shown}; difference {with_interval(own.value, own.low, own.high, 4)}", data, verdict, why)
 
 
 def not_testable(*, timed: bool = False) -> list[Claim]:
-    """What the files at hand cannot say; ``timed``: the length of training sequences has a row of its own."""
+    """Claims that these files cannot test; ``timed``: the length of training sequences has a row of its own."""
     untestable: Verdict = "not testable on this data"
     rows = (
-        ("every figure of Table II itself", "tyre C", "recordings of tyre C are not at hand; tyre D stands in"),
+        ("every figure of Table II itself", "tyre C", "no recordings of tyre C; tyre D stands in"),
         ("RMS errors 0.062 and 0.070 m/s on tyre A", "0.062; 0.070 m/s", "the test is another part of tyre A's recordings"),
-        ("99th percentile of rear slip beyond 40°", "40°", "3 of the data set's files are at hand"),
+        ("99th percentile of rear slip beyond 40°", "40°", "only 3 of the data set's files"),
         *(() if timed else (("longer training sequences take longer an epoch", "Figure 7", "times are in no published file"),)),
     )
     return [Claim(claim, words, "–", "none", untestable, why) for claim, words, why in rows]

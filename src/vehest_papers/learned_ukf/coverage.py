@@ -11,8 +11,8 @@ from vehest.evaluation.consistency import COVERAGE
 from vehest.evaluation.metrics import Scored
 from vehest.report.document import Column, Table
 from vehest.studies.artefacts import EvaluatedModel, PartArtefacts
+from vehest_papers.kit.reading import with_interval
 from vehest_papers.learned_ukf.candidates import SETS, losses, scored_of
-from vehest_papers.learned_ukf.errors import in_words
 
 
 def coverage_table(trained: Mapping[str, tuple[PartArtefacts, list[EvaluatedModel]]], candidate: str, name: str, data: str) -> Table:
@@ -29,14 +29,18 @@ def coverage_table(trained: Mapping[str, tuple[PartArtefacts, list[EvaluatedMode
         for words, (part, models) in trained.items():
             errors = losses(part, test)
             mse = errors.mean(errors.squared[candidate])
-            row: dict[str, object] = {"tyre": tyre, "training": words, "mse_words": in_words(mse.value, max(mse.low, 0.0), mse.high, 4)}
+            row: dict[str, object] = {
+                "tyre": tyre,
+                "training": words,
+                "mse_words": with_interval(mse.value, max(mse.low, 0.0), mse.high, 4),
+            }
             scored = [scored_of(part, model, test) for model in models]
             for sigma, expected in COVERAGE.items():
                 inside = np.stack([np.concatenate([_within(piece, sigma) for piece in own]) for own in scored])
                 share = errors.mean(inside)
                 row |= {
                     f"inside_{sigma}": share.value,
-                    f"words_{sigma}": in_words(share.value, max(share.low, 0.0), min(share.high, 1.0), 3),
+                    f"words_{sigma}": with_interval(share.value, max(share.low, 0.0), min(share.high, 1.0), 3),
                 }
                 row[f"expected_{sigma}"] = expected
             row["width"] = float(np.mean([np.sqrt(_variance(piece)).mean() for own in scored for piece in own]))

@@ -1,4 +1,4 @@
-"""What a study's trainings do in another way than the paper, said from their settings."""
+"""Differences of the trainings to the paper's, read from their settings."""
 
 from __future__ import annotations
 

@@ -8,17 +8,18 @@ from dataclasses import dataclass, field
 import pandas as pd
 
 from vehest.data.errors import DataError
-from vehest.evaluation.significance import CONFIDENCE, holm
 from vehest.report.document import REPORT, Block, Document, as_text
 from vehest.report.style import fixed, listed
 from vehest.studies.artefacts import EvaluatedModel, PartArtefacts, StudyArtefacts
-from vehest.studies.kit.claims import Claim, claims_table
-from vehest_papers.kit.reading import words_of_kinds
+from vehest_papers.kit.claims import Claim, claims_table
+from vehest_papers.kit.methods import absent_parts, kinds_of_parts
+from vehest_papers.kit.reading import with_interval, words_of_kinds
+from vehest_papers.kit.statements import corrected
 from vehest_papers.learned_ukf import ablations, claims, coverage, friction, paper, prediction, tables, traces
 from vehest_papers.learned_ukf.ablations import CURVATURE, DIAGONAL, LENGTH, SCRATCH
 from vehest_papers.learned_ukf.appendix import appendix_of_part, how_it_was_made, minutes
 from vehest_papers.learned_ukf.candidates import SETS, chosen, losses, models_by_candidate, runs_of
-from vehest_papers.learned_ukf.errors import Errors, in_words
+from vehest_papers.learned_ukf.errors import Losses
 from vehest_papers.learned_ukf.filtering import definiteness, drives_of, filtered, loaded
 from vehest_papers.learned_ukf.oracle import EPOCHS, train_on
 
@@ -73,11 +74,7 @@ def documents(artefacts: StudyArtefacts) -> dict[str, Document]:
 
 
 def _asked(artefacts: StudyArtefacts, main: Mapping[str, PartArtefacts]) -> list[Block]:
-    kinds = "; ".join(f"**{artefacts.titles[name]}: {words_of_kinds(part).upper()} data**" for name, part in main.items())
-    words = f"{kinds}. The paper's are real."
-    if artefacts.absent:
-        absent = "; ".join(artefacts.titles[name] for name in artefacts.absent)
-        words += f" Not in this report, since the recordings were not at hand: {absent}."
+    words = f"{kinds_of_parts(artefacts, main)}. The paper's are real.{absent_parts(artefacts)}"
     learnt = "; ".join(f"{fixed(minutes(part, part.split.train), 1)} min ({words_of_kinds(part)})" for part in main.values())
     words += f" Learnt on: {learnt}; in the paper about {fixed(paper.MINUTES_LEARNT, 1)} min of the same tyre."
     return [words, artefacts.about]
@@ -113,9 +110,7 @@ def _budgets_in_words(main: Mapping[str, PartArtefacts]) -> str:
         if paper.NN in groups and groups[paper.NN][0].training:
             words.append(f"{paper.NN} {groups[paper.NN][0].training['one_step']['max_epochs']} one-step, too few for it")
         if words:
-            sentences.append(
-                f"**Budgets are small** ({words_of_kinds(part)}): {', '.join(words)}; what more of them does, docs/learned_ukf.md says."
-            )
+            sentences.append(f"**Budgets are small** ({words_of_kinds(part)}): {', '.join(words)}; larger ones: docs/learned_ukf.md.")
     return " ".join(sentences)
 
 
@@ -148,7 +143,7 @@ def _outcome(name: str, part: PartArtefacts, artefacts: StudyArtefacts, data: di
     return own
 
 
-def _add_oracle(part: PartArtefacts, runs: pd.DataFrame, errors: Mapping[str, Errors]) -> None:
+def _add_oracle(part: PartArtefacts, runs: pd.DataFrame, errors: Mapping[str, Losses]) -> None:
     """Losses of the oracle on each test, beside those of the methods."""
     if paper.NNTF_UH not in models_by_candidate(part):
         return
@@ -161,8 +156,8 @@ def _add_oracle(part: PartArtefacts, runs: pd.DataFrame, errors: Mapping[str, Er
         own.add(paper.ORACLE, error)
 
 
-def _accuracy(own: Outcome, name: str, errors: Mapping[str, Errors], kind: str, *, summary: bool) -> None:
-    """Who may be called best, the summary, and Tables I and II."""
+def _accuracy(own: Outcome, name: str, errors: Mapping[str, Losses], kind: str, *, summary: bool) -> None:
+    """The best method, the summary, and Tables I and II."""
     own.front.append("## Tables I and II\n\n" + "\n\n".join(_standing(of_test, SETS[test]) for test, of_test in errors.items()))
     if summary:
         own.front.append(tables.overview(errors, kind))
@@ -177,16 +172,15 @@ def _accuracy(own: Outcome, name: str, errors: Mapping[str, Errors], kind: str, 
         own.appendix.append(tables.accuracy(errors[test], test, f"table_{1 if test == 'tyre_a' else 2}_{name}", caption))
 
 
-def _standing(errors: Errors, tyre: str) -> str:
-    """Who has the lowest error, whether that is more than chance, and who is below the baselines."""
+def _standing(errors: Losses, tyre: str) -> str:
+    """Method with the lowest error, whether the difference is significant, and methods below the baselines."""
     means = {name: float(own.mean()) for name, own in errors.squared.items() if name != paper.ORACLE}
     order = sorted(means, key=means.__getitem__)
     best = order[0]
-    against = {name: errors.of_pair(best, name) for name in order[1:]}
-    adjusted = dict(zip(against, holm([own.p_value for own in against.values()]), strict=True))
-    level = [name for name, p_value in adjusted.items() if p_value >= 1.0 - CONFIDENCE]
+    against = [errors.of_pair(best, name) for name in order[1:]]
+    level = [name for name, (_, apart) in zip(order[1:], corrected(against), strict=True) if not apart]
     interval = errors.mean(errors.squared[best])
-    figure = in_words(interval.value, interval.low, interval.high, 4)
+    figure = with_interval(interval.value, interval.low, interval.high, 4)
     if not level and best not in paper.BASELINES:
         words = f"On {tyre} **{best}** has the lowest MSE, {figure}: below every other method and the baselines, each by more than chance."
     else:
@@ -196,10 +190,8 @@ def _standing(errors: Errors, tyre: str) -> str:
     baselines = [name for name in paper.BASELINES if name in means]
     if baselines:
         pairs = [(name, other) for name in order if name not in baselines for other in baselines]
-        tested = [errors.of_pair(*pair) for pair in pairs]
-        lower = {
-            pair for pair, own, p in zip(pairs, tested, holm([own.p_value for own in tested]), strict=True) if own.value < 0 and p < 0.05
-        }
+        tested = corrected([errors.of_pair(*pair) for pair in pairs])
+        lower = {pair for pair, (own, apart) in zip(pairs, tested, strict=True) if own.value < 0 and apart}
         weak = [name for name in order if name not in baselines and not all((name, other) in lower for other in baselines)]
         if len(weak) == len(order) - len(baselines):
             words += f" No method is below all of {listed(baselines)} by more than chance."

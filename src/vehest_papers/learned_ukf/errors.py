@@ -13,7 +13,6 @@ from scipy import stats
 from vehest.constants import FloatArray
 from vehest.evaluation.metrics import WEIGHTS
 from vehest.evaluation.significance import CONFIDENCE, Interval, paired_difference
-from vehest.report.style import fixed
 from vehest_papers.learned_ukf import paper
 
 N_RESAMPLES = 500
@@ -21,7 +20,7 @@ SAME_WEIGHTS = {paper.NNTF_UH, paper.NNTF_UH_LOW}
 
 
 @dataclass(frozen=True)
-class Errors:
+class Losses:
     """What the methods lose on a test, sample by sample.
 
     Args:
@@ -97,8 +96,3 @@ def _edge(apart: Callable[[float], bool], inside: float, outside: float) -> floa
         middle = 0.5 * (inside + outside)
         inside, outside = (inside, middle) if apart(middle) else (middle, outside)
     return 0.5 * (inside + outside)
-
-
-def in_words(value: float, low: float, high: float, decimals: int) -> str:
-    """A figure with its interval: ``0.0086 [0.0071, 0.0101]``."""
-    return f"{fixed(value, decimals)} [{fixed(low, decimals)}, {fixed(high, decimals)}]"

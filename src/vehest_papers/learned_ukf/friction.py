@@ -16,10 +16,10 @@ from vehest.evaluation.significance import CONFIDENCE, Interval
 from vehest.report.document import Column, Figure, Table
 from vehest.report.style import DOUBLE_COLUMN, MISSING, fixed, legend_above, new_figure, paper_style
 from vehest.training.through_filter import Drive
+from vehest_papers.kit.reading import with_interval
 from vehest_papers.learned_ukf import paper
 from vehest_papers.learned_ukf.candidates import SETS
 from vehest_papers.learned_ukf.claims import TOLERANCE
-from vehest_papers.learned_ukf.errors import in_words
 from vehest_papers.learned_ukf.filtering import filtered, squares_of, weighted
 from vehest_papers.learned_ukf.prediction import over_sequences
 
@@ -99,7 +99,7 @@ def mean(values: FloatArray) -> float:
 
 
 def convergence_table(tracks: Mapping[str, Mapping[float, Tracks]], skip_seconds: float, name: str, data: str) -> Table:
-    """A row a tyre and start: time to converge, final value, and what the filter itself says of it."""
+    """A row a tyre and start: time to converge, final value, and and the filter's own deviation."""
     rows = []
     for test, by_start in tracks.items():
         for start, own in by_start.items():
@@ -109,14 +109,14 @@ def convergence_table(tracks: Mapping[str, Mapping[float, Tracks]], skip_seconds
             rows.append(
                 {
                     "forgotten": apart.value,
-                    "forgotten_words": MISSING if start == TRAINED_FROM else in_words(apart.value, max(apart.low, 0.0), apart.high, 2),
+                    "forgotten_words": MISSING if start == TRAINED_FROM else with_interval(apart.value, max(apart.low, 0.0), apart.high, 2),
                     "tyre": SETS[test],
                     "start": start,
                     "time": time.value,
-                    "time_words": in_words(time.value, max(time.low, 0.0), time.high, 2),
+                    "time_words": with_interval(time.value, max(time.low, 0.0), time.high, 2),
                     "within": 100.0 * float(np.mean(times <= skip_seconds)),
                     "final": final.value,
-                    "final_words": in_words(final.value, final.low, final.high, 3),
+                    "final_words": with_interval(final.value, final.low, final.high, 3),
                     "spread": float(np.std(own.final)),
                     "deviation": float(own.deviation[..., -1].mean()),
                     "nominal": paper.NOMINAL_FRICTION[test],
@@ -135,7 +135,7 @@ def convergence_table(tracks: Mapping[str, Mapping[float, Tracks]], skip_seconds
     caption = (
         f"The friction of {paper.NNTF_UH} from three starts, {data}: 95 % intervals over sequences and seeds. Converged: stays within "
         f"{TOLERANCE:g} of its mean over the last {LAST_SECONDS:g} s. Time to the track from {TRAINED_FROM:g}: until it stays within "
-        f"{TOLERANCE:g} of it, which says how long a wrong start lasts; added after the tests had been seen, so it decides no claim."
+        f"{TOLERANCE:g} of it, the effect of a wrong start; added after the tests had been seen, so it decides no claim."
     )
     return Table(f"friction_{name}", caption, pd.DataFrame(rows), columns)
 
@@ -195,7 +195,7 @@ def start_table(filters: Sequence[LearnedUkf], drives: Mapping[str, Drive], prot
                     "usual": float(squares[TRAINED_FROM].mean()),
                     "low": float(squares[LOW].mean()),
                     "change": change.value,
-                    "change_words": in_words(change.value, change.low, change.high, 4),
+                    "change_words": with_interval(change.value, change.low, change.high, 4),
                 }
             )
     columns = {

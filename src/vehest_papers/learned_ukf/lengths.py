@@ -13,10 +13,10 @@ from vehest.data.errors import DataError
 from vehest.report.document import Column, Figure, Table
 from vehest.report.style import DOUBLE_COLUMN, OTHER_COLOURS, legend_above, listed, new_figure, paper_style
 from vehest.studies.artefacts import PartArtefacts
-from vehest.studies.kit.claims import Claim
-from vehest_papers.learned_ukf.additions import Comparison, Subject, drive_lengths
+from vehest_papers.kit.claims import Claim
+from vehest_papers.kit.reading import lengths_of, with_interval
+from vehest_papers.learned_ukf.additions import Comparison, Subject
 from vehest_papers.learned_ukf.candidates import SETS, models_by_candidate
-from vehest_papers.learned_ukf.errors import in_words
 
 _SUBSCRIPT_U = re.compile(r"_uh?(_|$)")
 WAYS = {"batch": "constant batch", "samples": "constant samples a batch"}
@@ -61,7 +61,7 @@ def lengths(parts: Mapping[str, PartArtefacts]) -> list[Length]:
         steps, batch = int(training["steps"]), int(training["batch_size"])
         candidate = next(iter(models_by_candidate(part)))
         subject = Subject.of(part, candidate, f"{candidate}, {batch} × {steps} samples")
-        sequences = sum(length // steps for length in drive_lengths(part))
+        sequences = sum(length // steps for length in lengths_of(part, part.split.train))
         found.append(Length(steps, batch, int(training["through"]["max_epochs"]), sequences, subject))
     return sorted(found, key=lambda own: (own.steps, own.batch))
 
@@ -84,7 +84,7 @@ def figure_7(found: Sequence[Length], data: str) -> tuple[Figure, Table]:
             for test, errors in own.subject.errors.items():
                 mse = errors.mean(own.subject.squared(test))
                 row |= {f"mse.{test}": mse.value, f"low.{test}": mse.low, f"high.{test}": mse.high}
-                row[f"words.{test}"] = in_words(mse.value, max(mse.low, 0.0), mse.high, 4)
+                row[f"words.{test}"] = with_interval(mse.value, max(mse.low, 0.0), mse.high, 4)
             rows.append(row)
     frame, tests = pd.DataFrame(rows), list(SETS)
     with paper_style():
@@ -107,9 +107,8 @@ def figure_7(found: Sequence[Length], data: str) -> tuple[Figure, Table]:
     seeds = sorted({len(own.subject.seeds) for own in found})
     caption = (
         f"Length of training sequences against MSE (weighted), Figure 7 of the paper: {found[0].subject.candidate}, "
-        f"{listed([str(own) for own in seeds])} seeds, "
-        f"{found[0].epochs} epochs through the filter. An epoch goes once through the drives, so a smaller batch takes more steps. "
-        f"Bars: 95 % intervals over sequences and seeds. Data: {data}."
+        f"{listed([str(own) for own in seeds])} seeds, {found[0].epochs} epochs through the filter. An epoch goes once through the drives, "
+        f"so a smaller batch takes more steps. Bars: 95 % intervals over sequences and seeds. Data: {data}."
     )
     columns = {"way": Column("held constant"), "steps": Column("samples", decimals=0), "batch": Column("sequences in a batch", decimals=0)}
     columns |= {"epochs": Column("epochs", decimals=0), "batches": Column("batches an epoch", decimals=0)}

@@ -1,4 +1,4 @@
-"""The oracle: NNTF_UH, trained on through the filter on the very sequences that it is tested on. What it reaches nobody is asked to."""
+"""The oracle: NNTF_UH, trained on through the filter on the very sequences that it is tested on."""
 
 from __future__ import annotations
 

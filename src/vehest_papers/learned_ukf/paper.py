@@ -1,4 +1,4 @@
-"""What Węgrzynowski et al. 2024 report, by table, and what their public code makes of the files at hand."""
+"""Figures of Węgrzynowski et al. 2024 by table, and errors of their public code on the files of this study."""
 
 from __future__ import annotations
 

@@ -59,7 +59,7 @@ def over_sequences(first: FloatArray, second: FloatArray) -> Interval:
 
 
 def compared(pairs: Mapping[int, Pair], drives: Mapping[str, Drive], protocol: Protocol) -> dict[str, Compared]:
-    """Errors of both models as predictors and in their filters, and of all four filters that can be put together of them.
+    """Losses of both models as predictors and in their filters, and of all four filters that can be put together of them.
 
     Args:
         pairs: seed -> NNTF and NNTF_U.

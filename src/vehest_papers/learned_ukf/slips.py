@@ -13,7 +13,7 @@ from vehest.report.document import Column, Figure, Table
 from vehest.report.style import DOUBLE_COLUMN, OTHER_COLOURS, legend_above, new_figure, paper_style
 from vehest_papers.learned_ukf import paper
 
-LEAST_SPEED = 0.5  # [m/s] below which an angle of slip says little
+LEAST_SPEED = 0.5  # [m/s] below which a slip angle is noise
 LIMIT = 90.0  # [deg] of the axis; what lies beyond counts in the outermost bins
 WIDTH = 2.0  # [deg] of a bin
 PERCENTILES = (50, 90, 99)

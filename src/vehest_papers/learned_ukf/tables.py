@@ -12,10 +12,10 @@ from vehest.evaluation.consistency import COVERAGE
 from vehest.report.document import Column, Table
 from vehest.report.style import MISSING, fixed
 from vehest.studies.artefacts import PartArtefacts
-from vehest_papers.kit.reading import median_and_range
+from vehest_papers.kit.reading import median_and_range, with_interval
 from vehest_papers.learned_ukf import paper
 from vehest_papers.learned_ukf.candidates import SETS, models_by_candidate, of_candidate
-from vehest_papers.learned_ukf.errors import Errors, in_words
+from vehest_papers.learned_ukf.errors import Losses
 from vehest_papers.learned_ukf.filtering import Definiteness
 from vehest_papers.learned_ukf.paper import Published
 
@@ -25,7 +25,7 @@ METRICS = {"mse": ("mse_weighted", "MSE (weighted)"), "mae": ("mae_weighted", "M
 STATES = {"vx": "m/s", "vy": "m/s", "yaw_rate": "rad/s"}
 
 
-def accuracy(errors: Errors, test: str, name: str, caption: str) -> Table:
+def accuracy(errors: Losses, test: str, name: str, caption: str) -> Table:
     """Table I or II: the paper's figures and ours, means over seeds with 95 % intervals over sequences and seeds.
 
     Args:
@@ -44,7 +44,7 @@ def accuracy(errors: Errors, test: str, name: str, caption: str) -> Table:
             row[f"paper_{short}"] = _figure(published.get(candidate), short)
         for short, own in values.items():
             row |= {short: own.value, f"{short}_low": own.low, f"{short}_high": own.high}
-            row[f"ours_{short}"] = in_words(own.value, max(own.low, 0.0), own.high, 4)
+            row[f"ours_{short}"] = with_interval(own.value, max(own.low, 0.0), own.high, 4)
         row["ours_ae99"] = float(np.percentile(absolute, 99.0, axis=1).mean())
         rows.append(row | {"n_seeds": len(squared)})
     columns = {"candidate": Column("method")}
@@ -55,7 +55,7 @@ def accuracy(errors: Errors, test: str, name: str, caption: str) -> Table:
     return Table(name, caption, pd.DataFrame(rows), columns)
 
 
-def overview(errors: Mapping[str, Errors], kind: str) -> Table:
+def overview(errors: Mapping[str, Losses], kind: str) -> Table:
     """What the terminal shows: weighted MSE of every method on both tyres, with its interval, beside the paper's."""
     rows = []
     for candidate in next(iter(errors.values())).squared:
@@ -65,7 +65,7 @@ def overview(errors: Mapping[str, Errors], kind: str) -> Table:
             mse = own.mean(own.squared[candidate])
             row |= {f"paper_{test}": known.mse if known else math.nan, f"ours_{test}": mse.value}
             row |= {f"low_{test}": mse.low, f"high_{test}": mse.high}
-            row[f"words_{test}"] = in_words(mse.value, max(mse.low, 0.0), mse.high, 4)
+            row[f"words_{test}"] = with_interval(mse.value, max(mse.low, 0.0), mse.high, 4)
             row["n_seeds"] = len(own.squared[candidate])
         rows.append(row)
     columns = {"candidate": Column("method")}

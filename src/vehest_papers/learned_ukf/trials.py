@@ -1,4 +1,4 @@
-"""Which step sizes were tried and what validation said of them: as many trials for the filter as for either recurrent network."""
+"""Step sizes that were tried, and their validation errors: as many trials for the filter as for either recurrent network."""
 
 from __future__ import annotations
 

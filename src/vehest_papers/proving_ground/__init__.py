@@ -1,4 +1,4 @@
-"""The study of the simulated cars: what they do, beside what papers say of real ones and beside a real recording.
+"""The study of the simulated cars: their drives, beside published figures of real ones and beside a real recording.
 
 Used by the pipeline ``proving_ground``. `documents` makes an index and a page a vehicle.
 """

@@ -1,7 +1,7 @@
 """Gates on the simulated race cars: what their inputs must look like before any network is trained on them.
 
-Fixed by what Da Lio et al. 2023 print of their recordings (Table I, Section VII-A) and by the one real recording at hand. No estimator's
-error is among them but that of the static map on its own car, which says how much of v needs more than a map.
+Fixed by what Da Lio et al. 2023 print of their recordings (Table I, Section VII-A) and by the one real recording. No estimator's
+error is among them but that of the static map on its own car, the share of v that a map leaves unexplained.
 """
 
 from __future__ import annotations
@@ -103,7 +103,7 @@ def gates(drives: Mapping[str, Mapping[str, Sequence[Recording]]], real: Sequenc
 
     Args:
         drives: data set -> set of drives, ``c1`` say -> its recordings at `RATE_HZ`.
-        real: the real Ferrari's, at the same rate; empty where it is not at hand, and the gate on its spectrum is then left out.
+        real: the real Ferrari's, at the same rate; empty where it is missing, and the gate on its spectrum is then left out.
     """
     found = [gate for name, published in PUBLISHED.items() for gate in _of_table_one(name, published, drives)]
     by_car = {name: _by_car(sets) for name, sets in drives.items()}

@@ -86,7 +86,7 @@ class Characteristic:
 
 
 def vehicle_of(provenance: Mapping[str, Any], name: str) -> Vehicle:
-    """The car of a simulated recording, from what the recording says of itself."""
+    """The car of a simulated recording, from its provenance."""
     return Vehicle(name, int(provenance["parameter_set"]), provenance["overrides"])
 
 

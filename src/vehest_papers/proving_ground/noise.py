@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 
 import numpy as np
 import pandas as pd
 from scipy import signal
 
+from vehest.constants import FloatArray
 from vehest.data.recording import Recording
 from vehest_papers.proving_ground.noise_reading import NOISE_ABOVE, WELCH_SECONDS, read_off
-from vehest_papers.proving_ground.recording_figures import Spectrum
 
 SHOWN = {
     "vx": "vx [m/s/√Hz]",
@@ -38,6 +39,21 @@ LEVELS = {
     "roll_gradient": ("roll that leaks gravity into ay", "rad/(m/s²)"),
     "pitch_gradient": ("pitch that leaks gravity into ax", "rad/(m/s²)"),
 }
+
+
+@dataclass(frozen=True, eq=False)
+class Spectrum:
+    """Amplitude density of a channel.
+
+    Args:
+        kind: ``real`` or ``simulated``.
+        frequency: (F,) [Hz].
+        density: (F,) [unit/√Hz].
+    """
+
+    kind: str
+    frequency: FloatArray
+    density: FloatArray
 
 
 def spectra(samples: Mapping[str, Recording]) -> dict[str, list[Spectrum]]:

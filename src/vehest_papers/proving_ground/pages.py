@@ -171,8 +171,7 @@ def _how_alike(simulated: Tally, real: Tally) -> str:
     size = "smaller" if ratio["sideslip"] < 1.0 else "larger"
     return (
         f"The 99 % quantile of |β| is {fixed(ratio['sideslip'], 2)} times the real one, that of |ay| {fixed(ratio['ay'], 2)} times: what "
-        f"an estimator has to find is that much {size} here than on the real car. The parameters "
-        f"were not fitted to the recording."
+        f"an estimator has to find is that much {size} here than on the real car. The parameters were not fitted to the recording."
     )
 
 

@@ -1,4 +1,4 @@
-"""What the papers say of the recordings that the simulated ones stand for, and how these were prepared."""
+"""Published figures of the recordings that the simulated ones stand for, and how these were prepared."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ from dataclasses import dataclass
 
 from vehest.data.recording import Recording
 from vehest.data.transforms import LowPass, Resample
+from vehest_papers.ksnn.data_quality import PUBLISHED
 
 TABLE_I = "Table I of Da Lio, Piccinini and Biral 2023"
 
@@ -37,7 +38,7 @@ class Profile:
         sets: what its tables give.
         rate_hz: rate that its recordings were brought to, and ours before they are counted; none: as recorded.
         cutoff_hz: of the zero-phase low-pass that its recordings went through; none: none.
-        prose: what else it says, and how it was read.
+        prose: its text beside the figures, and how it was read.
         ay_limit: marked in the distribution of the lateral acceleration [m/s²]: what the paper's 99 % or range are.
         sideslip_limit: likewise, of the sideslip angle [deg].
         limit_label: what those marks are.
@@ -71,24 +72,21 @@ class Profile:
         return f"{' and '.join(steps)} first, as in the paper" if steps else "as recorded"
 
 
-_Range = tuple[float, float]
-
-
-def _race(name: str, drives: str, vx: _Range, vy: _Range, yaw: _Range, rest: tuple[float, float, float]) -> PaperSet:
-    """A row of Table I; ``rest`` are its largest |ay|, its length in km and its duration in min."""
-    ay, kilometres, minutes = rest
+def _race(name: str) -> PaperSet:
+    """A row of Table I of Da Lio et al. 2023, ``C-1`` say, whose drives begin with ``c1``."""
+    own = PUBLISHED[name]
     values = {
-        "duration": 60.0 * minutes,
-        "distance": 1000.0 * kilometres,
-        "vx_min": vx[0],
-        "vx_max": vx[1],
-        "vy_q01": vy[0],
-        "vy_q99": vy[1],
-        "yaw_rate_min": yaw[0],
-        "yaw_rate_max": yaw[1],
-        "ay_abs_q99": ay,
+        "duration": 60.0 * own.minutes,
+        "distance": 1000.0 * own.length_km,
+        "vx_min": own.u_min,
+        "vx_max": own.u_max,
+        "vy_q01": own.v_low,
+        "vy_q99": own.v_high,
+        "yaw_rate_min": own.yaw_rate_min,
+        "yaw_rate_max": own.yaw_rate_max,
+        "ay_abs_q99": own.ay,
     }
-    return PaperSet(name, drives, values)
+    return PaperSet(name, name.replace("-", "").lower(), values)
 
 
 _RACE_PROSE = (
@@ -100,25 +98,19 @@ PROFILES: Mapping[str, Profile] = {
     "corvette_grand_sport": Profile(
         title="Corvette Grand Sport-like race car",
         source=TABLE_I,
-        sets=(
-            _race("C-1", "c1", (11.5, 63.7), (-1.03, 1.30), (-0.67, 0.61), (11.33, 35.4, 19.0)),
-            _race("C-2", "c2", (11.1, 61.2), (-1.28, 1.43), (-0.67, 0.63), (11.60, 24.1, 12.6)),
-        ),
+        sets=(_race("C-1"), _race("C-2")),
         rate_hz=20.0,
         prose=_RACE_PROSE,
-        ay_limit=11.6,
+        ay_limit=PUBLISHED["C-2"].ay,
         limit_label="paper, 99 % of C-2",
     ),
     "ferrari_250_lm": Profile(
         title="Ferrari 250 LM-like race car",
         source=TABLE_I,
-        sets=(
-            _race("F-1", "f1", (10.1, 61.2), (-1.66, 1.80), (-0.56, 0.55), (10.55, 45.8, 25.7)),
-            _race("F-2", "f2", (7.6, 65.4), (-1.73, 1.62), (-0.59, 0.59), (10.78, 33.6, 18.1)),
-        ),
+        sets=(_race("F-1"), _race("F-2")),
         rate_hz=20.0,
         prose=_RACE_PROSE,
-        ay_limit=10.78,
+        ay_limit=PUBLISHED["F-2"].ay,
         limit_label="paper, 99 % of F-2",
         counterpart="ferrari_250lm",
     ),
@@ -133,8 +125,8 @@ PROFILES: Mapping[str, Profile] = {
         cutoff_hz=5.0,
         prose=(
             "The paper's Fig. 4 shows the distributions of β and ay in bins of 1° and 1 m/s² on a logarithmic scale, of samples above 5 "
-            "m/s. Its numbers are not at hand; its text says that the lateral acceleration is spread almost equally over ±10 m/s² and that "
-            "the sideslip angle lies mainly within ±3°."
+            "m/s. Its numbers are not published; its text says that the lateral acceleration is spread almost equally over ±10 m/s² and "
+            "that the sideslip angle lies mainly within ±3°."
         ),
         ay_limit=10.0,
         sideslip_limit=3.0,
@@ -150,7 +142,7 @@ PROFILES: Mapping[str, Profile] = {
         prose=(
             "The paper drove three laps of about 2.5 km in 721 s (299, 227 and 195 s, about 30, 40 and 45 km/h), the last of which ends "
             "with a stop within about 5 s, and one fast lap of 76 km/h on average and 115 km/h at most. It shows lateral acceleration and "
-            "sideslip in figures whose numbers are not at hand, so that none stand beside ours."
+            "sideslip in figures whose numbers are not published, so that none stand beside ours."
         ),
     ),
 }

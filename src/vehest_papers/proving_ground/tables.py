@@ -50,7 +50,7 @@ COLUMNS: Mapping[str, Column] = {
 
 
 def row_of(tally: Tally, *, with_flags: bool = True) -> dict[str, float]:
-    """The cells under `COLUMNS`; nobody knows the flags of a real drive."""
+    """The cells under `COLUMNS`; a real drive has no flags."""
     values = {name: value for name, (value, _) in tally.values().items()}
     row = {**values, "minutes": values["duration"] / 60.0, "km": values["distance"] / 1000.0}
     hidden = () if with_flags else FLAGS

@@ -203,7 +203,7 @@ def busiest_stretch(recording: Recording, seconds: float) -> Stretch:
 
 
 def manoeuvre_of(recording: Recording) -> str:
-    """What was driven, ``drive`` where the recording does not say."""
+    """What was driven, ``drive`` where the recording has no name for it."""
     manoeuvre = recording.provenance.get("manoeuvre")
     return str(manoeuvre["name"]) if isinstance(manoeuvre, Mapping) else "drive"
 

@@ -86,7 +86,7 @@ def _headline(artefacts: StudyArtefacts, together: Mapping[str, Statistics]) -> 
         )
     absent = [f"{as_code(missing.name)}" for missing in artefacts.absent_datasets]
     if absent:
-        text += f"\n\nNot at hand when this was made: {listed(absent)}."
+        text += f"\n\nMissing when this was made: {listed(absent)}."
     return [block for block in (artefacts.about, text) if block.strip()]
 
 
@@ -107,8 +107,8 @@ def _overview(datasets: Sequence[StoredDataset], together: Mapping[str, Statisti
         "overview",
         f"Data sets, all recordings together, while driving (faster than {100 * DRIVEN:.0f} % of the recording's highest speed), at "
         f"{RATE:g} Hz. β 99 %: of the samples lie below. v = 0 and static map: RMSE(β) of knowing nothing, and of v = r·(b − k·u²) fitted "
-        f"on these very samples. Noise: white noise of the reference, a lower bound. Bound: posterior Cramér-Rao bound from every input at "
-        f"hand, axles known but for 23 % of the tyres' stiffness; its levels of noise are those of all recordings together, too high for "
+        f"on these very samples. Noise: white noise of the reference, a lower bound. Bound: posterior Cramér-Rao bound from all "
+        f"inputs, axles known but for 23 % of the tyres' stiffness; its levels of noise are those of all recordings together, too high for "
         f"the quiet ones. All in deg. Correlation: of v with the yaw rate.",
         pd.DataFrame(rows),
         {
@@ -210,9 +210,9 @@ def _planted(found: pd.DataFrame) -> list[Block]:
     alarms = found[found["false_alarms"] != ""]
     missed = decidable[~decidable["found"]]
     text = (
-        f"Into three ranges of the real Ferrari drive {len(found)} faults were planted. Of {len(decidable)} that the channels at hand can "
-        f"show **{int(decidable['found'].sum())} were found**, and in **{len(alarms)}** of all {len(found)} cases a channel that nobody "
-        f"touched was accused. Thresholds come from the first range, but the method was revised after all three had been seen: none of "
+        f"Into three ranges of the real Ferrari drive {len(found)} faults were planted. Of {len(decidable)} that the channels can "
+        f"show **{int(decidable['found'].sum())} were found**, and in **{len(alarms)}** of all {len(found)} cases an untouched "
+        f"channel was accused. Thresholds come from the first range, but the method was revised after all three had been seen: none of "
         f"them is an untouched test."
     )
     if len(missed):
@@ -222,7 +222,7 @@ def _planted(found: pd.DataFrame) -> list[Block]:
         false_alarms=found["false_alarms"].replace("", MISSING),
         reported=found["reported"].replace("", MISSING),
     )
-    caption = "Faults planted into real data, what the checks say of them, and false alarms: findings on channels that nobody touched."
+    caption = "Faults planted into real data, what the checks find, and false alarms: findings on untouched channels."
     columns = {
         "range": Column("range"),
         "fault": Column("fault"),

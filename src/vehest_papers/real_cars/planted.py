@@ -1,4 +1,4 @@
-"""Faults that are planted into a recording, to see which the checks find and whether they accuse a channel that nobody touched."""
+"""Faults that are planted into a recording, to see which the checks find and whether they accuse an untouched channel."""
 
 from __future__ import annotations
 
@@ -88,7 +88,7 @@ def planted_faults() -> list[Fault]:
 def detections(recording: Recording, faults: Sequence[Fault] | None = None) -> pd.DataFrame:
     """Which faults the checks find.
 
-    What they say of the untouched recording does not count. A fault is found where one of its checks names one of its channels, or, where
+    Findings on the untouched recording do not count. A fault is found where one of its checks names one of its channels, or, where
     the channels contradict each other undecidedly, tells of it among the alternatives.
 
     Args:
@@ -97,7 +97,7 @@ def detections(recording: Recording, faults: Sequence[Fault] | None = None) -> p
 
     Returns:
         A row a fault: ``fault``, ``channel``, ``size``, ``decidable``, ``found``, ``reported`` (channels that its checks name),
-        ``message``, ``false_alarms`` (checks and channels that nobody touched, separated by "; ").
+        ``message``, ``false_alarms`` (checks and untouched channels, separated by "; ").
     """
     own = {(finding.level, finding.check, finding.channel) for finding in _counted(recording)}
     rows = []

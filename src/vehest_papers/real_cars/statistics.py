@@ -19,7 +19,7 @@ from vehest.sources.base import origin_in_words
 
 RATE = 20.0  # Hz, at which everything here is read
 DRIVEN = 0.2
-"""Share of its 99th percentile that a recording's speed has to reach to count as driving; sideslip of a car that stands says nothing."""
+"""Share of its 99th percentile that a recording's speed has to reach to count as driving; sideslip of a standing car is noise."""
 QUANTILES = (0.5, 0.9, 0.99)
 
 # Rules by which a recording can rank estimators, set before the table was first drawn.
@@ -47,7 +47,7 @@ class Statistics:
         bound: posterior Cramér-Rao bound with every input that was measured, axles known [deg].
         kinematic_bound: the same by kinematics alone, from u, ω, a_y and a_x where they are there [deg].
         point: where the reference was measured, in words.
-        missing: the channel without which nothing can be said; empty where there are all.
+        missing: the channel that is missing; empty where all are there.
     """
 
     seconds: float
@@ -161,8 +161,8 @@ def _drive(piece: Recording) -> Drive:
 
 
 def _point(recording: Recording) -> str:
-    said = next((line for line in origin_in_words(recording) if line.startswith("reference measured ")), "")
-    return said.removeprefix("reference measured ") or "not said"
+    origin = next((line for line in origin_in_words(recording) if line.startswith("reference measured ")), "")
+    return origin.removeprefix("reference measured ") or "not said"
 
 
 def _joined(pieces: Sequence[Recording], name: str) -> FloatArray:

@@ -14,12 +14,12 @@ from numpy.typing import NDArray
 from vehest.constants import FloatArray
 from vehest.data.recording import Recording
 from vehest.data.splits import Span
-from vehest.data.store import read_recording
 from vehest.evaluation.integrity import detection_delay
 from vehest.studies.artefacts import PartArtefacts
 from vehest.trust.faults import KINDS, SEVERITIES, Fault, applies, inject, window
 from vehest.trust.guard import Guard, learn_limits
 from vehest.trust.health import HealthModel, health_rows, learn_health
+from vehest_papers.kit.reading import recordings_of
 from vehest_papers.trust.oracle import HORIZON_SECONDS, Oracle, learn_oracle, motion_of
 
 WATCHED = ("yaw_rate", "vx", "ay", "ax", "steer", "motor_speed", "motor_current")
@@ -56,7 +56,7 @@ def trials_of(name: str, part: PartArtefacts) -> FaultTrials:
 
     Health and oracle learn on the part's training and validation ranges.
     """
-    train, validation, tests = (_ranges(part, spans) for spans in (part.split.train, part.split.validation, _tested(part)))
+    train, validation, tests = (recordings_of(part, spans) for spans in (part.split.train, part.split.validation, _tested(part)))
     channels = _channels([*train, *validation, *tests])
     rate = part.protocol.rate_hz
     model, oracle = learn_health(train, validation, channels, rate), learn_oracle(train, validation, channels, rate)
@@ -82,10 +82,10 @@ def trials_of(name: str, part: PartArtefacts) -> FaultTrials:
 
 def health_of(part: PartArtefacts) -> dict[tuple[str, int], FloatArray]:
     """(test set, number of the range) -> status without faults, (T,), of the channels that the car has."""
-    train, validation = (_ranges(part, spans) for spans in (part.split.train, part.split.validation))
+    train, validation = (recordings_of(part, spans) for spans in (part.split.train, part.split.validation))
     found = {}
     for test_set, spans in part.split.tests.items():
-        tests = _ranges(part, spans)
+        tests = recordings_of(part, spans)
         channels = _channels([*train, *validation, *tests])
         model = learn_health(train, validation, channels, part.protocol.rate_hz)
         for position, recording in enumerate(tests):
@@ -127,22 +127,18 @@ def _flags(model: HealthModel, guard: Guard, rows: FloatArray) -> NDArray[np.boo
     return np.asarray(health_rows(model.packed(), received, guard(received).measured, model.start()).status > 0)
 
 
-def elsewhere(part: PartArtefacts, test_set: str) -> bool:
+def other_vehicle(part: PartArtefacts, test_set: str) -> bool:
     """Whether a test set is of another car, or other tyres, than training and validation."""
     learnt = {span.dataset for span in (*part.split.train, *part.split.validation)}
     return test_set in part.protocol.sets_elsewhere or not {span.dataset for span in part.split.tests[test_set]} <= learnt
 
 
 def _tested(part: PartArtefacts) -> list[Span]:
-    return [span for name, spans in part.split.tests.items() if not elsewhere(part, name) for span in spans]
+    return [span for name, spans in part.split.tests.items() if not other_vehicle(part, name) for span in spans]
 
 
 def _channels(recordings: Sequence[Recording]) -> tuple[str, ...]:
     return tuple(channel for channel in WATCHED if all(_complete(recording, channel) for recording in recordings))
-
-
-def _ranges(part: PartArtefacts, spans: Sequence[Span]) -> list[Recording]:
-    return [read_recording(part.references[span.dataset, span.recording]).cut(span.start, span.stop) for span in spans]
 
 
 def _complete(recording: Recording, channel: str) -> bool:

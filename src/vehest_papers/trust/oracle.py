@@ -113,7 +113,7 @@ class Oracle:
         innovations = np.nan_to_num(self.model.innovations(received)[first:])
         levels = levels_at(self.levels, parts[2][self.speed][first:]) if self.speed else np.ones((1, len(self.channels)))
         signature, innovations = signature / levels, innovations / levels
-        test = _random_test(signature, self.model.covariance) if drawn else _known_test(signature, self.model.covariance)
+        test = _random_test(signature, self.model.covariance) if drawn else known_test(signature, self.model.covariance)
         threshold = self._threshold(test, within)
         ratio = np.cumsum(test(innovations + signature))
         above = np.flatnonzero(ratio > threshold)
@@ -135,7 +135,7 @@ Test = Callable[[FloatArray], FloatArray]
 """Innovations as received, (T, C) -> growth of the log-likelihood ratio at each sample, (T,)."""
 
 
-def _known_test(signature: FloatArray, covariance: FloatArray) -> Test:
+def known_test(signature: FloatArray, covariance: FloatArray) -> Test:
     """N(s_k, S) against N(0, S): s_kᵀS⁻¹(ε_k + s_k) - ½ s_kᵀS⁻¹s_k."""
     weighted = np.linalg.solve(covariance, signature.T).T
     half = 0.5 * np.einsum("ti,ti->t", weighted, signature)
@@ -148,19 +148,6 @@ def _random_test(signature: FloatArray, covariance: FloatArray) -> Test:
     difference = np.linalg.inv(covariance) - np.linalg.inv(larger)
     grown = 0.5 * float(np.linalg.slogdet(larger)[1] - np.linalg.slogdet(covariance)[1])
     return lambda received: 0.5 * np.einsum("ti,ij,tj->t", received, difference, received) - grown
-
-
-def likelihood_ratio_delay(signature: FloatArray, innovations: FloatArray, covariance: FloatArray, threshold: float) -> int | None:
-    """Samples from the onset of a known fault to its alarm; None if there is none.
-
-    Args:
-        signature: what the fault adds to the innovations, (T, C), from its onset on.
-        innovations: of the healthy drive at the same samples, (T, C).
-        covariance: of the innovations, (C, C).
-        threshold: log A.
-    """
-    above = np.flatnonzero(np.cumsum(_known_test(signature, covariance)(innovations + signature)) > threshold)
-    return int(above[0]) + 1 if len(above) else None
 
 
 def motion_of(samples: Mapping[str, FloatArray], rate_hz: float) -> dict[str, FloatArray]:

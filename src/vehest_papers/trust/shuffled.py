@@ -177,9 +177,8 @@ def over_parts(board: pd.DataFrame, scores: Sequence[Scores | None]) -> list[Blo
         return []
     frame = pd.DataFrame(rows)
     caption = (
-        "The same over all parts of a drive together, each test by the model and the band that had not seen it: "
-        f"0.90 lies in {int((frame['inside'] == 'yes').sum())} of {len(frame)} intervals, over manoeuvres. Added after the tests had "
-        "been seen."
+        "The same over all parts of a drive together, each test by the model and the band that had not seen it: 0.90 lies in "
+        f"{int((frame['inside'] == 'yes').sum())} of {len(frame)} intervals, over manoeuvres. Added after the tests had been seen."
     )
     columns = {
         "where": Column("drive"),

@@ -1,4 +1,4 @@
-"""The study of trust: do bands hold what they say, on cars learnt on and on others, and which faults of sensors are flagged in time.
+"""The study of trust: coverage of bands, on cars learnt on and on others, and which faults of sensors are flagged in time.
 
 A part of the pipeline is a comparison on one car, or a lap of it. Test sets of cars and tyres that bands were calibrated on stand apart
 from those of others. Faults are tried on each part's test ranges at the evaluation rate, with health learnt on its training and
@@ -16,17 +16,18 @@ import pandas as pd
 
 from vehest.data.store import read_recording
 from vehest.estimators.registry import estimator_class
-from vehest.evaluation.integrity import Integrity, false_alarms_per_hour, integrity_of
 from vehest.evaluation.under_fault import FAULTED
 from vehest.report.document import PATENT_NOTE, REPORT, Block, Column, Document, Figure, Table, as_text
-from vehest.report.integrity_figures import stanford_figure
 from vehest.report.reliability import Reliability, reliability_figure
 from vehest.report.style import lines_of, listed
 from vehest.studies.artefacts import PartArtefacts, StudyArtefacts
 from vehest.studies.drive import appendix_of
 from vehest.studies.kit.runs import by_name
 from vehest.trust.bands import LEVELS, OTHER_VEHICLE
-from vehest_papers.trust.faults import FaultTrials, elsewhere, health_of, trials_of
+from vehest_papers.kit.reading import sideslip_error
+from vehest_papers.trust.faults import FaultTrials, health_of, other_vehicle, trials_of
+from vehest_papers.trust.integrity import Integrity, false_alarms_per_hour, integrity_of
+from vehest_papers.trust.integrity_figures import stanford_figure
 from vehest_papers.trust.shuffled import LEARNT, if_shuffled, in_words, over_parts, scores_learnt, shuffled_in_words
 
 TAKES = "parts"
@@ -40,7 +41,7 @@ SHOWN = ("ksnn", "gru", "kalman", "rational_ekf", "static_map")
 
 
 def documents(artefacts: StudyArtefacts) -> dict[str, Document]:
-    """The report: bands on cars learnt on, bands elsewhere, faults against what could be seen, integrity, then how it was made."""
+    """The report: bands on cars learnt on, bands on other vehicles, faults against what could be seen, integrity, then how it was made."""
     parts = artefacts.parts
     board = coverage_board(parts)
     scores = scores_learnt(parts, board)
@@ -78,7 +79,7 @@ def coverage_board(parts: Mapping[str, PartArtefacts]) -> pd.DataFrame:
                     continue
                 row: dict[str, Any] = {"part": key, "title": as_text(part.title), "test_set": test_set, "estimator": name[0]}
                 row |= {"variant": name[1], "estimator_title": as_text(models[0].title)}
-                row |= {"car": OTHER if elsewhere(part, test_set) else LEARNT}
+                row |= {"car": OTHER if other_vehicle(part, test_set) else LEARNT}
                 row |= {figure: float(own["value"][figure]) for figure in (*COVERAGES, *FIGURES) if figure in own.index}
                 row |= {end: float(own[end]["coverage_90"]) for end in ("low", "high")}
                 row |= {"inside": in_words(row["low"], row["high"])}
@@ -92,8 +93,7 @@ def _without_widening(part: PartArtefacts, model: Any, test_set: str) -> float:
     inside = []
     for position, scored in enumerate(part.scored(model, test_set)):
         band = model.estimate(test_set, position).held_at(scored.time, "band_sideslip") / OTHER_VEHICLE
-        turned = np.remainder(scored.sideslip - scored.sideslip_ref + np.pi, 2.0 * np.pi) - np.pi
-        inside.append(np.abs(turned) <= band)
+        inside.append(np.abs(sideslip_error(scored)) <= np.degrees(band))
     return float(np.concatenate(inside).mean())
 
 
@@ -172,7 +172,7 @@ def _reliability(board: pd.DataFrame) -> Figure:
         rows.append(Reliability(estimator_class(family).title, lines[family, ""], values.mean(axis=0), low, high))
     caption = (
         "Reliability of the bands of β on cars learnt on: errors inside over the nominal level, mean over test sets and variants of a "
-        "family, bars from the 10 to the 90 % quantile over them. On the diagonal bands hold what they say."
+        "family, bars from the 10 to the 90 % quantile over them. On the diagonal the coverage is the nominal one."
     )
     return Figure("reliability", caption, reliability_figure(LEVELS, rows))
 
@@ -203,7 +203,7 @@ def _range_in_words(regime: str) -> str:
 
 def _tries_faults(part: PartArtefacts) -> bool:
     """Whether a part's tests are of the car that was learnt on, so that its channels can be held against what is normal for it."""
-    return any(not elsewhere(part, test_set) for test_set in part.split.tests)
+    return any(not other_vehicle(part, test_set) for test_set in part.split.tests)
 
 
 def _faults_in_words(trials: Sequence[FaultTrials]) -> str:
@@ -279,7 +279,7 @@ def _faults(trials: Sequence[FaultTrials]) -> list[Block]:
 def bands_under_faults(parts: Mapping[str, PartArtefacts], trials: Sequence[FaultTrials]) -> pd.DataFrame:
     """One row a part and fault: whether the oracle sees such a fault there, and what bands of β hold while it lasts.
 
-    Estimators count whose error it changes; ``lowest`` is that of the worst of them, ``unflagged`` is over samples said to be valid.
+    Estimators count whose error it changes; ``lowest`` is that of the worst of them, ``unflagged`` is over samples that are not flagged.
     """
     rows = []
     for key, part in parts.items():
@@ -359,9 +359,8 @@ def _stanford(parts: Mapping[str, PartArtefacts]) -> Figure | None:
             for test_set in part.split.tests:
                 for position, scored in enumerate(part.scored(models[0], test_set)):
                     band = models[0].estimate(test_set, position).held_at(scored.time, "band_sideslip")
-                    turned = np.remainder(scored.sideslip - scored.sideslip_ref + np.pi, 2.0 * np.pi) - np.pi
                     invalid = status[test_set, position][-len(scored.time) :] == 2
-                    own = integrity_of(np.degrees(turned), np.degrees(band), invalid)
+                    own = integrity_of(sideslip_error(scored), np.degrees(band), invalid)
                     found.setdefault(as_text(models[0].title), []).append(own)
     if not found:
         return None

@@ -1,4 +1,4 @@
-"""The Stanford diagram: error against protection level, and what an estimate that says so is worth."""
+"""The Stanford diagram: error against protection level, with the share of samples in each region."""
 
 from __future__ import annotations
 
@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from vehest.evaluation.integrity import HAZARDOUS, MISLEADING, NOMINAL, UNAVAILABLE, Integrity
 from vehest.report.style import DOUBLE_COLUMN, LINEAR_BLUES, NONLINEAR_ORANGES, REFERENCE, new_figure, paper_style, with_unit
+from vehest_papers.trust.integrity import HAZARDOUS, MISLEADING, NOMINAL, UNAVAILABLE, Integrity
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure as MatplotlibFigure

@@ -7,12 +7,12 @@ from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
-import pandas as pd
+from study_parts import metric_rows, part_of
 
 from vehest.data.splits import Span, Split
 from vehest.evaluation.blocks import Segments, write_segments
 from vehest.evaluation.metrics import Protocol
-from vehest.studies.artefacts import METRIC_COLUMNS, EvaluatedModel, PartArtefacts
+from vehest.studies.artefacts import EvaluatedModel, PartArtefacts
 from vehest_papers.ksnn import paper
 
 SEGMENTS, SAMPLES = 600, 20
@@ -90,24 +90,10 @@ def planted_part(
                 values |= {(test, "n_parameters"): N_PARAMETERS[category], (test, "epochs"): 10}
             for test in ("validation", *tests):
                 values |= {(test, "r2"): 1.0 - values[test, "fvu"], (test, "rmse_sideslip"): 2.0 * values[test, "rmse_vy"]}
-            for (test, metric), value in values.items():
-                row = ("ksnn", estimator, variant, "cars", "cars", "simulated", test, "all", "nominal", 20.0, "causal", seed, metric, value)
-                rows.append((*row, "1", None, None))
+            rows += [row for (test, metric), value in values.items() for row in metric_rows(models[-1], test, {metric: value})]
     spans = {name: (Span("cars", f"{name}_001", -math.inf, math.inf),) for name in (f"{train}1", f"{other}1", *tests)}
-    return PartArtefacts(
-        study="ksnn",
-        title="t",
-        about="a",
-        command="c",
-        split=Split("scheme", spans[f"{train}1"], spans[f"{other}1"], {test: spans[test] for test in tests}),
-        protocol=Protocol(),
-        kinds={"cars": "simulated"},
-        data_titles={"cars": "Cars"},
-        metrics=pd.DataFrame(rows, columns=list(METRIC_COLUMNS)),
-        models=models,
-        references={},
-        facts=[],
-    )
+    split = Split("scheme", spans[f"{train}1"], spans[f"{other}1"], {test: spans[test] for test in tests})
+    return part_of(split, Protocol(), models, rows, kinds={"cars": "simulated"}, data_titles={"cars": "Cars"})
 
 
 def of_the_paper(table: Mapping[str, paper.Published], static_map: float = 0.6) -> dict[str, dict[str, float]]:

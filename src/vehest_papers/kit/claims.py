@@ -11,6 +11,7 @@ import pandas as pd
 from vehest.evaluation.ranking import Name, Ranking
 from vehest.report.document import Column, Table
 from vehest.report.style import fixed
+from vehest_papers.kit.reading import with_interval
 
 Verdict = Literal["reproduced", "not reproduced", "undecided", "not testable on this data"]
 
@@ -64,9 +65,8 @@ def order_claim(ranking: Ranking, lower: Name, higher: Name, titles: Mapping[Nam
         missing = [titles[name] for name in (lower, higher) if name not in ranking.rmse]
         why = f"no finite error of {' and '.join(missing)}" if missing else f"the test has {ranking.n_blocks} blocks only"
         return Claim(claim, paper, "–", data, "not testable on this data", why)
-    figures = (
-        f"{fixed(ranking.rmse[lower], 3)}° and {fixed(ranking.rmse[higher], 3)}°; difference {_interval(own.difference, own.low, own.high)}"
-    )
+    difference = with_interval(own.difference, own.low, own.high, 3, "°")
+    figures = f"{fixed(ranking.rmse[lower], 3)}° and {fixed(ranking.rmse[higher], 3)}°; difference {difference}"
     verdict, why = _OF_ORDER[own.verdict]
     return Claim(claim, paper, figures, data, verdict, why)
 
@@ -77,14 +77,22 @@ def bound_claim(ranking: Ranking, name: Name, title: str, limit: float, paper: s
     if name not in ranking.intervals:
         return Claim(claim, paper, "–", data, "not testable on this data", f"the test has {ranking.n_blocks} blocks only")
     low, high = ranking.intervals[name]
-    verdict: Verdict = "reproduced" if high < limit else "not reproduced" if low > limit else "undecided"
+    verdict = verdict_below(low, high, limit)
     why = {"reproduced": "the interval lies below", "not reproduced": "the interval lies above"}
     words = why.get(verdict, "the interval holds the limit")
-    return Claim(claim, paper, _interval(ranking.rmse[name], low, high), data, verdict, words)
+    return Claim(claim, paper, with_interval(ranking.rmse[name], low, high, 3, "°"), data, verdict, words)
 
 
-def _interval(value: float, low: float, high: float) -> str:
-    return f"{fixed(value, 3)}° [{fixed(low, 3)}, {fixed(high, 3)}]"
+def verdict_below(low: float, high: float, limit: float = 0.0) -> Verdict:
+    """Of the claim that a figure lies below a limit, by its interval."""
+    return "reproduced" if high < limit else "not reproduced" if low > limit else "undecided"
+
+
+def verdict_of_all(verdicts: Sequence[Verdict]) -> Verdict:
+    """Of a claim on several figures: reproduced if all are, not reproduced if one is not, else undecided."""
+    if "not reproduced" in verdicts:
+        return "not reproduced"
+    return "reproduced" if set(verdicts) == {"reproduced"} else "undecided"
 
 
 _VERDICTS: tuple[Verdict, ...] = ("reproduced", "not reproduced", "undecided", "not testable on this data")

@@ -10,7 +10,7 @@ from test_ranking import RATE, candidates, scored
 
 from vehest.evaluation.blocks import segments_of
 from vehest.evaluation.ranking import rank
-from vehest.studies.kit.claims import bound_claim, claims_table, order_claim
+from vehest_papers.kit.claims import bound_claim, claims_table, order_claim
 from vehest_papers.kit.statements import percent
 
 NAMES = {name: (name, name) for name in ("good", "other", "like", "zero", "static_map")}

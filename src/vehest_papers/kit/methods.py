@@ -1,0 +1,76 @@
+"""Data and methods in the reports of papers: kinds of data, missing parts, warnings, scoring, and the ranges that were used."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+
+import pandas as pd
+
+from vehest.evaluation.metrics import Protocol
+from vehest.report.document import Column, Table
+from vehest.studies.artefacts import PartArtefacts, StudyArtefacts
+from vehest.studies.kit.warnings import warnings_of
+from vehest_papers.kit.reading import spans_in_words, words_of_kinds
+
+
+def kinds_of_parts(artefacts: StudyArtefacts, names: Iterable[str]) -> str:
+    """``**Title: REAL data**`` of some parts."""
+    return "; ".join(f"**{artefacts.titles[name]}: {words_of_kinds(artefacts.parts[name]).upper()} data**" for name in names)
+
+
+def absent_parts(artefacts: StudyArtefacts) -> str:
+    """A sentence after a space on the parts whose recordings are missing; empty where none is."""
+    absent = "; ".join(artefacts.titles[name] for name in artefacts.absent)
+    return f" Not in this report, since the recordings are missing: {absent}." if absent else ""
+
+
+def scoring(protocol: Protocol, reading: str = "") -> str:
+    """How estimates are scored; ``reading`` follows the rate at which they are read."""
+    return (
+        f"Evaluation: every estimate is read at {protocol.rate_hz:g} Hz{reading}; the first {protocol.skip_seconds:g} s of each "
+        f"{protocol.piece} are not scored.{protocol.start_in_words}"
+    )
+
+
+def warnings_in_words(parts: Mapping[str, PartArtefacts]) -> str:
+    """Warnings on parts, by title; empty where there is none."""
+    lines = dict.fromkeys(f"{title}: {line}" for title, part in parts.items() for line in warnings_of(part))
+    return bullets("**Mind:**", lines) if lines else ""
+
+
+def facts_of(parts: Iterable[PartArtefacts]) -> list[str]:
+    """Budgets, versions and machine of all parts, each line once."""
+    return list(dict.fromkeys(fact for part in parts for fact in part.facts))
+
+
+def bullets(heading: str, lines: Iterable[str]) -> str:
+    """A section of lines; empty ones are left out."""
+    return f"{heading}\n\n" + "\n".join(f"- {line}" for line in lines if line)
+
+
+def how_it_was_made(lines: Sequence[str]) -> str:
+    """The appendix of that name."""
+    return bullets("## Appendix: how it was made", lines)
+
+
+def ranges_table(artefacts: StudyArtefacts, name: str, caption: str, tests: Mapping[str, str]) -> Table:
+    """Ranges of training, validation and tests, a row a part.
+
+    Args:
+        artefacts: of the study.
+        name: of the file.
+        caption: of the table.
+        tests: test set -> what it is called, where that is another name.
+    """
+    rows = [
+        {
+            "part": artefacts.titles[key],
+            "kind": words_of_kinds(part),
+            "train": spans_in_words(part.split.train),
+            "validation": spans_in_words(part.split.validation),
+            "tests": "; ".join(f"{tests.get(test, test)}: {spans_in_words(spans)}" for test, spans in part.split.tests.items()),
+        }
+        for key, part in artefacts.parts.items()
+    ]
+    titles = {"part": "part", "kind": "data", "train": "training", "validation": "validation", "tests": "tests"}
+    return Table(name, caption, pd.DataFrame(rows), {column: Column(title) for column, title in titles.items()})

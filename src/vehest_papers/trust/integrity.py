@@ -1,0 +1,105 @@
+"""Integrity of an estimate that states how wrong it may be: protection levels, misleading information, false alarms.
+
+The terms are those of satellite navigation: the **protection level** is the error that is exceeded with a stated risk only, here the
+calibrated band; the **alert limit** the error beyond which the estimate must not be used. Information is **misleading** when the error
+exceeds the protection level and nothing was flagged, **hazardously** so when it exceeds the alert limit as well. Where the level is beyond
+the limit, or the estimate was flagged as invalid, it is **unavailable**.
+
+Source: RTCA DO-229; Tossaint et al., The Stanford-ESA integrity diagram, Navigation 54, 2007.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import stats
+
+from vehest.constants import FloatArray
+from vehest.data.runs import true_runs
+
+ALERT_LIMIT = 2.0  # deg of sideslip
+CONFIDENCE = 0.95
+
+NOMINAL, MISLEADING, HAZARDOUS, UNAVAILABLE = "nominal", "misleading", "hazardously misleading", "unavailable"
+
+
+@dataclass(frozen=True, eq=False)
+class Integrity:
+    """Errors and protection levels of samples, and where they lie in the Stanford diagram; arrays are (K,).
+
+    Args:
+        error: size of the error [deg, or the unit of the levels].
+        level: protection level.
+        flagged: whether the estimate was flagged as invalid.
+        alert_limit: the same for all.
+    """
+
+    error: FloatArray
+    level: FloatArray
+    flagged: NDArray[np.bool_]
+    alert_limit: float = ALERT_LIMIT
+
+    def masks(self) -> dict[str, NDArray[np.bool_]]:
+        """Region -> samples in it, (K,); each sample lies in one."""
+        unavailable = self.flagged | ~(self.level <= self.alert_limit)
+        outside = ~unavailable & ~(self.error <= self.level)
+        hazardous = outside & ~(self.error <= self.alert_limit)
+        return {NOMINAL: ~unavailable & ~outside, MISLEADING: outside & ~hazardous, HAZARDOUS: hazardous, UNAVAILABLE: unavailable}
+
+    def shares(self) -> dict[str, float]:
+        """Region -> share of the samples; NaN without samples."""
+        return {region: float(mask.mean()) if len(mask) else math.nan for region, mask in self.masks().items()}
+
+
+def integrity_of(error: FloatArray, level: FloatArray, flagged: NDArray[np.bool_], alert_limit: float = ALERT_LIMIT) -> Integrity:
+    """Of signed errors; samples without error or level (a window that is not full yet) are left out.
+
+    Args:
+        error: estimate less reference, (T,).
+        level: protection level in the same unit, (T,).
+        flagged: whether the estimate was flagged as invalid, (T,).
+        alert_limit: in the same unit.
+    """
+    known = ~np.isnan(error) & ~np.isnan(level)
+    return Integrity(np.abs(error[known]), level[known], np.asarray(flagged, bool)[known], alert_limit)
+
+
+@dataclass(frozen=True)
+class AlarmRate:
+    """False alarms in so many hours.
+
+    Args:
+        alarms: how many there were.
+        hours: of healthy driving.
+        per_hour: alarms an hour; NaN without any time.
+        low, high: 95 % interval of the rate, exact for a Poisson process.
+    """
+
+    alarms: int
+    hours: float
+    per_hour: float
+    low: float
+    high: float
+
+
+def false_alarms_per_hour(flagged: Sequence[NDArray[np.bool_]], rate_hz: float) -> AlarmRate:
+    """Alarms on healthy drives; flagged samples in a row are one.
+
+    Args:
+        flagged: of each drive, (T,).
+        rate_hz: [Hz].
+
+    Source of the interval: Garwood, Fiducial limits for the Poisson distribution, Biometrika 28 (3/4), 1936.
+    """
+    alarms = sum(len(true_runs(drive)) for drive in flagged)
+    hours = sum(len(drive) for drive in flagged) / rate_hz / 3600.0
+    if hours == 0.0:
+        return AlarmRate(0, 0.0, math.nan, 0.0, math.inf)
+    tail = 0.5 * (1.0 - CONFIDENCE)
+    low = 0.5 * float(stats.chi2.ppf(tail, 2 * alarms)) if alarms else 0.0
+    high = 0.5 * float(stats.chi2.ppf(1.0 - tail, 2 * alarms + 2))
+    return AlarmRate(alarms, hours, alarms / hours, low / hours, high / hours)
