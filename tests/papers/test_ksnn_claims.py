@@ -8,9 +8,9 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import pytest
+from ksnn_study import DEVIATION, NAMES, SEGMENTS, of_the_paper, planted_part, planted_segments
 from scipy import stats
 
-from ksnn_study import DEVIATION, NAMES, SEGMENTS, of_the_paper, planted_part, planted_segments
 from vehest.evaluation.blocks import Segments, segments_of
 from vehest.evaluation.metrics import Scored
 from vehest_papers.kit.statements import Change, Compared, Statement, counted, decided, outcomes

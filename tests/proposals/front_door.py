@@ -36,7 +36,9 @@ def differences(told: Mapping[str, Any], code: int, plain: Mapping[str, Any], wo
         f"{channel} is {found.get(channel)}, not {column}" for channel, column in told["channels"].items() if found.get(channel) != column
     ]
     wrong += [f"nothing is asked about {column}" for column in told.get("asked", ()) if column not in asked]
-    said = " ".join([words, *plain["notes"], *plain["limits"], *plain["findings"], *(text for one in plain["channels"] for text in one["evidence"])])
+    said = " ".join(
+        [words, *plain["notes"], *plain["limits"], *plain["findings"], *(text for one in plain["channels"] for text in one["evidence"])]
+    )
     return wrong + ([f"'{told['note']}' is not said"] if told.get("note", "") not in said else [])
 
 
