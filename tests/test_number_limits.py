@@ -1,4 +1,4 @@
-"""Numbers without physical sense are refused in one line before anything is computed, and text is no formula."""
+"""What makes no sense is refused in one line that says what to do: numbers without physical sense, spreadsheets; and text is no formula."""
 
 from __future__ import annotations
 
@@ -13,6 +13,8 @@ from vehest.data.recording import Recording
 from vehest.estimators.luenberger import Luenberger
 from vehest.report.document import _no_formula
 from vehest.run.compare_files import compare_estimates
+from vehest.sources.base import read_single
+from vehest.sources.surveys import survey
 from vehest.training.supervised import SupervisedSettings
 from vehest.trust.contract import GuardedStepper
 from vehest.trust.record import read_trust
@@ -64,3 +66,13 @@ def test_a_damaged_calibration_names_its_file(tmp_path: Path) -> None:
 )
 def test_tables_to_download_start_no_formula(cell: object, written: object) -> None:
     assert _no_formula(cell) == written
+
+
+def test_a_spreadsheet_and_a_measurement_are_refused_with_what_to_do(tmp_path: Path) -> None:
+    for name in ("lap.xlsx", "drive.mf4"):
+        (tmp_path / name).write_bytes(b"PK")
+    for read in (survey, lambda file: read_single({"name": "mine", "source": "tabular"}, file)):
+        with pytest.raises(DataError, match=r"lap\.xlsx' is a spreadsheet; save it as CSV"):
+            read(tmp_path / "lap.xlsx")
+    with pytest.raises(ConfigurationError, match=r"describe its signals once by 'vehest new NAME drive\.mf4'"):
+        read_single({"name": "mine", "source": "tabular"}, tmp_path / "drive.mf4")

@@ -13,7 +13,7 @@ from typing import Annotated, Any, ClassVar, Literal, TypeVar, cast
 
 import vehest.sources as package
 from vehest.data.derived import ScaleToWheelbase
-from vehest.data.errors import ConfigurationError, MissingError
+from vehest.data.errors import ConfigurationError, DataError, MissingError
 from vehest.data.files import regular_file
 from vehest.data.recording import Kind, Recording
 from vehest.data.schema import validated
@@ -21,12 +21,8 @@ from vehest.data.splits import check_name
 from vehest.data.transforms import ReferenceLever, transform_from_config
 from vehest.sources.clocks import require_clock
 
-TEMPLATES = {
-    ".vbo": "vbo",
-    **dict.fromkeys((".mf4", ".mdf", ".dat"), "mdf"),
-    **dict.fromkeys((".bag", ".db3", ".mcap"), "f1tenth_bag"),
-}
-"""Ending of a file that is no table -> data set that shows how such files are declared."""
+NO_TABLES = (".vbo", ".mf4", ".mdf", ".dat", ".bag", ".db3", ".mcap")
+SPREADSHEETS = (".xlsx", ".xls", ".xlsm", ".ods")
 DERIVED = "derived"
 """Key of a recording's provenance: transforms of its data set, and where its channels were measured."""
 SIMULATED = "simulated"
@@ -223,11 +219,17 @@ def read_single(dataset: Mapping[str, Any], file: Path) -> Recording:
         MissingError: it is not there.
         DataError: it cannot be used as it is.
     """
-    template = TEMPLATES.get(file.suffix.lower())
-    if dataset.get("source") == "tabular" and template is not None:
-        what = f"copy the data set '{template}' to conf/dataset/NAME.yaml, declare the columns there, and add dataset=NAME"
+    require_no_spreadsheet(file)
+    if dataset.get("source") == "tabular" and file.suffix.lower() in NO_TABLES:
+        what = f"describe its signals once by 'vehest new NAME {file.name}', then add dataset=NAME"
         raise ConfigurationError(f"'{file}' is no table; {what}")
     return open_source(dataset).read_file(file)
+
+
+def require_no_spreadsheet(file: Path) -> None:
+    """Raises `DataError` for a spreadsheet's file, which no source reads."""
+    if file.suffix.lower() in SPREADSHEETS:
+        raise DataError(f"'{file}' is a spreadsheet; save it as CSV")
 
 
 def source_class(dataset: Mapping[str, Any]) -> type[Source]:

@@ -11,6 +11,7 @@ from typing import Literal
 
 from vehest.data.errors import DataError, MissingError
 from vehest.data.store import is_stored_recording
+from vehest.sources.base import require_no_spreadsheet
 from vehest.sources.clocks import clock_fault, span_fault
 from vehest.sources.surveys.bags import survey_bag
 from vehest.sources.surveys.log import Log, RawColumn, Stamps
@@ -33,6 +34,7 @@ def survey(path: Path) -> Log:
     """
     if not path.exists():
         raise MissingError(f"there is no file '{path}'")
+    require_no_spreadsheet(path)
     log = _survey(path)
     for run in log.runs:
         if log.seconds is not None and run.stop - run.start > 1 and (fault := span_fault(log.seconds[run])):
