@@ -1,7 +1,7 @@
-"""Write what is made from the code, docs/reference.md, docs/channels.md and docs/manoeuvres.md, and from published results: two tables in
-docs/results.md and what they say of each family in docs/estimators/.
+"""Write docs/reference.md, docs/channels.md and docs/manoeuvres.md from the code, and from published results two tables of
+docs/results.md and the figures of each family in docs/estimators/.
 
-Run by ``make docs``; tests/test_docs.py sees that the pages are up to date.
+Run by ``make docs``; tests/test_docs.py checks that the pages are up to date.
 """
 
 from __future__ import annotations
@@ -32,9 +32,7 @@ SETTINGS_START = "<!-- settings: made by docs/make_reference.py from what the fa
 SETTINGS_END = "<!-- end of settings -->"
 BASELINES = ("zero", "static_map")
 
-ROOT_FILES = ("common", "ingest", "downsample", "train", "eval", "estimate")
-TABLED = ("estimator", "training", "tracking")
-VERBATIM = ("dataset", "split", "vehicle")
+GROUPS = ("estimator", "training", "dataset", "split", "vehicle", "fault", "tracking")
 TYPER_OWN = {"install_completion", "show_completion", "help"}
 
 
@@ -55,18 +53,19 @@ def reference_page(root: Path) -> str:
     parts = [
         "# Reference",
         MADE,
-        "Every command with its options, every configuration file with its values, every pipeline. What they are for: [cli.md](cli.md).",
+        "Every option of a command and every configuration file. How they belong together: [cli.md](cli.md).",
         "## Commands",
         *_commands(),
         "## Configuration",
-        "Options of a command are set as `key=value` after it. `vehest config COMMAND` prints all of them, resolved.",
-        *_roots(root),
-        *_groups(root),
-        "## Pipelines",
-        "What `vehest run` and `vehest report` take.",
+        "Options of a command are set as `key=value` after it; each file says in comments what its keys mean. "
+        "`vehest config COMMAND` prints all of them, resolved.",
+        "### `conf/`",
+        _files(root, [root / "conf"]),
     ]
-    for file in sorted((root / "pipelines").glob("*.yaml")):
-        parts += [f"### `pipelines/{file.name}`", _fenced(file)]
+    for group in GROUPS:
+        folders = [root / "conf" / group, root / "src" / "vehest_papers" / "conf" / group]
+        parts += [f"### `conf/{group}/`", f"Choices of `{group}=NAME`:", _files(root, folders)]
+    parts += ["## Pipelines", "Studies that `vehest run` and `vehest report` take:", _files(root, [root / "pipelines"])]
     return "\n\n".join(parts) + "\n"
 
 
@@ -381,10 +380,9 @@ def _shown(study: str, figure: str, root: Path) -> list[str]:
 
 def with_leaderboard(page: str, source: Path) -> str:
     """A page with the leaderboard that is in results/; as it is where there are no results."""
-    if not source.is_file():
+    rows = _rows(source)
+    if not rows:
         return page
-    with open(source, newline="", encoding="utf-8") as stream:
-        rows = list(csv.DictReader(stream))
     lines = [
         (
             row["title"],
@@ -414,10 +412,9 @@ def with_leaderboard(page: str, source: Path) -> str:
 
 def with_overview(page: str, source: Path) -> str:
     """A page with what the study across vehicles came to; as it is where there are no results."""
-    if not source.is_file():
+    rows = _rows(source)
+    if not rows:
         return page
-    with open(source, newline="", encoding="utf-8") as stream:
-        rows = list(csv.DictReader(stream))
     lines = []
     for model in dict.fromkeys(row["model"] for row in rows):
         own = [row for row in rows if row["model"] == model]
@@ -479,69 +476,15 @@ def _parameters(command: Any) -> str:
     return _table(("argument or option", "meaning"), rows)
 
 
-def _roots(root: Path) -> Iterable[str]:
-    for name in ROOT_FILES:
-        file = root / "conf" / f"{name}.yaml"
-        yield f"### `conf/{name}.yaml`"
-        yield _first_comment(file)
-        groups = _default_groups(file)
-        if groups:
-            yield "Starts from " + ", ".join(groups) + "."
-        rows = list(_options(file))
-        if rows:
-            yield _table(("option", "default", "meaning"), rows)
+def _files(root: Path, folders: Sequence[Path]) -> str:
+    """A row for each YAML file of some folders: a link, and the first sentence of its comment."""
+    files = sorted((file for folder in folders for file in folder.glob("*.yaml")), key=lambda file: file.name)
+    rows = [(f"[`{file.stem}`](../{file.relative_to(root).as_posix()})", _first_sentence(_first_comment(file))) for file in files]
+    return _table(("file", "content"), rows)
 
 
-def _groups(root: Path) -> Iterable[str]:
-    for group in (*TABLED, *VERBATIM):
-        yield f"### `conf/{group}/`"
-        papers = root / "src" / "vehest_papers" / "conf"
-        for file in sorted([*(root / "conf" / group).glob("*.yaml"), *(papers / group).glob("*.yaml")], key=lambda own: own.name):
-            yield f"#### `conf/{group}/{file.name}`" if group == "vehicle" else f"#### `{group}={file.stem}`"
-            if group in VERBATIM:
-                yield _fenced(file)
-                continue
-            yield _first_comment(file)
-            nested = re.search(r"^  - (\w+)@(\w+)", file.read_text(encoding="utf-8"), re.MULTILINE)
-            if nested:
-                yield f"`{group}.{nested[2]}.*`: the options of [`{group}={nested[1]}`](#{group}{nested[1]})."
-            forced = re.search(r"override /(\w+): (\w+)", file.read_text(encoding="utf-8"))
-            if forced:
-                yield f"Chooses `{forced[1]}={forced[2]}`."
-            rows = [row for row in _options(file, group) if not row[0].endswith(".name`")]
-            if rows:
-                yield _table(("option", "default", "meaning"), rows)
-
-
-def _options(file: Path, prefix: str = "") -> Iterable[tuple[str, str, str]]:
-    """Scalar options of a file with their dotted keys, defaults and comments."""
-    lines = file.read_text(encoding="utf-8").splitlines()
-    if any("@package _global_" in line for line in lines):
-        prefix = ""
-    above: list[tuple[int, str]] = []  # indentation and name of the groups that a line stands in
-    skipping = False
-    for line in lines:
-        found = re.match(r"^(\s*)(\w+):\s*(.*?)\s*(?:(?<=\s)#\s*(.*))?$", line)
-        if not found:
-            continue
-        indent, key, value, comment = found.groups()
-        if not indent:
-            skipping = key == "defaults"
-        if skipping:
-            continue
-        above = [(depth, group) for depth, group in above if depth < len(indent)]
-        if value:
-            dotted = ".".join(filter(None, [prefix, *(group for _, group in above), key]))
-            yield f"`{dotted}`", f"`{value}`", comment or ""
-        else:
-            above.append((len(indent), key))
-
-
-def _default_groups(file: Path) -> list[str]:
-    text = file.read_text(encoding="utf-8")
-    block = re.search(r"^defaults:\n((?:  .*\n)+)", text, re.MULTILINE)
-    entries = re.findall(r"^  - ([\w/@]+)(?:: (\S+))?", block[1], re.MULTILINE) if block else []
-    return [f"`{key}={value}`" if value else f"`conf/{key}.yaml`" for key, value in entries if key != "_self_"]
+def _first_sentence(text: str) -> str:
+    return re.split(r"(?<=\.)\s+(?=[A-Z])", text, maxsplit=1)[0]
 
 
 def _first_comment(file: Path) -> str:
@@ -552,10 +495,6 @@ def _first_comment(file: Path) -> str:
         if "@package" not in line:
             comments.append(line.lstrip("# ").rstrip())
     return " ".join(comments)
-
-
-def _fenced(file: Path) -> str:
-    return f"```yaml\n{file.read_text(encoding='utf-8').rstrip()}\n```"
 
 
 def _paragraphs(text: str | None) -> str:
