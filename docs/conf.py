@@ -7,6 +7,10 @@ from __future__ import annotations
 
 import re
 from pathlib import Path
+from typing import Any
+
+from docutils import nodes
+from docutils.utils.math.latex2mathml import tex2mathml
 
 ROOT = Path(__file__).resolve().parents[1]
 
@@ -22,6 +26,8 @@ exclude_patterns = [".*", "build", "outputs", "src", "tests", "conf", "pipelines
 
 myst_heading_anchors = 5
 myst_enable_extensions = ["colon_fence"]
+myst_fence_as_directive = ["math"]
+html_math_renderer = "mathml"
 nitpicky = True
 suppress_warnings: list[str] = []
 highlight_language = "text"
@@ -41,3 +47,18 @@ html_theme_options = {
     "dark_css_variables": {"color-brand-primary": "#8cc4f5", "color-brand-content": "#8cc4f5", "color-brand-visited": "#8cc4f5"},
     "navigation_with_keys": True,
 }
+
+
+def _inline_mathml(translator: Any, node: nodes.Element) -> None:
+    translator.body.append(tex2mathml(node.astext()))
+    raise nodes.SkipNode
+
+
+def _displayed_mathml(translator: Any, node: nodes.Element) -> None:
+    translator.body.append(f'<div class="math">{tex2mathml(node.astext(), as_block=True)}</div>')
+    raise nodes.SkipNode
+
+
+def setup(app: Any) -> None:
+    """Render equations as MathML while the site is built, so that a page needs neither script nor network for them."""
+    app.add_html_math_renderer("mathml", (_inline_mathml, None), (_displayed_mathml, None))

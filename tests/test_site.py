@@ -60,6 +60,15 @@ def test_every_local_link_of_the_site_leads_somewhere(site: Path) -> None:
 
 
 @pytest.mark.page
+def test_every_equation_of_the_pages_is_mathml(site: Path) -> None:
+    for source in sorted((ROOT / "docs").rglob("*.md")):
+        equations = source.read_text(encoding="utf-8").count("```math\n")
+        page = (site / source.relative_to(ROOT)).with_suffix(".html").read_text(encoding="utf-8")
+        assert page.count("<math ") == equations, f"{source.name} has {equations} equations"
+        assert "mathjax" not in page.lower()
+
+
+@pytest.mark.page
 @pytest.mark.parametrize(("width", "scheme"), zip(WIDTHS, ("light", "dark"), strict=True))
 @pytest.mark.parametrize("name", SHOWN)
 def test_pages_are_accessible_and_fit_their_width(chromium: Any, site: Path, name: str, scheme: str, width: int) -> None:
