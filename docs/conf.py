@@ -19,7 +19,7 @@ author = "the authors of vehest"
 copyright = "the authors of vehest, MIT licence"
 release = re.findall(r'__version__ = "([^"]+)"', (ROOT / "src" / "vehest" / "version.py").read_text(encoding="utf-8"))[0]
 
-extensions = ["myst_parser", "sphinx_copybutton"]
+extensions = ["myst_parser", "sphinx_copybutton", "sphinx.ext.autodoc", "sphinx.ext.napoleon"]
 root_doc = "docs/index"
 include_patterns = ["docs/*.md", "docs/estimators/*.md", "docs/sources/*.md", "results/*/*.md", "CHANGELOG.md"]
 exclude_patterns = [".*", "build", "outputs", "src", "tests", "conf", "pipelines", "benchmarks", "docs/examples"]
@@ -28,7 +28,10 @@ myst_heading_anchors = 5
 myst_enable_extensions = ["colon_fence"]
 myst_fence_as_directive = ["math"]
 html_math_renderer = "mathml"
+autodoc_member_order = "bysource"
+autodoc_typehints_format = "short"
 nitpicky = True
+nitpick_ignore_regex = [("py:.*", ".*")]  # types and errors of the interface that no page describes
 suppress_warnings: list[str] = []
 highlight_language = "text"
 copybutton_prompt_text = r"\$ "

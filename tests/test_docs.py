@@ -331,6 +331,11 @@ def test_pages_know_every_name():
         assert f"`{name}`" in cli, f"docs/cli.md does not explain {name}"
 
 
+def test_page_of_the_python_interface_has_every_public_name():
+    documented = set(re.findall(r"^\.\. auto(?:function|class):: (\w+)$", page("docs/api.md"), re.MULTILINE))
+    assert documented == set(vehest.__all__) - {"__version__"}
+
+
 def class_of(source: str) -> Any:
     return importlib.import_module(f"vehest.sources.{source}").SOURCE
 

@@ -14,7 +14,7 @@ import pytest
 from chromium import WIDTHS, axe_violations, browser, complaints, opened
 
 ROOT = Path(__file__).resolve().parents[1]
-SHOWN = ("docs/index.html", "docs/estimators.html", "docs/estimators/ksnn.html", "results/ferrari_drive/report.html")
+SHOWN = ("docs/index.html", "docs/api.html", "docs/estimators.html", "docs/estimators/ksnn.html", "results/ferrari_drive/report.html")
 
 
 def broken_links(site: Path) -> list[str]:
