@@ -10,6 +10,7 @@ import csv
 import inspect
 import math
 import re
+from collections import Counter
 from collections.abc import Iterable, Sequence
 from dataclasses import fields, is_dataclass
 from pathlib import Path
@@ -33,6 +34,7 @@ SETTINGS_END = "<!-- end of settings -->"
 BASELINES = ("zero", "static_map")
 
 GROUPS = ("estimator", "training", "dataset", "split", "vehicle", "fault", "tracking")
+COMMON = 4  # commands from which on an option is listed once for all
 TYPER_OWN = {"install_completion", "show_completion", "help"}
 
 
@@ -70,31 +72,30 @@ def reference_page(root: Path) -> str:
 
 
 def channels_page() -> str:
-    """Channels, units, the errors of simulated sensors, and metrics."""
+    """Channels, units, and the errors of simulated sensors."""
     from vehest.data import units
     from vehest.data.channels import CHANNELS
-    from vehest.evaluation.metrics import UNITS
 
     channels = [
         (f"`{c.name}`", c.unit, c.meaning, f"{c.low:g} … {c.high:g}" if abs(c.low) != 3.141592653589793 else "-π … π")
         for c in CHANNELS.values()
     ]
-    conversions = [(f"`{unit}`", si, f"{factor:.10g}") for unit, (si, factor) in units._UNITS.items()]
+    conversions: dict[str, list[str]] = {}
+    for unit, (si, factor) in units._UNITS.items():
+        conversions.setdefault(si, []).append(f"`{unit}`" + (f" × {factor:.10g}" if factor != 1.0 else ""))
     parts = [
-        "# Channels, units and metrics",
+        "# Channels, units and simulated sensors",
         MADE,
+        "Look up a channel's name, sign and possible range, what `unit:` may say in a data set, and how simulated sensors err.",
         "## Channels",
         "Units are SI, angles are radians. Axes are those of ISO 8855: x forward, y left, z up, counter-clockwise positive; a left turn "
         "has positive `steer`, `yaw_rate` and `ay`. Channels that end in `_ref` come from a reference sensor; estimators never see them. "
         "A value outside the range is reported by `vehest data check` and stops an ingest.",
         _table(("channel", "unit", "meaning", "possible range"), channels),
         "## Units",
-        "What `unit:` may say in conf/dataset; values are multiplied by the factor.",
-        _table(("unit", "becomes", "factor"), conversions),
+        "What `unit:` may say in conf/dataset, with the factor by which values are multiplied.",
+        _table(("unit of channels", "may be given as"), [(si, ", ".join(dict.fromkeys(given))) for si, given in conversions.items()]),
         *_simulated_sensors(),
-        "## Metrics",
-        "Names and units in `metrics.csv`; definitions: [estimators.md](evaluation.md#metrics).",
-        _table(("metric", "unit"), [(f"`{name}`", unit) for name, unit in UNITS.items()]),
     ]
     return "\n\n".join(parts) + "\n"
 
@@ -107,16 +108,17 @@ def _manoeuvre(name: str, made: type[Any]) -> list[str]:
 
 
 def manoeuvres_page(root: Path) -> str:
-    """Manoeuvres of the proving ground with their parameters, its courses, and its vehicles."""
+    """Manoeuvres of the proving ground with their parameters, and its courses."""
     from vehest.simulation.driving.manoeuvres import MANOEUVRES
     from vehest.simulation.planar_drive import PLANAR_MANOEUVRES
     from vehest.simulation.road import tracks
     from vehest.simulation.road.course import course_by_name
 
     parts = [
-        "# Manoeuvres, courses and vehicles of the proving ground",
+        "# Manoeuvres and courses of the proving ground",
         MADE,
-        "How a data set uses them: [sources/simulated.md](sources/simulated.md).",
+        "Look up what a simulated drive can do and on which course; how a data set names them: "
+        "[sources/simulated.md](sources/simulated.md).",
         "## Manoeuvres",
         "A parameter with a pair as its default is a range: give a number, or a pair from which every drive draws, uniformly. `severity` "
         "is the share of the grip that the driver means to use, on the surface of the drive.",
@@ -138,12 +140,7 @@ def manoeuvres_page(root: Path) -> str:
             right=3,
         ),
         "Where their layouts come from: `vehest.simulation.road.tracks`.",
-        "## Vehicles",
-        "With the source of every value: [reference.md](reference.md#confvehicle).",
-        _table(
-            ("vehicle", "what it is"),
-            [(f"`{file.stem}`", _first_comment(file)) for file in sorted((root / "conf" / "vehicle").glob("*.yaml"))],
-        ),
+        "Vehicles, with the source of every value: [reference.md](reference.md#confvehicle).",
     ]
     return "\n\n".join(parts) + "\n"
 
@@ -202,24 +199,24 @@ def _simulated_sensors() -> Iterable[str]:
     yield "\n".join(f"- {line}" for line in _arguments(SensorLevels))
     yield "### `sensors: race`"
     yield f"A race car of the sixties with good instruments, as in the Ferrari recording. {_mounting(PRESETS['race'].imu)}"
-    yield _table(header, _sensor_rows(PRESETS["race"]))
+    yield _table(header, _sensor_rows(PRESETS["race"], PRESETS["default"]))
     yield (
         "Read off the recording by `read_off` of `vehest_papers.proving_ground.noise_reading`: the noise of `vx`, `yaw_rate`, `ax`, `ay` "
         "and `steer` (median spectral density above 10 Hz; the body's shaking is part of it), the step of `steer`, the delay of "
         "`yaw_rate`, `ax` and `ay` against the reference's velocities, and of `ax` and `ay` the offset and the drift (mean, and what is "
         "left below 0.5 Hz, of the reference's accelerations less theirs when delays, white noise, roll and pitch are taken out; a "
-        "banked road is part of it). How `imu` is turned is part of the offsets. All else is assumed; wheel speeds and tyre forces are "
+        "banked road is part of it). How `imu` is turned is part of the offsets. All else is assumed; sensors that are not listed are "
         "those of `default`."
     )
     yield "### `sensors: small_car`"
     vibration = PRESETS["small_car"].vibration
     shaken = ", ".join(f"`{field.name}` {getattr(vibration, field.name):g}" for field in fields(vibration))
     yield f"A model race car of 5 kg, as in the F1TENTH recordings. {_mounting(PRESETS['small_car'].imu)}"
-    yield _table(header, _sensor_rows(PRESETS["small_car"]))
+    yield _table(header, _sensor_rows(PRESETS["small_car"], PRESETS["default"]))
     yield (
         f"Its inertial unit shakes with the wheels: `vibration` adds white noise whose standard deviation is, per rad/s of the wheels' "
         f"mean speed, {shaken}. These and what the comments in `vehest.simulation.sensors.levels` name are read off the recording that the "
-        "learned-dynamics UKF trains on; the rest is assumed."
+        "learned-dynamics UKF trains on; the rest is assumed, and what is not listed is that of `default`."
     )
     yield "### `reference: gnss`, `reference: optical` and `reference: motion_capture`"
     yield (
@@ -233,16 +230,19 @@ def _simulated_sensors() -> Iterable[str]:
     yield _table(("reference", *(f"`{lever}` [m]" for lever in levers)), rows)
 
 
-def _sensor_rows(levels: Any) -> Iterable[tuple[str, ...]]:
-    """A row for each sensor among the fields of a dataclass of levels."""
+def _sensor_rows(levels: Any, listed: Any = None) -> Iterable[tuple[str, ...]]:
+    """A row for the sensors of equal levels among the fields of a dataclass, less those that another one lists."""
     from vehest.simulation.sensors.levels import SensorLevel
 
+    rows: dict[tuple[str, ...], list[str]] = {}
     for field in fields(levels):
         level = getattr(levels, field.name)
-        if isinstance(level, SensorLevel):
+        if isinstance(level, SensorLevel) and level != getattr(listed, field.name, None):
             drift = f"{level.drift:g} ({level.drift_time:g} s)" if level.drift else "0"
             rest = (f"{level.quantisation:g}", f"{1e3 * level.delay:g}", f"{1e2 * level.scale:g}")
-            yield f"`{field.name}`", f"{level.noise:g}", f"{level.offset:g}", drift, *rest
+            rows.setdefault((f"{level.noise:g}", f"{level.offset:g}", drift, *rest), []).append(f"`{field.name}`")
+    for values, names in rows.items():
+        yield ", ".join(names), *values
 
 
 def _mounting(imu: Any) -> str:
@@ -268,7 +268,7 @@ def family_page(path: Path, root: Path) -> str:
     """The page of the families that its title names, with what published studies say of them."""
     text = path.read_text(encoding="utf-8")
     estimators = re.findall(r"`(\w+)`", text.partition("\n")[0])
-    tables = [part for name in estimators for part in _settings(name, many=len(estimators) > 1)]
+    tables = list(_settings(estimators))
     text = _between(text, SETTINGS_START, SETTINGS_END, "\n" + "\n\n".join(tables) + "\n")
     start = FIGURES_START.search(text)
     if start is None:
@@ -278,14 +278,21 @@ def family_page(path: Path, root: Path) -> str:
     return _between(text, start.group(), FIGURES_END, "\n" + "\n\n".join(parts) + "\n")
 
 
-def _settings(name: str, many: bool) -> Iterable[str]:
-    """Settings and fitted numbers of a family, as its class declares them."""
+def _settings(estimators: Sequence[str]) -> Iterable[str]:
+    """Settings and fitted numbers of families, as their classes declare them; many that an earlier one has too are only named."""
     from vehest.estimators.registry import estimator_class
 
-    rows = list(_declared(estimator_class(name).settings_type(), ""))
-    if many:
-        yield f"`{name}`:"
-    yield _table(("`estimator.`", "default", "unit", "meaning"), rows)
+    listed: set[tuple[str, ...]] = set()
+    for name in estimators:
+        rows = list(_declared(estimator_class(name).settings_type(), ""))
+        same = [row[0] for row in rows if row in listed]
+        if len(same) > 3:
+            yield f"`{name}`, besides {', '.join(same)} as above:"
+            rows = [row for row in rows if row not in listed]
+        elif len(estimators) > 1:
+            yield f"`{name}`:"
+        listed.update(rows)
+        yield _table(("`estimator.`", "default", "unit", "meaning"), rows)
 
 
 def _declared(settings: Any, above: str) -> Iterable[tuple[str, str, str, str]]:
@@ -435,16 +442,25 @@ def _commands() -> Iterable[str]:
     from vehest.cli import app
 
     root: Any = typer.main.get_command(app)
+    leaves = list(_leaves(root, ("vehest",)))
+    counts = Counter(row for _, command in leaves for row in _parameters(command))
+    common = {row for row, count in counts.items() if count >= COMMON}
+    header = ("argument or option", "meaning")
     yield _paragraphs(root.help)
-    yield _parameters(root)
     yield f"{root.epilog} `-h` and `--help` explain every command; `--install-completion` sets up tab completion."
-    for words, command in _leaves(root, ("vehest",)):
+    yield "### Common options"
+    yield _table(header, [*_parameters(root), *(row for row in counts if row in common)])
+    for words, command in leaves:
         arguments = [_argument(p) for p in command.params if p.param_type_name == "argument"]
-        usage = " ".join([*words, *arguments, "[OPTIONS]"])
+        rows = _parameters(command)
         yield f"### `{' '.join(words)}`"
-        yield f"```text\n{usage}\n```"
+        yield f"```text\n{' '.join([*words, *arguments, '[OPTIONS]'])}\n```"
         yield _paragraphs(command.help)
-        yield _parameters(command)
+        own = [row for row in rows if row not in common]
+        if own:
+            yield _table(header, own)
+        if len(own) < len(rows):
+            yield f"{'Also' if own else 'Takes'} {', '.join(row[0] for row in rows if row in common)}."
 
 
 def _leaves(group: Any, words: tuple[str, ...]) -> Iterable[tuple[tuple[str, ...], Any]]:
@@ -460,7 +476,8 @@ def _argument(parameter: Any) -> str:
     return f"[{name}]..." if parameter.nargs == -1 else name
 
 
-def _parameters(command: Any) -> str:
+def _parameters(command: Any) -> list[tuple[str, str]]:
+    """Arguments and options of a command, with their meaning."""
     rows = []
     for parameter in command.params:
         if parameter.name in TYPER_OWN:
@@ -473,7 +490,7 @@ def _parameters(command: Any) -> str:
         default = parameter.default
         shown = f" Default: `{default}`." if not (default is None or isinstance(default, bool) or callable(default)) else ""
         rows.append((name, f"{parameter.help}{shown}"))
-    return _table(("argument or option", "meaning"), rows)
+    return rows
 
 
 def _files(root: Path, folders: Sequence[Path]) -> str:
