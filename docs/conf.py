@@ -1,4 +1,4 @@
-"""The documentation site: Sphinx with MyST over docs/, the reports in results/ and the changelog (`make docs-site`).
+"""The documentation site: Sphinx with MyST over docs/, the reports in results/, the changelog and how to contribute (`make docs-site`).
 
 The root of the repository is the source folder, so that links between docs/ and results/ are the same on the site and in a checkout.
 """
@@ -21,7 +21,7 @@ release = re.findall(r'__version__ = "([^"]+)"', (ROOT / "src" / "vehest" / "ver
 
 extensions = ["myst_parser", "sphinx_copybutton", "sphinx.ext.autodoc", "sphinx.ext.napoleon"]
 root_doc = "docs/index"
-include_patterns = ["docs/*.md", "docs/estimators/*.md", "docs/sources/*.md", "results/*/*.md", "CHANGELOG.md"]
+include_patterns = ["docs/*.md", "docs/estimators/*.md", "docs/sources/*.md", "results/*/*.md", "CHANGELOG.md", "CONTRIBUTING.md"]
 exclude_patterns = [".*", "build", "outputs", "src", "tests", "conf", "pipelines", "benchmarks", "docs/examples"]
 
 myst_heading_anchors = 5

@@ -18,7 +18,6 @@ from scipy import signal
 
 import vehest
 from example_package import forget_examples, install_examples, write_laps
-from fuzz import case
 from vehest.alignment import checks
 from vehest.cli import app
 from vehest.data.errors import ConfigurationError, DataError, JobsFailedError, MissingError
@@ -40,6 +39,7 @@ ROOT = Path(__file__).resolve().parents[1]
 PAGES = [
     ROOT / "README.md",
     ROOT / "CHANGELOG.md",
+    ROOT / "CONTRIBUTING.md",
     *sorted((ROOT / "docs").glob("*.md")),
     *sorted((ROOT / "docs" / "estimators").glob("*.md")),
 ]
@@ -150,7 +150,6 @@ def test_example_files_are_valid(workplace):
 
 
 def test_python_examples_run(workplace, drive, monkeypatch, request):
-    monkeypatch.setattr(case, "GENERATORS", [])
     request.addfinalizer(forget_examples)
     install_examples(workplace / "site", monkeypatch)
     write_laps()
