@@ -16,18 +16,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import yaml
-from identification import (
-    Array,
-    Mask,
-    accelerations,
-    best_delay,
-    block_regression,
-    data_folder,
-    late,
-    regression,
-    smooth,
-    squared_scatter,
-)
+from identification import Array, Mask, accelerations, best_delay, block_regression, data_folder, late, regression, smooth, squared_scatter
 from numpy.typing import NDArray
 
 from vehest.sources.pose import PoseOptions

@@ -145,8 +145,12 @@ def channels() -> Iterable[str]:
     """Names, units, meanings and possible ranges."""
     from vehest.data.channels import CHANNELS
 
-    rows = [(f"`{c.name}`", c.unit, c.meaning, f"{c.low:g} … {c.high:g}" if abs(c.low) != math.pi else "-π … π") for c in CHANNELS.values()]
-    yield _table(("channel", "unit", "meaning", "possible range"), rows)
+    rows: dict[tuple[str, str, str], list[str]] = {}
+    for c in CHANNELS.values():
+        of_all = re.sub(r"(the )?(front|rear) (left|right)( wheel)?", "each wheel", c.meaning)
+        possible = f"{c.low:g} … {c.high:g}" if abs(c.low) != math.pi else "-π … π"
+        rows.setdefault((c.unit, of_all, possible), []).append(f"`{c.name}`")
+    yield _table(("channel", "unit", "meaning", "possible range"), [(", ".join(names), *row) for row, names in rows.items()])
 
 
 def units() -> Iterable[str]:
