@@ -222,21 +222,12 @@ def _sensor_rows(levels: Any, listed: Any = None) -> Iterable[tuple[str, ...]]:
 # Manoeuvres and courses
 
 
-def manoeuvres() -> Iterable[str]:
-    """Manoeuvres of the multi-body plant's cars with their parameters."""
+def manoeuvres(plant: str) -> Iterable[str]:
+    """Manoeuvres of the cars of a plant, multi-body or planar, with their parameters."""
     from vehest.simulation.driving.manoeuvres import MANOEUVRES
-
-    yield from _manoeuvres(MANOEUVRES)
-
-
-def planar_manoeuvres() -> Iterable[str]:
-    """Those of the planar plant's cars."""
     from vehest.simulation.planar_drive import PLANAR_MANOEUVRES
 
-    yield from _manoeuvres(PLANAR_MANOEUVRES)
-
-
-def _manoeuvres(known: Any) -> Iterable[str]:
+    known: dict[str, Any] = {**(PLANAR_MANOEUVRES if plant == "planar" else MANOEUVRES)}
     for name, made in sorted(known.items()):
         described = _sections(made)
         rows = [(f"`{field.name}`", f"`{_as_yaml(field.default)}`", described.get(field.name, "")) for field in fields(made)]
@@ -412,7 +403,7 @@ def _table(header: Sequence[str], rows: Iterable[Sequence[str]], right: int = 0)
 PARTS: dict[str, Callable[..., Iterable[str]]] = {
     part.__name__: part
     for part in (
-        *(commands, files, channels, units, sensors, sensor_sources, references, manoeuvres, planar_manoeuvres, courses),
+        *(commands, files, channels, units, sensors, sensor_sources, references, manoeuvres, courses),
         *(settings, figures, leaderboard, across_vehicles, other_vehicles),
     )
 }
