@@ -34,6 +34,7 @@ nitpicky = True
 nitpick_ignore_regex = [("py:.*", ".*")]  # types and errors of the interface that no page describes
 suppress_warnings: list[str] = []
 highlight_language = "text"
+smartquotes_action = "q"  # the dashes of options stay
 copybutton_prompt_text = r"\$ "
 copybutton_prompt_is_regexp = True
 
