@@ -1,4 +1,4 @@
-"""The documentation site: Sphinx with MyST over docs/, the reports in results/ and the changelog (`make docs-site`).
+"""The documentation site: Sphinx with MyST over docs/, the reports in results/, the changelog and how to contribute (`make docs-site`).
 
 The root of the repository is the source folder, so that links between docs/ and results/ are the same on the site and in a checkout.
 """
@@ -7,6 +7,10 @@ from __future__ import annotations
 
 import re
 from pathlib import Path
+from typing import Any
+
+from docutils import nodes
+from docutils.utils.math.latex2mathml import tex2mathml
 
 ROOT = Path(__file__).resolve().parents[1]
 
@@ -15,16 +19,22 @@ author = "the authors of vehest"
 copyright = "the authors of vehest, MIT licence"
 release = re.findall(r'__version__ = "([^"]+)"', (ROOT / "src" / "vehest" / "version.py").read_text(encoding="utf-8"))[0]
 
-extensions = ["myst_parser", "sphinx_copybutton"]
+extensions = ["myst_parser", "sphinx_copybutton", "sphinx.ext.autodoc", "sphinx.ext.napoleon"]
 root_doc = "docs/index"
-include_patterns = ["docs/*.md", "docs/estimators/*.md", "docs/sources/*.md", "results/*/*.md", "CHANGELOG.md"]
+include_patterns = ["docs/*.md", "docs/estimators/*.md", "docs/sources/*.md", "results/*/*.md", "CHANGELOG.md", "CONTRIBUTING.md"]
 exclude_patterns = [".*", "build", "outputs", "src", "tests", "conf", "pipelines", "benchmarks", "docs/examples"]
 
 myst_heading_anchors = 5
 myst_enable_extensions = ["colon_fence"]
+myst_fence_as_directive = ["math"]
+html_math_renderer = "mathml"
+autodoc_member_order = "bysource"
+autodoc_typehints_format = "short"
 nitpicky = True
+nitpick_ignore_regex = [("py:.*", ".*")]  # types and errors of the interface that no page describes
 suppress_warnings: list[str] = []
 highlight_language = "text"
+smartquotes_action = "q"  # the dashes of options stay
 copybutton_prompt_text = r"\$ "
 copybutton_prompt_is_regexp = True
 
@@ -41,3 +51,18 @@ html_theme_options = {
     "dark_css_variables": {"color-brand-primary": "#8cc4f5", "color-brand-content": "#8cc4f5", "color-brand-visited": "#8cc4f5"},
     "navigation_with_keys": True,
 }
+
+
+def _inline_mathml(translator: Any, node: nodes.Element) -> None:
+    translator.body.append(tex2mathml(node.astext()))
+    raise nodes.SkipNode
+
+
+def _displayed_mathml(translator: Any, node: nodes.Element) -> None:
+    translator.body.append(f'<div class="math">{tex2mathml(node.astext(), as_block=True)}</div>')
+    raise nodes.SkipNode
+
+
+def setup(app: Any) -> None:
+    """Render equations as MathML while the site is built, so that a page needs neither script nor network for them."""
+    app.add_html_math_renderer("mathml", (_inline_mathml, None), (_displayed_mathml, None))

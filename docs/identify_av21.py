@@ -7,15 +7,9 @@ conf/dataset/av21.yaml declares the constants, docs/sources/av21.md explains the
 
 from __future__ import annotations
 
-import os
-import sys
-from pathlib import Path
-
 import numpy as np
 import pandas as pd
-from numpy.typing import NDArray
-
-Array = NDArray[np.float64]
+from identification import data_folder, regression
 
 FILES = ("LVMS_23_01_04_B", "Putnam_park2023_run4_2")
 MOVING = 5.0  # m/s
@@ -24,19 +18,16 @@ NOMINAL = 0.3  # m, by which speeds at the rim become rotational speeds; the pub
 
 def main() -> None:
     """Print every figure."""
-    root = os.environ.get("VEHEST_DATA")
-    if not root:
-        sys.exit("set VEHEST_DATA to the folder with the recordings")
     ratios = []
     for stem in FILES:
-        table = pd.read_csv(Path(root) / "av21" / f"{stem}.csv")
+        table = pd.read_csv(data_folder() / "av21" / f"{stem}.csv")
         time, vx, vy, r = (table[name].to_numpy(np.float64) for name in ("# time(s)", "vx(m/s)", "vy(m/s)", "omega(rad/s)"))
         moving = vx > MOVING
         what = f"{len(table)} rows, {time[-1] - time[0]:.1f} s from {time[0]:.2f} s"
         print(f"{stem}: {what}, {moving.sum()} rows faster than {MOVING:g} m/s, to {vx.max():.1f} m/s")
         wheels = {name: table[f"wheel_{name}(kmph)"].to_numpy(np.float64) / 3.6 for name in ("fl", "fr", "rl", "rr")}
         for name, speed in wheels.items():
-            (gain, side, traction), rest = _regression([vx, r, np.gradient(vx, time)], speed, moving)
+            (gain, side, traction), rest = regression([vx, r, np.gradient(vx, time)], speed, moving)
             print(f"  wheel {name}: {gain:.4f} vx {side:+.2f} m r {traction:+.3f} s dvx/dt, rest {rest:.3f} m/s")
         mean = np.mean(list(wheels.values()), axis=0)
         ratio = float(np.median(mean[moving] / vx[moving]))
@@ -55,12 +46,6 @@ def main() -> None:
     both = float(np.mean(ratios))
     errors = " and ".join(f"{100 * (ratio / both - 1):+.2f} %" for ratio in ratios)
     print(f"wheel radius: {NOMINAL:g} m by {both:.4f} is {NOMINAL / both:.4f} m; errors of the speed by file {errors}")
-
-
-def _regression(columns: list[Array], measured: Array, chosen: NDArray[np.bool_]) -> tuple[list[float], float]:
-    rows = np.stack(columns, axis=1)[chosen]
-    factors = np.linalg.lstsq(rows, measured[chosen], rcond=None)[0]
-    return factors.tolist(), float((measured[chosen] - rows @ factors).std())
 
 
 if __name__ == "__main__":

@@ -8,8 +8,6 @@ are used here. ± is one standard deviation over 200 resamples of the drives in 
 
 from __future__ import annotations
 
-import os
-import sys
 from collections.abc import Callable
 from dataclasses import dataclass
 from fnmatch import fnmatchcase
@@ -18,14 +16,11 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import yaml
+from identification import Array, Mask, accelerations, best_delay, block_regression, data_folder, late, regression, smooth, squared_scatter
 from numpy.typing import NDArray
-from scipy import signal
 
 from vehest.sources.pose import PoseOptions
 from vehest.sources.table_rows import dropped_rows_from_config, kept_rows
-
-Array = NDArray[np.float64]
-Mask = NDArray[np.bool_]
 
 ROOT = Path(__file__).resolve().parents[1]
 RATE = 100.0
@@ -35,7 +30,6 @@ MOVING = 0.3  # m/s
 JUMP = 60.0  # m/s², beyond what a pose's noise of 0.2 mm makes
 CUTOFF = 3.0  # Hz, of what sensors at 10 Hz can show
 KNOTS = np.linspace(-1.0, 1.0, 9)
-BLOCK = 50  # samples of the sensors
 
 
 @dataclass(frozen=True)
@@ -55,8 +49,7 @@ class Drive:
 
     def late(self, samples: Array, delay: float) -> Array:
         """A signal of the poses at the rows in which sensors are new, as it was some time earlier."""
-        times = np.arange(len(samples)) / RATE
-        return np.interp(times[self.new] - delay, times, samples)
+        return late(samples, delay, RATE)[self.new]
 
     @property
     def moving(self) -> Mask:
@@ -68,13 +61,10 @@ class Drive:
 
 def main() -> None:
     """Print every figure."""
-    root = os.environ.get("VEHEST_DATA")
-    if not root:
-        sys.exit("set VEHEST_DATA to the folder with the recordings")
     declared = yaml.safe_load((ROOT / "conf" / "dataset" / "dart.yaml").read_text(encoding="utf-8"))
     dropped = dropped_rows_from_config(declared["drop_rows"], "dart")
     drives = []
-    for file in sorted((Path(root) / "dart").glob("*/*.csv")):
+    for file in sorted((data_folder() / "dart").glob("*/*.csv")):
         table = pd.read_csv(file)
         excluded = any(fnmatchcase(file.stem, pattern) for pattern in declared["exclude"])
         print(("left out " if excluded else "") + f"{file.parent.name}/{file.stem}: {_described(table)}")
@@ -127,16 +117,9 @@ def _clocks(drives: list[Drive]) -> None:
         fast = np.flatnonzero(drive.vx > MOVING)
         fast = fast[(fast > 8) & (fast < len(stamps) - 8)][::20]
         for name, times in (("stamps", stamps - stamps[0]), ("even", np.arange(len(stamps)) / RATE)):
-            scatter[name] += [_roughness(times, place, int(middle)) for middle in fast]
+            scatter[name] += [float(np.sqrt(squared_scatter(times, place, int(middle)).sum())) for middle in fast]
     by = {name: 1e3 * float(np.median(values)) for name, values in scatter.items()}
     print(f"poses scatter about cubics through 9 of them by {by['stamps']:.3f} mm by their stamps, {by['even']:.3f} mm by an even clock")
-
-
-def _roughness(times: Array, place: Array, middle: int) -> float:
-    near = slice(middle - 4, middle + 5)
-    basis = np.vander((times[near] - times[middle]) / 0.04, 4)
-    rest = place[near] - basis @ np.linalg.lstsq(basis, place[near], rcond=None)[0]
-    return float(np.sqrt(np.square(rest).sum() / 5.0))
 
 
 def _rigid_body(drives: list[Drive]) -> None:
@@ -154,7 +137,7 @@ def _rigid_body(drives: list[Drive]) -> None:
     ]
     tangent = joined(lambda one: one.vy / one.vx)
     kept = _trimmed(columns, tangent)
-    (yaw, lever, slip), spread = _regression([column[kept] for column in columns], tangent[kept])
+    (yaw, lever, slip), spread = block_regression([column[kept] for column in columns], tangent[kept])
     print(f"body's x axis to the car's forward axis: {yaw:+.4f} ± {spread[0]:.4f} rad counter-clockwise (upstream corrects by 0.0077 rad)")
     print(
         f"rear axle to origin: {lever:.4f} ± {spread[1]:.4f} m forward (upstream: 0.115 m); "
@@ -163,7 +146,7 @@ def _rigid_body(drives: list[Drive]) -> None:
     encoder = np.concatenate([drive.column("vel encoder")[rows] for drive, rows in zip(drives, gentle, strict=True)])
     columns = [joined(lambda one: one.vx), joined(lambda one: one.yaw_rate)]
     kept = _trimmed(columns, encoder)
-    factors, spread = _regression([column[kept] for column in columns], encoder[kept])
+    factors, spread = block_regression([column[kept] for column in columns], encoder[kept])
     sideways = factors[1] / factors[0]
     print(
         f"encoder: {factors[0]:.3f} ± {spread[0]:.3f} times (vx {sideways:+.4f} ± {spread[1]:.4f} m times r): that far left lies the origin"
@@ -181,13 +164,10 @@ def _gyro_and_encoder(drives: list[Drive]) -> None:
             return [true, np.ones_like(true)]
 
         kept = _trimmed(regressors(0.05), measured)
-        scored = []
-        for delay in np.arange(-0.05, 0.1501, 0.0025):
-            columns = [column[kept] for column in regressors(delay)]
-            factors, _ = _regression(columns, measured[kept], draws=0)
-            scored.append((float((measured[kept] - np.stack(columns, axis=1) @ factors).std()), float(delay), columns))
-        rest, delay, columns = min(scored, key=lambda one: one[0])
-        factors, spread = _regression(columns, measured[kept])
+        measured = measured[kept]
+        delays = np.arange(-0.05, 0.1501, 0.0025)
+        rest, delay, columns = best_delay(delays, lambda delay, of=regressors, rows=kept: [one[rows] for one in of(delay)], measured)
+        factors, spread = block_regression(columns, measured)
         print(
             f"{name}: {factors[0]:.3f} ± {spread[0]:.3f} times the poses', offset {factors[1]:+.4f}, rest {rest:.3f}, "
             f"{kept.sum()} samples; "
@@ -202,12 +182,8 @@ def _gyro_and_encoder(drives: list[Drive]) -> None:
 
 def _delay_of(drive: Drive, name: str, true: Array) -> float:
     measured, rows = drive.column(name), drive.moving
-    scored = []
-    for delay in np.arange(-0.05, 0.1501, 0.005):
-        shifted = drive.late(true, delay)[rows]
-        rest = measured[rows] - np.polyval(np.polyfit(shifted, measured[rows], 1), shifted)
-        scored.append((float(rest.std()), float(delay)))
-    return min(scored)[1]
+    ones = np.ones(rows.sum())
+    return best_delay(np.arange(-0.05, 0.1501, 0.005), lambda delay: [drive.late(true, delay)[rows], ones], measured[rows])[1]
 
 
 def _accelerometer(drives: list[Drive]) -> None:
@@ -215,18 +191,14 @@ def _accelerometer(drives: list[Drive]) -> None:
     motions = [_accelerations(drive) for drive in drives]
     for name, order in (("acc x (IMU)", (1, 0, 3)), ("acc y (IMU)", (0, 1, 2))):
         measured = np.concatenate([drive.column(name)[drive.moving] for drive in drives])
-        scored = []
-        for delay in np.arange(-0.05, 0.1501, 0.005):
-            columns = [
-                np.concatenate([drive.late(motion[index], delay)[drive.moving] for drive, motion in zip(drives, motions, strict=True)])
-                for index in order
-            ]
-            columns.append(np.ones_like(measured))
-            factors, _ = _regression(columns, measured, draws=0)
-            rest = float((measured - np.stack(columns, axis=1) @ factors).std())
-            scored.append((rest, float(delay), columns))
-        rest, delay, columns = min(scored, key=lambda one: one[0])
-        factors, spread = _regression(columns, measured)
+
+        def columns_of(delay: float, order: tuple[int, ...] = order) -> list[Array]:
+            pairs = list(zip(drives, motions, strict=True))
+            columns = [np.concatenate([drive.late(motion[index], delay)[drive.moving] for drive, motion in pairs]) for index in order]
+            return [*columns, np.ones_like(columns[0])]
+
+        rest, delay, columns = best_delay(np.arange(-0.05, 0.1501, 0.005), columns_of, measured)
+        factors, spread = block_regression(columns, measured)
         axes = "forward, lateral, square of the yaw rate" if order[0] else "lateral, forward, yaw acceleration"
         what = ", ".join(f"{factor:+.3f} ± {sd:.3f}" for factor, sd in zip(factors, spread, strict=True))
         print(
@@ -240,9 +212,8 @@ def _accelerometer(drives: list[Drive]) -> None:
 
 
 def _accelerations(drive: Drive) -> list[Array]:
-    lateral = np.gradient(drive.vy) * RATE + drive.vx * drive.yaw_rate
-    forward = np.gradient(drive.vx) * RATE - drive.vy * drive.yaw_rate
-    return [_smooth(one) for one in (lateral, forward, np.gradient(drive.yaw_rate) * RATE, drive.yaw_rate**2)]
+    planar = accelerations(drive.vx, drive.vy, drive.yaw_rate, RATE)
+    return [smooth(one, CUTOFF, RATE) for one in (*planar, np.gradient(drive.yaw_rate) * RATE, drive.yaw_rate**2)]
 
 
 def _steering(drives: list[Drive]) -> None:
@@ -257,7 +228,7 @@ def _steering(drives: list[Drive]) -> None:
         angles.append(np.arctan(WHEELBASE * drive.yaw_rate[rows] / drive.vx[rows]))
     command, angle = np.concatenate(commands), np.concatenate(angles)
     hats = [np.interp(command, KNOTS, np.eye(len(KNOTS))[k]) for k in range(len(KNOTS))]
-    factors, spread = _regression(hats, angle)
+    factors, spread = block_regression(hats, angle)
     print(f"{len(command)} samples with |vx·r| < 1 m/s² and a command that stood for 0.8 s; corners of the curve through them:")
     for knot, factor, sd in zip(KNOTS, factors, spread, strict=True):
         print(f"  {knot:+.2f}: {factor:+.4f} ± {sd:.4f} rad")
@@ -283,27 +254,10 @@ def _trimmed(columns: list[Array], measured: Array) -> Mask:
     """Samples within four standard deviations of a regression, by the median absolute residual: without spinning wheels and slides."""
     kept = np.ones(len(measured), dtype=np.bool_)
     for _ in range(10):
-        factors, _ = _regression([column[kept] for column in columns], measured[kept], draws=0)
+        factors, _ = regression([column[kept] for column in columns], measured[kept])
         rest = np.abs(measured - np.stack(columns, axis=1) @ factors)
         kept = rest < 4.0 * 1.4826 * np.median(rest[kept])
     return kept
-
-
-def _smooth(samples: Array) -> Array:
-    return np.asarray(signal.sosfiltfilt(signal.butter(2, CUTOFF, fs=RATE, output="sos"), samples))
-
-
-def _regression(columns: list[Array], measured: Array, draws: int = 200) -> tuple[list[float], list[float]]:
-    """Least squares, and the standard deviation of its factors over resampled blocks."""
-    rows = np.stack(columns, axis=1)
-    factors = np.linalg.lstsq(rows, measured, rcond=None)[0]
-    blocks = len(rows) // BLOCK
-    generator = np.random.default_rng(0)
-    drawn = []
-    for _ in range(draws):
-        picked = (generator.integers(0, blocks, blocks)[:, None] * BLOCK + np.arange(BLOCK)).ravel()
-        drawn.append(np.linalg.lstsq(rows[picked], measured[picked], rcond=None)[0])
-    return factors.tolist(), np.std(drawn, axis=0).tolist() if drawn else []
 
 
 if __name__ == "__main__":

@@ -9,7 +9,6 @@ deviations over 200 resamples of the drive in blocks of half a second.
 
 from __future__ import annotations
 
-import os
 import sys
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
@@ -19,6 +18,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 import yaml
+from identification import Array, accelerations, block_regression, data_folder, smooth, squared_scatter
 from numpy.typing import NDArray
 from scipy import signal
 
@@ -31,8 +31,6 @@ from vehest.sources.pose import PoseOptions, ground_plane
 from vehest.sources.rosbag import POSE_FIELDS
 from vehest.sources.rosbag.topics import read_bag
 
-Array = NDArray[np.float64]
-
 ROOT = Path(__file__).resolve().parents[1]
 BAG = "iros_hoons_12_final"
 CSV_FILES = ("iros_hoons_1_with_friction", "hoons_all_test", "xray_duck_all_test")
@@ -42,7 +40,6 @@ WHEELBASE = 0.33  # m, the publishers'
 MOVING = 0.5  # m/s, below which the CSV files hold nothing
 GENTLE = 4.0  # m/s² of lateral acceleration, up to which a tyre's slip is taken as proportional to it
 CUTOFF = 8.0  # Hz
-BLOCK = 50  # samples
 
 
 @dataclass(frozen=True)
@@ -70,11 +67,9 @@ class Drive:
 
 def main() -> None:
     """Print every figure."""
-    root = os.environ.get("VEHEST_DATA")
-    if not root:
-        sys.exit("set VEHEST_DATA to the folder with the recordings")
+    folder = data_folder() / "f1tenth"
     try:
-        identify(Path(root) / "f1tenth", print)
+        identify(folder, print)
     except VehestError as error:
         sys.exit(str(error))
 
@@ -146,23 +141,14 @@ def _clocks(bag: Reading, say: Callable[[str], None]) -> dict[str, float]:
     place = np.stack([bag.arrays[f"/optitrack/rigid_body_0.pose.position.{axis}"][kept] for axis in "xy"], axis=1)
     fast = np.flatnonzero(np.hypot(*np.gradient(place, even, axis=0).T) > 1.0)
     for name, times in (("header", stamps), ("even", even)):
-        found[f"pose_roughness_{name}"] = _roughness(times, place, fast[(fast > 8) & (fast < len(stamps) - 8)])
+        squares = [squared_scatter(times, place, middle) for middle in fast[(fast > 8) & (fast < len(stamps) - 8)]]
+        found[f"pose_roughness_{name}"] = float(np.sqrt(np.mean(squares)))
     scatter = {name: 1e3 * found[f"pose_roughness_{name}"] for name in ("header", "even")}
     say(
         f"poses above 1 m/s scatter about cubics through 9 of them by {scatter['header']:.3f} mm with the headers' times, "
         f"by {scatter['even']:.3f} mm with an even clock: they were taken evenly and stamped late"
     )
     return found
-
-
-def _roughness(times: Array, place: Array, at: NDArray[np.int64]) -> float:
-    squares = []
-    for middle in at:
-        near = slice(middle - 4, middle + 5)
-        basis = np.vander((times[near] - times[middle]) / 0.04, 4)
-        rest = place[near] - basis @ np.linalg.lstsq(basis, place[near], rcond=None)[0]
-        squares.append(np.square(rest).sum(axis=0) / (9 - 4))
-    return float(np.sqrt(np.mean(squares)))
 
 
 def _drive(bag: Reading) -> Drive:
@@ -212,7 +198,7 @@ def _rigid_body(drive: Drive, say: Callable[[str], None]) -> dict[str, float]:
     say("\n## Rigid body")
     gentle = (drive.vx > MOVING) & (np.abs(drive.vx * drive.yaw_rate) < GENTLE)
     columns = [np.ones_like(drive.vx), drive.yaw_rate / np.maximum(drive.vx, 0.1), drive.vx * drive.yaw_rate]
-    (yaw, lever, slip), spread = _regression(columns, drive.vy / np.maximum(drive.vx, 0.1), gentle)
+    (yaw, lever, slip), spread = block_regression(columns, drive.vy / np.maximum(drive.vx, 0.1), gentle)
     straight = gentle & (np.abs(drive.yaw_rate) < 0.3)
     sideslip = np.degrees(np.arctan2(drive.vy, drive.vx)[straight].mean())
     say(
@@ -235,7 +221,7 @@ def _imu(unturned: Drive, drive: Drive, bag: Reading, say: Callable[[str], None]
         ("acc_y", _smooth(drive.ay), [lateral, forward, turning, one]),
         ("acc_x", _smooth(drive.ax), [forward, lateral, _smooth(drive.yaw_rate**2), one]),
     ):
-        factors, spread = _regression(columns, measured, inner)
+        factors, spread = block_regression(columns, measured, inner)
         correlation = np.corrcoef(measured[inner], columns[0][inner])[0, 1]
         found[name] = factors[0]
         rest = (
@@ -244,7 +230,7 @@ def _imu(unturned: Drive, drive: Drive, bag: Reading, say: Callable[[str], None]
             else f", the other axis' {factors[1]:+.3f} ± {spread[1]:.3f}, lever {factors[2]:+.3f} ± {spread[2]:.3f} m"
         )
         say(f"{name}: {factors[0]:+.3f} ± {spread[0]:.3f} times the car's, correlation {correlation:+.3f}{rest}, offset {factors[-1]:+.4f}")
-    crossed, crossed_sd = _regression(_planar_accelerations(unturned), _smooth(drive.ay), inner)
+    crossed, crossed_sd = block_regression(_planar_accelerations(unturned), _smooth(drive.ay), inner)
     say(f"acc_y before the rigid body is turned: the other axis' {crossed[1]:+.3f} ± {crossed_sd[1]:.3f}")
     acc_z = bag.arrays["/imu.linear_acceleration.z"]
     still = np.abs(drive.motor) < 1.0
@@ -270,9 +256,8 @@ def _imu(unturned: Drive, drive: Drive, bag: Reading, say: Callable[[str], None]
 
 def _planar_accelerations(drive: Drive) -> list[Array]:
     """Lateral, longitudinal and yaw acceleration from motion capture, and a constant."""
-    lateral = _smooth(np.gradient(drive.vy) * RATE + drive.vx * drive.yaw_rate)
-    forward = _smooth(np.gradient(drive.vx) * RATE - drive.vy * drive.yaw_rate)
-    return [lateral, forward, _smooth(np.gradient(drive.yaw_rate) * RATE), np.ones_like(lateral)]
+    planar = accelerations(drive.vx, drive.vy, drive.yaw_rate, RATE)
+    return [*(_smooth(one) for one in (*planar, np.gradient(drive.yaw_rate) * RATE)), np.ones_like(drive.vx)]
 
 
 def _steering(drive: Drive, runs: list[Drive], say: Callable[[str], None]) -> dict[str, float]:
@@ -321,7 +306,7 @@ def _motor(drive: Drive, runs: list[Drive], say: Callable[[str], None]) -> dict[
         factors, spread = _motor_regression(one, gentle, current=True)
         straight = gentle & (np.abs(one.yaw_rate) < 0.5)
         acceleration = signal.savgol_filter(one.vx, 21, 2, deriv=1, delta=1.0 / RATE)
-        drag, drag_spread = _regression([one.current, np.ones_like(one.vx), one.vx], acceleration, straight)
+        drag, drag_spread = block_regression([one.current, np.ones_like(one.vx), one.vx], acceleration, straight)
         found[f"motor_scale {one.name}"], found[f"acceleration_per_ampere {one.name}"] = factors[0], drag[0]
         say(
             f"{one.name}: motor speed {factors[0]:.3f} ± {spread[0]:.3f} times vx at no current, "
@@ -338,7 +323,7 @@ def _motor_regression(drive: Drive, chosen: NDArray[np.bool_], current: bool = F
     acceleration = signal.savgol_filter(drive.vx, 21, 2, deriv=1, delta=1.0 / RATE)
     lock = np.arctan(WHEELBASE * drive.yaw_rate / np.maximum(drive.vx, 0.1))
     columns = [drive.vx, acceleration, drive.vx * (1.0 / np.cos(lock) - 1.0)]
-    return _regression([*columns, drive.current] if current else columns, drive.motor, chosen)
+    return block_regression([*columns, drive.current] if current else columns, drive.motor, chosen)
 
 
 def _joined(runs: list[Drive]) -> Drive:
@@ -441,26 +426,12 @@ def _residuals(declared: dict[str, Any], folder: Path, runs: list[Drive], say: C
 
 
 def _smooth(samples: Array, cutoff: float = CUTOFF) -> Array:
-    return signal.sosfiltfilt(signal.butter(2, cutoff, fs=RATE, output="sos"), samples)
+    return smooth(samples, cutoff, RATE)
 
 
 def _most_frequent(samples: Array) -> tuple[float, float]:
     values, counts = np.unique(np.round(samples, 9), return_counts=True)
     return float(values[np.argmax(counts)]), float(counts.max() / len(samples))
-
-
-def _regression(columns: list[Array], measured: Array, chosen: NDArray[np.bool_]) -> tuple[list[float], list[float]]:
-    """Least squares, and the standard deviation of its factors over resampled blocks of the drive."""
-    rows = np.stack(columns, axis=1)[chosen]
-    values = measured[chosen]
-    factors = np.linalg.lstsq(rows, values, rcond=None)[0]
-    blocks = len(rows) // BLOCK
-    generator = np.random.default_rng(0)
-    drawn = []
-    for _ in range(200):
-        picked = (generator.integers(0, blocks, blocks)[:, None] * BLOCK + np.arange(BLOCK)).ravel()
-        drawn.append(np.linalg.lstsq(rows[picked], values[picked], rcond=None)[0])
-    return factors.tolist(), np.std(drawn, axis=0).tolist()
 
 
 if __name__ == "__main__":

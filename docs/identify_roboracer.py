@@ -8,23 +8,16 @@ declarations. Factors are those of the training file's four runs together; the v
 
 from __future__ import annotations
 
-import os
-import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from itertools import pairwise
-from pathlib import Path
 
 import numpy as np
 import pandas as pd
-from numpy.typing import NDArray
-from scipy import signal
+from identification import Array, Mask, accelerations, best_delay, data_folder, late, regression, smooth
 
 from vehest.data.units import factor_to_si
 from vehest.sources.pose import PoseOptions
-
-Array = NDArray[np.float64]
-Mask = NDArray[np.bool_]
 
 RATE = 20.0
 FILES = ("ftg_stanley_total_training", "ftg_stanley_total_validation")
@@ -59,12 +52,9 @@ class Run:
 
 def main() -> None:
     """Print every figure."""
-    root = os.environ.get("VEHEST_DATA")
-    if not root:
-        sys.exit("set VEHEST_DATA to the folder with the recordings")
     runs = []
     for stem in FILES:
-        table = pd.read_csv(Path(root) / "roboracer" / f"{stem}.csv")
+        table = pd.read_csv(data_folder() / "roboracer" / f"{stem}.csv")
         corrupt = np.flatnonzero(table["velocity_vehicle_x"] > 100.0) + 1
         restarts = np.flatnonzero(np.diff(table["t"]) < 0) + 2
         rows = f"time goes backwards at data rows {restarts.tolist()}; speeds above 100 m/s in {corrupt.tolist()}"
@@ -114,15 +104,14 @@ def _lost_ranges(table: pd.DataFrame) -> list[tuple[float, float]]:
 def _publishers_reference(runs: list[Run]) -> None:
     """Columns velocity_vehicle_* against poses differentiated without delay."""
     for column, own in (("velocity_vehicle_x", "vx"), ("velocity_vehicle_y", "vy"), ("angular_velocity_from_yaw", "yaw_rate")):
-        scored = []
-        for delay in np.arange(-0.02, 0.0801, 0.0025):
-            columns = [_joined(runs, lambda run, shift=delay, name=own: _late(getattr(run, name), shift))]
-            if own == "vy":
-                columns.append(_joined(runs, lambda run, shift=delay: _late(run.vx * run.yaw_rate, shift)))
-            measured = _joined(runs, lambda run, name=column: run.table[name].to_numpy(np.float64))
-            factors, rest = _regression(columns, measured)
-            scored.append((rest, delay, factors))
-        rest, delay, factors = min(scored, key=lambda one: one[0])
+
+        def columns_of(delay: float, name: str = own) -> list[Array]:
+            columns = [_joined(runs, lambda run: late(getattr(run, name), delay, RATE))]
+            return columns if name != "vy" else [*columns, _joined(runs, lambda run: late(run.vx * run.yaw_rate, delay, RATE))]
+
+        measured = _joined(runs, lambda run, name=column: run.table[name].to_numpy(np.float64))
+        rest, delay, columns = best_delay(np.arange(-0.02, 0.0801, 0.0025), columns_of, measured)
+        factors, _ = regression(columns, measured)
         more = "" if own != "vy" else f" and {1e3 * factors[1]:+.0f} ms times vx·r"
         print(f"{column}: {factors[0]:.3f} times that of the poses{more}, {1e3 * delay:.0f} ms late (rest {rest:.3f})")
     bias = _joined(runs, lambda run: run.table["velocity_vehicle_y"].to_numpy(np.float64) - run.vy)
@@ -153,22 +142,23 @@ def _inertial_unit(runs: list[Run]) -> None:
     gravity = factor_to_si("g", "m/s²")
 
     def kinematic(run: Run, delay: float) -> list[Array]:
-        lateral = np.gradient(run.vy) * RATE + run.vx * run.yaw_rate
-        forward = np.gradient(run.vx) * RATE - run.vy * run.yaw_rate
-        return [_late(_smooth(one), delay) for one in (run.yaw_rate, lateral, forward, np.gradient(run.yaw_rate) * RATE, run.yaw_rate**2)]
+        lateral, forward = accelerations(run.vx, run.vy, run.yaw_rate, RATE)
+        turning = (np.gradient(run.yaw_rate) * RATE, run.yaw_rate**2)
+        return [late(smooth(one, CUTOFF, RATE), delay, RATE) for one in (run.yaw_rate, lateral, forward, *turning)]
 
     for name, column, scale, chosen in (
         ("yaw_rate", "yaw_rate", np.pi / 180.0, (0,)),
         ("accy", "accy", gravity, (1, 2, 3)),
         ("accx", "accx", gravity, (2, 1, 4)),
     ):
-        scored = []
-        for delay in np.arange(-0.06, 0.0801, 0.005):
-            columns = [_joined(runs, lambda run, shift=delay, which=index: kinematic(run, shift)[which]) for index in chosen]
-            measured = _joined(runs, lambda run, which=column, unit=scale: unit * _smooth(run.table[which].to_numpy(np.float64)))
-            factors, rest = _regression([*columns, np.ones_like(measured)], measured)
-            scored.append((rest, delay, factors, np.corrcoef(columns[0], measured)[0, 1]))
-        rest, delay, factors, correlation = min(scored, key=lambda one: one[0])
+
+        def columns_of(delay: float, chosen: tuple[int, ...] = chosen) -> list[Array]:
+            columns = [_joined(runs, lambda run, which=index: kinematic(run, delay)[which]) for index in chosen]
+            return [*columns, np.ones_like(columns[0])]
+
+        measured = _joined(runs, lambda run, which=column, unit=scale: unit * smooth(run.table[which].to_numpy(np.float64), CUTOFF, RATE))
+        rest, delay, columns = best_delay(np.arange(-0.06, 0.0801, 0.005), columns_of, measured)
+        factors, correlation = regression(columns, measured)[0], np.corrcoef(columns[0], measured)[0, 1]
         axes = (
             ""
             if name == "yaw_rate"
@@ -188,25 +178,9 @@ def _steering(runs: list[Run]) -> None:
     print(f"steering_angle: {what}, {angle.min():.3f} to {angle.max():.3f} rad")
 
 
-def _joined(runs: list[Run], of: object) -> Array:
+def _joined(runs: list[Run], of: Callable[[Run], Array]) -> Array:
     """What a function makes of each run, sound rows of all."""
-    assert callable(of)
     return np.concatenate([of(run)[run.sound] for run in runs])
-
-
-def _smooth(samples: Array) -> Array:
-    return np.asarray(signal.sosfiltfilt(signal.butter(2, CUTOFF, fs=RATE, output="sos"), samples))
-
-
-def _late(samples: Array, delay: float) -> Array:
-    times = np.arange(len(samples)) / RATE
-    return np.interp(times - delay, times, samples)
-
-
-def _regression(columns: list[Array], measured: Array) -> tuple[list[float], float]:
-    matrix = np.stack(columns, axis=1)
-    factors = np.linalg.lstsq(matrix, measured, rcond=None)[0]
-    return factors.tolist(), float((measured - matrix @ factors).std())
 
 
 if __name__ == "__main__":

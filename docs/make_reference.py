@@ -1,7 +1,7 @@
-"""Write what is made from the code, docs/reference.md, docs/channels.md and docs/manoeuvres.md, and from published results: two tables in
-docs/results.md and what they say of each family in docs/estimators/.
+"""Write the made parts of the pages in docs/, from the code and from published results.
 
-Run by ``make docs``; tests/test_docs.py sees that the pages are up to date.
+A part stands between ``<!-- made by docs/make_reference.py: NAME WORDS -->`` and ``<!-- end -->``; NAME is one of `PARTS`, which takes the
+words. Run by ``make docs``; tests/test_docs.py checks that the pages are up to date.
 """
 
 from __future__ import annotations
@@ -10,7 +10,8 @@ import csv
 import inspect
 import math
 import re
-from collections.abc import Iterable, Sequence
+from collections import Counter
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import fields, is_dataclass
 from pathlib import Path
 from typing import Any
@@ -18,135 +19,232 @@ from typing import Any
 import typer
 
 ROOT = Path(__file__).resolve().parents[1]
-MADE = "<!-- Made by docs/make_reference.py (make docs); changes belong in the code. -->"
-BOARD_START = "<!-- leaderboard: made by docs/make_reference.py from results/ferrari_drive -->"
-BOARD_END = "<!-- end of leaderboard -->"
-BOARD_SOURCE = "results/ferrari_drive/tables/leaderboard_test.csv"
-ACROSS_START = "<!-- across vehicles: made by docs/make_reference.py from results/ksnn -->"
-ACROSS_END = "<!-- end of across vehicles -->"
-ACROSS_SOURCE = "results/ksnn/tables/overview.csv"
+RESULTS = ROOT / "results"
+PART = re.compile(r"(?<=<!-- made by docs/make_reference.py: )(\w+)(.*?) -->\n.*?(?=\n<!-- end -->)", re.DOTALL)
 
-FIGURES_START = re.compile(r"<!-- figures of (\w+)/(\w+): made by docs/make_reference.py from results -->")  # study and figure
-FIGURES_END = "<!-- end of figures -->"
-SETTINGS_START = "<!-- settings: made by docs/make_reference.py from what the families declare -->"
-SETTINGS_END = "<!-- end of settings -->"
 BASELINES = ("zero", "static_map")
+OVERVIEWS = {
+    "rational_ekf": (
+        "heavy_ekf",
+        "RMSE(β) [deg], the truck **simulated**",
+        {"test": "test", **{key: key for key in ("LINT", "RATT", "RATTE", "RATT with friction", "zero", "static map")}},
+    ),
+    "cnn_ukf": (
+        "cnn_ukf",
+        "Squared errors of β [deg²] over all samples and over those from 4 m/s² on, **simulated** cars, medians of seeds",
+        {"part": "learnt on", "candidate": "method", "ours_mse": "MSE", "ours_mse_nonlinear": "MSE_nl", "n_seeds": "seeds"},
+    ),
+    "learned_ukf": (
+        "learned_ukf",
+        "Weighted squared error of the states, **real** recordings, means over seeds; D is a tyre that none has seen",
+        {"candidate": "method", "ours_tyre_a": "tyre A", "ours_tyre_d": "tyre D", "n_seeds": "seeds"},
+    ),
+}
+"""Estimator -> study that re-creates its paper, caption of its overview, columns with their headings."""
 
-ROOT_FILES = ("common", "ingest", "downsample", "train", "eval", "estimate")
-TABLED = ("estimator", "training", "tracking")
-VERBATIM = ("dataset", "split", "vehicle")
+COMMON = 4  # commands from which on an option is listed once for all
 TYPER_OWN = {"install_completion", "show_completion", "help"}
 
 
-def pages(root: Path = ROOT) -> dict[Path, str]:
-    """Every page that is made here, by its path: what it should hold."""
-    results = root / "docs" / "results.md"
-    return {
-        root / "docs" / "reference.md": reference_page(root),
-        root / "docs" / "channels.md": channels_page(),
-        root / "docs" / "manoeuvres.md": manoeuvres_page(root),
-        results: with_overview(with_leaderboard(results.read_text(encoding="utf-8"), root / BOARD_SOURCE), root / ACROSS_SOURCE),
-        **{path: family_page(path, root) for path in _family_pages(root)},
-    }
+def pages() -> dict[Path, str]:
+    """Every page with made parts, by its path: what it should hold."""
+    found = {file: file.read_text(encoding="utf-8") for file in sorted((ROOT / "docs").rglob("*.md"))}
+    return {file: PART.sub(_made, text) for file, text in found.items() if PART.search(text)}
 
 
-def reference_page(root: Path) -> str:
-    """Commands, configuration files and pipelines."""
-    parts = [
-        "# Reference",
-        MADE,
-        "Every command with its options, every configuration file with its values, every pipeline. What they are for: [cli.md](cli.md).",
-        "## Commands",
-        *_commands(),
-        "## Configuration",
-        "Options of a command are set as `key=value` after it. `vehest config COMMAND` prints all of them, resolved.",
-        *_roots(root),
-        *_groups(root),
-        "## Pipelines",
-        "What `vehest run` and `vehest report` take.",
-    ]
-    for file in sorted((root / "pipelines").glob("*.yaml")):
-        parts += [f"### `pipelines/{file.name}`", _fenced(file)]
-    return "\n\n".join(parts) + "\n"
+def _made(part: re.Match[str]) -> str:
+    """A part anew; as it is where the results that it shows are not here."""
+    paragraphs = list(PARTS[part[1]](*part[2].split()))
+    return f"{part[1]}{part[2]} -->\n" + "\n\n".join(paragraphs) if paragraphs else part[0]
 
 
-def channels_page() -> str:
-    """Channels, units, the errors of simulated sensors, and metrics."""
-    from vehest.data import units
+def main() -> None:
+    """Write the pages that have changed and name them."""
+    for path, text in pages().items():
+        if path.read_text(encoding="utf-8") != text:
+            path.write_text(text, encoding="utf-8")
+            print(path.relative_to(ROOT))
+
+
+# Commands and configuration files
+
+
+def commands() -> Iterable[str]:
+    """Every command with its options; those that several have come first."""
+    from vehest.cli import app
+
+    root: Any = typer.main.get_command(app)
+    leaves = list(_leaves(root, ("vehest",)))
+    counts = Counter(row for _, command in leaves for row in _parameters(command))
+    common = {row for row, count in counts.items() if count >= COMMON}
+    header = ("argument or option", "meaning")
+    yield _paragraphs(root.help)
+    yield f"{root.epilog} `-h` and `--help` explain every command; `--install-completion` sets up tab completion."
+    yield "### Common options"
+    yield _table(header, [*_parameters(root), *(row for row in counts if row in common)])
+    for words, command in leaves:
+        arguments = [_argument(p) for p in command.params if p.param_type_name == "argument"]
+        rows = _parameters(command)
+        yield f"### `{' '.join(words)}`"
+        yield f"Usage: `{' '.join([*words[1:], *arguments, '[OPTIONS]'])}`. {_paragraphs(command.help)}"
+        own = [row for row in rows if row not in common]
+        if own:
+            yield _table(header, own)
+        if len(own) < len(rows):
+            yield f"{'Also' if own else 'Takes'} {', '.join(row[0] for row in rows if row in common)}."
+
+
+def _leaves(group: Any, words: tuple[str, ...]) -> Iterable[tuple[tuple[str, ...], Any]]:
+    for name, command in group.commands.items():
+        if hasattr(command, "commands"):
+            yield from _leaves(command, (*words, name))
+        else:
+            yield (*words, name), command
+
+
+def _argument(parameter: Any) -> str:
+    name = parameter.name.upper()
+    return f"[{name}]..." if parameter.nargs == -1 else name
+
+
+def _parameters(command: Any) -> list[tuple[str, str]]:
+    """Arguments and options of a command, with their meaning."""
+    rows = []
+    for parameter in command.params:
+        if parameter.name in TYPER_OWN:
+            continue
+        if parameter.param_type_name == "argument":
+            name = f"`{_argument(parameter)}`"
+        else:
+            value = "" if parameter.is_flag else f" {parameter.name.upper()}"
+            name = ", ".join(f"`{option}{value}`" for option in parameter.opts)
+        default = parameter.default
+        shown = f" Default: `{default}`." if not (default is None or isinstance(default, bool) or callable(default)) else ""
+        rows.append((name, f"{parameter.help}{shown}"))
+    return rows
+
+
+def files(*folders: str) -> Iterable[str]:
+    """A row for each YAML file of some folders: a link, and the first sentence of its comment."""
+    found = sorted((file for folder in folders for file in (ROOT / folder).glob("*.yaml")), key=lambda file: file.name)
+    rows = [(f"[`{file.stem}`](../{file.relative_to(ROOT).as_posix()})", _first_sentence(file)) for file in found]
+    yield _table(("file", "content"), rows)
+
+
+def _first_sentence(file: Path) -> str:
+    """Of the comment at the top of a file."""
+    comment = re.match(r"(?:#.*\n)+", file.read_text(encoding="utf-8"))
+    lines = [line.lstrip("# ").rstrip() for line in comment[0].splitlines() if "@package" not in line] if comment else []
+    return re.split(r"(?<=\.)\s+(?=[A-Z])", " ".join(lines), maxsplit=1)[0]
+
+
+# Channels and simulated sensors
+
+
+def channels() -> Iterable[str]:
+    """Names, units, meanings and possible ranges."""
     from vehest.data.channels import CHANNELS
-    from vehest.evaluation.metrics import UNITS
 
-    channels = [
-        (f"`{c.name}`", c.unit, c.meaning, f"{c.low:g} … {c.high:g}" if abs(c.low) != 3.141592653589793 else "-π … π")
-        for c in CHANNELS.values()
-    ]
-    conversions = [(f"`{unit}`", si, f"{factor:.10g}") for unit, (si, factor) in units._UNITS.items()]
-    parts = [
-        "# Channels, units and metrics",
-        MADE,
-        "## Channels",
-        "Units are SI, angles are radians. Axes are those of ISO 8855: x forward, y left, z up, counter-clockwise positive; a left turn "
-        "has positive `steer`, `yaw_rate` and `ay`. Channels that end in `_ref` come from a reference sensor; estimators never see them. "
-        "A value outside the range is reported by `vehest data check` and stops an ingest.",
-        _table(("channel", "unit", "meaning", "possible range"), channels),
-        "## Units",
-        "What `unit:` may say in conf/dataset; values are multiplied by the factor.",
-        _table(("unit", "becomes", "factor"), conversions),
-        *_simulated_sensors(),
-        "## Metrics",
-        "Names and units in `metrics.csv`; definitions: [estimators.md](evaluation.md#metrics).",
-        _table(("metric", "unit"), [(f"`{name}`", unit) for name, unit in UNITS.items()]),
-    ]
-    return "\n\n".join(parts) + "\n"
+    rows: dict[tuple[str, str, str], list[str]] = {}
+    for c in CHANNELS.values():
+        of_all = re.sub(r"(the )?(front|rear) (left|right)( wheel)?", "each wheel", c.meaning)
+        possible = f"{c.low:g} … {c.high:g}" if abs(c.low) != math.pi else "-π … π"
+        rows.setdefault((c.unit, of_all, possible), []).append(f"`{c.name}`")
+    yield _table(("channel", "unit", "meaning", "possible range"), [(", ".join(names), *row) for row, names in rows.items()])
 
 
-def _manoeuvre(name: str, made: type[Any]) -> list[str]:
-    """Heading, meaning and parameters of one manoeuvre."""
-    described = _sections(made)
-    rows = [(f"`{field.name}`", f"`{_as_yaml(field.default)}`", described.get(field.name, "")) for field in fields(made)]
-    return [f"### `{name}`", described[""], _table(("parameter", "default", "meaning"), rows)]
+def units() -> Iterable[str]:
+    """What a unit may be given as, with factors."""
+    from vehest.data.units import _UNITS
+
+    conversions: dict[str, list[str]] = {}
+    for unit, (si, factor) in _UNITS.items():
+        conversions.setdefault(si, []).append(f"`{unit}`" + (f" × {factor:.10g}" if factor != 1.0 else ""))
+    yield _table(("unit of channels", "may be given as"), [(si, ", ".join(dict.fromkeys(given))) for si, given in conversions.items()])
 
 
-def manoeuvres_page(root: Path) -> str:
-    """Manoeuvres of the proving ground with their parameters, its courses, and its vehicles."""
+SENSOR_HEADER = ("sensor", "noise [/√Hz]", "offset", "drift (time)", "step", "delay [ms]", "scale [%]")
+
+
+def sensors(preset: str, besides: str = "") -> Iterable[str]:
+    """Levels of a preset, less those that are equal in another one, its mounting and its vibration."""
+    from vehest.simulation.sensors.levels import PRESETS
+
+    levels = PRESETS[preset]
+    place = _nonzero(levels.imu)
+    yield _table(SENSOR_HEADER, _sensor_rows(levels, PRESETS.get(besides)))
+    yield f"`imu`: {place}; the rest is zero." if place else "`imu`: all zero."
+    if besides and _nonzero(levels.vibration):
+        yield f"`vibration`: {_nonzero(levels.vibration)}."
+
+
+def _nonzero(values: Any) -> str:
+    return ", ".join(f"`{field.name}` {getattr(values, field.name):g}" for field in fields(values) if getattr(values, field.name))
+
+
+def sensor_sources() -> Iterable[str]:
+    """Where the levels of the default preset come from, as its dataclass says."""
+    from vehest.simulation.sensors.levels import SensorLevels
+
+    names: dict[str, list[str]] = {}
+    for name, meaning in _sections(SensorLevels).items():
+        if name in {field.name for field in fields(SensorLevels)}:
+            names.setdefault(meaning, []).append(f"`{name}`")
+    yield "\n".join(f"- {', '.join(named)}: {meaning}" for meaning, named in names.items())
+
+
+def references() -> Iterable[str]:
+    """Levels and levers of the reference sensors."""
+    from vehest.simulation.sensors.levels import REFERENCES
+
+    shown = (REFERENCES["gnss"], REFERENCES["optical"], REFERENCES["motion_capture"])
+    levers = ("lever_x", "lever_y", "lever_z", "lever_error")
+    yield _table(("reference", *SENSOR_HEADER), [(f"`{r.kind}`", *row) for r in shown for row in _sensor_rows(r)])
+    rows = [(f"`{r.kind}`", *(f"{getattr(r, lever):g}" for lever in levers)) for r in shown]
+    yield _table(("reference", *(f"`{lever}` [m]" for lever in levers)), rows)
+
+
+def _sensor_rows(levels: Any, listed: Any = None) -> Iterable[tuple[str, ...]]:
+    """A row for the sensors of equal levels among the fields of a dataclass, less those that another one lists."""
+    from vehest.simulation.sensors.levels import SensorLevel
+
+    rows: dict[tuple[str, ...], list[str]] = {}
+    for field in fields(levels):
+        level = getattr(levels, field.name)
+        if isinstance(level, SensorLevel) and level != getattr(listed, field.name, None):
+            drift = f"{level.drift:g} ({level.drift_time:g} s)" if level.drift else "0"
+            rest = (f"{level.quantisation:g}", f"{1e3 * level.delay:g}", f"{1e2 * level.scale:g}")
+            rows.setdefault((f"{level.noise:g}", f"{level.offset:g}", drift, *rest), []).append(f"`{field.name}`")
+    for values, names in rows.items():
+        yield ", ".join(names), *values
+
+
+# Manoeuvres and courses
+
+
+def manoeuvres(plant: str) -> Iterable[str]:
+    """Manoeuvres of the cars of a plant, multi-body or planar, with their parameters."""
     from vehest.simulation.driving.manoeuvres import MANOEUVRES
     from vehest.simulation.planar_drive import PLANAR_MANOEUVRES
+
+    known: dict[str, Any] = {**(PLANAR_MANOEUVRES if plant == "planar" else MANOEUVRES)}
+    for name, made in sorted(known.items()):
+        described = _sections(made)
+        rows = [(f"`{field.name}`", f"`{_as_yaml(field.default)}`", described.get(field.name, "")) for field in fields(made)]
+        yield from (f"### `{name}`", described[""], _table(("parameter", "default", "meaning"), rows))
+
+
+def courses() -> Iterable[str]:
+    """Length, smallest radius and bank of every course."""
     from vehest.simulation.road import tracks
     from vehest.simulation.road.course import course_by_name
 
-    parts = [
-        "# Manoeuvres, courses and vehicles of the proving ground",
-        MADE,
-        "How a data set uses them: [sources/simulated.md](sources/simulated.md).",
-        "## Manoeuvres",
-        "A parameter with a pair as its default is a range: give a number, or a pair from which every drive draws, uniformly. `severity` "
-        "is the share of the grip that the driver means to use, on the surface of the drive.",
+    known = [(name, course_by_name(name)) for name in tracks.LAYOUTS]
+    rows = [
+        (f"`{name}`", f"{c.length:.0f}", f"{1.0 / abs(c.curvature).max():.0f}", f"{math.degrees(abs(c.bank).max()):.1f}")
+        for name, c in known
     ]
-    for name, made in sorted(MANOEUVRES.items()):
-        parts += _manoeuvre(name, made)
-    parts.append("## Manoeuvres of the planar plant's cars")
-    for name, free in sorted(PLANAR_MANOEUVRES.items()):
-        parts += _manoeuvre(name, free)
-    courses = [(name, course_by_name(name)) for name in tracks.LAYOUTS]
-    parts += [
-        "## Courses",
-        _table(
-            ("course", "length [m]", "smallest radius [m]", "bank up to [deg]"),
-            [
-                (f"`{name}`", f"{c.length:.0f}", f"{1.0 / abs(c.curvature).max():.0f}", f"{math.degrees(abs(c.bank).max()):.1f}")
-                for name, c in courses
-            ],
-            right=3,
-        ),
-        "Where their layouts come from: `vehest.simulation.road.tracks`.",
-        "## Vehicles",
-        "With the source of every value: [reference.md](reference.md#confvehicle).",
-        _table(
-            ("vehicle", "what it is"),
-            [(f"`{file.stem}`", _first_comment(file)) for file in sorted((root / "conf" / "vehicle").glob("*.yaml"))],
-        ),
-    ]
-    return "\n\n".join(parts) + "\n"
+    yield _table(("course", "length [m]", "smallest radius [m]", "bank up to [deg]"), rows, right=3)
 
 
 def _as_yaml(value: Any) -> str:
@@ -169,124 +267,24 @@ def _sections(described: type) -> dict[str, str]:
     return sections
 
 
-def _simulated_sensors() -> Iterable[str]:
-    from vehest.simulation.sensors.levels import PRESETS, REFERENCES, SensorLevels
-
-    header = ("sensor", "noise [/√Hz]", "offset", "drift (time)", "step", "delay [ms]", "scale [%]")
-    references = (REFERENCES["gnss"], REFERENCES["optical"], REFERENCES["motion_capture"])
-    levers = ("lever_x", "lever_y", "lever_z", "lever_error")
-    yield "## Simulated sensors"
-    yield (
-        "`shown = quantise((1 + gain)(1 + scale) true(t - delay) + bias + offset + drift(t) + noise(t))`, in the channel's unit. "
-        "`gain` and `bias` belong to the car, the same in each of its drives. Noise is a density: at a rate of f Hz it is the √(f/2)-fold "
-        "as standard deviation of a sample, 7.07 times at 100 Hz. Offset and scale are drawn for each drive, with these standard "
-        "deviations; drift is a first-order Gauss-Markov process of this standard deviation and correlation time. Each error of each "
-        "sensor has a random stream of its own: what one level is changes no other sample."
-    )
-    yield (
-        "`imu` is where the gyros and accelerometers sit (`lever_x`, `lever_y`, `lever_z` from the centre of gravity [m]) and how they are "
-        "turned (`roll`, `pitch`, `yaw`, and a `misalignment` drawn for each of the three [rad]). `tilt` says which of `roll` and `pitch` "
-        "of the body, `bank` and `grade` of the road let gravity into the accelerometers. Roll and pitch themselves are not measured."
-    )
-    yield (
-        "A data set says `sensors: default`, `race`, `small_car` or `ideal` (no errors, the road's axes), or changes a preset. `off` "
-        "takes a whole sensor's errors away, `switched_off` names single ones; `*` stands for all sensors but the reference:"
-    )
-    yield (
-        "```yaml\nsensors:\n  preset: race\n  reference: optical\n  ay: {noise: 0, offset: 0.05}\n  steer: off\n  tilt: {bank: off}\n"
-        '  imu: {lever_x: 0.3}\n  switched_off: [vx.delay, "*.drift"]\n```'
-    )
-    yield "### `sensors: default`"
-    yield f"Production sensors. {_mounting(PRESETS['default'].imu)}"
-    yield _table(header, _sensor_rows(PRESETS["default"]))
-    yield "Where the numbers come from:"
-    yield "\n".join(f"- {line}" for line in _arguments(SensorLevels))
-    yield "### `sensors: race`"
-    yield f"A race car of the sixties with good instruments, as in the Ferrari recording. {_mounting(PRESETS['race'].imu)}"
-    yield _table(header, _sensor_rows(PRESETS["race"]))
-    yield (
-        "Read off the recording by `read_off` of `vehest_papers.proving_ground.noise_reading`: the noise of `vx`, `yaw_rate`, `ax`, `ay` "
-        "and `steer` (median spectral density above 10 Hz; the body's shaking is part of it), the step of `steer`, the delay of "
-        "`yaw_rate`, `ax` and `ay` against the reference's velocities, and of `ax` and `ay` the offset and the drift (mean, and what is "
-        "left below 0.5 Hz, of the reference's accelerations less theirs when delays, white noise, roll and pitch are taken out; a "
-        "banked road is part of it). How `imu` is turned is part of the offsets. All else is assumed; wheel speeds and tyre forces are "
-        "those of `default`."
-    )
-    yield "### `sensors: small_car`"
-    vibration = PRESETS["small_car"].vibration
-    shaken = ", ".join(f"`{field.name}` {getattr(vibration, field.name):g}" for field in fields(vibration))
-    yield f"A model race car of 5 kg, as in the F1TENTH recordings. {_mounting(PRESETS['small_car'].imu)}"
-    yield _table(header, _sensor_rows(PRESETS["small_car"]))
-    yield (
-        f"Its inertial unit shakes with the wheels: `vibration` adds white noise whose standard deviation is, per rad/s of the wheels' "
-        f"mean speed, {shaken}. These and what the comments in `vehest.simulation.sensors.levels` name are read off the recording that the "
-        "learned-dynamics UKF trains on; the rest is assumed."
-    )
-    yield "### `reference: gnss`, `reference: optical` and `reference: motion_capture`"
-    yield (
-        "Where `vx_ref`, `vy_ref`, `yaw_rate_ref` and `sideslip_ref` come from; `gnss` belongs to `default` and `race`, `motion_capture` "
-        "to `small_car`. The sensor measures velocity where it sits, in axes turned by the error `heading` [rad], and moves it to the "
-        "centre of gravity with its own yaw rate and a lever known to `lever_error`. The sources stand beside the numbers in "
-        "`vehest.simulation.sensors.levels`."
-    )
-    yield _table(("reference", *header), [(f"`{r.kind}`", *row) for r in references for row in _sensor_rows(r)])
-    rows = [(f"`{r.kind}`", *(f"{getattr(r, lever):g}" for lever in levers)) for r in references]
-    yield _table(("reference", *(f"`{lever}` [m]" for lever in levers)), rows)
+# Families of estimators
 
 
-def _sensor_rows(levels: Any) -> Iterable[tuple[str, ...]]:
-    """A row for each sensor among the fields of a dataclass of levels."""
-    from vehest.simulation.sensors.levels import SensorLevel
-
-    for field in fields(levels):
-        level = getattr(levels, field.name)
-        if isinstance(level, SensorLevel):
-            drift = f"{level.drift:g} ({level.drift_time:g} s)" if level.drift else "0"
-            rest = (f"{level.quantisation:g}", f"{1e3 * level.delay:g}", f"{1e2 * level.scale:g}")
-            yield f"`{field.name}`", f"{level.noise:g}", f"{level.offset:g}", drift, *rest
-
-
-def _mounting(imu: Any) -> str:
-    place = ", ".join(f"`{field.name}` {getattr(imu, field.name):g}" for field in fields(imu) if getattr(imu, field.name))
-    return f"`imu`: {place}; the rest is zero." if place else "`imu`: all zero."
-
-
-def _arguments(described: type) -> Iterable[str]:
-    """What a dataclass's docstring says about its sensors, a line each."""
-    text = inspect.getdoc(described) or ""
-    for entry in re.split(r"\n    (?=\w)", text.split("Args:")[1].split("\nRaises:")[0]):
-        names, _, meaning = " ".join(entry.split()).partition(": ")
-        if names.split(", ")[0] in {field.name for field in fields(described)}:
-            yield f"{', '.join(f'`{name}`' for name in names.split(', '))}: {meaning}"
-
-
-def _family_pages(root: Path) -> list[Path]:
-    """Pages of families that show a figure of a study."""
-    return [page for page in sorted((root / "docs" / "estimators").glob("*.md")) if SETTINGS_START in page.read_text(encoding="utf-8")]
-
-
-def family_page(path: Path, root: Path) -> str:
-    """The page of the families that its title names, with what published studies say of them."""
-    text = path.read_text(encoding="utf-8")
-    estimators = re.findall(r"`(\w+)`", text.partition("\n")[0])
-    tables = [part for name in estimators for part in _settings(name, many=len(estimators) > 1)]
-    text = _between(text, SETTINGS_START, SETTINGS_END, "\n" + "\n\n".join(tables) + "\n")
-    start = FIGURES_START.search(text)
-    if start is None:
-        return text
-    study, figure = start.groups()
-    parts = [*_on_test_sets(estimators, root), *_in_study(study, root), *_shown(study, figure, root)]
-    return _between(text, start.group(), FIGURES_END, "\n" + "\n\n".join(parts) + "\n")
-
-
-def _settings(name: str, many: bool) -> Iterable[str]:
-    """Settings and fitted numbers of a family, as its class declares them."""
+def settings(*estimators: str) -> Iterable[str]:
+    """Settings and fitted numbers of families, as their classes declare them; many that an earlier one has too are only named."""
     from vehest.estimators.registry import estimator_class
 
-    rows = list(_declared(estimator_class(name).settings_type(), ""))
-    if many:
-        yield f"`{name}`:"
-    yield _table(("`estimator.`", "default", "unit", "meaning"), rows)
+    listed: set[tuple[str, ...]] = set()
+    for name in estimators:
+        rows = list(_declared(estimator_class(name).settings_type(), ""))
+        same = [row[0] for row in rows if row in listed]
+        if len(same) > 3:
+            yield f"`{name}`, besides {', '.join(same)} as above:"
+            rows = [row for row in rows if row not in listed]
+        elif len(estimators) > 1:
+            yield f"`{name}`:"
+        listed.update(rows)
+        yield _table(("`estimator.`", "default", "unit", "meaning"), rows)
 
 
 def _declared(settings: Any, above: str) -> Iterable[tuple[str, str, str, str]]:
@@ -301,90 +299,42 @@ def _declared(settings: Any, above: str) -> Iterable[tuple[str, str, str, str]]:
             yield f"`{above}{field.name}`", default, declared.unit, declared.doc
 
 
-def _rows(path: Path) -> list[dict[str, str]]:
-    if not path.is_file():
-        return []
-    with open(path, newline="", encoding="utf-8") as stream:
-        return list(csv.DictReader(stream))
-
-
-def _on_test_sets(estimators: Sequence[str], root: Path) -> list[str]:
-    """RMSE(β) with its interval on every test set of `ferrari_drive` and `leave_one_out`, a column a variant, baselines last."""
-    parts = []
-    for study, said in {"ferrari_drive": "learnt on the same drive", "leave_one_out": "learnt on other vehicles only"}.items():
-        files = sorted((root / "results" / study / "tables").glob("leaderboard_*.csv"))
-        own = [row for file in files if not file.stem.endswith("_seeds") for row in _rows(file) if row["rmse_sideslip"]]
-        titles: dict[str, str] = {}
-        for wanted in (*estimators, *(name for name in BASELINES if name not in estimators)):
-            titles |= {_title(row): wanted for row in own if row["estimator"] == wanted}
-        if not any(wanted in estimators for wanted in titles.values()):
-            continue
-        tests: dict[str, dict[str, str]] = {}
-        for row in own:
-            where = f"{row['title']}, {row['test_set']}" if "estimator_title" in row else "Ferrari 250 LM (real), 550 to 700 s"
-            tests.setdefault(where, {})[_title(row)] = f"{float(row['rmse_sideslip']):.3f} [{row['interval'].replace(' … ', ', ')}]"
-        shown = {where: cells for where, cells in tests.items() if any(titles.get(title) in estimators for title in cells)}
-        parts.append(f"RMSE(β) [deg] with its 95 % interval, {said} ([{study}](../../results/{study}/report.md)):")
-        parts.append(
-            _table(
-                ("test", *titles),
-                [(where, *(cells.get(title, "–") for title in titles)) for where, cells in shown.items()],
-                right=len(titles),
-            )
-        )
-    return parts
-
-
-def _title(row: dict[str, str]) -> str:
-    return row.get("estimator_title") or row["title"]
-
-
-def _in_study(study: str, root: Path) -> list[str]:
-    """The overview of the study that re-creates a family's paper, as far as it has one of its own."""
-    headers = {
-        "heavy_ekf": (
-            "RMSE(β) [deg], the truck **simulated**",
-            {"test": "test", **{key: key for key in ("LINT", "RATT", "RATTE", "RATT with friction", "zero", "static map")}},
-        ),
-        "cnn_ukf": (
-            "Squared errors of β [deg²] over all samples and over those from 4 m/s² on, **simulated** cars, medians of seeds",
-            {"part": "learnt on", "candidate": "method", "ours_mse": "MSE", "ours_mse_nonlinear": "MSE_nl", "n_seeds": "seeds"},
-        ),
-        "learned_ukf": (
-            "Weighted squared error of the states, **real** recordings, means over seeds; D is a tyre that none has seen",
-            {"candidate": "method", "ours_tyre_a": "tyre A", "ours_tyre_d": "tyre D", "n_seeds": "seeds"},
-        ),
-    }
-    rows = _rows(root / "results" / study / "tables" / "overview.csv")
-    if study not in headers or not rows:
-        return []
-    said, columns = headers[study]
-    text = [tuple(_rounded(row[key]) for key in columns) for row in rows]
-    return [f"{said} ([{study}](../../results/{study}/report.md)):", _table(tuple(columns.values()), text)]
-
-
-def _rounded(cell: str) -> str:
-    return f"{float(cell):.3f}" if re.fullmatch(r"-?\d+\.\d+", cell) else cell
-
-
-def _shown(study: str, figure: str, root: Path) -> list[str]:
-    """A published figure with what its report says of it."""
-    report = root / "results" / study / "report.md"
+def figures(shown: str, *estimators: str) -> Iterable[str]:
+    """What published studies say of families, and a figure, named as STUDY/FIGURE, with its caption."""
+    yield from _on_the_same_drive(estimators)
+    for study, caption, columns in (OVERVIEWS[name] for name in estimators if name in OVERVIEWS):
+        rows = [tuple(_rounded(row[key]) for key in columns) for row in _rows(RESULTS / study / "tables" / "overview.csv")]
+        if rows:
+            yield f"{caption} ([{study}](../../results/{study}/report.md)):"
+            yield _table(tuple(columns.values()), rows)
+    study, _, figure = shown.partition("/")
+    report = RESULTS / study / "report.md"
     found = re.search(rf"!\[([^\]]*)\]\(figures/{figure}\.png\)", report.read_text(encoding="utf-8")) if report.is_file() else None
-    if not found:
-        return []
-    return [
-        f"![{found[1]}](../../results/{study}/figures/{figure}.png)",
-        f"{found[1]} From [results/{study}](../../results/{study}/report.md).",
-    ]
+    if found:
+        yield f"![{found[1]}](../../results/{study}/figures/{figure}.png)"
+        yield f"{found[1]} From [results/{study}](../../results/{study}/report.md)."
 
 
-def with_leaderboard(page: str, source: Path) -> str:
-    """A page with the leaderboard that is in results/; as it is where there are no results."""
-    if not source.is_file():
-        return page
-    with open(source, newline="", encoding="utf-8") as stream:
-        rows = list(csv.DictReader(stream))
+def _on_the_same_drive(estimators: Sequence[str]) -> Iterable[str]:
+    """RMSE(β) with its interval on the test of `ferrari_drive`, a column a variant, baselines last."""
+    rows = _rows(RESULTS / "ferrari_drive" / "tables" / "leaderboard_test.csv")
+    wanted = [*estimators, *(name for name in BASELINES if name not in estimators)]
+    shown = [row for name in wanted for row in rows if row["estimator"] == name]
+    if any(row["estimator"] in estimators for row in shown):
+        yield "RMSE(β) [deg] with its 95 % interval, learnt on the same drive ([ferrari_drive](../../results/ferrari_drive/report.md)):"
+        cells = ("Ferrari 250 LM (real), 550 to 700 s", *(_with_interval(row) for row in shown))
+        yield _table(("test", *(row["title"] for row in shown)), [cells], right=len(shown))
+
+
+def _with_interval(row: dict[str, str]) -> str:
+    return f"{float(row['rmse_sideslip']):.3f} [{row['interval'].replace(' … ', ', ')}]"
+
+
+# Published results
+
+
+def leaderboard(source: str = "ferrari_drive/tables/leaderboard_test.csv") -> Iterable[str]:
+    """The leaderboard of the study on one real car."""
     lines = [
         (
             row["title"],
@@ -396,166 +346,47 @@ def with_leaderboard(page: str, source: Path) -> str:
             row["beats_static_map"] or "–",
             f"{float(row['fvu']):.3f}",
         )
-        for row in rows
+        for row in _rows(RESULTS / source)
     ]
-    header = (
-        "estimator",
-        "parameters",
-        "RMSE(β) [deg]",
-        "95 % interval [deg]",
-        "to the lowest [deg]",
-        "beats v = 0",
-        "beats static map",
-        "FVU",
-    )
-    table = _table(header, lines, right=7)
-    return _between(page, BOARD_START, BOARD_END, table)
+    columns = ("parameters", "RMSE(β) [deg]", "95 % interval [deg]", "to the lowest [deg]", "beats v = 0", "beats static map", "FVU")
+    if lines:
+        yield _table(("estimator", *columns), lines, right=len(columns))
 
 
-def with_overview(page: str, source: Path) -> str:
-    """A page with what the study across vehicles came to; as it is where there are no results."""
-    if not source.is_file():
-        return page
-    with open(source, newline="", encoding="utf-8") as stream:
-        rows = list(csv.DictReader(stream))
+def across_vehicles() -> Iterable[str]:
+    """FVU on the car not trained on, ours beside the paper's, from the study of the KS-NN."""
+    rows = _rows(RESULTS / "ksnn" / "tables" / "overview.csv")
     lines = []
     for model in dict.fromkeys(row["model"] for row in rows):
         own = [row for row in rows if row["model"] == model]
         lines.append((model, *(f"{float(row[key]):.3f}" if row[key] else "–" for row in own for key in ("paper_fvu_other", "fvu_other"))))
-    header = (
-        "estimator",
-        *(f"{scheme.lower()}, {who}" for scheme in dict.fromkeys(row["scheme"] for row in rows) for who in ("paper", "ours")),
-    )
-    return _between(page, ACROSS_START, ACROSS_END, _table(header, lines, right=len(header) - 1))
+    columns = [f"{scheme.lower()}, {who}" for scheme in dict.fromkeys(row["scheme"] for row in rows) for who in ("paper", "ours")]
+    if lines:
+        yield _table(("estimator", *columns), lines, right=len(columns))
 
 
-def _between(text: str, start: str, end: str, content: str) -> str:
-    before, rest = text.split(start)
-    return f"{before}{start}\n{content}\n{end}{rest.split(end)[1]}"
+def other_vehicles() -> Iterable[str]:
+    """RMSE(β) with its interval on every test set of `leave_one_out`, a column a variant."""
+    files = sorted((RESULTS / "leave_one_out" / "tables").glob("leaderboard_*.csv"))
+    rows = [row for file in files for row in _rows(file) if row["rmse_sideslip"]]
+    titles = list(dict.fromkeys(row["estimator_title"] for row in rows))
+    tests: dict[str, dict[str, str]] = {}
+    for row in rows:
+        tests.setdefault(f"{row['title']}, {row['test_set']}", {})[row["estimator_title"]] = _with_interval(row)
+    lines = [(test, *(cells.get(title, "–") for title in titles)) for test, cells in tests.items()]
+    if lines:
+        yield _table(("test", *titles), lines, right=len(titles))
 
 
-def _commands() -> Iterable[str]:
-    from vehest.cli import app
-
-    root: Any = typer.main.get_command(app)
-    yield _paragraphs(root.help)
-    yield _parameters(root)
-    yield f"{root.epilog} `-h` and `--help` explain every command; `--install-completion` sets up tab completion."
-    for words, command in _leaves(root, ("vehest",)):
-        arguments = [_argument(p) for p in command.params if p.param_type_name == "argument"]
-        usage = " ".join([*words, *arguments, "[OPTIONS]"])
-        yield f"### `{' '.join(words)}`"
-        yield f"```text\n{usage}\n```"
-        yield _paragraphs(command.help)
-        yield _parameters(command)
+def _rows(path: Path) -> list[dict[str, str]]:
+    if not path.is_file():
+        return []
+    with open(path, newline="", encoding="utf-8") as stream:
+        return list(csv.DictReader(stream))
 
 
-def _leaves(group: Any, words: tuple[str, ...]) -> Iterable[tuple[tuple[str, ...], Any]]:
-    for name, command in group.commands.items():
-        if hasattr(command, "commands"):
-            yield from _leaves(command, (*words, name))
-        else:
-            yield (*words, name), command
-
-
-def _argument(parameter: Any) -> str:
-    name = parameter.name.upper()
-    return f"[{name}]..." if parameter.nargs == -1 else name
-
-
-def _parameters(command: Any) -> str:
-    rows = []
-    for parameter in command.params:
-        if parameter.name in TYPER_OWN:
-            continue
-        if parameter.param_type_name == "argument":
-            name = f"`{_argument(parameter)}`"
-        else:
-            value = "" if parameter.is_flag else f" {parameter.name.upper()}"
-            name = ", ".join(f"`{option}{value}`" for option in parameter.opts)
-        default = parameter.default
-        shown = f" Default: `{default}`." if not (default is None or isinstance(default, bool) or callable(default)) else ""
-        rows.append((name, f"{parameter.help}{shown}"))
-    return _table(("argument or option", "meaning"), rows)
-
-
-def _roots(root: Path) -> Iterable[str]:
-    for name in ROOT_FILES:
-        file = root / "conf" / f"{name}.yaml"
-        yield f"### `conf/{name}.yaml`"
-        yield _first_comment(file)
-        groups = _default_groups(file)
-        if groups:
-            yield "Starts from " + ", ".join(groups) + "."
-        rows = list(_options(file))
-        if rows:
-            yield _table(("option", "default", "meaning"), rows)
-
-
-def _groups(root: Path) -> Iterable[str]:
-    for group in (*TABLED, *VERBATIM):
-        yield f"### `conf/{group}/`"
-        papers = root / "src" / "vehest_papers" / "conf"
-        for file in sorted([*(root / "conf" / group).glob("*.yaml"), *(papers / group).glob("*.yaml")], key=lambda own: own.name):
-            yield f"#### `conf/{group}/{file.name}`" if group == "vehicle" else f"#### `{group}={file.stem}`"
-            if group in VERBATIM:
-                yield _fenced(file)
-                continue
-            yield _first_comment(file)
-            nested = re.search(r"^  - (\w+)@(\w+)", file.read_text(encoding="utf-8"), re.MULTILINE)
-            if nested:
-                yield f"`{group}.{nested[2]}.*`: the options of [`{group}={nested[1]}`](#{group}{nested[1]})."
-            forced = re.search(r"override /(\w+): (\w+)", file.read_text(encoding="utf-8"))
-            if forced:
-                yield f"Chooses `{forced[1]}={forced[2]}`."
-            rows = [row for row in _options(file, group) if not row[0].endswith(".name`")]
-            if rows:
-                yield _table(("option", "default", "meaning"), rows)
-
-
-def _options(file: Path, prefix: str = "") -> Iterable[tuple[str, str, str]]:
-    """Scalar options of a file with their dotted keys, defaults and comments."""
-    lines = file.read_text(encoding="utf-8").splitlines()
-    if any("@package _global_" in line for line in lines):
-        prefix = ""
-    above: list[tuple[int, str]] = []  # indentation and name of the groups that a line stands in
-    skipping = False
-    for line in lines:
-        found = re.match(r"^(\s*)(\w+):\s*(.*?)\s*(?:(?<=\s)#\s*(.*))?$", line)
-        if not found:
-            continue
-        indent, key, value, comment = found.groups()
-        if not indent:
-            skipping = key == "defaults"
-        if skipping:
-            continue
-        above = [(depth, group) for depth, group in above if depth < len(indent)]
-        if value:
-            dotted = ".".join(filter(None, [prefix, *(group for _, group in above), key]))
-            yield f"`{dotted}`", f"`{value}`", comment or ""
-        else:
-            above.append((len(indent), key))
-
-
-def _default_groups(file: Path) -> list[str]:
-    text = file.read_text(encoding="utf-8")
-    block = re.search(r"^defaults:\n((?:  .*\n)+)", text, re.MULTILINE)
-    entries = re.findall(r"^  - ([\w/@]+)(?:: (\S+))?", block[1], re.MULTILINE) if block else []
-    return [f"`{key}={value}`" if value else f"`conf/{key}.yaml`" for key, value in entries if key != "_self_"]
-
-
-def _first_comment(file: Path) -> str:
-    comments = []
-    for line in file.read_text(encoding="utf-8").splitlines():
-        if not line.startswith("#"):
-            break
-        if "@package" not in line:
-            comments.append(line.lstrip("# ").rstrip())
-    return " ".join(comments)
-
-
-def _fenced(file: Path) -> str:
-    return f"```yaml\n{file.read_text(encoding='utf-8').rstrip()}\n```"
+def _rounded(cell: str) -> str:
+    return f"{float(cell):.3f}" if re.fullmatch(r"-?\d+\.\d+", cell) else cell
 
 
 def _paragraphs(text: str | None) -> str:
@@ -569,13 +400,13 @@ def _table(header: Sequence[str], rows: Iterable[Sequence[str]], right: int = 0)
     return "\n".join(f"| {' | '.join(line)} |" for line in lines)
 
 
-def main() -> None:
-    """Write the pages that have changed and name them."""
-    for path, text in pages().items():
-        if not path.is_file() or path.read_text(encoding="utf-8") != text:
-            path.write_text(text, encoding="utf-8")
-            print(path.relative_to(ROOT))
-
+PARTS: dict[str, Callable[..., Iterable[str]]] = {
+    part.__name__: part
+    for part in (
+        *(commands, files, channels, units, sensors, sensor_sources, references, manoeuvres, courses),
+        *(settings, figures, leaderboard, across_vehicles, other_vehicles),
+    )
+}
 
 if __name__ == "__main__":
     main()

@@ -18,7 +18,6 @@ from scipy import signal
 
 import vehest
 from example_package import forget_examples, install_examples, write_laps
-from fuzz import case
 from vehest.alignment import checks
 from vehest.cli import app
 from vehest.data.errors import ConfigurationError, DataError, JobsFailedError, MissingError
@@ -40,6 +39,7 @@ ROOT = Path(__file__).resolve().parents[1]
 PAGES = [
     ROOT / "README.md",
     ROOT / "CHANGELOG.md",
+    ROOT / "CONTRIBUTING.md",
     *sorted((ROOT / "docs").glob("*.md")),
     *sorted((ROOT / "docs" / "estimators").glob("*.md")),
 ]
@@ -86,10 +86,15 @@ def test_leaderboard_on_the_page_of_results_follows_them(tmp_path):
     columns = "title,n_parameters,rmse_sideslip,interval,against_best,beats_zero,beats_static_map,fvu"
     rows = '"KS-NN, small",12,0.12345,0.100 … 0.200,lowest,yes,no,0.0123\nOther,2,0.5,0.400 … 0.600,not told apart,,,0.2\n'
     source.write_text(f"{columns}\n{rows}", encoding="utf-8")
-    made = generator().with_leaderboard(page("docs/results.md"), source)
+    (made,) = generator().leaderboard(str(source))
     first = "| KS-NN, small | 12 | 0.123 | 0.100 … 0.200 | lowest | yes | no | 0.012 |"
-    assert f"{first}\n| Other | 2 | 0.500 | 0.400 … 0.600 | not told apart | – | – | 0.200 |" in made
-    assert made.count("<!-- end of leaderboard -->") == 1
+    assert made.endswith(f"{first}\n| Other | 2 | 0.500 | 0.400 … 0.600 | not told apart | – | – | 0.200 |")
+
+
+def test_a_part_without_results_stays_as_it_is(tmp_path, monkeypatch):
+    made = generator()
+    monkeypatch.setattr(made, "RESULTS", tmp_path)
+    assert made.PART.sub(made._made, page("docs/results.md")) == page("docs/results.md")
 
 
 # Links
@@ -150,7 +155,6 @@ def test_example_files_are_valid(workplace):
 
 
 def test_python_examples_run(workplace, drive, monkeypatch, request):
-    monkeypatch.setattr(case, "GENERATORS", [])
     request.addfinalizer(forget_examples)
     install_examples(workplace / "site", monkeypatch)
     write_laps()
@@ -329,6 +333,11 @@ def test_pages_know_every_name():
     assert ", ".join(METRIC_COLUMNS).replace("kind,", "kind (`real` or `simulated`),") in " ".join(evaluation.split())
     for name in {*(field.name for kind in (PipelineFile, Part) for field in fields(kind)), *GROUPS}:
         assert f"`{name}`" in cli, f"docs/cli.md does not explain {name}"
+
+
+def test_page_of_the_python_interface_has_every_public_name():
+    documented = set(re.findall(r"^\.\. auto(?:function|class):: (\w+)$", page("docs/api.md"), re.MULTILINE))
+    assert documented == set(vehest.__all__) - {"__version__"}
 
 
 def class_of(source: str) -> Any:

@@ -14,7 +14,7 @@ import pytest
 from chromium import WIDTHS, axe_violations, browser, complaints, opened
 
 ROOT = Path(__file__).resolve().parents[1]
-SHOWN = ("docs/index.html", "docs/estimators.html", "docs/estimators/ksnn.html", "results/ferrari_drive/report.html")
+SHOWN = ("docs/index.html", "docs/api.html", "docs/estimators.html", "docs/estimators/ksnn.html", "results/ferrari_drive/report.html")
 
 
 def broken_links(site: Path) -> list[str]:
@@ -57,6 +57,15 @@ def test_links_to_no_file_no_anchor_and_out_of_the_site_are_found(tmp_path: Path
 def test_every_local_link_of_the_site_leads_somewhere(site: Path) -> None:
     assert len(list(site.rglob("*.html"))) > 40
     assert broken_links(site) == []
+
+
+@pytest.mark.page
+def test_every_equation_of_the_pages_is_mathml(site: Path) -> None:
+    for source in sorted((ROOT / "docs").rglob("*.md")):
+        equations = source.read_text(encoding="utf-8").count("```math\n")
+        page = (site / source.relative_to(ROOT)).with_suffix(".html").read_text(encoding="utf-8")
+        assert page.count("<math ") == equations, f"{source.name} has {equations} equations"
+        assert "mathjax" not in page.lower()
 
 
 @pytest.mark.page
