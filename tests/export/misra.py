@@ -16,6 +16,7 @@ if __name__ == "__main__":
     sys.path[:0] = [str(Path(__file__).parents[1] / part) for part in (".", "estimators", "export")]
 
 from exports import FAMILIES
+
 from golden import contract, methods, write
 
 VERSION = "Cppcheck 2.10"
