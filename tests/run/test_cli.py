@@ -34,13 +34,13 @@ def _statuses(err: str) -> list[tuple[str, str]]:
 
 
 def test_pipeline_runs_then_skips_then_reruns_only_what_a_change_touches(place):
-    code, out, err = place("run", "small", "--jobs", "1", "tracking=none")
+    code, out, err = place("run", "small", "tracking=none")
     assert code == 0, err
     assert "KS-NN linear no bias, P = 2" in out
     assert [stage for status, stage in _statuses(err) if status == "done"].count("train") == 4
     made = place.files()
 
-    code, again, err = place("run", "small", "--jobs", "1", "tracking=none")
+    code, again, err = place("run", "small", "tracking=none")
     assert {status for status, _ in _statuses(err)} == {"skipped"}
     assert again == out
     assert place.files() == made
@@ -51,7 +51,7 @@ def test_pipeline_runs_then_skips_then_reruns_only_what_a_change_touches(place):
     _, _, err = place("run", "small", "tracking=none", "--dry-run")
     assert {status for status, _ in _statuses(err)} == {"skipped"}
 
-    _, _, err = place("run", "small", "--jobs", "1", "tracking=none", "training.learning_rate=0.002")
+    _, _, err = place("run", "small", "tracking=none", "training.learning_rate=0.002")
     done = [line for line in err.splitlines() if line.startswith("done")]
     assert not any("luenberger" in line for line in done), "its training has no learning rate"
     assert sum(" train " in line for line in done) == 3
@@ -66,7 +66,7 @@ def test_dry_run_tells_and_makes_nothing(place):
 
 
 def test_two_processes_give_the_same_numbers_as_one(place):
-    place("run", "small", "--jobs", "1", "tracking=none", "output=one")
+    place("run", "small", "tracking=none", "output=one")
     code, _, err = place("run", "small", "--jobs", "2", "tracking=none", "output=two")
     assert code == 0, err
     for model in (place.folder / "one" / "train").iterdir():
@@ -77,7 +77,7 @@ def test_two_processes_give_the_same_numbers_as_one(place):
 def test_a_failed_job_is_reported_and_the_others_are_kept(place):
     sweeps = [*PIPELINE["sweeps"], ["estimator=ksnn", "estimator.n_hidden=0", "estimator.bias=true", "training.learning_rate=1e6"]]
     (place.folder / "pipelines" / "small.yaml").write_text(yaml.safe_dump({**PIPELINE, "sweeps": sweeps}))
-    code, out, err = place("run", "small", "--jobs", "1", "tracking=none")
+    code, out, err = place("run", "small", "tracking=none")
     assert code == 5
     assert "1 of 5 jobs failed, the others are kept; ksnn-linear_bias_p2 seed 0: training: the validation loss" in err
     assert "Traceback" not in err
@@ -149,7 +149,7 @@ def test_report_draws_what_is_there_and_asks_for_what_is_not(place):
     code, line = place.refused("report", "small", "tracking=none")
     assert code == 4
     assert "run 'vehest run" in line
-    place("run", "small", "--jobs", "1", "tracking=none")
+    place("run", "small", "tracking=none")
     code, out, err = place("report", "small", "tracking=none", "--json")
     assert code == 0, err
     assert json.loads(out)["leaderboard"][0]["test_set"] == "test"
@@ -359,18 +359,18 @@ def test_what_did_not_fit_into_the_minutes_is_named_and_the_same_command_goes_on
 
     with monkeypatch.context() as patched:
         patched.setattr(runner, "TimeLimit", OneEvaluation)
-        code, out, err = place("run", "small", "--jobs", "1", "tracking=none", "--minutes", "10")
+        code, out, err = place("run", "small", "tracking=none", "--minutes", "10")
     assert code == 0, err
     assert "Luenberger" in out
     assert "left out: gru-states_2-seed0: not done yet: no time was left, the same command goes on" in out
-    code, out, _ = place("run", "small", "--jobs", "1", "tracking=none", "--minutes", "10")
+    code, out, _ = place("run", "small", "tracking=none", "--minutes", "10")
     assert code == 0
     assert "not done yet" not in out
     assert "GRU" in out
 
 
 def test_a_time_in_which_nothing_can_be_done_is_said(place):
-    code, line = place.refused("run", "small", "--jobs", "1", "tracking=none", "--minutes", "0.000001")
+    code, line = place.refused("run", "small", "tracking=none", "--minutes", "0.000001")
     assert code == 3
     assert "no estimator was done in this time; the same command goes on with: luenberger-luenberger-seed0" in line
     assert place.refused("run", "small", "--minutes", "0")[1] == "error: --minutes must be positive, not 0"
@@ -382,9 +382,9 @@ def test_a_time_in_which_nothing_can_be_done_is_said(place):
 def test_only_the_study_as_it_is_written_is_published(place):
     (place.folder / "pipelines" / "small.yaml").write_text(yaml.safe_dump({**PIPELINE, "publish": True}))
     results = place.folder / "results" / "small"
-    assert place("run", "small", "--jobs", "1", "tracking=none", "training.max_epochs=1")[0] == 0
+    assert place("run", "small", "tracking=none", "training.max_epochs=1")[0] == 0
     assert not results.exists(), "overrides changed the outcome"
-    assert place("run", "small", "--jobs", "1", "tracking=none")[0] == 0
+    assert place("run", "small", "tracking=none")[0] == 0
     assert (results / "metrics.csv").is_file()
     assert not (results / "report.html").exists()
     text = (results / "report.md").read_text()
@@ -392,7 +392,7 @@ def test_only_the_study_as_it_is_written_is_published(place):
     assert str(place.folder) not in text + (results / "provenance.json").read_text()
     (results / "metrics.csv").unlink()
     (results / "provenance.json").unlink()
-    code, line = place.refused("run", "small", "--jobs", "1", "tracking=none")
+    code, line = place.refused("run", "small", "tracking=none")
     assert code == 2
     assert "holds files that vehest did not publish" in line
 
@@ -609,7 +609,7 @@ def test_killed_pipeline_leaves_no_processes_and_the_next_run_finishes(place):
     while any(Path(f"/proc/{pid}").exists() and "Z" not in Path(f"/proc/{pid}/stat").read_text().split()[2] for pid in children):
         assert time.monotonic() < deadline, "workers must end with their parent"
         time.sleep(0.1)
-    code, _, err = place("run", "small", "--jobs", "1", "tracking=none")
+    code, _, err = place("run", "small", "tracking=none")
     assert code == 0, err
 
 

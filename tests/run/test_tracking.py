@@ -28,7 +28,7 @@ STARTUP_SECONDS = 120.0  # of a server on a busy machine
 
 
 def test_runs_are_tracked_with_parameters_metrics_model_and_figures(place):
-    code, _, err = place("run", "small", "--jobs", "1")
+    code, _, err = place("run", "small")
     assert code == 0, err
     from mlflow import MlflowClient
 
@@ -73,11 +73,11 @@ def _local(place: Place, stage: str = "") -> list:
 def test_what_a_server_that_was_away_missed_is_logged_by_the_next_run(place: Place, monkeypatch: pytest.MonkeyPatch):
     with monkeypatch.context() as away:
         away.setattr(Tracker, "_log", _raising(ConnectionError("no answer")))
-        code, _, err = place("run", "small", "--jobs", "1")
+        code, _, err = place("run", "small")
         assert code == 0, err
         assert err.count("logging to MLflow") == 1
     assert not (place.folder / "outputs" / "finished").exists()
-    code, _, err = place("run", "small", "--jobs", "1")
+    code, _, err = place("run", "small")
     assert code == 0, err
     assert "done" not in err, "nothing is made again for it"
     assert sorted(run.info.status for run in _local(place)) == ["FINISHED"] * 12
@@ -132,7 +132,7 @@ def test_a_store_that_is_gone_is_filled_again(place: Place):
 
 
 def test_a_finished_and_tracked_study_is_recognised_without_mlflow(place: Place):
-    assert place("run", "small", "--jobs", "1")[0] == 0
+    assert place("run", "small")[0] == 0
     done = _in_process(
         "import vehest.cli, atexit; atexit.register(lambda: print('mlflow' in sys.modules)); vehest.cli.main()", "run", "small"
     )
@@ -164,7 +164,7 @@ def test_a_disk_that_fills_up_while_runs_are_logged_loses_none(place: Place):
     full = _in_process(FULL.replace("200_000", str(size)), "run", "small", "--jobs", "1")
     assert full.returncode == 0, full.stderr
     assert full.stderr.count("going on without tracking") == 1
-    code, _, err = place("run", "small", "--jobs", "1")
+    code, _, err = place("run", "small")
     assert code == 0, err
     assert [run.info.status for run in _local(place)] == ["FINISHED"] * 14
 
@@ -228,7 +228,7 @@ def test_a_server_receives_every_run_of_a_study_and_its_loss_half_way_stops_noth
 
     with mlflow_server(place.folder / "server") as (address, process):
         client = MlflowClient(address)
-        code, _, err = place("run", "small", "--jobs", "1", f"tracking.uri={address}")
+        code, _, err = place("run", "small", f"tracking.uri={address}")
         assert code == 0, err
         assert "logging to MLflow" not in err
         runs = _runs(client)
@@ -247,7 +247,7 @@ def test_a_server_receives_every_run_of_a_study_and_its_loss_half_way_stops_noth
 
         watcher = threading.Thread(target=fell_over)
         watcher.start()
-        again = ("run", "small", "--jobs", "1", "--force", "output=again", f"tracking.uri={address}", "tracking.experiment=second")
+        again = ("run", "small", "--force", "output=again", f"tracking.uri={address}", "tracking.experiment=second")
         code, out, err = place(*again)
         watcher.join()
     assert code == 0, err
