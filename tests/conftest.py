@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 import torch
 
+import processes
 from vehest.data.recording import Recording
 
 if TYPE_CHECKING:
@@ -25,6 +26,12 @@ def _one_core() -> Iterator[None]:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(os, "sched_getaffinity", lambda _: {0})
         yield
+
+
+@pytest.fixture(autouse=True)
+def _processes_end_with_their_test() -> Iterator[None]:
+    yield
+    processes.end_all()
 
 
 @pytest.fixture(scope="session")

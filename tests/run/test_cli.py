@@ -9,8 +9,8 @@ import shutil
 import signal
 import subprocess
 import sys
-import time
 from pathlib import Path
+from types import ModuleType
 
 import numpy as np
 import pandas as pd
@@ -18,14 +18,17 @@ import pyarrow.parquet as pq
 import pytest
 import yaml
 
+import processes
 import vehest
 from conftest import planar_drive
 from place import DATASET, PIPELINE, Place, write_csv
+from processes import HANGS, Striking, is_alive, start, wait_for
 from vehest.data.files import ASIDE_PREFIX
 from vehest.data.store import read_recording
-from vehest.run import runner
+from vehest.run import ingest, runner
 from vehest.run.artefacts import read_artefact
 from vehest.run.signals import TimeLimit
+from vehest.training import supervised
 from vehest.trust.health import reason_in_words
 
 
@@ -461,19 +464,6 @@ def test_a_model_remembers_how_its_recordings_were_prepared(place):
     assert len(references) == 1, "what is scored against is never filtered"
 
 
-def test_force_trains_from_the_start_again(place):
-    process = _start(place, "train", *LONG)
-    _wait_for(process, lambda: _checkpoint_epoch(place) >= 300)
-    process.send_signal(signal.SIGINT)
-    process.communicate(timeout=HANGS)
-    reached = _checkpoint_epoch(place)
-    assert reached >= 300, "so many that the second training cannot pass them unseen"
-    process = _start(place, "train", *LONG, "--force")
-    _wait_for(process, lambda: 0 < _checkpoint_epoch(place) < reached)
-    process.kill()
-    process.communicate()
-
-
 @pytest.mark.parametrize(
     "arguments",
     [
@@ -500,115 +490,82 @@ def test_odd_values_are_refused_in_one_line(place, arguments):
 
 # --- signals, kills and full disks -----------------------------------------------------------------------------------
 
-LONG = ("training.max_epochs=100000", "training.patience=100000", "training.checkpoint_seconds=0", "tracking=none", "split=mine")
+BUDGET = ("split=mine", "training.max_epochs=8", "training.patience=8", "training.checkpoint_seconds=0", "tracking=none", "--json")
+SAVES = (supervised, "save_checkpoint")  # once an epoch
 
 
-HANGS = 900.0  # s after which a test fails; until then it waits for what happens
-_started: list[subprocess.Popen[str]] = []
+def _killed(place: Place, module: ModuleType, name: str, call: int, *arguments: str) -> None:
+    """Run a command in a process that is killed once a function of a module is through for the n-th time."""
+    program = f"import sys; sys.path.insert(0, {str(Path(processes.__file__).parent)!r}); sys.argv = {['vehest', *arguments]!r}\n"
+    program += f"import {module.__name__} as module; from processes import Striking; from vehest.cli import main\n"
+    program += f"module.{name} = Striking(module.{name}, {call}, {int(signal.SIGKILL)}); main()"
+    assert start([sys.executable, "-c", program], cwd=place.folder).wait(HANGS) == -signal.SIGKILL
 
 
-@pytest.fixture(autouse=True)
-def _nothing_outlives_its_test():
-    yield
-    while _started:
-        process = _started.pop()
-        if process.poll() is None:
-            process.kill()
-            process.communicate()
+def _epochs(place: Place, monkeypatch: pytest.MonkeyPatch, *arguments: str) -> tuple[list[int], dict]:
+    """Run a training: epochs of its checkpoints, and what it says."""
+    with monkeypatch.context() as patch:
+        save = Striking(supervised.save_checkpoint)
+        patch.setattr(*SAVES, save)
+        code, out, err = place("train", *BUDGET, *arguments)
+    assert code == 0, err
+    return [checkpoint.values["epoch"] for _, checkpoint in save.calls], json.loads(out)
 
 
-def _start(place: Place, *arguments: str) -> subprocess.Popen[str]:
-    command = [sys.executable, "-m", "vehest", *arguments]
-    _started.append(subprocess.Popen(command, cwd=place.folder, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True))
-    return _started[-1]
-
-
-def _wait_for(process: subprocess.Popen[str], condition) -> None:
-    deadline = time.monotonic() + HANGS
-    while not condition():
-        assert process.poll() is None, process.communicate()
-        assert time.monotonic() < deadline, "nothing happened in time"
-        time.sleep(0.02)
-
-
-def _checkpoint_epoch(place: Place) -> int:
-    from vehest.training.checkpoints import resume_epoch
-
-    return max((resume_epoch(folder) for folder in (place.folder / "outputs" / "checkpoints").glob("*")), default=0)
-
-
-@pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
-def test_a_signal_in_training_keeps_the_best_so_far_and_the_next_run_goes_on(place, number, code):
-    process = _start(place, "train", *LONG)
-    _wait_for(process, lambda: _checkpoint_epoch(place) >= 3)
-    process.send_signal(number)
-    _, err = process.communicate(timeout=HANGS)
-    assert process.returncode == code, err
+@pytest.mark.parametrize(
+    ("number", "code", "options", "first"),
+    [(signal.SIGINT, 130, (), 4), (signal.SIGTERM, 143, (), 4), (signal.SIGTERM, 143, ("--force",), 1)],
+)
+def test_a_signal_in_training_keeps_the_best_so_far_and_the_next_run_goes_on(place, monkeypatch, number, code, options, first):
+    with monkeypatch.context() as patch:
+        patch.setattr(*SAVES, Striking(supervised.save_checkpoint, 3, number))
+        ended, _, err = place("train", *BUDGET)
+    assert ended == code, err
     assert "the best so far is kept in" in err
     (model,) = (place.folder / "outputs" / "train").iterdir()
     assert read_artefact(model).status == "interrupted"
     assert not any(ASIDE_PREFIX in name for name in place.files())
-    reached = _checkpoint_epoch(place)
-    process = _start(place, "train", *LONG)
-    seen = [reached]
-
-    def went_on() -> bool:
-        seen.append(_checkpoint_epoch(place))
-        return seen[-1] > reached
-
-    _wait_for(process, went_on)
-    process.kill()
-    process.communicate()
-    assert min(seen) == reached, "it must go on from the checkpoint, not from the start"
+    assert _epochs(place, monkeypatch, *options)[0][0] == first, "from the checkpoint, with --force from the start"
 
 
-def test_kill_9_in_training_goes_on_to_the_result_of_an_undisturbed_run(place):
-    budget = ("split=mine", "training.max_epochs=400", "training.patience=400", "training.checkpoint_seconds=0", "tracking=none", "--json")
-    process = _start(place, "train", *budget)
-    _wait_for(process, lambda: _checkpoint_epoch(place) >= 3)
-    process.kill()
-    process.communicate()
+def test_kill_9_in_training_goes_on_to_the_result_of_an_undisturbed_run(place, monkeypatch):
+    _killed(place, *SAVES, 3, "train", *BUDGET)
     assert not list((place.folder / "outputs").glob("train/[!.]*"))
-    code, out, err = place("train", *budget)
-    assert code == 0, err
-    resumed = json.loads(out)
-    code, out, err = place("train", *budget, "output=undisturbed")
-    whole = json.loads(out)
-    assert resumed["epochs"] == whole["epochs"] == 400
+    epochs, resumed = _epochs(place, monkeypatch)
+    assert epochs[0] == 4
+    _, whole = _epochs(place, monkeypatch, "output=undisturbed")
+    assert resumed["epochs"] == whole["epochs"] == 8
     weights = [(Path(model) / "model.safetensors").read_bytes() for model in (resumed["model"], whole["model"])]
     assert weights[0] == weights[1]
     assert not any("checkpoint" in name for name in place.files())
 
 
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGKILL])
-def test_a_signal_or_kill_in_ingest_leaves_nothing_that_looks_finished(place, number):
-    for seed in range(40):
-        write_csv(place.folder / "raw" / f"more_{seed}.csv", seed, 60.0)
-    process = _start(place, "ingest", "mine")
-    _wait_for(process, lambda: len(list((place.folder / "outputs" / "ingest").glob(f"{ASIDE_PREFIX}*/*.parquet"))) > 2)
-    process.send_signal(number)
-    _, err = process.communicate(timeout=HANGS)
-    assert process.returncode == (143 if number == signal.SIGTERM else -signal.SIGKILL), err
-    assert not list((place.folder / "outputs" / "ingest").glob("mine-*"))
+def test_a_signal_or_kill_in_ingest_leaves_nothing_that_looks_finished(place, monkeypatch, number):
     if number == signal.SIGTERM:
+        with monkeypatch.context() as patch:
+            patch.setattr(ingest, "write_recording", Striking(ingest.write_recording, 2, number))
+            assert place("ingest", "mine")[0] == 143
         assert not any(ASIDE_PREFIX in name for name in place.files())
+    else:
+        _killed(place, ingest, "write_recording", 2, "ingest", "mine")
+        assert sum(name.endswith(".parquet") for name in place.files()) == 2, "it was in the middle"
+    assert not list((place.folder / "outputs" / "ingest").glob("mine-*"))
     code, out, err = place("ingest", "mine", "--json")
     assert code == 0, err
-    assert len(json.loads(out)["recordings"]) == 43
+    assert len(json.loads(out)["recordings"]) == 3
     assert not any(ASIDE_PREFIX in name for name in place.files()), "what the killed run left is cleared away"
 
 
 def test_killed_pipeline_leaves_no_processes_and_the_next_run_finishes(place):
-    process = _start(place, "run", "small", "--jobs", "2", *LONG[:4])
-    _wait_for(process, lambda: _checkpoint_epoch(place) >= 2)
+    (place.folder / "pipelines" / "small.yaml").write_text(yaml.safe_dump({**PIPELINE, "sweeps": PIPELINE["sweeps"][:2]}))
+    endless = ("training.max_epochs=100000", "training.patience=100000", "training.checkpoint_seconds=0", "tracking=none")
+    process = start([sys.executable, "-m", "vehest", "run", "small", "--jobs", "2", *endless], cwd=place.folder)
+    wait_for(lambda: list((place.folder / "outputs" / "checkpoints").glob("*/*")), process)
     children = [int(pid) for pid in Path(f"/proc/{process.pid}/task/{process.pid}/children").read_text().split()]
     assert children
     process.kill()
-    process.communicate()
-    deadline = time.monotonic() + HANGS
-    while any(Path(f"/proc/{pid}").exists() and "Z" not in Path(f"/proc/{pid}/stat").read_text().split()[2] for pid in children):
-        assert time.monotonic() < deadline, "workers must end with their parent"
-        time.sleep(0.1)
+    wait_for(lambda: not any(map(is_alive, children)))
     code, _, err = place("run", "small", "tracking=none")
     assert code == 0, err
 
