@@ -163,7 +163,7 @@ def test_report_says_how_many_others_the_interval_of_the_chosen_one_covers():
 # The command
 
 
-def test_a_sweep_makes_tables_and_heat_maps_and_then_skips(place):
+def test_a_sweep_makes_tables_and_heat_maps_and_then_skips(place, drawn):
     code, out, err = place("sweep", *GRID, "--json")
     assert code == 0, err
     outcome = json.loads(out)

@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Iterator
+from copy import deepcopy
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -24,6 +27,7 @@ from vehest.data.transforms import TRANSFORMS, transform_from_config
 from vehest.estimators.base import FitData
 from vehest.estimators.needs import lacking_to_train
 from vehest.estimators.registry import estimator_class, estimator_names
+from vehest.run import usable
 from vehest.run.comparison import lower_rate
 from vehest.run.config import compose_config
 from vehest.run.train import new_estimator
@@ -46,6 +50,15 @@ def log(channels: set[str], rate_hz: float = 50.0, seed: int = 1, seconds: float
     known = {**drive.channels, "steer": steer, "handwheel": RATIO * steer}
     known |= {f"wheel_speed_{wheel}": drive["vx"] / RADIUS for wheel in WHEELS}
     return replace(drive, channels={channel: known[channel] for channel in sorted(channels)})
+
+
+@pytest.fixture(autouse=True, scope="module")
+def _composed_once() -> Iterator[None]:
+    """The configuration of each estimator is composed once for all tables."""
+    composed = cache(lambda command, *overrides: compose_config(command, list(overrides)))
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(usable, "compose_config", lambda command, overrides: deepcopy(composed(command, *overrides)))
+        yield
 
 
 def rows(recording: Recording) -> dict[str, dict]:
