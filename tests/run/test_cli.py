@@ -402,7 +402,6 @@ def test_only_the_study_as_it_is_written_is_published(place):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"study": "../elsewhere"}, "becomes part of file names"),
         ({"study": ""}, "is not a pipeline"),
         ({"sweeps": [["estimator=gru"], ["estimator=lstm", "evaluation.rate_hz=10"]]}, "must agree in 'evaluation'"),
         ({"sweeps": [["estimator=gru", "training.learning_rate=0.001,0.01"]]}, "two jobs are both called gru-states_5-seed0"),
