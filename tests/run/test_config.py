@@ -96,14 +96,14 @@ def test_first_and_last_job_of_every_sweep_of_shipped_pipelines_compose(elsewher
     pipeline = read_study(name)
     if pipeline.datasets:
         assert jobs_of(pipeline, [])
-    ends = {
-        (part.split, *part.overrides, *job)
-        for part in pipeline.parts.values()
-        for sweep in part.sweeps
-        for job in (expand(sweep)[0], expand(sweep)[-1])
-    }
-    for split, *job in sorted(ends):
-        assert compose_config("eval", [f"split={split}", *job])["split"]["name"] == split
+    composed: set[object] = set()
+    for part in pipeline.parts.values():
+        for sweep in part.sweeps:
+            for job in (expand(sweep)[0], expand(sweep)[-1]):
+                words = (*part.overrides, *job)
+                if not {part.split, words} <= composed:  # parts repeat their sweeps on many splits
+                    assert compose_config("eval", [f"split={part.split}", *words])["split"]["name"] == part.split
+                    composed |= {part.split, words}
 
 
 def test_pipeline_overrides_reach_the_sweeps_that_have_the_key(elsewhere):
