@@ -19,7 +19,7 @@ PILOTS ?= build/pilots
 SEED ?= 0
 MINUTES ?= 30
 
-.PHONY: reference_minutes help install run test lint test-apart test-page test-export test-cluster bench-launchers export_all test-docs test-fuzz test-wheel test-processes test-slow ui docs reference docs-site screenshots clean ferrari_drive ksnn learned_ukf learned_ukf_sim heavy_ekf cnn_ukf proving_ground real_cars leave_one_out sim_to_real trust online_faults own_car_proposals own_car pretrained sweep bench-training bench-ingest bench-simulation bench-ksnn bench-ukf bench-ekf bench-cnn bench-trust bench-workflow replay_check replay_30min examples fuzz kills golden lock pilots pilots-compare
+.PHONY: reference_minutes help install run test test-durations lint test-apart test-page test-export test-cluster bench-launchers export_all test-docs test-fuzz test-wheel test-processes test-slow ui docs reference docs-site screenshots clean ferrari_drive ksnn learned_ukf learned_ukf_sim heavy_ekf cnn_ukf proving_ground real_cars leave_one_out sim_to_real trust online_faults own_car_proposals own_car pretrained sweep bench-training bench-ingest bench-simulation bench-ksnn bench-ukf bench-ekf bench-cnn bench-trust bench-workflow replay_check replay_30min examples fuzz kills golden lock pilots pilots-compare
 
 help: ## list the targets
 	@grep -hE '^[a-z0-9_-]+:.*?## ' $(MAKEFILE_LIST) | awk -F':.*?## ' '{printf "  make %-16s %s\n", $$1, $$2}'
@@ -45,8 +45,11 @@ endif
 run: $(INSTALLED) ## train and compare four families on simulated drives (a few minutes)
 	$(BIN)/vehest run pipelines/quickstart.yaml
 
-test: $(INSTALLED) lint ## lint, types, layers, tests (11 minutes on two cores the first time)
-	$(BIN)/python -m pytest -n $(JOBS) --dist worksteal -m "not slow and not apart and not page and not export and not cluster"
+test: $(INSTALLED) ## tests (6 minutes on two cores); `make lint` has style, types and layers
+	$(TESTS)
+
+test-durations: $(INSTALLED) ## the same, with the 50 that take longest
+	$(TESTS) --durations=50
 
 test-apart: $(INSTALLED) ## tests that are slow by nature: documentation, fuzzing, the wheel, many processes (4 minutes)
 	$(BIN)/python -m pytest -n $(JOBS) --dist worksteal -m "apart and not slow"
@@ -64,12 +67,13 @@ test-cluster: $(INSTALLED) ## trainings on two Ray nodes of this machine, worker
 test-page: $(INSTALLED) ## report pages in headless Chromium (Debian: chromium chromium-driver); skipped without it
 	$(BIN)/python -m pytest -m "page and not slow" -rs
 
+TESTS = $(BIN)/python -m pytest -n $(JOBS) --dist worksteal -m "not slow and not apart and not page and not export and not cluster"
 TESTS_docs := tests/test_docs.py tests/test_examples.py
 TESTS_fuzz := tests/fuzz
 TESTS_wheel := tests/test_wheel.py
 TESTS_processes := tests/run/test_locks.py tests/run/test_kills.py tests/run/test_tracking.py
 
-lint: $(INSTALLED)
+lint: $(INSTALLED) ## style, types, layers of imports
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -10,12 +11,27 @@ import numpy as np
 import pytest
 import torch
 
+import processes
 from vehest.data.recording import Recording
 
 if TYPE_CHECKING:
     from place import Place
 
 torch.set_num_threads(1)
+
+
+@pytest.fixture(scope="session", autouse=True)
+def _one_core() -> Iterator[None]:
+    """Commands that name no number of jobs run them in this process."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(os, "sched_getaffinity", lambda _: {0})
+        yield
+
+
+@pytest.fixture(autouse=True)
+def _processes_end_with_their_test() -> Iterator[None]:
+    yield
+    processes.end_all()
 
 
 @pytest.fixture(scope="session")
@@ -52,10 +68,24 @@ def drive() -> Recording:
 
 
 @pytest.fixture
-def place(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Place:
-    """A fresh place to work in, without a data root or a tracking server from outside."""
+def drawn() -> None:
+    """Figures of a `place` are drawn as users see them."""
+
+
+@pytest.fixture
+def place(request: pytest.FixtureRequest, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Place:
+    """A fresh place to work in, without a data root or a tracking server from outside.
+
+    Laying out the figures of a small study takes longer than all the rest of it: they are saved without their content unless the test
+    uses `drawn`.
+    """
+    from matplotlib.figure import Figure
+
     from place import Place
 
+    if "drawn" not in request.fixturenames:
+        save = Figure.savefig
+        monkeypatch.setattr(Figure, "savefig", lambda _, *arguments, **options: save(Figure((6, 4)), *arguments, **options))
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("VEHEST_DATA", str(tmp_path / "raw"))
     monkeypatch.delenv("VEHEST_OUTPUT", raising=False)

@@ -5,10 +5,11 @@ from __future__ import annotations
 import importlib.util
 import os
 import signal
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from pretended_slurm import install, states
+from pretended_slurm import install, scancel, states
 from test_two_nodes import FORTY, LONGER, Alone, alone, folder  # noqa: F401
 from two_nodes import Driver, manifests, metrics, under_way, weights, with_recordings
 
@@ -16,6 +17,14 @@ pytestmark = [
     pytest.mark.cluster,
     pytest.mark.skipif(importlib.util.find_spec("submitit") is None, reason="submitit is not installed: pip install 'vehest[slurm]'"),
 ]
+
+
+@pytest.fixture
+def queue(tmp_path: Path) -> Iterator[Path]:
+    """A folder for a queue; the jobs in it end with the test."""
+    yield tmp_path / "queue"
+    for job in states(tmp_path / "queue"):
+        scancel(tmp_path / "queue", job)
 
 
 def with_a_checkpoint(output: Path, but: dict | None = None) -> dict | None:
@@ -32,9 +41,8 @@ def test_processes_of_this_machine_give_the_bits_of_the_local_launcher(folder, a
     assert not list(output.glob("clusters/*")), "what was handed over is forgotten"
 
 
-def test_a_queue_gives_the_same_although_a_job_dies_and_another_is_put_back(folder, alone, tmp_path):  # noqa: F811
-    output, queue = with_recordings(alone["longer"], tmp_path / "out"), tmp_path / "queue"
-    environment = install(queue)
+def test_a_queue_gives_the_same_although_a_job_dies_and_another_is_put_back(folder, alone, queue, tmp_path):  # noqa: F811
+    output, environment = with_recordings(alone["longer"], tmp_path / "out"), install(queue)
     driver = Driver(folder, output, "sweep", *LONGER, "--launcher", "slurm", "--slurm", "minutes=10", **environment)
     lost = driver.sees(lambda: with_a_checkpoint(output))
     os.kill(lost["pid"], signal.SIGKILL)
@@ -47,9 +55,8 @@ def test_a_queue_gives_the_same_although_a_job_dies_and_another_is_put_back(fold
     assert set(states(queue).values()) <= {"COMPLETED", "FAILED"}
 
 
-def test_ctrl_c_takes_jobs_back_and_the_next_call_goes_on(folder, alone, tmp_path):  # noqa: F811
-    output, queue = with_recordings(alone["longer"], tmp_path / "out"), tmp_path / "queue"
-    environment = install(queue)
+def test_ctrl_c_takes_jobs_back_and_the_next_call_goes_on(folder, alone, queue, tmp_path):  # noqa: F811
+    output, environment = with_recordings(alone["longer"], tmp_path / "out"), install(queue)
     driver = Driver(folder, output, "sweep", *LONGER, "--launcher", "slurm", **environment)
     driver.sees(lambda: with_a_checkpoint(output))
     driver.process.send_signal(signal.SIGINT)
@@ -59,10 +66,10 @@ def test_ctrl_c_takes_jobs_back_and_the_next_call_goes_on(folder, alone, tmp_pat
     assert metrics(output) == metrics(alone["longer"])
 
 
-def test_a_queue_that_takes_no_jobs_is_an_error_of_one_line(folder, alone, tmp_path):  # noqa: F811
+def test_a_queue_that_takes_no_jobs_is_an_error_of_one_line(folder, alone, queue, tmp_path):  # noqa: F811
     output = with_recordings(alone["forty"], tmp_path / "out")
-    environment = install(tmp_path / "queue")
-    (tmp_path / "queue" / "bin" / "sbatch").write_text("#!/bin/sh\necho 'sbatch: error: invalid partition specified: none' >&2\nexit 1\n")
+    environment = install(queue)
+    (queue / "bin" / "sbatch").write_text("#!/bin/sh\necho 'sbatch: error: invalid partition specified: none' >&2\nexit 1\n")
     driver = Driver(folder, output, "sweep", *FORTY, "--launcher", "slurm", "--slurm", "partition=none", **environment)
     assert driver.ended() == 4, driver.said
     assert "error: SLURM takes no jobs" in driver.said
@@ -71,9 +78,8 @@ def test_a_queue_that_takes_no_jobs_is_an_error_of_one_line(folder, alone, tmp_p
     assert not manifests(output)
 
 
-def test_a_queue_that_takes_no_more_jobs_ends_the_command_and_the_next_call_goes_on(folder, alone, tmp_path):  # noqa: F811
-    output, queue = with_recordings(alone["longer"], tmp_path / "out"), tmp_path / "queue"
-    environment = install(queue)
+def test_a_queue_that_takes_no_more_jobs_ends_the_command_and_the_next_call_goes_on(folder, alone, queue, tmp_path):  # noqa: F811
+    output, environment = with_recordings(alone["longer"], tmp_path / "out"), install(queue)
     sbatch = queue / "bin" / "sbatch"
     takes_jobs = sbatch.read_text()
     driver = Driver(folder, output, "sweep", *LONGER, "--launcher", "slurm", **environment)

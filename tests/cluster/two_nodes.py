@@ -5,9 +5,7 @@ from __future__ import annotations
 import os
 import shutil
 import signal
-import subprocess
 import sys
-import time
 from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
@@ -15,8 +13,7 @@ from typing import Any
 
 import pandas as pd
 
-MOMENT = 0.02  # between two looks for an event
-PATIENCE = 900.0  # s, after which an event that never came is a failure of the test
+from processes import HANGS, start, wait_for
 
 
 class TwoNodes:
@@ -89,22 +86,15 @@ class Driver:
             command = ["unshare", "--mount", "sh", "-c", script, str(hidden), str(output), *command]
         with open(self._log, "ab") as log:
             own = {**os.environ, "VEHEST_OUTPUT": str(output), **environment}
-            self.process = subprocess.Popen(command, cwd=folder, stdout=log, stderr=log, env=own, start_new_session=True)
+            self.process = start(command, cwd=folder, stdout=log, stderr=log, env=own)
 
     def ended(self) -> int:
         """Exit code, once it has one."""
-        return self.process.wait(PATIENCE)
+        return self.process.wait(HANGS)
 
     def sees(self, event: Callable[[], Any]) -> Any:
         """Wait for an event; a command that ends before it fails the test."""
-        limit = time.monotonic() + PATIENCE
-        while time.monotonic() < limit:
-            found = event()
-            if found:
-                return found
-            assert self.process.poll() is None, f"it ended before the event:\n{self.said}"
-            time.sleep(MOMENT)
-        raise AssertionError(f"the event did not come:\n{self.said}")
+        return wait_for(event, self.process, lambda: self.said)
 
     @property
     def said(self) -> str:

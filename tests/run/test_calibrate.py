@@ -95,13 +95,13 @@ def test_metrics_say_coverage_width_and_scores_with_intervals_and_by_acceleratio
 
 
 def test_a_run_calibrates_each_model_once_and_shows_it(place):
-    code, _, err = place("run", "small", "--jobs", "1", "tracking=none")
+    code, _, err = place("run", "small", "tracking=none")
     assert code == 0, err
     assert [line.split()[0] for line in err.splitlines() if line.split()[1] == STAGE] == ["done"] * 4
     [report] = (place.folder / "outputs" / "report").iterdir()
     assert (report / "tables" / "bands_test.csv").is_file()
     assert "reliability_test" in (report / "report.md").read_text()
-    code, _, err = place("run", "small", "--jobs", "1", "tracking=none")
+    code, _, err = place("run", "small", "tracking=none")
     assert {line.split()[0] for line in err.splitlines() if line.split()[1] == STAGE} == {"skipped"}
 
 

@@ -89,14 +89,9 @@ def test_the_start_is_drawn_between_20_and_40_percent_of_the_range_and_another_i
     [
         (("fault=frozn",), "fault=frozn is not there; did you mean frozen?"),
         (("fault=frozen", "fault.channel=yawrate"), "fault.channel 'yawrate' is not there; did you mean yaw_rate?"),
-        (("fault=frozen", "fault.channel=vy_ref"), "is a reference, which no estimator sees"),
-        (("fault=sign", "fault.channel=vx"), "a fault 'sign' makes no sense for channel 'vx'"),
         (("fault=frozen", "fault.severity=harsh"), "fault.severity 'harsh' is not one of: mild, medium, severe"),
-        (("fault=frozen", "fault.start=-1"), "fault.start must be a time from 0 s on, not -1"),
-        (("fault=frozen", "fault.size=2"), "fault.size of a fault 'frozen' must be a share"),
         (("fault.channel=ay",), "unknown option 'fault.channel'"),
         (("faults=[{channel:ay}]",), "faults must be a list of faults, each with its kind"),
-        (("faults=[{kind:frozn,channel:ay}]",), "each with its kind"),
         (("faults=[{kind:bias,colour:red}]",), "fault.colour is not an option of fault"),
     ],
 )
@@ -190,7 +185,7 @@ def test_without_faults_the_key_holds_nothing_of_them(trained):
 
 
 def test_a_sweep_over_faults_trains_each_model_once(place):
-    quick = ("split=mine", "estimator=gru", "estimator.n_states=2", "training.max_epochs=1", "tracking=none", "--jobs", "1")
+    quick = ("split=mine", "estimator=gru", "estimator.n_states=2", "training.max_epochs=1", "tracking=none")
     code, out, err = place("sweep", *quick, "fault=frozen,bias", "fault.channel=yaw_rate,ay", "seed=range(2)", "--json")
     assert code == 0, err
     assert sum(line.startswith("done") and " train " in line for line in err.splitlines()) == 2
@@ -212,7 +207,7 @@ def test_a_sweep_over_faults_trains_each_model_once(place):
 
 
 def test_settings_under_one_fault_are_still_chosen_on_validation(place):
-    quick = ("split=mine", "estimator=kinematic,zero", "tracking=none", "--jobs", "1")
+    quick = ("split=mine", "estimator=kinematic,zero", "tracking=none")
     code, out, err = place("sweep", *quick, *FROZEN, "--json")
     assert code == 0, err
     assert json.loads(out)["chosen"]["rmse_sideslip.validation"] == min(
@@ -221,7 +216,7 @@ def test_settings_under_one_fault_are_still_chosen_on_validation(place):
 
 
 def test_a_fault_that_suits_no_channel_is_named_and_the_others_go_on(place):
-    quick = ("split=mine", "estimator=kinematic", "tracking=none", "--jobs", "1")
+    quick = ("split=mine", "estimator=kinematic", "tracking=none")
     code, out, err = place("sweep", *quick, "fault=sign,bias", "fault.channel=vx,ay", "--json")
     assert code == 5
     assert "fault=sign, channel=vx seed 0: a fault 'sign' makes no sense for channel 'vx'" in err.splitlines()[-1]
@@ -237,7 +232,7 @@ def pipeline_with(place: Place, sweeps: list[list[str]], **keys: Any) -> str:
 def test_a_pipeline_lists_faults_for_all_of_its_evaluations(place):
     faults = [{"kind": "frozen", "channel": "yaw_rate", "severity": "severe"}, {"kind": "nan", "channel": "ay", "severity": "mild"}]
     name = pipeline_with(place, [["estimator=zero,kinematic"]], evaluation={"faults": faults, "skip_seconds": 1})
-    code, out, err = place("run", name, "tracking=none", "--jobs", "1", "--json")
+    code, out, err = place("run", name, "tracking=none", "--json")
     assert code == 0, err
     files = list((place.folder / "outputs" / "evaluate").glob("*/metrics.csv"))
     assert len(files) == 2
@@ -249,7 +244,7 @@ def test_a_pipeline_lists_faults_for_all_of_its_evaluations(place):
 
 def test_sweeps_of_a_pipeline_over_faults_fill_the_same_list(place):
     name = pipeline_with(place, [["estimator=kinematic", "fault=frozen,bias"], ["estimator=zero"]])
-    code, _, err = place("run", name, "tracking=none", "--jobs", "1")
+    code, _, err = place("run", name, "tracking=none")
     assert code == 0, err
     assert sum(line.startswith("done") and " train " in line for line in err.splitlines()) == 2
     for file in (place.folder / "outputs" / "evaluate").glob("*/metrics.csv"):

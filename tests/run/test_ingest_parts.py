@@ -39,7 +39,7 @@ def failing(monkeypatch: pytest.MonkeyPatch, name: str, error: BaseException) ->
 
 
 def ingested(place: Place) -> Path:
-    code, out, err = place("ingest", "mine", "--jobs", "1", "--json")
+    code, out, err = place("ingest", "mine", "--json")
     assert code == 0, err
     return Path(json.loads(out)["folder"])
 
@@ -47,7 +47,7 @@ def ingested(place: Place) -> Path:
 def test_what_was_finished_before_a_failure_is_not_made_again(place: Place, slow: list[str], monkeypatch: pytest.MonkeyPatch) -> None:
     with monkeypatch.context() as broken:
         failing(broken, "three", DataError("'three.csv' is unwell"))
-        code, _, err = place("ingest", "mine", "--jobs", "1")
+        code, _, err = place("ingest", "mine")
         assert code == 3
         assert err.strip() == "error: 'three.csv' is unwell"
         assert [folder.name for folder in (place.folder / "outputs" / "ingest").glob("mine-*")] == []
@@ -61,7 +61,7 @@ def test_what_was_finished_before_a_failure_is_not_made_again(place: Place, slow
 def test_an_interruption_keeps_what_is_done(place: Place, slow: list[str], monkeypatch: pytest.MonkeyPatch) -> None:
     with monkeypatch.context() as broken:
         failing(broken, "three", KeyboardInterrupt())
-        assert place("ingest", "mine", "--jobs", "1")[0] == 130
+        assert place("ingest", "mine")[0] == 130
     ingested(place)
     assert slow == ["one", "three", "two"], "each is read once"
 
@@ -79,6 +79,6 @@ def test_side_by_side_makes_the_same_samples(place: Place, monkeypatch: pytest.M
 def test_a_part_of_other_settings_is_not_used(place: Place, slow: list[str], monkeypatch: pytest.MonkeyPatch) -> None:
     with monkeypatch.context() as broken:
         failing(broken, "three", DataError("unwell"))
-        assert place("ingest", "mine", "--jobs", "1")[0] == 3
-    assert place("ingest", "mine", "--jobs", "1", "dataset.vehicle=another")[0] == 0
+        assert place("ingest", "mine")[0] == 3
+    assert place("ingest", "mine", "dataset.vehicle=another")[0] == 0
     assert slow == ["one", "two", "one", "three", "two"]

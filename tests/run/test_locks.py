@@ -14,6 +14,7 @@ from pathlib import Path
 import pytest
 
 from place import Place
+from processes import start
 from vehest.run.artefacts import StagePlan, read_artefact
 from vehest.run.group import _held
 from vehest.run.locks import Lock, Waiting, held
@@ -35,7 +36,7 @@ sys.stdin.read()
 def held_elsewhere(output: Path, stage: str, name: str) -> Iterator[subprocess.Popen[str]]:
     """A process of its own that holds a lock until it is ended."""
     own = [sys.executable, "-c", HOLDER, str(output), stage, name]
-    process = subprocess.Popen(own, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
+    process = start(own, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
     assert process.stdout is not None
     try:
         assert process.stdout.readline() == "True\n"
@@ -111,7 +112,7 @@ def test_a_run_waits_for_what_another_makes_says_so_and_goes_on(place: Place):
     assert place("ingest", "mine")[0] == 0
     [folder] = (place.folder / "outputs" / "ingest").iterdir()
     with held_elsewhere(place.folder / "outputs", "ingest", folder.name) as holder:
-        waiting = subprocess.Popen([*COMMAND, "ingest", "mine", "--force"], stderr=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
+        waiting = start([*COMMAND, "ingest", "mine", "--force"], stderr=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
         assert waiting.stderr is not None
         line = waiting.stderr.readline()
         assert line.split()[:3] == ["waiting", "ingest", folder.name]
@@ -129,7 +130,7 @@ def test_a_run_that_waits_stops_at_once_and_leaves_nothing(place: Place, stage: 
     before = place.files()
     [folder] = (place.folder / "outputs" / stage).iterdir()
     with held_elsewhere(place.folder / "outputs", stage, folder.name):
-        waiting = subprocess.Popen([*COMMAND, *command, "--force"], stderr=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
+        waiting = start([*COMMAND, *command, "--force"], stderr=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
         assert waiting.stderr is not None
         while "waiting" not in (line := waiting.stderr.readline()):
             assert line, "it ended without waiting"

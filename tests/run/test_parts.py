@@ -58,9 +58,9 @@ def parts_place(place) -> Place:
     return place
 
 
-def test_parts_run_as_one_study_and_the_next_run_skips_all(parts_place):
+def test_parts_run_as_one_study_and_the_next_run_skips_all(parts_place, drawn):
     place = parts_place
-    code, out, err = place("run", "both", "--jobs", "1", "--json", "tracking=none")
+    code, out, err = place("run", "both", "--json", "tracking=none")
     assert code == 0, err
     assert "goes on without part 'ferrari_drive'" in " ".join(err.split())
     overview = pd.DataFrame(json.loads(out)["overview"])
@@ -79,7 +79,7 @@ def test_parts_run_as_one_study_and_the_next_run_skips_all(parts_place):
 
     assert place("report", "both", "tracking=none")[0] == 0
     made = place.files()
-    code, again, err = place("run", "both", "--jobs", "1", "--json", "tracking=none")
+    code, again, err = place("run", "both", "--json", "tracking=none")
     assert json.loads(again)["overview"] == json.loads(out)["overview"]
     assert {line.split()[0] for line in err.splitlines() if line.split()[1] in {"train", "evaluate", "report"}} == {"skipped"}
     assert place.files() == made
@@ -104,7 +104,7 @@ def test_a_study_module_without_an_overview_is_told_so(parts_place, monkeypatch)
     content = yaml.safe_load(file.read_text())
     content["parts"] = {"scheme_1": {"split": "forth", "sweeps": CANDIDATES[:1]}}
     file.write_text(yaml.safe_dump(content))
-    code, _, err = parts_place("run", "both", "--jobs", "1", "tracking=none")
+    code, _, err = parts_place("run", "both", "tracking=none")
     assert code == 2
     assert "gives no table 'overview'" in " ".join(err.split())
     assert not list((parts_place.folder / "outputs" / "report").glob("both-*"))
@@ -118,11 +118,11 @@ def test_a_run_without_a_part_does_not_replace_a_published_study_that_shows_it(p
         part["sweeps"] = [sweep for sweep in CANDIDATES if "estimator=ksnn" not in sweep]
     file.write_text(yaml.safe_dump(content))
     shutil.copytree(place.folder / "raw", place.folder / "raw" / "other")
-    code, _, err = place("run", "both", "--jobs", "1", "tracking=none")
+    code, _, err = place("run", "both", "tracking=none")
     assert code == 0, err
     published = (place.folder / "results" / "both" / "report.md").read_bytes()
     shutil.rmtree(place.folder / "raw" / "other")
-    code, out, err = place("run", "both", "--jobs", "1", "--json", "tracking=none")
+    code, out, err = place("run", "both", "--json", "tracking=none")
     assert "not published: 'results/both' shows part 'ferrari_drive'" in " ".join(err.split())
     assert json.loads(out)["published"] is None
     assert (place.folder / "results" / "both" / "report.md").read_bytes() == published
@@ -137,7 +137,7 @@ def test_a_study_of_real_cars_is_nowhere_called_simulated(parts_place):
     content = yaml.safe_load(file.read_text())
     content["parts"]["devbot_ferrari"] = content["parts"]["minutes_5_a"] = {"split": "back", "sweeps": CANDIDATES[::2]}
     file.write_text(yaml.safe_dump(content, sort_keys=False))
-    code, _, err = place("run", "both", "--jobs", "1", "tracking=none")
+    code, _, err = place("run", "both", "tracking=none")
     assert code == 0, err
     report = (place.folder / "results" / "both" / "report.md").read_text(encoding="utf-8")
     made_here = report.replace("a simulated DevBot", "").replace("samples, simulated, σ", "")  # a heading, and noise put into a made turn
@@ -180,10 +180,11 @@ def test_the_study_of_the_paper_differs_from_that_on_its_own_recordings_in_split
 
 
 def test_both_schemes_have_the_39_candidates_of_table_3_and_three_baselines():
-    jobs = jobs_of(read_study("ksnn"), [])
+    study, schemes = read_study("ksnn"), ("scheme_1", "scheme_2")
+    jobs = jobs_of(dataclasses.replace(study, parts={name: study.parts[name] for name in schemes}), [])
     configs = {part: [job.config for job in own] for part, own in jobs.items()}
     baselines = ("zero", "static_map", "kinematic")
-    for scheme in ("scheme_1", "scheme_2"):
+    for scheme in schemes:
         names = [(new_estimator(config["estimator"]).name, new_estimator(config["estimator"]).variant) for config in configs[scheme]]
         candidates = [name for name in dict.fromkeys(names) if name[0] not in baselines]
         assert {name[0] for name in names} - {name[0] for name in candidates} == set(baselines)
@@ -218,7 +219,7 @@ def test_every_part_of_the_study_in_which_a_car_is_tested_has_zero_and_the_stati
 def test_parts_that_make_no_sense_are_refused(parts_place, change, message):
     file = parts_place.folder / "pipelines" / "both.yaml"
     file.write_text(yaml.safe_dump({**yaml.safe_load(file.read_text()), **change}))
-    code, _, err = parts_place("run", "both", "--jobs", "1", "tracking=none", "--quiet")
+    code, _, err = parts_place("run", "both", "tracking=none", "--quiet")
     assert code != 0
     assert message in " ".join(err.split())
     assert "Traceback" not in err

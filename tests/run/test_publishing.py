@@ -24,7 +24,7 @@ QUICK = PIPELINE | {
         ["estimator=gru", "estimator.n_states=2", "seed=0,1", "training.max_epochs=2"],
     ],
 }
-RUN = ("run", "small", "--jobs", "1", "tracking=none")
+RUN = ("run", "small", "tracking=none")
 CHECK = ("report", "--check")
 TIME_NAMES = ("seconds", "minutes", "[ms]", "## Times")
 

@@ -24,7 +24,7 @@ def study(place):
     """A place with a small study that has just been run."""
     quick = PIPELINE | {"sweeps": [["estimator=luenberger", "training.grid=1", "training.max_evaluations=5"]]}
     (place.folder / "pipelines" / "small.yaml").write_text(yaml.safe_dump(quick))
-    code, _, err = place("run", *WORDS, "--jobs", "1")
+    code, _, err = place("run", *WORDS)
     assert code == 0, err
     return place
 
@@ -63,7 +63,7 @@ def test_a_finished_study_imports_nothing_that_made_it(study):
 
 
 def test_a_finished_sweep_prints_what_a_run_in_full_prints(place):
-    code, first, err = place("sweep", *SWEEP, "--jobs", "1")
+    code, first, err = place("sweep", *SWEEP)
     assert code == 0, err
     assert RunCache("sweep", "", SWEEP).load() is not None
     recognised = place("sweep", *SWEEP)
@@ -131,7 +131,7 @@ def test_a_study_on_raw_files_that_changed_is_made_anew(study):
 
 
 def test_force_runs_what_is_there(study):
-    code, _, err = study("run", *WORDS, "--force", "--jobs", "1")
+    code, _, err = study("run", *WORDS, "--force")
     assert code == 0, err
     assert "skipped" not in err
     assert cached()

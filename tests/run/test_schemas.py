@@ -440,7 +440,8 @@ PIPELINE = {"study": "mine", "report": "drive", "split": "quickstart", "sweeps":
         ({"report": "os"}, "there is no study module"),
         ({"report": "drive.os"}, "there is no study module"),
         ({"publish": "yes"}, "publish must be true or false"),
-        ({"sweeps": "estimator=gru"}, "sweeps must be a list"),
+        ({"sweeps": "estimator=gru"}, "sweeps must be a list of lists of overrides, not 'estimator=gru'"),
+        ({"sweeps": ["estimator=gru"]}, "sweeps.0 must be a list of overrides, not 'est"),
         ({"sweeps": []}, "sweeps must be a list of lists"),
         ({"sweeps": [[]]}, "sweeps must be a list of lists"),
         ({"sweeps": [[3]]}, "sweeps.0.0 must be text"),
@@ -451,6 +452,7 @@ PIPELINE = {"study": "mine", "report": "drive", "split": "quickstart", "sweeps":
         ({"title": __import__("datetime").date(2026, 1, 1)}, "title is no plain value but a date"),
         ({"unknown": 1}, "unknown key 'unknown'"),
         ({"split": ...}, "it needs split and sweeps"),
+        ({"report": ...}, "it needs study, report and one of: split and sweeps"),
         ({"based_on": 3}, "based_on must be text"),
     ],
 )
@@ -466,7 +468,7 @@ def test_a_pipeline_that_does_not_fit_is_one_line(tmp_path: Path, changes: dict[
 BOMB = "\n".join(["a0: &a0 [x, x, x, x, x, x, x, x, x]", *(f"a{n}: &a{n} [{', '.join([f'*a{n - 1}'] * 9)}]" for n in range(1, 12))])
 
 
-@pytest.mark.parametrize("text", [BOMB, "[" * 200, b"\xff", "3", "- a", "a: &a {b: *a}"])
+@pytest.mark.parametrize("text", [BOMB, "[" * 200, "[1, 2", b"\xff", "3", "- a", "a: &a {b: *a}"])
 def test_a_pipeline_that_is_none_is_one_line(tmp_path: Path, text: str | bytes) -> None:
     path = tmp_path / "mine.yaml"
     path.write_bytes(text if isinstance(text, bytes) else text.encode())

@@ -50,19 +50,19 @@ def samples(folder: str) -> dict[str, np.ndarray]:
 
 def test_a_seed_gives_the_same_samples_however_many_processes_make_them(place: Place) -> None:
     simulated(place, [{"id": "lap", "count": 3, "manoeuvre": LAP}])
-    alone = samples(made(place, "seed=1", "--jobs", "1")["folder"])
+    alone = samples(made(place, "seed=1")["folder"])
     together = samples(made(place, "seed=1", "--jobs", "2", "--force")["folder"])
     assert list(alone) == ["lap_001", "lap_002", "lap_003"]
     for name, values in alone.items():
         np.testing.assert_array_equal(values, together[name])
-    other = samples(made(place, "seed=2", "--jobs", "1")["folder"])
+    other = samples(made(place, "seed=2")["folder"])
     assert not any(np.array_equal(values, other[name]) for name, values in alone.items())
 
 
 def test_seed_is_short_for_the_data_sets_seed(place: Place) -> None:
     simulated(place, [{"id": "lap", "manoeuvre": LAP}])
-    folder = made(place, "seed=1", "--jobs", "1")["folder"]
-    again = made(place, "dataset.seed=1", "--jobs", "1")
+    folder = made(place, "seed=1")["folder"]
+    again = made(place, "dataset.seed=1")
     assert again["folder"] == folder
     assert again["skipped"]
     code, out, _ = place("ingest", "sim", "dataset.seed=1", "--json")
@@ -71,7 +71,7 @@ def test_seed_is_short_for_the_data_sets_seed(place: Place) -> None:
 
 def test_everything_it_makes_says_that_it_is_simulated(place: Place) -> None:
     simulated(place, [{"id": "lap", "manoeuvre": LAP}])
-    (file,) = Path(made(place, "--jobs", "1")["folder"]).glob("*.parquet")
+    (file,) = Path(made(place)["folder"]).glob("*.parquet")
     recording = read_recording(file)
     assert recording.kind == "simulated"
     assert recording.provenance["flags"]["spun"] is False
@@ -90,8 +90,8 @@ def test_drives_that_were_done_before_a_kill_are_not_made_again(place: Place, mo
         return read(self, recording_id)
 
     monkeypatch.setattr(SimulatedSource, "read", interrupted)
-    assert place("simulate", "sim", "--jobs", "1")[0] == 130
-    assert made(place, "--jobs", "1")["drives"] == 3
+    assert place("simulate", "sim")[0] == 130
+    assert made(place)["drives"] == 3
     assert begun == ["lap_001", "lap_002", "lap_002", "lap_003"]
 
 
@@ -103,7 +103,7 @@ def test_a_drive_that_spins_is_kept_flagged_and_counted(place: Place) -> None:
         vehicle={"overrides": tail_happy},
         sensors="ideal",
     )
-    outcome = made(place, "--jobs", "1")
+    outcome = made(place)
     assert outcome["drives"] == 2
     assert outcome["spun"] == ["wild"]
     assert outcome["not_completed"] == ["wild"]
@@ -111,14 +111,14 @@ def test_a_drive_that_spins_is_kept_flagged_and_counted(place: Place) -> None:
     assert np.isfinite(recording["vy_ref"]).all()
     assert np.abs(recording["sideslip_ref"]).max() > 1.0, "it did spin"
     assert np.hypot(recording["vx_ref"], recording["vy_ref"])[-1] == pytest.approx(0.0, abs=1e-6), "and stands at the end"
-    _, out, _ = place("simulate", "sim", "--jobs", "1")
+    _, out, _ = place("simulate", "sim")
     assert "spun: 1 (wild)" in out
 
 
 def test_a_spin_at_high_speed_is_no_impossible_recording(place: Place) -> None:
     wild = {"name": "random_steer", "speed": [45.0, 60.0], "severity": [1.4, 1.8], "duration": 8.0}
     simulated(place, [{"id": "fast", "count": 4, "manoeuvre": wild}], defaults=[{"/vehicle@vehicle": "bmw_545i"}, "_self_"])
-    outcome = made(place, "--jobs", "1")
+    outcome = made(place)
     assert outcome["drives"] == 4
     assert len(outcome["spun"]) >= 1
     sideways = [np.abs(read_recording(Path(outcome["folder"]) / f"{name}.parquet")["vy_ref"]).max() for name in outcome["spun"]]
@@ -140,7 +140,7 @@ def test_a_report_of_simulated_drives_never_says_real(place: Place) -> None:
     study = {"study": "s", "title": "t", "report": "drive", "split": "sim"}
     study["sweeps"] = [["estimator=luenberger", "training.grid=1", "training.max_evaluations=5"]]
     (place.folder / "pipelines" / "sim.yaml").write_text(yaml.safe_dump(study))
-    code, out, err = place("run", "sim", "--jobs", "1", "--json")
+    code, out, err = place("run", "sim", "--json")
     assert code == 0, err
     report = Path(json.loads(out)["report"]).with_name("report.md").read_text()
     assert "**Simulated data:** every number here comes from simulated recordings" in report
@@ -150,7 +150,7 @@ def test_a_report_of_simulated_drives_never_says_real(place: Place) -> None:
 
 def test_looking_at_a_simulated_data_set_reads_what_is_in_the_store(place: Place, monkeypatch: pytest.MonkeyPatch) -> None:
     simulated(place, [{"id": "lap", "manoeuvre": LAP}])
-    made(place, "--jobs", "1")
+    made(place)
     monkeypatch.setattr(compiled, "advance", None)  # nothing can be simulated any more
     code, out, err = place("data", "check", "sim")
     assert code == 0, err

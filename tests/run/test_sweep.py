@@ -163,8 +163,8 @@ def test_report_says_how_many_others_the_interval_of_the_chosen_one_covers():
 # The command
 
 
-def test_a_sweep_makes_tables_and_heat_maps_and_then_skips(place):
-    code, out, err = place("sweep", *GRID, "--jobs", "1", "--json")
+def test_a_sweep_makes_tables_and_heat_maps_and_then_skips(place, drawn):
+    code, out, err = place("sweep", *GRID, "--json")
     assert code == 0, err
     outcome = json.loads(out)
     folder = Path(outcome["folder"])
@@ -189,13 +189,13 @@ def test_a_sweep_makes_tables_and_heat_maps_and_then_skips(place):
     assert by_hand["rmse_sideslip.test"] == own.tolist()[1], "a job is what train and eval make"
 
     made = place.files()
-    code, again, err = place("sweep", *GRID, "--jobs", "1", "--json")
+    code, again, err = place("sweep", *GRID, "--json")
     assert code == 0, err
     assert json.loads(again) == {**outcome, "skipped": True}
     assert place.files() == made
     assert {line.split()[0] for line in err.splitlines()} == {"skipped"}
 
-    code, out, err = place("sweep", *GRID[:-1], "seed=range(3)", "--jobs", "1", "--name", "more")
+    code, out, err = place("sweep", *GRID[:-1], "seed=range(3)", "--name", "more")
     assert code == 0, err
     assert sum(line.startswith("done") and " train " in line for line in err.splitlines()) == 4, "only the third seeds were missing"
     assert "± " in out
@@ -205,7 +205,7 @@ def test_a_sweep_makes_tables_and_heat_maps_and_then_skips(place):
 def test_failing_combinations_are_named_and_the_others_go_on(place):
     arguments = (*QUICK, "estimator.n_hidden=-1,0,0.5", "training.learning_rate=0.001,1e6", "training.max_epochs=2", "seed=range(2)")
     arguments = tuple(word for word in arguments if word != "training.max_epochs=1")
-    code, out, err = place("sweep", *arguments, "--jobs", "1", "--json")
+    code, out, err = place("sweep", *arguments, "--json")
     assert code == 5
     last = err.splitlines()[-1]
     assert last.startswith("error: 10 of 12 jobs failed, the others are kept; ")
@@ -258,7 +258,7 @@ def test_sweeps_that_make_no_sense_are_refused(place, overrides, message):
 
 
 def test_the_same_training_twice_is_refused_and_named(place):
-    code, _, err = place("sweep", *QUICK, "training.checkpoint_seconds=10,20", "estimator.n_hidden=0", "--jobs", "1")
+    code, _, err = place("sweep", *QUICK, "training.checkpoint_seconds=10,20", "estimator.n_hidden=0")
     assert code == 5
     assert "checkpoint_seconds=20 seed 0: it is the same training as checkpoint_seconds=10" in err.splitlines()[-1]
 

@@ -9,26 +9,23 @@ import sqlite3
 import subprocess
 import sys
 import threading
-import time
 import urllib.request
-from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
 from place import Place
+from processes import start, wait_for
 from vehest.run.artefacts import MANIFEST, Artefact, read_artefact
 from vehest.run.tracking import Tracker
 
 pytestmark = pytest.mark.apart
 
-STARTUP_SECONDS = 120.0  # of a server on a busy machine
-
 
 def test_runs_are_tracked_with_parameters_metrics_model_and_figures(place):
-    code, _, err = place("run", "small", "--jobs", "1")
+    code, _, err = place("run", "small")
     assert code == 0, err
     from mlflow import MlflowClient
 
@@ -73,11 +70,11 @@ def _local(place: Place, stage: str = "") -> list:
 def test_what_a_server_that_was_away_missed_is_logged_by_the_next_run(place: Place, monkeypatch: pytest.MonkeyPatch):
     with monkeypatch.context() as away:
         away.setattr(Tracker, "_log", _raising(ConnectionError("no answer")))
-        code, _, err = place("run", "small", "--jobs", "1")
+        code, _, err = place("run", "small")
         assert code == 0, err
         assert err.count("logging to MLflow") == 1
     assert not (place.folder / "outputs" / "finished").exists()
-    code, _, err = place("run", "small", "--jobs", "1")
+    code, _, err = place("run", "small")
     assert code == 0, err
     assert "done" not in err, "nothing is made again for it"
     assert sorted(run.info.status for run in _local(place)) == ["FINISHED"] * 12
@@ -132,7 +129,7 @@ def test_a_store_that_is_gone_is_filled_again(place: Place):
 
 
 def test_a_finished_and_tracked_study_is_recognised_without_mlflow(place: Place):
-    assert place("run", "small", "--jobs", "1")[0] == 0
+    assert place("run", "small")[0] == 0
     done = _in_process(
         "import vehest.cli, atexit; atexit.register(lambda: print('mlflow' in sys.modules)); vehest.cli.main()", "run", "small"
     )
@@ -164,7 +161,7 @@ def test_a_disk_that_fills_up_while_runs_are_logged_loses_none(place: Place):
     full = _in_process(FULL.replace("200_000", str(size)), "run", "small", "--jobs", "1")
     assert full.returncode == 0, full.stderr
     assert full.stderr.count("going on without tracking") == 1
-    code, _, err = place("run", "small", "--jobs", "1")
+    code, _, err = place("run", "small")
     assert code == 0, err
     assert [run.info.status for run in _local(place)] == ["FINISHED"] * 14
 
@@ -182,40 +179,24 @@ def _in_process(code: str, *arguments: str) -> subprocess.CompletedProcess[str]:
     return subprocess.run(own, capture_output=True, text=True, check=False)
 
 
-@contextmanager
-def mlflow_server(folder: Path) -> Iterator[tuple[str, subprocess.Popen[bytes]]]:
+def mlflow_server(folder: Path) -> tuple[str, subprocess.Popen[bytes]]:
     """A real MLflow server on loopback, ready to answer: its address and its process."""
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
-        port = free.getsockname()[1]
+        address = f"http://127.0.0.1:{free.getsockname()[1]}"
     folder.mkdir()
-    command = [sys.executable, "-m", "mlflow", "server", "--host", "127.0.0.1", "--port", str(port), "--workers", "1"]
-    command += ["--backend-store-uri", f"sqlite:///{folder / 'server.db'}", "--artifacts-destination", str(folder / "artifacts")]
+    command = [sys.executable, "-m", "mlflow", "server", "--host", "127.0.0.1", "--port", address.rpartition(":")[2], "--workers", "1"]
+    command += ["--backend-store-uri", f"sqlite:///{folder / 'server.db'}", "--artifacts-destination", folder / "artifacts"]
     with open(folder / "log", "wb") as log:
-        process = subprocess.Popen(command, stdout=log, stderr=log, cwd=folder, start_new_session=True)
-    try:
-        _await_answer(f"http://127.0.0.1:{port}", process, folder / "log")
-        yield f"http://127.0.0.1:{port}", process
-    finally:
-        _kill(process)
+        process = start(command, stdout=log, stderr=log, cwd=folder)
 
+    def answers() -> bool:
+        with suppress(OSError), urllib.request.urlopen(f"{address}/health", timeout=5):
+            return True
+        return False
 
-def _await_answer(address: str, process: subprocess.Popen[bytes], log: Path) -> None:
-    ends = time.monotonic() + STARTUP_SECONDS
-    while time.monotonic() < ends:
-        assert process.poll() is None, log.read_text()
-        try:
-            with urllib.request.urlopen(f"{address}/health", timeout=5):
-                return
-        except OSError:
-            time.sleep(0.1)
-    raise AssertionError(f"the server did not start:\n{log.read_text()}")
-
-
-def _kill(process: subprocess.Popen[bytes]) -> None:
-    if process.poll() is None:
-        os.killpg(process.pid, signal.SIGKILL)
-        process.wait()
+    wait_for(answers, process, (folder / "log").read_text)
+    return address, process
 
 
 def _runs(client, name: str = "vehest") -> dict:
@@ -226,30 +207,30 @@ def _runs(client, name: str = "vehest") -> dict:
 def test_a_server_receives_every_run_of_a_study_and_its_loss_half_way_stops_nothing(place: Place):
     from mlflow import MlflowClient
 
-    with mlflow_server(place.folder / "server") as (address, process):
-        client = MlflowClient(address)
-        code, _, err = place("run", "small", "--jobs", "1", f"tracking.uri={address}")
-        assert code == 0, err
-        assert "logging to MLflow" not in err
-        runs = _runs(client)
-        assert len(runs) == 13
-        trained = runs["ksnn-linear_no_bias_p2-seed1"]
-        assert trained.info.status == "FINISHED"
-        assert len(client.get_metric_history(trained.info.run_id, "validation_loss")) == 2
-        kept = {entry.path for entry in client.list_artifacts(trained.info.run_id)}
-        assert {"model.safetensors", "model.yaml", "manifest.json", "figures"} <= kept
-        assert not (place.folder / "outputs" / "mlflow.db").exists()
+    address, process = mlflow_server(place.folder / "server")
+    client = MlflowClient(address)
+    code, _, err = place("run", "small", f"tracking.uri={address}")
+    assert code == 0, err
+    assert "logging to MLflow" not in err
+    runs = _runs(client)
+    assert len(runs) == 13
+    trained = runs["ksnn-linear_no_bias_p2-seed1"]
+    assert trained.info.status == "FINISHED"
+    assert len(client.get_metric_history(trained.info.run_id, "validation_loss")) == 2
+    kept = {entry.path for entry in client.list_artifacts(trained.info.run_id)}
+    assert {"model.safetensors", "model.yaml", "manifest.json", "figures"} <= kept
+    assert not (place.folder / "outputs" / "mlflow.db").exists()
 
-        def fell_over() -> None:
-            while len(_runs(client, "second")) < 1:
-                time.sleep(0.05)
-            _kill(process)
+    def fell_over() -> None:
+        wait_for(lambda: _runs(client, "second"), process)
+        os.killpg(process.pid, signal.SIGKILL)
+        process.wait()
 
-        watcher = threading.Thread(target=fell_over)
-        watcher.start()
-        again = ("run", "small", "--jobs", "1", "--force", "output=again", f"tracking.uri={address}", "tracking.experiment=second")
-        code, out, err = place(*again)
-        watcher.join()
+    watcher = threading.Thread(target=fell_over)
+    watcher.start()
+    again = ("run", "small", "--force", "output=again", f"tracking.uri={address}", "tracking.experiment=second")
+    code, out, err = place(*again)
+    watcher.join()
     assert code == 0, err
     assert err.count("logging to MLflow") == 1
     assert "going on without tracking" in err

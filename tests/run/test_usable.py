@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Iterator
+from copy import deepcopy
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -24,6 +27,7 @@ from vehest.data.transforms import TRANSFORMS, transform_from_config
 from vehest.estimators.base import FitData
 from vehest.estimators.needs import lacking_to_train
 from vehest.estimators.registry import estimator_class, estimator_names
+from vehest.run import usable
 from vehest.run.comparison import lower_rate
 from vehest.run.config import compose_config
 from vehest.run.train import new_estimator
@@ -46,6 +50,15 @@ def log(channels: set[str], rate_hz: float = 50.0, seed: int = 1, seconds: float
     known = {**drive.channels, "steer": steer, "handwheel": RATIO * steer}
     known |= {f"wheel_speed_{wheel}": drive["vx"] / RADIUS for wheel in WHEELS}
     return replace(drive, channels={channel: known[channel] for channel in sorted(channels)})
+
+
+@pytest.fixture(autouse=True, scope="module")
+def _composed_once() -> Iterator[None]:
+    """The configuration of each estimator is composed once for all tables."""
+    composed = cache(lambda command, *overrides: compose_config(command, list(overrides)))
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(usable, "compose_config", lambda command, overrides: deepcopy(composed(command, *overrides)))
+        yield
 
 
 def rows(recording: Recording) -> dict[str, dict]:
@@ -313,7 +326,7 @@ def test_training_on_a_log_that_lacks_a_channel_is_refused_with_the_remedy_which
 def test_candidates_that_lack_something_are_told_at_once_and_the_others_are_shown(place):
     add_logged(place, FULL - {"ax", "steer"})
     add_study(place, ["estimator=zero"], ["estimator=static_map"], ["estimator=ksnn", "seed=0,1"], ["estimator=kalman"])
-    code, out, err = place("run", "logged", "--jobs", "1", "--json", "tracking=none")
+    code, out, err = place("run", "logged", "--json", "tracking=none")
     assert code == 5
     told = json.loads(out)
     assert {row["estimator"] for row in told["leaderboard"]} == {"zero", "static_map"}
@@ -335,7 +348,7 @@ def test_candidates_that_lack_something_are_told_at_once_and_the_others_are_show
 def test_study_none_of_whose_candidates_will_do_trains_nothing(place):
     add_logged(place, {"vx", "yaw_rate", "vy_ref"})
     add_study(place, ["estimator=ksnn"], ["estimator=kalman"])
-    code, _, err = place("run", "logged", "--jobs", "1", "tracking=none")
+    code, _, err = place("run", "logged", "tracking=none")
     assert code == 3
     assert "none of these estimators can be used with the recordings of split 'logged'" in err.splitlines()[-1]
     assert not models(place)
@@ -344,7 +357,7 @@ def test_study_none_of_whose_candidates_will_do_trains_nothing(place):
 def test_recordings_without_the_reference_that_scores_are_refused_for_all(place):
     add_logged(place, FULL - {"vy_ref"})
     add_study(place, ["estimator=zero"], ["estimator=kalman"])
-    code, _, err = place("run", "logged", "--jobs", "1", "tracking=none")
+    code, _, err = place("run", "logged", "tracking=none")
     assert code == 3
     assert "vy_ref (not in the log)" in err.splitlines()[-1]
     assert not models(place)
@@ -354,12 +367,12 @@ def test_channels_that_the_downsampling_makes_are_not_missing(place):
     add_logged(place, (FULL - {"steer"}) | {"handwheel"})
     made = f"downsample.transforms=[{{name: steering_ratio, ratio: {RATIO}}}]"
     add_study(place, ["estimator=kalman", made])
-    assert place("run", "logged", "--jobs", "1", "--json", "tracking=none")[0] == 0
+    assert place("run", "logged", "--json", "tracking=none")[0] == 0
 
 
 def test_sweep_names_combinations_that_lack_something_and_finishes_the_others(place):
     add_logged(place, FULL - {"steer"})
-    code, out, err = place("sweep", "estimator=kalman,static_map", "split=logged", "--json", "tracking=none", "--jobs", "1")
+    code, out, err = place("sweep", "estimator=kalman,static_map", "split=logged", "--json", "tracking=none")
     assert code == 5
     told = json.loads(out)
     assert [row["estimator"] for row in told["summary"] if row["rmse_sideslip.test"] is not None] == ["static_map"]
@@ -397,7 +410,7 @@ def test_rate_that_an_override_asks_for_is_not_lowered(place):
 def test_one_candidate_at_a_rate_that_the_log_does_not_have_hides_no_other(place):
     add_logged(place, FULL)
     add_study(place, ["estimator=zero"], ["estimator=kalman"], ["estimator=static_map", "estimator.rate_hz=100"])
-    code, out, err = place("run", "logged", "--jobs", "1", "--json", "tracking=none")
+    code, out, err = place("run", "logged", "--json", "tracking=none")
     assert code == 5
     told = json.loads(out)
     assert {row["estimator"] for row in told["leaderboard"]} == {"zero", "kalman"}
@@ -411,8 +424,8 @@ def test_one_candidate_at_a_rate_that_the_log_does_not_have_hides_no_other(place
 def test_study_whose_rates_were_lowered_is_recognised_when_it_is_finished(place):
     add_logged(place, FULL)
     add_study(place, ["estimator=kalman"])
-    first = place("run", "logged", "--jobs", "1", "tracking=none")
-    second = place("run", "logged", "--jobs", "1", "tracking=none")
+    first = place("run", "logged", "tracking=none")
+    second = place("run", "logged", "tracking=none")
     assert (first[0], second[0], second[1]) == (0, 0, first[1])
     assert list((place.folder / "outputs" / "finished").iterdir())
     assert "kalman runs at 50 Hz instead of its 100 Hz" in " ".join(second[2].split())
@@ -421,7 +434,7 @@ def test_study_whose_rates_were_lowered_is_recognised_when_it_is_finished(place)
 def test_evaluation_grid_is_no_finer_than_a_log_of_10_hz(place):
     add_logged(place, FULL, rate_hz=10.0)
     add_study(place, ["estimator=static_map"], ["estimator=ksnn", "estimator.window=10", "training.max_epochs=2"])
-    code, out, err = place("run", "logged", "--jobs", "1", "--json", "tracking=none")
+    code, out, err = place("run", "logged", "--json", "tracking=none")
     assert code == 0, err
     words = " ".join(err.split())
     assert words.count("evaluation reads estimates at 10 Hz instead of 20 Hz") == 1
@@ -429,7 +442,7 @@ def test_evaluation_grid_is_no_finer_than_a_log_of_10_hz(place):
     assert "estimator.window of 10 samples lasts 1 s instead of 0.5 s (estimator.window=5 keeps that)" in words
     metrics = pd.read_csv(Path(json.loads(out)["report"]).parent / "metrics.csv")
     assert set(metrics["rate_hz"]) == {10.0}
-    code, _, err = place("run", "logged", "evaluation.rate_hz=20", "--jobs", "1", "tracking=none")
+    code, _, err = place("run", "logged", "evaluation.rate_hz=20", "tracking=none")
     assert code == 3
     assert "evaluation.rate_hz asks for 20 Hz, and recording 'lap1' is sampled at 10 Hz" in err.splitlines()[-1]
 
@@ -441,7 +454,7 @@ def test_lowest_rate_of_all_data_sets_of_a_split_counts(place):
     split["tests"]["other"] = [{"dataset": "mine", "recording": "three"}]  # sampled at 100 Hz
     file.write_text(yaml.safe_dump(split))
     add_study(place, ["estimator=luenberger", "training.grid=1", "training.max_evaluations=10"])
-    code, out, err = place("run", "logged", "--jobs", "1", "--json", "tracking=none")
+    code, out, err = place("run", "logged", "--json", "tracking=none")
     assert code == 0, err
     assert "luenberger runs at 50 Hz instead of its 100 Hz" in " ".join(err.split())
     assert {row["test_set"] for row in json.loads(out)["leaderboard"]} >= {"test", "other"}

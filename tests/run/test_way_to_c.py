@@ -41,7 +41,7 @@ def test_two_commands_lead_to_a_verdict_and_those_it_names_to_an_estimate_and_to
     pipeline["parts"] = {"all": {**pipeline["parts"]["all"], "sweeps": [sweeps[0], tuned]}, **short}  # for the sake of time
     file.write_text(yaml.safe_dump(pipeline), encoding="utf-8")
 
-    code, out, err = run_vehest(capsys, "run", "my_car", "--minutes", "60", "tracking=none", "--jobs", "1", "training.max_epochs=3")
+    code, out, err = run_vehest(capsys, "run", "my_car", "--minutes", "60", "tracking=none", "training.max_epochs=3")
     assert code == 0, err
     said = out[out.index("FVU") :]
     assert re.search(r"Use |can be called best|Nothing beats|cannot rank estimators", said)
