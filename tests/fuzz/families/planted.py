@@ -29,7 +29,7 @@ def _misdeed(verdict: str) -> Callable[[Callable[[], None]], Callable[[], None]]
     return register
 
 
-@generator(has_honest=False)
+@generator()
 def planted(case: Case) -> Command:
     name = list(MISDEEDS)[case.visit % len(MISDEEDS)]
     (case.place / "raw").mkdir()
