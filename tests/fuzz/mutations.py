@@ -117,9 +117,9 @@ def _holders(tree: Any) -> list[Any]:
 
 def spoil_items(tree: Mapping[str, Any], rng: random.Random) -> dict[Any, Any]:
     """A tree spoilt besides its defaults, which stay; of one key alone, or of all."""
-    key = rng.choice([key for key in tree if key != "defaults"])
-    some = rng.choice([{key: tree[key]}, {key: value for key, value in tree.items() if key != "defaults"}])
-    spoilt = spoil_tree(some, rng)
+    items = {key: value for key, value in tree.items() if key != "defaults"}
+    key = rng.choice([*items, ""])
+    spoilt = spoil_tree({key: items[key]} if key else items, rng)
     return {**tree, **spoilt} if isinstance(spoilt, dict) else dict(tree)
 
 

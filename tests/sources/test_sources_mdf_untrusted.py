@@ -132,7 +132,7 @@ def test_a_conversion_that_leads_elsewhere_is_not_left_out(tmp_path: Path, versi
 
 @pytest.mark.parametrize(("block", "link"), [(b"##DG", 0), (b"##CN", 1)])
 def test_a_chain_that_leads_back_ends_in_one_line(tmp_path: Path, block: bytes, link: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("vehest.sources.limited.SECONDS", 4.0)
+    monkeypatch.setattr("vehest.sources.limited.SECONDS", 3.0)
     assert refused(overwritten(written(tmp_path / "a.mf4"), block, 0, 8 * link, "<Q", None))
 
 

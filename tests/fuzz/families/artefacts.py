@@ -9,7 +9,6 @@ import os
 import sqlite3
 import struct
 from collections.abc import Callable
-from contextlib import suppress
 from pathlib import Path
 from random import Random
 from typing import Any
@@ -20,7 +19,7 @@ from safetensors.numpy import load_file, save_file
 
 from fuzz.case import Case, Command, generator, template
 from fuzz.honest import KSNN, drives, run, write_yaml
-from fuzz.mutations import NAMES, WRITABLE_NAMES, spoil_bytes, spoil_json, spoil_text, spoil_tree, spoil_yaml
+from fuzz.mutations import NAMES, WRITABLE_NAMES, spoil_bytes, spoil_json, spoil_text, spoil_yaml
 from place import DATASET
 
 STAGES = ("ingest", "downsample", "train", "calibrate", "evaluate", "report")
@@ -101,23 +100,18 @@ def leftovers(case: Case) -> Command:
     outputs, elsewhere = case.place / "outputs", case.folder / "elsewhere"
     elsewhere.mkdir()
     (elsewhere / "kept.txt").write_text("kept")
-    train, before = outputs / "train", case.place / "raw" / "before"
-    ideas: list[Callable[[], Any]] = [
-        lambda: (train / ".writing-1-aaaaaaaa-x").symlink_to(elsewhere),
-        lambda: (train / ".writing-999999-aaaaaaaa-x").symlink_to(elsewhere),
-        lambda: (train / ".writing-99999999999999999999-a-x").mkdir(),
-        lambda: (train / "not a model").write_text("a file"),
-        lambda: (train.rename(before), train.write_text("a file where a folder belongs")),
-        lambda: (train / "\udcff\udcfe").mkdir(),
-        lambda: (outputs.rename(before), outputs.write_text("a file")),
-        lambda: (outputs.rename(before), outputs.symlink_to("outputs")),
-        lambda: (outputs.rename(before), outputs.symlink_to("/dev/null")),
-        lambda: (outputs.rename(before), os.mkfifo(outputs)),
-    ]
-    how = case.idea(10)
-    if not case.honest:
-        ideas[how]()
-    return Command(("ingest", "mine") if how >= 6 else ("eval", *KSNN))
+    train, before, how = outputs / "train", case.place / "raw" / "before", case.idea(8)
+    if how in (0, 1):
+        (train / (".writing-1-aaaaaaaa-x", ".writing-999999-aaaaaaaa-x")[how]).symlink_to(elsewhere)
+    elif how == 2:
+        (train / ".writing-99999999999999999999-a-x").mkdir()
+        (train / "\udcff\udcfe").mkdir()
+    elif how >= 3:
+        place = train if how == 3 else outputs
+        place.rename(before)
+        makers = [lambda: place.write_text("a file"), lambda: place.symlink_to(place.name), lambda: place.symlink_to("/dev/null")]
+        [makers[0], *makers, lambda: os.mkfifo(place)][how - 3]()
+    return Command(("ingest", "mine") if how >= 4 else ("eval", *KSNN))
 
 
 @generator("study", weight=10)
@@ -237,23 +231,14 @@ def tracking_store(case: Case) -> Command:
 
 @generator("drives", weight=2)
 def downloads(case: Case) -> Command:
-    """All files are there already; what is declared about them, and the record of their checksums, is spoilt. Nothing is fetched."""
-    case.copy("drives")
-    raw, rng, how = case.place / "raw", case.rng, case.idea(4)
+    """All files are there already; the record of their checksums, or what is declared, is spoilt. Nothing is fetched."""
+    raw = case.copy("drives") / "raw"
     sums = {file.name: hashlib.sha256(file.read_bytes()).hexdigest() for file in sorted(raw.iterdir())}
+    record = case.write("raw/checksums.txt", "".join(f"{name} {digest}\n" for name, digest in sums.items()))
     declared = {"url": "https://example.org/folder", "files": list(sums), "sha256": dict(sums)}
-    record = "".join(f"{name} {digest}\n" for name, digest in sums.items()).encode()
-    if how == 0:
-        record = spoil_text(record.decode(), rng)
-    elif how == 1:
-        spoilt = spoil_tree(declared, rng)
-        kept = isinstance(spoilt, dict) and str(spoilt.get("files")) == str(declared["files"])
-        declared = spoilt if kept else declared | {"files": [rng.choice(WRITABLE_NAMES)]}
-    elif how == 2:
-        declared["url"] = rng.choice(URLS)
-    elif how == 3:
-        record += f"{rng.choice(NAMES)} {rng.choice(['0' * 64, 'x', '', '0' * 64 + ' 1'])}\n".encode("utf-8", "surrogatepass")
-    (raw / "checksums.txt").write_bytes(record)
-    with suppress(UnicodeEncodeError):
-        write_yaml(case.place / "conf" / "dataset" / "mine.yaml", DATASET | {"download": declared})
+    if case.idea(2) == 0:
+        case.spoil(record, lambda content, rng: spoil_text(content.decode(), rng))
+    elif not case.honest:
+        declared |= {"url": case.rng.choice(URLS)} if case.rng.random() < 0.5 else {"files": [case.rng.choice(WRITABLE_NAMES)]}
+    write_yaml(case.place / "conf" / "dataset" / "mine.yaml", DATASET | {"download": declared})
     return Command(("ingest", "mine", "--download"), targets=("raw/checksums.txt", "raw/.download"))

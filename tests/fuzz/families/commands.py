@@ -59,8 +59,6 @@ BASES: tuple[tuple[str, ...], ...] = (
     ("data", "check", "lap.csv"),
 )
 OUTS = ("out.csv", "out.parquet", "out", "out.csv/x", "/dev/full", "/dev/null", "", "lap.csv", "raw", "OUT.CSV", "outputs/x.csv")
-NUMBERS = ("0", "-1", "nan", "inf", "1e400", "1e18", "1e-300", "1e9", "24.999", "a", "")
-ALIGNED = ("offsets", "delay", "lever_arm", "mounting", "delay,offsets", "lever_arm,mounting,delay,offsets", "", ",", "all", "delay,delay")
 TYPED = (("train", "estimator=k"), ("ingest", ""), ("estimate", ""), ("run", ""), ("sweep", "estimator.n_l"), ("eval", "--model", ""))
 SWEEPS = (
     "seed=range(100000000)", "seed=range(1000) estimator.n_local=range(1000)", "seed=" + ",".join(map(str, range(20_000))),
@@ -173,19 +171,6 @@ def _argument(argument: click.Parameter, words: tuple[str, ...], rng: random.Ran
     if rng.random() < 0.75 and argument.name in sound:
         return [sound[argument.name]]
     return [rng.choice([*WRITABLE_NAMES, "mine", "sim_small", "tabular", "lap.parquet", "raw", "conf", "quickstart", "one"])]
-
-
-@generator("study", weight=2)
-def alignment(case: Case) -> Command:
-    """Options of data align are numbers that reach a solver."""
-    case.copy("study")
-    command, rng = ("data", "align", "lap.csv", "-e"), case.rng
-    if case.honest:
-        return Command((*command, "offsets", "-o", "out"), targets=("out",))
-    names = rng.sample(["--wheelbase", "--cutoff", "--max-delay", "--tilt", "--max-ay", "--min-speed"], 2)
-    chosen = [word for name in names for word in (name, rng.choice(NUMBERS))]
-    wheres = [(), ("-o", "out"), ("-o", "lap.csv"), ("-o", "raw"), ("-o", "/dev/null"), ("-r", "nothing"), ("--steering-channel", "vx")]
-    return Command((*command, rng.choice(ALIGNED), *chosen, *rng.choice(wheres)), targets=("out",))
 
 
 @generator("study", weight=2)

@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import os
-from pathlib import Path
 from typing import Any
 
 import yaml
 
-from fuzz.case import Case, Command, generator, template
-from fuzz.honest import KALMAN, KSNN, LUENBERGER, PIPELINE, SPLIT, run, write_yaml
+from fuzz.case import Case, Command, generator
+from fuzz.honest import KSNN, LUENBERGER, PIPELINE, SPLIT, write_yaml
 from fuzz.mutations import NAMES, WRITABLE_NAMES, hostile, spoil_items, spoil_yaml, yaml_of
 from place import DATASET
 from vehest.run.config_files import packaged_conf, packaged_pipelines
@@ -22,20 +21,6 @@ DATASETS = (
     "tum", "f1tenth", "f1tenth_bag", "ferrari_250lm", "revs_targa_2014", "mdf", "sim_quickstart", "sim_small", "sim_fleet", "sim_bmw",
     "sim_two_cars", "sim_heavy", "sim_fleet_real",
 )  # fmt: skip
-LANE_CHANGE = {"id": "d", "manoeuvre": {"name": "double_lane_change", "severity": 0.5}}
-SHORT: dict[str, Any] = {
-    "defaults": [{"/vehicle@vehicle": "bmw_320i_low"}],
-    "name": "short",
-    "kind": "simulated",
-    "licence": "none",
-    "citation": "none",
-    "source": "simulated",
-    "seed": 0,
-    "rate_hz": 100,
-    "sensors": "default",
-    "surface": "dry",
-    "stability_control": False,
-}
 DERIVED: dict[str, Any] = DATASET | {
     "transforms": [{"name": "acceleration_from_speed", "cutoff_hz": 5.0}, {"name": "sideslip_from_velocity"}],
     "reference_point": {"x": 0.4, "y": -0.1},
@@ -113,31 +98,6 @@ def packaged_dataset(case: Case) -> Command:
     return Command(case.rng.choice(commands if case.honest else commands + more))
 
 
-@template
-def simulated(folder: Path) -> None:
-    """One short drive, after which the plant's kernels are loaded."""
-    write_yaml(folder / "conf" / "dataset" / "short.yaml", SHORT | {"drives": [LANE_CHANGE]})
-    run("simulate", "short", "--jobs", "1", "--quiet")
-
-
-@generator("simulated")
-def simulated_drive(case: Case) -> Command:
-    """A short drive that is simulated, with numbers far outside of what a car does."""
-    rng, lane_change = case.rng, "double_lane_change"
-    changes: list[dict[str, Any]] = [
-        {"id": rng.choice(WRITABLE_NAMES)},
-        {"manoeuvre": {"name": lane_change, rng.choice(["severity", "duration", "speed"]): rng.choice([-1, 0, 1e9, "a", None])}},
-        {"manoeuvre": {"name": "random_steer", "duration": rng.choice([1e9, 1e18, -1, 0, 1e-9])}},
-        {"manoeuvre": {"name": "laps", "course": rng.choice(["handling", *NAMES[:8]]), "duration": rng.choice([1e9, 0.001])}},
-        {"count": rng.choice([10**9, -1, 0, "a", 1.5])},
-        {},
-    ]
-    drive = LANE_CHANGE | ({} if case.honest else changes[case.visit % 6])
-    rate = {"rate_hz": rng.choice([1000, 1, 0.5, 1e9, "a"])} if case.idea(6) == 5 else {}
-    write_yaml(case.place / "conf" / "dataset" / "short.yaml", SHORT | rate | {"drives": [drive]})
-    return Command(("simulate", "short", "--jobs", "1"))
-
-
 @generator("drives", weight=6)
 def split(case: Case) -> Command:
     """Recordings, percentages, laps and folds; honest drives of half a minute have no laps."""
@@ -197,21 +157,19 @@ def root_file(case: Case) -> Command:
 def odd_files(case: Case) -> Command:
     """Names, links, pipes and sizes of files in ./conf."""
     case.copy("drives")
-    folder, mine, how = case.place / "conf" / "dataset", case.place / "conf" / "dataset" / "mine.yaml", case.idea(10)
-    names = [b"\xff\xfe", b"a\nb", b"\x1b[2J", b"a=b,c", b"-x", *(b"n%d" % k for k in range(3000 if how == 7 else 1))]
-    ideas = [
-        lambda: os.mkfifo(folder / "pipe.yaml"),
-        lambda: (folder / "zero.yaml").symlink_to("/dev/zero"),
-        lambda: (folder / "loop.yaml").symlink_to("loop.yaml"),
-        lambda: (folder / "folder.yaml").mkdir(),
-        lambda: (folder / "deeper").symlink_to(".."),
-        lambda: (folder / "empty.yaml").write_bytes(b""),
-        lambda: (folder / "big.yaml").write_bytes(b"# " + b"x" * 30_000_000),
-        *[lambda: [case.write(b"conf/dataset/" + name + b".yaml", "name: x\nsource: tabular\n") for name in names]] * 2,
-        lambda: (mine.unlink(), mine.mkdir()),
-    ]
-    if not case.honest:
-        ideas[how]()
+    file, how = case.place / "conf" / "dataset" / "odd.yaml", case.idea(6)
+    if how == 0:
+        os.mkfifo(file)
+    elif how in (1, 2):
+        file.symlink_to(("/dev/zero", "odd.yaml")[how - 1])
+    elif how == 3:
+        file.write_bytes(b"# " + b"x" * 30_000_000)
+    elif how == 4:
+        (case.place / "conf" / "dataset" / "mine.yaml").rename(file)
+        (case.place / "conf" / "dataset" / "mine.yaml").mkdir()
+    elif how == 5:
+        for name in (b"\xff\xfe", b"a\nb", b"\x1b[2J", b"a=b,c", b"-x", *(b"n%d" % k for k in range(1000))):
+            case.write(b"conf/dataset/" + name + b".yaml", "name: x\nsource: tabular\n")
     commands = [("data", "show", "mine"), ("ingest", "--help"), ("ingest", "nothing"), ("config", "ingest", "dataset=mine")]
     return Command(commands[0] if case.honest else case.rng.choice(commands))
 
@@ -233,14 +191,3 @@ def pipeline(case: Case) -> Command:
         tree = PIPELINE if case.honest else case.rng.choice(PIPELINES)
     _write(case, f"pipelines/{name}.yaml", tree)
     return Command(("run", name, "--dry-run", "tracking=none"))
-
-
-@generator("steered", weight=2)
-def cars_of_a_filter(case: Case) -> Command:
-    """Parameters of the car that a Kalman filter is told; it is fitted and written."""
-    case.copy("steered")
-    keys = ["mass", "yaw_inertia", "cg_to_front_axle", "cg_to_rear_axle", "cornering_stiffness_front", "cornering_stiffness_rear"]
-    keys = [*(f"car.{key}" for key in keys), "rate_hz", "minimum_speed", "initial_deviation", "noise.cutoff", "noise.ay"]
-    values = ("0", "-1", "1e-300", "1e300", "nan", "inf", "1e400", "null", "a", "true", "[1]", "{a: 1}", "1e18")
-    more = [f"estimator.{key}={case.rng.choice(values)}" for key in case.rng.sample(keys, case.rng.choice([1, 2]))]
-    return Command(("train", *KALMAN, *([] if case.honest else more)))
