@@ -477,6 +477,7 @@ def test_folds_of_recordings_and_of_seconds_leave_nothing_out(of: str) -> None:
             {"train": [], "validation": [], "tests": {}, "folds": {"number": 2}},
             "split.folds.number: input should be greater than or equal to 3, not 2",
         ),
+        ({"train": [], "validation": [], "tests": {}, "folds": {"number": 2}}, "number: input should be greater than or equal to 3, not 2"),
         ({"train": [], "validation": [], "tests": {}, "folds": {"number": 9}}, "do not fill 9 folds"),
         ({"train": [], "validation": [], "tests": {}, "folds": {"number": 3}, "fold": 3}, "fold 3 is not one of 0 to 2"),
         ({"train": [], "validation": [], "tests": {}, "folds": {"of": "corners"}}, "folds.of 'corners' is not one of"),

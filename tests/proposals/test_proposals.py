@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 import numpy as np
@@ -370,28 +371,44 @@ def test_whole_nanoseconds_since_1970_are_read(tmp_path) -> None:
     assert (clock.column, clock.unit) == ("stamp", "ns")
 
 
-def test_a_time_that_is_no_clock_is_said(tmp_path) -> None:
-    table = usual(drive()).sample(frac=1.0, random_state=0)
-    said = inspect("my_car", [write(tmp_path / "lap.csv", table)]).proposals.notes
-    assert any("'Time [s]' as the time: it goes backwards" in note and "sort the rows" in note for note in said)
+def standing() -> pd.DataFrame:
+    random, names = np.random.default_rng(0), ("Speed [km/h]", "Gyro [deg/s]", "LatAcc [m/s^2]")
+    return pd.DataFrame({"Time [s]": np.arange(3000) / 50.0} | {name: 0.02 * random.standard_normal(3000) for name in names})
 
 
-def test_a_column_without_a_name_is_said(tmp_path) -> None:
-    table = usual(drive()).rename(columns={"Beta": ""})
-    assert "not read: column 7 has no name" in inspect("my_car", [write(tmp_path / "lap.csv", table)]).proposals.notes
+def unrelated_pose() -> pd.DataFrame:
+    random = np.random.default_rng(0)
+    return (
+        usual(drive()).drop(columns="Beta").assign(**{f"pose_{name}": random.standard_normal(6000).cumsum() for name in ("x", "y", "yaw")})
+    )
+
+
+@pytest.mark.parametrize(
+    ("table", "said", "absent"),
+    [
+        (lambda: usual(drive()).sample(frac=1.0, random_state=0), r"'Time \[s\]' as the time: it goes backwards.*sort the rows", ""),
+        (lambda: usual(drive()).rename(columns={"Beta": ""}), "^not read: column 7 has no name$", "sideslip_ref"),
+        (
+            lambda: usual(drive()).assign(**{"roll (rad)": 0.9 + 0.02 * np.arange(6000) % 1.6}),
+            r"'roll \(rad\)' is named as roll.*left out",
+            "roll",
+        ),
+        (unrelated_pose, "no reference is made of 'pose_x', 'pose_y', 'pose_yaw'", "vy_ref"),
+        (standing, "stands all the time", ""),
+    ],
+    ids=["no clock", "no name", "impossible angle", "unrelated pose", "standing"],
+)
+def test_what_is_left_out_is_noted(tmp_path, table, said: str, absent: str) -> None:
+    proposals = inspect("my_car", [write(tmp_path / "lap.csv", table())]).proposals
+    assert any(re.search(said, note) for note in proposals.notes)
+    assert absent not in proposals.by_channel
+    assert not proposals.pose
 
 
 def test_without_lateral_acceleration_the_longitudinal_one_tells_the_unit_of_the_speed(tmp_path) -> None:
     found = proposed(write(tmp_path / "lap.csv", usual(drive()).drop(columns="LatAcc")))
     assert (found["vx"].column, found["vx"].unit) == ("Speed", "km/h")
     assert (found["ax"].column, found["ax"].unit) == ("LongAcc", "g")
-
-
-def test_an_angle_beyond_what_a_car_can_do_is_left_out_and_said(tmp_path) -> None:
-    table = usual(drive()).assign(**{"roll (rad)": 0.9 + 0.02 * np.arange(6000) % 1.6})
-    examined = inspect("my_car", [write(tmp_path / "lap.csv", table)])
-    assert "roll" not in examined.proposals.by_channel
-    assert any("'roll (rad)' is named as roll" in note and "left out" in note for note in examined.proposals.notes)
 
 
 def test_a_second_file_in_another_unit_is_told_of(tmp_path) -> None:
@@ -439,21 +456,6 @@ def test_samples_that_rows_repeat_are_told_of(tmp_path) -> None:
     remarks = draft(inspect("my_car", [write(tmp_path / "lap.csv", table)])).remarks
     assert any(one.startswith("yaw_rate: ") for one in remarks)
     assert not draft(inspect("my_car", [write(tmp_path / "plain.csv", usual(drive()))])).remarks
-
-
-def test_a_pose_that_does_not_follow_the_motion_is_told_of(tmp_path) -> None:
-    random = np.random.default_rng(0)
-    walk = {name: random.standard_normal(6000).cumsum() for name in ("pose_x", "pose_y", "pose_yaw")}
-    proposals = inspect("my_car", [write(tmp_path / "lap.csv", usual(drive()).drop(columns="Beta").assign(**walk))]).proposals
-    assert not proposals.pose
-    assert any("no reference is made of 'pose_x', 'pose_y', 'pose_yaw'" in note for note in proposals.notes)
-
-
-def test_a_car_that_stands_all_the_time_is_told_of(tmp_path) -> None:
-    random = np.random.default_rng(0)
-    names = ("Speed [km/h]", "Gyro [deg/s]", "LatAcc [m/s^2]")
-    table = pd.DataFrame({"Time [s]": np.arange(3000) / 50.0} | {name: 0.02 * random.standard_normal(3000) for name in names})
-    assert any("stands all the time" in note for note in inspect("my_car", [write(tmp_path / "lap.csv", table)]).proposals.notes)
 
 
 def test_a_few_rows_that_no_vehicle_drives_are_left_out_and_said(tmp_path) -> None:
