@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from functools import cache
 
 import numpy as np
 
@@ -58,6 +59,14 @@ def broadband_drive(
         lever: how far ahead of the reference the inertial unit sits [m].
         slow_yaw_rate: time constant of its low-pass [s].
     """
+    return _made(seconds, rate_hz, seed, tuple(sorted((late or {}).items())), lever, slow_yaw_rate, noise)
+
+
+@cache
+def _made(
+    seconds: float, rate_hz: float, seed: int, late: tuple[tuple[str, float], ...], lever: float, slow_yaw_rate: float, noise: float
+) -> Recording:
+    """Made once; recordings cannot be written to."""
     generator = np.random.default_rng(seed)
     turn, slide = Wave.random(generator, 0.3, 0.05, 4.0), Wave.random(generator, 0.25, 0.05, 4.0)
     speed = Wave.random(generator, 6.0, 0.01, 1.5, level=20.0, corner=0.15)
@@ -80,7 +89,7 @@ def broadband_drive(
     }
     channels = {}
     for name, quantity in exact.items():
-        samples = quantity(clock - (late or {}).get(name, 0.0))
+        samples = quantity(clock - dict(late).get(name, 0.0))
         channels[name] = samples + noise * NOISE.get(name, 0.0) * generator.standard_normal(len(clock))
     return Recording("broadband", "car", rate_hz, 5.0, channels)
 

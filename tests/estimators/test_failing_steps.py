@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from functools import cache
 from itertools import product
 
 import numpy as np
@@ -31,10 +32,13 @@ FITTED = ("kinematic", "static_map", "luenberger")  # in a moment
 OTHERS = [name for name in estimator_names() if name not in (*FILTERS, "ensemble_ukf")]  # whose stepper is that of cnn_ukf
 
 
+known = cache(fitted)
+
+
 def ready(name: str) -> Estimator:
     """As it starts to learn, where that runs already."""
     if name in FITTED:
-        return fitted(name)
+        return known(name)
     made = filter_of(name, 5.0) if name in FILTERS else estimator_class(name).from_config(SETTINGS.get(name, {}))
     made.seed(0)
     return made

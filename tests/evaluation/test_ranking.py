@@ -133,10 +133,10 @@ def test_a_clear_winner_is_named():
 def test_equals_are_not_told_apart_and_no_winner_is_named():
     wrongly = 0
     generator = np.random.default_rng(4)
-    for _ in range(20):
+    for _ in range(10):
         found = rank(candidates(generator, a=0.2, b=0.2, c=0.2, zero=2.0, static_map=1.0), RATE)
         wrongly += found.winner is not None
-    assert wrongly <= 2
+    assert wrongly <= 1
 
 
 def test_whoever_does_not_beat_the_static_map_is_no_winner():

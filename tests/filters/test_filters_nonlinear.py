@@ -8,7 +8,6 @@ import pytest
 import torch
 from readable_filters import (
     NonlinearModel,
-    covariance_of,
     extended_filter,
     factorised,
     mean_of,
@@ -75,19 +74,6 @@ def measured_pendulum(steps: int = 40, sequences: int = 1, seed: int = 1) -> tup
 
 
 # Sigma points
-
-
-@pytest.mark.parametrize("name", RULES)
-def test_sigma_points_have_the_mean_and_covariance_they_stand_for(name):
-    generator = torch.Generator().manual_seed(0)
-    root = torch.randn(4, 3, 3, generator=generator, dtype=torch.float64)
-    covariance = root @ root.mT + 0.1 * torch.eye(3, dtype=torch.float64)
-    mean = torch.randn(4, 3, generator=generator, dtype=torch.float64)
-    rule = RULES[name]
-    points = sigma_points(rule, mean, torch.linalg.cholesky(covariance))
-    deviations = points - mean.unsqueeze(-2)
-    assert torch.allclose(mean_of(rule, points), mean, atol=1e-12)
-    assert torch.allclose(covariance_of(rule, deviations, deviations), covariance, atol=1e-12)
 
 
 def test_kappa_of_the_learned_dynamics_paper_meets_the_fourth_moments_of_a_normal_distribution():
@@ -196,67 +182,6 @@ def test_extended_filter_is_that_of_an_independent_library():
         assert ours.filtered.covariance[k].numpy() == pytest.approx(theirs.P, abs=1e-8)
 
 
-def test_gradients_are_those_of_finite_differences():
-    measurements, inputs, initial = measured_pendulum(steps=6, sequences=2)
-    measurements[0, 2, 1] = measurements[1, 4] = torch.nan
-    base = pendulum_with_radar()
-
-    def loss(mean, spread, process_root, gain):
-        model = NonlinearModel(
-            lambda x, u: base.transition(x, gain * u),
-            base.observation,
-            constant(process_root @ process_root.mT + 1e-4 * torch.eye(3, dtype=torch.float64)),
-            base.observation_noise,
-        )
-        first = Gaussian(mean, torch.diag(spread))
-        steps = unscented_filter(model, measurements, inputs, first, scaled_rule(3, 0.7)).steps
-        return steps.filtered.mean.square().sum() + steps.log_likelihood.sum()
-
-    generator = torch.Generator().manual_seed(3)
-    root = 0.1 * torch.randn(3, 3, generator=generator, dtype=torch.float64)
-    wanted = (initial.mean, initial.covariance.diagonal(), root, torch.tensor(1.1, dtype=torch.float64))
-    assert torch.autograd.gradcheck(loss, tuple(value.clone().requires_grad_() for value in wanted), atol=1e-6, rtol=1e-4)
-
-
-def test_sequences_of_a_batch_do_not_know_each_other():
-    measurements, inputs, initial = measured_pendulum(sequences=3)
-    together = unscented_filter(pendulum_with_radar(), measurements, inputs, initial, cubature_rule(3)).steps
-    for position in range(3):
-        alone = unscented_filter(pendulum_with_radar(), measurements[position], inputs[position], initial, cubature_rule(3)).steps
-        assert torch.allclose(together.filtered.mean[position], alone.filtered.mean, atol=1e-12)
-
-
-def test_where_nothing_is_measured_the_prediction_stands():
-    measurements, inputs, initial = measured_pendulum()
-    measurements[:, 10:15] = torch.nan
-    steps = unscented_filter(pendulum_with_radar(), measurements, inputs, initial, cubature_rule(3)).steps
-    assert torch.equal(steps.filtered.mean[:, 10:15], steps.predicted.mean[:, 10:15])
-    assert torch.allclose(steps.filtered.covariance[:, 10:15], steps.predicted.covariance[:, 10:15], rtol=1e-12)
-    assert (steps.log_likelihood[:, 10:15] == 0).all()
-    assert (steps.innovation[:, 10:15] == 0).all()
-
-
-def test_constrained_states_stay_where_they_may_be():
-    """Without damping in the data, the estimate of the damping goes below zero unless it is kept."""
-    measurements, inputs, initial = measured_pendulum(steps=80)
-    generator = torch.Generator().manual_seed(5)
-    measurements = measurements + 0.3 * torch.randn(measurements.shape, generator=generator, dtype=torch.float64)
-    free = pendulum_with_radar()
-    kept = NonlinearModel(
-        free.transition,
-        free.observation,
-        free.process_noise,
-        free.observation_noise,
-        lambda x: torch.cat([x[..., :2], x[..., 2:].clamp(min=0.19)], -1),
-    )
-    damping = []
-    for model in (free, kept):
-        steps = unscented_filter(model, measurements, inputs, initial, cubature_rule(3)).steps
-        damping.append(float(steps.filtered.mean[..., 2].min()))
-    assert damping[0] < 0.19
-    assert damping[1] >= 0.19
-
-
 # Definiteness
 
 
@@ -272,19 +197,6 @@ def test_a_covariance_that_is_not_definite_is_lifted_just_enough():
     assert torch.allclose(repaired.factor @ repaired.factor.mT, repaired.covariance, atol=1e-12)
 
 
-def test_a_covariance_that_is_not_finite_stays_nan_and_harms_no_other():
-    covariance = torch.eye(2, dtype=torch.float64).repeat(3, 1, 1)
-    covariance[1, 0, 1] = torch.nan
-    covariance[2, 1, 1] = torch.inf
-    covariance.requires_grad_()
-    factor = factorised(covariance)
-    assert torch.isfinite(factor.factor[0]).all()
-    assert torch.isnan(factor.factor[1:]).all()
-    assert not factor.repaired.any(), "what is not finite cannot be repaired, and is not counted as if it had been"
-    factor.factor[0].sum().backward()
-    assert torch.isfinite(covariance.grad).all()
-
-
 def sharp() -> NonlinearModel:
     """A model whose curvature makes a negative centre weight lose the covariance's definiteness."""
     return NonlinearModel(
@@ -293,29 +205,3 @@ def sharp() -> NonlinearModel:
         constant(1e-6 * torch.eye(5, dtype=torch.float64)),
         constant(1e-2 * torch.eye(2, dtype=torch.float64)),
     )
-
-
-def test_lost_definiteness_is_repaired_and_counted():
-    generator = torch.Generator().manual_seed(2)
-    measurements = 0.1 * torch.randn(2, 20, 2, generator=generator, dtype=torch.float64)
-    inputs = torch.zeros(2, 20, 1, dtype=torch.float64)
-    spreads = torch.tensor([1.0, 1e-3], dtype=torch.float64)[:, None, None] * torch.eye(5, dtype=torch.float64)
-    initial = Gaussian(torch.zeros(2, 5, dtype=torch.float64), spreads)
-    rule = symmetric_rule(5, -2.0)
-    repaired = unscented_filter(sharp(), measurements, inputs, initial, rule)
-    assert repaired.repaired[0].any()
-    assert not repaired.repaired[1].any(), "the other sequence is tame"
-    assert torch.isfinite(repaired.steps.filtered.mean).all()
-    assert (torch.linalg.eigvalsh(repaired.steps.innovation_covariance) > 0).all()
-
-
-def test_gradients_pass_a_repair():
-    generator = torch.Generator().manual_seed(2)
-    measurements = 0.1 * torch.randn(1, 20, 2, generator=generator, dtype=torch.float64)
-    start = torch.zeros(1, 5, dtype=torch.float64, requires_grad=True)
-    initial = Gaussian(start, torch.eye(5, dtype=torch.float64))
-    outcome = unscented_filter(sharp(), measurements, torch.zeros(1, 20, 1, dtype=torch.float64), initial, symmetric_rule(5, -2.0))
-    assert outcome.repaired.any()
-    outcome.steps.filtered.mean.square().sum().backward()
-    assert torch.isfinite(start.grad).all()
-    assert start.grad.abs().sum() > 0

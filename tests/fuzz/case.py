@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib
+import os
 import pkgutil
 import random
 import shutil
@@ -14,6 +15,8 @@ import numpy as np
 
 CANARY = "EXECUTED"
 """Name of the file that every payload tries to make."""
+PLANTED = "planted"
+"""Family of the commands that misbehave on purpose."""
 
 # so deep that some steps upwards still end inside the case's own folder, where they are noticed
 _DEPTH = ("up", "up", "up", "place")
@@ -26,14 +29,14 @@ class Command:
     Args:
         argv: words after ``vehest``, as the operating system would hand them over (bytes where they are no UTF-8).
         targets: files and folders, beside the output root, that the command may write, relative to the place.
-        environment: variables to set (None: to remove).
+        environment: variables to set.
         stdout: where standard output goes to instead of a file, for example ``/dev/full``.
         unprivileged: whether it runs as a user without rights, so that permissions matter.
     """
 
     argv: tuple[str | bytes, ...]
-    targets: tuple[str, ...] = ()
-    environment: Mapping[str, str | None] = field(default_factory=dict)
+    targets: tuple[str, ...] = ("out.csv",)
+    environment: Mapping[str, str] = field(default_factory=dict)
     stdout: str | None = None
     unprivileged: bool = False
 
@@ -69,28 +72,25 @@ class Case:
         return np.random.default_rng(self.rng.getrandbits(63))
 
     def copy(self, template: str, to: str = ".") -> Path:
-        """Copy a template's folder or file into the place, and say where."""
-        source, target = self.templates / template, self.place / to
-        if source.is_dir():
-            shutil.copytree(source, target, symlinks=True, dirs_exist_ok=True)
-            return target
-        target.parent.mkdir(parents=True, exist_ok=True)
-        target = target / source.name if target.is_dir() else target
-        shutil.copy2(source, target)
-        return target
+        """Copy a template's folder into the place, and say where."""
+        return Path(shutil.copytree(self.templates / template, self.place / to, symlinks=True, dirs_exist_ok=True))
 
     def write(self, name: str | bytes, content: bytes | str) -> Path:
         """Write a file into the place."""
-        import os
-
         path = self.place / os.fsdecode(name)
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_bytes(content if isinstance(content, bytes) else content.encode("utf-8", "surrogatepass"))
         return path
 
-    def idea(self, *ideas: object) -> object:
-        """One of several ideas: all of them in turn, visit after visit."""
-        return ideas[self.visit % len(ideas)]
+    def spoil(self, file: Path, spoil: Callable[[bytes, random.Random], bytes]) -> bool:
+        """Replace the content of a file by what ``spoil`` makes of it, unless the case is honest; returns whether that was done."""
+        if not self.honest:
+            file.write_bytes(spoil(file.read_bytes(), self.rng))
+        return not self.honest
+
+    def idea(self, number: int) -> int:
+        """One of several ideas: all of them in turn, visit after visit; -1 in an honest case."""
+        return -1 if self.honest else self.visit % number
 
 
 Build = Callable[[Case], Command]
@@ -105,8 +105,7 @@ class Generator:
         name: of the function.
         build: writes the files of a case and returns the command.
         needs: names of templates.
-        weight: how often it is taken, beside 1.
-        has_honest: whether there is an honest variant at all.
+        weight: how often it is taken in a round.
     """
 
     family: str
@@ -114,19 +113,17 @@ class Generator:
     build: Build
     needs: tuple[str, ...]
     weight: int
-    has_honest: bool
 
 
 GENERATORS: list[Generator] = []
 TEMPLATES: dict[str, Callable[[Path], None]] = {}
 
 
-def generator(*needs: str, weight: int = 1, has_honest: bool = True) -> Callable[[Build], Build]:
+def generator(*needs: str, weight: int = 1) -> Callable[[Build], Build]:
     """Register a generator with the templates that it copies from."""
 
     def register(build: Build) -> Build:
-        family = build.__module__.rpartition(".")[2]
-        GENERATORS.append(Generator(family, build.__name__, build, needs, weight, has_honest))
+        GENERATORS.append(Generator(build.__module__.rpartition(".")[2], build.__name__, build, needs, weight))
         return build
 
     return register
@@ -148,10 +145,9 @@ def load_families() -> None:
 
 def schedule(chosen: list[Generator]) -> list[Generator]:
     """The generators in the order in which they take turns; heavier ones come more than once a round."""
-    rounds = [one for turn in range(max(one.weight for one in chosen)) for one in chosen if one.weight > turn]
-    return rounds
+    return [one for turn in range(max(one.weight for one in chosen)) for one in chosen if one.weight > turn]
 
 
 def is_honest(one: Generator, position: int, visit: int) -> bool:
     """Whether a visit makes the honest variant: the first visits of an eighth of the generators, then each in its turn."""
-    return one.has_honest and (visit + position) % 8 == 0
+    return one.family != PLANTED and (visit + position) % 8 == 0

@@ -1,9 +1,13 @@
-"""Honest files, made once by vehest's own commands and by the writers that the tests use; generators copy and spoil them."""
+"""Imports made beforehand, and honest files made once by vehest's own commands; generators copy and spoil these."""
 
 from __future__ import annotations
 
+import encodings
+import importlib
 import os
+import pkgutil
 import sys
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +17,7 @@ import yaml
 
 from conftest import planar_drive
 from fuzz.case import Case, template
-from place import DATASET, STEERED
+from place import DATASET, STEERED, write_csv
 from single_track_drive import linear_drive
 from vehest.cli import main
 
@@ -47,21 +51,6 @@ LUENBERGER = (
 )
 STEERED_SPLIT = SPLIT | {"name": "steered", "dataset": "steered"}
 KALMAN = ("estimator=kalman", "estimator.rate_hz=50", "split=steered", "tracking=none")
-
-
-def table(seed: int, seconds: float = SECONDS, rate_hz: float = RATE_HZ) -> pd.DataFrame:
-    """A drive with columns of names and units of its own, as conf/dataset/mine.yaml describes them."""
-    drive = planar_drive(seconds, rate_hz, seed=seed, noise=0.02)
-    return pd.DataFrame(
-        {
-            "Time": drive.time,
-            "Speed": drive["vx"] * 3.6,
-            "Yaw": np.degrees(drive["yaw_rate"]),
-            "LatAcc": -drive["ay"],
-            "LongAcc": drive["ax"],
-            "Vy": drive["vy_ref"],
-        }
-    )
 
 
 def lap(seed: int = 9, seconds: float = SECONDS, rate_hz: float = RATE_HZ) -> pd.DataFrame:
@@ -100,9 +89,8 @@ def drives(folder: Path) -> None:
     """Three tables of a car, with its data set, split and pipeline; a lap with columns called like channels."""
     (folder / "raw").mkdir()
     for seed, name in enumerate(("one", "two", "three"), start=1):
-        table(seed).to_csv(folder / "raw" / f"{name}.csv", index=False)
+        write_csv(folder / "raw" / f"{name}.csv", seed, SECONDS)
     lap().to_csv(folder / "lap.csv", index=False)
-    lap().to_parquet(folder / "lap.parquet")
     write_yaml(folder / "conf" / "dataset" / "mine.yaml", DATASET)
     write_yaml(folder / "conf" / "split" / "mine.yaml", SPLIT)
     write_yaml(folder / "pipelines" / "small.yaml", PIPELINE)
@@ -133,6 +121,7 @@ def warm_up(folder: Path) -> None:
     """Run what commands have in common once in this process: kernels are loaded, plugins of Hydra found, first imports done."""
     drives(folder)
     steered(folder)
+    lap().to_parquet(folder / "lap.parquet")
     run("estimate", "lap.csv", "-o", "out.parquet")
     run("estimate", "lap.parquet", "-o", "out.csv")
     for command in ("check", "show", "align"):
@@ -147,3 +136,65 @@ def warm_up(folder: Path) -> None:
 def models_in(case: Case) -> list[Path]:
     """Model folders of the copied study."""
     return sorted((case.place / "outputs" / "train").iterdir())
+
+
+# Libraries that are imported piece by piece while they work, and what they import then.
+PIECES = (
+    "asammdf",
+    "asammdf.blocks",
+    "rosbags.rosbag2",
+    "rosbags.typesys",
+    "mlflow",
+    "optuna",
+    "can.interfaces.virtual",
+    "can.io.asc",
+    "can.io.blf",
+    "can.io.canutils",
+    "cantools.database",
+    "torch",
+    "pooch",
+    "requests",
+    "netrc",
+    "pydantic._internal._serializers",
+)
+PACKAGES = ("typer", "rich")
+
+
+def import_everything() -> None:
+    """Import all of vehest, the libraries that it loads when it needs them, and every text encoding."""
+    import vehest
+    import vehest_papers
+
+    for module in (*pkgutil.walk_packages(vehest.__path__, "vehest."), *pkgutil.walk_packages(vehest_papers.__path__, "vehest_papers.")):
+        if module.name != "vehest.__main__":
+            importlib.import_module(module.name)
+    for name in PIECES:
+        importlib.import_module(name)
+    for name in PACKAGES:
+        for module in pkgutil.walk_packages(importlib.import_module(name).__path__, f"{name}."):
+            if not module.name.endswith("__main__"):
+                with suppress(ImportError, AssertionError):  # of what is not installed, or made for another system
+                    importlib.import_module(module.name)
+    for module in pkgutil.iter_modules(encodings.__path__):
+        if module.name not in ("mbcs", "oem", "cp65001"):
+            importlib.import_module(f"encodings.{module.name}")
+    from vehest.run.artefacts import commit
+
+    commit()
+    load_kernels()
+
+
+def load_kernels() -> None:
+    """Load what every estimate runs from the compile cache, which is unpickled: later that means that an input asked for it."""
+    import vehest
+
+    time = np.arange(1200) / 20.0
+    yaw_rate = 0.3 * np.sin(0.7 * time) + 0.05 * np.sin(2.9 * time)
+    vy, vx = -2.0 * yaw_rate, 20.0 + np.sin(0.2 * time)
+    channels = {"yaw_rate": yaw_rate, "vx": vx, "ay": np.gradient(vy, time) + vx * yaw_rate, "vy_ref": vy}
+    drive = vehest.Recording("drive", "car", 20.0, 0.0, channels, "simulated")
+    for drives in ([drive], []):
+        vehest.estimate(vehest.train("zero", drives, drives), drive.without_references())
+    stepper = vehest.online(vehest.load_model(), 100.0)
+    for _ in range(400):
+        stepper.step({"vx": 20.0, "yaw_rate": 0.0, "ay": 0.0, "ax": 0.0})

@@ -19,18 +19,17 @@ import time
 import traceback
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import asdict, dataclass, fields
+from dataclasses import astuple, dataclass, fields
 from pathlib import Path
 from typing import Any
 
-from fuzz.case import GENERATORS, TEMPLATES, Case, Command, Generator, is_honest, load_families, schedule
+from fuzz.case import GENERATORS, PLANTED, TEMPLATES, Case, Command, Generator, is_honest, load_families, schedule
 from fuzz.verdicts import Outcome, differences, judge, last_line, refusal_lines, snapshot
 from fuzz.watched import READER, become
 from vehest.data.errors import printable
 
 MOST_WALL_SECONDS = 180.0
 POLL_SECONDS = 0.02
-PLANTED = "planted"
 
 
 @dataclass(frozen=True)
@@ -57,28 +56,17 @@ class Fuzzer:
     Args:
         folder: to work in; templates and cases go there.
         seed: of all inputs.
-        families: names of those to use; all if there are none.
-        generators: names of those to use; all if there are none.
+        families: names of those to use; all but the planted ones if there are none.
         keep: whether the cases' folders stay.
         seconds: that a command may take.
     """
 
-    def __init__(
-        self,
-        folder: Path,
-        seed: int,
-        families: Sequence[str] = (),
-        generators: Sequence[str] = (),
-        *,
-        keep: bool = False,
-        seconds: float = 20.0,
-    ) -> None:
+    def __init__(self, folder: Path, seed: int, families: Sequence[str] = (), *, keep: bool = False, seconds: float = 20.0) -> None:
         self.folder, self.seed, self.keep, self.seconds = folder.resolve(), seed, keep, seconds
         load_families()
-        wanted = families or sorted({one.family for one in GENERATORS} - {PLANTED})
-        chosen = [one for one in GENERATORS if one.family in wanted and (not generators or one.name in generators)]
+        chosen = [one for one in GENERATORS if (one.family in families if families else one.family != PLANTED)]
         if not chosen:
-            raise SystemExit("no generator has such a name")
+            raise SystemExit("no family has such a name")
         self.turns = schedule(chosen)
 
     def prepare(self) -> None:
@@ -86,9 +74,9 @@ class Fuzzer:
         self.folder.chmod(0o711)  # for commands that run as a user without rights
         if all(one.family == PLANTED for one in self.turns):
             return
-        from fuzz import honest, warming
+        from fuzz import honest
 
-        warming.import_everything()
+        honest.import_everything()
         first = self.folder / "templates" / "first"
         first.mkdir(parents=True)
         with _quiet(first):
@@ -145,20 +133,9 @@ class Fuzzer:
         if not self.keep:
             _remove(case.folder)
         error = last_line("\n".join(refusal_lines(outcome.stderr)))
-        return Row(
-            index,
-            one.family,
-            one.name,
-            honest,
-            _shown(command, case),
-            outcome.exit_code,
-            round(outcome.seconds, 3),
-            round(outcome.cpu_seconds, 3),
-            round(outcome.peak_mb, 1),
-            _line(error.replace(str(case.folder), "…")),
-            verdict,
-            _line(detail.replace(str(case.folder), "…")),
-        )
+        shown, took = _shown(command, case), (outcome.exit_code, outcome.seconds, outcome.cpu_seconds, outcome.peak_mb)
+        said = (printable(text.replace(str(case.folder), "…"))[:200] for text in (error, verdict, detail))
+        return Row(index, one.family, one.name, honest, shown, *(round(number, 3) for number in took), *said)
 
     def case_of(self, index: int, visit: int, honest: bool) -> Case:
         """An empty folder for an input; what is drawn depends on seed and index alone."""
@@ -296,10 +273,6 @@ def _shown(command: Command, case: Case) -> str:
     return printable(" ".join(shlex.quote(word) for word in cut))[:600]
 
 
-def _line(text: str) -> str:
-    return printable(text)[:200]
-
-
 @contextlib.contextmanager
 def _quiet(folder: Path) -> Iterator[None]:
     """Work in a folder, with what is printed kept back."""
@@ -320,10 +293,9 @@ def write_rows(rows: Sequence[Row], path: Path) -> None:
     """Rows as CSV, in the order of their index."""
     path.parent.mkdir(parents=True, exist_ok=True)
     with open(path, "w", newline="", encoding="utf-8") as stream:
-        writer = csv.DictWriter(stream, [field.name for field in fields(Row)], lineterminator="\n")
-        writer.writeheader()
-        for row in sorted(rows, key=lambda one: one.index):
-            writer.writerow(asdict(row))
+        writer = csv.writer(stream, lineterminator="\n")
+        writer.writerow(field.name for field in fields(Row))
+        writer.writerows(astuple(row) for row in sorted(rows, key=lambda one: one.index))
 
 
 def described(row: Row) -> str:
@@ -337,13 +309,10 @@ def described(row: Row) -> str:
 
 def summary(rows: Sequence[Row]) -> str:
     """A line a family: how many inputs, how many honest ones, and how they ended."""
-    verdicts = [verdict for verdict, _ in Counter(row.verdict for row in rows).most_common()]
-    lines = [["family", "inputs", "honest", "done", *verdicts]]
-    for family in [*sorted({row.family for row in rows}), ""]:
-        own = [row for row in rows if not family or row.family == family]
-        counted = [sum(row.verdict == verdict for row in own) for verdict in verdicts]
-        lines.append(
-            [family or "all", *map(str, (len(own), sum(row.honest for row in own), sum(row.exit_code == 0 for row in own), *counted))]
-        )
-    widths = [max(len(line[column]) for line in lines) for column in range(len(lines[0]))]
-    return "\n".join("  ".join(cell.ljust(width) for cell, width in zip(line, widths, strict=True)).rstrip() for line in lines)
+    lines = []
+    for family in [*sorted({row.family for row in rows}), "all"]:
+        own = [row for row in rows if family in (row.family, "all")]
+        ended = ", ".join(f"{number} {verdict}" for verdict, number in Counter(row.verdict for row in own).most_common())
+        honest, done = sum(row.honest for row in own), sum(row.exit_code == 0 for row in own)
+        lines.append(f"{family:<14} {len(own):>5} inputs, {honest:>4} honest, {done:>4} done: {ended}")
+    return "\n".join(lines)

@@ -8,6 +8,7 @@ slip (0.32 m, tracks of 1.35 m), heading by integration, gear, temperatures.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +23,7 @@ UNIX = 1_393_000_000.0
 Columns = dict[str, np.ndarray]
 
 
+@cache
 def ferrari(data: Path, step: int = 1) -> Columns:
     """150 to 450 s of the drive in SI units and ISO 8855 axes, every ``step``-th sample, (T,) each."""
     names = {"t": "t", "vx": "vx", "vy": "vy", "r": "yawRate", "ax": "axCG", "ay": "ayCG", "delta": "delta", "beta": "beta_true"}
@@ -31,6 +33,7 @@ def ferrari(data: Path, step: int = 1) -> Columns:
     return {**drive, "t": drive["t"] - drive["t"][0]}
 
 
+@cache
 def f1tenth(data: Path, run: int, rate_hz: float = 100.0) -> Columns:
     """One run in SI units and ISO 8855 axes, by straight lines where another rate is wanted, (T,) each."""
     table = pd.read_csv(data / RUNS)

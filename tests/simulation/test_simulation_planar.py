@@ -315,12 +315,9 @@ def test_every_value_says_where_it_comes_from_or_that_it_is_assumed() -> None:
     ("changes", "complaint"),
     [
         ({"colour": "red"}, "unknown key 'colour'"),
-        ({"parameters": 3}, "parameters must be a mapping"),
         ({"parameters": {**CONFIGURATION["parameters"], "height": 1.0}}, "unknown key 'height'"),
         ({"parameters": {"mass": 5.0}}, "is missing"),
         ({"parameters": {**CONFIGURATION["parameters"], "mass": -1.0}}, "mass: .* greater than 0, not -1"),
-        ({"parameters": {**CONFIGURATION["parameters"], "air_drag": -1.0}}, "air_drag: .* greater than or equal to 0"),
-        ({"parameters": {**CONFIGURATION["parameters"], "mass": "heavy"}}, "mass must be a number"),
         ({"parameters": {**CONFIGURATION["parameters"], "shape_factor": 3.0}}, "shape_factor: .* less than or equal to 2"),
     ],
 )

@@ -35,7 +35,7 @@ from vehest.simulation.plant.parameters import (
     rear_tyre,
     vehicle_from_configuration,
 )
-from vehest.simulation.plant.regimes import FIRST_WHEEL, ROLL, STEER, VX, VY, YAW_RATE, Regime
+from vehest.simulation.plant.regimes import FIRST_WHEEL, ROLL, VX, VY, YAW_RATE, Regime
 
 CONFIGURATIONS = Path(__file__).parents[2] / "conf" / "vehicle"
 
@@ -486,12 +486,6 @@ def test_start_that_makes_no_sense_is_refused() -> None:
 # --- repeatability
 
 
-def test_same_inputs_give_the_same_states_bit_by_bit() -> None:
-    plant = MultiBodyPlant(FERRARI)
-    first, again = (drive(plant, plant.initial_state(0.0, 0.0, 0.0, 25.0), lane_change, 3.0)[1][-1] for _ in range(2))
-    assert first.values.tobytes() == again.values.tobytes()
-
-
 def test_first_call_waits_for_another_process_that_compiles(monkeypatch: pytest.MonkeyPatch) -> None:
     function, called = compiled._Kept(compiled._advance), Event()
     assert function.lock is not None
@@ -516,12 +510,3 @@ def test_no_kind_of_array_is_compiled_for_twice() -> None:
             plant.motion([state] * 3, inputs, 100.0, friction=friction)
         plant.advance(state, inputs[0], 1)
     assert [len(function.dispatcher.signatures) for function in (compiled.advance, compiled.evaluate)] == [1, 1]
-
-
-def test_state_shows_what_a_driver_sees() -> None:
-    plant = MultiBodyPlant(FERRARI)
-    state = plant.advance(plant.initial_state(1.0, 2.0, 0.1, 20.0), inputs_of(0.1), 300)
-    assert (state.x, state.y, state.yaw) == (state.values[0], state.values[1], state.values[4])
-    assert (state.vx, state.vy, state.yaw_rate, state.steer) == tuple(state.values[[VX, VY, YAW_RATE, STEER]])
-    assert state.regime is Regime.ROLLING
-    assert not state.stands

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 from dataclasses import asdict, fields, replace
 from pathlib import Path
@@ -146,14 +145,6 @@ def test_vibration_grows_with_the_wheels_speed_and_moves_nothing_else() -> None:
     np.testing.assert_array_equal(louder["ax"], shaken["ax"])
 
 
-@pytest.mark.parametrize("preset", list(PRESETS))
-def test_presets_make_a_recording_whose_provenance_is_json(preset: str) -> None:
-    levels = PRESETS[preset]
-    recording = Recording("drive", "car", 100.0, 0.0, measure(weaving(), levels, seed=1), "simulated")
-    assert len(recording) == 2000
-    assert json.loads(json.dumps(asdict(levels)))["reference"]["kind"] == levels.reference.kind
-
-
 def test_a_single_sample_is_measured_too() -> None:
     levels = replace(SensorLevels(), imu=Mounting(lever_x=0.5), reference=PRESETS["race"].reference)
     assert all(np.isfinite(samples).all() and samples.shape == (1,) for samples in measure(motion_of(1, vx=20.0), levels, 0).values())
@@ -235,23 +226,11 @@ def test_delay_holds_the_start_and_takes_whole_samples_as_they_are() -> None:
 # --- gravity and mounting
 
 
-@pytest.mark.parametrize("angle", ["roll", "bank"])
-def test_gravity_of_roll_and_bank_leaks_into_ay_at_rest(angle: str) -> None:
+@pytest.mark.parametrize(("angle", "ax", "ay"), [("roll", 0, 1), ("bank", 0, 1), ("pitch", -1, 0), ("grade", -1, 0)])
+def test_gravity_leaks_in_at_rest_with_the_left_side_up_or_the_nose_down(angle: str, ax: int, ay: int) -> None:
     shown = measure(motion_of(3, **{angle: 0.05}), only(tilt=Tilt()), seed=0)
-    np.testing.assert_allclose(shown["ay"], G * math.sin(0.05), rtol=1e-12)  # left side up
-    np.testing.assert_allclose(shown["ax"], 0.0, atol=1e-12)
-
-
-@pytest.mark.parametrize("angle", ["pitch", "grade"])
-def test_gravity_of_pitch_and_grade_leaks_into_ax_at_rest(angle: str) -> None:
-    shown = measure(motion_of(3, **{angle: 0.02}), only(tilt=Tilt()), seed=0)
-    np.testing.assert_allclose(shown["ax"], -G * math.sin(0.02), rtol=1e-12)  # nose down
-    np.testing.assert_allclose(shown["ay"], 0.0, atol=1e-12)
-
-
-def test_roll_adds_to_bank_and_pitch_to_grade() -> None:
-    assert specific_force(motion_of(1, roll=0.05, bank=0.03))[1, 0] == pytest.approx(G * math.sin(0.08))
-    assert specific_force(motion_of(1, pitch=0.05, grade=0.03))[0, 0] == pytest.approx(-G * math.sin(0.08))
+    np.testing.assert_allclose(shown["ax"], ax * G * math.sin(0.05), rtol=1e-12, atol=1e-12)
+    np.testing.assert_allclose(shown["ay"], ay * G * math.sin(0.05), rtol=1e-12, atol=1e-12)
 
 
 def test_specific_force_is_the_acceleration_less_gravity_in_turned_axes() -> None:
@@ -291,13 +270,6 @@ def test_accelerometer_away_from_the_axis_of_a_turntable() -> None:
     shown = measure(motion_of(200, yaw_rate=0.5 * t), only(imu=Mounting(lever_x=1.2, lever_y=-0.4)), seed=0)
     np.testing.assert_allclose(shown["ax"], 0.5 * 0.4 - (0.5 * t) ** 2 * 1.2, atol=1e-12)
     np.testing.assert_allclose(shown["ay"], 0.5 * 1.2 + (0.5 * t) ** 2 * 0.4, atol=1e-12)
-
-
-def test_accelerometer_above_the_roll_axis_feels_the_roll_acceleration() -> None:
-    t = np.arange(200) / 100.0
-    shown = measure(motion_of(200, roll_rate=0.3 * t), only(imu=Mounting(lever_z=0.5)), seed=0)
-    np.testing.assert_allclose(shown["ay"], -0.3 * 0.5, atol=1e-12)
-    np.testing.assert_allclose(shown["ax"], 0.0, atol=1e-12)
 
 
 def test_accelerometer_on_a_swinging_arm_feels_the_second_derivative_of_its_place() -> None:
@@ -467,14 +439,11 @@ def test_a_longer_drive_begins_with_the_same_errors() -> None:
     ("spelt", "meant"),
     [
         ("", SensorLevels()),
-        ("default", SensorLevels()),
         ("race", PRESETS["race"]),
         ("ideal", ideal_sensors()),
-        ("{preset: race}", PRESETS["race"]),
         ("{ay: {noise: 0}}", replace(SensorLevels(), ay=replace(SensorLevels().ay, noise=0.0))),
         ("{preset: race, ay: {noise: 0}}", switched_off(PRESETS["race"], "ay.noise")),
         ("{preset: ideal, ay: {noise: 1, drift: 0.5, drift_time: 20}}", only(ay=SensorLevel(noise=1.0, drift=0.5, drift_time=20.0))),
-        ("{steer: off}", switched_off(SensorLevels(), "steer")),
         ("{steer: 'off'}", switched_off(SensorLevels(), "steer")),
         ("{tilt: off}", switched_off(SensorLevels(), "tilt")),
         ("{tilt: {bank: off, roll: 'on'}}", switched_off(SensorLevels(), "tilt.bank")),
@@ -483,7 +452,6 @@ def test_a_longer_drive_begins_with_the_same_errors() -> None:
         ("{reference: off}", replace(SensorLevels(), reference=Reference())),
         ("{reference: {vy: {noise: 0}}}", switched_off(SensorLevels(), "reference.vy.noise")),
         ("{switched_off: [ay.noise, '*.drift']}", switched_off(SensorLevels(), "ay.noise", "*.drift")),
-        ("{switched_off: ay}", switched_off(SensorLevels(), "ay")),
     ],
 )
 def test_configurations_mean_what_they_say(spelt: str, meant: SensorLevels) -> None:
@@ -502,22 +470,16 @@ def test_reference_kinds_are_different() -> None:
     [
         ("perfect", "sensors 'perfect' is not one of: default, race, ideal"),
         ("[race]", "sensors is the name of a preset"),
-        ("{preset: perfect}", "sensors 'perfect' is not one of"),
         ("{az: {noise: 0}}", "sensors: 'az' is not one of: vx, yaw_rate"),
         ("{ay: {slope: 0}}", "sensors: ay: 'slope' is not one of: noise, offset"),
-        ("{ay: {noise: loud}}", "sensors: ay.noise is a number, not 'loud'"),
         ("{ay: {noise: true}}", "sensors: ay.noise is a number, not True"),
         ("{ay: {noise: -1}}", "sensors: ay: noise must be zero or positive, not -1.0"),
         ("{ay: {noise: .nan}}", "sensors: ay: noise must be finite, not nan"),
         ("{ay: {drift_time: 0}}", "drift_time must be positive"),
-        ("{ay: 0.1}", "sensors: ay is a mapping of what changes, or off, not 0.1"),
         ("{ay: on}", "sensors: ay is a mapping of what changes, or off, not True"),
         ("{tilt: {bank: 0}}", "sensors: tilt.bank is on or off, not 0"),
         ("{imu: {lever_x: .inf}}", "sensors: imu: lever_x must be finite"),
-        ("{imu: {misalignment: -1}}", "misalignment must be zero or positive"),
         ("{reference: radar}", "sensors: reference 'radar' is not one of: optical, gnss, motion_capture, ideal"),
-        ("{reference: {kind: [radar]}}", "is not one of: optical, gnss, motion_capture, ideal"),
-        ("{reference: {vz: {noise: 1}}}", "sensors: reference: 'vz' is not one of"),
         ("{reference: {heading: {delay: 1}}}", "sensors: reference: heading has noise, offset and drift only"),
         ("{switched_off: [ay.slope]}", "sensors: cannot switch off 'ay.slope': 'slope' is not one of: noise, offset"),
         ("{switched_off: 3}", "switched_off is a list of names"),
@@ -528,12 +490,6 @@ def test_configuration_that_makes_no_sense_is_refused_in_one_line(spelt: str, sa
         sensor_levels_from_config(yaml.safe_load(spelt))
     assert said in str(error.value)
     assert "\n" not in str(error.value)
-
-
-@pytest.mark.parametrize("values", [{"noise": -0.1}, {"delay": float("inf")}, {"drift_time": 0.0}])
-def test_level_that_makes_no_sense_is_an_error(values: dict[str, float]) -> None:
-    with pytest.raises(ConfigurationError):
-        SensorLevel(**values)
 
 
 # --- levels from the real recording

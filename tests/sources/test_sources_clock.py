@@ -90,7 +90,6 @@ def test_units_and_signs_are_applied() -> None:
         ({"vz": {"column": "a", "unit": "m/s"}}, "channel 'vz' is not known"),
         ({"vx": {"column": "a", "unit": "furlong"}}, "unit 'furlong' is not known"),
         ({"vx": {"column": "a", "unit": "deg"}}, "unit 'deg' cannot be converted to 'm/s'"),
-        ({"vx": {"column": "a", "unit": "m/s", "scale": 2}}, "unknown key 'scale'; there are: column, unit, sign, factor"),
     ],
 )
 def test_a_misspelt_map_of_columns_is_refused_in_one_line(entries: dict[str, object], what: str) -> None:

@@ -218,7 +218,6 @@ def test_a_slow_gappy_signal_stands_at_its_nearest_ticks_and_nowhere_else(tmp_pa
 @pytest.mark.parametrize(
     ("changes", "said"),
     [
-        ({"channels": {"vx": {**ONE["vx"], "max_gap": 0}}}, "max_gap: input should be greater than 0, not 0"),
         ({"rate_hz": None}, "give either rate_hz, or as raster"),
         ({"rate_hz": None, "raster": "steer"}, "raster must name one of its channels"),
         ({"gappy": ["steer"]}, "gappy names 'steer'"),

@@ -172,11 +172,16 @@ def refused(folder: Path, kind: type[VehestError] = DataError, **changes: Any) -
     return message
 
 
+@pytest.fixture(scope="module")
+def bags(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with the circle's bag, which tests leave as it is."""
+    return write_bag(tmp_path_factory.mktemp("bags"), drive()).parent
+
+
 @pytest.fixture
-def folder(tmp_path: Path) -> Path:
-    """A folder with the circle's bag."""
-    write_bag(tmp_path / "bags", drive())
-    return tmp_path / "bags"
+def folder(bags: Path, tmp_path: Path) -> Path:
+    """The same, to be changed."""
+    return Path(shutil.copytree(bags, tmp_path / "bags"))
 
 
 def filter_gain(pulsation: float) -> float:
@@ -190,9 +195,9 @@ def inside(recording: Recording, name: str) -> NDArray[np.float64]:
     return recording[name][WINDOW:-WINDOW]
 
 
-def test_a_circle_comes_back_from_its_poses(folder: Path) -> None:
+def test_a_circle_comes_back_from_its_poses(bags: Path) -> None:
     """In body axes the velocity is constant: what is left is the filter's gain, 0.9996 here, and the stamps' nanoseconds."""
-    recording = read(folder)
+    recording = read(bags)
     gain = filter_gain(YAW_RATE)
     assert gain == pytest.approx(1 - YAW_RATE**2 * 1.18e-3 / 6, abs=1e-6)  # second term: Σk⁴/Σk² = 11.8 samples² at 100 Hz
     np.testing.assert_allclose(inside(recording, "vx_ref"), gain * VX, rtol=0, atol=1e-6)
@@ -201,9 +206,9 @@ def test_a_circle_comes_back_from_its_poses(folder: Path) -> None:
     np.testing.assert_allclose(inside(recording, "sideslip_ref"), np.arctan2(VY, VX), rtol=0, atol=1e-6)
 
 
-def test_sensors_come_back_in_si_units_with_signs_zeros_and_factors(folder: Path) -> None:
+def test_sensors_come_back_in_si_units_with_signs_zeros_and_factors(bags: Path) -> None:
     """Straight lines are exact; a line between samples 2.5 ms apart misses a sine by up to A·(ω·dt)²/8 = 1e-4 m/s²."""
-    recording = read(folder)
+    recording = read(bags)
     missed = ACCELERATION * (PULSATION / 400) ** 2 / 8
     np.testing.assert_allclose(recording["ax"], ACCELERATION * np.sin(PULSATION * recording.time), rtol=0, atol=1.01 * missed)
     np.testing.assert_allclose(recording["ay"], ACCELERATION * np.cos(PULSATION * recording.time), rtol=0, atol=1.01 * missed)
@@ -214,8 +219,8 @@ def test_sensors_come_back_in_si_units_with_signs_zeros_and_factors(folder: Path
 
 
 @pytest.mark.parametrize(("storage", "form"), [("sqlite3", "zip"), ("sqlite3", "file"), ("mcap", "folder"), ("mcap", "file")])
-def test_storage_and_packing_make_no_difference(tmp_path: Path, storage: str, form: str) -> None:
-    expected = read(write_bag(tmp_path / "expected", drive()).parent)
+def test_storage_and_packing_make_no_difference(bags: Path, tmp_path: Path, storage: str, form: str) -> None:
+    expected = read(bags)
     bag = write_bag(tmp_path / "made", drive(), storage)
     (data,) = [file for file in bag.iterdir() if file.suffix in (".db3", ".mcap")]
     there = tmp_path / "there"
@@ -367,6 +372,7 @@ def test_the_real_bag_has_no_errors_and_its_velocities_follow_its_imu(data_root:
     assert [finding.channel for finding in findings if finding.check == "kinematics"] == ["vy_ref"]
 
 
+@pytest.mark.slow
 def test_declared_constants_are_those_that_the_data_show(data_root: Path) -> None:
     """Within two of the standard deviations that the script prints; what the publishers' files fix exactly, to a millionth."""
     identified = runpy.run_path(str(ROOT / "docs" / "identify_f1tenth.py"))["identify"](data_root / "f1tenth")

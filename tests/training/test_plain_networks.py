@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -118,10 +119,16 @@ def test_members_are_one_computation_where_torch_can_batch_every_layer(name, one
     assert (members[0].network in _ONE_BY_ONE) is one_by_one
 
 
+@cache
+def known(name, dtype="float64"):
+    """One trained for a moment; tests leave it as it is."""
+    return fit(NETWORKS[name], [0], dtype=dtype)[0][0]
+
+
 @pytest.mark.parametrize("name", NETWORKS)
 @pytest.mark.parametrize(("dtype", "tolerance"), [("float64", 1e-9), ("float32", 1e-4)])
 def test_online_agrees_with_batch(name, dtype, tolerance):
-    (member,), _ = fit(NETWORKS[name], [0], dtype=dtype)
+    member = known(name, dtype)
     drive = planar_drive(10.0, seed=3).without_references()
     batch, stepper = member.estimate([drive])[0]["vy"], member.online()
     online = [stepper.step({channel: drive[channel][k] for channel in drive.channels})["vy"] for k in range(len(drive))]
@@ -131,7 +138,7 @@ def test_online_agrees_with_batch(name, dtype, tolerance):
 
 @pytest.mark.parametrize("name", NETWORKS)
 def test_estimates_are_those_of_the_network_called_by_hand_on_each_window(name):
-    (member,), _ = fit(NETWORKS[name], [0])
+    member = known(name)
     drive = planar_drive(90.0, seed=3)  # more windows than are evaluated at once
     series = torch.as_tensor(drive.stack(member.channels))
     network = member.network.eval()
@@ -170,8 +177,7 @@ def test_global_random_state_neither_matters_nor_changes(name):
 
 
 def test_dropout_counts_in_training_and_not_in_estimates():
-    (with_dropout,), _ = fit(NETWORKS["dropout"], [0])
-    (without,), _ = fit(Perceptron, [0])
+    with_dropout, without = known("dropout"), known("perceptron")
     assert not np.allclose(flat(with_dropout), flat(without))
     drive = planar_drive(10.0, seed=3).without_references()
     one, other = (with_dropout.estimate([drive])[0]["vy"] for _ in range(2))
@@ -192,7 +198,7 @@ def test_interrupted_training_goes_on_to_the_same_result(tmp_path: Path, name):
 
 @pytest.mark.parametrize("name", NETWORKS)
 def test_weights_read_back_estimate_the_same(name):
-    (member,), _ = fit(NETWORKS[name], [0], dtype="float32")
+    member = known(name, "float32")
     other = estimator_of(NETWORKS[name])
     other.load_weights(member.weights())
     drive = planar_drive(5.0, seed=3).without_references()

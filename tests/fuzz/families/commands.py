@@ -10,7 +10,7 @@ import typer
 
 from fuzz.case import CANARY, Case, Command, generator
 from fuzz.honest import KALMAN, KSNN, LUENBERGER
-from fuzz.mutations import NAMES
+from fuzz.mutations import CALL, WRITABLE_NAMES
 from vehest.cli import app
 
 KEYS = (
@@ -29,7 +29,7 @@ VALUES = (
     "bool(2)", "json_str({})", "cast(1)", "extend_list(1)", "${seed}", "${nothing}", "${oc.env:HOME}", "${oc.env:NONE}", "${oc.decode:1}",
     "${oc.create:[1]}", "${oc.deprecated:seed}", "${..}", "${", "$", "???", "\\", "\\,", "a b", "a\tb", "a\nb", "\x1b[2J", "\u202e", "😀",
     "ä", "[" * 500, "{a:" * 200, "-" * 1000, "x" * 100_000, "1_000", "0x10", "0b1", "1e5", ".5", "5.", "1e", "None", "~", "!", "*", "?",
-    f"__import__('os').system('touch {CANARY}')", f"$(touch {CANARY})", "../../../evil", "/dev/full", "/", ".", "..",
+    CALL, f"$(touch {CANARY})", "../../../evil", "/dev/full", "/", ".", "..",
 )  # fmt: skip
 FORMS = (
     "{key}={value}", "+{key}={value}", "++{key}={value}", "~{key}", "~{key}={value}", "{key}", "={value}", "{key}==", "{key}.={value}",
@@ -41,14 +41,13 @@ FORMS = (
 
 def _override(rng: random.Random) -> str:
     form = "{key}={value}" if rng.random() < 0.6 else rng.choice(FORMS)
-    return form.format(key=rng.choice(KEYS), value=rng.choice(VALUES)).replace("\0", "")
+    return form.format(key=rng.choice(KEYS), value=rng.choice(VALUES))
 
 
 BASES: tuple[tuple[str, ...], ...] = (
     ("train", *KSNN, "--dry-run"),
     ("train", *LUENBERGER, "--dry-run"),
     ("train", *KALMAN, "--dry-run"),
-    ("eval", *KSNN, "--dry-run"),
     ("sweep", *KSNN, "--dry-run"),
     ("config", "train"),
     ("config", "eval"),
@@ -59,68 +58,40 @@ BASES: tuple[tuple[str, ...], ...] = (
     ("data", "show", "mine"),
     ("data", "check", "lap.csv"),
 )
+OUTS = ("out.csv", "out.parquet", "out", "out.csv/x", "/dev/full", "/dev/null", "", "lap.csv", "raw", "OUT.CSV", "outputs/x.csv")
+TYPED = (("train", "estimator=k"), ("ingest", ""), ("estimate", ""), ("run", ""), ("sweep", "estimator.n_l"), ("eval", "--model", ""))
+SWEEPS = (
+    "seed=range(100000000)", "seed=range(1000) estimator.n_local=range(1000)", "seed=" + ",".join(map(str, range(20_000))),
+    "seed=0,1 estimator.n_local=range(2,4) estimator.bias=true,false", "seed=range(0,1,1e-9)", "seed=range(1000000) seed=range(1000000)",
+    "seed=choice(1,2) limits.jobs=1", "limits.jobs=1,2", "estimator=ksnn,gru,nothing", "estimator=glob(*)", "split=mine,mine", "seed=0,0,0",
+    "output=a,b", "seed=", "seed=range()", "+a=1,2", "seed=nan,inf", "seed=range(-5,5)", "seed=1e400,2",
+)  # fmt: skip
 
 
 @generator("drives", "steered", weight=10)
 def overrides(case: Case) -> Command:
     case.copy("drives")
     case.copy("steered")
-    base = case.rng.choice(BASES if not case.honest else [one for one in BASES if one[0] != "eval"])
-    more = () if case.honest else tuple(_override(case.rng) for _ in range(case.rng.choice([1, 1, 1, 2, 3])))
-    return Command((*base, *more), targets=("out.csv",))
+    more = () if case.honest else (_override(case.rng) for _ in range(case.rng.choice([1, 1, 1, 2, 3])))
+    return Command((*case.rng.choice(BASES), *more))
 
 
-@generator("drives", "steered", weight=3)
-def settings_of_trainings(case: Case) -> Command:
-    """A value far outside of what makes sense reaches a training that really runs, as small as it can be."""
-    case.copy("drives")
-    case.copy("steered")
-    base = case.rng.choice([KSNN, LUENBERGER, KALMAN])
-    keys = [
-        key
-        for key in KEYS
-        if key.startswith(("estimator.", "seed", "split.", "downsample", "training.b", "training.l", "training.p", "training.d", "limits"))
-    ]
-    more = () if case.honest else (f"{case.rng.choice(keys)}={case.rng.choice(VALUES[:30])}",)
-    return Command(("train", *base, *more))
-
-
-@generator("study", weight=3)
-def settings_of_evaluations(case: Case) -> Command:
+@generator("study", "steered", weight=5)
+def settings(case: Case) -> Command:
+    """A value far outside of what makes sense reaches a training or an evaluation that really runs, as small as it can be."""
     case.copy("study")
-    keys = [key for key in KEYS if key.startswith(("evaluation", "downsample"))]
-    more = () if case.honest else (f"{case.rng.choice(keys)}={case.rng.choice(VALUES[:30])}",)
-    return Command(("eval", *KSNN, *more))
-
-
-SWEEPS = (
-    ("seed=range(100000000)",),
-    ("seed=range(1000)", "estimator.n_local=range(1000)"),
-    ("seed=" + ",".join(map(str, range(20_000))),),
-    ("seed=0,1", "estimator.n_local=range(2,4)", "estimator.bias=true,false"),
-    ("seed=range(0,1,1e-9)",),
-    ("seed=range(1000000)", "seed=range(1000000)"),
-    ("seed=choice(1,2)", "limits.jobs=1"),
-    ("limits.jobs=1,2",),
-    ("estimator=ksnn,gru,nothing",),
-    ("estimator=glob(*)",),
-    ("split=mine,mine",),
-    ("seed=0,0,0",),
-    ("output=a,b",),
-    ("seed=",),
-    ("seed=range()",),
-    ("+a=1,2",),
-    ("seed=nan,inf",),
-    ("seed=range(-5,5)",),
-    ("seed=1e400,2",),
-)
+    case.copy("steered")
+    starts = ("estimator.", "seed", "split.", "downsample", "training.b", "training.l", "training.p", "training.d", "limits")
+    base = case.rng.choice([("train", *KSNN), ("train", *LUENBERGER), ("train", *KALMAN), ("eval", *KSNN)])
+    keys = [key for key in KEYS if key.startswith(("evaluation", "downsample") if base[0] == "eval" else starts)]
+    return Command((*base, *(() if case.honest else (f"{case.rng.choice(keys)}={case.rng.choice(VALUES[:30])}",))))
 
 
 @generator("drives", weight=3)
-def sweeps(case: Case) -> Command:
+def sweep(case: Case) -> Command:
     case.copy("drives")
-    words = ("seed=0,1",) if case.honest else SWEEPS[case.visit % len(SWEEPS)]
-    name = () if case.honest or case.rng.random() < 0.5 else ("--name", case.rng.choice(NAMES).replace("\0", ""))
+    words = ("seed=0,1",) if case.honest else SWEEPS[case.visit % len(SWEEPS)].split()
+    name = () if case.honest or case.rng.random() < 0.5 else ("--name", case.rng.choice(WRITABLE_NAMES))
     return Command(("sweep", *KSNN, *words, *name, "--dry-run"))
 
 
@@ -164,7 +135,7 @@ def options(case: Case) -> Command:
     case.copy("study")
     words, command = case.rng.choice([one for one in _commands().items() if one[0] != ("data", "list") or case.rng.random() < 0.1])
     if case.honest:
-        return Command((*words, *HONEST.get(words, ("--help",))), targets=("out.csv",))
+        return Command((*words, *HONEST.get(words, ("--help",))))
     chosen: list[str] = []
     for parameter in command.params:
         if isinstance(parameter, click.Option):
@@ -175,14 +146,10 @@ def options(case: Case) -> Command:
     if case.rng.random() < 0.25:
         case.rng.shuffle(chosen)
     if case.rng.random() < 0.15:
-        chosen.append(
-            case.rng.choice(
-                ["--nothing", "-z", "--", "-", "--json=1", "--jobs", "-h", "--help", "--version", "--install-completion-x", "-j-1"]
-            )
-        )
+        chosen.append(case.rng.choice(["--nothing", "-z", "--", "-", "--json=1", "--jobs", "-h", "--help", "--version", "-j-1"]))
     safe = [word for word in chosen if word not in ("--install-completion", "--show-completion", "--download")]
     dry = ["--dry-run"] if words[0] in ("train", "sweep", "run", "simulate") and "--dry-run" not in safe else []
-    return Command((*words, *(word.replace("\0", "") for word in safe[:1] + dry + safe[1:])), targets=("out.csv", "out.parquet", "out"))
+    return Command((*words, *safe[:1], *dry, *safe[1:]), targets=("out.csv", "out.parquet", "out"))
 
 
 def _option(option: click.Option, rng: random.Random) -> list[str]:
@@ -190,13 +157,10 @@ def _option(option: click.Option, rng: random.Random) -> list[str]:
     if option.is_flag:
         return [name]
     if "out" in (option.name or ""):
-        return [
-            name,
-            rng.choice(
-                ["out.csv", "out.parquet", "out", "out.csv/x", "/dev/full", "/dev/null", "", "lap.csv", "raw", "OUT.CSV", "outputs/x.csv"]
-            ),
-        ]
-    value = rng.choice([*VALUES, *NAMES, "0", "1", "2", "100", "0.5", "offsets", "lever_arm,mounting,delay,offsets,steering_ratio", "one"])
+        return [name, rng.choice(OUTS)]
+    value = rng.choice(
+        [*VALUES, *WRITABLE_NAMES, "0", "1", "2", "100", "0.5", "offsets", "lever_arm,mounting,delay,offsets,steering_ratio", "one"]
+    )
     return rng.choice([[name, value], [f"{name}={value}"], [name]])
 
 
@@ -206,64 +170,23 @@ def _argument(argument: click.Parameter, words: tuple[str, ...], rng: random.Ran
         return [_override(rng) for _ in range(rng.randrange(3))]
     if rng.random() < 0.75 and argument.name in sound:
         return [sound[argument.name]]
-    return [rng.choice([*NAMES, "mine", "sim_small", "tabular", "lap.parquet", "raw", "conf", "quickstart", "one"])]
-
-
-@generator("study", weight=2)
-def alignments(case: Case) -> Command:
-    """Options of data align are numbers that reach a solver."""
-    case.copy("study")
-    if case.honest:
-        return Command(("data", "align", "lap.csv", "-e", "offsets", "-o", "out"), targets=("out",))
-    chosen = [
-        word
-        for name in case.rng.sample(["--wheelbase", "--cutoff", "--max-delay", "--tilt", "--max-ay", "--min-speed"], 2)
-        for word in (name, case.rng.choice(["0", "-1", "nan", "inf", "1e400", "1e18", "1e-300", "1e9", "24.999", "a", ""]))
-    ]
-    what = case.rng.choice(
-        [
-            "offsets",
-            "delay",
-            "lever_arm",
-            "mounting",
-            "steering_ratio",
-            "delay,offsets",
-            "lever_arm,mounting,delay,offsets",
-            "",
-            ",",
-            "all",
-            "delay,delay",
-        ]
-    )
-    where = case.rng.choice(
-        [(), ("-o", "out"), ("-o", "lap.csv"), ("-o", "raw"), ("-o", "/dev/null"), ("-r", "nothing"), ("--steering-channel", "vx")]
-    )
-    return Command(("data", "align", "lap.csv", "-e", what, *chosen, *where), targets=("out",))
+    return [rng.choice([*WRITABLE_NAMES, "mine", "sim_small", "tabular", "lap.parquet", "raw", "conf", "quickstart", "one"])]
 
 
 @generator("study", weight=2)
 def completion(case: Case) -> Command:
     """What a shell asks for while somebody types."""
     case.copy("study")
-    words = [
-        "vehest",
-        *case.rng.choice(
-            [("train", "estimator=k"), ("ingest", ""), ("estimate", ""), ("run", ""), ("sweep", "estimator.n_l"), ("eval", "--model", "")]
-        ),
-    ]
+    words = ["vehest", *case.rng.choice(TYPED)]
     if not case.honest:
-        words.append(case.rng.choice([*(value for value in VALUES if "\0" not in value), _override(case.rng)]))
+        words.append(case.rng.choice([*VALUES, _override(case.rng)]))
         if case.visit % 4 == 0:
             case.write(f"conf/dataset/{case.rng.choice(['odd', 'a b'])}.yaml", b"\xff\xfe: [")
-    shell = case.rng.choice(["bash", "zsh", "fish"])
+    line = " ".join(words)
     environment = {
-        "_VEHEST_COMPLETE": f"complete_{shell}",
-        "COMP_WORDS": " ".join(words).replace("\0", ""),
-        "COMP_CWORD": str(len(words) - 1),
+        "_VEHEST_COMPLETE": f"complete_{case.rng.choice(['bash', 'zsh', 'fish'])}",
+        "COMP_WORDS": line,
+        "_TYPER_COMPLETE_ARGS": line,
     }
-    environment |= {
-        "_TYPER_COMPLETE_ARGS": environment["COMP_WORDS"],
-        "_TYPER_COMPLETE_FISH_ACTION": "get-args",
-        "_TYPER_COMPLETE_WORD_TO_COMPLETE": words[-1].replace("\0", ""),
-    }
-    return Command((), environment=environment)
+    environment |= {"COMP_CWORD": str(len(words) - 1), "_TYPER_COMPLETE_FISH_ACTION": "get-args"}
+    return Command((), environment=environment | {"_TYPER_COMPLETE_WORD_TO_COMPLETE": words[-1]})

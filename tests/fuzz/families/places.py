@@ -1,216 +1,132 @@
-"""Names of files, special files, links, and where outcomes are written to."""
+"""Names of files, special files, links, rights, streams, variables, and where outcomes are written to."""
 
 from __future__ import annotations
 
 import os
 import socket
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 from fuzz.case import Case, Command, generator
 from fuzz.honest import KSNN
 
 NAMES: tuple[bytes, ...] = (
-    b"\xff\xfe.csv",
-    b"lap\xe4.csv",
-    b"a\nb.csv",
-    b"\x1b[2J.csv",
-    b" .csv",
-    b"a b.csv",
-    b"-x.csv",
-    b"--out.csv",
-    b"a=b.csv",
-    b"~a.csv",
-    b"a'b.csv",
-    b'a"b.csv',
-    b"[a].csv",
-    b"*.csv",
-    b"\xe2\x80\xaeevil.csv",
-    b"x" * 200 + b".csv",
-    b".csv",
-    b".hidden.csv",
-    b"LAP.CSV",
-    b"lap.csv.csv",
-    b"lap.",
-    b"lap",
-    b"lap.csv ",
-    b"$(touch EXECUTED).csv",
-    b"a;touch EXECUTED.csv",
-    b"<b>.csv",
-    b"[red]a[blue].csv",
-    b"null.csv",
-    b"${root}.csv",
+    b"\xff\xfe.csv", b"lap\xe4.csv", b"a\nb.csv", b"\x1b[2J.csv", b" .csv", b"a b.csv", b"-x.csv", b"--out.csv", b"a=b.csv", b"~a.csv",
+    b"a'b.csv", b'a"b.csv', b"[a].csv", b"*.csv", b"\xe2\x80\xaeevil.csv", b"x" * 200 + b".csv", b".csv", b".hidden.csv", b"LAP.CSV",
+    b"lap.csv.csv", b"lap.", b"lap", b"lap.csv ", b"$(touch EXECUTED).csv", b"a;touch EXECUTED.csv", b"<b>.csv", b"[red]a[blue].csv",
+    b"null.csv", b"${root}.csv",
+)  # fmt: skip
+LINKS = (
+    "/dev/zero",
+    "/dev/null",
+    "/dev/full",
+    "/dev/stdin",
+    "/dev/urandom",
+    "/proc/self/mem",
+    "/proc/self/environ",
+    "gone.csv",
+    "special.csv",
 )
-
-
-def _reads(case: Case, name: bytes) -> tuple[bytes | str, ...]:
-    how = case.rng.randrange(5)
-    if how <= 2:
-        return ("estimate", name, "-o", "out.csv")
-    return ("data", "check" if how == 3 else "show", name)
-
-
-@generator("drives", weight=3)
-def names_of_files(case: Case) -> Command:
-    case.copy("drives")
-    if case.honest:
-        return Command(_reads(case, b"lap.csv"), targets=("out.csv",))
-    name = NAMES[case.visit % len(NAMES)]
-    os.rename(case.place / "lap.csv", os.fsencode(case.place) + b"/" + name)
-    return Command(_reads(case, b"./" + name if case.rng.random() < 0.3 else name), targets=("out.csv",))
-
-
-@generator("drives", weight=2)
-def names_in_a_data_set(case: Case) -> Command:
-    """Files whose names become recordings' ids and names of files in the store."""
-    case.copy("drives")
-    if not case.honest:
-        os.rename(case.place / "raw" / "three.csv", os.fsencode(case.place / "raw") + b"/" + NAMES[case.visit % len(NAMES)])
-    return Command(case.rng.choice([("ingest", "mine"), ("data", "check", "mine"), ("downsample", "mine", "rate_hz=20")]))
-
-
-def _special(folder: Path, how: int) -> Path:
-    """Something that is no file, or none that ends."""
-    path = folder / "special.csv"
-    if how == 0:
-        os.mkfifo(path)
-    elif how == 1:
-        path.symlink_to("/dev/zero")
-    elif how == 2:
-        path.symlink_to("/dev/null")
-    elif how == 3:
-        path.symlink_to(path.name)
-    elif how == 4:
-        path.symlink_to("gone.csv")
-    elif how == 5:
-        path.mkdir()
-    elif how == 6:
-        made, here = socket.socket(socket.AF_UNIX), os.getcwd()
-        os.chdir(folder)  # a socket's path must be short
-        made.bind(path.name)
-        os.chdir(here)
-        made.close()
-    elif how == 7:
-        path.symlink_to("/dev/full")
-    elif how == 8:
-        path.symlink_to("/proc/self/mem")
-    elif how == 9:
-        path.symlink_to("/dev/stdin")
-    elif how == 10:
-        path.symlink_to("/proc/self/environ")
-    elif how == 11:
-        with open(path, "wb") as stream:
-            stream.truncate(3 * 2**40)
-    elif how == 12:
-        with open(path, "wb") as stream:
-            stream.truncate(2**31)
-    else:
-        path.symlink_to("/dev/urandom")
-    return path
-
-
-@generator("drives", weight=4)
-def special_files(case: Case) -> Command:
-    case.copy("drives")
-    if case.honest:
-        os.link(case.place / "lap.csv", case.place / "special.csv")
-        return Command(_reads(case, b"special.csv"), targets=("out.csv",))
-    how = case.visit % 14
-    path = _special(case.place, how)
-    if case.rng.random() < 0.4:
-        path = path.rename(path.with_suffix(".parquet"))
-    return Command(_reads(case, os.fsencode(path.name)), targets=("out.csv",))
-
-
-@generator("drives", weight=2)
-def special_files_in_a_data_set(case: Case) -> Command:
-    case.copy("drives")
-    if not case.honest:
-        (case.place / "raw" / "three.csv").unlink()
-        path = _special(case.place / "raw", case.visit % 14)
-        path.rename(path.with_name("three.csv")) if case.rng.random() < 0.7 else None
-    return Command(case.rng.choice([("ingest", "mine"), ("data", "check", "mine"), ("data", "show", "mine")]))
-
-
 TARGETS = (
     "/dev/full", "/dev/null", "/dev/stdout", "out", "out.txt", "out.csv/", "raw", "raw/one.csv/x.csv", "", ".", "..", "/",
     "x" * 300 + ".csv", "loop.csv", "pipe.csv", "zero.csv", "full.csv", "full.parquet", "lap.csv", "./lap.csv", "link.csv",
     "a\nb.csv", "deep/er/out.csv", "/proc/x.csv", "-.csv",
 )  # fmt: skip
+ROOTS = ("/dev/null", "/dev/full/x", "outputs/" + "x" * 300, "''", "null", "[1]", "outputs/\x01", "3", "/proc/x", "/dev/stdin")
+VARIABLES = ("VEHEST_DATA", "VEHEST_OUTPUT", "MLFLOW_TRACKING_URI", "HOME", "COLUMNS", "TMPDIR", "VEHEST_DEBUG_X", "LANG", "TERM")
+VALUES = (
+    "", "/dev/null", "nothing", "raw/one.csv", "\udcff\udcfe", "${root}", "a\nb", "x" * 5000, "-1", "null", "[1]", "{", "http://[",
+    "file:///evil", "sqlite:////dev/full",
+)  # fmt: skip
 
 
-@generator("study", weight=3)
+def _bind(path: Path) -> None:
+    made, here = socket.socket(socket.AF_UNIX), os.getcwd()
+    os.chdir(path.parent)  # a socket's path must be short
+    made.bind(path.name)
+    os.chdir(here)
+    made.close()
+
+
+def _special(case: Case, folder: Path) -> Path:
+    """Something that is no file, or none that ends."""
+    path = folder / "special.csv"
+    makers: list[Callable[[], Any]] = [
+        lambda: os.mkfifo(path),
+        path.mkdir,
+        lambda: _bind(path),
+        lambda: (path.touch(), os.truncate(path, case.rng.choice([2**31, 3 * 2**40]))),
+        *(lambda link=link: path.symlink_to(link) for link in LINKS),
+    ]
+    makers[case.visit // 2 % len(makers)]()
+    return path
+
+
+@generator("drives", weight=8)
+def files(case: Case) -> Command:
+    """Names of files that are read, alone or in a data set, where they become recordings' ids; special files in their place."""
+    case.copy("drives")
+    alone = case.visit // 8 % 2 == 0
+    file = case.place / "lap.csv" if alone else case.place / "raw" / "three.csv"
+    name = b"special.csv"
+    if case.honest:
+        file.rename(file.with_name("special.csv"))
+    elif case.visit % 2:
+        name = case.rng.choice(NAMES)
+        os.rename(file, os.fsencode(file.parent) + b"/" + name)
+    else:
+        file.unlink()
+        special = _special(case, file.parent)
+        name = os.fsencode(special.rename(special.with_suffix(case.rng.choice([".csv", ".parquet"]))).name)
+    name = b"./" + name if case.rng.random() < 0.2 else name
+    lone = [("estimate", name, "-o", "out.csv"), ("data", "check", name), ("data", "show", name)]
+    of_a_set = [("ingest", "mine"), ("data", "check", "mine"), ("data", "show", "mine")]
+    return Command(case.rng.choice(lone if alone else of_a_set))
+
+
+@generator("study", weight=4)
 def targets(case: Case) -> Command:
-    """Where an estimate is written to."""
+    """Where an estimate is written to, the output root, and standard output that takes nothing."""
     case.copy("study")
     place = case.place
-    out = "out.csv" if case.honest else str(case.idea(*TARGETS))
-    (place / "loop.csv").symlink_to("loop.csv")
+    how = case.idea(4)
+    if how == 0:
+        return Command(("ingest", "mine", f"output={case.rng.choice(ROOTS)}"))
+    if how == 1:
+        commands = [("data", "channels"), ("config", "train"), ("data", "show", "lap.csv", "--json"), ("--help",), ("train", "--help")]
+        commands += [("--version",), ("estimate", "lap.csv", "-o", "out.csv"), ("data", "align", "lap.csv", "-e", "offsets")]
+        return Command(case.rng.choice(commands), stdout="/dev/full")
+    links = {"loop.csv": "loop.csv", "zero.csv": "/dev/zero", "full.csv": "/dev/full", "full.parquet": "/dev/full", "link.csv": "lap.csv"}
+    for name, target in links.items():
+        (place / name).symlink_to(target)
     os.mkfifo(place / "pipe.csv")
-    (place / "zero.csv").symlink_to("/dev/zero")
-    (place / "full.csv").symlink_to("/dev/full")
-    (place / "full.parquet").symlink_to("/dev/full")
-    (place / "link.csv").symlink_to("lap.csv")
-    model = () if case.rng.random() < 0.5 else ("ksnn",)
-    return Command(
-        ("estimate", *model, "lap.csv", "--out", out),
-        targets=("out.csv", "deep", "a\nb.csv", "-.csv", "loop.csv", "pipe.csv", "zero.csv", "full.csv", "full.parquet", "link.csv"),
-    )
+    out = "out.csv" if case.honest else case.rng.choice(TARGETS)
+    named = ("out.csv", "deep", "a\nb.csv", "-.csv", "pipe.csv", *links)
+    return Command(("estimate", *case.rng.choice([(), ("ksnn",)]), "lap.csv", "--out", out), targets=named)
 
 
 @generator("study", weight=2)
-def streams(case: Case) -> Command:
-    """Standard output that takes nothing."""
-    case.copy("study")
-    commands = [
-        ("data", "channels"),
-        ("config", "train"),
-        ("data", "show", "lap.csv"),
-        ("data", "show", "lap.csv", "--json"),
-    ]
-    commands += [
-        ("--help",),
-        ("train", "--help"),
-        ("--version",),
-        ("estimate", "lap.csv", "-o", "out.csv"),
-        ("data", "align", "lap.csv", "-e", "offsets"),
-    ]
-    command = case.rng.choice(commands)
-    return Command(command, targets=("out.csv",), stdout=None if case.honest else "/dev/full")
-
-
-@generator("study", weight=2)
-def environments(case: Case) -> Command:
+def environment(case: Case) -> Command:
     """Variables that vehest reads, with values that make no sense."""
     case.copy("study")
-    variable = case.rng.choice(
-        ["VEHEST_DATA", "VEHEST_OUTPUT", "MLFLOW_TRACKING_URI", "HOME", "COLUMNS", "TMPDIR", "VEHEST_DEBUG_X", "LANG", "TERM"]
-    )
-    value = case.rng.choice(
-        [
-            "",
-            "/dev/null",
-            "/nothing",
-            "raw/one.csv",
-            "\udcff\udcfe",
-            "${root}",
-            "a\nb",
-            "x" * 5000,
-            "-1",
-            "null",
-            "[1]",
-            "{",
-            "http://[",
-            "file:///evil",
-            "sqlite:////dev/full",
-        ]
-    )
+    variable, value = case.rng.choice(VARIABLES), case.rng.choice(VALUES)
     command = case.rng.choice([("ingest", "mine"), ("data", "show", "mine"), ("train", *KSNN, "--dry-run"), ("data", "channels")])
     if variable == "MLFLOW_TRACKING_URI":
         command = ("config", "train")
-    if variable == "VEHEST_OUTPUT" and value == "/nothing":  # told to write there, it would, and nobody could call that wrong
-        value = "nothing"
-    return Command(
-        command,
-        environment={} if case.honest else {variable: value},
-        targets=() if case.honest or variable != "VEHEST_OUTPUT" else ("file:" if value.startswith("file:") else value.strip("/") or ".",),
-    )
+    if case.honest:
+        return Command(command)
+    written = "file:" if value.startswith("file:") else value.strip("/") or "."
+    return Command(command, environment={variable: value}, targets=(written,) if variable == "VEHEST_OUTPUT" else ())
+
+
+@generator("drives")
+def rights(case: Case) -> Command:
+    """Folders and files that may not be read or written."""
+    case.copy("drives")
+    (case.place / "outputs").mkdir()
+    if not case.honest:
+        what = case.rng.choice(["outputs", "raw/one.csv", "raw", "conf", "conf/dataset/mine.yaml", "conf/dataset", "pipelines"])
+        os.chmod(case.place / what, case.rng.choice([0o000, 0o000, 0o444]))
+    commands = [("ingest", "mine"), ("data", "check", "mine"), ("data", "show", "mine"), ("run", "small", "--dry-run", "tracking=none")]
+    return Command(case.rng.choice(commands), unprivileged=True)
