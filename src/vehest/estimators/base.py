@@ -23,7 +23,7 @@ from vehest.training.context import FitRecord as FitRecord
 
 def rate(default: float) -> Any:
     """The setting ``rate_hz`` with another default [Hz]."""
-    return setting(default, "sampling rate it works at", unit="Hz", above=0.0, most=HIGHEST_RATE)
+    return setting(default, "sampling rate it works at", unit="Hz", positive=True, most=HIGHEST_RATE)
 
 
 @dataclass(frozen=True)
