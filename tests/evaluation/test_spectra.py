@@ -84,5 +84,5 @@ def test_level_is_the_mean_of_a_third_of_an_octave_and_differences_are_in_decibe
     inside = [density for hz, density in zip(own.frequency, own.density, strict=True) if 0.8909 <= hz <= 1.1225]
     assert own.level(1.0) == pytest.approx(np.mean(inside))
     assert decibels(10.0 * own.level(1.0), own.level(1.0)) == pytest.approx(10.0)
-    with pytest.raises(DataError, match="says nothing of 15 Hz"):
+    with pytest.raises(DataError, match="has no line at 15 Hz"):
         own.level(15.0)

@@ -255,7 +255,7 @@ def models(folder: Path) -> dict[str, dict[str, bytes]]:
     return {name: {file: own for file, own in files.items() if file not in (TIMINGS, "manifest.json")} for name, files in found.items()}
 
 
-def test_a_run_elsewhere_takes_the_published_weights_and_comes_to_the_same_results(published: Path, checked: Place) -> None:
+def test_a_run_elsewhere_takes_the_published_weights_and_comes_to_the_same_results(drawn: None, published: Path, checked: Place) -> None:
     before = contents(checked.folder / "results")
     code, _, said = checked(*RUN)
     assert code == 0
