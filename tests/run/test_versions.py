@@ -65,6 +65,6 @@ def test_a_raised_version_of_a_training_retrains_those_trained_by_it(monkeypatch
 
 def test_what_has_no_version_is_of_version_1():
     assert code_of_training("zero").endswith(" training=1")
-    assert code_of_report("drive").endswith(" drive=1")
+    assert code_of_report("folds").endswith(" folds=1")
     with pytest.raises(ConfigurationError, match="no study module 'nobody'"):
         code_of_report("nobody")
