@@ -7,7 +7,7 @@ import pytest
 from scipy import signal, stats
 
 from vehest.data.errors import DataError
-from vehest.evaluation.significance import Difference, paired_difference, sequence_labels
+from vehest.evaluation.significance import Difference, _degrees_of_freedom, paired_difference, sequence_labels
 
 N_SEQUENCES, LENGTH = 16, 100
 LABELS = sequence_labels([LENGTH] * N_SEQUENCES)
@@ -97,3 +97,17 @@ def test_a_sequence_ends_a_block_and_equal_losses_do_not_differ() -> None:
 def test_losses_that_cannot_be_compared_are_refused(first: np.ndarray, labels: list[int], message: str) -> None:
     with pytest.raises(DataError, match=message):
         paired_difference(first, np.zeros((1, 6)), sequence_labels(labels), rate_hz=10.0)
+
+
+def test_degrees_of_freedom_are_those_of_blocks_or_of_seeds_where_either_decides_alone() -> None:
+    """Welch-Satterthwaite of one part of the variance: its own degrees of freedom; of two equal ones: their sum."""
+    sizes, even = np.ones(40), np.full((3, 40), 0.0)
+    seeds = [np.array([-1.0, 0.0, 1.0]), np.array([-1.0, 0.0, 1.0])]
+    assert _degrees_of_freedom([even, even], sizes, seeds) == pytest.approx(4.0)
+    blocks = np.tile(np.tile([-1.0, 1.0], 20), (3, 1))
+    assert _degrees_of_freedom([blocks, even], sizes, [np.zeros(3), np.zeros(3)]) == pytest.approx(39.0)
+    generator = np.random.default_rng(1)
+    sizes, own, other = generator.uniform(0.5, 1.5, 40), *generator.standard_normal((2, 40))
+    a, b = float(np.var((own - other) / sizes.mean(), ddof=1)) / 40.0, 1.0 / 3.0
+    found = _degrees_of_freedom([np.tile(2.0 * sizes + own, (3, 1)), np.tile(other, (3, 1))], sizes, [seeds[0] + 2.0, seeds[1]])
+    assert found == pytest.approx((a + 2.0 * b) ** 2 / (a**2 / 39.0 + 2.0 * b**2 / 2.0))
