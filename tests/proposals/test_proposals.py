@@ -484,3 +484,50 @@ def test_steering_and_yaw_rate_without_names_are_not_taken_for_yaw_rate_and_acce
     rate, wheelbase = 4.0 * d["r"], 3.6  # by which yaw_rate = steer·vx/wheelbase has the scale of km/h
     table = pd.DataFrame({"t": d["t"], "a": d["vx"], "b": wheelbase * rate / d["vx"], "c": rate})
     assert {"a", "b", "c"} <= set(asked(write(tmp_path / "lap.csv", table)))
+
+
+# The car's own signals, and what only looks like one
+
+
+def test_of_two_speeds_the_one_of_the_car_s_bus_is_its_own_whatever_their_noise(tmp_path) -> None:
+    d = drive()
+    table = usual(d).rename(columns={"Speed": "Velocity"})
+    table["VehSpd_CAN"] = 3.6 * d["vx"]
+    table["Velocity"] = 3.6 * (d["vx"] + 0.1 * np.random.default_rng(1).standard_normal(len(d["t"])))
+    found = proposed(write(tmp_path / "lap.csv", table))
+    assert (found["vx"].column, found["vx_ref"].column) == ("VehSpd_CAN", "Velocity")
+    assert not {"VehSpd_CAN", "Velocity"} & set(asked(tmp_path / "lap.csv"))
+
+
+def test_a_column_without_unit_or_clear_name_that_is_no_acceleration_by_its_scale_is_asked(tmp_path) -> None:
+    table = usual(drive()).rename(columns={"LatAcc": "Ch7"})
+    table["Ch7"] *= 0.8
+    file = write(tmp_path / "lap.csv", table)
+    assert proposed(file)["ay"].column == "Ch7"
+    assert "it may be a velocity" in proposed(file)["ay"].asked
+    table["Ch7"] /= 0.8
+    assert proposed(write(file, table))["ay"].asked == ""
+
+
+@pytest.mark.parametrize("excess", [1.0, 1.05])
+def test_a_speedometer_that_reads_too_much_is_asked_where_wheels_agree(tmp_path, excess: float) -> None:
+    d = drive()
+    table = usual(d).assign(Speed=3.6 * excess * d["vx"])
+    for corner in ("fl", "fr", "rl", "rr"):
+        table[f"WheelSpeed{corner.upper()}"] = 3.6 * RADIUS * d[f"wheel_{corner}"]
+    file = write(tmp_path / "lap.csv", table)
+    found = proposed(file)
+    assert "km/h at the rim by the speed" in found["wheel_speed_rl"].evidence
+    assert ("5 % too much by the wheels" in found["vx"].asked) == (excess > 1.0)
+    assert ("vx km/h +1 0.952" in found["vx"].others) == (excess > 1.0)
+    without = write(tmp_path / "no_wheels.csv", table.drop(columns=[name for name in table if name.startswith("Wheel")]))
+    assert any("too much by ay over yaw_rate" in note for note in inspect("my_car", [without]).proposals.notes) == (excess > 1.0)
+
+
+def test_the_angle_of_a_steering_wheel_with_a_unit_is_one_even_where_no_slow_corner_shows_it(tmp_path) -> None:
+    d = drive()
+    table = usual(d).rename(columns={"Steer": "SWA [rad]"})
+    table["SWA [rad]"] = 4.0 * d["handwheel"]
+    found = proposed(write(tmp_path / "lap.csv", table))
+    assert (found["handwheel"].column, found["handwheel"].unit) == ("SWA [rad]", "rad")
+    assert not any("by slow corners" in text for text in found["handwheel"].evidence)

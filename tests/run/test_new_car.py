@@ -179,3 +179,21 @@ def test_without_speed_and_accelerations_the_yaw_rate_alone_is_written(tmp_path,
     code, out, err = run_vehest(capsys, "new", "my_car", "gyro.csv", "--yes")
     assert (code, err) == (0, "")
     assert "it lacks vx, ax, ay" in out
+
+
+def test_short_recordings_stay_whole_and_too_little_stops_with_what_to_record(tmp_path, capsys, log) -> None:
+    for number in range(10):
+        part = usual(drive(seed=number)).iloc[:400]
+        write(tmp_path / f"turn_{number}.csv", part)
+    files = [f"turn_{number}.csv" for number in range(10)]
+    code, out, _ = run_vehest(capsys, "new", "my_car", *files, "--yes")
+    assert code == 0
+    assert "whole recordings (10, 80 s in all)" in out
+    split = yaml.safe_load(Path(FILES[1]).read_text(encoding="utf-8"))
+    parts = {"train": split["train"], "validation": split["validation"], "test": split["tests"]["test"]}
+    assert {name: len(own) for name, own in parts.items()} == {"train": 5, "validation": 2, "test": 3}
+    assert sorted(one["recording"] for own in parts.values() for one in own) == [f"turn_{number}" for number in range(10)]
+    code, out, _ = run_vehest(capsys, "new", "my_car", *files[:2], "--yes", "--force")
+    assert code == 0
+    assert "16 s in 2 recordings are too short to train, stop and test on: record two minutes or more" in out
+    assert "vehest run" not in out

@@ -167,7 +167,7 @@ class Runner:
             MissingError: a command has to be run first, and not one member is there.
             Stopped: a signal came; finished artefacts stay.
         """
-        if self.weights is not None and TRAIN not in self.force and not self.dry_run:
+        if self.weights is not None and TRAIN not in self.force:
             self._take_published([job.plan for group in groups for job in group.jobs], self.weights)
         members: dict[str, Member] = {}
         waiting: list[Group] = []
@@ -211,7 +211,7 @@ class Runner:
     def _take_published(self, plans: Sequence[StagePlan], weights: PublishedWeights) -> None:
         """Take models that are published under the key of a training and are not there."""
         wanted = [plan for plan in plans if plan.key in weights and find(plan) is None]
-        for plan in wanted:
+        for plan in wanted if not self.dry_run else ():
             ensured(plan, partial(weights.write, plan.key), False, self.stop.requested, self._print_waiting)
             self.stop.raise_if_requested()
         if wanted:

@@ -96,8 +96,8 @@ def leaderboard(artefacts: PartArtefacts) -> pd.DataFrame:
             row |= {f"rmse_{what}_{role}": values_of(runs, name, [seed], role, f"rmse_{what}")[0] for what, role in _OTHER_RANGES}
             row |= {metric: of_model(runs, name, seed, metric) for metric in _OF_MODEL}
             row[_BOUND] = values_of(runs, name, [seed], test_set, _BOUND)[0]
-            diverged = name not in ranking.order or not math.isfinite(values_of(runs, name, [seed], test_set, "rmse_sideslip")[0])
-            row["_place"] = math.inf if diverged else ranking.order.index(name)
+            finite = name in ranking.order and math.isfinite(own["rmse_sideslip"][seeds.index(seed)])
+            row["_place"] = ranking.order.index(name) if finite else math.inf
             rows.append(row)
     board = pd.DataFrame(rows, columns=[*_LEADERBOARD_COLUMNS, "_place"])
     board["epochs"] = board["epochs"].where(board["epochs"] > 0)

@@ -92,8 +92,8 @@ def propose(
     if stands:
         notes.append("the car stands all the time, by its speed; names alone suggest channels")
     if search is not None:
-        proposals, said = _speedometer(proposals, search.turning, wheels)
-        notes += said
+        proposals, more = _speedometer(proposals, search.turning, wheels)
+        notes += more
     clues = () if known is None else _clues(found, wheels, known, compass, west_positive)
     proposals = _left_and_right(replace(proposals, notes=tuple(notes)), found, known, clues)
     proposals = possible(proposals, {column.name: column.values for column in found})
@@ -267,9 +267,7 @@ def _turning_proposals(turning: Turning) -> Iterator[Proposal]:
         if not column.is_made:
             doubt = "" if column.unit and "ay" in turning.columns and is_close else asked
             if channel == "ay" and not is_evident(column, turning.scale):
-                doubt = (
-                    doubt or f"it is {turning.scale:.2g} times vx·yaw_rate and has no unit: it may be another quantity, such as a velocity"
-                )
+                doubt = doubt or f"it is {turning.scale:.2g} times vx·yaw_rate without a unit or clear name: it may be a velocity"
             if column.hint(channel) <= -STRONG:
                 doubt = doubt or "the motion contradicts its name"
             yield Proposal(column.name, channel, turning.units[channel], turning.signs[channel], (evidence,), doubt)

@@ -19,7 +19,7 @@ from vehest.constants import FloatArray
 LEAST_CORRELATION = 0.75
 RARE = {"mph": 0.1, "knots": 0.2}  # units of speed, with a penalty on their mismatch
 CLOSE, FAR = 0.3, 0.6  # logarithms of a scale: within, units explain it; beyond, they do not
-EVIDENT = 0.1  # likewise: within, the scale alone speaks for an acceleration
+EVIDENT = 0.1  # likewise: within, the scale alone indicates an acceleration
 APART = 0.2  # by which the next best units must be worse
 RANGES = {"vx": (0.5, 110.0), "yaw_rate": (0.02, 8.0), "ay": (0.3, 60.0)}  # of the 99th percentile, SI
 MOST_COLUMNS = 60
@@ -124,8 +124,8 @@ def _is_forward(slow: FloatArray) -> bool:
 
 
 def is_evident(ay: Candidate, scale: float) -> bool:
-    """Whether unit, or a scale near 1 over vx·yaw_rate, speaks for a lateral acceleration: names of velocities read alike."""
-    return bool(ay.unit) or abs(math.log(scale)) < EVIDENT
+    """Whether a unit, a clear name or a scale near 1 over vx·yaw_rate indicates a lateral acceleration; a velocity follows a turn alike."""
+    return bool(ay.unit) or ay.hints.get("ay") == STRONG or abs(math.log(scale)) < EVIDENT
 
 
 def _is_plausible(column: Candidate, channel: str, unit: str) -> bool:
