@@ -7,8 +7,8 @@ import math
 import numpy as np
 import pytest
 import torch
-
 from trained_ksnn import ksnn_with_weights
+
 from vehest.estimators.kernels.luenberger import observe
 from vehest.estimators.luenberger import Luenberger
 from vehest_papers.ksnn.linear_system import LocalModels

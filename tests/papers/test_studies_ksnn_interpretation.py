@@ -7,9 +7,9 @@ import re
 import numpy as np
 import pytest
 import torch
+from trained_ksnn import ksnn_with_weights
 
 from conftest import planar_drive
-from trained_ksnn import ksnn_with_weights
 from vehest.data.errors import ConfigurationError, DataError
 from vehest.report.document import Document, Figure, Table, write_document
 from vehest_papers.ksnn.interpretation import (

@@ -6,9 +6,9 @@ import math
 
 import numpy as np
 import pytest
+from trained_ksnn import ksnn_with_weights
 
 from conftest import planar_drive
-from trained_ksnn import ksnn_with_weights
 from vehest.data.errors import ConfigurationError
 from vehest.estimators.luenberger import Luenberger
 from vehest.evaluation.metrics import Scored

@@ -6,8 +6,8 @@ import math
 
 import numpy as np
 import pytest
-
 from trained_ksnn import ksnn_with_weights
+
 from vehest.data.errors import ConfigurationError
 from vehest.estimators.lstm import Lstm
 from vehest.estimators.luenberger import Luenberger
