@@ -112,15 +112,10 @@ class Step:
 
 @dataclass(frozen=True)
 class Choice:
-    """A step, and a seed of it, by its errors on simulated cars.
+    """A step, and a seed of it, by its errors on simulated cars."""
 
-    Args:
-        step: with the lowest median error.
-        seed: position of its seed with the lowest error.
-    """
-
-    step: Step
-    seed: int
+    step: Step  # with the lowest median error
+    seed: int  # position of its seed with the lowest error
 
     @property
     def model(self) -> EvaluatedModel:

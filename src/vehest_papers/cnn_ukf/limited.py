@@ -17,19 +17,12 @@ from vehest_papers.cnn_ukf.subjects import Prepared, Run, Runs
 
 @dataclass(frozen=True, eq=False)
 class Limited:
-    """What learnt on the limited set.
+    """What learnt on the limited set."""
 
-    Args:
-        comparison: with the filters alone, which are those of the full set, as in the paper.
-        runs: candidate -> its seeds, of what learnt.
-        outputs: hybrid -> outputs of its networks, seed by seed, manoeuvre by manoeuvre.
-        scaling: DE-UKF as tuned, and with p₁ and p₂ of the full set's, on the same seeds.
-    """
-
-    comparison: ManoeuvreErrors
-    runs: Runs
-    outputs: Mapping[str, Sequence[Sequence[Outputs]]]
-    scaling: ManoeuvreErrors
+    comparison: ManoeuvreErrors  # with the filters alone, which are those of the full set, as in the paper
+    runs: Runs  # candidate -> its seeds, of what learnt
+    outputs: Mapping[str, Sequence[Sequence[Outputs]]]  # hybrid -> outputs of its networks, seed by seed, manoeuvre by manoeuvre
+    scaling: ManoeuvreErrors  # DE-UKF as tuned, and with p₁ and p₂ of the full set's, on the same seeds
 
 
 AS_TUNED, OF_THE_FULL_SET = "tuned on the limited set", "p₁, p₂ of the full set"

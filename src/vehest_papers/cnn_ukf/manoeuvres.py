@@ -34,38 +34,23 @@ BIN = 0.25  # deg, of Figs. 5 and 11
 
 @dataclass(frozen=True)
 class Kpis:
-    """Errors of the sideslip angle; those of the nonlinear range are NaN where no sample lies in it, or ay was not measured.
+    """Errors of the sideslip angle; those of the nonlinear range are NaN where no sample lies in it, or ay was not measured."""
 
-    Args:
-        mse: mean squared error over all samples [deg²].
-        mse_nonlinear: the same of samples with |ay| ≥ 4 m/s² [deg²].
-        max_error: mean over manoeuvres of the largest absolute error [deg].
-        max_error_nonlinear: the same of samples with |ay| ≥ 4 m/s², over manoeuvres that have some [deg].
-        manoeuvres: how many there are.
-    """
-
-    mse: float
-    mse_nonlinear: float
-    max_error: float
-    max_error_nonlinear: float
-    manoeuvres: int
+    mse: float  # mean squared error over all samples [deg²]
+    mse_nonlinear: float  # the same of samples with |ay| ≥ 4 m/s² [deg²]
+    max_error: float  # mean over manoeuvres of the largest absolute error [deg]
+    max_error_nonlinear: float  # the same of samples with |ay| ≥ 4 m/s², over manoeuvres that have some [deg]
+    manoeuvres: int  # how many there are
 
 
 @dataclass(frozen=True, eq=False)
 class ErrorDistribution:
-    """How often the sideslip angle was how wrong.
+    """How often the sideslip angle was how wrong."""
 
-    Args:
-        edges: of the bins, (K + 1,) [deg]; multiples of the width.
-        counts: samples in each, (K,).
-        mean: of the errors [deg].
-        deviation: their standard deviation [deg].
-    """
-
-    edges: FloatArray
-    counts: NDArray[np.int64]
-    mean: float
-    deviation: float
+    edges: FloatArray  # of the bins, (K + 1,) [deg]; multiples of the width
+    counts: NDArray[np.int64]  # samples in each, (K,)
+    mean: float  # of the errors [deg]
+    deviation: float  # their standard deviation [deg]
 
 
 def manoeuvres_of(spans: Sequence[Span], parts: Sequence[Scored]) -> dict[str, list[Scored]]:

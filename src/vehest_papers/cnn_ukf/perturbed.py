@@ -41,17 +41,11 @@ TRIALS, STAGES, SHRINK = 30, 2, 0.3  # of the search for p₁ and p₂, as in th
 
 @dataclass(frozen=True, eq=False)
 class Perturbed:
-    """Candidates whose filters take the car for another.
+    """Candidates whose filters take the car for another."""
 
-    Args:
-        stiffness: of each of `COMBINATIONS` the runs of each candidate.
-        bodies: of each of `BODIES` likewise.
-        tuned: DE-UKF with both stiffnesses off by -10 %, p₁ and p₂ tuned anew on validation; empty where there is none.
-    """
-
-    stiffness: Sequence[Runs]
-    bodies: Mapping[str, Runs]
-    tuned: Sequence[Run]
+    stiffness: Sequence[Runs]  # of each of `COMBINATIONS` the runs of each candidate
+    bodies: Mapping[str, Runs]  # of each of `BODIES` likewise
+    tuned: Sequence[Run]  # DE-UKF with both stiffnesses off by -10 %, p₁ and p₂ tuned anew on validation; empty where there is none
 
 
 def with_stiffness(fitted: Estimator, front: float, rear: float) -> Estimator:

@@ -85,19 +85,12 @@ PARTS_AWAY = {
 
 @dataclass(frozen=True, eq=False)
 class Run:
-    """One training and what it makes of the validation and the test manoeuvres.
+    """One training and what it makes of the validation and the test manoeuvres."""
 
-    Args:
-        candidate: what the report calls it.
-        model: where it comes from.
-        validation: what was scored of each manoeuvre that stopped it.
-        test: what was scored of each manoeuvre it is tested on.
-    """
-
-    candidate: str
-    model: EvaluatedModel
-    validation: Manoeuvres
-    test: Manoeuvres
+    candidate: str  # what the report calls it
+    model: EvaluatedModel  # where it comes from
+    validation: Manoeuvres  # what was scored of each manoeuvre that stopped it
+    test: Manoeuvres  # what was scored of each manoeuvre it is tested on
 
     @property
     def kpis(self) -> Kpis:

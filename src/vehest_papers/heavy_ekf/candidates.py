@@ -38,34 +38,21 @@ TUNED_SLIPS, TUNED_MISMATCHES, FIRST_TUNING_SEED = (2.5, 4.5, 6.5), (-0.25, -0.0
 
 @dataclass(frozen=True)
 class Levels:
-    """What was tuned for a filter, once for all cells.
+    """What was tuned for a filter, once for all cells."""
 
-    Args:
-        ay: σ_ay [m/s²].
-        steer: σ_δ [rad √s].
-        tyres: wander of the logarithms of tyre parameters [1/√s].
-    """
-
-    ay: float
-    steer: float
-    tyres: float = 1e-3
+    ay: float  # σ_ay [m/s²]
+    steer: float  # σ_δ [rad √s]
+    tyres: float = 1e-3  # wander of the logarithms of tyre parameters [1/√s]
 
 
 @dataclass(frozen=True)
 class Tuned:
-    """Outcome of a search.
+    """Outcome of a search."""
 
-    Args:
-        levels: the best.
-        cost: geometric mean of RMSE(β) over the tuning drives [deg].
-        evaluations: of all tuning drives.
-        at_limits: level that ended on a limit of the box -> by how much the cost changes a decade inwards [%].
-    """
-
-    levels: Levels
-    cost: float
-    evaluations: int
-    at_limits: Mapping[str, float]
+    levels: Levels  # the best
+    cost: float  # geometric mean of RMSE(β) over the tuning drives [deg]
+    evaluations: int  # of all tuning drives
+    at_limits: Mapping[str, float]  # level that ended on a limit of the box -> by how much the cost changes a decade inwards [%]
 
 
 def estimator_of(name: str, levels: Levels, curves: FloatArray, car: SingleTrackParameters = TRUCK) -> RationalFilter:

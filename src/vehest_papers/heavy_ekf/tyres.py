@@ -37,16 +37,11 @@ LINEAR_LABELS = {"cornering_stiffness_front": "$C_F$ [kN/rad]", "cornering_stiff
 
 @dataclass(frozen=True, eq=False)
 class OwnCurves:
-    """Curves of the plant itself, from its tyre forces.
+    """Curves of the plant itself, from its tyre forces."""
 
-    Args:
-        rational: fit of rational curves.
-        linear: fit of straight lines.
-        offsets: recording -> slip angle of the front and of the rear axle by its sensors where the axle makes no force, (2,) [rad].
-    """
-
-    rational: TyreFit
-    linear: TyreFit
+    rational: TyreFit  # fit of rational curves
+    linear: TyreFit  # fit of straight lines
+    # recording -> slip angle of the front and of the rear axle by its sensors where the axle makes no force, (2,) [rad]
     offsets: Mapping[str, FloatArray]
 
     @classmethod

@@ -24,17 +24,11 @@ TESTS = {"own": "own car", "other": "other car"}
 
 @dataclass(frozen=True, eq=False)
 class Curve:
-    """Errors by category and amount.
+    """Errors by category and amount."""
 
-    Args:
-        errors: ``own`` or ``other`` -> errors of candidates called ``CATEGORY@MINUTES``.
-        minutes: amounts, from the least, as they are written in names.
-        lines: category -> estimator and variant.
-    """
-
-    errors: Mapping[str, SegmentErrors]
-    minutes: Sequence[str]
-    lines: Mapping[str, tuple[str, str]]
+    errors: Mapping[str, SegmentErrors]  # ``own`` or ``other`` -> errors of candidates called ``CATEGORY@MINUTES``
+    minutes: Sequence[str]  # amounts, from the least, as they are written in names
+    lines: Mapping[str, tuple[str, str]]  # category -> estimator and variant
 
 
 def curve_of(whole: Scheme, shorter: Mapping[str, Scheme]) -> Curve | None:

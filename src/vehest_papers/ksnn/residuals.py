@@ -23,38 +23,23 @@ PUBLISHED_ABOVE_KSNN = "7 dB at 0.1 Hz and 8 to 10 dB at 1 Hz"
 
 @dataclass(frozen=True, eq=False)
 class Residuals:
-    """Estimates of one estimator on a test set.
+    """Estimates of one estimator on a test set."""
 
-    Args:
-        estimator: name in conf/estimator.
-        variant: what the paper calls it.
-        title: for people, with the seed.
-        scored: estimate and reference, range by range.
-    """
-
-    estimator: str
-    variant: str
-    title: str
-    scored: Sequence[Scored]
+    estimator: str  # name in conf/estimator
+    variant: str  # what the paper calls it
+    title: str  # for people, with the seed
+    scored: Sequence[Scored]  # estimate and reference, range by range
 
 
 @dataclass(frozen=True, eq=False)
 class Panel:
-    """One panel of the figure.
+    """One panel of the figure."""
 
-    Args:
-        test: test set, for example ``Ferrari F-2``.
-        trained_on: training set, for example ``Corvette C-1``.
-        data: real or simulated, and which data set.
-        estimators: the KS-NN first: the others are compared with it.
-        rate_hz: rate of the scored samples [Hz].
-    """
-
-    test: str
-    trained_on: str
-    data: str
-    estimators: Sequence[Residuals]
-    rate_hz: float
+    test: str  # test set, for example ``Ferrari F-2``
+    trained_on: str  # training set, for example ``Corvette C-1``
+    data: str  # real or simulated, and which data set
+    estimators: Sequence[Residuals]  # the KS-NN first: the others are compared with it
+    rate_hz: float  # rate of the scored samples [Hz]
 
     @property
     def title(self) -> str:

@@ -41,23 +41,14 @@ def segments_on(model: EvaluatedModel, test: str) -> Segments:
 
 @dataclass(frozen=True, eq=False)
 class Scheme:
-    """One part, and which of its test sets is of which car.
+    """One part, and which of its test sets is of which car."""
 
-    Args:
-        name: of the part.
-        title: for people.
-        part: what was compared.
-        own: test set of the car that is learnt on.
-        other: test set of the car that is stopped on.
-        published: the paper's table of this scheme; empty where it has none.
-    """
-
-    name: str
-    title: str
-    part: PartArtefacts
-    own: str
-    other: str
-    published: Mapping[str, Published] = field(default_factory=dict)
+    name: str  # of the part
+    title: str  # for people
+    part: PartArtefacts  # what was compared
+    own: str  # test set of the car that is learnt on
+    other: str  # test set of the car that is stopped on
+    published: Mapping[str, Published] = field(default_factory=dict)  # the paper's table of this scheme; empty where it has none
 
     @cached_property
     def runs(self) -> pd.DataFrame:

@@ -35,15 +35,10 @@ DASHES = ("solid", "dashed", "dashdot", "dotted")
 
 @dataclass(frozen=True)
 class Injected:
-    """Outcome of injecting white noise into one acceleration of an estimator in a steady turn.
+    """Outcome of injecting white noise into one acceleration of an estimator in a steady turn."""
 
-    Args:
-        gain: standard deviation of what is added to v̂, for noise of one m/s² a sample [m/s].
-        scatter: standard deviation of ``gain`` by chance, relative; successive outputs are correlated.
-    """
-
-    gain: float
-    scatter: float
+    gain: float  # standard deviation of what is added to v̂, for noise of one m/s² a sample [m/s]
+    scatter: float  # standard deviation of ``gain`` by chance, relative; successive outputs are correlated
 
 
 def sensitivity_of(estimator: Estimator, yaw_rate: float, error: float = 0.0) -> NoiseSensitivity:

@@ -26,19 +26,12 @@ MOVING = STATES[:4]
 
 @dataclass(frozen=True)
 class Definiteness:
-    """What became of covariances on a test set.
+    """What became of covariances on a test set."""
 
-    Args:
-        sequences: how many there are.
-        lost: of them without repair, those that lose definiteness.
-        lost_steps: with repair, steps that needed one.
-        steps: all steps of all sequences.
-    """
-
-    sequences: int
-    lost: int
-    lost_steps: int
-    steps: int
+    sequences: int  # how many there are
+    lost: int  # of them without repair, those that lose definiteness
+    lost_steps: int  # with repair, steps that needed one
+    steps: int  # all steps of all sequences
 
 
 class Swapped(PointModel):

@@ -34,17 +34,11 @@ N_RESAMPLES = 2000
 
 @dataclass(frozen=True)
 class Tracks:
-    """The friction of all seeds on all sequences of a test.
+    """The friction of all seeds on all sequences of a test."""
 
-    Args:
-        mean: (S, B, T).
-        deviation: the filter's own, (S, B, T).
-        rate_hz: of the samples.
-    """
-
-    mean: FloatArray
-    deviation: FloatArray
-    rate_hz: float
+    mean: FloatArray  # (S, B, T)
+    deviation: FloatArray  # the filter's own, (S, B, T)
+    rate_hz: float  # of the samples
 
     @property
     def final(self) -> FloatArray:

@@ -24,21 +24,13 @@ WAYS = {"batch": "constant batch", "samples": "constant samples a batch"}
 
 @dataclass(frozen=True)
 class Length:
-    """Trainings on sequences of one length.
+    """Trainings on sequences of one length."""
 
-    Args:
-        steps: samples of a sequence.
-        batch: sequences in a batch.
-        epochs: through the filter.
-        sequences: that an epoch goes through.
-        subject: the candidate, with its losses.
-    """
-
-    steps: int
-    batch: int
-    epochs: int
-    sequences: int
-    subject: Subject
+    steps: int  # samples of a sequence
+    batch: int  # sequences in a batch
+    epochs: int  # through the filter
+    sequences: int  # that an epoch goes through
+    subject: Subject  # the candidate, with its losses
 
     @property
     def batches(self) -> int:

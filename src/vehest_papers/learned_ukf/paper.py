@@ -20,17 +20,11 @@ CANDIDATES = (PC, PCR, NN, NN_U, NNT, NNT_U, NNTF, NNTF_U, NNTF_UH, NNTF_UH_LOW,
 
 @dataclass(frozen=True)
 class Published:
-    """A column of Tables I or II.
+    """A column of Tables I or II."""
 
-    Args:
-        mse: mean weighted squared error.
-        mae: mean weighted absolute error.
-        ae99: 99th percentile of the weighted absolute error.
-    """
-
-    mse: float
-    mae: float
-    ae99: float
+    mse: float  # mean weighted squared error
+    mae: float  # mean weighted absolute error
+    ae99: float  # 99th percentile of the weighted absolute error
 
 
 TABLE_I: Mapping[str, Published] = {

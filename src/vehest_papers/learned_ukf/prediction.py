@@ -31,17 +31,11 @@ Pair = tuple[LearnedUkf, LearnedUkf]
 
 @dataclass(frozen=True)
 class Compared:
-    """NNTF and NNTF_U on a test set.
+    """NNTF and NNTF_U on a test set."""
 
-    Args:
-        one_step: of both, mean squared errors as predictors by seed, sequence and state, (2, S, B, 4).
-        estimation: the same of their filters.
-        swaps: (which predicts, which observes) -> weighted MSE by seed and sequence, (S, B); 0 is NNTF.
-    """
-
-    one_step: FloatArray
-    estimation: FloatArray
-    swaps: Mapping[tuple[int, int], FloatArray]
+    one_step: FloatArray  # of both, mean squared errors as predictors by seed, sequence and state, (2, S, B, 4)
+    estimation: FloatArray  # the same of their filters
+    swaps: Mapping[tuple[int, int], FloatArray]  # (which predicts, which observes) -> weighted MSE by seed and sequence, (S, B); 0 is NNTF
 
     def states(self, task: str, lower: Mapping[str, bool]) -> dict[str, tuple[Interval, float, bool]]:
         """State -> difference NNTF_U - NNTF of mean squares, the error of NNTF, and whether the paper has it lower."""

@@ -40,17 +40,11 @@ QUANTITIES = {
 
 @dataclass(frozen=True, eq=False)
 class Distribution:
-    """Counts in bins.
+    """Counts in bins."""
 
-    Args:
-        kind: ``real`` or ``simulated``.
-        edges: (B + 1,).
-        counts: (B,).
-    """
-
-    kind: str
-    edges: FloatArray
-    counts: NDArray[np.int64]
+    kind: str  # ``real`` or ``simulated``
+    edges: FloatArray  # (B + 1,)
+    counts: NDArray[np.int64]  # (B,)
 
 
 def shown_stretches(stretches: Mapping[str, Stretch]) -> list[Stretch]:

@@ -28,19 +28,12 @@ WELCH_SECONDS = 20.0
 
 @dataclass(frozen=True)
 class SlowError:
-    """What a kinematic residual is made of below ``SLOW_BELOW``.
+    """What a kinematic residual is made of below ``SLOW_BELOW``."""
 
-    Args:
-        mean: of the whole residual.
-        slopes: of the residual over each explaining signal, by least squares.
-        std: of what the explaining signals and white noise leave.
-        time: after which the autocorrelation of that has fallen to 1/e [s].
-    """
-
-    mean: float
-    slopes: tuple[float, ...]
-    std: float
-    time: float
+    mean: float  # of the whole residual
+    slopes: tuple[float, ...]  # of the residual over each explaining signal, by least squares
+    std: float  # of what the explaining signals and white noise leave
+    time: float  # after which the autocorrelation of that has fallen to 1/e [s]
 
 
 def read_off(channels: Mapping[str, FloatArray], rate_hz: float) -> dict[str, float]:

@@ -25,21 +25,13 @@ Change = Callable[[FloatArray, float], FloatArray]
 
 @dataclass(frozen=True)
 class Fault:
-    """One fault.
+    """One fault."""
 
-    Args:
-        name: what is done.
-        channels: to which channels; those that a recording does not have are left out, at least one must be there.
-        size: how much, with its unit.
-        checks: names of checks of which one must find it; empty where none can.
-        change: samples (T,) and sampling rate [Hz] to samples.
-    """
-
-    name: str
-    channels: tuple[str, ...]
-    size: str
-    checks: frozenset[str]
-    change: Change
+    name: str  # what is done
+    channels: tuple[str, ...]  # to which channels; those that a recording does not have are left out, at least one must be there
+    size: str  # how much, with its unit
+    checks: frozenset[str]  # names of checks of which one must find it; empty where none can
+    change: Change  # samples (T,) and sampling rate [Hz] to samples
 
     def __call__(self, recording: Recording) -> Recording:
         """The recording with the fault in it."""

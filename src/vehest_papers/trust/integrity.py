@@ -29,19 +29,12 @@ NOMINAL, MISLEADING, HAZARDOUS, UNAVAILABLE = "nominal", "misleading", "hazardou
 
 @dataclass(frozen=True, eq=False)
 class Integrity:
-    """Errors and protection levels of samples, and where they lie in the Stanford diagram; arrays are (K,).
+    """Errors and protection levels of samples, and where they lie in the Stanford diagram; arrays are (K,)."""
 
-    Args:
-        error: size of the error [deg, or the unit of the levels].
-        level: protection level.
-        flagged: whether the estimate was flagged as invalid.
-        alert_limit: the same for all.
-    """
-
-    error: FloatArray
-    level: FloatArray
-    flagged: NDArray[np.bool_]
-    alert_limit: float = ALERT_LIMIT
+    error: FloatArray  # size of the error [deg, or the unit of the levels]
+    level: FloatArray  # protection level
+    flagged: NDArray[np.bool_]  # whether the estimate was flagged as invalid
+    alert_limit: float = ALERT_LIMIT  # the same for all
 
     def masks(self) -> dict[str, NDArray[np.bool_]]:
         """Region -> samples in it, (K,); each sample lies in one."""

@@ -37,46 +37,27 @@ MOST_DEVIATIONS = 1e3  # of an innovation, beyond which a signature is certain
 
 @dataclass(frozen=True)
 class Visibility:
-    """What the oracle makes of a fault.
+    """What the oracle makes of a fault."""
 
-    Args:
-        visible: whether it is seen within the horizon.
-        delay: from the onset to the alarm [s]; NaN if it is not seen.
-        threshold: log A.
-    """
-
-    visible: bool
-    delay: float
-    threshold: float
+    visible: bool  # whether it is seen within the horizon
+    delay: float  # from the onset to the alarm [s]; NaN if it is not seen
+    threshold: float  # log A
 
 
 @dataclass(frozen=True, eq=False)
 class Oracle:
-    """What the test knows of healthy drives.
+    """What the test knows of healthy drives."""
 
-    Args:
-        channels: that are measured.
-        rate_hz: [Hz].
-        relations: between channels.
-        least_speed: that goes with them.
-        model: of what they leave.
-        speed: channel that the noise goes by.
-        levels: speeds, and the noise at each.
-        healthy: innovations over their levels, of healthy drives on which the threshold is tried, (T, C) each.
-        false_alarms_per_hour: that the test may have.
-        reserve: how many times as large the innovations of healthy drives may be without an alarm, as with limits of the detector.
-    """
-
-    channels: tuple[str, ...]
-    rate_hz: float
-    relations: tuple[Relation, ...]
-    least_speed: float
-    model: Autoregression
-    speed: str | None
-    levels: tuple[FloatArray, FloatArray]
-    healthy: tuple[FloatArray, ...]
-    false_alarms_per_hour: float
-    reserve: float
+    channels: tuple[str, ...]  # that are measured
+    rate_hz: float  # [Hz]
+    relations: tuple[Relation, ...]  # between channels
+    least_speed: float  # that goes with them
+    model: Autoregression  # of what they leave
+    speed: str | None  # channel that the noise goes by
+    levels: tuple[FloatArray, FloatArray]  # speeds, and the noise at each
+    healthy: tuple[FloatArray, ...]  # innovations over their levels, of healthy drives on which the threshold is tried, (T, C) each
+    false_alarms_per_hour: float  # that the test may have
+    reserve: float  # how many times as large the innovations of healthy drives may be without an alarm, as with limits of the detector
 
     def sees(
         self,
