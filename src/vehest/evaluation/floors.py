@@ -74,34 +74,21 @@ _SILENT = ("motor_current", "wheel_torque_", "brake_pressure_")  # thrust and br
 
 @dataclass(frozen=True)
 class Floor:
-    """A standard deviation over the scored samples of a test set.
+    """A standard deviation over the scored samples of a test set."""
 
-    Args:
-        vy: of lateral velocity [m/s].
-        sideslip: of the sideslip angle [deg].
-    """
-
-    vy: float
-    sideslip: float
+    vy: float  # of lateral velocity [m/s]
+    sideslip: float  # of the sideslip angle [deg]
 
 
 @dataclass(frozen=True, eq=False)
 class Drive:
-    """A range or sequence of a test set, from where estimators may start, at the evaluation rate; arrays are of shape (T,).
+    """A range or sequence of a test set, from where estimators may start, at the evaluation rate; arrays are of shape (T,)."""
 
-    Args:
-        rate_hz: [Hz].
-        inputs: those of `INPUTS` that were measured, gaps filled by straight lines [SI].
-        vy_ref: reference lateral velocity [m/s]; may be NaN before the scored samples.
-        first: index of the first scored sample; all after it are scored.
-        told: whether estimators are told the state at the first sample.
-    """
-
-    rate_hz: float
-    inputs: dict[str, FloatArray]
-    vy_ref: FloatArray
-    first: int
-    told: bool = False
+    rate_hz: float  # [Hz]
+    inputs: dict[str, FloatArray]  # those of `INPUTS` that were measured, gaps filled by straight lines [SI]
+    vy_ref: FloatArray  # reference lateral velocity [m/s]; may be NaN before the scored samples
+    first: int  # index of the first scored sample; all after it are scored
+    told: bool = False  # whether estimators are told the state at the first sample
 
     @property
     def step(self) -> float:
@@ -213,29 +200,18 @@ def _robust_deviation(samples: FloatArray) -> float:
 
 
 class Noise(NamedTuple):
-    """A disturbance in two parts.
+    """A disturbance in two parts."""
 
-    Attributes:
-        density: of its white part [unit²/Hz], two-sided: the variance of a mean over T is density/T.
-        deviation: standard deviation of its slow part, a Gauss-Markov process [unit].
-        time_constant: of the slow part [s].
-    """
-
-    density: float
-    deviation: float
-    time_constant: float
+    density: float  # of its white part [unit²/Hz], two-sided: the variance of a mean over T is density/T
+    deviation: float  # standard deviation of its slow part, a Gauss-Markov process [unit]
+    time_constant: float  # of the slow part [s]
 
 
 class Axle(NamedTuple):
-    """What the force balance of an axle says of v, fitted to a test set.
+    """What the force balance of an axle says of v, fitted to a test set."""
 
-    Attributes:
-        coefficients: of the columns of `_axle_columns`.
-        error: what it leaves of v, in m/s.
-    """
-
-    coefficients: FloatArray
-    error: Noise
+    coefficients: FloatArray  # of the columns of `_axle_columns`
+    error: Noise  # what it leaves of v, in m/s
 
 
 @dataclass(frozen=True, eq=False)

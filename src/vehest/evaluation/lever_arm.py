@@ -25,15 +25,10 @@ METRICS = ("rmse_vy", "rmse_sideslip", "fvu")
 
 @dataclass(frozen=True)
 class LeverArm:
-    """A lever arm and what is left with it.
+    """A lever arm and what is left with it."""
 
-    Args:
-        x: how far ahead of the reference's point the estimate holds [m]; at most `LONGEST` either way.
-        parts: the estimates at the reference's point.
-    """
-
-    x: float
-    parts: tuple[Scored, ...]
+    x: float  # how far ahead of the reference's point the estimate holds [m]; at most `LONGEST` either way
+    parts: tuple[Scored, ...]  # the estimates at the reference's point
 
 
 def point_is_unknown(reference: Recording) -> bool:

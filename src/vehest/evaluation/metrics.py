@@ -124,34 +124,21 @@ class Protocol:
 
 @dataclass(frozen=True, eq=False)
 class Scored:
-    """Estimate and reference at the scored times; every array has shape (K,).
+    """Estimate and reference at the scored times; every array has shape (K,)."""
 
-    Args:
-        time: [s].
-        vy: estimated lateral velocity [m/s].
-        vy_ref: reference lateral velocity [m/s].
-        sideslip: estimated sideslip angle, atan2(vy, vx) with the measured vx [rad].
-        sideslip_ref: reference sideslip angle, atan2(vy_ref, vx) [rad].
-        ay: measured lateral acceleration [m/s²]; NaN where the recording has none.
-        others: ``vx`` [m/s] and ``yaw_rate`` [rad/s] -> estimate and reference, where both are there.
-        covariance: of the errors in ``covariance_of``, shape (K, n, n), where the method gives one.
-        covariance_of: those quantities among `errors` that the covariance is of.
-        nis: normalised innovation squared of the filter's update, where the method gives it.
-        nis_dof: numbers measured at each update.
-        bands: ``vy`` [m/s] and ``sideslip`` [rad] -> half width of the calibrated 90 % band, where there is one.
-    """
-
-    time: FloatArray
-    vy: FloatArray
-    vy_ref: FloatArray
-    sideslip: FloatArray
-    sideslip_ref: FloatArray
-    ay: FloatArray
+    time: FloatArray  # [s]
+    vy: FloatArray  # estimated lateral velocity [m/s]
+    vy_ref: FloatArray  # reference lateral velocity [m/s]
+    sideslip: FloatArray  # estimated sideslip angle, atan2(vy, vx) with the measured vx [rad]
+    sideslip_ref: FloatArray  # reference sideslip angle, atan2(vy_ref, vx) [rad]
+    ay: FloatArray  # measured lateral acceleration [m/s²]; NaN where the recording has none
+    # ``vx`` [m/s] and ``yaw_rate`` [rad/s] -> estimate and reference, where both are there
     others: Mapping[str, tuple[FloatArray, FloatArray]] = field(default_factory=dict)
-    covariance: FloatArray | None = None
-    covariance_of: tuple[str, ...] = ()
-    nis: FloatArray | None = None
-    nis_dof: FloatArray | None = None
+    covariance: FloatArray | None = None  # of the errors in ``covariance_of``, shape (K, n, n), where the method gives one
+    covariance_of: tuple[str, ...] = ()  # those quantities among `errors` that the covariance is of
+    nis: FloatArray | None = None  # normalised innovation squared of the filter's update, where the method gives it
+    nis_dof: FloatArray | None = None  # numbers measured at each update
+    # ``vy`` [m/s] and ``sideslip`` [rad] -> half width of the calibrated 90 % band, where there is one
     bands: Mapping[str, FloatArray] = field(default_factory=dict)
 
     @property

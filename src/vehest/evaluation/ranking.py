@@ -21,21 +21,13 @@ BASELINES = ("zero", "static_map")
 
 @dataclass(frozen=True)
 class Comparison:
-    """RMSE of one estimator less that of another, over all seeds of both.
+    """RMSE of one estimator less that of another, over all seeds of both."""
 
-    Args:
-        difference: first - second.
-        low: lower end of its interval, corrected by Holm over all comparisons of the table.
-        high: its upper end.
-        p_value: adjusted likewise.
-        verdict: whether the first lies lower, higher, or is not told apart from the second.
-    """
-
-    difference: float
-    low: float
-    high: float
-    p_value: float
-    verdict: Verdict
+    difference: float  # first - second
+    low: float  # lower end of its interval, corrected by Holm over all comparisons of the table
+    high: float  # its upper end
+    p_value: float  # adjusted likewise
+    verdict: Verdict  # whether the first lies lower, higher, or is not told apart from the second
 
     @property
     def turned(self) -> Comparison:
@@ -46,29 +38,17 @@ class Comparison:
 
 @dataclass(frozen=True)
 class Ranking:
-    """What a test set says of a number of estimators.
+    """What a test set says of a number of estimators."""
 
-    Args:
-        order: by RMSE over all seeds, the lowest first.
-        rmse: over all seeds of each.
-        intervals: its 95 % interval, blocks and seeds drawn anew.
-        against_best: the best against each other.
-        against_baseline: (candidate, baseline) -> comparison, of each baseline that is there.
-        pairs: (first, second) -> comparison, of every pair that was compared, either way round.
-        n_blocks: blocks that were resampled; below `LEAST_BLOCKS` there are no intervals and no comparisons.
-        block_seconds: mean length of a block [s].
-        effective_blocks: how many equal blocks the best one's squared error is spread over.
-    """
-
-    order: Sequence[Name]
-    rmse: Mapping[Name, float]
-    intervals: Mapping[Name, tuple[float, float]]
-    against_best: Mapping[Name, Comparison]
-    against_baseline: Mapping[tuple[Name, Name], Comparison]
-    pairs: Mapping[tuple[Name, Name], Comparison]
-    n_blocks: int
-    block_seconds: float
-    effective_blocks: float
+    order: Sequence[Name]  # by RMSE over all seeds, the lowest first
+    rmse: Mapping[Name, float]  # over all seeds of each
+    intervals: Mapping[Name, tuple[float, float]]  # its 95 % interval, blocks and seeds drawn anew
+    against_best: Mapping[Name, Comparison]  # the best against each other
+    against_baseline: Mapping[tuple[Name, Name], Comparison]  # (candidate, baseline) -> comparison, of each baseline that is there
+    pairs: Mapping[tuple[Name, Name], Comparison]  # (first, second) -> comparison, of every pair that was compared, either way round
+    n_blocks: int  # blocks that were resampled; below `LEAST_BLOCKS` there are no intervals and no comparisons
+    block_seconds: float  # mean length of a block [s]
+    effective_blocks: float  # how many equal blocks the best one's squared error is spread over
 
     @property
     def missing_baselines(self) -> list[str]:

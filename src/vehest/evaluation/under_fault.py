@@ -64,15 +64,10 @@ def errors_under_fault(parts: Sequence[Scored], nominal: Sequence[Scored], windo
 
 @dataclass(frozen=True, eq=False)
 class Flagged:
-    """What is said of an estimate besides its value, on the grid that errors are read on.
+    """What is said of an estimate besides its value, on the grid that errors are read on."""
 
-    Args:
-        band: half width of the 90 % band of β, (K,) [rad]; NaN where there is none.
-        health: 0 valid, 1 degraded, 2 invalid, (K,).
-    """
-
-    band: FloatArray
-    health: FloatArray
+    band: FloatArray  # half width of the 90 % band of β, (K,) [rad]; NaN where there is none
+    health: FloatArray  # 0 valid, 1 degraded, 2 invalid, (K,)
 
 
 def flags_under_fault(parts: Sequence[Scored], flagged: Sequence[Flagged], windows: Sequence[Window], rate_hz: float) -> dict[str, float]:

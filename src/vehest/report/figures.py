@@ -22,51 +22,31 @@ LOGARITHMIC_FROM = 20.0
 
 @dataclass(frozen=True, eq=False)
 class Spread:
-    """One row of a dot plot.
+    """One row of a dot plot."""
 
-    Args:
-        label: what the row shows.
-        line: its looks.
-        values: one value a seed, shape (S,); those that are not finite are left out.
-        chosen: value of the chosen seed.
-    """
-
-    label: str
+    label: str  # what the row shows
     line: Line
-    values: FloatArray
-    chosen: float
+    values: FloatArray  # one value a seed, shape (S,); those that are not finite are left out
+    chosen: float  # value of the chosen seed
 
 
 @dataclass(frozen=True, eq=False)
 class Traces:
-    """Time series of one source on the common grid; NaN breaks a line.
+    """Time series of one source on the common grid; NaN breaks a line."""
 
-    Args:
-        label: name of the source.
-        line: its looks.
-        vy: lateral velocity [m/s], shape (K,).
-        sideslip: [deg], shape (K,).
-    """
-
-    label: str
+    label: str  # name of the source
     line: Line
-    vy: FloatArray
-    sideslip: FloatArray
+    vy: FloatArray  # lateral velocity [m/s], shape (K,)
+    sideslip: FloatArray  # [deg], shape (K,)
 
 
 @dataclass(frozen=True, eq=False)
 class Errors:
-    """Sideslip errors of one estimator.
+    """Sideslip errors of one estimator."""
 
-    Args:
-        label: name of the estimator.
-        line: its looks.
-        error: estimate minus reference [deg], shape (K,).
-    """
-
-    label: str
+    label: str  # name of the estimator
     line: Line
-    error: FloatArray
+    error: FloatArray  # estimate minus reference [deg], shape (K,)
 
     @property
     def rmse(self) -> float:
@@ -76,21 +56,13 @@ class Errors:
 
 @dataclass(frozen=True, eq=False)
 class Learning:
-    """Losses of one training run.
+    """Losses of one training run."""
 
-    Args:
-        label: name of the estimator.
-        line: its looks.
-        epoch: shape (E,).
-        train: training loss, shape (E,).
-        validation: validation loss, shape (E,).
-    """
-
-    label: str
+    label: str  # name of the estimator
     line: Line
-    epoch: FloatArray
-    train: FloatArray
-    validation: FloatArray
+    epoch: FloatArray  # shape (E,)
+    train: FloatArray  # training loss, shape (E,)
+    validation: FloatArray  # validation loss, shape (E,)
 
 
 def spread_figure(rows: Sequence[Spread], quantity: str) -> MatplotlibFigure:

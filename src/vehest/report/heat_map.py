@@ -23,19 +23,12 @@ NO_VALUE = "#ececec"
 
 @dataclass(frozen=True, eq=False)
 class Panel:
-    """One panel of a heat map.
+    """One panel of a heat map."""
 
-    Args:
-        title: what it shows; may be empty.
-        mean: colour and first line of each cell, NaN where there is none; shape (R, C).
-        half: half the interval, NaN where there is none; shape (R, C).
-        marked: row and column of the cell with a frame.
-    """
-
-    title: str
-    mean: FloatArray
-    half: FloatArray
-    marked: tuple[int, int] | None = None
+    title: str  # what it shows; may be empty
+    mean: FloatArray  # colour and first line of each cell, NaN where there is none; shape (R, C)
+    half: FloatArray  # half the interval, NaN where there is none; shape (R, C)
+    marked: tuple[int, int] | None = None  # row and column of the cell with a frame
 
 
 def heat_map(

@@ -20,21 +20,13 @@ SIDESTEP = 0.005  # of intervals that would cover each other
 
 @dataclass(frozen=True, eq=False)
 class Reliability:
-    """Coverages of one estimator's bands, each of shape (L,); NaN where not known.
+    """Coverages of one estimator's bands, each of shape (L,); NaN where not known."""
 
-    Args:
-        label: name of the estimator.
-        line: its looks.
-        coverage: fraction of errors inside.
-        low: lower end of its interval.
-        high: upper end.
-    """
-
-    label: str
+    label: str  # name of the estimator
     line: Line
-    coverage: FloatArray
-    low: FloatArray
-    high: FloatArray
+    coverage: FloatArray  # fraction of errors inside
+    low: FloatArray  # lower end of its interval
+    high: FloatArray  # upper end
 
 
 def reliability_figure(levels: Sequence[float], rows: Sequence[Reliability]) -> MatplotlibFigure:

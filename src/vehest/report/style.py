@@ -68,17 +68,11 @@ _PAPER = {
 
 @dataclass(frozen=True)
 class Line:
-    """How one estimator is drawn, the same in every figure.
+    """How one estimator is drawn, the same in every figure."""
 
-    Args:
-        colour: hexadecimal, readable on white.
-        dash: ``solid``, ``dashed``, ``dotted`` or ``dashdot``.
-        marker: matplotlib's marker, where points are drawn.
-    """
-
-    colour: str
-    dash: str = "solid"
-    marker: str = "o"
+    colour: str  # hexadecimal, readable on white
+    dash: str = "solid"  # ``solid``, ``dashed``, ``dotted`` or ``dashdot``
+    marker: str = "o"  # matplotlib's marker, where points are drawn
 
 
 REFERENCE = Line(REFERENCE_COLOUR)

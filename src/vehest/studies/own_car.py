@@ -41,15 +41,10 @@ leaderboard = drive.leaderboard
 
 @dataclass(frozen=True)
 class Verdict:
-    """What is said of a test set.
+    """What is said of a test set."""
 
-    Args:
-        sentences: for people, in Markdown.
-        model: to go on with; none where nothing can be recommended.
-    """
-
-    sentences: tuple[str, ...]
-    model: EvaluatedModel | None
+    sentences: tuple[str, ...]  # for people, in Markdown
+    model: EvaluatedModel | None  # to go on with; none where nothing can be recommended
 
 
 def documents(artefacts: StudyArtefacts) -> dict[str, Document]:

@@ -23,17 +23,11 @@ from vehest.vehicle.tyres import STILL, PositiveParameters, Slips, TyreForces
 
 @dataclass(frozen=True)
 class Chassis:
-    """What of a car is known.
+    """What of a car is known."""
 
-    Args:
-        mass: [kg].
-        wheelbase: [m].
-        wheel_radius: R [m].
-    """
-
-    mass: float
-    wheelbase: float
-    wheel_radius: float
+    mass: float  # [kg]
+    wheelbase: float  # [m]
+    wheel_radius: float  # R [m]
 
 
 F1TENTH = Chassis(mass=5.1, wheelbase=0.33, wheel_radius=0.05)

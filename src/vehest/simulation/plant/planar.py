@@ -132,17 +132,11 @@ def _advance(state, wanted_steer, wanted_current, scale, p, step, n_steps):  # t
 
 @dataclass(frozen=True, eq=False)
 class Inputs:
-    """Inputs of the car.
+    """Inputs of the car."""
 
-    Args:
-        steer: wanted road-wheel angle [rad].
-        current: wanted motor current [A].
-        friction: scale of the tyres' friction.
-    """
-
-    steer: float = 0.0
-    current: float = 0.0
-    friction: float = 1.0
+    steer: float = 0.0  # wanted road-wheel angle [rad]
+    current: float = 0.0  # wanted motor current [A]
+    friction: float = 1.0  # scale of the tyres' friction
 
 
 class PlanarPlant:

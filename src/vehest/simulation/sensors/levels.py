@@ -20,30 +20,19 @@ class SensorLevel:
     Noise is a density, so that a level means the same at every sampling rate: a sensor that is low-passed at half the sampling rate has
     samples of standard deviation noise·√(rate/2), which at 100 Hz is 7.07 times the density.
 
-    Args:
-        noise: density of the white noise [unit/√Hz].
-        offset: standard deviation of a constant that is drawn for each drive [unit].
-        drift: standard deviation of a first-order Gauss-Markov process that is stationary from the first sample on [unit].
-        drift_time: its correlation time [s].
-        quantisation: step of the values shown [unit].
-        delay: age of what is shown; the first value is held before the start [s].
-        scale: standard deviation of a relative error that is drawn for each drive [1].
-        gain: relative error of every drive [1].
-        bias: constant of every drive [unit].
-
     Raises:
         ConfigurationError: a value is not finite or, but for gain and bias, negative, or the correlation time is zero.
     """
 
-    noise: float = 0.0
-    offset: float = 0.0
-    drift: float = 0.0
-    drift_time: float = 300.0
-    quantisation: float = 0.0
-    delay: float = 0.0
-    scale: float = 0.0
-    gain: float = 0.0
-    bias: float = 0.0
+    noise: float = 0.0  # density of the white noise [unit/√Hz]
+    offset: float = 0.0  # standard deviation of a constant that is drawn for each drive [unit]
+    drift: float = 0.0  # standard deviation of a first-order Gauss-Markov process that is stationary from the first sample on [unit]
+    drift_time: float = 300.0  # its correlation time [s]
+    quantisation: float = 0.0  # step of the values shown [unit]
+    delay: float = 0.0  # age of what is shown; the first value is held before the start [s]
+    scale: float = 0.0  # standard deviation of a relative error that is drawn for each drive [1]
+    gain: float = 0.0  # relative error of every drive [1]
+    bias: float = 0.0  # constant of every drive [unit]
 
     def __post_init__(self) -> None:
         _require_finite(self, *(entry.name for entry in fields(self) if entry.name not in ("gain", "bias")))

@@ -20,19 +20,12 @@ SYMBOLS = {"vx": "u", "yaw_rate": "ω", "ay": "a_y", "ax": "a_x", "steer": "δ"}
 
 @dataclass(frozen=True)
 class Row:
-    """A line of the table of floors.
+    """A line of the table of floors."""
 
-    Args:
-        what: for people.
-        inputs: that are read, in symbols.
-        floor: standard deviations.
-        share: of the mean square of v that it comes to.
-    """
-
-    what: str
-    inputs: str
-    floor: Floor
-    share: float
+    what: str  # for people
+    inputs: str  # that are read, in symbols
+    floor: Floor  # standard deviations
+    share: float  # of the mean square of v that it comes to
 
 
 def floors_of(part: PartArtefacts, test_set: str) -> list[Row]:

@@ -43,23 +43,14 @@ NEARLY = 0.15  # of the minutes asked for, that ends of a few seconds may take o
 
 @dataclass(frozen=True)
 class Point:
-    """An estimator after so much reference.
+    """An estimator after so much reference."""
 
-    Args:
-        estimator: its name.
-        variant: its variant.
-        title: for people.
-        start: what its training starts from; `SCRATCH` for nothing.
-        minutes: with reference that it learnt and stopped on, as they were asked for.
-        n_trainings: stretches of the drive times seeds.
-    """
-
-    estimator: str
-    variant: str
-    title: str
-    start: str
-    minutes: float
-    n_trainings: int
+    estimator: str  # its name
+    variant: str  # its variant
+    title: str  # for people
+    start: str  # what its training starts from; `SCRATCH` for nothing
+    minutes: float  # with reference that it learnt and stopped on, as they were asked for
+    n_trainings: int  # stretches of the drive times seeds
 
     @property
     def name(self) -> Name:
@@ -69,19 +60,12 @@ class Point:
 
 @dataclass(frozen=True)
 class Curve:
-    """Learning curves on one test set.
+    """Learning curves on one test set."""
 
-    Args:
-        title: of the first of its parts.
-        test_set: that was tested on.
-        points: by estimator, start and minutes.
-        ranking: of all of them.
-    """
-
-    title: str
-    test_set: str
-    points: Sequence[Point]
-    ranking: Ranking
+    title: str  # of the first of its parts
+    test_set: str  # that was tested on
+    points: Sequence[Point]  # by estimator, start and minutes
+    ranking: Ranking  # of all of them
 
     def interval(self, point: Point) -> tuple[float, float]:
         """95 % interval of its RMSE(β) [deg]; NaN where the test is too short for one."""
