@@ -106,9 +106,7 @@ def drives_of(spans: Sequence[Span], recording_of: Callable[[Span], Recording], 
     """The ranges or sequences of a test set, as `score_all` counts them.
 
     Args:
-        spans: ranges of the test set.
         recording_of: of a range: its recording at ``protocol.rate_hz``, references included.
-        protocol: see `Protocol`.
     """
     return [drive_of(reference, piece, protocol) for reference, piece in pieces_of(spans, recording_of, protocol)]
 
@@ -231,7 +229,6 @@ def cramer_rao_floor(drives: Sequence[Drive], inputs: Collection[str], *, car: b
     """Root mean square of the posterior Cramér-Rao bound of causal estimators over the scored samples.
 
     Args:
-        drives: of a test set.
         inputs: some of `INPUTS`, ``vx`` and ``yaw_rate`` among them.
         car: whether the car is known to about what a data sheet tells; else kinematics alone is.
 

@@ -62,7 +62,6 @@ def lever_arm_figures(parts: Sequence[Scored], pieces: Iterable[tuple[Recording,
     Args:
         parts: estimate and reference, of each piece.
         pieces: whole recordings at ``protocol.rate_hz`` and the ranges, or sequences, in them, as `pieces_of` counts them.
-        protocol: see `Protocol`.
 
     Returns:
         metric -> value, with ``lever_arm`` [m]; nothing where a reference's point is known or undeclared, or a recording has no yaw rate.

@@ -152,9 +152,7 @@ def sequences(spans: Sequence[Span], recording_of: Callable[[Span], Recording], 
     """The stretches that estimates are made of, one after another: the ranges, or the sequences that they are cut into.
 
     Args:
-        spans: ranges of a test set.
         recording_of: of a range: its recording at ``protocol.rate_hz``; asked for only if ranges are cut.
-        protocol: see `Protocol`.
 
     Raises:
         DataError: no range is as long as a sequence.
@@ -202,9 +200,7 @@ def score_all(
 
     Args:
         estimate_of: position among the sequences -> estimate.
-        spans: ranges of the test set.
         recording_of: of a range: its recording at ``protocol.rate_hz``, references included.
-        protocol: see `Protocol`.
 
     Raises:
         DataError: as `score` and `sequences` say.
@@ -219,9 +215,7 @@ def pieces_of(spans: Sequence[Span], recording_of: Callable[[Span], Recording], 
     """Each range, or sequence, of a test set with the whole recording that it lies in, one recording in memory at a time.
 
     Args:
-        spans: ranges of the test set.
         recording_of: of a range: its recording at ``protocol.rate_hz``, references included.
-        protocol: see `Protocol`.
 
     Raises:
         DataError: as `sequences` says.
@@ -247,7 +241,6 @@ def score(estimate: Estimate, reference: Recording, span: Span, protocol: Protoc
         estimate: at any rate; a value made for time t is scored at t.
         reference: the recording at ``protocol.rate_hz``, with vx and vy_ref; with ay, if errors are to be told apart by it.
         span: the range that is scored, after ``protocol.skip_seconds``.
-        protocol: see `Protocol`.
 
     Raises:
         DataError: the range is too short, or the estimate does not cover it.

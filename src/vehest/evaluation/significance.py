@@ -74,8 +74,6 @@ def paired_difference(
         sequence: which uninterrupted sequence a sample belongs to, shape (K,); a sequence's samples stand together, in order.
         rate_hz: of the samples [Hz].
         block_seconds: length of a block within a sequence [s], longer than errors are correlated; None takes whole sequences.
-        n_resamples: how many.
-        seed: of the resampling.
 
     Raises:
         DataError: shapes do not fit, a loss is not finite, or there are fewer than two blocks.
@@ -109,8 +107,6 @@ def difference_of_blocks(
         first: sum of the losses of each seed over each block, shape (S, B).
         second: shape (S', B).
         sizes: samples in each block, shape (B,).
-        n_resamples: how many.
-        seed: of the resampling.
 
     Raises:
         DataError: there are fewer than two blocks.
@@ -141,8 +137,6 @@ def root_interval(sums: FloatArray, sizes: FloatArray, *, n_resamples: int = 400
     Args:
         sums: sum of the losses of each seed over each block, (S, B), none negative.
         sizes: samples in each block, (B,).
-        n_resamples: how many.
-        seed: of the resampling.
     """
     value = float(np.sqrt(sums.sum(axis=1).mean() / sizes.sum()))
     if not value > 0:
@@ -163,7 +157,6 @@ def unexplained_interval(
         squared: of v².
         reference: of v.
         sizes: samples.
-        n_resamples: how many.
     """
     drawn = _counts(len(sizes), n_resamples, np.random.default_rng(0))
 

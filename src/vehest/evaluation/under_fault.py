@@ -51,7 +51,6 @@ def errors_under_fault(parts: Sequence[Scored], nominal: Sequence[Scored], windo
         parts: estimate under the fault and reference, of each range or sequence; an infinite estimate is a sideslip of 90° and an
             infinite error of the lateral velocity.
         nominal: the same without the fault.
-        windows: of the fault in each.
     """
     found = {}
     for subset, inside in ((FAULTED, _during), (AFTER, _after)):
@@ -81,7 +80,6 @@ def flags_under_fault(parts: Sequence[Scored], flagged: Sequence[Flagged], windo
     Args:
         parts: estimate under the fault and reference, of each range or sequence.
         flagged: band and health of each.
-        windows: of the fault in each.
         rate_hz: of the scored samples [Hz].
     """
     inside, valid, delays, undetected = [], [], [], []

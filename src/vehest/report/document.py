@@ -114,8 +114,6 @@ def write_documents(documents: Mapping[str, Document], folder: Path, *, page: bo
 
     Args:
         documents: name of the file -> document; ``report`` is the one to start with.
-        folder: an existing folder.
-        page: whether to write the self-contained pages too.
         on_page: text and tables that the page of ``report`` alone ends with, and no other file holds.
 
     Raises:
@@ -137,9 +135,6 @@ def write_document(
     The same document gives the same bytes.
 
     Args:
-        document: what to write.
-        folder: an existing folder.
-        page: whether to write the self-contained page too.
         name: of both files, without ending.
         on_page: text and tables that the page alone ends with, and no other file holds.
 

@@ -66,12 +66,7 @@ class Learning:
 
 
 def spread_figure(rows: Sequence[Spread], quantity: str) -> MatplotlibFigure:
-    """Dots of all seeds, one row an estimator; the chosen seed as a diamond, the median as a tick.
-
-    Args:
-        rows: from top to bottom.
-        quantity: label of the axis.
-    """
+    """Dots of all seeds, one row an estimator; the chosen seed as a diamond, the median as a tick."""
     with paper_style():
         figure = new_figure(DOUBLE_COLUMN * 0.86, 0.7 + 0.27 * max(len(rows), 2))
         axes = figure.add_subplot()
@@ -100,9 +95,6 @@ def traces_figure(time: FloatArray, reference: Traces, estimates: Sequence[Trace
 
     Args:
         time: [s], shape (K,).
-        reference: measured.
-        estimates: from top to bottom.
-        time_label: label of the time axes.
     """
     with paper_style():
         figure = new_figure(DOUBLE_COLUMN, 0.75 + 0.68 * max(len(estimates), 2))
@@ -134,9 +126,6 @@ def zoom_figure(
     Args:
         time: [s], shape (K,).
         ay: measured lateral acceleration [m/s²], shape (K,); None leaves its axes out.
-        reference: measured.
-        estimates: in the order of the legend.
-        time_label: label of the time axis.
         error_limit: errors are drawn up to this size [deg].
     """
     from matplotlib.ticker import MaxNLocator
@@ -226,12 +215,7 @@ def error_over_ay(ay: FloatArray, estimates: Sequence[Errors], width: float = 1.
 
 
 def learning_curves(runs: Sequence[Learning], quantity: str) -> MatplotlibFigure:
-    """Training and validation loss over the epochs, logarithmic; a marker where the validation loss is lowest.
-
-    Args:
-        runs: in the order of the legend.
-        quantity: label of the loss axis.
-    """
+    """Training and validation loss over the epochs, logarithmic; a marker where the validation loss is lowest."""
     with paper_style():
         figure = new_figure(DOUBLE_COLUMN, 3.0)
         left, right = figure.subplots(1, 2, sharex=True, sharey=True)

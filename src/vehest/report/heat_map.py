@@ -40,8 +40,6 @@ def heat_map(
         panels: of shape (R, C) each.
         columns: ticks of the horizontal axis, C of them.
         rows: ticks of the vertical axis from below, R of them.
-        column_label: of the horizontal axis.
-        row_label: of the vertical axis.
         quantity: what the colours show, with its unit.
     """
     import matplotlib

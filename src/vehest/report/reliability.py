@@ -34,7 +34,6 @@ def reliability_figure(levels: Sequence[float], rows: Sequence[Reliability]) -> 
 
     Args:
         levels: nominal, ascending.
-        rows: estimators.
     """
     nominal = np.array(levels)
     with paper_style():

@@ -81,14 +81,9 @@ def simulate_drive(
     A car that spins or leaves the road brakes to its stand, and the recording ends AFTER_STAND later; its provenance has ``flags``.
 
     Args:
-        id: name of the recording.
-        vehicle: the car.
-        manoeuvre: its manoeuvre.
         seed: of the driver, of what the manoeuvre draws, of patches on the surface and of the sensors' errors; zero or positive.
         rate_hz: sampling rate; a whole number of plant steps must fit between samples [Hz].
-        sensors: levels of the sensors' errors.
         stability_control: whether the car has it switched on.
-        surface: of the road.
         stint: loss of grip over the drive, unknown to the driver; by default none.
 
     Raises:

@@ -93,9 +93,6 @@ Options = TypeVar("Options")
 class Source(ABC):
     """Reads one data set.
 
-    Args:
-        dataset: its configuration, as conf/dataset/*.yaml holds it.
-
     Attributes:
         options_type: dataclass of its own options, with their types and defaults.
         options: the options of this data set.

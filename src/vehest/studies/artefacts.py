@@ -24,7 +24,6 @@ def read_frame(path: Path, columns: Iterable[str] = (), *, numbers: Iterable[str
     """A table that vehest wrote as CSV, its numbers bit for bit.
 
     Args:
-        path: the file.
         columns: that it must have.
         numbers: those of them that must hold numbers.
 

@@ -83,10 +83,6 @@ def verdict_of(part: PartArtefacts, test_set: str) -> Verdict:
 
     A winner is named only where it lies below every other candidate, v = 0 and the static map by more than chance (`Ranking.winner`). Of
     those that are not told apart the one with the lowest RMSE(v) on validation is what the next commands take.
-
-    Args:
-        part: the comparison.
-        test_set: of it.
     """
     ranking = ranking_of(part, test_set)
     titles = {name: as_text(models[0].title) for name, models in by_name(part.models).items()}

@@ -32,8 +32,6 @@ def limited(full: Runs, learnt: Runs, prepared: Prepared) -> Limited:
     """Hold what learnt on the limited set beside the filters of the full set.
 
     Args:
-        full: candidates of the full set.
-        learnt: those of the limited set.
         prepared: recordings; the test of both is the same.
 
     Raises:

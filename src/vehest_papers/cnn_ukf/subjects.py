@@ -126,10 +126,6 @@ def filter_of(fitted: Estimator) -> DugoffUkf | None:
 def runs_of(part: PartArtefacts, prepared: Prepared) -> dict[str, list[Run]]:
     """Candidate -> its seeds, in the order of Table II.
 
-    Args:
-        part: of the study.
-        prepared: its recordings.
-
     Raises:
         DataError: two models of one candidate have the same seed, a model is none of the paper's, or a recording has several test ranges.
     """
@@ -183,7 +179,6 @@ class Prepared:
     sample counts as non-linear is a matter of the low-passed lateral acceleration.
 
     Args:
-        part: of the study.
         whole: whether drives are scored beyond the moment in which |β| first exceeds 12°.
     """
 

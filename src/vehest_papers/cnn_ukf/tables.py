@@ -53,11 +53,8 @@ def accuracy(
     """Table II or III: our figures with their intervals, the paper's in brackets, errors of validation and of training.
 
     Args:
-        comparison: of the candidates.
         published: candidate -> the paper's figures.
         training: candidate -> mean RMSE of a training manoeuvre [deg], of the seed that is drawn.
-        name: of the file.
-        caption: of the table.
     """
     rows = []
     for candidate, own in comparison.runs.items():
@@ -92,13 +89,7 @@ def training_error(run: Run, prepared: Prepared) -> float:
 
 
 def ablation(comparison: ManoeuvreErrors, active: pd.DataFrame, caption: str) -> Table:
-    """CNN-UKF with one thing taken away: errors, how CNN-UKF stands to each, and what is active in it.
-
-    Args:
-        comparison: of CNN-UKF and its variants.
-        active: of `claims.activity`.
-        caption: of the table.
-    """
+    """CNN-UKF with one thing taken away: errors, how CNN-UKF stands to each, and what is active in it."""
     rows = []
     for row in active.to_dict("records"):
         candidate = row["candidate"]
@@ -173,8 +164,6 @@ def filters(parts: Mapping[str, tuple[str, Runs]], name: str, caption: str) -> T
 
     Args:
         parts: name -> title and runs.
-        name: of the file.
-        caption: of the table.
     """
     rows: list[dict[str, object]] = [
         {"part": "paper (real)", "candidate": paper.MODEL, **dict.fromkeys((*TYRES, *LEVELS), math.nan), **paper.LEVELS}

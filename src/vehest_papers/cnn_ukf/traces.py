@@ -44,16 +44,7 @@ def manoeuvre_of(part: PartArtefacts, prepared: Prepared, group: str) -> Span:
 
 
 def compared(runs: Mapping[str, Run], span: Span, name: str, number: int, what: str, data: str) -> Figure:
-    """Reference and all estimates of one manoeuvre.
-
-    Args:
-        runs: candidate -> the seed that validation chooses.
-        span: the manoeuvre, one of the test set's.
-        name: of the file.
-        number: of the paper's figure.
-        what: title of it.
-        data: real or simulated.
-    """
+    """Reference and all estimates of one manoeuvre."""
     parts = {candidate: run.test[span.recording][0] for candidate, run in runs.items()}
     with paper_style():
         figure = new_figure(DOUBLE_COLUMN, 3.9)
@@ -85,15 +76,8 @@ def inner_life(
     """Outputs of the hybrids' networks in one manoeuvre: β_DD beside β, both deviations of the process noise, distrust (Figure 8).
 
     Args:
-        runs: candidate -> the seed that validation chooses.
-        prepared: recordings.
         warm_up: of the estimates [s].
-        span: the manoeuvre.
-        name: of the file.
-        number: of the paper's figure.
-        what: title of it.
         constant: deviations of the filter's process noise where no network gives them, (2,).
-        data: real or simulated.
     """
     hybrids = {candidate: run for candidate, run in runs.items() if plain_name(candidate) in paper.HYBRIDS}
     outputs = _network_outputs(hybrids, prepared, warm_up, span)

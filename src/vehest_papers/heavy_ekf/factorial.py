@@ -222,9 +222,6 @@ def absorbed(levels: Mapping[str, Levels]) -> pd.DataFrame:
     """What each mistake does to the three filters: RMSE(β) against the truth, RATTE's change against RATT, and where its tyres end.
 
     Tyres are those that a fit to four further drives gives under the mistake, so that RATT is as good as its maker can have it.
-
-    Args:
-        levels: of each filter.
     """
     rows, cells, ends = [], [], []
     for mistake in MISTAKES:

@@ -161,12 +161,9 @@ def parameters_figure(
     """Estimated tyre parameters over time, a line a kind of tyre, with the plant's own dashed: Figures 8 and 9.
 
     Args:
-        drives: kind of tyre -> drive.
         estimates: kind of tyre -> what the filter made of it.
         own: kind of tyre -> the plant's own curves; empty where they are not known.
         filter_name: of the filter.
-        name: of the figure.
-        caption: of it.
     """
     linear = filter_name == paper.LINT
     quantities = list(LINEAR_LABELS) if linear else list(QUANTITIES)
@@ -210,8 +207,6 @@ def convergence_table(
     """Start, end and the plant's own value of every estimated parameter, and from when on it stays near.
 
     Args:
-        drives: test set -> drive.
-        estimates: test set -> filter -> estimate.
         own: kind of tyre -> the plant's own curves.
         names: filters whose parameters are states.
     """

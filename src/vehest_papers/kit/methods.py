@@ -57,9 +57,6 @@ def ranges_table(artefacts: StudyArtefacts, name: str, caption: str, tests: Mapp
     """Ranges of training, validation and tests, a row a part.
 
     Args:
-        artefacts: of the study.
-        name: of the file.
-        caption: of the table.
         tests: test set -> what it is called, where that is another name.
     """
     rows = [

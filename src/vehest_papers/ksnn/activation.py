@@ -25,7 +25,6 @@ def activation(own: Trained, recordings: Sequence[Recording] = ()) -> list[Block
     """Activation functions of a trained network over |ω|, and how much of the drives lies where.
 
     Args:
-        own: a KS-NN.
         recordings: drives whose |ω| is counted; none if empty.
 
     Raises:

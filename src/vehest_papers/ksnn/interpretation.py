@@ -342,9 +342,7 @@ def feedback_functions(own: Trained, drive: Recording, source: str, *, name: str
 
     Args:
         own: a nonlinear KS-NN.
-        drive: at its rate.
         source: what the drive is, for the caption.
-        name: of the figure.
 
     Raises:
         ConfigurationError: it is no nonlinear KS-NN.

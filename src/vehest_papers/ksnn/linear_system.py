@@ -214,7 +214,6 @@ def decomposed_estimate(estimator: Ksnn, recording: Recording) -> SubModels:
     """The parts of the estimate of a recording: every sample by a window of its own, as the network sees it.
 
     Args:
-        estimator: trained.
         recording: at the estimator's rate.
 
     Returns:

@@ -51,7 +51,6 @@ def residuals(panels: Sequence[Panel], segment_seconds: float = SEGMENT_SECONDS)
     """Spectra of v and of the residuals, one panel a test set, and how far they lie apart.
 
     Args:
-        panels: from top to bottom.
         segment_seconds: length of a segment of the periodograms [s].
 
     Raises:

@@ -64,7 +64,6 @@ def injected(
         yaw_rate: of the turn [rad/s].
         channel: ``ay`` or ``ax``.
         n_samples: length of the turn, of which the first `SETTLING_SAMPLES` do not count.
-        seed: of the noise.
         error: û - u_m at which the closed form, from which the scatter comes, linearises a nonlinear network [m/s].
     """
     constants = {"yaw_rate": yaw_rate, "vx": SPEED, "ay": yaw_rate * SPEED, "ax": 0.0}

@@ -130,7 +130,6 @@ def minima_claim(scratch: Subject, trained: Subject, data: str, share: float) ->
     Args:
         scratch: those that ended.
         trained: with pre-training.
-        data: real or simulated.
         share: samples learnt from, of those of the pre-trained; below 1 a minimum cannot be distinguished from a training that is not over.
     """
     limit = float(trained.validation().max())

@@ -109,7 +109,6 @@ def filtered(
 
     Args:
         estimator: its noise is used, and its models unless another is given.
-        drives: from `drives_of`.
         model: that moves and observes points instead.
         repair: whether covariances that lose definiteness are repaired; otherwise their sequences become NaN.
         friction: that the filter starts from; none: as its settings say.

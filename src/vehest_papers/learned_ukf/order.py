@@ -85,7 +85,6 @@ def order_in_words(pairs: pd.DataFrame, medians: Mapping[str, float], where: str
     """How many pairs are as in the paper, which are the other way round, and which of its neighbours cannot be told apart.
 
     Args:
-        pairs: from `differences`.
         medians: candidate -> median over seeds of its mean loss, of all that are compared.
         where: on which data, and of what, for people: ``on tyre A``.
         decimals: of the medians.

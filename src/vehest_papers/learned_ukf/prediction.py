@@ -56,8 +56,6 @@ def compared(pairs: Mapping[int, Pair], drives: Mapping[str, Drive], protocol: P
     """Losses of both models as predictors and in their filters, and of all four filters that can be put together of them.
 
     Args:
-        pairs: seed -> NNTF and NNTF_U.
-        drives: test set -> its sequences.
         protocol: how much of each sequence is not scored.
     """
     skip = round(protocol.skip_seconds * protocol.rate_hz)

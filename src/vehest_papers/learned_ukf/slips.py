@@ -42,7 +42,6 @@ def distribution(slips: Mapping[str, FloatArray], name: str, data: str, note: st
     Args:
         slips: set, for people -> slip angles [deg].
         name: of the files, ``slip_NAME``.
-        data: real or simulated, and what.
         note: sentence for the caption, such as where l_r is from.
     """
     edges = np.arange(-LIMIT, LIMIT + WIDTH, WIDTH)

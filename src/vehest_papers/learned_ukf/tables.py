@@ -26,14 +26,7 @@ STATES = {"vx": "m/s", "vy": "m/s", "yaw_rate": "rad/s"}
 
 
 def accuracy(errors: Losses, test: str, name: str, caption: str) -> Table:
-    """Table I or II: the paper's figures and ours, means over seeds with 95 % intervals over sequences and seeds.
-
-    Args:
-        errors: of all methods on the test.
-        test: test set.
-        name: of the file.
-        caption: of the table.
-    """
+    """Table I or II: the paper's figures and ours, means over seeds with 95 % intervals over sequences and seeds."""
     published = paper.TABLES[test]
     rows = []
     for candidate, squared in errors.squared.items():
@@ -131,10 +124,6 @@ def definiteness(
 
     Args:
         counted: (candidate, test set) -> one a seed.
-        runs: from `candidates.runs_of`.
-        tests: test sets.
-        name: of the file.
-        caption: of the table.
     """
     rows = []
     for candidate in dict.fromkeys(candidate for candidate, _ in counted):

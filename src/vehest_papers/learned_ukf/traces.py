@@ -56,13 +56,6 @@ def hard_sequence(
 ) -> tuple[Figure, pd.DataFrame]:
     """Reference and estimates over the sequence on which the shown models together err most.
 
-    Args:
-        part: of the study.
-        models: candidate -> the seed that validation chooses.
-        test: test set.
-        name: of the file, ``figure_4_NAME``.
-        data: real or simulated, and what.
-
     Returns:
         The figure and its values.
     """

@@ -25,7 +25,6 @@ def trials_table(parts: Mapping[str, PartArtefacts], used: Mapping[str, float]) 
     """A row a trial, and the candidates whose tables do not use what validation chose.
 
     Args:
-        parts: of the trials.
         used: candidate -> step size of the tables.
     """
     rows = []

@@ -92,7 +92,6 @@ def characteristic(vehicle: Vehicle, friction: float, label: str) -> Characteris
     """Ramps to either side up to the largest lateral acceleration.
 
     Args:
-        vehicle: the car.
         friction: scale of the tyres' friction.
         label: for the figure.
     """

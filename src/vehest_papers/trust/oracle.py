@@ -135,7 +135,6 @@ def motion_of(samples: Mapping[str, FloatArray], rate_hz: float) -> dict[str, Fl
     """What of the channels is the car's motion and not noise: all below `MOTION_HZ`, without a shift in time.
 
     Args:
-        samples: channel -> (T,), finite.
         rate_hz: [Hz].
     """
     if rate_hz <= 2.5 * MOTION_HZ:

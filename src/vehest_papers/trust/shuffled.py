@@ -78,8 +78,6 @@ def share_if_shuffled(calibration: Scores, test: Scores, draws: int = DRAWS, see
     Args:
         calibration: on the ranges that the band was calibrated on.
         test: on others.
-        draws: how often.
-        seed: of the draws.
 
     Returns:
         NaN where one of the two has too few manoeuvres.

@@ -156,10 +156,7 @@ def plan_laps(
     """Line and speed profile over whole laps.
 
     Args:
-        course: where.
         car: whose limits are kept.
-        driver: its driver.
-        style: of driving.
         n_laps: at least one.
         friction: of one lap, on the course's samples, shape (N,).
         highest_speed: [m/s], one value or one for each of the n_laps·(N - 1) + 1 samples.
@@ -203,7 +200,6 @@ def speed_profile(
         used: (N,), grip that is used at most [m/s²]; braking gets ``driver.braking_share`` of it, driving ``car.driving_share``.
         spacing: distance between samples [m].
         car: whose power and top speed are used.
-        driver: its driver.
         highest_speed: limit of the driver [m/s].
         bank: of the road, positive with its left side higher [rad]; gravity helps or hinders.
         grade: of the road, positive downhill [rad].
@@ -250,9 +246,6 @@ class Follower:
     """Drives a car along a plan.
 
     Args:
-        plan: line and speed.
-        car: the car.
-        driver: its driver.
         progress: where on the plan the car starts [m].
         speed_at: wanted speed [m/s] and acceleration [m/s²] at a time [s]; by default the plan's, by place.
         hands: corrections beside the line; by default none.

@@ -74,14 +74,7 @@ class Freestyle:
 
 
 class FreestyleDriver:
-    """Drives one car for the time of one recording.
-
-    Args:
-        style: of driving.
-        car: the car.
-        area: with its friction.
-        generator: of the decisions.
-    """
+    """Drives one car for the time of one recording."""
 
     def __init__(self, style: Freestyle, car: PlanarCar, area: OpenArea, generator: np.random.Generator) -> None:
         self._style, self._car, self._area, self._generator = style, car, area, generator

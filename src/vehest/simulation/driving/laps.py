@@ -251,11 +251,8 @@ class LapDriver(Follower):
 
     Args:
         plan: of one lap more than is recorded.
-        car: the car.
-        driver: its driver.
         lap: length of a lap [m].
         end: distance at which the drive is over, or the stop begins [m].
-        drawn: values that the seed drew.
         stop_time: time from the end to the stand [s]; by default the drive is over at the end.
         end_time: at which the drive is over wherever the car is [s].
         hands: corrections beside the line; by default none.

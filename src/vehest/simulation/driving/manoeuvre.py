@@ -76,10 +76,6 @@ class LineDriver(Follower):
     """Follows a line until its end.
 
     Args:
-        plan: line and speed.
-        car: the car.
-        driver: its driver.
-        drawn: values that the seed drew.
         end: distance at which the drive is over [m]; by default the plan's end.
         end_time: at which it is over at the latest [s].
         speed_at: see Follower.
@@ -109,7 +105,6 @@ class OpenArea:
     """Friction along the way on an open area.
 
     Args:
-        surface: of the area.
         seed: of the drive, for patches.
     """
 

@@ -182,12 +182,9 @@ class OpenLoop:
     """Steers by the clock on an open area and holds the speed.
 
     Args:
-        car: the car.
-        area: with its friction.
         speed: [m/s].
         steer_at: road-wheel angle [rad] at a time [s].
         end_time: at which the drive is over [s].
-        drawn: values that the seed drew.
     """
 
     def __init__(

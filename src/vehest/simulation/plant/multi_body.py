@@ -171,7 +171,6 @@ class MultiBodyPlant:
         """Derivatives of the states (T, 29), and tyre forces (T, 3, 4) along, across and up, for motion.WHEELS [N].
 
         Args:
-            states: T states.
             inputs: (T, 5).
             friction: scale of friction, (T,) or one for all.
         """
@@ -196,7 +195,6 @@ class MultiBodyPlant:
         """States sampled at ``rate_hz``, each with the inputs that hold from then on, as motion in ISO 8855 axes.
 
         Args:
-            states: T states.
             inputs: (T, 5).
             rate_hz: [Hz].
             friction: scale of friction, (T,) or one for all.

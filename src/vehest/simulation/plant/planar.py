@@ -143,7 +143,6 @@ class PlanarPlant:
     """A car and its equations of motion.
 
     Args:
-        car: the car.
         step: of the integration [s].
 
     Raises:

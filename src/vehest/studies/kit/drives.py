@@ -76,10 +76,7 @@ def regime_table(part: PartArtefacts, test_set: str, chosen: Mapping[Name, tuple
     """RMSE(β) of candidates by regime; None where metrics have no regimes.
 
     Args:
-        part: a comparison.
-        test_set: the test set.
         chosen: (estimator, variant) -> title and seed, in the order of the rows.
-        name: of the table.
     """
     metrics = part.metrics
     own = metrics[(metrics["test_set"] == test_set) & metrics["subset"].isin(REGIMES) & (metrics["condition"] == "nominal")]

@@ -23,7 +23,6 @@ def runs_of(artefacts: PartArtefacts, column: str = "value") -> Runs:
     """The metrics of all samples under nominal conditions, by run and test set.
 
     Args:
-        artefacts: of a comparison.
         column: ``value``, or ``low`` or ``high`` for the ends of intervals.
 
     Raises:

@@ -24,7 +24,6 @@ def ranking_of(
     """Candidates of a comparison, ranked on a test set by RMSE(β) over all their seeds; those with errors that are not finite are left out.
 
     Args:
-        artefacts: of the comparison.
         test_set: to rank on.
         models: those to rank; all if not given.
         asked: pairs to compare beside those that any ranking compares.
