@@ -42,11 +42,6 @@ def kpi_values(runs: Runs, candidate: str, name: str) -> FloatArray:
     return np.array([getattr(run.kpis, name) for run in runs[candidate]])
 
 
-def medians(runs: Runs, name: str) -> dict[str, float]:
-    """Candidate -> median over seeds of a figure of `KPIS`."""
-    return {candidate: float(np.median(kpi_values(runs, candidate, name))) for candidate in runs}
-
-
 def accuracy(
     comparison: ManoeuvreErrors, published: Mapping[str, paper.Published], training: Mapping[str, float], name: str, caption: str
 ) -> Table:

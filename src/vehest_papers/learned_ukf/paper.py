@@ -77,6 +77,3 @@ NOMINAL_FRICTION: Mapping[str, float] = {"tyre_a": 0.65, "tyre_d": 0.45}
 
 SLIP_99 = 40.0
 """[deg] what the slip angle of the rear axle exceeds in the paper's whole data set, 99th percentile (Section III-C)."""
-
-SWAP_GAIN = 18.0
-"""[%] by how much the MSE falls where the model that predicts is learnt through the filter (Section IV-D)."""
