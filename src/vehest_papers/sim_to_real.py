@@ -68,26 +68,17 @@ REASONS = {
 
 @dataclass(frozen=True)
 class Step:
-    """One estimator that learnt on one fleet.
+    """One estimator that learnt on one fleet."""
 
-    Args:
-        part: name in the pipeline.
-        title: of the part.
-        artefacts: of the part.
-        models: its seeds.
-        validation, race_cars, other, test: metric -> values, one a seed; on simulated cars, then on the real one.
-        weight: β₁ of the local model at zero yaw rate, one a seed; none for an estimator without.
-    """
-
-    part: str
-    title: str
-    artefacts: PartArtefacts
-    models: tuple[EvaluatedModel, ...]
-    validation: dict[str, FloatArray]
-    race_cars: dict[str, FloatArray]
-    other: dict[str, FloatArray]
-    test: dict[str, FloatArray]
-    weight: FloatArray
+    part: str  # name in the pipeline
+    title: str  # of the part
+    artefacts: PartArtefacts  # of the part
+    models: tuple[EvaluatedModel, ...]  # its seeds
+    validation: dict[str, FloatArray]  # metric -> values, one a seed, on simulated validation cars
+    race_cars: dict[str, FloatArray]  # on simulated race cars
+    other: dict[str, FloatArray]  # on a car of another simulation
+    test: dict[str, FloatArray]  # on the real car
+    weight: FloatArray  # β₁ of the local model at zero yaw rate, one a seed; none for an estimator without
 
     @property
     def label(self) -> str:

@@ -48,16 +48,11 @@ F1TENTH_START: Mapping[str, float] = {
 
 
 class Motion(NamedTuple):
-    """Rates of a planar car.
+    """Rates of a planar car."""
 
-    Attributes:
-        rates: dx/dt, (..., 4).
-        ax, ay: what an accelerometer at the centre of gravity reads (...) [m/s²].
-    """
-
-    rates: Tensor
-    ax: Tensor
-    ay: Tensor
+    rates: Tensor  # dx/dt, (..., 4)
+    ax: Tensor  # longitudinal acceleration that a sensor at the centre of gravity reads (...) [m/s²]
+    ay: Tensor  # the lateral one (...) [m/s²]
 
 
 class PlanarCar(nn.Module):

@@ -63,20 +63,13 @@ def integrity_of(error: FloatArray, level: FloatArray, flagged: NDArray[np.bool_
 
 @dataclass(frozen=True)
 class AlarmRate:
-    """False alarms in so many hours.
+    """False alarms in so many hours."""
 
-    Args:
-        alarms: how many there were.
-        hours: of healthy driving.
-        per_hour: alarms an hour; NaN without any time.
-        low, high: 95 % interval of the rate, exact for a Poisson process.
-    """
-
-    alarms: int
-    hours: float
-    per_hour: float
-    low: float
-    high: float
+    alarms: int  # how many there were
+    hours: float  # of healthy driving
+    per_hour: float  # alarms an hour; NaN without any time
+    low: float  # of the 95 % interval of the rate, exact for a Poisson process
+    high: float  # likewise
 
 
 def false_alarms_per_hour(flagged: Sequence[NDArray[np.bool_]], rate_hz: float) -> AlarmRate:

@@ -72,28 +72,17 @@ class DrivingStyle:
 
 @dataclass(frozen=True, eq=False)
 class Plan:
-    """Planned line and speed over the distance along the way; all arrays have shape (N,).
+    """Planned line and speed over the distance along the way; all arrays have shape (N,)."""
 
-    Args:
-        distance: [m], uniform from 0.
-        x, y: the line [m].
-        heading: of the line, not wrapped [rad].
-        curvature: of the line, positive to the left [1/m].
-        speed: [m/s].
-        friction: scale of the tyres' friction.
-        bank: positive with the left side higher [rad].
-        grade: positive downhill [rad].
-    """
-
-    distance: FloatArray
-    x: FloatArray
-    y: FloatArray
-    heading: FloatArray
-    curvature: FloatArray
-    speed: FloatArray
-    friction: FloatArray
-    bank: FloatArray
-    grade: FloatArray
+    distance: FloatArray  # [m], uniform from 0
+    x: FloatArray  # the line [m]
+    y: FloatArray  # the line [m]
+    heading: FloatArray  # of the line, not wrapped [rad]
+    curvature: FloatArray  # of the line, positive to the left [1/m]
+    speed: FloatArray  # [m/s]
+    friction: FloatArray  # scale of the tyres' friction
+    bank: FloatArray  # positive with the left side higher [rad]
+    grade: FloatArray  # positive downhill [rad]
 
     @cached_property
     def acceleration(self) -> FloatArray:

@@ -53,22 +53,17 @@ def _require_finite(levels: Any, *not_negative: str) -> None:
 class Mounting:
     """Where the inertial unit sits and how it is turned against the body.
 
-    Args:
-        lever_x, lever_y, lever_z: its place forward, left and up of the centre of gravity [m].
-        roll, pitch, yaw: of its axes against the body's, right-handed about x, y and z, as a body's roll, pitch and yaw [rad].
-        misalignment: standard deviation of what is drawn for a drive and added to each of the three angles [rad].
-
     Raises:
         ConfigurationError: a value is not finite, or the misalignment is negative.
     """
 
-    lever_x: float = 0.0
-    lever_y: float = 0.0
-    lever_z: float = 0.0
-    roll: float = 0.0
-    pitch: float = 0.0
-    yaw: float = 0.0
-    misalignment: float = 0.0
+    lever_x: float = 0.0  # its place forward of the centre of gravity [m]
+    lever_y: float = 0.0  # its place left of the centre of gravity [m]
+    lever_z: float = 0.0  # its place above the centre of gravity [m]
+    roll: float = 0.0  # of its axes against the body's, right-handed [rad]
+    pitch: float = 0.0  # of its axes against the body's, right-handed [rad]
+    yaw: float = 0.0  # of its axes against the body's, right-handed [rad]
+    misalignment: float = 0.0  # standard deviation of what is drawn for a drive and added to each of the three angles [rad]
 
     def __post_init__(self) -> None:
         _require_finite(self, "misalignment")
@@ -78,20 +73,15 @@ class Mounting:
 class Tilt:
     """Which angles the inertial unit is tilted by, so that gravity leaks into the accelerometers; the others count as zero.
 
-    Args:
-        roll, pitch: of the body against the road. They also make the gyros measure about the body's axes instead of the road's.
-        bank, grade: of the road.
-        roll_share: of the body's roll that leaks; an installation that corrects for roll leaves less than 1, one that corrects too much
-            a negative share.
-
     Raises:
         ConfigurationError: the share is not finite.
     """
 
-    roll: bool = True
-    pitch: bool = True
-    bank: bool = True
-    grade: bool = True
+    roll: bool = True  # of the body against the road; also makes the gyros measure about the body's axes instead of the road's
+    pitch: bool = True  # likewise
+    bank: bool = True  # of the road
+    grade: bool = True  # of the road
+    # of the body's roll that leaks; an installation that corrects for roll leaves less than 1, one that corrects too much a negative share
     roll_share: float = 1.0
 
     def __post_init__(self) -> None:
@@ -102,17 +92,13 @@ class Tilt:
 class Vibration:
     """How the wheels' turning shakes the inertial unit: white noise whose standard deviation grows with their mean speed.
 
-    Args:
-        yaw_rate: standard deviation of a sample per speed of the wheels [1].
-        ax, ay: the same [m/s² per rad/s].
-
     Raises:
         ConfigurationError: a value is negative or not finite.
     """
 
-    yaw_rate: float = 0.0
-    ax: float = 0.0
-    ay: float = 0.0
+    yaw_rate: float = 0.0  # standard deviation of a sample per speed of the wheels [1]
+    ax: float = 0.0  # the same [m/s² per rad/s]
+    ay: float = 0.0  # the same [m/s² per rad/s]
 
     def __post_init__(self) -> None:
         _require_finite(self, "yaw_rate", "ax", "ay")
@@ -125,27 +111,20 @@ class Reference:
     It measures the velocity where it sits, in axes turned by the error ``heading``, and moves it to the centre of gravity with its
     own yaw rate and a lever that is known but for ``lever_error``. Roll and pitch rate are left out of that, as is usual.
 
-    Args:
-        kind: what it stands for, ``optical``, ``gnss``, ``motion_capture`` or ``ideal``.
-        vx, vy: errors of the velocity along its axes [m/s].
-        yaw_rate: errors of its gyro [rad/s].
-        heading: errors of its heading against the body's [rad]; delay, scale and quantisation have no meaning here.
-        lever_x, lever_y, lever_z: its place forward, left and up of the centre of gravity [m].
-        lever_error: standard deviation of what is drawn for a drive for lever_x and lever_y each [m].
-
     Raises:
         ConfigurationError: a lever is not finite, lever_error is negative, or heading has errors without a meaning.
     """
 
-    kind: str = "ideal"
-    vx: SensorLevel = SensorLevel()
-    vy: SensorLevel = SensorLevel()
-    yaw_rate: SensorLevel = SensorLevel()
+    kind: str = "ideal"  # what it stands for, ``optical``, ``gnss``, ``motion_capture`` or ``ideal``
+    vx: SensorLevel = SensorLevel()  # errors of the velocity along its x axis [m/s]
+    vy: SensorLevel = SensorLevel()  # along its y axis [m/s]
+    yaw_rate: SensorLevel = SensorLevel()  # errors of its gyro [rad/s]
+    # errors of its heading against the body's [rad]; delay, scale and quantisation have no meaning here
     heading: SensorLevel = SensorLevel()
-    lever_x: float = 0.0
-    lever_y: float = 0.0
-    lever_z: float = 0.0
-    lever_error: float = 0.0
+    lever_x: float = 0.0  # its place forward of the centre of gravity [m]
+    lever_y: float = 0.0  # its place left of the centre of gravity [m]
+    lever_z: float = 0.0  # its place above the centre of gravity [m]
+    lever_error: float = 0.0  # standard deviation of what is drawn for a drive for lever_x and lever_y each [m]
 
     def __post_init__(self) -> None:
         _require_finite(self, "lever_error")
