@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from vehest.constants import FloatArray
-from vehest.report.style import DOUBLE_COLUMN, REFERENCE, Line, new_figure, paper_style, significant
+from vehest.report.style import DOUBLE_COLUMN, REFERENCE, Line, new_figure, significant
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure as MatplotlibFigure
@@ -67,8 +67,7 @@ class Learning:
 
 def spread_figure(rows: Sequence[Spread], quantity: str) -> MatplotlibFigure:
     """Dots of all seeds, one row an estimator; the chosen seed as a diamond, the median as a tick."""
-    with paper_style():
-        figure = new_figure(DOUBLE_COLUMN * 0.86, 0.7 + 0.27 * max(len(rows), 2))
+    with new_figure(DOUBLE_COLUMN * 0.86, 0.7 + 0.27 * max(len(rows), 2)) as figure:
         axes = figure.add_subplot()
         for position, row in enumerate(rows):
             values = row.values[np.isfinite(row.values)]
@@ -96,8 +95,7 @@ def traces_figure(time: FloatArray, reference: Traces, estimates: Sequence[Trace
     Args:
         time: [s], shape (K,).
     """
-    with paper_style():
-        figure = new_figure(DOUBLE_COLUMN, 0.75 + 0.68 * max(len(estimates), 2))
+    with new_figure(DOUBLE_COLUMN, 0.75 + 0.68 * max(len(estimates), 2)) as figure:
         grid = figure.subplots(len(estimates), 2, sharex=True, sharey="col", squeeze=False)
         for (left, right), estimate in zip(grid, estimates, strict=True):
             for axes, measured, estimated in ((left, reference.vy, estimate.vy), (right, reference.sideslip, estimate.sideslip)):
@@ -130,9 +128,8 @@ def zoom_figure(
     """
     from matplotlib.ticker import MaxNLocator
 
-    with paper_style():
-        heights = (1.5, 1.5, 1.2, 0.6) if ay is not None else (1.5, 1.5, 1.2)
-        figure = new_figure(DOUBLE_COLUMN, 1.25 * sum(heights))
+    heights = (1.5, 1.5, 1.2, 0.6) if ay is not None else (1.5, 1.5, 1.2)
+    with new_figure(DOUBLE_COLUMN, 1.25 * sum(heights)) as figure:
         all_axes = list(figure.subplots(len(heights), 1, sharex=True, height_ratios=heights))
         (top, middle, below), bottom = all_axes[:3], all_axes[-1]
         for source in (*reversed(estimates), reference):
@@ -158,8 +155,7 @@ def zoom_figure(
 
 def error_histogram(estimates: Sequence[Errors]) -> MatplotlibFigure:
     """Density of the sideslip error of each estimator on common bins; those beyond the axis count in the outermost bins."""
-    with paper_style():
-        figure = new_figure(DOUBLE_COLUMN, 3.2)
+    with new_figure(DOUBLE_COLUMN, 3.2) as figure:
         axes = figure.add_subplot()
         limit = max(float(np.quantile(np.abs(estimate.error), 0.995)) for estimate in estimates)
         limit = limit if limit > 0 else 1.0
@@ -195,8 +191,7 @@ def error_over_ay(ay: FloatArray, estimates: Sequence[Errors], width: float = 1.
     centres = edges[:-1] + width / 2
     index = np.minimum((np.abs(ay) / width).astype(int), n_bins - 1)
     counts = np.bincount(index, minlength=n_bins)
-    with paper_style():
-        figure = new_figure(DOUBLE_COLUMN, 3.4)
+    with new_figure(DOUBLE_COLUMN, 3.4) as figure:
         axes, below = figure.subplots(2, 1, sharex=True, height_ratios=(3.2, 1))
         for estimate in reversed(estimates):
             squares = np.bincount(index, weights=np.square(estimate.error), minlength=n_bins)
@@ -216,8 +211,7 @@ def error_over_ay(ay: FloatArray, estimates: Sequence[Errors], width: float = 1.
 
 def learning_curves(runs: Sequence[Learning], quantity: str) -> MatplotlibFigure:
     """Training and validation loss over the epochs, logarithmic; a marker where the validation loss is lowest."""
-    with paper_style():
-        figure = new_figure(DOUBLE_COLUMN, 3.0)
+    with new_figure(DOUBLE_COLUMN, 3.0) as figure:
         left, right = figure.subplots(1, 2, sharex=True, sharey=True)
         for run in reversed(runs):
             looks = {"color": run.line.colour, "linestyle": run.line.dash}

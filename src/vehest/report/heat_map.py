@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from vehest.constants import FloatArray
-from vehest.report.style import DOUBLE_COLUMN, MISSING, SINGLE_COLUMN, decimals_for, fixed, new_figure, paper_style
+from vehest.report.style import DOUBLE_COLUMN, MISSING, SINGLE_COLUMN, decimals_for, fixed, new_figure
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure as MatplotlibFigure
@@ -51,8 +51,7 @@ def heat_map(
     across = 1 if len(columns) > MOST_COLUMNS_SIDE_BY_SIDE else min(len(panels), 2)
     down = math.ceil(len(panels) / across)
     width = SINGLE_COLUMN if across == 1 and len(columns) <= MOST_COLUMNS_SIDE_BY_SIDE else DOUBLE_COLUMN
-    with paper_style():
-        figure = new_figure(width, down * (0.75 + CELL_HEIGHT * len(rows)))
+    with new_figure(width, down * (0.75 + CELL_HEIGHT * len(rows))) as figure:
         grid = figure.subplots(down, across, sharex=True, sharey=True, squeeze=False)
         shades = LinearSegmentedColormap.from_list("shades", matplotlib.colormaps["Blues"](np.linspace(0.1, 0.95, 64)))
         colours = ScalarMappable(_scale(finite), shades)

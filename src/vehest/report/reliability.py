@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from vehest.constants import FloatArray
-from vehest.report.style import REFERENCE, SINGLE_COLUMN, Line, new_figure, paper_style
+from vehest.report.style import REFERENCE, SINGLE_COLUMN, Line, new_figure
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure as MatplotlibFigure
@@ -36,8 +36,7 @@ def reliability_figure(levels: Sequence[float], rows: Sequence[Reliability]) -> 
         levels: nominal, ascending.
     """
     nominal = np.array(levels)
-    with paper_style():
-        figure = new_figure(SINGLE_COLUMN * 1.55, 3.2)
+    with new_figure(SINGLE_COLUMN * 1.55, 3.2) as figure:
         axes = figure.add_subplot()
         axes.plot([0.0, 1.0], [0.0, 1.0], color=REFERENCE.colour, linewidth=0.7)
         for position, row in enumerate(rows):

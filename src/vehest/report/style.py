@@ -131,16 +131,13 @@ def paper_style() -> Iterator[None]:
         yield
 
 
-def new_figure(width: float = DOUBLE_COLUMN, height: float = 3.0) -> MatplotlibFigure:
-    """An empty figure that no global state knows of; call it inside `paper_style`.
-
-    Args:
-        width: [in].
-        height: [in].
-    """
+@contextmanager
+def new_figure(width: float = DOUBLE_COLUMN, height: float = 3.0) -> Iterator[MatplotlibFigure]:
+    """An empty figure of a width and height [in] that no global state knows of, drawn inside the ``with`` block in `paper_style`."""
     from matplotlib.figure import Figure
 
-    return Figure(figsize=(width, height), layout="constrained")
+    with paper_style():
+        yield Figure(figsize=(width, height), layout="constrained")
 
 
 def legend_above(figure: MatplotlibFigure, *axes: Any, columns: int = 4) -> None:

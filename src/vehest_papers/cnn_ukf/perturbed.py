@@ -19,7 +19,7 @@ from vehest.estimators.ensemble_ukf import BOX, EnsembleUkf, scaled_variance
 from vehest.estimators.model_files import load_model
 from vehest.estimators.network_ukf import LEAST_VARIANCE
 from vehest.report.document import Column, Figure, Table
-from vehest.report.style import DOUBLE_COLUMN, legend_above, new_figure, paper_style
+from vehest.report.style import DOUBLE_COLUMN, legend_above, new_figure
 from vehest.training.context import FitContext
 from vehest.training.search import optuna_search
 from vehest.vehicle.dugoff import DugoffAxle
@@ -121,8 +121,7 @@ def perturbed(runs: Runs, prepared: Prepared) -> Perturbed:
 def figure_14(found: Perturbed, data: str) -> Figure:
     """MSE and MSE_nl over the combinations, with 95 % intervals over manoeuvres."""
     comparisons = [ManoeuvreErrors(runs, "test") for runs in found.stiffness]
-    with paper_style():
-        figure = new_figure(DOUBLE_COLUMN, 3.0)
+    with new_figure(DOUBLE_COLUMN, 3.0) as figure:
         panels = figure.subplots(1, 2)
         for axes, indicator, label in zip(panels, (MSE, MSE_NL), ("MSE [deg²]", "MSE$_{nl}$ [deg²]"), strict=True):
             for candidate in found.stiffness[NOMINAL]:

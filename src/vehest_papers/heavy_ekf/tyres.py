@@ -16,7 +16,7 @@ from vehest.data.recording import Recording
 from vehest.estimators.filtering.tyre_fit import AxleMotion, TyreFit, axle_force, axle_motion, fit_motion
 from vehest.report.document import Column, Figure, Table
 from vehest.report.figures import decimated
-from vehest.report.style import DOUBLE_COLUMN, MISSING, fixed, legend_above, new_figure, paper_style, significant
+from vehest.report.style import DOUBLE_COLUMN, MISSING, fixed, legend_above, new_figure, significant
 from vehest.vehicle.parameters import SingleTrackParameters
 from vehest_papers.heavy_ekf import paper
 from vehest_papers.heavy_ekf.laps import POINTS
@@ -74,8 +74,7 @@ def figure_3(fit: TyreFit, own: OwnCurves | None, name: str, data: str) -> Figur
     """Forces over slip angles with the fitted curve and its 95 % band, front and rear."""
     generator = np.random.default_rng(0)
     chosen = np.sort(generator.permutation(fit.slip.shape[1])[:DOTS])
-    with paper_style():
-        figure = new_figure(DOUBLE_COLUMN, 2.7)
+    with new_figure(DOUBLE_COLUMN, 2.7) as figure:
         panels = figure.subplots(1, 2, sharey=True)
         for row, (axes, axle) in enumerate(zip(panels, AXLES, strict=True)):
             slip, force = fit.slip[row], fit.force[row]
@@ -167,8 +166,7 @@ def parameters_figure(
     """
     linear = filter_name == paper.LINT
     quantities = list(LINEAR_LABELS) if linear else list(QUANTITIES)
-    with paper_style():
-        figure = new_figure(DOUBLE_COLUMN, 2.3 if linear else 3.8)
+    with new_figure(DOUBLE_COLUMN, 2.3 if linear else 3.8) as figure:
         panels = figure.subplots(1 if linear else 2, 2, sharex=True, squeeze=False)
         for axes, quantity in zip(panels.flat, quantities, strict=True):
             _, label, scale = QUANTITIES[quantity]

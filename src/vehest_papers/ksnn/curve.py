@@ -10,7 +10,7 @@ import pandas as pd
 
 from vehest.evaluation.blocks import Segments
 from vehest.report.document import Column, Figure, Table
-from vehest.report.style import DOUBLE_COLUMN, Line, legend_above, line_of, new_figure, paper_style
+from vehest.report.style import DOUBLE_COLUMN, Line, legend_above, line_of, new_figure
 from vehest.studies.kit.reference_minutes import minutes_of
 from vehest_papers.ksnn import paper
 from vehest_papers.ksnn.candidates import category_of
@@ -70,8 +70,7 @@ def curve_table(curve: Curve) -> Table:
 
 def curve_figure(curve: Curve) -> Figure:
     """Figure ``minutes``: FVU over minutes, a panel a car; of the baselines the static map, as a level that has no colour of its own."""
-    with paper_style():
-        figure = new_figure(DOUBLE_COLUMN, 2.6)
+    with new_figure(DOUBLE_COLUMN, 2.6) as figure:
         panels = figure.subplots(1, 2, sharey=True)
         for axes, (word, title) in zip(panels, TESTS.items(), strict=True):
             errors = curve.errors[word]

@@ -11,7 +11,7 @@ import pandas as pd
 
 from vehest.evaluation.metrics import Scored
 from vehest.report.document import Block, Column, Figure, Table
-from vehest.report.style import DOUBLE_COLUMN, REFERENCE_COLOUR, fixed, legend_above, lines_of, listed, new_figure, paper_style
+from vehest.report.style import DOUBLE_COLUMN, REFERENCE_COLOUR, fixed, legend_above, lines_of, listed, new_figure
 from vehest_papers.kit.spectra import SEGMENT_SECONDS, Periodogram, decibels, periodogram
 from vehest_papers.ksnn.subjects import plain_frequencies
 
@@ -70,8 +70,7 @@ def _spectra(panel: Panel, segment_seconds: float) -> list[Periodogram]:
 
 def _figure(panels: Sequence[Panel], spectra: Sequence[Sequence[Periodogram]], segment_seconds: float) -> Figure:
     lines = lines_of(dict.fromkeys((own.estimator, own.variant) for panel in panels for own in panel.estimators))
-    with paper_style():
-        figure = new_figure(DOUBLE_COLUMN * 0.85, 0.7 + 2.1 * len(panels))
+    with new_figure(DOUBLE_COLUMN * 0.85, 0.7 + 2.1 * len(panels)) as figure:
         grid = figure.subplots(len(panels), 1, sharex=True, squeeze=False)[:, 0]
         for axes, panel, (signal, *errors) in zip(grid, panels, spectra, strict=True):
             shown = (signal.frequency > 1.5 * signal.frequency[1]) & (signal.frequency <= min(HIGHEST_HZ, 0.4 * panel.rate_hz))

@@ -15,7 +15,7 @@ from vehest.estimators.base import Estimator
 from vehest.estimators.ksnn import Ksnn
 from vehest.estimators.luenberger import Luenberger
 from vehest.report.document import Block, Column, Figure, Table
-from vehest.report.style import DOUBLE_COLUMN, fixed, legend_above, line_of, listed, new_figure, paper_style, percent_below
+from vehest.report.style import DOUBLE_COLUMN, fixed, legend_above, line_of, listed, new_figure, percent_below
 from vehest_papers.ksnn.linear_system import LocalModels
 from vehest_papers.ksnn.noise_sensitivity import NoiseSensitivity, ksnn_sensitivity, luenberger_sensitivity
 from vehest_papers.ksnn.subjects import Trained
@@ -142,8 +142,7 @@ def _table(frame: pd.DataFrame, n_samples: int) -> Table:
 
 def _figure(columns: Sequence[tuple[Trained, Trained]], error: float) -> Figure:
     frequency = np.geomspace(LOWEST_HZ, HIGHEST_HZ, 400)
-    with paper_style():
-        figure = new_figure(DOUBLE_COLUMN, 4.4)
+    with new_figure(DOUBLE_COLUMN, 4.4) as figure:
         grid = figure.subplots(2, len(columns), sharex=True, sharey="row", squeeze=False)
         for column, pair in zip(grid.T, columns, strict=True):
             for own in pair:

@@ -14,7 +14,7 @@ from vehest.estimators.learned_ukf import LearnedUkf
 from vehest.evaluation.metrics import Protocol
 from vehest.evaluation.significance import CONFIDENCE, Interval
 from vehest.report.document import Column, Figure, Table
-from vehest.report.style import DOUBLE_COLUMN, MISSING, fixed, legend_above, new_figure, paper_style
+from vehest.report.style import DOUBLE_COLUMN, MISSING, fixed, legend_above, new_figure
 from vehest.training.through_filter import Drive
 from vehest_papers.kit.reading import with_interval
 from vehest_papers.learned_ukf import paper
@@ -136,8 +136,7 @@ def convergence_table(tracks: Mapping[str, Mapping[float, Tracks]], skip_seconds
 
 def figure(tracks: Mapping[str, Mapping[float, Tracks]], skip_seconds: float, name: str, data: str) -> Figure:
     """Mean over sequences and seeds from each start, with the 95 % interval of that mean."""
-    with paper_style():
-        drawn = new_figure(DOUBLE_COLUMN, 2.8)
+    with new_figure(DOUBLE_COLUMN, 2.8) as drawn:
         grid = drawn.subplots(1, len(tracks), sharey=True, squeeze=False)[0]
         for axes, (test, by_start) in zip(grid, tracks.items(), strict=True):
             for (start, own), colour in zip(by_start.items(), COLOURS, strict=True):

@@ -11,7 +11,7 @@ import pandas as pd
 
 from vehest.data.errors import DataError
 from vehest.report.document import Column, Figure, Table
-from vehest.report.style import DOUBLE_COLUMN, OTHER_COLOURS, legend_above, listed, new_figure, paper_style
+from vehest.report.style import DOUBLE_COLUMN, OTHER_COLOURS, legend_above, listed, new_figure
 from vehest.studies.artefacts import PartArtefacts
 from vehest_papers.kit.claims import Claim
 from vehest_papers.kit.reading import lengths_of, with_interval
@@ -79,8 +79,7 @@ def figure_7(found: Sequence[Length], data: str) -> tuple[Figure, Table]:
                 row[f"words.{test}"] = with_interval(mse.value, max(mse.low, 0.0), mse.high, 4)
             rows.append(row)
     frame, tests = pd.DataFrame(rows), list(SETS)
-    with paper_style():
-        figure = new_figure(DOUBLE_COLUMN, 2.7)
+    with new_figure(DOUBLE_COLUMN, 2.7) as figure:
         grid = figure.subplots(1, len(tests), squeeze=False)[0]
         for axes, test in zip(grid, tests, strict=True):
             for (_, words), colour, shift in zip(WAYS.items(), OTHER_COLOURS, (0.97, 1.03), strict=False):

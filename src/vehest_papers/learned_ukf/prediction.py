@@ -13,7 +13,7 @@ from vehest.estimators.learned_ukf import LearnedUkf
 from vehest.evaluation.metrics import Protocol
 from vehest.evaluation.significance import Interval, difference_of_blocks
 from vehest.report.document import Figure
-from vehest.report.style import DOUBLE_COLUMN, new_figure, paper_style
+from vehest.report.style import DOUBLE_COLUMN, new_figure
 from vehest.training.through_filter import Drive
 from vehest_papers.learned_ukf import paper
 from vehest_papers.learned_ukf.candidates import SETS
@@ -97,8 +97,7 @@ def frames(found: Mapping[str, Compared], seeds: Sequence[int]) -> tuple[pd.Data
 def figure_5(states: pd.DataFrame, name: str, data: str) -> Figure:
     """By how much learning through the filter lowers each state's error, as a predictor and as an estimator."""
     tests = list(dict.fromkeys(states["test_set"]))
-    with paper_style():
-        figure = new_figure(DOUBLE_COLUMN, 2.7)
+    with new_figure(DOUBLE_COLUMN, 2.7) as figure:
         grid = figure.subplots(1, len(tests), sharey=True, squeeze=False)[0]
         for axes, test in zip(grid, tests, strict=True):
             for offset, (task, label), colour in zip((-0.2, 0.2), TASKS.items(), (PLAIN_BLUE, THROUGH_RED), strict=True):
@@ -131,8 +130,7 @@ def figure_6(swaps: pd.DataFrame, name: str, data: str) -> Figure:
     """MSE of the four filters that can be put together of two models."""
     tests = list(dict.fromkeys(swaps["test_set"]))
     combinations = [(a, b) for a in (BEFORE, AFTER) for b in (BEFORE, AFTER)]
-    with paper_style():
-        figure = new_figure(DOUBLE_COLUMN, 2.8)
+    with new_figure(DOUBLE_COLUMN, 2.8) as figure:
         grid = figure.subplots(1, len(tests), squeeze=False)[0]
         for axes, test in zip(grid, tests, strict=True):
             for place, (predicts, observes) in enumerate(combinations):

@@ -25,7 +25,6 @@ from vehest.report.style import (
     fixed,
     legend_above,
     new_figure,
-    paper_style,
 )
 from vehest.studies.artefacts import EvaluatedModel, PartArtefacts
 from vehest_papers.learned_ukf import paper
@@ -90,8 +89,7 @@ def _values(reference: Recording, estimates: Mapping[str, Estimate], time: Float
 
 
 def _drawn(values: pd.DataFrame, candidates: Mapping[str, Estimate], skip_seconds: float, test: str) -> MatplotlibFigure:
-    with paper_style():
-        figure = new_figure(DOUBLE_COLUMN, 6.2)
+    with new_figure(DOUBLE_COLUMN, 6.2) as figure:
         grid = figure.subplots(4, 1, sharex=True)
         time = values["time_s"].to_numpy()
         for axes, (state, label) in zip(grid, AXES.items(), strict=False):

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from vehest.report.style import DOUBLE_COLUMN, LINEAR_BLUES, NONLINEAR_ORANGES, REFERENCE, new_figure, paper_style, with_unit
+from vehest.report.style import DOUBLE_COLUMN, LINEAR_BLUES, NONLINEAR_ORANGES, REFERENCE, new_figure, with_unit
 from vehest_papers.trust.integrity import HAZARDOUS, MISLEADING, NOMINAL, UNAVAILABLE, Integrity
 
 if TYPE_CHECKING:
@@ -35,8 +35,7 @@ def stanford_figure(families: Mapping[str, Integrity], quantity: str = "sideslip
 
     columns = min(len(families), COLUMNS)
     rows = -(-len(families) // columns)
-    with paper_style():
-        figure = new_figure(DOUBLE_COLUMN * columns / COLUMNS, 0.35 + 2.3 * rows)
+    with new_figure(DOUBLE_COLUMN * columns / COLUMNS, 0.35 + 2.3 * rows) as figure:
         panels = np.atleast_1d(figure.subplots(rows, columns, sharex=True, sharey=True, squeeze=False)).ravel()
         for axes, (title, own) in zip(panels, families.items(), strict=False):
             end = REACH * own.alert_limit

@@ -21,7 +21,7 @@ from vehest.data.store import read_recording
 from vehest.evaluation.blocks import Segments
 from vehest.evaluation.ranking import BASELINES, Name, Ranking, rank
 from vehest.report.document import Block, Column, Figure, Table, as_text
-from vehest.report.style import DOUBLE_COLUMN, fixed, line_of, listed, new_figure, paper_style
+from vehest.report.style import DOUBLE_COLUMN, fixed, line_of, listed, new_figure
 from vehest.studies.artefacts import EvaluatedModel, PartArtefacts
 
 if TYPE_CHECKING:
@@ -215,8 +215,7 @@ def _figure(curve: Curve) -> MatplotlibFigure:
     from matplotlib.ticker import FuncFormatter, NullFormatter
 
     ranking = curve.ranking
-    with paper_style():
-        figure = new_figure(DOUBLE_COLUMN, 3.2)
+    with new_figure(DOUBLE_COLUMN, 3.2) as figure:
         axes = figure.subplots()
         keys = list(
             dict.fromkeys((point.estimator, point.variant, point.start) for point in curve.points if point.estimator != BASELINES[0])
