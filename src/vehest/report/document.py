@@ -88,11 +88,7 @@ Block: TypeAlias = "str | Table | Figure"
 
 @dataclass(frozen=True, eq=False)
 class Document:
-    """A report.
-
-    Raises:
-        ValueError: two tables or two figures share a name, or a name is no file name.
-    """
+    """A report; raises `ValueError` where two tables or two figures share a name, or a name is no file name."""
 
     title: str  # plain text
     blocks: Sequence[Block]  # Markdown text (headings from ``##`` down), tables and figures, in reading order

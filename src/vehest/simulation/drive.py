@@ -111,11 +111,7 @@ def simulate_drive(
 
 @contextmanager
 def naming(id: str, seed: int) -> Iterator[None]:
-    """Names drive and seed in the errors of a simulation.
-
-    Raises:
-        ConfigurationError: the seed is negative.
-    """
+    """Names drive and seed in the errors of a simulation; raises `ConfigurationError` where the seed is negative."""
     if seed < 0:
         raise ConfigurationError(f"drive '{id}': a seed must be zero or positive, not {seed}")
     try:

@@ -87,11 +87,7 @@ def varied(vehicle: Vehicle, variations: Sequence[Variation], seed: int) -> Vehi
 
 
 def varied_planar(car: PlanarCar, variations: Sequence[Variation], seed: int) -> PlanarCar:
-    """The same for a car of the planar plant.
-
-    Raises:
-        ConfigurationError: a name is no parameter of the plant.
-    """
+    """The same for a car of the planar plant; raises `ConfigurationError` where a name is no parameter of the plant."""
     generator = np.random.default_rng(np.random.SeedSequence(entropy=seed, spawn_key=(_STREAM, 0)))
     factors: dict[str, float] = {}
     for variation in variations:

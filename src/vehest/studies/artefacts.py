@@ -92,11 +92,7 @@ class EvaluatedModel:
         return {row["metric"]: number_in(row, "value", path) for row in rows}
 
     def segments(self, test_set: str) -> Segments:
-        """Sums of its errors over segments of a test set.
-
-        Raises:
-            DataError: the file is damaged, or has no such test set.
-        """
+        """Sums of its errors over segments of a test set; raises `DataError` where the file is damaged, or has no such test set."""
         path = self.evaluation_folder / "blocks.csv"
         found = read_segments(path)
         if test_set not in found:

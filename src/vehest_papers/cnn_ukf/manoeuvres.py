@@ -73,11 +73,7 @@ def group_of(recording: str) -> str:
 
 
 def kpis(manoeuvres: Mapping[str, Sequence[Scored]]) -> Kpis:
-    """Indicators of a set of manoeuvres.
-
-    Raises:
-        DataError: the set is empty.
-    """
+    """Indicators of a set of manoeuvres; raises `DataError` where the set is empty."""
     if not manoeuvres:
         raise DataError("there are no manoeuvres to take errors of")
     errors = [np.concatenate([sideslip_error(part) for part in parts]) for parts in manoeuvres.values()]

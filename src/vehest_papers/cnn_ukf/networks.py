@@ -40,11 +40,7 @@ class Outputs:
 
 
 def hybrid_of(run: Run) -> NetworkUkf:
-    """The fitted hybrid of a run.
-
-    Raises:
-        DataError: it is another estimator's.
-    """
+    """The fitted hybrid of a run; raises `DataError` where it is another estimator's."""
     fitted = load_model(run.model.model_folder)
     if not isinstance(fitted, NetworkUkf):
         raise DataError(f"'{run.model.model_folder}' holds a model of '{fitted.name}', which has no network in a filter")

@@ -49,11 +49,7 @@ class Perturbed:
 
 
 def with_stiffness(fitted: Estimator, front: float, rear: float) -> Estimator:
-    """A copy of a filter whose cornering stiffnesses are off by shares of their values.
-
-    Raises:
-        DataError: it has none.
-    """
+    """A copy of a filter whose cornering stiffnesses are off by shares of their values; raises `DataError` where it has none."""
     changed = copy.deepcopy(fitted)
     of_filter = filter_of(changed)
     if of_filter is None:

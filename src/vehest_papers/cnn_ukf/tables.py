@@ -269,11 +269,7 @@ def given_as_found(full: Runs) -> str:
 
 
 def process_levels(run: Run) -> FloatArray:
-    """Deviations of a step's process noise where they are constant, (2,) [m/s, rad/s].
-
-    Raises:
-        DataError: the run has no filter.
-    """
+    """Deviations of a step's process noise where they are constant, (2,) [m/s, rad/s]; raises `DataError` where the run has no filter."""
     of_filter = filter_of(load_model(run.model.model_folder))
     if of_filter is None:
         raise DataError(f"'{run.candidate}' has no filter, and so no process noise")

@@ -125,11 +125,7 @@ def gain_curves(models: Sequence[Trained]) -> list[Block]:
 
 
 def gains_in_words(own: Trained) -> str:
-    """What the gains of a linear KS-NN mean, from their values.
-
-    Raises:
-        ConfigurationError: it is no linear KS-NN.
-    """
+    """What the gains of a linear KS-NN mean, from their values; raises `ConfigurationError` where it is no linear KS-NN."""
     model = _linear(own)
     sentences = [_of_the_leak(model), _of_the_slip_rate(model), _of_the_speed(model), _of_the_third(model), _of_the_poles(model)]
     if np.any(model.bias):

@@ -39,11 +39,7 @@ class Length:
 
 
 def lengths(parts: Mapping[str, PartArtefacts]) -> list[Length]:
-    """By length, then batch.
-
-    Raises:
-        DataError: a model was not trained through the filter.
-    """
+    """By length, then batch; raises `DataError` where a model was not trained through the filter."""
     found = []
     for name, part in parts.items():
         for model in part.models:

@@ -57,11 +57,7 @@ class Manoeuvre(ABC):
 
     @abstractmethod
     def controller(self, car: Car, surface: Surface, seed: int) -> Controller:
-        """The controller of this car on this surface, as the seed draws it.
-
-        Raises:
-            ConfigurationError: the car cannot do this.
-        """
+        """The controller of this car on this surface, as the seed draws it; raises `ConfigurationError` where the car cannot do this."""
 
     def description(self) -> dict[str, Any]:
         """Name and parameters."""

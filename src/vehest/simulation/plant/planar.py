@@ -168,11 +168,7 @@ class PlanarPlant:
         return _derivative(state, float(inputs.steer), float(inputs.current), float(inputs.friction), self._values, forces), forces
 
     def advance(self, state: FloatArray, inputs: Inputs, n_steps: int) -> FloatArray:
-        """The state after some steps with constant inputs, (22,).
-
-        Raises:
-            SimulationError: a state is not finite.
-        """
+        """The state after some steps with constant inputs, (22,); raises `SimulationError` where a state is not finite."""
         after: FloatArray = _advance(
             state, float(inputs.steer), float(inputs.current), float(inputs.friction), self._values, self.step, n_steps
         )

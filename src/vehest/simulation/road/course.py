@@ -69,11 +69,7 @@ def build_course(name: str, segments: Sequence[Segment] | Layout, spacing: float
 
 
 def course_by_name(name: str) -> Course:
-    """One of the courses of the proving ground.
-
-    Raises:
-        ConfigurationError: there is no such course.
-    """
+    """One of the courses of the proving ground; raises `ConfigurationError` where there is no such course."""
     if name not in LAYOUTS:
         raise ConfigurationError(f"there is no course '{name}'; there are {', '.join(sorted(LAYOUTS))}")
     return _build_by_name(name)
