@@ -79,10 +79,9 @@ class Ranking:
 def rank(
     segments: Mapping[Name, Sequence[Segments]],
     rate_hz: float,
-    loss: str = "squared_error_sideslip",
     asked: Sequence[tuple[Name, Name]] = (),
 ) -> Ranking:
-    """Compare estimators on one test set by the root of a mean loss.
+    """Compare estimators on one test set by RMSE(β).
 
     Every pair is compared on the same blocks, drawn together, with the seeds of each drawn on their own (`paired_difference`). Corrected
     together by Holm are: the best against every other, every candidate against each baseline, and the pairs that are asked for.
@@ -90,11 +89,10 @@ def rank(
     Args:
         segments: of each seed of each estimator, all over the same samples.
         rate_hz: of the scored samples [Hz].
-        loss: column of `Segments`, squared errors.
         asked: further pairs to compare, such as those whose order a paper claims; left out where one of the two is missing.
     """
     first = next(iter(segments.values()))[0]
-    losses = {name: np.stack([getattr(own, loss) for own in seeds]) for name, seeds in segments.items()}
+    losses = {name: np.stack([own.squared_error_sideslip for own in seeds]) for name, seeds in segments.items()}
     per_sample = np.concatenate([own / first.samples for own in losses.values()])
     labels = block_labels(first, per_sample)
     sizes = block_sums(first.samples, labels)

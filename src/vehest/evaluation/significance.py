@@ -55,7 +55,6 @@ def paired_difference(
     rate_hz: float,
     block_seconds: float | None = None,
     n_resamples: int = 10_000,
-    seed: int = 0,
 ) -> Difference:
     """Compare two estimators on the same samples.
 
@@ -94,13 +93,11 @@ def paired_difference(
         )
     sizes = np.diff([*starts, len(sequence)]).astype(np.float64)
     return difference_of_blocks(
-        np.add.reduceat(first, starts, axis=1), np.add.reduceat(second, starts, axis=1), sizes, n_resamples=n_resamples, seed=seed
+        np.add.reduceat(first, starts, axis=1), np.add.reduceat(second, starts, axis=1), sizes, n_resamples=n_resamples
     )
 
 
-def difference_of_blocks(
-    first: FloatArray, second: FloatArray, sizes: FloatArray, *, n_resamples: int = 10_000, seed: int = 0
-) -> Difference:
+def difference_of_blocks(first: FloatArray, second: FloatArray, sizes: FloatArray, *, n_resamples: int = 10_000) -> Difference:
     """Compare two estimators on the same blocks, as `paired_difference` says.
 
     Args:
@@ -116,7 +113,7 @@ def difference_of_blocks(
     sums = [first, second]
     means = [own.sum(axis=1) / sizes.sum() for own in sums]
     dof = _degrees_of_freedom(sums, sizes, means)
-    drawn = _resampled(sums, sizes, n_resamples, np.random.default_rng(seed))
+    drawn = _resampled(sums, sizes, n_resamples, np.random.default_rng(0))
     with np.errstate(invalid="ignore"):
         root = float(np.sqrt(means[0].mean()) - np.sqrt(means[1].mean()))
     return Difference(
@@ -128,7 +125,7 @@ def difference_of_blocks(
     )
 
 
-def root_interval(sums: FloatArray, sizes: FloatArray, *, n_resamples: int = 4000, seed: int = 0) -> Interval:
+def root_interval(sums: FloatArray, sizes: FloatArray, *, n_resamples: int = 4000) -> Interval:
     """The square root of a mean loss over blocks and seeds, an RMSE where losses are squared errors, with its interval.
 
     Blocks and seeds are drawn as in `paired_difference`; the interval is symmetric on a logarithmic axis, on which the distribution of a
@@ -142,7 +139,7 @@ def root_interval(sums: FloatArray, sizes: FloatArray, *, n_resamples: int = 400
     if not value > 0:
         return Interval(value, value, value, 1.0)
     nothing = np.zeros((1, len(sizes)))
-    drawn = _resampled([sums, nothing], sizes, n_resamples, np.random.default_rng(seed))[2]
+    drawn = _resampled([sums, nothing], sizes, n_resamples, np.random.default_rng(0))[2]
     return _logarithmic(value, drawn, _degrees_of_freedom([sums, nothing], sizes, [sums.sum(axis=1) / sizes.sum(), np.zeros(1)]))
 
 

@@ -105,7 +105,7 @@ class Document:
                     raise ValueError(f"report '{self.title}' has {names.count(name)} {kind.__name__.lower()}s called '{name}'")
 
 
-def write_documents(documents: Mapping[str, Document], folder: Path, *, page: bool = True, on_page: Sequence[str | Table] = ()) -> None:
+def write_documents(documents: Mapping[str, Document], folder: Path, *, on_page: Sequence[str | Table] = ()) -> None:
     """Write documents that link to each other as ``NAME.md``; their tables and figures lie side by side.
 
     Args:
@@ -120,7 +120,7 @@ def write_documents(documents: Mapping[str, Document], folder: Path, *, page: bo
     for name, document in documents.items():
         if not _NAME.fullmatch(name):
             raise ValueError(f"'{name}' cannot name a file of a report")
-        write_document(document, folder, page=page, name=name, on_page=on_page if name == REPORT else ())
+        write_document(document, folder, name=name, on_page=on_page if name == REPORT else ())
 
 
 def write_document(

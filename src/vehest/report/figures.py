@@ -116,15 +116,12 @@ def zoom_figure(
     reference: Traces,
     estimates: Sequence[Traces],
     time_label: str,
-    *,
-    error_limit: float = math.inf,
 ) -> MatplotlibFigure:
     """Reference and all estimates over a short while: lateral velocity, sideslip, its error, and the lateral acceleration.
 
     Args:
         time: [s], shape (K,).
         ay: measured lateral acceleration [m/s²], shape (K,); None leaves its axes out.
-        error_limit: errors are drawn up to this size [deg].
     """
     from matplotlib.ticker import MaxNLocator
 
@@ -138,7 +135,7 @@ def zoom_figure(
             middle.plot(time, source.sideslip, **looks)
             if source is not reference:
                 error = source.sideslip - reference.sideslip
-                below.plot(time, np.where(np.abs(error) <= error_limit, error, np.nan), **looks)
+                below.plot(time, error, **looks)
         below.axhline(0.0, color=reference.line.colour, linewidth=0.7)
         if ay is not None:
             bottom.plot(time, ay, color="#444444", linewidth=0.8)
@@ -178,18 +175,17 @@ def error_histogram(estimates: Sequence[Errors]) -> MatplotlibFigure:
     return figure
 
 
-def error_over_ay(ay: FloatArray, estimates: Sequence[Errors], width: float = 1.0) -> MatplotlibFigure:
-    """RMSE of the sideslip in bins of |a_y|, and how many samples each bin holds; bins of fewer than 20 samples show none.
+def error_over_ay(ay: FloatArray, estimates: Sequence[Errors]) -> MatplotlibFigure:
+    """RMSE of the sideslip in bins of |a_y| of 1 m/s², and how many samples each bin holds; bins of fewer than 20 samples show none.
 
     Args:
         ay: lateral acceleration at the scored times [m/s²], shape (K,).
         estimates: errors at the same times.
-        width: of a bin [m/s²].
     """
-    n_bins = max(math.ceil(float(np.abs(ay).max()) / width), 1)
-    edges = width * np.arange(n_bins + 1)
-    centres = edges[:-1] + width / 2
-    index = np.minimum((np.abs(ay) / width).astype(int), n_bins - 1)
+    n_bins = max(math.ceil(float(np.abs(ay).max())), 1)
+    edges = np.arange(n_bins + 1)
+    centres = edges[:-1] + 0.5
+    index = np.minimum(np.abs(ay).astype(int), n_bins - 1)
     counts = np.bincount(index, minlength=n_bins)
     with new_figure(DOUBLE_COLUMN, 3.4) as figure:
         axes, below = figure.subplots(2, 1, sharex=True, height_ratios=(3.2, 1))
@@ -198,7 +194,7 @@ def error_over_ay(ay: FloatArray, estimates: Sequence[Errors], width: float = 1.
             rmse = np.sqrt(np.divide(squares, counts, out=np.full(n_bins, np.nan), where=counts >= LEAST_SAMPLES))
             line = estimate.line
             axes.plot(centres, rmse, color=line.colour, linestyle=line.dash, marker=line.marker, label=estimate.label)
-        below.bar(centres, counts, width=0.9 * width, color="#b5b9be")
+        below.bar(centres, counts, width=0.9, color="#b5b9be")
         axes.set_ylabel("RMSE(β) [deg]")
         axes.set_ylim(bottom=0.0)
         below.set_ylabel("samples")

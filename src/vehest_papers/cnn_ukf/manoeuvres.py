@@ -96,7 +96,7 @@ def kpis_by_group(manoeuvres: Mapping[str, Sequence[Scored]]) -> dict[str, Kpis]
     return {group: kpis(groups[group]) for group in (*GROUPS.values(), "other") if group in groups}
 
 
-def error_distribution(parts: Sequence[Scored], width: float = BIN, nonlinear_only: bool = True) -> ErrorDistribution:
+def error_distribution(parts: Sequence[Scored], nonlinear_only: bool = True) -> ErrorDistribution:
     """Distribution of the error of the sideslip angle, by default of samples with |ay| ≥ 4 m/s² only.
 
     Raises:
@@ -105,9 +105,9 @@ def error_distribution(parts: Sequence[Scored], width: float = BIN, nonlinear_on
     errors = np.concatenate([sideslip_error(part)[is_nonlinear(part)] if nonlinear_only else sideslip_error(part) for part in parts])
     if not len(errors):
         raise DataError(f"no sample has a lateral acceleration of {NONLINEAR_AY:g} m/s² or more; count all with nonlinear_only=False")
-    first, last = np.floor(errors.min() / width), np.floor(errors.max() / width) + 1
-    edges = width * np.arange(first, last + 1)
-    counts = np.bincount((np.floor(errors / width) - first).astype(np.int64), minlength=len(edges) - 1)
+    first, last = np.floor(errors.min() / BIN), np.floor(errors.max() / BIN) + 1
+    edges = BIN * np.arange(first, last + 1)
+    counts = np.bincount((np.floor(errors / BIN) - first).astype(np.int64), minlength=len(edges) - 1)
     return ErrorDistribution(edges, counts, float(errors.mean()), float(errors.std()))
 
 

@@ -80,9 +80,9 @@ class Change:
         value = percent(math.exp(self.log_ratio))
         return f"{value} % [{percent(low)}, {percent(high)}]" if math.isfinite(low) else f"{value} %"
 
-    def as_ratio(self, confidence: float = CONFIDENCE) -> str:
+    def as_ratio(self) -> str:
         """The ratio in words: ``2.1 [1.7, 2.6]``."""
-        low, high = self.ends(confidence)
+        low, high = self.ends()
         value = math.exp(self.log_ratio)
         return f"{short(value)} [{short(low)}, {short(high)}]" if math.isfinite(low) else short(value)
 

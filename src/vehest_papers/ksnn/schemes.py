@@ -107,13 +107,13 @@ class Scheme:
         """From one category to another on a test set."""
         return self.errors(test).change(self.name_of(first), self.name_of(second), metric)
 
-    def other_over_own(self, category: str, metric: str = "fvu") -> Change | None:
-        """How many times the figure on the own car is left on the other one."""
-        return self.ratio(self.name_of(category), metric)
+    def other_over_own(self, category: str) -> Change | None:
+        """How many times the FVU on the own car is left on the other one."""
+        return self.ratio(self.name_of(category))
 
-    def ratio(self, name: str, metric: str = "fvu") -> Change | None:
+    def ratio(self, name: str) -> Change | None:
         """The same of any structure."""
-        other, own = (self.errors(test).get(name, metric) for test in (self.other, self.own))
+        other, own = (self.errors(test).get(name, "fvu") for test in (self.other, self.own))
         return Change.of(other, own) if other is not None and own is not None else None
 
     def structures(self, categories: Iterable[str] = (*paper.CATEGORIES,)) -> dict[str, str]:

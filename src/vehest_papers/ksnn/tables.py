@@ -127,7 +127,7 @@ def small_cars(pairs: Sequence[Scheme]) -> Table:
     )
 
 
-def sideslip(schemes: pd.DataFrame, drive: pd.DataFrame | None, whole: pd.DataFrame | None, kind: str, name: str = "table_6") -> Table:
+def sideslip(schemes: pd.DataFrame, drive: pd.DataFrame | None, whole: pd.DataFrame | None, kind: str) -> Table:
     """Table VI: RMSE of the sideslip angle.
 
     Args:
@@ -157,7 +157,7 @@ def sideslip(schemes: pd.DataFrame, drive: pd.DataFrame | None, whole: pd.DataFr
         "file the filter's noise levels are read off that file, and the graph is one batch. They need a car's parameters and were not run "
         "in scheme 2: no entry there."
     )
-    return Table(name, caption, pd.DataFrame(rows), columns)
+    return Table("table_6", caption, pd.DataFrame(rows), columns)
 
 
 def regularisation(with_it: pd.DataFrame, without: pd.DataFrame) -> Table:

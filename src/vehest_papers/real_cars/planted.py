@@ -77,15 +77,11 @@ def planted_faults() -> list[Fault]:
     return faults
 
 
-def detections(recording: Recording, faults: Sequence[Fault] | None = None) -> pd.DataFrame:
-    """Which faults the checks find.
+def detections(recording: Recording) -> pd.DataFrame:
+    """Which of `planted_faults` the checks find; those whose channels are missing are left out.
 
     Findings on the untouched recording do not count. A fault is found where one of its checks names one of its channels, or, where
     the channels contradict each other undecidedly, tells of it among the alternatives.
-
-    Args:
-        recording: as it was measured.
-        faults: all of `planted_faults` if not given; those whose channels are missing are left out.
 
     Returns:
         A row a fault: ``fault``, ``channel``, ``size``, ``decidable``, ``found``, ``reported`` (channels that its checks name),
@@ -93,7 +89,7 @@ def detections(recording: Recording, faults: Sequence[Fault] | None = None) -> p
     """
     own = {(finding.level, finding.check, finding.channel) for finding in _counted(recording)}
     rows = []
-    for fault in planted_faults() if faults is None else faults:
+    for fault in planted_faults():
         touched = [name for name in fault.channels if name in recording]
         if not touched:
             continue

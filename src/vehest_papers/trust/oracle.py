@@ -32,6 +32,7 @@ N_LEVELS = 5  # speeds at which the noise is looked at
 HORIZON_SECONDS = 10.0  # after the onset, within which a fault has to be seen
 STARTS_SECONDS = 1.0  # between the places of healthy drives at which the test is tried
 MOTION_HZ = 4.0  # below which a car moves
+FALSE_ALARMS_PER_HOUR = 1.0  # that the test may have, as the detector that it is compared with
 MOST_DEVIATIONS = 1e3  # of an innovation, beyond which a signature is certain
 
 
@@ -56,7 +57,6 @@ class Oracle:
     speed: str | None  # channel that the noise goes by
     levels: tuple[FloatArray, FloatArray]  # speeds, and the noise at each
     healthy: tuple[FloatArray, ...]  # innovations over their levels, of healthy drives on which the threshold is tried, (T, C) each
-    false_alarms_per_hour: float  # that the test may have
     reserve: float  # how many times as large the innovations of healthy drives may be without an alarm, as with limits of the detector
 
     def sees(
@@ -104,7 +104,7 @@ class Oracle:
 
     def _threshold(self, test: Test, within: int) -> float:
         """log A: of the false alarms that it may have in a horizon, and not below what healthy drives reach."""
-        highest = -math.log(self.false_alarms_per_hour * HORIZON_SECONDS / 3600.0)
+        highest = -math.log(FALSE_ALARMS_PER_HOUR * HORIZON_SECONDS / 3600.0)
         step = max(round(STARTS_SECONDS * self.rate_hz), 1)
         for innovations in self.healthy:
             for begin in range(self.model.order, len(innovations) - within + 1, step):
@@ -148,7 +148,6 @@ def learn_oracle(
     validation: Sequence[Recording],
     channels: Sequence[str],
     rate_hz: float,
-    false_alarms_per_hour: float = 1.0,
 ) -> Oracle:
     """Fit relations and autoregression to training drives; healthy drives are these and those of validation.
 
@@ -156,7 +155,6 @@ def learn_oracle(
         train, validation: at ``rate_hz``.
         channels: that an estimator reads.
         rate_hz: [Hz].
-        false_alarms_per_hour: those of the detector that it is compared with.
 
     Raises:
         DataError: a channel is missing or there are too few samples.
@@ -173,7 +171,7 @@ def learn_oracle(
     levels = learn_noise_levels(np.concatenate(innovations[:seen]), model.covariance, np.concatenate(speeds[:seen]), N_LEVELS)
     reserve = margin(STARTS_SECONDS, sum(len(recording) for recording in (*train, *validation)) / rate_hz)
     healthy = tuple(own / levels_at(levels, at) for own, at in zip(innovations, speeds, strict=True))
-    return Oracle(names, rate_hz, relations, least_speed, model, speed, levels, healthy, false_alarms_per_hour, reserve)
+    return Oracle(names, rate_hz, relations, least_speed, model, speed, levels, healthy, reserve)
 
 
 def filtered(model: Autoregression, signature: FloatArray) -> FloatArray:
