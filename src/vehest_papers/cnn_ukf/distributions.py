@@ -11,8 +11,8 @@ from vehest.constants import FloatArray
 from vehest.report.document import Column, Figure, Table
 from vehest.report.style import DOUBLE_COLUMN, fixed, legend_above, new_figure
 from vehest.studies.artefacts import PartArtefacts
-from vehest_papers.cnn_ukf.manoeuvres import BIN, ErrorDistribution, error_distribution, kpis_by_group
-from vehest_papers.cnn_ukf.subjects import Prepared, Run, Runs, chosen, line_of
+from vehest_papers.cnn_ukf.manoeuvres import BIN, error_distribution, kpis_by_group
+from vehest_papers.cnn_ukf.subjects import Prepared, Runs, chosen, line_of
 from vehest_papers.kit.reading import median_and_range
 
 SETS_COLOURS = ("#9aa7b5", "#0b4f9c")
@@ -62,7 +62,7 @@ def errors_figure(runs: Runs, name: str, number: int, title: str, data: str) -> 
         The figure and its values.
     """
     picked = {candidate: chosen(own) for candidate, own in runs.items()}
-    found = {candidate: _distribution(run) for candidate, run in picked.items()}
+    found = {name: error_distribution([part for parts in run.test.values() for part in parts]) for name, run in picked.items()}
     with new_figure(DOUBLE_COLUMN, 3.4) as figure:
         upper, axes = figure.subplots(2, 1, height_ratios=(1.2, 3.2))  # errors reach ten times as far as deviations
         for place, (candidate, own) in enumerate(found.items()):
@@ -92,10 +92,6 @@ def errors_figure(runs: Runs, name: str, number: int, title: str, data: str) -> 
         for low, count in zip(own.edges[:-1].tolist(), own.counts.tolist(), strict=True)
     ]
     return Figure(name, caption, figure), pd.DataFrame(rows)
-
-
-def _distribution(run: Run) -> ErrorDistribution:
-    return error_distribution([part for parts in run.test.values() for part in parts])
 
 
 def groups(runs: Runs, name: str, title: str, data: str, number: int | None = None) -> tuple[Figure, Table]:

@@ -155,11 +155,7 @@ def networks_alone(comparison: ManoeuvreErrors, outputs: OutputsOf, name: str, c
 
 
 def filters(parts: Mapping[str, tuple[str, Runs]], name: str, caption: str) -> Table:
-    """Tyres and levels of noise of the filters, each seed a row, below what the paper gives.
-
-    Args:
-        parts: name -> title and runs.
-    """
+    """Tyres and levels of noise of the filters, each seed a row, below what the paper gives; ``parts``: name -> title and runs."""
     rows: list[dict[str, object]] = [
         {"part": "paper (real)", "candidate": paper.MODEL, **dict.fromkeys((*TYRES, *LEVELS), math.nan), **paper.LEVELS}
     ]

@@ -99,7 +99,8 @@ def baselines(tuning: Sequence[Drive]) -> dict[str, Callable[[Drive], FloatArray
     recordings = [own.recording for own in tuning]
     fitted = StaticMap(StaticMap.settings_type(RATE))
     fitted.values = fitted.closed_form(recordings)
-    sheet = DataSheet(DataSheet.settings_type(rate_hz=RATE, wheelbase=_wheelbase(), cg_to_rear_axle=float(TRUCK.cg_to_rear_axle)))
+    front, rear = float(TRUCK.cg_to_front_axle), float(TRUCK.cg_to_rear_axle)
+    sheet = DataSheet(DataSheet.settings_type(rate_hz=RATE, wheelbase=front + rear, cg_to_rear_axle=rear))
 
     def of(baseline: Recursive) -> Callable[[Drive], FloatArray]:
         return lambda own: np.arctan2(baseline.run(own.samples[:, [1, 0]], None)[0]["vy"], own.samples[:, 1])  # vx, yaw_rate
@@ -166,10 +167,6 @@ def sideslip_of(name: str, levels: Levels, own: Drive, curves: FloatArray) -> Fl
 def rmse(sideslip: FloatArray, own: Drive) -> float:
     """RMSE(β) of a drive [deg], its first 1.5 s left out (Eq. 65)."""
     return float(np.degrees(np.sqrt(np.mean(np.square(sideslip - own.sideslip)[SKIP:]))))
-
-
-def _wheelbase() -> float:
-    return float(TRUCK.cg_to_front_axle) + float(TRUCK.cg_to_rear_axle)
 
 
 def table_of(found: Mapping[str, Tuned]) -> list[dict[str, object]]:

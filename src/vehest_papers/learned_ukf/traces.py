@@ -42,11 +42,7 @@ AXES = {"vx": "$v_x$ [m/s]", "vy": "$v_y$ [m/s]", "yaw_rate": "yaw rate [rad/s]"
 
 
 def hardest(errors: Sequence[Sequence[FloatArray]]) -> int:
-    """The sequence on which the models together err most.
-
-    Args:
-        errors: of each model its losses, sequence by sequence.
-    """
+    """The sequence on which the models together err most; ``errors``: of each model its losses, sequence by sequence."""
     return int(np.argmax([sum(float(own[position].mean()) for own in errors) for position in range(len(errors[0]))]))
 
 

@@ -131,8 +131,4 @@ def _tested(part: PartArtefacts) -> list[Span]:
 
 
 def _channels(recordings: Sequence[Recording]) -> tuple[str, ...]:
-    return tuple(channel for channel in WATCHED if all(_complete(recording, channel) for recording in recordings))
-
-
-def _complete(recording: Recording, channel: str) -> bool:
-    return channel in recording and bool(np.isfinite(recording[channel]).all())
+    return tuple(channel for channel in WATCHED if all(channel in own and np.isfinite(own[channel]).all() for own in recordings))

@@ -132,11 +132,7 @@ def _random_test(signature: FloatArray, covariance: FloatArray) -> Test:
 
 
 def motion_of(samples: Mapping[str, FloatArray], rate_hz: float) -> dict[str, FloatArray]:
-    """What of the channels is the car's motion and not noise: all below `MOTION_HZ`, without a shift in time.
-
-    Args:
-        rate_hz: [Hz].
-    """
+    """What of the channels is the car's motion and not noise: all below `MOTION_HZ`, without a shift in time."""
     if rate_hz <= 2.5 * MOTION_HZ:
         return {name: np.array(values) for name, values in samples.items()}
     band = signal.butter(2, MOTION_HZ, fs=rate_hz, output="sos")

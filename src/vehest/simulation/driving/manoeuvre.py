@@ -98,11 +98,7 @@ class LineDriver(Follower):
 
 
 class OpenArea:
-    """Friction along the way on an open area.
-
-    Args:
-        seed: of the drive, for patches.
-    """
+    """Friction along the way on an open area; ``seed``: of the drive, for patches."""
 
     def __init__(self, surface: Surface, seed: int) -> None:
         self._friction = surface.along(np.arange(0.0, OPEN_AREA_LAP), seed, OPEN_AREA_LAP).tolist()
