@@ -1,6 +1,6 @@
-"""What a drive can show: the noise of its reference, and how well v can be told at all from a set of inputs along it.
+"""What a drive can show: the noise of its reference, and how well v can be estimated at all from a set of inputs along it.
 
-Two figures to hold errors against, so that a poor estimator is told from a silent drive. Both rest on models: yardsticks, not truths.
+Errors are held against both, to separate a poor estimator from a drive that shows little. Both rest on models: yardsticks, not truths.
 
 **Noise of the reference** (`reference_floor`). White noise of standard deviation σ has third differences of variance 20 σ². What the
 inertial signals explain of those of v, the second differences of a_y and of u ω, is taken out by least squares. The rest is measured by
@@ -88,7 +88,7 @@ class Drive:
     inputs: dict[str, FloatArray]  # those of `INPUTS` that were measured, gaps filled by straight lines [SI]
     vy_ref: FloatArray  # reference lateral velocity [m/s]; may be NaN before the scored samples
     first: int  # index of the first scored sample; all after it are scored
-    told: bool = False  # whether estimators are told the state at the first sample
+    known_start: bool = False  # whether estimators start from the reference at the first sample
 
     @property
     def step(self) -> float:
@@ -388,7 +388,7 @@ def _model_of(drive: Drive, inputs: set[str], levels: _Levels) -> tuple[LinearMo
     steps, step = len(drive.vy_ref), drive.step
     blocks = _Blocks(steps)
     decay, noise = _in_steps(levels.velocity, step)
-    start = levels.reference**2 if drive.told else levels.velocity.deviation**2
+    start = levels.reference**2 if drive.known_start else levels.velocity.deviation**2
     v = blocks.state(decay, noise, start)
     if levels.lateral is not None:
         white = levels.lateral.density * step + TINY**2

@@ -1,4 +1,4 @@
-"""Errors with the best lever arm, where nobody knows at which point of the car the reference was measured.
+"""Errors with the best lever arm, where the point of the car at which the reference was measured is unknown.
 
 Lateral velocity x ahead of a point is v + x·r, and satisfies the kinematics as well for any x: inertial sensors cannot tell an estimate
 at one point from an error at another. Where the reference's point is unknown, the plain error therefore ranks estimators by the point that
@@ -32,7 +32,7 @@ class LeverArm:
 
 
 def point_is_unknown(reference: Recording) -> bool:
-    """Whether a recording's data set says that nobody knows where its reference was measured."""
+    """Whether a recording's data set declares that the point at which its reference was measured is unknown."""
     derived = reference.provenance.get("derived")
     return isinstance(derived, dict) and derived.get("reference_point") == "unknown"
 

@@ -239,7 +239,7 @@ def score(estimate: Estimate, reference: Recording, span: Span, protocol: Protoc
 
     Args:
         estimate: at any rate; a value made for time t is scored at t.
-        reference: the recording at ``protocol.rate_hz``, with vx and vy_ref; with ay, if errors are to be told apart by it.
+        reference: the recording at ``protocol.rate_hz``, with vx and vy_ref; with ay, if errors are to be split by it.
         span: the range that is scored, after ``protocol.skip_seconds``.
 
     Raises:

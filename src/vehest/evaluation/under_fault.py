@@ -63,7 +63,7 @@ def errors_under_fault(parts: Sequence[Scored], nominal: Sequence[Scored], windo
 
 @dataclass(frozen=True, eq=False)
 class Flagged:
-    """What is said of an estimate besides its value, on the grid that errors are read on."""
+    """Band and flags of an estimate, on the grid that errors are read on."""
 
     band: FloatArray  # half width of the 90 % band of β, (K,) [rad]; NaN where there is none
     health: FloatArray  # 0 valid, 1 degraded, 2 invalid, (K,)
@@ -72,7 +72,7 @@ class Flagged:
 def flags_under_fault(parts: Sequence[Scored], flagged: Sequence[Flagged], windows: Sequence[Window], rate_hz: float) -> dict[str, float]:
     """Whether bands hold and faults are flagged while they last, over all parts together.
 
-    ``coverage_90`` share of samples whose error of β lies in the band, ``coverage_90_unflagged`` the same of those said to be valid; of
+    ``coverage_90`` share of samples whose error of β lies in the band, ``coverage_90_unflagged`` the same of those marked valid; of
     ranges that were valid before: ``missed_detections`` share in which nothing is flagged before the fault's end, ``detection_delay`` mean
     time to the first flag of the others [s], ``max_error_sideslip_undetected`` largest error before it [deg]. Only figures that there
     is something for.

@@ -37,7 +37,7 @@ Tyres = Literal["plain", "smooth"]
 
 @dataclass(frozen=True)
 class LoadedCar:
-    """A car as a single track whose axles carry what a steady longitudinal acceleration leaves them; a BMW 545i, if not told otherwise.
+    """A car as a single track whose axles carry what a steady longitudinal acceleration leaves them; a BMW 545i by default.
 
     Raises:
         ValueError: a number that is not positive.

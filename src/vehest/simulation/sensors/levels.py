@@ -250,7 +250,7 @@ def _gyros(level: SensorLevel) -> dict[str, Any]:
 
 
 # The Ferrari's figures are what noise_reading.read_off finds in 55,001 samples of Palm Beach 2014, 20140222_01_01_03; its sensors cannot
-# be told from the car and the road they shake with. What a recording without truth cannot show is assumed, or taken from ``default``.
+# be separated from the car and the road they shake with. What a recording without truth cannot show is assumed, or taken from ``default``.
 RACE = SensorLevels(
     vx=SensorLevel(noise=0.0017),  # read off; it is the reference's own speed
     **_gyros(SensorLevel(noise=6.5e-4, offset=5e-4, delay=0.0116, scale=0.003)),  # noise and delay read off; offset and scale assumed
@@ -269,7 +269,7 @@ RACE = SensorLevels(
 # ax, ay and yaw_rate by the spread of what they lack against the reference's derivatives, sorted by the motor's speed
 # (docs/compare_tyre_sets.py).
 SMALL_CAR = SensorLevels(
-    # vx stays: a planar drive shows the motor's speed at the rim instead. So do the tyres' forces, which nobody measures there.
+    # vx stays: a planar drive shows the motor's speed at the rim instead. So do the tyres' forces, which are not measured there.
     **_gyros(SensorLevel(noise=0.006, offset=0.0065, delay=0.005)),  # noise, offset read off; delay assumed
     ax=SensorLevel(noise=0.17, offset=0.1, delay=0.005),  # noise read off; offset and delay assumed
     ay=SensorLevel(noise=0.17, offset=0.15, delay=0.005),  # noise as ax; offset as docs/sources/f1tenth.md finds it; delay assumed

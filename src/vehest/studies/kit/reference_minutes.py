@@ -201,11 +201,11 @@ def _in_words(curve: Curve) -> str:
     better = [f"{point.minutes:g}" for point in curve.points if _against_scratch(curve, point) == "lower"]
     worse = [f"{point.minutes:g}" for point in curve.points if _against_scratch(curve, point) == "higher"]
     if any(_against_scratch(curve, point) for point in curve.points):
-        told = [f"lower by more than chance with {listed(better)} min"] if better else []
-        told += [f"higher with {listed(worse)} min"] if worse else []
+        found = [f"lower by more than chance with {listed(better)} min"] if better else []
+        found += [f"higher with {listed(worse)} min"] if worse else []
         sentences.append(
-            f"Starting from another model, the error is {' and '.join(told)}."
-            if told
+            f"Starting from another model, the error is {' and '.join(found)}."
+            if found
             else "Starting from another model is not told apart from starting from scratch with any amount."
         )
     return f"**{curve.title}.** " + " ".join(sentences)
