@@ -256,7 +256,7 @@ def _as_yaml(value: Any) -> str:
 
 
 def _sections(described: type) -> dict[str, str]:
-    """A docstring's first paragraph, under the empty name, and its arguments by name."""
+    """A docstring's first paragraph, under the empty name, and arguments or fields by name: from the docstring or the comment of each."""
     text = inspect.getdoc(described) or ""
     sections = {"": " ".join(text.split("\n\n")[0].split())}
     if "Args:" in text:
@@ -264,6 +264,8 @@ def _sections(described: type) -> dict[str, str]:
             names, _, meaning = " ".join(entry.split()).replace("``", "`").partition(": ")
             if names:
                 sections |= dict.fromkeys(names.split(", "), meaning)
+    for name, meaning in re.findall(r"^    (\w+): .*?  # (.+)$", inspect.getsource(described), re.MULTILINE):
+        sections.setdefault(name, f"{meaning.removesuffix('.')}.".replace("``", "`"))
     return sections
 
 

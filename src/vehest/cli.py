@@ -828,11 +828,7 @@ def _fail(message: str, exit_code: int) -> NoReturn:
 
 
 def _print_ran(ran: Ran, as_json: bool, *, sweep: bool = False) -> None:
-    """Print a study's tables and the path of its report, or all as one JSON object.
-
-    Raises:
-        JobsFailedError: some jobs failed.
-    """
+    """Print a study's tables and the path of its report, or all as one JSON object; raises `JobsFailedError` where some jobs failed."""
     page, summary = ran.folder / ran.summary.page, ran.summary
     own: dict[str, Any] = {"folder": str(ran.folder), "skipped": ran.skipped}
     if not sweep:

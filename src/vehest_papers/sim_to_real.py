@@ -68,26 +68,17 @@ REASONS = {
 
 @dataclass(frozen=True)
 class Step:
-    """One estimator that learnt on one fleet.
+    """One estimator that learnt on one fleet."""
 
-    Args:
-        part: name in the pipeline.
-        title: of the part.
-        artefacts: of the part.
-        models: its seeds.
-        validation, race_cars, other, test: metric -> values, one a seed; on simulated cars, then on the real one.
-        weight: β₁ of the local model at zero yaw rate, one a seed; none for an estimator without.
-    """
-
-    part: str
-    title: str
-    artefacts: PartArtefacts
-    models: tuple[EvaluatedModel, ...]
-    validation: dict[str, FloatArray]
-    race_cars: dict[str, FloatArray]
-    other: dict[str, FloatArray]
-    test: dict[str, FloatArray]
-    weight: FloatArray
+    part: str  # name in the pipeline
+    title: str  # of the part
+    artefacts: PartArtefacts  # of the part
+    models: tuple[EvaluatedModel, ...]  # its seeds
+    validation: dict[str, FloatArray]  # metric -> values, one a seed, on simulated validation cars
+    race_cars: dict[str, FloatArray]  # on simulated race cars
+    other: dict[str, FloatArray]  # on a car of another simulation
+    test: dict[str, FloatArray]  # on the real car
+    weight: FloatArray  # β₁ of the local model at zero yaw rate, one a seed; none for an estimator without
 
     @property
     def label(self) -> str:
@@ -112,15 +103,10 @@ class Step:
 
 @dataclass(frozen=True)
 class Choice:
-    """A step, and a seed of it, by its errors on simulated cars.
+    """A step, and a seed of it, by its errors on simulated cars."""
 
-    Args:
-        step: with the lowest median error.
-        seed: position of its seed with the lowest error.
-    """
-
-    step: Step
-    seed: int
+    step: Step  # with the lowest median error
+    seed: int  # position of its seed with the lowest error
 
     @property
     def model(self) -> EvaluatedModel:

@@ -37,7 +37,7 @@ from vehest_papers.learned_ukf.additions import (
 from vehest_papers.learned_ukf.candidates import candidate_of, chosen, models_by_candidate, runs_of, scored_of
 from vehest_papers.learned_ukf.departures import departures, settings_table
 from vehest_papers.learned_ukf.errors import Losses
-from vehest_papers.learned_ukf.filtering import definiteness, drives_of, filtered, loaded, one_step_squares, squares_of, swapped, weighted
+from vehest_papers.learned_ukf.filtering import drives_of, filtered, loaded, lost_sequences, one_step_squares, squares_of, swapped, weighted
 from vehest_papers.learned_ukf.lengths import lengths
 from vehest_papers.learned_ukf.oracle import TRAINING, train_on
 from vehest_papers.learned_ukf.order import APART, AS_IN_THE_PAPER, LEVEL, TURNED, UNDECIDED, differences, order_in_words
@@ -230,11 +230,12 @@ def test_swapping_a_model_for_itself_changes_nothing_and_for_another_both_halves
 def test_lost_definiteness_is_counted_without_repair_and_repaired_with_it(part):
     estimator = loaded(model(part, "NNTF"))
     drives = drives_of(part, estimator, "tyre_a")
-    assert definiteness(estimator, drives).lost == 0
+    assert lost_sequences(estimator, drives) == (0, 3)
     estimator.filter.initial_covariance = lambda: -torch.eye(5)
-    counted = definiteness(estimator, drives)
-    assert (counted.sequences, counted.lost, counted.steps) == (3, 3, 300)
-    assert counted.lost_steps >= 3
+    assert lost_sequences(estimator, drives) == (3, 3)
+    repaired = filtered(estimator, drives).repaired
+    assert repaired.numel() == 300
+    assert int(repaired.sum()) >= 3
     assert estimator.filter.repair
 
 

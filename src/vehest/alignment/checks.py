@@ -185,7 +185,7 @@ def _steering_offset(recording: Recording) -> Iterator[Finding]:
 def _wheel_dropout(recording: Recording) -> Iterator[Finding]:
     """A wheel that shows next to nothing beside the other three while the car neither stands nor brakes hard.
 
-    On slippery roads wheels lock under gentle braking too; without a channel of the brakes that cannot be told from a dropout for certain.
+    On slippery roads wheels lock under gentle braking too; without a channel of the brakes that looks like a dropout.
     """
     if not {"vx", *WHEELS} <= set(recording.channels):
         return

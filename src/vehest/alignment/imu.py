@@ -401,7 +401,7 @@ def _noise_of_columns(signals: Signals) -> dict[str, tuple[float, float, float]]
 
 
 def _is_seen(column: FloatArray, noise: tuple[float, float, float]) -> bool:
-    """Whether an effect varies enough to be told from noise; where it does not, it counts as an uncertainty only."""
+    """Whether an effect varies enough to be separated from noise; where it does not, it counts as an uncertainty only."""
     return sum(size**2 for size in noise) <= LARGEST_NOISE_SHARE * float(column.var(axis=1).sum())
 
 

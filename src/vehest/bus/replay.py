@@ -105,10 +105,7 @@ class Replay:
     """A log's frames, sent onto a bus by the car, and a control unit that estimates from what it hears there.
 
     Args:
-        log: frames to send.
         signals: of the bus that the model reads.
-        timing: of the log.
-        bus: where frames go.
         frames: writes estimates as frames.
         stopped: whether to end early; what was written is kept.
 

@@ -67,22 +67,16 @@ class Split:
 
     Without training and validation stretches it is for estimators that learn nothing.
 
-    Args:
-        name: of the split.
-        train: stretches to learn from.
-        validation: stretches to stop on.
-        tests: name of a test set -> its stretches.
-        kept: ``train``, ``validation`` or name of a test set -> what was kept, where a condition decided it.
-
     Raises:
         ConfigurationError: training without validation stretches or the other way round, no stretch at all, or a stretch that
             serves two purposes.
     """
 
     name: str
-    train: tuple[Span, ...]
-    validation: tuple[Span, ...]
-    tests: Mapping[str, tuple[Span, ...]]
+    train: tuple[Span, ...]  # stretches to learn from
+    validation: tuple[Span, ...]  # stretches to stop on
+    tests: Mapping[str, tuple[Span, ...]]  # name of a test set -> its stretches
+    # ``train``, ``validation`` or name of a test set -> what was kept, where a condition decided it
     kept: Mapping[str, Kept] = field(default_factory=dict, compare=False)
 
     def __post_init__(self) -> None:

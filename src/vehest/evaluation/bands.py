@@ -27,15 +27,10 @@ SUFFIXES = {"sideslip": "", "vy": "_vy"}
 
 @dataclass(frozen=True, eq=False)
 class Banded:
-    """Errors of one quantity and the half widths of its bands, one array a range or sequence.
+    """Errors of one quantity and the half widths of its bands, one array a range or sequence."""
 
-    Args:
-        errors: (K,) each, [deg] or [m/s].
-        half: (K, L) each, one column a level of `LEVELS`, in the same unit.
-    """
-
-    errors: Sequence[FloatArray]
-    half: Sequence[FloatArray]
+    errors: Sequence[FloatArray]  # (K,) each, [deg] or [m/s]
+    half: Sequence[FloatArray]  # (K, L) each, one column a level of `LEVELS`, in the same unit
 
     @property
     def together(self) -> tuple[FloatArray, FloatArray]:

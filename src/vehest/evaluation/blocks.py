@@ -25,27 +25,16 @@ LEAST_BLOCKS = 3  # below which no interval is given
 
 @dataclass(frozen=True, eq=False)
 class Segments:
-    """Sums over the scored samples of each segment, all of shape (K,).
+    """Sums over the scored samples of each segment, all of shape (K,)."""
 
-    Args:
-        piece: number of the range, or sequence, that a segment belongs to.
-        start: time of its first sample [s].
-        samples: how many it has.
-        squared_error_vy: sum of (v̂ - v)² [m²/s²].
-        squared_error_sideslip: sum of (β̂ - β)² [deg²].
-        error_vy: sum of v̂ - v [m/s].
-        vy_ref: sum of v [m/s].
-        squared_vy_ref: sum of v² [m²/s²].
-    """
-
-    piece: FloatArray
-    start: FloatArray
-    samples: FloatArray
-    squared_error_vy: FloatArray
-    squared_error_sideslip: FloatArray
-    error_vy: FloatArray
-    vy_ref: FloatArray
-    squared_vy_ref: FloatArray
+    piece: FloatArray  # number of the range, or sequence, that a segment belongs to
+    start: FloatArray  # time of its first sample [s]
+    samples: FloatArray  # how many it has
+    squared_error_vy: FloatArray  # sum of (v̂ - v)² [m²/s²]
+    squared_error_sideslip: FloatArray  # sum of (β̂ - β)² [deg²]
+    error_vy: FloatArray  # sum of v̂ - v [m/s]
+    vy_ref: FloatArray  # sum of v [m/s]
+    squared_vy_ref: FloatArray  # sum of v² [m²/s²]
 
     def __len__(self) -> int:
         return len(self.piece)

@@ -1,6 +1,6 @@
-"""What a drive can show: the noise of its reference, and how well v can be told at all from a set of inputs along it.
+"""What a drive can show: the noise of its reference, and how well v can be estimated at all from a set of inputs along it.
 
-Two figures to hold errors against, so that a poor estimator is told from a silent drive. Both rest on models: yardsticks, not truths.
+Errors are held against both, to separate a poor estimator from a drive that shows little. Both rest on models: yardsticks, not truths.
 
 **Noise of the reference** (`reference_floor`). White noise of standard deviation σ has third differences of variance 20 σ². What the
 inertial signals explain of those of v, the second differences of a_y and of u ω, is taken out by least squares. The rest is measured by
@@ -74,34 +74,21 @@ _SILENT = ("motor_current", "wheel_torque_", "brake_pressure_")  # thrust and br
 
 @dataclass(frozen=True)
 class Floor:
-    """A standard deviation over the scored samples of a test set.
+    """A standard deviation over the scored samples of a test set."""
 
-    Args:
-        vy: of lateral velocity [m/s].
-        sideslip: of the sideslip angle [deg].
-    """
-
-    vy: float
-    sideslip: float
+    vy: float  # of lateral velocity [m/s]
+    sideslip: float  # of the sideslip angle [deg]
 
 
 @dataclass(frozen=True, eq=False)
 class Drive:
-    """A range or sequence of a test set, from where estimators may start, at the evaluation rate; arrays are of shape (T,).
+    """A range or sequence of a test set, from where estimators may start, at the evaluation rate; arrays are of shape (T,)."""
 
-    Args:
-        rate_hz: [Hz].
-        inputs: those of `INPUTS` that were measured, gaps filled by straight lines [SI].
-        vy_ref: reference lateral velocity [m/s]; may be NaN before the scored samples.
-        first: index of the first scored sample; all after it are scored.
-        told: whether estimators are told the state at the first sample.
-    """
-
-    rate_hz: float
-    inputs: dict[str, FloatArray]
-    vy_ref: FloatArray
-    first: int
-    told: bool = False
+    rate_hz: float  # [Hz]
+    inputs: dict[str, FloatArray]  # those of `INPUTS` that were measured, gaps filled by straight lines [SI]
+    vy_ref: FloatArray  # reference lateral velocity [m/s]; may be NaN before the scored samples
+    first: int  # index of the first scored sample; all after it are scored
+    known_start: bool = False  # whether estimators start from the reference at the first sample
 
     @property
     def step(self) -> float:
@@ -119,9 +106,7 @@ def drives_of(spans: Sequence[Span], recording_of: Callable[[Span], Recording], 
     """The ranges or sequences of a test set, as `score_all` counts them.
 
     Args:
-        spans: ranges of the test set.
         recording_of: of a range: its recording at ``protocol.rate_hz``, references included.
-        protocol: see `Protocol`.
     """
     return [drive_of(reference, piece, protocol) for reference, piece in pieces_of(spans, recording_of, protocol)]
 
@@ -213,29 +198,18 @@ def _robust_deviation(samples: FloatArray) -> float:
 
 
 class Noise(NamedTuple):
-    """A disturbance in two parts.
+    """A disturbance in two parts."""
 
-    Attributes:
-        density: of its white part [unit²/Hz], two-sided: the variance of a mean over T is density/T.
-        deviation: standard deviation of its slow part, a Gauss-Markov process [unit].
-        time_constant: of the slow part [s].
-    """
-
-    density: float
-    deviation: float
-    time_constant: float
+    density: float  # of its white part [unit²/Hz], two-sided: the variance of a mean over T is density/T
+    deviation: float  # standard deviation of its slow part, a Gauss-Markov process [unit]
+    time_constant: float  # of the slow part [s]
 
 
 class Axle(NamedTuple):
-    """What the force balance of an axle says of v, fitted to a test set.
+    """What the force balance of an axle says of v, fitted to a test set."""
 
-    Attributes:
-        coefficients: of the columns of `_axle_columns`.
-        error: what it leaves of v, in m/s.
-    """
-
-    coefficients: FloatArray
-    error: Noise
+    coefficients: FloatArray  # of the columns of `_axle_columns`
+    error: Noise  # what it leaves of v, in m/s
 
 
 @dataclass(frozen=True, eq=False)
@@ -255,7 +229,6 @@ def cramer_rao_floor(drives: Sequence[Drive], inputs: Collection[str], *, car: b
     """Root mean square of the posterior Cramér-Rao bound of causal estimators over the scored samples.
 
     Args:
-        drives: of a test set.
         inputs: some of `INPUTS`, ``vx`` and ``yaw_rate`` among them.
         car: whether the car is known to about what a data sheet tells; else kinematics alone is.
 
@@ -415,7 +388,7 @@ def _model_of(drive: Drive, inputs: set[str], levels: _Levels) -> tuple[LinearMo
     steps, step = len(drive.vy_ref), drive.step
     blocks = _Blocks(steps)
     decay, noise = _in_steps(levels.velocity, step)
-    start = levels.reference**2 if drive.told else levels.velocity.deviation**2
+    start = levels.reference**2 if drive.known_start else levels.velocity.deviation**2
     v = blocks.state(decay, noise, start)
     if levels.lateral is not None:
         white = levels.lateral.density * step + TINY**2

@@ -9,9 +9,6 @@ from vehest.evaluation.significance import root_interval, unexplained_interval
 def figure_intervals(segments: Segments) -> dict[str, tuple[float, float]]:
     """95 % intervals over blocks of the drive, of one training: what another drive of this kind would give.
 
-    Args:
-        segments: of one estimate on one test set.
-
     Returns:
         Metric -> lower and upper end, as `accuracy` has the metrics; nothing where there are fewer than `LEAST_BLOCKS` blocks.
     """

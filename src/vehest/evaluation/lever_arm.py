@@ -1,4 +1,4 @@
-"""Errors with the best lever arm, where nobody knows at which point of the car the reference was measured.
+"""Errors with the best lever arm, where the point of the car at which the reference was measured is unknown.
 
 Lateral velocity x ahead of a point is v + x·r, and satisfies the kinematics as well for any x: inertial sensors cannot tell an estimate
 at one point from an error at another. Where the reference's point is unknown, the plain error therefore ranks estimators by the point that
@@ -25,19 +25,14 @@ METRICS = ("rmse_vy", "rmse_sideslip", "fvu")
 
 @dataclass(frozen=True)
 class LeverArm:
-    """A lever arm and what is left with it.
+    """A lever arm and what is left with it."""
 
-    Args:
-        x: how far ahead of the reference's point the estimate holds [m]; at most `LONGEST` either way.
-        parts: the estimates at the reference's point.
-    """
-
-    x: float
-    parts: tuple[Scored, ...]
+    x: float  # how far ahead of the reference's point the estimate holds [m]; at most `LONGEST` either way
+    parts: tuple[Scored, ...]  # the estimates at the reference's point
 
 
 def point_is_unknown(reference: Recording) -> bool:
-    """Whether a recording's data set says that nobody knows where its reference was measured."""
+    """Whether a recording's data set declares that the point at which its reference was measured is unknown."""
     derived = reference.provenance.get("derived")
     return isinstance(derived, dict) and derived.get("reference_point") == "unknown"
 
@@ -67,7 +62,6 @@ def lever_arm_figures(parts: Sequence[Scored], pieces: Iterable[tuple[Recording,
     Args:
         parts: estimate and reference, of each piece.
         pieces: whole recordings at ``protocol.rate_hz`` and the ranges, or sequences, in them, as `pieces_of` counts them.
-        protocol: see `Protocol`.
 
     Returns:
         metric -> value, with ``lever_arm`` [m]; nothing where a reference's point is known or undeclared, or a recording has no yaw rate.

@@ -124,34 +124,21 @@ class Protocol:
 
 @dataclass(frozen=True, eq=False)
 class Scored:
-    """Estimate and reference at the scored times; every array has shape (K,).
+    """Estimate and reference at the scored times; every array has shape (K,)."""
 
-    Args:
-        time: [s].
-        vy: estimated lateral velocity [m/s].
-        vy_ref: reference lateral velocity [m/s].
-        sideslip: estimated sideslip angle, atan2(vy, vx) with the measured vx [rad].
-        sideslip_ref: reference sideslip angle, atan2(vy_ref, vx) [rad].
-        ay: measured lateral acceleration [m/s²]; NaN where the recording has none.
-        others: ``vx`` [m/s] and ``yaw_rate`` [rad/s] -> estimate and reference, where both are there.
-        covariance: of the errors in ``covariance_of``, shape (K, n, n), where the method gives one.
-        covariance_of: those quantities among `errors` that the covariance is of.
-        nis: normalised innovation squared of the filter's update, where the method gives it.
-        nis_dof: numbers measured at each update.
-        bands: ``vy`` [m/s] and ``sideslip`` [rad] -> half width of the calibrated 90 % band, where there is one.
-    """
-
-    time: FloatArray
-    vy: FloatArray
-    vy_ref: FloatArray
-    sideslip: FloatArray
-    sideslip_ref: FloatArray
-    ay: FloatArray
+    time: FloatArray  # [s]
+    vy: FloatArray  # estimated lateral velocity [m/s]
+    vy_ref: FloatArray  # reference lateral velocity [m/s]
+    sideslip: FloatArray  # estimated sideslip angle, atan2(vy, vx) with the measured vx [rad]
+    sideslip_ref: FloatArray  # reference sideslip angle, atan2(vy_ref, vx) [rad]
+    ay: FloatArray  # measured lateral acceleration [m/s²]; NaN where the recording has none
+    # ``vx`` [m/s] and ``yaw_rate`` [rad/s] -> estimate and reference, where both are there
     others: Mapping[str, tuple[FloatArray, FloatArray]] = field(default_factory=dict)
-    covariance: FloatArray | None = None
-    covariance_of: tuple[str, ...] = ()
-    nis: FloatArray | None = None
-    nis_dof: FloatArray | None = None
+    covariance: FloatArray | None = None  # of the errors in ``covariance_of``, shape (K, n, n), where the method gives one
+    covariance_of: tuple[str, ...] = ()  # those quantities among `errors` that the covariance is of
+    nis: FloatArray | None = None  # normalised innovation squared of the filter's update, where the method gives it
+    nis_dof: FloatArray | None = None  # numbers measured at each update
+    # ``vy`` [m/s] and ``sideslip`` [rad] -> half width of the calibrated 90 % band, where there is one
     bands: Mapping[str, FloatArray] = field(default_factory=dict)
 
     @property
@@ -165,9 +152,7 @@ def sequences(spans: Sequence[Span], recording_of: Callable[[Span], Recording], 
     """The stretches that estimates are made of, one after another: the ranges, or the sequences that they are cut into.
 
     Args:
-        spans: ranges of a test set.
         recording_of: of a range: its recording at ``protocol.rate_hz``; asked for only if ranges are cut.
-        protocol: see `Protocol`.
 
     Raises:
         DataError: no range is as long as a sequence.
@@ -215,9 +200,7 @@ def score_all(
 
     Args:
         estimate_of: position among the sequences -> estimate.
-        spans: ranges of the test set.
         recording_of: of a range: its recording at ``protocol.rate_hz``, references included.
-        protocol: see `Protocol`.
 
     Raises:
         DataError: as `score` and `sequences` say.
@@ -232,9 +215,7 @@ def pieces_of(spans: Sequence[Span], recording_of: Callable[[Span], Recording], 
     """Each range, or sequence, of a test set with the whole recording that it lies in, one recording in memory at a time.
 
     Args:
-        spans: ranges of the test set.
         recording_of: of a range: its recording at ``protocol.rate_hz``, references included.
-        protocol: see `Protocol`.
 
     Raises:
         DataError: as `sequences` says.
@@ -258,9 +239,8 @@ def score(estimate: Estimate, reference: Recording, span: Span, protocol: Protoc
 
     Args:
         estimate: at any rate; a value made for time t is scored at t.
-        reference: the recording at ``protocol.rate_hz``, with vx and vy_ref; with ay, if errors are to be told apart by it.
+        reference: the recording at ``protocol.rate_hz``, with vx and vy_ref; with ay, if errors are to be split by it.
         span: the range that is scored, after ``protocol.skip_seconds``.
-        protocol: see `Protocol`.
 
     Raises:
         DataError: the range is too short, or the estimate does not cover it.

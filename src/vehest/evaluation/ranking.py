@@ -21,21 +21,13 @@ BASELINES = ("zero", "static_map")
 
 @dataclass(frozen=True)
 class Comparison:
-    """RMSE of one estimator less that of another, over all seeds of both.
+    """RMSE of one estimator less that of another, over all seeds of both."""
 
-    Args:
-        difference: first - second.
-        low: lower end of its interval, corrected by Holm over all comparisons of the table.
-        high: its upper end.
-        p_value: adjusted likewise.
-        verdict: whether the first lies lower, higher, or is not told apart from the second.
-    """
-
-    difference: float
-    low: float
-    high: float
-    p_value: float
-    verdict: Verdict
+    difference: float  # first - second
+    low: float  # lower end of its interval, corrected by Holm over all comparisons of the table
+    high: float  # its upper end
+    p_value: float  # adjusted likewise
+    verdict: Verdict  # whether the first lies lower, higher, or is not told apart from the second
 
     @property
     def turned(self) -> Comparison:
@@ -46,29 +38,17 @@ class Comparison:
 
 @dataclass(frozen=True)
 class Ranking:
-    """What a test set says of a number of estimators.
+    """What a test set says of a number of estimators."""
 
-    Args:
-        order: by RMSE over all seeds, the lowest first.
-        rmse: over all seeds of each.
-        intervals: its 95 % interval, blocks and seeds drawn anew.
-        against_best: the best against each other.
-        against_baseline: (candidate, baseline) -> comparison, of each baseline that is there.
-        pairs: (first, second) -> comparison, of every pair that was compared, either way round.
-        n_blocks: blocks that were resampled; below `LEAST_BLOCKS` there are no intervals and no comparisons.
-        block_seconds: mean length of a block [s].
-        effective_blocks: how many equal blocks the best one's squared error is spread over.
-    """
-
-    order: Sequence[Name]
-    rmse: Mapping[Name, float]
-    intervals: Mapping[Name, tuple[float, float]]
-    against_best: Mapping[Name, Comparison]
-    against_baseline: Mapping[tuple[Name, Name], Comparison]
-    pairs: Mapping[tuple[Name, Name], Comparison]
-    n_blocks: int
-    block_seconds: float
-    effective_blocks: float
+    order: Sequence[Name]  # by RMSE over all seeds, the lowest first
+    rmse: Mapping[Name, float]  # over all seeds of each
+    intervals: Mapping[Name, tuple[float, float]]  # its 95 % interval, blocks and seeds drawn anew
+    against_best: Mapping[Name, Comparison]  # the best against each other
+    against_baseline: Mapping[tuple[Name, Name], Comparison]  # (candidate, baseline) -> comparison, of each baseline that is there
+    pairs: Mapping[tuple[Name, Name], Comparison]  # (first, second) -> comparison, of every pair that was compared, either way round
+    n_blocks: int  # blocks that were resampled; below `LEAST_BLOCKS` there are no intervals and no comparisons
+    block_seconds: float  # mean length of a block [s]
+    effective_blocks: float  # how many equal blocks the best one's squared error is spread over
 
     @property
     def missing_baselines(self) -> list[str]:
@@ -99,10 +79,9 @@ class Ranking:
 def rank(
     segments: Mapping[Name, Sequence[Segments]],
     rate_hz: float,
-    loss: str = "squared_error_sideslip",
     asked: Sequence[tuple[Name, Name]] = (),
 ) -> Ranking:
-    """Compare estimators on one test set by the root of a mean loss.
+    """Compare estimators on one test set by RMSE(β).
 
     Every pair is compared on the same blocks, drawn together, with the seeds of each drawn on their own (`paired_difference`). Corrected
     together by Holm are: the best against every other, every candidate against each baseline, and the pairs that are asked for.
@@ -110,11 +89,10 @@ def rank(
     Args:
         segments: of each seed of each estimator, all over the same samples.
         rate_hz: of the scored samples [Hz].
-        loss: column of `Segments`, squared errors.
         asked: further pairs to compare, such as those whose order a paper claims; left out where one of the two is missing.
     """
     first = next(iter(segments.values()))[0]
-    losses = {name: np.stack([getattr(own, loss) for own in seeds]) for name, seeds in segments.items()}
+    losses = {name: np.stack([own.squared_error_sideslip for own in seeds]) for name, seeds in segments.items()}
     per_sample = np.concatenate([own / first.samples for own in losses.values()])
     labels = block_labels(first, per_sample)
     sizes = block_sums(first.samples, labels)

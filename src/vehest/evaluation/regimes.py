@@ -53,7 +53,6 @@ def regimes_of(reference: Recording, span: Span, protocol: Protocol) -> dict[str
     Args:
         reference: the recording at ``protocol.rate_hz``.
         span: the range.
-        protocol: see `Protocol`.
 
     Returns:
         Regime -> (K,); without yaw rate neither straight nor turning, without lateral acceleration no bands, without both none.

@@ -19,23 +19,14 @@ DRAWN_AT_ONCE = 2_000_000  # block counts of so many resamples are held at once
 
 @dataclass(frozen=True)
 class Interval:
-    """A figure, or a difference first - second, and how well it is known.
+    """A figure, or a difference first - second, and how well it is known."""
 
-    Args:
-        value: the figure; of a difference, negative where the first has the lower loss.
-        low: lower end of the 95 % interval.
-        high: its upper end.
-        p_value: two-sided, of the hypothesis that there is no difference; below 0.05 exactly if the interval leaves 0 out.
-        error: standard error.
-        dof: degrees of freedom of Student's t.
-    """
-
-    value: float
-    low: float
-    high: float
-    p_value: float
-    error: float = 0.0
-    dof: float = np.inf
+    value: float  # the figure; of a difference, negative where the first has the lower loss
+    low: float  # lower end of the 95 % interval
+    high: float  # its upper end
+    p_value: float  # two-sided, of the hypothesis that there is no difference; below 0.05 exactly if the interval leaves 0 out
+    error: float = 0.0  # standard error
+    dof: float = np.inf  # degrees of freedom of Student's t
 
     def at(self, confidence: float) -> tuple[float, float]:
         """Both ends at another confidence than 95 %."""
@@ -45,22 +36,15 @@ class Interval:
 
 @dataclass(frozen=True)
 class Difference:
-    """How the losses of two estimators differ.
+    """How the losses of two estimators differ."""
 
-    Args:
-        mean: of their mean losses over all seeds and samples.
-        median: of the medians over seeds of their mean losses over samples.
-        root: of the square roots of their mean losses over all seeds and samples, an RMSE where losses are squared errors; NaN where a
-            loss is negative.
-        n_blocks: blocks that were resampled.
-        dof: degrees of freedom of Student's t behind both intervals.
-    """
-
-    mean: Interval
-    median: Interval
+    mean: Interval  # of their mean losses over all seeds and samples
+    median: Interval  # of the medians over seeds of their mean losses over samples
+    # of the square roots of their mean losses over all seeds and samples, an RMSE where losses are squared errors; NaN where a loss is
+    # negative
     root: Interval
-    n_blocks: int
-    dof: float
+    n_blocks: int  # blocks that were resampled
+    dof: float  # degrees of freedom of Student's t behind both intervals
 
 
 def paired_difference(
@@ -71,7 +55,6 @@ def paired_difference(
     rate_hz: float,
     block_seconds: float | None = None,
     n_resamples: int = 10_000,
-    seed: int = 0,
 ) -> Difference:
     """Compare two estimators on the same samples.
 
@@ -90,8 +73,6 @@ def paired_difference(
         sequence: which uninterrupted sequence a sample belongs to, shape (K,); a sequence's samples stand together, in order.
         rate_hz: of the samples [Hz].
         block_seconds: length of a block within a sequence [s], longer than errors are correlated; None takes whole sequences.
-        n_resamples: how many.
-        seed: of the resampling.
 
     Raises:
         DataError: shapes do not fit, a loss is not finite, or there are fewer than two blocks.
@@ -112,21 +93,17 @@ def paired_difference(
         )
     sizes = np.diff([*starts, len(sequence)]).astype(np.float64)
     return difference_of_blocks(
-        np.add.reduceat(first, starts, axis=1), np.add.reduceat(second, starts, axis=1), sizes, n_resamples=n_resamples, seed=seed
+        np.add.reduceat(first, starts, axis=1), np.add.reduceat(second, starts, axis=1), sizes, n_resamples=n_resamples
     )
 
 
-def difference_of_blocks(
-    first: FloatArray, second: FloatArray, sizes: FloatArray, *, n_resamples: int = 10_000, seed: int = 0
-) -> Difference:
+def difference_of_blocks(first: FloatArray, second: FloatArray, sizes: FloatArray, *, n_resamples: int = 10_000) -> Difference:
     """Compare two estimators on the same blocks, as `paired_difference` says.
 
     Args:
         first: sum of the losses of each seed over each block, shape (S, B).
         second: shape (S', B).
         sizes: samples in each block, shape (B,).
-        n_resamples: how many.
-        seed: of the resampling.
 
     Raises:
         DataError: there are fewer than two blocks.
@@ -136,7 +113,7 @@ def difference_of_blocks(
     sums = [first, second]
     means = [own.sum(axis=1) / sizes.sum() for own in sums]
     dof = _degrees_of_freedom(sums, sizes, means)
-    drawn = _resampled(sums, sizes, n_resamples, np.random.default_rng(seed))
+    drawn = _resampled(sums, sizes, n_resamples, np.random.default_rng(0))
     with np.errstate(invalid="ignore"):
         root = float(np.sqrt(means[0].mean()) - np.sqrt(means[1].mean()))
     return Difference(
@@ -148,7 +125,7 @@ def difference_of_blocks(
     )
 
 
-def root_interval(sums: FloatArray, sizes: FloatArray, *, n_resamples: int = 4000, seed: int = 0) -> Interval:
+def root_interval(sums: FloatArray, sizes: FloatArray, *, n_resamples: int = 4000) -> Interval:
     """The square root of a mean loss over blocks and seeds, an RMSE where losses are squared errors, with its interval.
 
     Blocks and seeds are drawn as in `paired_difference`; the interval is symmetric on a logarithmic axis, on which the distribution of a
@@ -157,14 +134,12 @@ def root_interval(sums: FloatArray, sizes: FloatArray, *, n_resamples: int = 400
     Args:
         sums: sum of the losses of each seed over each block, (S, B), none negative.
         sizes: samples in each block, (B,).
-        n_resamples: how many.
-        seed: of the resampling.
     """
     value = float(np.sqrt(sums.sum(axis=1).mean() / sizes.sum()))
     if not value > 0:
         return Interval(value, value, value, 1.0)
     nothing = np.zeros((1, len(sizes)))
-    drawn = _resampled([sums, nothing], sizes, n_resamples, np.random.default_rng(seed))[2]
+    drawn = _resampled([sums, nothing], sizes, n_resamples, np.random.default_rng(0))[2]
     return _logarithmic(value, drawn, _degrees_of_freedom([sums, nothing], sizes, [sums.sum(axis=1) / sizes.sum(), np.zeros(1)]))
 
 
@@ -179,7 +154,6 @@ def unexplained_interval(
         squared: of v².
         reference: of v.
         sizes: samples.
-        n_resamples: how many.
     """
     drawn = _counts(len(sizes), n_resamples, np.random.default_rng(0))
 

@@ -51,7 +51,6 @@ def errors_under_fault(parts: Sequence[Scored], nominal: Sequence[Scored], windo
         parts: estimate under the fault and reference, of each range or sequence; an infinite estimate is a sideslip of 90° and an
             infinite error of the lateral velocity.
         nominal: the same without the fault.
-        windows: of the fault in each.
     """
     found = {}
     for subset, inside in ((FAULTED, _during), (AFTER, _after)):
@@ -64,21 +63,16 @@ def errors_under_fault(parts: Sequence[Scored], nominal: Sequence[Scored], windo
 
 @dataclass(frozen=True, eq=False)
 class Flagged:
-    """What is said of an estimate besides its value, on the grid that errors are read on.
+    """Band and flags of an estimate, on the grid that errors are read on."""
 
-    Args:
-        band: half width of the 90 % band of β, (K,) [rad]; NaN where there is none.
-        health: 0 valid, 1 degraded, 2 invalid, (K,).
-    """
-
-    band: FloatArray
-    health: FloatArray
+    band: FloatArray  # half width of the 90 % band of β, (K,) [rad]; NaN where there is none
+    health: FloatArray  # 0 valid, 1 degraded, 2 invalid, (K,)
 
 
 def flags_under_fault(parts: Sequence[Scored], flagged: Sequence[Flagged], windows: Sequence[Window], rate_hz: float) -> dict[str, float]:
     """Whether bands hold and faults are flagged while they last, over all parts together.
 
-    ``coverage_90`` share of samples whose error of β lies in the band, ``coverage_90_unflagged`` the same of those said to be valid; of
+    ``coverage_90`` share of samples whose error of β lies in the band, ``coverage_90_unflagged`` the same of those marked valid; of
     ranges that were valid before: ``missed_detections`` share in which nothing is flagged before the fault's end, ``detection_delay`` mean
     time to the first flag of the others [s], ``max_error_sideslip_undetected`` largest error before it [deg]. Only figures that there
     is something for.
@@ -86,7 +80,6 @@ def flags_under_fault(parts: Sequence[Scored], flagged: Sequence[Flagged], windo
     Args:
         parts: estimate under the fault and reference, of each range or sequence.
         flagged: band and health of each.
-        windows: of the fault in each.
         rate_hz: of the scored samples [Hz].
     """
     inside, valid, delays, undetected = [], [], [], []

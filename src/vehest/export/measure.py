@@ -21,17 +21,11 @@ _STACK = re.compile(r"(\d+) bytes \((\w+)")
 
 @dataclass(frozen=True)
 class Target:
-    """A compiler and what it compiles for.
+    """A compiler and what it compiles for."""
 
-    Args:
-        title: for people.
-        prefix: of its tools' names.
-        options: beside those of all.
-    """
-
-    title: str
-    prefix: str = ""
-    options: tuple[str, ...] = ("-O2",)
+    title: str  # for people
+    prefix: str = ""  # of its tools' names
+    options: tuple[str, ...] = ("-O2",)  # beside those of all
 
     @property
     def compiler(self) -> str | None:
@@ -46,27 +40,16 @@ TARGETS = (HOST, CORTEX_M4F)
 
 @dataclass(frozen=True)
 class Footprint:
-    """What an export takes on a target.
+    """What an export takes on a target."""
 
-    Args:
-        target: title of the target.
-        compiler: first line of what it says of itself.
-        state: bytes of ``vehest_state``.
-        code: bytes of instructions.
-        tables: bytes of constants.
-        data: bytes of variables, which an export has none of.
-        stack: bytes of the deepest chain of calls, without what the C library takes.
-        library: functions of the C library that are called.
-    """
-
-    target: str
-    compiler: str
-    state: int
-    code: int
-    tables: int
-    data: int
-    stack: int
-    library: tuple[str, ...]
+    target: str  # title of the target
+    compiler: str  # first line of what it says of itself
+    state: int  # bytes of ``vehest_state``
+    code: int  # bytes of instructions
+    tables: int  # bytes of constants
+    data: int  # bytes of variables, which an export has none of
+    stack: int  # bytes of the deepest chain of calls, without what the C library takes
+    library: tuple[str, ...]  # functions of the C library that are called
 
     def figures(self) -> dict[str, int]:
         """What the command prints, by name."""

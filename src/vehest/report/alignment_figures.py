@@ -48,8 +48,7 @@ def alignment_figure(alignment: Alignment) -> MatplotlibFigure:
     """
     residuals, steering = alignment.residuals, alignment.steering
     heights = [*([OVERVIEW_HEIGHT] if residuals else []), *([1.0] * len(residuals)), *([STEERING_HEIGHT] if steering else [])]
-    with paper_style():
-        figure = new_figure(DOUBLE_COLUMN, 0.3 + 1.25 * sum(heights))
+    with new_figure(DOUBLE_COLUMN, 0.3 + 1.25 * sum(heights)) as figure:
         grid = figure.add_gridspec(len(heights), 2, height_ratios=heights)
         shared = None
         if residuals:

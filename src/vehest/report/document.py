@@ -43,70 +43,44 @@ _LINK_TO_PAGE = re.compile(r'href="([a-z0-9][a-z0-9_-]*)\.md"')
 
 @dataclass(frozen=True)
 class Column:
-    """How a column of a table is shown; its CSV file keeps every digit.
+    """How a column of a table is shown; its CSV file keeps every digit."""
 
-    Args:
-        header: what it is called, unit included.
-        digits: significant digits of its typical value, from which the decimals of all follow.
-        decimals: decimals of every value, instead of ``digits``.
-        each: every value has its own decimals, as in a column of different units.
-        bar: columns of the frame with a value and the ends of its interval; the page draws them into the cells, and sorts by the value.
-    """
-
-    header: str
-    digits: int = 3
-    decimals: int | None = None
-    each: bool = False
+    header: str  # what it is called, unit included
+    digits: int = 3  # significant digits of its typical value, from which the decimals of all follow
+    decimals: int | None = None  # decimals of every value, instead of ``digits``
+    each: bool = False  # every value has its own decimals, as in a column of different units
+    # columns of the frame with a value and the ends of its interval; the page draws them into the cells, and sorts by the value
     bar: tuple[str, str, str] | None = None
 
 
 @dataclass(frozen=True)
 class ModelLink:
-    """Where the model behind a row of a table is.
+    """Where the model behind a row of a table is."""
 
-    Args:
-        folder: relative to the page.
-        command: that runs it.
-    """
-
-    folder: str
-    command: str
+    folder: str  # relative to the page
+    command: str  # that runs it
 
 
 @dataclass(frozen=True, eq=False)
 class Table:
-    """A table with a caption.
+    """A table with a caption."""
 
-    Args:
-        name: file name without ending: small letters, digits, ``_``, ``-`` and ``.``.
-        caption: Markdown.
-        frame: the values, with short names as columns.
-        columns: column of the frame -> how it is shown, in this order; all of them, by their own names, if empty.
-        links: a model a row, for the page alone; none if empty.
-    """
-
-    name: str
-    caption: str
-    frame: pd.DataFrame
+    name: str  # file name without ending: small letters, digits, ``_``, ``-`` and ``.``
+    caption: str  # Markdown
+    frame: pd.DataFrame  # the values, with short names as columns
+    # column of the frame -> how it is shown, in this order; all of them, by their own names, if empty
     columns: Mapping[str, Column] = field(default_factory=dict)
-    links: Sequence[ModelLink] = ()
+    links: Sequence[ModelLink] = ()  # a model a row, for the page alone; none if empty
 
 
 @dataclass(frozen=True, eq=False)
 class Figure:
-    """A figure with a caption.
+    """A figure with a caption."""
 
-    Args:
-        name: file name without ending, as in `Table`.
-        caption: Markdown; its first sentence is what those are told who cannot see the figure.
-        static: matplotlib figure, for PNG, SVG and print.
-        interactive: what the page draws in its place, to zoom and filter, where that helps.
-    """
-
-    name: str
-    caption: str
-    static: MatplotlibFigure
-    interactive: Explorer | None = None
+    name: str  # file name without ending, as in `Table`
+    caption: str  # Markdown; its first sentence is the alternative text
+    static: MatplotlibFigure  # matplotlib figure, for PNG, SVG and print
+    interactive: Explorer | None = None  # what the page draws in its place, to zoom and filter, where that helps
 
 
 Block: TypeAlias = "str | Table | Figure"
@@ -114,19 +88,11 @@ Block: TypeAlias = "str | Table | Figure"
 
 @dataclass(frozen=True, eq=False)
 class Document:
-    """A report.
+    """A report; raises `ValueError` where two tables or two figures share a name, or a name is no file name."""
 
-    Args:
-        title: plain text.
-        blocks: Markdown text (headings from ``##`` down), tables and figures, in reading order.
-        data: name -> table that is written beside the others without being shown; text may link to ``tables/NAME.csv``.
-
-    Raises:
-        ValueError: two tables or two figures share a name, or a name is no file name.
-    """
-
-    title: str
-    blocks: Sequence[Block]
+    title: str  # plain text
+    blocks: Sequence[Block]  # Markdown text (headings from ``##`` down), tables and figures, in reading order
+    # name -> table that is written beside the others without being shown; text may link to ``tables/NAME.csv``
     data: Mapping[str, pd.DataFrame] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
@@ -139,13 +105,11 @@ class Document:
                     raise ValueError(f"report '{self.title}' has {names.count(name)} {kind.__name__.lower()}s called '{name}'")
 
 
-def write_documents(documents: Mapping[str, Document], folder: Path, *, page: bool = True, on_page: Sequence[str | Table] = ()) -> None:
+def write_documents(documents: Mapping[str, Document], folder: Path, *, on_page: Sequence[str | Table] = ()) -> None:
     """Write documents that link to each other as ``NAME.md``; their tables and figures lie side by side.
 
     Args:
         documents: name of the file -> document; ``report`` is the one to start with.
-        folder: an existing folder.
-        page: whether to write the self-contained pages too.
         on_page: text and tables that the page of ``report`` alone ends with, and no other file holds.
 
     Raises:
@@ -156,7 +120,7 @@ def write_documents(documents: Mapping[str, Document], folder: Path, *, page: bo
     for name, document in documents.items():
         if not _NAME.fullmatch(name):
             raise ValueError(f"'{name}' cannot name a file of a report")
-        write_document(document, folder, page=page, name=name, on_page=on_page if name == REPORT else ())
+        write_document(document, folder, name=name, on_page=on_page if name == REPORT else ())
 
 
 def write_document(
@@ -167,9 +131,6 @@ def write_document(
     The same document gives the same bytes.
 
     Args:
-        document: what to write.
-        folder: an existing folder.
-        page: whether to write the self-contained page too.
         name: of both files, without ending.
         on_page: text and tables that the page alone ends with, and no other file holds.
 

@@ -27,71 +27,41 @@ GAP = 65_535
 
 @dataclass(frozen=True, eq=False)
 class Signal:
-    """A channel that was measured.
+    """A channel that was measured."""
 
-    Args:
-        label: for people.
-        unit: that it is drawn in.
-        values: shape (K,); NaN where there is none.
-        drawn: whether it is drawn before anybody asks.
-    """
-
-    label: str
-    unit: str
-    values: FloatArray
-    drawn: bool = True
+    label: str  # for people
+    unit: str  # that it is drawn in
+    values: FloatArray  # shape (K,); NaN where there is none
+    drawn: bool = True  # whether it is drawn at first
 
 
 @dataclass(frozen=True, eq=False)
 class Candidate:
-    """An estimator in the traces.
+    """An estimator in the traces."""
 
-    Args:
-        label: its title.
-        line: its looks.
-        vy: estimated lateral velocity [m/s], shape (K,).
-        band_vy: half width of its calibrated 90 % band of v [m/s], (K,), where it has one.
-        band_sideslip: the same of β [deg].
-        health: 0 valid, 1 degraded, 2 invalid, (K,), where it is known.
-    """
-
-    label: str
+    label: str  # its title
     line: Line
-    vy: FloatArray
-    band_vy: FloatArray | None = None
-    band_sideslip: FloatArray | None = None
-    health: FloatArray | None = None
+    vy: FloatArray  # estimated lateral velocity [m/s], shape (K,)
+    band_vy: FloatArray | None = None  # half width of its calibrated 90 % band of v [m/s], (K,), where it has one
+    band_sideslip: FloatArray | None = None  # the same of β [deg]
+    health: FloatArray | None = None  # 0 valid, 1 degraded, 2 invalid, (K,), where it is known
 
 
 @dataclass(frozen=True, eq=False)
 class Explorer:
-    """Everything over one uniform time axis; NaN breaks all lines between two ranges.
+    """Everything over one uniform time axis; NaN breaks all lines between two ranges."""
 
-    Args:
-        start: first time [s].
-        step: between two samples [s].
-        time_label: label of the time axis.
-        zoom: a range that deserves a button [s].
-        vx: measured forward velocity [m/s], shape (K,).
-        vy: reference lateral velocity [m/s], (K,).
-        ay: measured lateral acceleration [m/s²], (K,); None where there is none.
-        inputs: further channels as measured.
-        candidates: in the order of the table.
-        course: x and y of the car [m], (K,) each, where they are known.
-        course_note: how they are known.
-    """
-
-    start: float
-    step: float
-    time_label: str
-    zoom: tuple[float, float]
-    vx: FloatArray
-    vy: FloatArray
-    ay: FloatArray | None
-    inputs: Sequence[Signal]
-    candidates: Sequence[Candidate]
-    course: tuple[FloatArray, FloatArray] | None = None
-    course_note: str = ""
+    start: float  # first time [s]
+    step: float  # between two samples [s]
+    time_label: str  # label of the time axis
+    zoom: tuple[float, float]  # a range that deserves a button [s]
+    vx: FloatArray  # measured forward velocity [m/s], shape (K,)
+    vy: FloatArray  # reference lateral velocity [m/s], (K,)
+    ay: FloatArray | None  # measured lateral acceleration [m/s²], (K,); None where there is none
+    inputs: Sequence[Signal]  # further channels as measured
+    candidates: Sequence[Candidate]  # in the order of the table
+    course: tuple[FloatArray, FloatArray] | None = None  # x and y of the car [m], (K,) each, where they are known
+    course_note: str = ""  # how they are known
 
     def to_json(self) -> str:
         """What the page reads; nothing in it can end a script element."""

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from vehest.constants import FloatArray
-from vehest.report.style import DOUBLE_COLUMN, REFERENCE, Line, new_figure, paper_style, significant
+from vehest.report.style import DOUBLE_COLUMN, REFERENCE, Line, new_figure, significant
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure as MatplotlibFigure
@@ -22,51 +22,31 @@ LOGARITHMIC_FROM = 20.0
 
 @dataclass(frozen=True, eq=False)
 class Spread:
-    """One row of a dot plot.
+    """One row of a dot plot."""
 
-    Args:
-        label: what the row shows.
-        line: its looks.
-        values: one value a seed, shape (S,); those that are not finite are left out.
-        chosen: value of the chosen seed.
-    """
-
-    label: str
+    label: str  # what the row shows
     line: Line
-    values: FloatArray
-    chosen: float
+    values: FloatArray  # one value a seed, shape (S,); those that are not finite are left out
+    chosen: float  # value of the chosen seed
 
 
 @dataclass(frozen=True, eq=False)
 class Traces:
-    """Time series of one source on the common grid; NaN breaks a line.
+    """Time series of one source on the common grid; NaN breaks a line."""
 
-    Args:
-        label: name of the source.
-        line: its looks.
-        vy: lateral velocity [m/s], shape (K,).
-        sideslip: [deg], shape (K,).
-    """
-
-    label: str
+    label: str  # name of the source
     line: Line
-    vy: FloatArray
-    sideslip: FloatArray
+    vy: FloatArray  # lateral velocity [m/s], shape (K,)
+    sideslip: FloatArray  # [deg], shape (K,)
 
 
 @dataclass(frozen=True, eq=False)
 class Errors:
-    """Sideslip errors of one estimator.
+    """Sideslip errors of one estimator."""
 
-    Args:
-        label: name of the estimator.
-        line: its looks.
-        error: estimate minus reference [deg], shape (K,).
-    """
-
-    label: str
+    label: str  # name of the estimator
     line: Line
-    error: FloatArray
+    error: FloatArray  # estimate minus reference [deg], shape (K,)
 
     @property
     def rmse(self) -> float:
@@ -76,32 +56,18 @@ class Errors:
 
 @dataclass(frozen=True, eq=False)
 class Learning:
-    """Losses of one training run.
+    """Losses of one training run."""
 
-    Args:
-        label: name of the estimator.
-        line: its looks.
-        epoch: shape (E,).
-        train: training loss, shape (E,).
-        validation: validation loss, shape (E,).
-    """
-
-    label: str
+    label: str  # name of the estimator
     line: Line
-    epoch: FloatArray
-    train: FloatArray
-    validation: FloatArray
+    epoch: FloatArray  # shape (E,)
+    train: FloatArray  # training loss, shape (E,)
+    validation: FloatArray  # validation loss, shape (E,)
 
 
 def spread_figure(rows: Sequence[Spread], quantity: str) -> MatplotlibFigure:
-    """Dots of all seeds, one row an estimator; the chosen seed as a diamond, the median as a tick.
-
-    Args:
-        rows: from top to bottom.
-        quantity: label of the axis.
-    """
-    with paper_style():
-        figure = new_figure(DOUBLE_COLUMN * 0.86, 0.7 + 0.27 * max(len(rows), 2))
+    """Dots of all seeds, one row an estimator; the chosen seed as a diamond, the median as a tick."""
+    with new_figure(DOUBLE_COLUMN * 0.86, 0.7 + 0.27 * max(len(rows), 2)) as figure:
         axes = figure.add_subplot()
         for position, row in enumerate(rows):
             values = row.values[np.isfinite(row.values)]
@@ -128,12 +94,8 @@ def traces_figure(time: FloatArray, reference: Traces, estimates: Sequence[Trace
 
     Args:
         time: [s], shape (K,).
-        reference: measured.
-        estimates: from top to bottom.
-        time_label: label of the time axes.
     """
-    with paper_style():
-        figure = new_figure(DOUBLE_COLUMN, 0.75 + 0.68 * max(len(estimates), 2))
+    with new_figure(DOUBLE_COLUMN, 0.75 + 0.68 * max(len(estimates), 2)) as figure:
         grid = figure.subplots(len(estimates), 2, sharex=True, sharey="col", squeeze=False)
         for (left, right), estimate in zip(grid, estimates, strict=True):
             for axes, measured, estimated in ((left, reference.vy, estimate.vy), (right, reference.sideslip, estimate.sideslip)):
@@ -154,24 +116,17 @@ def zoom_figure(
     reference: Traces,
     estimates: Sequence[Traces],
     time_label: str,
-    *,
-    error_limit: float = math.inf,
 ) -> MatplotlibFigure:
     """Reference and all estimates over a short while: lateral velocity, sideslip, its error, and the lateral acceleration.
 
     Args:
         time: [s], shape (K,).
         ay: measured lateral acceleration [m/s²], shape (K,); None leaves its axes out.
-        reference: measured.
-        estimates: in the order of the legend.
-        time_label: label of the time axis.
-        error_limit: errors are drawn up to this size [deg].
     """
     from matplotlib.ticker import MaxNLocator
 
-    with paper_style():
-        heights = (1.5, 1.5, 1.2, 0.6) if ay is not None else (1.5, 1.5, 1.2)
-        figure = new_figure(DOUBLE_COLUMN, 1.25 * sum(heights))
+    heights = (1.5, 1.5, 1.2, 0.6) if ay is not None else (1.5, 1.5, 1.2)
+    with new_figure(DOUBLE_COLUMN, 1.25 * sum(heights)) as figure:
         all_axes = list(figure.subplots(len(heights), 1, sharex=True, height_ratios=heights))
         (top, middle, below), bottom = all_axes[:3], all_axes[-1]
         for source in (*reversed(estimates), reference):
@@ -180,7 +135,7 @@ def zoom_figure(
             middle.plot(time, source.sideslip, **looks)
             if source is not reference:
                 error = source.sideslip - reference.sideslip
-                below.plot(time, np.where(np.abs(error) <= error_limit, error, np.nan), **looks)
+                below.plot(time, error, **looks)
         below.axhline(0.0, color=reference.line.colour, linewidth=0.7)
         if ay is not None:
             bottom.plot(time, ay, color="#444444", linewidth=0.8)
@@ -197,8 +152,7 @@ def zoom_figure(
 
 def error_histogram(estimates: Sequence[Errors]) -> MatplotlibFigure:
     """Density of the sideslip error of each estimator on common bins; those beyond the axis count in the outermost bins."""
-    with paper_style():
-        figure = new_figure(DOUBLE_COLUMN, 3.2)
+    with new_figure(DOUBLE_COLUMN, 3.2) as figure:
         axes = figure.add_subplot()
         limit = max(float(np.quantile(np.abs(estimate.error), 0.995)) for estimate in estimates)
         limit = limit if limit > 0 else 1.0
@@ -221,28 +175,26 @@ def error_histogram(estimates: Sequence[Errors]) -> MatplotlibFigure:
     return figure
 
 
-def error_over_ay(ay: FloatArray, estimates: Sequence[Errors], width: float = 1.0) -> MatplotlibFigure:
-    """RMSE of the sideslip in bins of |a_y|, and how many samples each bin holds; bins of fewer than 20 samples show none.
+def error_over_ay(ay: FloatArray, estimates: Sequence[Errors]) -> MatplotlibFigure:
+    """RMSE of the sideslip in bins of |a_y| of 1 m/s², and how many samples each bin holds; bins of fewer than 20 samples show none.
 
     Args:
         ay: lateral acceleration at the scored times [m/s²], shape (K,).
         estimates: errors at the same times.
-        width: of a bin [m/s²].
     """
-    n_bins = max(math.ceil(float(np.abs(ay).max()) / width), 1)
-    edges = width * np.arange(n_bins + 1)
-    centres = edges[:-1] + width / 2
-    index = np.minimum((np.abs(ay) / width).astype(int), n_bins - 1)
+    n_bins = max(math.ceil(float(np.abs(ay).max())), 1)
+    edges = np.arange(n_bins + 1)
+    centres = edges[:-1] + 0.5
+    index = np.minimum(np.abs(ay).astype(int), n_bins - 1)
     counts = np.bincount(index, minlength=n_bins)
-    with paper_style():
-        figure = new_figure(DOUBLE_COLUMN, 3.4)
+    with new_figure(DOUBLE_COLUMN, 3.4) as figure:
         axes, below = figure.subplots(2, 1, sharex=True, height_ratios=(3.2, 1))
         for estimate in reversed(estimates):
             squares = np.bincount(index, weights=np.square(estimate.error), minlength=n_bins)
             rmse = np.sqrt(np.divide(squares, counts, out=np.full(n_bins, np.nan), where=counts >= LEAST_SAMPLES))
             line = estimate.line
             axes.plot(centres, rmse, color=line.colour, linestyle=line.dash, marker=line.marker, label=estimate.label)
-        below.bar(centres, counts, width=0.9 * width, color="#b5b9be")
+        below.bar(centres, counts, width=0.9, color="#b5b9be")
         axes.set_ylabel("RMSE(β) [deg]")
         axes.set_ylim(bottom=0.0)
         below.set_ylabel("samples")
@@ -254,14 +206,8 @@ def error_over_ay(ay: FloatArray, estimates: Sequence[Errors], width: float = 1.
 
 
 def learning_curves(runs: Sequence[Learning], quantity: str) -> MatplotlibFigure:
-    """Training and validation loss over the epochs, logarithmic; a marker where the validation loss is lowest.
-
-    Args:
-        runs: in the order of the legend.
-        quantity: label of the loss axis.
-    """
-    with paper_style():
-        figure = new_figure(DOUBLE_COLUMN, 3.0)
+    """Training and validation loss over the epochs, logarithmic; a marker where the validation loss is lowest."""
+    with new_figure(DOUBLE_COLUMN, 3.0) as figure:
         left, right = figure.subplots(1, 2, sharex=True, sharey=True)
         for run in reversed(runs):
             looks = {"color": run.line.colour, "linestyle": run.line.dash}

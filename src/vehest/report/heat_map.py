@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from vehest.constants import FloatArray
-from vehest.report.style import DOUBLE_COLUMN, MISSING, SINGLE_COLUMN, decimals_for, fixed, new_figure, paper_style
+from vehest.report.style import DOUBLE_COLUMN, MISSING, SINGLE_COLUMN, decimals_for, fixed, new_figure
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure as MatplotlibFigure
@@ -23,19 +23,12 @@ NO_VALUE = "#ececec"
 
 @dataclass(frozen=True, eq=False)
 class Panel:
-    """One panel of a heat map.
+    """One panel of a heat map."""
 
-    Args:
-        title: what it shows; may be empty.
-        mean: colour and first line of each cell, NaN where there is none; shape (R, C).
-        half: half the interval, NaN where there is none; shape (R, C).
-        marked: row and column of the cell with a frame.
-    """
-
-    title: str
-    mean: FloatArray
-    half: FloatArray
-    marked: tuple[int, int] | None = None
+    title: str  # what it shows; may be empty
+    mean: FloatArray  # colour and first line of each cell, NaN where there is none; shape (R, C)
+    half: FloatArray  # half the interval, NaN where there is none; shape (R, C)
+    marked: tuple[int, int] | None = None  # row and column of the cell with a frame
 
 
 def heat_map(
@@ -47,8 +40,6 @@ def heat_map(
         panels: of shape (R, C) each.
         columns: ticks of the horizontal axis, C of them.
         rows: ticks of the vertical axis from below, R of them.
-        column_label: of the horizontal axis.
-        row_label: of the vertical axis.
         quantity: what the colours show, with its unit.
     """
     import matplotlib
@@ -60,8 +51,7 @@ def heat_map(
     across = 1 if len(columns) > MOST_COLUMNS_SIDE_BY_SIDE else min(len(panels), 2)
     down = math.ceil(len(panels) / across)
     width = SINGLE_COLUMN if across == 1 and len(columns) <= MOST_COLUMNS_SIDE_BY_SIDE else DOUBLE_COLUMN
-    with paper_style():
-        figure = new_figure(width, down * (0.75 + CELL_HEIGHT * len(rows)))
+    with new_figure(width, down * (0.75 + CELL_HEIGHT * len(rows))) as figure:
         grid = figure.subplots(down, across, sharex=True, sharey=True, squeeze=False)
         shades = LinearSegmentedColormap.from_list("shades", matplotlib.colormaps["Blues"](np.linspace(0.1, 0.95, 64)))
         colours = ScalarMappable(_scale(finite), shades)

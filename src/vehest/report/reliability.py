@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from vehest.constants import FloatArray
-from vehest.report.style import REFERENCE, SINGLE_COLUMN, Line, new_figure, paper_style
+from vehest.report.style import REFERENCE, SINGLE_COLUMN, Line, new_figure
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure as MatplotlibFigure
@@ -20,21 +20,13 @@ SIDESTEP = 0.005  # of intervals that would cover each other
 
 @dataclass(frozen=True, eq=False)
 class Reliability:
-    """Coverages of one estimator's bands, each of shape (L,); NaN where not known.
+    """Coverages of one estimator's bands, each of shape (L,); NaN where not known."""
 
-    Args:
-        label: name of the estimator.
-        line: its looks.
-        coverage: fraction of errors inside.
-        low: lower end of its interval.
-        high: upper end.
-    """
-
-    label: str
+    label: str  # name of the estimator
     line: Line
-    coverage: FloatArray
-    low: FloatArray
-    high: FloatArray
+    coverage: FloatArray  # fraction of errors inside
+    low: FloatArray  # lower end of its interval
+    high: FloatArray  # upper end
 
 
 def reliability_figure(levels: Sequence[float], rows: Sequence[Reliability]) -> MatplotlibFigure:
@@ -42,11 +34,9 @@ def reliability_figure(levels: Sequence[float], rows: Sequence[Reliability]) -> 
 
     Args:
         levels: nominal, ascending.
-        rows: estimators.
     """
     nominal = np.array(levels)
-    with paper_style():
-        figure = new_figure(SINGLE_COLUMN * 1.55, 3.2)
+    with new_figure(SINGLE_COLUMN * 1.55, 3.2) as figure:
         axes = figure.add_subplot()
         axes.plot([0.0, 1.0], [0.0, 1.0], color=REFERENCE.colour, linewidth=0.7)
         for position, row in enumerate(rows):

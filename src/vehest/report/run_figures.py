@@ -34,9 +34,6 @@ def trace_figure(
     """Measured and estimated lateral velocity and sideslip over a test range.
 
     Args:
-        label: of the run.
-        estimator: its estimator.
-        variant: its variant.
         time: scored times [s], shape (K,).
         measured: lateral velocity [m/s] and sideslip angle [rad], each (K,).
         estimated: the same as estimated.

@@ -68,17 +68,11 @@ _PAPER = {
 
 @dataclass(frozen=True)
 class Line:
-    """How one estimator is drawn, the same in every figure.
+    """How one estimator is drawn, the same in every figure."""
 
-    Args:
-        colour: hexadecimal, readable on white.
-        dash: ``solid``, ``dashed``, ``dotted`` or ``dashdot``.
-        marker: matplotlib's marker, where points are drawn.
-    """
-
-    colour: str
-    dash: str = "solid"
-    marker: str = "o"
+    colour: str  # hexadecimal, readable on white
+    dash: str = "solid"  # ``solid``, ``dashed``, ``dotted`` or ``dashdot``
+    marker: str = "o"  # matplotlib's marker, where points are drawn
 
 
 REFERENCE = Line(REFERENCE_COLOUR)
@@ -137,16 +131,13 @@ def paper_style() -> Iterator[None]:
         yield
 
 
-def new_figure(width: float = DOUBLE_COLUMN, height: float = 3.0) -> MatplotlibFigure:
-    """An empty figure that no global state knows of; call it inside `paper_style`.
-
-    Args:
-        width: [in].
-        height: [in].
-    """
+@contextmanager
+def new_figure(width: float = DOUBLE_COLUMN, height: float = 3.0) -> Iterator[MatplotlibFigure]:
+    """An empty figure of a width and height [in] that no global state knows of, drawn inside the ``with`` block in `paper_style`."""
     from matplotlib.figure import Figure
 
-    return Figure(figsize=(width, height), layout="constrained")
+    with paper_style():
+        yield Figure(figsize=(width, height), layout="constrained")
 
 
 def legend_above(figure: MatplotlibFigure, *axes: Any, columns: int = 4) -> None:

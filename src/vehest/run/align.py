@@ -31,7 +31,6 @@ def align_recording(source: str, overrides: Sequence[str], recording_id: str | N
         source: a data set, or a CSV or Parquet file.
         overrides: of the configuration that reads it.
         recording_id: which recording of a data set; not needed where it has one.
-        settings: quantities to estimate.
 
     Raises:
         VehestError: there is no such recording, it cannot be read, or it does not determine them.

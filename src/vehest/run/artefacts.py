@@ -171,7 +171,6 @@ def make(plan: StagePlan, write: Callable[[Path], Status | None]) -> Artefact:
     """Run a stage: ``write`` fills an empty folder, which gets its manifest and then its final name.
 
     Args:
-        plan: of the artefact.
         write: fills the folder; returns ``interrupted`` if it was stopped.
 
     Raises:

@@ -223,7 +223,7 @@ def plan_training(config: Mapping[str, Any], split: Split, data: Mapping[str, Ar
 
 
 def _check_name(job: Job, training: TrainJob, names: dict[Any, Any]) -> None:
-    """Refuse a training that cannot be told from another: one of two combinations of a sweep, or of two of one name in a study."""
+    """Refuse a training that cannot be distinguished from another: one of two combinations of a sweep, or of two of one name in a study."""
     key = training.plan.key
     if job.label:
         twin = names.setdefault((key, faults_of(job.config)), job.label)

@@ -100,11 +100,7 @@ def _settings(content: Mapping[str, Any]) -> FaultSettings:
 
 
 def all_of(faults: Iterable[Iterable[FaultSettings]]) -> tuple[FaultSettings, ...]:
-    """Faults of several configurations together, each once.
-
-    Raises:
-        ConfigurationError: two different ones have one name.
-    """
+    """Faults of several configurations together, each once; raises `ConfigurationError` where two different ones have one name."""
     found: dict[str, FaultSettings] = {}
     for fault in (fault for some in faults for fault in some):
         if found.setdefault(fault.condition, fault) != fault:

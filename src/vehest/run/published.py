@@ -49,8 +49,6 @@ def keys_of_study(study: Study, jobs: Jobs, absent: Collection[str], runner: Run
     """Keys of everything that determines the results of a study.
 
     Args:
-        study: with its parts or data sets.
-        jobs: of the study.
         absent: parts or data sets that it goes on without.
         runner: composes the configurations of data sets.
         inputs: data set -> raw file or library -> digest or version; without those whose raw files are missing.

@@ -125,11 +125,7 @@ def _plan(
 
 
 def code_of_report(study: str) -> str:
-    """Version of what a report runs, by the name of the module that draws it.
-
-    Raises:
-        ConfigurationError: the name is unknown.
-    """
+    """Version of what a report runs, by the name of the module that draws it; raises `ConfigurationError` where the name is unknown."""
     return f"report={VERSION} {study}={getattr(study_module(study), 'VERSION', '1')}"
 
 

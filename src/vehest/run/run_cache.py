@@ -82,9 +82,7 @@ class RunCache:
     """The record of one command.
 
     Args:
-        command: ``run`` or ``sweep``.
         name: of the pipeline, or its path; of the sweep, if it was given.
-        overrides: of the command.
 
     Attributes:
         file: of the record; none where the output root depends on more than overrides and environment.

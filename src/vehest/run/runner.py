@@ -92,11 +92,7 @@ class Runner:
         return {name: self.dataset_config(name, config)["dataset"] for name in dataset_names(config["split"])}
 
     def look_for_files(self, config: Config) -> None:
-        """Make sure that the raw files of every data set of a split are here; read nothing.
-
-        Raises:
-            MissingError: some are not.
-        """
+        """Make sure that the raw files of every data set of a split are here; read nothing; raises `MissingError` where some are not."""
         for dataset in self.datasets_of(config).values():
             if not missing_keys(dict(dataset)):  # which its ingest reports
                 open_source(dataset).inputs()

@@ -64,7 +64,6 @@ def run_study(
     Args:
         name: of the pipeline, or its path; of a sweep the start of its folder's name, none for the estimators and the split.
         overrides: for all jobs that have their key; of a sweep, with several values.
-        options: of the command.
         cache: keeps the finished study.
         sweep: whether the overrides make a sweep.
         only_report: train and evaluate nothing.

@@ -26,15 +26,11 @@ SCORED = ("vx", "vy_ref")
 
 @dataclass(frozen=True)
 class Missing:
-    """Channels that some recording lacks, those that an estimator reads and those that its fit reads.
-
-    Args:
-        supplies: channel -> transforms that make it of channels that are there; None where none do.
-    """
+    """Channels that some recording lacks, those that an estimator reads and those that its fit reads."""
 
     to_estimate: list[str]
     to_train: list[str]
-    supplies: dict[str, Derivation | None]
+    supplies: dict[str, Derivation | None]  # channel -> transforms that make it of channels that are there; None where none do
 
     @property
     def unsupplied(self) -> list[str]:
@@ -48,31 +44,18 @@ class Missing:
 
 @dataclass(frozen=True)
 class Usability:
-    """Whether an estimator can be used with recordings.
+    """Whether an estimator can be used with recordings."""
 
-    Args:
-        estimator: name in conf/estimator.
-        rate_hz: that it would run at [Hz]; None where its settings are incomplete.
-        own_rate_hz: of its configuration [Hz].
-        missing: channels that the recordings lack.
-        gaps: channels with gaps that it cannot skip.
-        settings: overrides that avoid channels without a supply.
-        without: the same in words, with channels that are missing even then.
-        patterns: overrides that its fit needs, since it asks for recordings by other names.
-        to_give: setting that only the user knows, in words; empty if none.
-        car: keys of the car's parameters, which are those of another car unless given.
-    """
-
-    estimator: str
-    rate_hz: float | None
-    own_rate_hz: float | None
-    missing: Missing
-    gaps: tuple[str, ...] = ()
-    settings: tuple[str, ...] = ()
-    without: str = ""
-    patterns: tuple[str, ...] = ()
-    to_give: str = ""
-    car: tuple[str, ...] = ()
+    estimator: str  # name in conf/estimator
+    rate_hz: float | None  # that it would run at [Hz]; None where its settings are incomplete
+    own_rate_hz: float | None  # of its configuration [Hz]
+    missing: Missing  # channels that the recordings lack
+    gaps: tuple[str, ...] = ()  # channels with gaps that it cannot skip
+    settings: tuple[str, ...] = ()  # overrides that avoid channels without a supply
+    without: str = ""  # the same in words, with channels that are missing even then
+    patterns: tuple[str, ...] = ()  # overrides that its fit needs, since it asks for recordings by other names
+    to_give: str = ""  # setting that only the user knows, in words; empty if none
+    car: tuple[str, ...] = ()  # keys of the car's parameters, which are those of another car unless given
 
     @property
     def usable(self) -> str:

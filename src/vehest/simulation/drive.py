@@ -41,46 +41,27 @@ STOPPING_SHARE = 0.7
 
 @dataclass(frozen=True)
 class Flags:
-    """Outcome of a drive.
+    """Outcome of a drive."""
 
-    Args:
-        spun: the car slid beyond the validity of its equations of rolling.
-        left_road: it was further beside its line than the manoeuvre's half_width.
-        stood: it stands at the end.
-        completed: the manoeuvre came to its own end, and was not cut off because it took too long.
-        gave_up_at: when the driver began to stop because of a spin or beside the road [s]; none if never.
-        largest_lateral_error: distance from the line [m]; none where there is no line.
-        largest_sideslip: above 1 m/s, either sign [rad].
-        largest_ay: either sign [m/s²].
-        stability_share: of the recorded time in which stability control intervened; none where it is off.
-    """
-
-    spun: bool
-    left_road: bool
-    stood: bool
-    completed: bool
-    gave_up_at: float | None
-    largest_lateral_error: float | None
-    largest_sideslip: float
-    largest_ay: float
-    stability_share: float | None
+    spun: bool  # the car slid beyond the validity of its equations of rolling
+    left_road: bool  # it was further beside its line than the manoeuvre's half_width
+    stood: bool  # it stands at the end
+    completed: bool  # the manoeuvre came to its own end, and was not cut off because it took too long
+    gave_up_at: float | None  # when the driver began to stop because of a spin or beside the road [s]; none if never
+    largest_lateral_error: float | None  # distance from the line [m]; none where there is no line
+    largest_sideslip: float  # above 1 m/s, either sign [rad]
+    largest_ay: float  # either sign [m/s²]
+    stability_share: float | None  # of the recorded time in which stability control intervened; none where it is off
 
 
 @dataclass(frozen=True, eq=False)
 class Trip:
-    """True motion and outcome of a drive.
+    """True motion and outcome of a drive."""
 
-    Args:
-        motion: true motion, first sample after the settling time.
-        lateral_error: the car's place left of its line [m], (T,); NaN where there is no line.
-        flags: how it went.
-        drawn: values that the seed drew.
-    """
-
-    motion: Motion
-    lateral_error: FloatArray
-    flags: Flags
-    drawn: dict[str, Any]
+    motion: Motion  # true motion, first sample after the settling time
+    lateral_error: FloatArray  # the car's place left of its line [m], (T,); NaN where there is no line
+    flags: Flags  # how it went
+    drawn: dict[str, Any]  # values that the seed drew
 
 
 def simulate_drive(
@@ -100,14 +81,9 @@ def simulate_drive(
     A car that spins or leaves the road brakes to its stand, and the recording ends AFTER_STAND later; its provenance has ``flags``.
 
     Args:
-        id: name of the recording.
-        vehicle: the car.
-        manoeuvre: its manoeuvre.
         seed: of the driver, of what the manoeuvre draws, of patches on the surface and of the sensors' errors; zero or positive.
         rate_hz: sampling rate; a whole number of plant steps must fit between samples [Hz].
-        sensors: levels of the sensors' errors.
         stability_control: whether the car has it switched on.
-        surface: of the road.
         stint: loss of grip over the drive, unknown to the driver; by default none.
 
     Raises:
@@ -135,11 +111,7 @@ def simulate_drive(
 
 @contextmanager
 def naming(id: str, seed: int) -> Iterator[None]:
-    """Names drive and seed in the errors of a simulation.
-
-    Raises:
-        ConfigurationError: the seed is negative.
-    """
+    """Names drive and seed in the errors of a simulation; raises `ConfigurationError` where the seed is negative."""
     if seed < 0:
         raise ConfigurationError(f"drive '{id}': a seed must be zero or positive, not {seed}")
     try:

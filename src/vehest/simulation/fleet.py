@@ -22,17 +22,11 @@ Scales = Annotated[tuple[float, float], "a pair [lowest, highest] of scales"]
 
 @dataclass(frozen=True)
 class Variation:
-    """Parameters of the plant that are scaled together.
+    """Parameters of the plant that are scaled together."""
 
-    Args:
-        parameters: the library's names, ``tire.p_dy1`` for one of a group.
-        factor: lowest and highest scale, drawn uniformly for every drive.
-        log: draw uniformly over the logarithm instead, so that half as much is as likely as twice as much.
-    """
-
-    parameters: tuple[str, ...]
-    factor: Scales
-    log: bool = False
+    parameters: tuple[str, ...]  # the library's names, ``tire.p_dy1`` for one of a group
+    factor: Scales  # lowest and highest scale, drawn uniformly for every drive
+    log: bool = False  # draw uniformly over the logarithm instead, so that half as much is as likely as twice as much
 
     def __post_init__(self) -> None:
         if not 0.0 < self.factor[0] <= self.factor[1]:
@@ -93,11 +87,7 @@ def varied(vehicle: Vehicle, variations: Sequence[Variation], seed: int) -> Vehi
 
 
 def varied_planar(car: PlanarCar, variations: Sequence[Variation], seed: int) -> PlanarCar:
-    """The same for a car of the planar plant.
-
-    Raises:
-        ConfigurationError: a name is no parameter of the plant.
-    """
+    """The same for a car of the planar plant; raises `ConfigurationError` where a name is no parameter of the plant."""
     generator = np.random.default_rng(np.random.SeedSequence(entropy=seed, spawn_key=(_STREAM, 0)))
     factors: dict[str, float] = {}
     for variation in variations:
@@ -109,14 +99,10 @@ def varied_planar(car: PlanarCar, variations: Sequence[Variation], seed: int) ->
 
 @dataclass(frozen=True)
 class SensorVariation:
-    """Scales of the sensors' errors that are drawn for every drive, one for each sensor and kind of error.
+    """Scales of the sensors' errors that are drawn for every drive, one for each sensor and kind of error."""
 
-    Args:
-        factors: kind of error (``noise``, ``offset``, …) -> lowest and highest scale.
-        roll_share: lowest and highest share of the body's roll that leaks into ay, of either sign; none: as the sensors have it.
-    """
-
-    factors: Mapping[str, tuple[float, float]]
+    factors: Mapping[str, tuple[float, float]]  # kind of error (``noise``, ``offset``, …) -> lowest and highest scale
+    # lowest and highest share of the body's roll that leaks into ay, of either sign; none: as the sensors have it
     roll_share: tuple[float, float] | None = None
 
     @classmethod

@@ -45,14 +45,9 @@ def simulate_planar_drive(
     ``vx`` is the motor's speed at the rim, as such a car knows its speed: it errs where the wheels slip. Spins are driven on from.
 
     Args:
-        id: name of the recording.
-        car: the car.
-        manoeuvre: its manoeuvre.
         seed: of the driver, of patches on the surface and of the sensors' errors; zero or positive.
         rate_hz: sampling rate; a whole number of plant steps must fit between samples [Hz].
-        sensors: levels of the sensors' errors.
         stability_control: such a car has none; anything but False is refused.
-        surface: of the floor.
 
     Raises:
         ConfigurationError: a value that makes no sense.

@@ -71,11 +71,7 @@ def unpacked(file: Path, *, most_bytes: int = MOST_BYTES) -> Iterator[Path]:
 
 @contextmanager
 def temporary_folder(file: Path) -> Iterator[Path]:
-    """Yield a folder to unpack a file into, which is removed afterwards.
-
-    Raises:
-        MissingError: there is no room for one.
-    """
+    """Yield a folder to unpack a file into, which is removed afterwards; raises `MissingError` where there is no room for one."""
     try:
         kept = tempfile.TemporaryDirectory(prefix="vehest-", ignore_cleanup_errors=True)
     except OSError as error:

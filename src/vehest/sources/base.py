@@ -93,9 +93,6 @@ Options = TypeVar("Options")
 class Source(ABC):
     """Reads one data set.
 
-    Args:
-        dataset: its configuration, as conf/dataset/*.yaml holds it.
-
     Attributes:
         options_type: dataclass of its own options, with their types and defaults.
         options: the options of this data set.
@@ -253,11 +250,7 @@ def source_names() -> list[str]:
 
 
 def existing_folder(path: Any, dataset: str) -> Path:
-    """A folder of raw data.
-
-    Raises:
-        MissingError: no root was given, or the folder is not there.
-    """
+    """A folder of raw data; raises `MissingError` where no root was given, or the folder is not there."""
     folder = Path(str(path)).expanduser()
     has_root = bool(path) and folder.parts[:1] not in {("None",), ("null",)}
     if not (has_root and folder.is_dir()):

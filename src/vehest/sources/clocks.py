@@ -251,11 +251,7 @@ def _robust_line(number: FloatArray, stamps: FloatArray) -> tuple[float, float]:
 
 
 def common_span(spans: Mapping[str, tuple[float, float]], where: str) -> tuple[float, float]:
-    """Time that all spans [s] have in common; their keys name them in messages.
-
-    Raises:
-        DataError: there is none.
-    """
+    """Time that all spans [s] have in common; their keys name them in messages; raises `DataError` where there is none."""
     late, early = max(spans, key=lambda name: spans[name][0]), min(spans, key=lambda name: spans[name][1])
     begin, end = spans[late][0], spans[early][1]
     if begin >= end:

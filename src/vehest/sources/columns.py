@@ -24,18 +24,12 @@ Rate = Annotated[float, Field(gt=0, le=HIGHEST_RATE)]
 
 @dataclass(frozen=True)
 class Column:
-    """Declaration of a column that becomes a channel.
+    """Declaration of a column that becomes a channel."""
 
-    Args:
-        column: the column's name in the file.
-        unit: the unit its values have there.
-        sign: 1, or -1 where the file counts the other way round than ISO 8855.
-        factor: what the file's values must be multiplied with to be in ``unit``, such as 1 / wheel radius.
-    """
-
-    column: ColumnName
-    unit: str
-    sign: Literal[1, -1] = 1
+    column: ColumnName  # the column's name in the file
+    unit: str  # the unit its values have there
+    sign: Literal[1, -1] = 1  # 1, or -1 where the file counts the other way round than ISO 8855
+    # what the file's values must be multiplied with to be in ``unit``, such as 1 / wheel radius
     factor: Annotated[float, "a number other than 0"] = 1.0
 
     def to_si(self, values: FloatArray, si_unit: str) -> FloatArray:

@@ -160,11 +160,7 @@ def download_of(source: Source) -> Download:
 
 
 def _read_checksums(folder: Path) -> dict[str, str]:
-    """Recorded checksums by name, empty if there is no record.
-
-    Raises:
-        DataError: it is damaged.
-    """
+    """Recorded checksums by name, empty if there is no record; raises `DataError` where it is damaged."""
     import pooch
 
     file = folder / CHECKSUMS

@@ -77,11 +77,7 @@ class FileSource(Source):
     def _recording(
         self, recording_id: str, where: str, clock: Clock, channels: Mapping[str, FloatArray], provenance: Mapping[str, Any]
     ) -> Recording:
-        """A recording of this data set.
-
-        Raises:
-            DataError: its channels make none; ``where`` names the file.
-        """
+        """A recording of this data set; raises `DataError` where its channels make none; ``where`` names the file."""
         try:
             return Recording(
                 id=recording_id,

@@ -22,7 +22,7 @@ Wanted = Mapping[str, tuple[str, int | str | None]]
 
 @dataclass(frozen=True)
 class MdfOptions(SignalOptions):
-    """Options of the source, by type; what is None is not said."""
+    """Options of the source, by type; None leaves an option open."""
 
     files: str = "*.mf4"
 

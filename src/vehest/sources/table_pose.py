@@ -20,19 +20,12 @@ UNITS = {"x": "m", "y": "m", "yaw": "rad"}
 
 @dataclass(frozen=True)
 class TablePose(PoseOptions):
-    """Columns of poses.
+    """Columns of poses."""
 
-    Args:
-        x: column of the position and its unit, z up.
-        y: the same.
-        yaw: column of the yaw angle and its unit.
-        yaw_offset: from the rigid body's x axis to the car's forward axis, counter-clockwise [rad].
-    """
-
-    x: Column
-    y: Column
-    yaw: Column
-    yaw_offset: float = 0.0
+    x: Column  # column of the position and its unit, z up
+    y: Column  # the same
+    yaw: Column  # column of the yaw angle and its unit
+    yaw_offset: float = 0.0  # from the rigid body's x axis to the car's forward axis, counter-clockwise [rad]
 
     @property
     def columns(self) -> dict[str, Column]:

@@ -34,11 +34,7 @@ def _rows(row: int | str, where: str) -> slice:
 
 
 def kept_rows(n_rows: int, dropped: Iterable[slice], file: Path) -> NDArray[np.bool_]:
-    """Which rows count, shape (n_rows,).
-
-    Raises:
-        DataError: the table has no such row.
-    """
+    """Which rows count, shape (n_rows,); raises `DataError` where the table has no such row."""
     kept = np.ones(n_rows, dtype=np.bool_)
     for rows in dropped:
         last = rows.stop or rows.start + 1
@@ -49,11 +45,7 @@ def kept_rows(n_rows: int, dropped: Iterable[slice], file: Path) -> NDArray[np.b
 
 
 def counted_runs(numbers: FloatArray, column: str, file: Path) -> dict[int | None, slice]:
-    """Rows of each run that a column of whole numbers counts.
-
-    Raises:
-        DataError: a number is none, or a run begins again.
-    """
+    """Rows of each run that a column of whole numbers counts; raises `DataError` where a number is none, or a run begins again."""
     odd = np.flatnonzero(~(np.isfinite(numbers) & (numbers == np.rint(numbers))))
     if len(odd):
         where = f"column '{column}' holds {numbers[odd[0]]} in data row {odd[0] + 1}"

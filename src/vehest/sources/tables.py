@@ -85,11 +85,7 @@ def read_head(file: Path, size: int = BLOCK) -> bytes:
 
 
 def require_columns(file: Path, names: Sequence[str], wanted: Iterable[str]) -> None:
-    """See that a table has every wanted column once.
-
-    Raises:
-        DataError: it does not.
-    """
+    """See that a table has every wanted column once; raises `DataError` where it does not."""
     for name in wanted:
         count = names.count(name)
         if count > 1:

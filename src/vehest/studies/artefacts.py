@@ -24,7 +24,6 @@ def read_frame(path: Path, columns: Iterable[str] = (), *, numbers: Iterable[str
     """A table that vehest wrote as CSV, its numbers bit for bit.
 
     Args:
-        path: the file.
         columns: that it must have.
         numbers: those of them that must hold numbers.
 
@@ -69,27 +68,17 @@ METRIC_COLUMNS = (
 
 @dataclass(frozen=True)
 class EvaluatedModel:
-    """One fitted and evaluated estimator.
+    """One fitted and evaluated estimator."""
 
-    Args:
-        estimator: name in conf/estimator.
-        variant: what the paper calls it.
-        title: for people, for example ``KS-NN linear + bias, P = 2``.
-        seed: its seed.
-        model_folder: what the train stage wrote (``history.csv`` in it, where there is one).
-        evaluation_folder: what the evaluate stage wrote: ``<test set>/<n>.parquet`` for the n-th range of a test set, or the n-th sequence.
-        training: how it was trained, as configured.
-        calibration_folder: where trust.yaml lies, if it was calibrated.
-    """
-
-    estimator: str
-    variant: str
-    title: str
-    seed: int
-    model_folder: Path
+    estimator: str  # name in conf/estimator
+    variant: str  # what the paper calls it
+    title: str  # for people, for example ``KS-NN linear + bias, P = 2``
+    seed: int  # its seed
+    model_folder: Path  # what the train stage wrote (``history.csv`` in it, where there is one)
+    # what the evaluate stage wrote: ``<test set>/<n>.parquet`` for the n-th range of a test set, or the n-th sequence
     evaluation_folder: Path
-    training: Mapping[str, Any] = field(default_factory=dict)
-    calibration_folder: Path | None = None
+    training: Mapping[str, Any] = field(default_factory=dict)  # how it was trained, as configured
+    calibration_folder: Path | None = None  # where trust.yaml lies, if it was calibrated
 
     def history(self) -> pd.DataFrame | None:
         """Training history, one row an epoch (or a search); none if the method has none."""
@@ -103,11 +92,7 @@ class EvaluatedModel:
         return {row["metric"]: number_in(row, "value", path) for row in rows}
 
     def segments(self, test_set: str) -> Segments:
-        """Sums of its errors over segments of a test set.
-
-        Raises:
-            DataError: the file is damaged, or has no such test set.
-        """
+        """Sums of its errors over segments of a test set; raises `DataError` where the file is damaged, or has no such test set."""
         path = self.evaluation_folder / "blocks.csv"
         found = read_segments(path)
         if test_set not in found:
@@ -121,38 +106,24 @@ class EvaluatedModel:
 
 @dataclass(frozen=True)
 class PartArtefacts:
-    """One comparison: estimators that learnt on one split and were scored on it.
+    """One comparison: estimators that learnt on one split and were scored on it."""
 
-    Args:
-        study: name of the study.
-        title: its title.
-        about: a paragraph on what is compared, from the pipeline file.
-        command: the command that makes this report.
-        split: training, validation and test ranges.
-        protocol: how estimates are scored.
-        kinds: data set -> ``real`` or ``simulated``.
-        data_titles: data set -> title, for people.
-        metrics: long table with `METRIC_COLUMNS`; test_set ``validation`` is the validation range. Times are not among them, since what a
-            study draws is published, and a time is never the same twice.
-        models: evaluated models, in the order of the pipeline file.
-        references: (data set, recording) -> Parquet file at the evaluation rate, references included; of all ranges of the split.
-        facts: further lines on how it was made: training budget, versions, machine.
-        failed: name of what is left out, since it failed or is not there -> why.
-    """
-
-    study: str
-    title: str
-    about: str
-    command: str
-    split: Split
-    protocol: Protocol
-    kinds: Mapping[str, str]
-    data_titles: Mapping[str, str]
+    study: str  # name of the study
+    title: str  # its title
+    about: str  # a paragraph on what is compared, from the pipeline file
+    command: str  # the command that makes this report
+    split: Split  # training, validation and test ranges
+    protocol: Protocol  # how estimates are scored
+    kinds: Mapping[str, str]  # data set -> ``real`` or ``simulated``
+    data_titles: Mapping[str, str]  # data set -> title, for people
+    # long table with `METRIC_COLUMNS`; test_set ``validation`` is the validation range. Times are not among them, since what a study draws
+    # is published, and a time is never the same twice.
     metrics: pd.DataFrame
-    models: Sequence[EvaluatedModel]
+    models: Sequence[EvaluatedModel]  # evaluated models, in the order of the pipeline file
+    # (data set, recording) -> Parquet file at the evaluation rate, references included; of all ranges of the split
     references: Mapping[tuple[str, str], Path]
-    facts: Sequence[str]
-    failed: Mapping[str, str] = field(default_factory=dict)
+    facts: Sequence[str]  # further lines on how it was made: training budget, versions, machine
+    failed: Mapping[str, str] = field(default_factory=dict)  # name of what is left out, since it failed or is not there -> why
 
     def scored(self, model: EvaluatedModel, test_set: str) -> list[Scored]:
         """Estimate and reference of a model on each range of a test set, or on each sequence if the protocol cuts ranges."""
@@ -173,25 +144,15 @@ def of_parts(tables: Mapping[str, pd.DataFrame]) -> pd.DataFrame:
 
 @dataclass(frozen=True)
 class StoredDataset:
-    """A data set in the store.
+    """A data set in the store."""
 
-    Args:
-        name: in conf/dataset.
-        title: for people.
-        kind: ``real`` or ``simulated``.
-        config: what its ingest was told, prose aside.
-        files: recording -> Parquet file at the native rate.
-        licence: whose recordings they are.
-        citation: what to cite.
-    """
-
-    name: str
-    title: str
-    kind: str
-    config: Mapping[str, Any]
-    files: Mapping[str, Path]
-    licence: str = ""
-    citation: str = ""
+    name: str  # in conf/dataset
+    title: str  # for people
+    kind: str  # ``real`` or ``simulated``
+    config: Mapping[str, Any]  # of its ingest, prose aside
+    files: Mapping[str, Path]  # recording -> Parquet file at the native rate
+    licence: str = ""  # whose recordings they are
+    citation: str = ""  # what to cite
 
     def recordings(self, channels: Iterable[str] | None = None) -> Iterator[Recording]:
         """All recordings, one at a time, with all or some of their channels.
@@ -206,46 +167,28 @@ class StoredDataset:
 
 @dataclass(frozen=True)
 class AbsentDataset:
-    """A data set that a study would show and whose raw files are not here.
+    """A data set that a study would show and whose raw files are not here."""
 
-    Args:
-        name: in conf/dataset.
-        title: for people.
-        licence: whose recordings they are.
-        citation: what to cite.
-    """
-
-    name: str
-    title: str
-    licence: str
-    citation: str
+    name: str  # in conf/dataset
+    title: str  # for people
+    licence: str  # whose recordings they are
+    citation: str  # what to cite
 
 
 @dataclass(frozen=True)
 class StudyArtefacts:
-    """Everything that a study module may look at: parts that compare estimators, or data sets.
+    """Everything that a study module may look at: parts that compare estimators, or data sets."""
 
-    Args:
-        study: name of the study.
-        title: its title.
-        about: a paragraph on what is compared or shown, from the pipeline file.
-        command: the command that makes this report.
-        titles: part -> title, of all there are in the pipeline file.
-        parts: part -> what was compared in it; a study that is not in parts has one without a name.
-        absent: parts whose raw files were not here.
-        datasets: of a study of recordings alone, in the order of the pipeline file.
-        absent_datasets: data sets that could not be read.
-    """
-
-    study: str
-    title: str
-    about: str
-    command: str
-    titles: Mapping[str, str] = field(default_factory=dict)
+    study: str  # name of the study
+    title: str  # its title
+    about: str  # a paragraph on what is compared or shown, from the pipeline file
+    command: str  # the command that makes this report
+    titles: Mapping[str, str] = field(default_factory=dict)  # part -> title, of all there are in the pipeline file
+    # part -> what was compared in it; a study that is not in parts has one without a name
     parts: Mapping[str, PartArtefacts] = field(default_factory=dict)
-    absent: Sequence[str] = ()
-    datasets: Sequence[StoredDataset] = ()
-    absent_datasets: Sequence[AbsentDataset] = ()
+    absent: Sequence[str] = ()  # parts whose raw files were not here
+    datasets: Sequence[StoredDataset] = ()  # of a study of recordings alone, in the order of the pipeline file
+    absent_datasets: Sequence[AbsentDataset] = ()  # data sets that could not be read
 
     @property
     def only(self) -> PartArtefacts:

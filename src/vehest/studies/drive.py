@@ -384,23 +384,14 @@ def _shown(board: pd.DataFrame) -> pd.DataFrame:
 
 @dataclass(frozen=True, eq=False)
 class _Drive:
-    """All scored ranges of a test set on one time axis, with a gap of NaN between two ranges.
+    """All scored ranges of a test set on one time axis, with a gap of NaN between two ranges."""
 
-    Args:
-        time: [s], shape (K,).
-        time_label: label of that axis.
-        reference: measured; every array of shape (K,).
-        estimates: (estimator, variant) -> estimated.
-        zoom: `ZOOM_SECONDS` with the largest mean square of the reference sideslip [s].
-        explorer: all of it and what was measured, for the page.
-    """
-
-    time: FloatArray
-    time_label: str
-    reference: Scored
-    estimates: dict[Name, Scored]
-    zoom: tuple[float, float]
-    explorer: Explorer
+    time: FloatArray  # [s], shape (K,)
+    time_label: str  # label of that axis
+    reference: Scored  # measured; every array of shape (K,)
+    estimates: dict[Name, Scored]  # (estimator, variant) -> estimated
+    zoom: tuple[float, float]  # `ZOOM_SECONDS` with the largest mean square of the reference sideslip [s]
+    explorer: Explorer  # all of it and what was measured, for the page
 
     @classmethod
     def of(cls, artefacts: PartArtefacts, board: pd.DataFrame, test_set: str, lines: dict[Name, Line]) -> _Drive:

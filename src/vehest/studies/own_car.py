@@ -41,25 +41,20 @@ leaderboard = drive.leaderboard
 
 @dataclass(frozen=True)
 class Verdict:
-    """What is said of a test set.
+    """Verdict on one test set: text and best estimator."""
 
-    Args:
-        sentences: for people, in Markdown.
-        model: to go on with; none where nothing can be recommended.
-    """
-
-    sentences: tuple[str, ...]
-    model: EvaluatedModel | None
+    sentences: tuple[str, ...]  # for people, in Markdown
+    model: EvaluatedModel | None  # to go on with; none where nothing can be recommended
 
 
 def documents(artefacts: StudyArtefacts) -> dict[str, Document]:
     """The verdict, then the report of the comparison."""
     part = artefacts.first
     compared = drive.comparison(part)
-    told = [f"{'**On test set ' + as_code(name) + ':** ' if len(part.split.tests) > 1 else ''}{text}" for name, text in _told(part)]
+    verdicts = [f"{'**On test set ' + as_code(name) + ':** ' if len(part.split.tests) > 1 else ''}{text}" for name, text in _verdicts(part)]
     commands = "\n".join(_commands(part, artefacts.study))
     absent = not_compared(part)
-    blocks = ["## Verdict\n\n" + "\n\n".join(told)]
+    blocks = ["## Verdict\n\n" + "\n\n".join(verdicts)]
     if commands:
         blocks.append(f"What to do next:\n\n```sh\n{commands}\n```")
     if absent:
@@ -74,24 +69,20 @@ def documents(artefacts: StudyArtefacts) -> dict[str, Document]:
 def verdict(artefacts: StudyArtefacts) -> list[str]:
     """The verdict as lines of plain text, next commands last."""
     part = artefacts.first
-    lines = [text.replace("**", "").replace("`", "") for _, text in _told(part)]
+    lines = [text.replace("**", "").replace("`", "") for _, text in _verdicts(part)]
     commands = _commands(part, artefacts.study)
     return [*lines, *(["next:", *(f"  {command}" for command in commands)] if commands else [])]
 
 
-def _told(part: PartArtefacts) -> list[tuple[str, str]]:
+def _verdicts(part: PartArtefacts) -> list[tuple[str, str]]:
     return [(name, " ".join(verdict_of(part, name).sentences)) for name in part.split.tests]
 
 
 def verdict_of(part: PartArtefacts, test_set: str) -> Verdict:
-    """Which estimator to trust on a test set and how far; that none can be told, and why.
+    """Which estimator to trust on a test set and how far; that none can be recommended, and why.
 
     A winner is named only where it lies below every other candidate, v = 0 and the static map by more than chance (`Ranking.winner`). Of
     those that are not told apart the one with the lowest RMSE(v) on validation is what the next commands take.
-
-    Args:
-        part: the comparison.
-        test_set: of it.
     """
     ranking = ranking_of(part, test_set)
     titles = {name: as_text(models[0].title) for name, models in by_name(part.models).items()}

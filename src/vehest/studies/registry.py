@@ -32,11 +32,7 @@ def study_names() -> list[str]:
 
 
 def study_module(name: str) -> ModuleType:
-    """The module behind a name.
-
-    Raises:
-        ConfigurationError: the name is unknown.
-    """
+    """The module behind a name; raises `ConfigurationError` where the name is unknown."""
     if name in OWN:
         return importlib.import_module(f"{ENTRY_POINTS}.{name}")
     point = _entry_point(name)

@@ -29,35 +29,22 @@ Value = bool | int | float | str
 
 @dataclass(frozen=True)
 class SweepArtefacts:
-    """Everything that tables and figures of a sweep are made from.
+    """Everything that tables and figures of a sweep are made from."""
 
-    Args:
-        name: name of the sweep.
-        command: the command that makes it.
-        keys: those that take several values, the seed aside, in the order of the command.
-        jobs: a row a job: ``combination`` (counted from 0), ``title``, the keys, ``seed``, ``status`` (``done`` or ``failed``), ``error``,
-            ``n_parameters``, ``epochs``, and ``rmse_sideslip.SET``, ``rmse_vy.SET`` and ``fvu.SET`` for each set of `sets`;
-            those of a combination with a fault count the samples while it lasts.
-        split: training, validation and test ranges.
-        protocol: how estimates are scored.
-        kinds: data set -> ``real`` or ``simulated``.
-        data_titles: data set -> title, for people.
-        facts: lines on how it was made: budget, resampling.
-        failures: what failed -> why.
-        patented: whether a KS-NN is among the estimators.
-    """
-
-    name: str
-    command: str
-    keys: Sequence[str]
+    name: str  # name of the sweep
+    command: str  # the command that makes it
+    keys: Sequence[str]  # those that take several values, the seed aside, in the order of the command
+    # a row a job: ``combination`` (counted from 0), ``title``, the keys, ``seed``, ``status`` (``done`` or ``failed``), ``error``,
+    # ``n_parameters``, ``epochs``, and ``rmse_sideslip.SET``, ``rmse_vy.SET`` and ``fvu.SET`` for each set of `sets`; those of a
+    # combination with a fault count the samples while it lasts
     jobs: pd.DataFrame
-    split: Split
-    protocol: Protocol
-    kinds: Mapping[str, str]
-    data_titles: Mapping[str, str]
-    facts: Sequence[str]
-    failures: Mapping[str, str] = field(default_factory=dict)
-    patented: bool = False
+    split: Split  # training, validation and test ranges
+    protocol: Protocol  # how estimates are scored
+    kinds: Mapping[str, str]  # data set -> ``real`` or ``simulated``
+    data_titles: Mapping[str, str]  # data set -> title, for people
+    facts: Sequence[str]  # lines on how it was made: budget, resampling
+    failures: Mapping[str, str] = field(default_factory=dict)  # what failed -> why
+    patented: bool = False  # whether a KS-NN is among the estimators
 
     @property
     def sets(self) -> list[str]:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import pandas as pd
 
-from vehest.report.style import DOUBLE_COLUMN, lines_of, new_figure, paper_style
+from vehest.report.style import DOUBLE_COLUMN, lines_of, new_figure
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure as MatplotlibFigure
@@ -32,8 +32,7 @@ def transfer_figure(board: pd.DataFrame) -> MatplotlibFigure:
     rows = -(-len(places) // columns)
     from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
-    with paper_style():
-        figure = new_figure(DOUBLE_COLUMN, rows * (0.75 + ROW * len(names)))
+    with new_figure(DOUBLE_COLUMN, rows * (0.75 + ROW * len(names))) as figure:
         grid = figure.subplots(rows, columns, sharex=True, sharey=True, squeeze=False)
         for axes in grid.flat[len(places) :]:
             axes.set_visible(False)

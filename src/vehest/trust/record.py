@@ -45,11 +45,7 @@ def is_other_vehicle(trust: Trust | None, recording: Recording) -> bool:
 
 
 def write_trust(trust: Trust, folder: Path) -> None:
-    """Write trust.yaml into an existing folder.
-
-    Raises:
-        OSError: it cannot be written.
-    """
+    """Write trust.yaml into an existing folder; raises `OSError` where it cannot be written."""
     content = json.loads(json.dumps({"format": FORMAT, **asdict(trust)}))  # tuples as lists
     (folder / TRUST).write_text(yaml.safe_dump(content, sort_keys=False, allow_unicode=True), encoding="utf-8")
 

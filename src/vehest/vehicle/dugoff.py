@@ -37,14 +37,7 @@ Tyres = Literal["plain", "smooth"]
 
 @dataclass(frozen=True)
 class LoadedCar:
-    """A car as a single track whose axles carry what a steady longitudinal acceleration leaves them; a BMW 545i, if not told otherwise.
-
-    Args:
-        mass: [kg].
-        yaw_inertia: about the vertical axis through the centre of gravity [kg m²].
-        cg_to_front_axle: distance from the centre of gravity [m].
-        cg_to_rear_axle: the same [m].
-        cg_height: of the centre of gravity above the road [m]; the paper gives none, 0.52 is assumed.
+    """A car as a single track whose axles carry what a steady longitudinal acceleration leaves them; a BMW 545i by default.
 
     Raises:
         ValueError: a number that is not positive.
@@ -52,11 +45,11 @@ class LoadedCar:
     Source: Bertipaglia et al. 2024, Eq. 2.
     """
 
-    mass: float = 1970.0
-    yaw_inertia: float = 3498.0
-    cg_to_front_axle: float = 1.47
-    cg_to_rear_axle: float = 1.41
-    cg_height: float = 0.52
+    mass: float = 1970.0  # [kg]
+    yaw_inertia: float = 3498.0  # about the vertical axis through the centre of gravity [kg m²]
+    cg_to_front_axle: float = 1.47  # distance from the centre of gravity [m]
+    cg_to_rear_axle: float = 1.41  # the same [m]
+    cg_height: float = 0.52  # of the centre of gravity above the road [m]; the paper gives none, 0.52 is assumed
 
     def __post_init__(self) -> None:
         for entry in fields(self):
@@ -77,17 +70,11 @@ BMW_545I = LoadedCar()
 
 
 class DugoffAxle(NamedTuple):
-    """Parameters of an axle's tyres; tensors where many are tried at once.
+    """Parameters of an axle's tyres; tensors where many are tried at once."""
 
-    Attributes:
-        cornering_stiffness: C [N/rad].
-        friction: μ₀ of a tyre that hardly slides [1].
-        reduction: e_r, share of the friction that is lost per m/s of sliding [s/m].
-    """
-
-    cornering_stiffness: Any
-    friction: Any
-    reduction: Any
+    cornering_stiffness: Any  # C [N/rad]
+    friction: Any  # μ₀ of a tyre that hardly slides [1]
+    reduction: Any  # e_r, share of the friction that is lost per m/s of sliding [s/m]
 
     def force(self, tangent: Tensor, load: Tensor, vx: Tensor, tyres: Tyres) -> Tensor:
         """Lateral force of the axle in the wheels' axes, positive to the left; everything broadcasts.
@@ -114,24 +101,15 @@ class DugoffTrack:
     """The single track on Dugoff's tyres, as a filter takes it.
 
     Below the minimum speed wheels roll without slip, v = l_R u δ/L and r = u δ/L, whatever the state was.
-
-    Args:
-        car: the car.
-        front: the front axle's tyres.
-        rear: the rear axle's tyres.
-        step: Δt [s].
-        tyres: ``plain`` (Eq. 9) or ``smooth`` (Eq. 10).
-        minimum_speed: see above [m/s].
-        sees_sideslip: whether the sideslip angle is among the measurements (β_DD of Eq. 4).
     """
 
-    car: LoadedCar
-    front: DugoffAxle
-    rear: DugoffAxle
-    step: float
-    tyres: Tyres = "plain"
-    minimum_speed: float = 3.0
-    sees_sideslip: bool = False
+    car: LoadedCar  # the car
+    front: DugoffAxle  # the front axle's tyres
+    rear: DugoffAxle  # the rear axle's tyres
+    step: float  # Δt [s]
+    tyres: Tyres = "plain"  # ``plain`` (Eq. 9) or ``smooth`` (Eq. 10).
+    minimum_speed: float = 3.0  # see above [m/s]
+    sees_sideslip: bool = False  # whether the sideslip angle is among the measurements (β_DD of Eq. 4).
 
     def forces(self, states: Tensor, inputs: Tensor) -> tuple[Tensor, Tensor]:
         """Forces of both axles across the body, F_F cos δ and F_R, of states (..., 2) and inputs (..., 3): (...) [N] each."""

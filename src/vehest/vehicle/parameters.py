@@ -9,24 +9,16 @@ from dataclasses import dataclass, fields
 class SingleTrackParameters:
     """A car as a single track: each axle one tyre on the centre line.
 
-    Args:
-        mass: [kg].
-        yaw_inertia: about the vertical axis through the centre of gravity [kg m²].
-        cg_to_front_axle: distance from the centre of gravity [m].
-        cg_to_rear_axle: distance from the centre of gravity [m].
-        cornering_stiffness_front: lateral force of the axle per slip angle [N/rad].
-        cornering_stiffness_rear: the same of the rear axle [N/rad].
-
     Raises:
         ValueError: a number that is not positive.
     """
 
-    mass: float
-    yaw_inertia: float
-    cg_to_front_axle: float
-    cg_to_rear_axle: float
-    cornering_stiffness_front: float
-    cornering_stiffness_rear: float
+    mass: float  # [kg]
+    yaw_inertia: float  # about the vertical axis through the centre of gravity [kg m²]
+    cg_to_front_axle: float  # distance from the centre of gravity [m]
+    cg_to_rear_axle: float  # distance from the centre of gravity [m]
+    cornering_stiffness_front: float  # lateral force of the axle per slip angle [N/rad]
+    cornering_stiffness_rear: float  # the same of the rear axle [N/rad]
 
     def __post_init__(self) -> None:
         for entry in fields(self):

@@ -23,17 +23,11 @@ from vehest.vehicle.tyres import STILL, PositiveParameters, Slips, TyreForces
 
 @dataclass(frozen=True)
 class Chassis:
-    """What of a car is known.
+    """What of a car is known."""
 
-    Args:
-        mass: [kg].
-        wheelbase: [m].
-        wheel_radius: R [m].
-    """
-
-    mass: float
-    wheelbase: float
-    wheel_radius: float
+    mass: float  # [kg]
+    wheelbase: float  # [m]
+    wheel_radius: float  # R [m]
 
 
 F1TENTH = Chassis(mass=5.1, wheelbase=0.33, wheel_radius=0.05)
@@ -54,16 +48,11 @@ F1TENTH_START: Mapping[str, float] = {
 
 
 class Motion(NamedTuple):
-    """Rates of a planar car.
+    """Rates of a planar car."""
 
-    Attributes:
-        rates: dx/dt, (..., 4).
-        ax, ay: what an accelerometer at the centre of gravity reads (...) [m/s²].
-    """
-
-    rates: Tensor
-    ax: Tensor
-    ay: Tensor
+    rates: Tensor  # dx/dt, (..., 4)
+    ax: Tensor  # longitudinal acceleration that a sensor at the centre of gravity reads (...) [m/s²]
+    ay: Tensor  # the lateral one (...) [m/s²]
 
 
 class PlanarCar(nn.Module):

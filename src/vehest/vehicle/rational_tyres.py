@@ -12,21 +12,13 @@ from typing import Any, NamedTuple
 
 
 class AxleForce(NamedTuple):
-    """Lateral force of an axle and what it changes by.
+    """Lateral force of an axle and what it changes by."""
 
-    Attributes:
-        force: positive to the left [N].
-        per_slip: ∂F/∂α [N/rad]; ∂F/∂α = c₂ μ (1 - q)/(1 + q)², negative beyond the peak.
-        per_log_c1: ∂F/∂ln c₁ [N].
-        per_log_c2: ∂F/∂ln c₂ [N].
-        per_log_friction: ∂F/∂ln μ [N].
-    """
-
-    force: Any
-    per_slip: Any
-    per_log_c1: Any
-    per_log_c2: Any
-    per_log_friction: Any
+    force: Any  # positive to the left [N]
+    per_slip: Any  # ∂F/∂α [N/rad]; ∂F/∂α = c₂ μ (1 - q)/(1 + q)², negative beyond the peak
+    per_log_c1: Any  # ∂F/∂ln c₁ [N]
+    per_log_c2: Any  # ∂F/∂ln c₂ [N]
+    per_log_friction: Any  # ∂F/∂ln μ [N]
 
 
 def rational_axle(slip: Any, c1: Any, c2: Any, friction: Any) -> AxleForce:

@@ -20,19 +20,12 @@ from vehest.vehicle.parameters import SingleTrackParameters
 
 
 class LateralModel(NamedTuple):
-    """dx/dt = A x + B δ, or x⁺ = A x + B δ in steps, and a_y = C x + D δ [m/s²].
+    """dx/dt = A x + B δ, or x⁺ = A x + B δ in steps, and a_y = C x + D δ [m/s²]."""
 
-    Attributes:
-        A: (..., 2, 2).
-        B: (..., 2).
-        C: (..., 2).
-        D: (...).
-    """
-
-    A: FloatArray
-    B: FloatArray
-    C: FloatArray
-    D: FloatArray
+    A: FloatArray  # (..., 2, 2)
+    B: FloatArray  # (..., 2)
+    C: FloatArray  # (..., 2)
+    D: FloatArray  # (...)
 
     def in_steps(self, step: float) -> LateralModel:
         """Forward Euler, x⁺ = (I + τA) x + τB δ; stable while τ(Cf + Cr)/(m u) and τ(lf² Cf + lr² Cr)/(J u) stay below about 2."""

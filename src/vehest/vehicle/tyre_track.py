@@ -28,19 +28,13 @@ TYRE_PARAMETERS = ("c1_front", "c2_front", "c1_rear", "c2_rear", "friction")
 
 @dataclass(frozen=True)
 class TyreTrack:
-    """A single track whose tyre parameters may be part of its state.
+    """A single track whose tyre parameters may be part of its state."""
 
-    Args:
-        car: mass, inertia and the places of the axles; its cornering stiffnesses are not used.
-        nominal: c₁ and c₂ of the front, then of the rear axle, and the friction, in the order of `TYRE_PARAMETERS`.
-        adapted: which of them are states, as indices.
-        step: Δt [s].
-    """
-
-    car: SingleTrackParameters
+    car: SingleTrackParameters  # mass, inertia and the places of the axles; its cornering stiffnesses are not used
+    # c₁ and c₂ of the front, then of the rear axle, and the friction, in the order of `TYRE_PARAMETERS`
     nominal: tuple[float, float, float, float, float]
-    adapted: Sequence[int]
-    step: float
+    adapted: Sequence[int]  # which of them are states, as indices
+    step: float  # Δt [s]
 
     def parameters(self, states: Tensor) -> list[Tensor]:
         """Tyre parameters in the order of `TYRE_PARAMETERS`, of states (..., n): five of shape (...)."""

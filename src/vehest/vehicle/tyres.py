@@ -14,17 +14,11 @@ STILL = 1e-6
 
 
 class Slips(NamedTuple):
-    """How tyres slide.
+    """How tyres slide."""
 
-    Attributes:
-        front: slip angle of the front axle, positive where it slides to the left of where it points (...) [rad].
-        rear: of the rear axle.
-        ratio: longitudinal slip, positive where wheels drive, the same for both axles (...).
-    """
-
-    front: Tensor
-    rear: Tensor
-    ratio: Tensor
+    front: Tensor  # slip angle of the front axle, positive where it slides to the left of where it points (...) [rad]
+    rear: Tensor  # of the rear axle
+    ratio: Tensor  # longitudinal slip, positive where wheels drive, the same for both axles (...)
 
 
 class TyreForces(NamedTuple):

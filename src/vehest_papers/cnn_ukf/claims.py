@@ -284,9 +284,8 @@ def _nearest_zero(main: ManoeuvreErrors, data: str) -> Claim:
 def _groups(main: ManoeuvreErrors, data: str) -> Claim:
     """In how many groups of manoeuvres CNN-UKF has the lowest MSE_nl of the four (Figure 6)."""
     groups = [group for group in GROUPS.values() if group in main.groups]
-    values = np.array(
-        [[np.concatenate([[math.log(max(own.value, 1e-300))], own.draws]) for own in _of_group(main, group)] for group in groups]
-    )
+    of_four = {group: [main.get(name, MSE_NL, group) for name in paper.OF_FOUR] for group in groups}
+    values = np.array([[np.concatenate([[math.log(max(own.value, 1e-300))], own.draws]) for own in of_four[group]] for group in groups])
     best = np.argmin(values, axis=1) == paper.OF_FOUR.index(paper.CNN)  # (groups, draws)
     drawn = best.sum(axis=0)
     low, high = np.quantile(drawn[1:], [0.025, 0.975])
@@ -294,10 +293,6 @@ def _groups(main: ManoeuvreErrors, data: str) -> Claim:
     ours = f"{drawn[0]} [{low:.0f}, {high:.0f}] of {len(groups)}: {named}"
     verdict: Verdict = "reproduced" if low >= 5 else "not reproduced" if high < 5 else "undecided"
     return Claim("Fig. 6: CNN-UKF best in MSE_nl in five groups or more", "5 of 7", ours, data, verdict, "against 5")
-
-
-def _of_group(main: ManoeuvreErrors, group: str) -> list[Measured]:
-    return [main.get(name, MSE_NL, group) for name in paper.OF_FOUR]
 
 
 def _peaks(main: ManoeuvreErrors, data: str) -> Statement:

@@ -9,10 +9,10 @@ import pandas as pd
 
 from vehest.constants import FloatArray
 from vehest.report.document import Column, Figure, Table
-from vehest.report.style import DOUBLE_COLUMN, fixed, legend_above, new_figure, paper_style
+from vehest.report.style import DOUBLE_COLUMN, fixed, legend_above, new_figure
 from vehest.studies.artefacts import PartArtefacts
-from vehest_papers.cnn_ukf.manoeuvres import BIN, ErrorDistribution, error_distribution, kpis_by_group
-from vehest_papers.cnn_ukf.subjects import Prepared, Run, Runs, chosen, line_of
+from vehest_papers.cnn_ukf.manoeuvres import BIN, error_distribution, kpis_by_group
+from vehest_papers.cnn_ukf.subjects import Prepared, Runs, chosen, line_of
 from vehest_papers.kit.reading import median_and_range
 
 SETS_COLOURS = ("#9aa7b5", "#0b4f9c")
@@ -22,8 +22,7 @@ def figure_4(parts: Mapping[str, PartArtefacts], prepared: Mapping[str, Prepared
     """How often which sideslip angle and lateral acceleration is driven: training, validation and test of each part together."""
     driven = {name: _driven(part, prepared[name]) for name, part in parts.items()}
     labels = ("sideslip angle [deg]", "lateral acceleration [m/s²]")
-    with paper_style():
-        figure = new_figure(DOUBLE_COLUMN, 2.6)
+    with new_figure(DOUBLE_COLUMN, 2.6) as figure:
         panels = figure.subplots(1, 2)
         for (name, columns), colour in zip(driven.items(), SETS_COLOURS, strict=False):
             for axes, values, label in zip(panels, columns, labels, strict=True):
@@ -63,9 +62,8 @@ def errors_figure(runs: Runs, name: str, number: int, title: str, data: str) -> 
         The figure and its values.
     """
     picked = {candidate: chosen(own) for candidate, own in runs.items()}
-    found = {candidate: _distribution(run) for candidate, run in picked.items()}
-    with paper_style():
-        figure = new_figure(DOUBLE_COLUMN, 3.4)
+    found = {name: error_distribution([part for parts in run.test.values() for part in parts]) for name, run in picked.items()}
+    with new_figure(DOUBLE_COLUMN, 3.4) as figure:
         upper, axes = figure.subplots(2, 1, height_ratios=(1.2, 3.2))  # errors reach ten times as far as deviations
         for place, (candidate, own) in enumerate(found.items()):
             line = line_of(candidate)
@@ -96,10 +94,6 @@ def errors_figure(runs: Runs, name: str, number: int, title: str, data: str) -> 
     return Figure(name, caption, figure), pd.DataFrame(rows)
 
 
-def _distribution(run: Run) -> ErrorDistribution:
-    return error_distribution([part for parts in run.test.values() for part in parts])
-
-
 def groups(runs: Runs, name: str, title: str, data: str, number: int | None = None) -> tuple[Figure, Table]:
     """MSE_nl by group of manoeuvres, of all seeds, as bars and as a table."""
     of_run = {candidate: [kpis_by_group(run.test) for run in own] for candidate, own in runs.items()}
@@ -110,8 +104,7 @@ def groups(runs: Runs, name: str, title: str, data: str, number: int | None = No
         for group in known
     }
     counted = {group: next(iter(of_run.values()))[0][group].manoeuvres for group in known}
-    with paper_style():
-        figure = new_figure(DOUBLE_COLUMN, 2.9)
+    with new_figure(DOUBLE_COLUMN, 2.9) as figure:
         axes = figure.subplots()
         width = 0.84 / len(of_run)
         for place, candidate in enumerate(of_run):

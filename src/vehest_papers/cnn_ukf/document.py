@@ -89,7 +89,8 @@ def _together(parts: Mapping[str, Runs]) -> dict[str, Sequence[Run]]:
 def _report(artefacts: StudyArtefacts, parts: Mapping[str, Runs], runs: Runs, prepared: Mapping[str, Prepared]) -> Document:
     kind = words_of_kinds(artefacts.parts[FULL])
     main, own = ManoeuvreErrors(runs, "test"), prepared[FULL]
-    hybrids = [name for name in runs if _is_hybrid(runs[name][0]) and name != paper.ORACLE_DISTRUST]
+    filters_with_networks = ("ensemble_ukf", "cnn_ukf")
+    hybrids = [name for name in runs if runs[name][0].model.estimator in filters_with_networks and name != paper.ORACLE_DISTRUST]
     outputs = {name: [outputs_of(run, own) for run in runs[name]] for name in hybrids}
     shifts = {name: [shift_of(run, own) for run in runs[name]] for name in hybrids}
     active = claims.activity(outputs, shifts)
@@ -142,11 +143,6 @@ def _report(artefacts: StudyArtefacts, parts: Mapping[str, Runs], runs: Runs, pr
     return Document(artefacts.title, blocks, data)
 
 
-def _is_hybrid(run: Run) -> bool:
-    """Whether a run's estimator is a filter with a network."""
-    return run.model.estimator in ("ensemble_ukf", "cnn_ukf")
-
-
 def _filter(run: Run) -> DugoffUkf:
     found = filter_of(load_model(run.model.model_folder))
     assert found is not None
@@ -170,7 +166,8 @@ def _asked(
     words += methods.absent_parts(artefacts)
     four = sorted(paper.OF_FOUR, key=lambda name: main.get(name, MSE_NL).value)
     order = ", ".join(f"{titles[name]} {main.in_words(name, MSE_NL)}" for name in four)
-    paper_order = ", ".join(f"{name} {fixed(paper.TABLE_II[name].mse_nonlinear, 3)}" for name in sorted(paper.OF_FOUR, key=_in_paper))
+    published = {name: paper.TABLE_II[name].mse_nonlinear for name in paper.OF_FOUR}
+    paper_order = ", ".join(f"{name} {fixed(published[name], 3)}" for name in sorted(published, key=published.__getitem__))
     sentences = [f"**Order by MSE_nl [deg²], best first:** {order} (paper: {paper_order})."]
     if paper.BEFORE in main:
         change = main.change(paper.CNN, paper.BEFORE, MSE_NL)
@@ -194,10 +191,6 @@ def _asked(
         f"**Influence of the network on the filter:** 1° of β_DD moves β by {fixed(row['shift'], 2)}°; σ_DD, 5/50/95 %: {row['distrust']}°."
     )
     return [words, " ".join(sentences)]
-
-
-def _in_paper(name: str) -> float:
-    return paper.TABLE_II[name].mse_nonlinear
 
 
 def _claims(verdicts: Sequence[Claim]) -> Table:

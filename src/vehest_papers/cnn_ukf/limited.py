@@ -17,19 +17,12 @@ from vehest_papers.cnn_ukf.subjects import Prepared, Run, Runs
 
 @dataclass(frozen=True, eq=False)
 class Limited:
-    """What learnt on the limited set.
+    """What learnt on the limited set."""
 
-    Args:
-        comparison: with the filters alone, which are those of the full set, as in the paper.
-        runs: candidate -> its seeds, of what learnt.
-        outputs: hybrid -> outputs of its networks, seed by seed, manoeuvre by manoeuvre.
-        scaling: DE-UKF as tuned, and with p₁ and p₂ of the full set's, on the same seeds.
-    """
-
-    comparison: ManoeuvreErrors
-    runs: Runs
-    outputs: Mapping[str, Sequence[Sequence[Outputs]]]
-    scaling: ManoeuvreErrors
+    comparison: ManoeuvreErrors  # with the filters alone, which are those of the full set, as in the paper
+    runs: Runs  # candidate -> its seeds, of what learnt
+    outputs: Mapping[str, Sequence[Sequence[Outputs]]]  # hybrid -> outputs of its networks, seed by seed, manoeuvre by manoeuvre
+    scaling: ManoeuvreErrors  # DE-UKF as tuned, and with p₁ and p₂ of the full set's, on the same seeds
 
 
 AS_TUNED, OF_THE_FULL_SET = "tuned on the limited set", "p₁, p₂ of the full set"
@@ -39,8 +32,6 @@ def limited(full: Runs, learnt: Runs, prepared: Prepared) -> Limited:
     """Hold what learnt on the limited set beside the filters of the full set.
 
     Args:
-        full: candidates of the full set.
-        learnt: those of the limited set.
         prepared: recordings; the test of both is the same.
 
     Raises:

@@ -34,38 +34,23 @@ BIN = 0.25  # deg, of Figs. 5 and 11
 
 @dataclass(frozen=True)
 class Kpis:
-    """Errors of the sideslip angle; those of the nonlinear range are NaN where no sample lies in it, or ay was not measured.
+    """Errors of the sideslip angle; those of the nonlinear range are NaN where no sample lies in it, or ay was not measured."""
 
-    Args:
-        mse: mean squared error over all samples [deg²].
-        mse_nonlinear: the same of samples with |ay| ≥ 4 m/s² [deg²].
-        max_error: mean over manoeuvres of the largest absolute error [deg].
-        max_error_nonlinear: the same of samples with |ay| ≥ 4 m/s², over manoeuvres that have some [deg].
-        manoeuvres: how many there are.
-    """
-
-    mse: float
-    mse_nonlinear: float
-    max_error: float
-    max_error_nonlinear: float
-    manoeuvres: int
+    mse: float  # mean squared error over all samples [deg²]
+    mse_nonlinear: float  # the same of samples with |ay| ≥ 4 m/s² [deg²]
+    max_error: float  # mean over manoeuvres of the largest absolute error [deg]
+    max_error_nonlinear: float  # the same of samples with |ay| ≥ 4 m/s², over manoeuvres that have some [deg]
+    manoeuvres: int  # how many there are
 
 
 @dataclass(frozen=True, eq=False)
 class ErrorDistribution:
-    """How often the sideslip angle was how wrong.
+    """How often the sideslip angle was how wrong."""
 
-    Args:
-        edges: of the bins, (K + 1,) [deg]; multiples of the width.
-        counts: samples in each, (K,).
-        mean: of the errors [deg].
-        deviation: their standard deviation [deg].
-    """
-
-    edges: FloatArray
-    counts: NDArray[np.int64]
-    mean: float
-    deviation: float
+    edges: FloatArray  # of the bins, (K + 1,) [deg]; multiples of the width
+    counts: NDArray[np.int64]  # samples in each, (K,)
+    mean: float  # of the errors [deg]
+    deviation: float  # their standard deviation [deg]
 
 
 def manoeuvres_of(spans: Sequence[Span], parts: Sequence[Scored]) -> dict[str, list[Scored]]:
@@ -88,11 +73,7 @@ def group_of(recording: str) -> str:
 
 
 def kpis(manoeuvres: Mapping[str, Sequence[Scored]]) -> Kpis:
-    """Indicators of a set of manoeuvres.
-
-    Raises:
-        DataError: the set is empty.
-    """
+    """Indicators of a set of manoeuvres; raises `DataError` where the set is empty."""
     if not manoeuvres:
         raise DataError("there are no manoeuvres to take errors of")
     errors = [np.concatenate([sideslip_error(part) for part in parts]) for parts in manoeuvres.values()]
@@ -115,7 +96,7 @@ def kpis_by_group(manoeuvres: Mapping[str, Sequence[Scored]]) -> dict[str, Kpis]
     return {group: kpis(groups[group]) for group in (*GROUPS.values(), "other") if group in groups}
 
 
-def error_distribution(parts: Sequence[Scored], width: float = BIN, nonlinear_only: bool = True) -> ErrorDistribution:
+def error_distribution(parts: Sequence[Scored], nonlinear_only: bool = True) -> ErrorDistribution:
     """Distribution of the error of the sideslip angle, by default of samples with |ay| ≥ 4 m/s² only.
 
     Raises:
@@ -124,9 +105,9 @@ def error_distribution(parts: Sequence[Scored], width: float = BIN, nonlinear_on
     errors = np.concatenate([sideslip_error(part)[is_nonlinear(part)] if nonlinear_only else sideslip_error(part) for part in parts])
     if not len(errors):
         raise DataError(f"no sample has a lateral acceleration of {NONLINEAR_AY:g} m/s² or more; count all with nonlinear_only=False")
-    first, last = np.floor(errors.min() / width), np.floor(errors.max() / width) + 1
-    edges = width * np.arange(first, last + 1)
-    counts = np.bincount((np.floor(errors / width) - first).astype(np.int64), minlength=len(edges) - 1)
+    first, last = np.floor(errors.min() / BIN), np.floor(errors.max() / BIN) + 1
+    edges = BIN * np.arange(first, last + 1)
+    counts = np.bincount((np.floor(errors / BIN) - first).astype(np.int64), minlength=len(edges) - 1)
     return ErrorDistribution(edges, counts, float(errors.mean()), float(errors.std()))
 
 

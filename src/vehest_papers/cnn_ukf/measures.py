@@ -39,12 +39,6 @@ def sums_of(manoeuvres: Manoeuvres, indicator: str) -> Sums:
     return np.array([float(np.square(error).sum()) for error in errors]), np.array([float(len(error)) for error in errors])
 
 
-def value_of(manoeuvres: Manoeuvres, indicator: str) -> float:
-    """An indicator over all manoeuvres [deg², deg]."""
-    sums, sizes = sums_of(manoeuvres, indicator)
-    return float(sums.sum() / sizes.sum())
-
-
 class ManoeuvreErrors(SampledErrors):
     """Candidates on one test, all on the same resamples of whole manoeuvres; seeds of each candidate are drawn on their own.
 

@@ -30,29 +30,17 @@ IDENTIFICATION = IdentificationSettings(trials=20, restarts=1, error="recordings
 
 @dataclass(frozen=True, eq=False)
 class Outputs:
-    """Outputs of a network at the scored samples of one manoeuvre.
+    """Outputs of a network at the scored samples of one manoeuvre."""
 
-    Args:
-        error: β_DD - β [deg], (K,).
-        distrust: σ_DD as the filter takes it [deg], (K,).
-        process: σ_Vy and σ_ψ̇ [m/s, rad/s], (K, 2); none where they are the filter's.
-        sideslip: β [deg], (K,).
-        nonlinear: which samples have |ay| ≥ 4 m/s², (K,).
-    """
-
-    error: FloatArray
-    distrust: FloatArray
-    process: FloatArray | None
-    sideslip: FloatArray
-    nonlinear: NDArray[np.bool_]
+    error: FloatArray  # β_DD - β [deg], (K,)
+    distrust: FloatArray  # σ_DD as the filter takes it [deg], (K,)
+    process: FloatArray | None  # σ_Vy and σ_ψ̇ [m/s, rad/s], (K, 2); none where they are the filter's
+    sideslip: FloatArray  # β [deg], (K,)
+    nonlinear: NDArray[np.bool_]  # which samples have |ay| ≥ 4 m/s², (K,)
 
 
 def hybrid_of(run: Run) -> NetworkUkf:
-    """The fitted hybrid of a run.
-
-    Raises:
-        DataError: it is another estimator's.
-    """
+    """The fitted hybrid of a run; raises `DataError` where it is another estimator's."""
     fitted = load_model(run.model.model_folder)
     if not isinstance(fitted, NetworkUkf):
         raise DataError(f"'{run.model.model_folder}' holds a model of '{fitted.name}', which has no network in a filter")

@@ -29,19 +29,12 @@ OWN_FILTER = {DEEP: MODEL, CNN: SMOOTH, CNN_FREE: FREE}
 
 @dataclass(frozen=True)
 class Published:
-    """A row of Tables II and III.
+    """A row of Tables II and III."""
 
-    Args:
-        mse: mean squared error of the sideslip angle [deg²].
-        mse_nonlinear: of samples with |ay| ≥ 4 m/s² [deg²].
-        max_error: largest absolute error of a manoeuvre, mean over manoeuvres [deg].
-        max_error_nonlinear: of samples with |ay| ≥ 4 m/s² [deg].
-    """
-
-    mse: float
-    mse_nonlinear: float
-    max_error: float
-    max_error_nonlinear: float
+    mse: float  # mean squared error of the sideslip angle [deg²]
+    mse_nonlinear: float  # of samples with |ay| ≥ 4 m/s² [deg²]
+    max_error: float  # largest absolute error of a manoeuvre, mean over manoeuvres [deg]
+    max_error_nonlinear: float  # of samples with |ay| ≥ 4 m/s² [deg]
 
 
 TABLE_II: Mapping[str, Published] = {

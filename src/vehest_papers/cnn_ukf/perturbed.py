@@ -19,7 +19,7 @@ from vehest.estimators.ensemble_ukf import BOX, EnsembleUkf, scaled_variance
 from vehest.estimators.model_files import load_model
 from vehest.estimators.network_ukf import LEAST_VARIANCE
 from vehest.report.document import Column, Figure, Table
-from vehest.report.style import DOUBLE_COLUMN, legend_above, new_figure, paper_style
+from vehest.report.style import DOUBLE_COLUMN, legend_above, new_figure
 from vehest.training.context import FitContext
 from vehest.training.search import optuna_search
 from vehest.vehicle.dugoff import DugoffAxle
@@ -41,25 +41,15 @@ TRIALS, STAGES, SHRINK = 30, 2, 0.3  # of the search for p₁ and p₂, as in th
 
 @dataclass(frozen=True, eq=False)
 class Perturbed:
-    """Candidates whose filters take the car for another.
+    """Candidates whose filters take the car for another."""
 
-    Args:
-        stiffness: of each of `COMBINATIONS` the runs of each candidate.
-        bodies: of each of `BODIES` likewise.
-        tuned: DE-UKF with both stiffnesses off by -10 %, p₁ and p₂ tuned anew on validation; empty where there is none.
-    """
-
-    stiffness: Sequence[Runs]
-    bodies: Mapping[str, Runs]
-    tuned: Sequence[Run]
+    stiffness: Sequence[Runs]  # of each of `COMBINATIONS` the runs of each candidate
+    bodies: Mapping[str, Runs]  # of each of `BODIES` likewise
+    tuned: Sequence[Run]  # DE-UKF with both stiffnesses off by -10 %, p₁ and p₂ tuned anew on validation; empty where there is none
 
 
 def with_stiffness(fitted: Estimator, front: float, rear: float) -> Estimator:
-    """A copy of a filter whose cornering stiffnesses are off by shares of their values.
-
-    Raises:
-        DataError: it has none.
-    """
+    """A copy of a filter whose cornering stiffnesses are off by shares of their values; raises `DataError` where it has none."""
     changed = copy.deepcopy(fitted)
     of_filter = filter_of(changed)
     if of_filter is None:
@@ -127,8 +117,7 @@ def perturbed(runs: Runs, prepared: Prepared) -> Perturbed:
 def figure_14(found: Perturbed, data: str) -> Figure:
     """MSE and MSE_nl over the combinations, with 95 % intervals over manoeuvres."""
     comparisons = [ManoeuvreErrors(runs, "test") for runs in found.stiffness]
-    with paper_style():
-        figure = new_figure(DOUBLE_COLUMN, 3.0)
+    with new_figure(DOUBLE_COLUMN, 3.0) as figure:
         panels = figure.subplots(1, 2)
         for axes, indicator, label in zip(panels, (MSE, MSE_NL), ("MSE [deg²]", "MSE$_{nl}$ [deg²]"), strict=True):
             for candidate in found.stiffness[NOMINAL]:

@@ -85,19 +85,12 @@ PARTS_AWAY = {
 
 @dataclass(frozen=True, eq=False)
 class Run:
-    """One training and what it makes of the validation and the test manoeuvres.
+    """One training and what it makes of the validation and the test manoeuvres."""
 
-    Args:
-        candidate: what the report calls it.
-        model: where it comes from.
-        validation: what was scored of each manoeuvre that stopped it.
-        test: what was scored of each manoeuvre it is tested on.
-    """
-
-    candidate: str
-    model: EvaluatedModel
-    validation: Manoeuvres
-    test: Manoeuvres
+    candidate: str  # what the report calls it
+    model: EvaluatedModel  # where it comes from
+    validation: Manoeuvres  # what was scored of each manoeuvre that stopped it
+    test: Manoeuvres  # what was scored of each manoeuvre it is tested on
 
     @property
     def kpis(self) -> Kpis:
@@ -132,10 +125,6 @@ def filter_of(fitted: Estimator) -> DugoffUkf | None:
 
 def runs_of(part: PartArtefacts, prepared: Prepared) -> dict[str, list[Run]]:
     """Candidate -> its seeds, in the order of Table II.
-
-    Args:
-        part: of the study.
-        prepared: its recordings.
 
     Raises:
         DataError: two models of one candidate have the same seed, a model is none of the paper's, or a recording has several test ranges.
@@ -190,7 +179,6 @@ class Prepared:
     sample counts as non-linear is a matter of the low-passed lateral acceleration.
 
     Args:
-        part: of the study.
         whole: whether drives are scored beyond the moment in which |β| first exceeds 12°.
     """
 

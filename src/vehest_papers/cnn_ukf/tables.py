@@ -42,22 +42,14 @@ def kpi_values(runs: Runs, candidate: str, name: str) -> FloatArray:
     return np.array([getattr(run.kpis, name) for run in runs[candidate]])
 
 
-def medians(runs: Runs, name: str) -> dict[str, float]:
-    """Candidate -> median over seeds of a figure of `KPIS`."""
-    return {candidate: float(np.median(kpi_values(runs, candidate, name))) for candidate in runs}
-
-
 def accuracy(
     comparison: ManoeuvreErrors, published: Mapping[str, paper.Published], training: Mapping[str, float], name: str, caption: str
 ) -> Table:
     """Table II or III: our figures with their intervals, the paper's in brackets, errors of validation and of training.
 
     Args:
-        comparison: of the candidates.
         published: candidate -> the paper's figures.
         training: candidate -> mean RMSE of a training manoeuvre [deg], of the seed that is drawn.
-        name: of the file.
-        caption: of the table.
     """
     rows = []
     for candidate, own in comparison.runs.items():
@@ -92,13 +84,7 @@ def training_error(run: Run, prepared: Prepared) -> float:
 
 
 def ablation(comparison: ManoeuvreErrors, active: pd.DataFrame, caption: str) -> Table:
-    """CNN-UKF with one thing taken away: errors, how CNN-UKF stands to each, and what is active in it.
-
-    Args:
-        comparison: of CNN-UKF and its variants.
-        active: of `claims.activity`.
-        caption: of the table.
-    """
+    """CNN-UKF with one thing taken away: errors, how CNN-UKF stands to each, and what is active in it."""
     rows = []
     for row in active.to_dict("records"):
         candidate = row["candidate"]
@@ -169,13 +155,7 @@ def networks_alone(comparison: ManoeuvreErrors, outputs: OutputsOf, name: str, c
 
 
 def filters(parts: Mapping[str, tuple[str, Runs]], name: str, caption: str) -> Table:
-    """Tyres and levels of noise of the filters, each seed a row, below what the paper gives.
-
-    Args:
-        parts: name -> title and runs.
-        name: of the file.
-        caption: of the table.
-    """
+    """Tyres and levels of noise of the filters, each seed a row, below what the paper gives; ``parts``: name -> title and runs."""
     rows: list[dict[str, object]] = [
         {"part": "paper (real)", "candidate": paper.MODEL, **dict.fromkeys((*TYRES, *LEVELS), math.nan), **paper.LEVELS}
     ]
@@ -285,11 +265,7 @@ def given_as_found(full: Runs) -> str:
 
 
 def process_levels(run: Run) -> FloatArray:
-    """Deviations of a step's process noise where they are constant, (2,) [m/s, rad/s].
-
-    Raises:
-        DataError: the run has no filter.
-    """
+    """Deviations of a step's process noise where they are constant, (2,) [m/s, rad/s]; raises `DataError` where the run has no filter."""
     of_filter = filter_of(load_model(run.model.model_folder))
     if of_filter is None:
         raise DataError(f"'{run.candidate}' has no filter, and so no process noise")

@@ -14,7 +14,7 @@ from vehest.data.splits import Span
 from vehest.estimators.dugoff_ukf import PseudoMeasurement
 from vehest.evaluation.metrics import Scored
 from vehest.report.document import Figure, as_code
-from vehest.report.style import DOUBLE_COLUMN, REFERENCE, fixed, legend_above, new_figure, paper_style
+from vehest.report.style import DOUBLE_COLUMN, REFERENCE, fixed, legend_above, new_figure
 from vehest.studies.artefacts import PartArtefacts
 from vehest_papers.cnn_ukf import paper
 from vehest_papers.cnn_ukf.manoeuvres import group_of
@@ -44,19 +44,9 @@ def manoeuvre_of(part: PartArtefacts, prepared: Prepared, group: str) -> Span:
 
 
 def compared(runs: Mapping[str, Run], span: Span, name: str, number: int, what: str, data: str) -> Figure:
-    """Reference and all estimates of one manoeuvre.
-
-    Args:
-        runs: candidate -> the seed that validation chooses.
-        span: the manoeuvre, one of the test set's.
-        name: of the file.
-        number: of the paper's figure.
-        what: title of it.
-        data: real or simulated.
-    """
+    """Reference and all estimates of one manoeuvre."""
     parts = {candidate: run.test[span.recording][0] for candidate, run in runs.items()}
-    with paper_style():
-        figure = new_figure(DOUBLE_COLUMN, 3.9)
+    with new_figure(DOUBLE_COLUMN, 3.9) as figure:
         upper, lower = figure.subplots(2, 1, sharex=True, height_ratios=(2.2, 1.0))
         _angles(upper, parts)
         for candidate, part in parts.items():
@@ -85,21 +75,13 @@ def inner_life(
     """Outputs of the hybrids' networks in one manoeuvre: β_DD beside β, both deviations of the process noise, distrust (Figure 8).
 
     Args:
-        runs: candidate -> the seed that validation chooses.
-        prepared: recordings.
         warm_up: of the estimates [s].
-        span: the manoeuvre.
-        name: of the file.
-        number: of the paper's figure.
-        what: title of it.
         constant: deviations of the filter's process noise where no network gives them, (2,).
-        data: real or simulated.
     """
     hybrids = {candidate: run for candidate, run in runs.items() if plain_name(candidate) in paper.HYBRIDS}
     outputs = _network_outputs(hybrids, prepared, warm_up, span)
     parts = {candidate: run.test[span.recording][0] for candidate, run in hybrids.items()}
-    with paper_style():
-        figure = new_figure(DOUBLE_COLUMN, 4.4)
+    with new_figure(DOUBLE_COLUMN, 4.4) as figure:
         grid = figure.subplots(2, 2, sharex=True)
         _angles(grid[0, 0], parts)
         for candidate, (time, output) in outputs.items():
@@ -136,8 +118,7 @@ def angles_of_networks(
     """β of both hybrids and β_DD of their networks (Figure 13)."""
     hybrids = {candidate: run for candidate, run in runs.items() if plain_name(candidate) in paper.HYBRIDS}
     parts = {candidate: run.test[span.recording][0] for candidate, run in hybrids.items()}
-    with paper_style():
-        figure = new_figure(DOUBLE_COLUMN, 2.7)
+    with new_figure(DOUBLE_COLUMN, 2.7) as figure:
         axes = figure.subplots()
         _angles(axes, parts)
         for candidate, (time, output) in _network_outputs(hybrids, prepared, warm_up, span).items():
@@ -158,8 +139,7 @@ def lap(runs: Mapping[str, Run], prepared: Prepared, warm_up: float, span: Span,
     parts = {candidate: _within(run.test[span.recording][0], window) for candidate, run in runs.items()}
     drive = prepared.recording(span.dataset, span.recording).cut(*window)
     hybrids = {candidate: run for candidate, run in runs.items() if plain_name(candidate) in paper.HYBRIDS}
-    with paper_style():
-        figure = new_figure(DOUBLE_COLUMN, 4.9)
+    with new_figure(DOUBLE_COLUMN, 4.9) as figure:
         grid = figure.subplots(3, 1, sharex=True, height_ratios=(1.6, 1.0, 1.0))
         _angles(grid[0], parts)
         time = drive.time - window[0]

@@ -38,34 +38,21 @@ TUNED_SLIPS, TUNED_MISMATCHES, FIRST_TUNING_SEED = (2.5, 4.5, 6.5), (-0.25, -0.0
 
 @dataclass(frozen=True)
 class Levels:
-    """What was tuned for a filter, once for all cells.
+    """What was tuned for a filter, once for all cells."""
 
-    Args:
-        ay: σ_ay [m/s²].
-        steer: σ_δ [rad √s].
-        tyres: wander of the logarithms of tyre parameters [1/√s].
-    """
-
-    ay: float
-    steer: float
-    tyres: float = 1e-3
+    ay: float  # σ_ay [m/s²]
+    steer: float  # σ_δ [rad √s]
+    tyres: float = 1e-3  # wander of the logarithms of tyre parameters [1/√s]
 
 
 @dataclass(frozen=True)
 class Tuned:
-    """Outcome of a search.
+    """Outcome of a search."""
 
-    Args:
-        levels: the best.
-        cost: geometric mean of RMSE(β) over the tuning drives [deg].
-        evaluations: of all tuning drives.
-        at_limits: level that ended on a limit of the box -> by how much the cost changes a decade inwards [%].
-    """
-
-    levels: Levels
-    cost: float
-    evaluations: int
-    at_limits: Mapping[str, float]
+    levels: Levels  # the best
+    cost: float  # geometric mean of RMSE(β) over the tuning drives [deg]
+    evaluations: int  # of all tuning drives
+    at_limits: Mapping[str, float]  # level that ended on a limit of the box -> by how much the cost changes a decade inwards [%]
 
 
 def estimator_of(name: str, levels: Levels, curves: FloatArray, car: SingleTrackParameters = TRUCK) -> RationalFilter:
@@ -112,7 +99,8 @@ def baselines(tuning: Sequence[Drive]) -> dict[str, Callable[[Drive], FloatArray
     recordings = [own.recording for own in tuning]
     fitted = StaticMap(StaticMap.settings_type(RATE))
     fitted.values = fitted.closed_form(recordings)
-    sheet = DataSheet(DataSheet.settings_type(rate_hz=RATE, wheelbase=_wheelbase(), cg_to_rear_axle=float(TRUCK.cg_to_rear_axle)))
+    front, rear = float(TRUCK.cg_to_front_axle), float(TRUCK.cg_to_rear_axle)
+    sheet = DataSheet(DataSheet.settings_type(rate_hz=RATE, wheelbase=front + rear, cg_to_rear_axle=rear))
 
     def of(baseline: Recursive) -> Callable[[Drive], FloatArray]:
         return lambda own: np.arctan2(baseline.run(own.samples[:, [1, 0]], None)[0]["vy"], own.samples[:, 1])  # vx, yaw_rate
@@ -179,10 +167,6 @@ def sideslip_of(name: str, levels: Levels, own: Drive, curves: FloatArray) -> Fl
 def rmse(sideslip: FloatArray, own: Drive) -> float:
     """RMSE(β) of a drive [deg], its first 1.5 s left out (Eq. 65)."""
     return float(np.degrees(np.sqrt(np.mean(np.square(sideslip - own.sideslip)[SKIP:]))))
-
-
-def _wheelbase() -> float:
-    return float(TRUCK.cg_to_front_axle) + float(TRUCK.cg_to_rear_axle)
 
 
 def table_of(found: Mapping[str, Tuned]) -> list[dict[str, object]]:

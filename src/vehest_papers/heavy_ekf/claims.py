@@ -47,7 +47,9 @@ def claims_blocks(truck: PartArtefacts, ferrari: PartArtefacts | None, others: S
         tests.append((REAL, f"{words_of_kinds(ferrari)}, the Ferrari", titles_of(ferrari), real[REAL]))
     for test, words, own, ranking in tests:
         for better, worse in ASKED:
-            known = f"{paper.GAINS[better, worse]:.0f} % below on its three laps" if test != FAST else _on_the_fast_lap(better, worse)
+            known = f"{paper.GAINS[better, worse]:.0f} % below on its three laps"
+            if test == FAST:
+                known = f"{paper.FAST[better]}° and {paper.FAST[worse]}°"
             claims.append(order_claim(ranking, variant_of[better], variant_of[worse], own, known, words))
     sentences = [verdict_sentences(ranking, own, words) for _, words, own, ranking in tests]
     note = (
@@ -55,10 +57,6 @@ def claims_blocks(truck: PartArtefacts, ferrari: PartArtefacts | None, others: S
         "paired over seeds."
     )
     return claims_table([*claims, *others], note), "\n\n".join(sentences)
-
-
-def _on_the_fast_lap(better: str, worse: str) -> str:
-    return f"{paper.FAST[better]}° and {paper.FAST[worse]}°"
 
 
 def baseline_errors(part: PartArtefacts) -> Mapping[tuple[str, str], float]:

@@ -47,23 +47,14 @@ ABSORBED_SLIP = 5.0
 
 @dataclass(frozen=True, eq=False)
 class Cell:
-    """Errors of all candidates in a cell, seed by seed.
+    """Errors of all candidates in a cell, seed by seed."""
 
-    Args:
-        tuned_on: what the levels were tuned on.
-        conditions: of the plant; its slip is what the driver was asked for.
-        mismatch: of the filters' stiffnesses.
-        squared: candidate -> mean squared error of β of each seed [rad²], (S,).
-        lost: candidate -> share of seeds with an error above `LOST_DEGREES` at some time.
-        reached: largest rear slip [deg] and largest |a_y| [m/s²], means over seeds, and the largest |a_y| of all.
-    """
-
-    tuned_on: str
-    conditions: Conditions
-    mismatch: float
-    squared: Mapping[str, FloatArray]
-    lost: Mapping[str, float]
-    reached: tuple[float, float, float]
+    tuned_on: str  # what the levels were tuned on
+    conditions: Conditions  # of the plant; its slip is what the driver was asked for
+    mismatch: float  # of the filters' stiffnesses
+    squared: Mapping[str, FloatArray]  # candidate -> mean squared error of β of each seed [rad²], (S,)
+    lost: Mapping[str, float]  # candidate -> share of seeds with an error above `LOST_DEGREES` at some time
+    reached: tuple[float, float, float]  # largest rear slip [deg] and largest |a_y| [m/s²], means over seeds, and the largest |a_y| of all
 
     def rmse(self, name: str) -> float:
         """RMSE(β) over all seeds [deg]."""
@@ -72,32 +63,20 @@ class Cell:
 
 @dataclass(frozen=True)
 class Change:
-    """By how much the first filter's RMSE(β) lies above the second's in a cell.
+    """By how much the first filter's RMSE(β) lies above the second's in a cell."""
 
-    Args:
-        percent: 100 (first/second - 1).
-        low: its lower end, corrected by Holm over the table, from the interval of the difference.
-        high: its upper end.
-        told_apart: whether the corrected interval leaves 0 out.
-    """
-
-    percent: float
-    low: float
-    high: float
-    told_apart: bool
+    percent: float  # 100 (first/second - 1)
+    low: float  # its lower end, corrected by Holm over the table, from the interval of the difference
+    high: float  # its upper end
+    told_apart: bool  # whether the corrected interval leaves 0 out
 
 
 @dataclass(frozen=True, eq=False)
 class Factorial:
-    """All that the twin is asked.
+    """All that the twin is asked."""
 
-    Args:
-        tuned: what the levels were tuned on -> filter -> what was tuned.
-        cells: all cells, those of `ONCE` over all plants, those of `PLAIN_ONLY` on the plain one.
-    """
-
-    tuned: Mapping[str, Mapping[str, Tuned]]
-    cells: Sequence[Cell]
+    tuned: Mapping[str, Mapping[str, Tuned]]  # what the levels were tuned on -> filter -> what was tuned
+    cells: Sequence[Cell]  # all cells, those of `ONCE` over all plants, those of `PLAIN_ONLY` on the plain one
 
     def grid(self, plant: tuple[bool, bool, bool] = PLAIN, tuned_on: str = ONCE) -> list[list[Cell]]:
         """Cells of one plant, a row a mismatch, a column a slip."""
@@ -202,25 +181,15 @@ def column(name: str) -> str:
 
 @dataclass(frozen=True)
 class Mistake:
-    """What is wrong in a filter, or in its reference, while its tyres are those of the plant.
+    """What is wrong in a filter, or in its reference, while its tyres are those of the plant."""
 
-    Args:
-        name: in words.
-        forward: by how much the filter's centre of gravity lies too far forward [m].
-        steering: factor on the steering angle that it is given.
-        lever_arm: by how far ahead of the centre of gravity the reference measures, which the tyres are fitted by [m].
-        ay: offset of the accelerometer [m/s²].
-        yaw_rate: offset of the gyroscope [rad/s].
-        crossfall: whether the road has one.
-    """
-
-    name: str
-    forward: float = 0.0
-    steering: float = 1.0
-    lever_arm: float = 0.0
-    ay: float = 0.0
-    yaw_rate: float = 0.0
-    crossfall: bool = False
+    name: str  # in words
+    forward: float = 0.0  # by how much the filter's centre of gravity lies too far forward [m]
+    steering: float = 1.0  # factor on the steering angle that it is given
+    lever_arm: float = 0.0  # by how far ahead of the centre of gravity the reference measures, which the tyres are fitted by [m]
+    ay: float = 0.0  # offset of the accelerometer [m/s²]
+    yaw_rate: float = 0.0  # offset of the gyroscope [rad/s]
+    crossfall: bool = False  # whether the road has one
 
     def car(self) -> SingleTrackParameters:
         """The car that the filter takes it for."""
@@ -253,9 +222,6 @@ def absorbed(levels: Mapping[str, Levels]) -> pd.DataFrame:
     """What each mistake does to the three filters: RMSE(β) against the truth, RATTE's change against RATT, and where its tyres end.
 
     Tyres are those that a fit to four further drives gives under the mistake, so that RATT is as good as its maker can have it.
-
-    Args:
-        levels: of each filter.
     """
     rows, cells, ends = [], [], []
     for mistake in MISTAKES:

@@ -13,7 +13,7 @@ from vehest.data.estimate import Estimate
 from vehest.data.recording import Recording
 from vehest.report.document import Figure
 from vehest.report.figures import decimated
-from vehest.report.style import DOUBLE_COLUMN, fixed, legend_above, new_figure, paper_style
+from vehest.report.style import DOUBLE_COLUMN, fixed, legend_above, new_figure
 from vehest_papers.heavy_ekf import paper
 from vehest_papers.heavy_ekf.subjects import LINES, MEASURED, moving
 
@@ -40,8 +40,7 @@ def figure_5(drive: Recording, wheels: SpeedFromWheels, data: str) -> Figure:
     shown = drive.cut(start, stop)
     raw = wheels.wheel_radius * shown.stack([f"wheel_speed_{wheel}" for wheel in WHEELS]).T
     corrected = wheels.corrected(shown)
-    with paper_style():
-        figure = new_figure(DOUBLE_COLUMN, 3.6)
+    with new_figure(DOUBLE_COLUMN, 3.6) as figure:
         panels = figure.subplots(2, 1, sharex=True, sharey=True)
         for axes, speeds, title in zip(panels, (raw, corrected), ("as measured", "corrected, Eqs. 61 to 64"), strict=True):
             for values, colour, name in zip(speeds, WHEEL_COLOURS, WHEELS.values(), strict=True):
@@ -67,8 +66,7 @@ def figure_6(drive: Recording, estimates: Mapping[str, Estimate], minimum_speed:
     """The track, β over the three laps, and details on a straight and in the handling section."""
     straight, handling = busiest(drive, STRAIGHT_SECONDS, calmest=True), busiest(drive, HANDLING_SECONDS)
     x, y = _track(drive)
-    with paper_style():
-        figure = new_figure(DOUBLE_COLUMN, 5.6)
+    with new_figure(DOUBLE_COLUMN, 5.6) as figure:
         grid = figure.add_gridspec(3, 2, height_ratios=(1.1, 1.2, 1.2))
         track, whole = figure.add_subplot(grid[0, 0]), figure.add_subplot(grid[1, :])
         bends, calm = figure.add_subplot(grid[2, :]), figure.add_subplot(grid[0, 1])
@@ -98,8 +96,7 @@ def figure_6(drive: Recording, estimates: Mapping[str, Estimate], minimum_speed:
 
 def speed_and_acceleration(drive: Recording, name: str, number: int, what: str, data: str) -> Figure:
     """Speed and lateral acceleration along a drive: Figures 7 and 11."""
-    with paper_style():
-        figure = new_figure(DOUBLE_COLUMN * 0.8, 2.9)
+    with new_figure(DOUBLE_COLUMN * 0.8, 2.9) as figure:
         panels = figure.subplots(2, 1, sharex=True)
         panels[0].plot(*decimated(drive.time, 3.6 * drive["vx"], POINTS), color="#0b4f9c")
         panels[1].plot(*decimated(drive.time, drive["ay"], POINTS), color="#b8480b", linewidth=0.8)
@@ -117,8 +114,7 @@ def speed_and_acceleration(drive: Recording, name: str, number: int, what: str, 
 
 def sideslip_figure(drive: Recording, estimates: Mapping[str, Estimate], minimum_speed: float, name: str, caption: str) -> Figure:
     """β measured and estimated over a whole drive, and the errors: Figure 10."""
-    with paper_style():
-        figure = new_figure(DOUBLE_COLUMN, 3.4)
+    with new_figure(DOUBLE_COLUMN, 3.4) as figure:
         top, below = figure.subplots(2, 1, sharex=True, height_ratios=(1.6, 1))
         _sideslip(top, drive, estimates, minimum_speed, None)
         shown = moving(drive, minimum_speed)

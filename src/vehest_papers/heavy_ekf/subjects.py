@@ -35,17 +35,11 @@ TYRE_COLOURS = {"nominal": "#0b4f9c", "worn": "#b8480b", "wet": "#17a2b8"}
 
 @dataclass(frozen=True, eq=False)
 class Filter:
-    """A fitted filter.
+    """A fitted filter."""
 
-    Args:
-        name: what it is called in the report.
-        model: where it comes from.
-        fitted: ready to estimate.
-    """
-
-    name: str
-    model: EvaluatedModel
-    fitted: RationalFilter
+    name: str  # what it is called in the report
+    model: EvaluatedModel  # where it comes from
+    fitted: RationalFilter  # ready to estimate
 
     def of(self, drive: Recording) -> Estimate:
         """What it makes of a whole drive, which it does not see the references of."""

@@ -22,7 +22,7 @@ Rmse = Mapping[tuple[str, str], float]
 DRIVES = {"laps": "three laps", "fast": "fast lap"}
 
 
-def table_3(rmse: Rmse, names: list[str], data: str, name: str = "table_3") -> Table:
+def table_3(rmse: Rmse, names: list[str], data: str) -> Table:
     """RMSE(β) of every filter on every test, beside what the paper's prose gives."""
     rows = []
     for own in names:
@@ -38,7 +38,7 @@ def table_3(rmse: Rmse, names: list[str], data: str, name: str = "table_3") -> T
         f"RMSE(β) [deg] (Table 3 of the paper, whose figures are those of its prose: its RATTE is below 0.5, 44 % below its RATT and 65 % "
         f"below its LINT on the three laps). Ours: {data}. Fitted on other laps with nominal tyres."
     )
-    return Table(name, caption, pd.DataFrame(rows), columns)
+    return Table("table_3", caption, pd.DataFrame(rows), columns)
 
 
 def overview(rmse: Rmse, ferrari: Rmse, names: list[str]) -> Table:

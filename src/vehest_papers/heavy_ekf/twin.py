@@ -47,19 +47,12 @@ SMALLEST_BEND = 0.4  # of the largest rear slip of a drive
 
 @dataclass(frozen=True)
 class Conditions:
-    """What a drive of the plant is like.
+    """What a drive of the plant is like."""
 
-    Args:
-        slip: largest rear slip angle that the driver holds [deg].
-        payload: whether a quarter of the mass is loaded behind the centre of gravity, which no filter knows.
-        wet_patches: whether the friction steps from 1 to 0.6 and back along the road.
-        crossfall: whether the road falls by 1° to the left all along, as on one side of a crown.
-    """
-
-    slip: float
-    payload: bool = False
-    wet_patches: bool = False
-    crossfall: bool = False
+    slip: float  # largest rear slip angle that the driver holds [deg]
+    payload: bool = False  # whether a quarter of the mass is loaded behind the centre of gravity, which no filter knows
+    wet_patches: bool = False  # whether the friction steps from 1 to 0.6 and back along the road
+    crossfall: bool = False  # whether the road falls by 1° to the left all along, as on one side of a crown
 
 
 @dataclass(frozen=True)
@@ -104,46 +97,27 @@ class Plant:
 
 @dataclass(frozen=True, eq=False)
 class Course:
-    """What is asked of the driver and what the road is like at the plant's steps, (K,) each.
+    """What is asked of the driver and what the road is like at the plant's steps, (K,) each."""
 
-    Args:
-        speed: u [m/s].
-        slip: wanted rear slip angle [rad].
-        slip_rate: its slope [rad/s].
-        friction: μ.
-        road: g sin φ, positive where it pulls to the left [m/s²].
-    """
-
-    speed: FloatArray
-    slip: FloatArray
-    slip_rate: FloatArray
-    friction: FloatArray
-    road: FloatArray
+    speed: FloatArray  # u [m/s]
+    slip: FloatArray  # wanted rear slip angle [rad]
+    slip_rate: FloatArray  # its slope [rad/s]
+    friction: FloatArray  # μ
+    road: FloatArray  # g sin φ, positive where it pulls to the left [m/s²]
 
 
 @dataclass(frozen=True, eq=False)
 class Drive:
-    """A drive at the filters' rate.
+    """A drive at the filters' rate."""
 
-    Args:
-        conditions: of the plant.
-        samples: yaw_rate, vx, ay and steer with the sensors' noise, (T, 4).
-        sideslip: β as it is [rad], (T,).
-        yaw_rate: r as it is [rad/s], (T,).
-        rear_slip: α_R as it is [rad], (T,).
-        lateral: a_y as it is [m/s²], (T,).
-        friction: μ, (T,).
-        plant: what was driven.
-    """
-
-    conditions: Conditions
-    samples: FloatArray
-    sideslip: FloatArray
-    yaw_rate: FloatArray
-    rear_slip: FloatArray
-    lateral: FloatArray
-    friction: FloatArray
-    plant: Plant
+    conditions: Conditions  # of the plant
+    samples: FloatArray  # yaw_rate, vx, ay and steer with the sensors' noise, (T, 4)
+    sideslip: FloatArray  # β as it is [rad], (T,)
+    yaw_rate: FloatArray  # r as it is [rad/s], (T,)
+    rear_slip: FloatArray  # α_R as it is [rad], (T,)
+    lateral: FloatArray  # a_y as it is [m/s²], (T,)
+    friction: FloatArray  # μ, (T,)
+    plant: Plant  # what was driven
 
     @cached_property
     def recording(self) -> Recording:

@@ -11,7 +11,7 @@ import pandas as pd
 
 from vehest.constants import FloatArray
 from vehest.report.document import Block, Column, Figure, Table
-from vehest.report.style import DOUBLE_COLUMN, fixed, new_figure, paper_style
+from vehest.report.style import DOUBLE_COLUMN, fixed, new_figure
 from vehest_papers.heavy_ekf import paper
 from vehest_papers.heavy_ekf.candidates import DATA_SHEET, DRAWN, FILTERS, ORACLE, REFINED, STATIC_MAP, WITH_STATE, ZERO, table_of
 from vehest_papers.heavy_ekf.factorial import (
@@ -144,8 +144,7 @@ def _drawn(values: dict[tuple[str, str], FloatArray], apart: dict[tuple[str, str
     from matplotlib.colors import Normalize
     from matplotlib.patches import Rectangle
 
-    with paper_style():
-        figure = new_figure(DOUBLE_COLUMN, 3.1)
+    with new_figure(DOUBLE_COLUMN, 3.1) as figure:
         panels = figure.subplots(1, 2, sharey=True)
         colours: Any = ScalarMappable(Normalize(-LIMIT, LIMIT), "RdBu_r")
         for axes, pair in zip(panels, CLAIMED, strict=True):

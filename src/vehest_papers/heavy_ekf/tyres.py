@@ -16,7 +16,7 @@ from vehest.data.recording import Recording
 from vehest.estimators.filtering.tyre_fit import AxleMotion, TyreFit, axle_force, axle_motion, fit_motion
 from vehest.report.document import Column, Figure, Table
 from vehest.report.figures import decimated
-from vehest.report.style import DOUBLE_COLUMN, MISSING, fixed, legend_above, new_figure, paper_style, significant
+from vehest.report.style import DOUBLE_COLUMN, MISSING, fixed, legend_above, new_figure, significant
 from vehest.vehicle.parameters import SingleTrackParameters
 from vehest_papers.heavy_ekf import paper
 from vehest_papers.heavy_ekf.laps import POINTS
@@ -37,16 +37,11 @@ LINEAR_LABELS = {"cornering_stiffness_front": "$C_F$ [kN/rad]", "cornering_stiff
 
 @dataclass(frozen=True, eq=False)
 class OwnCurves:
-    """Curves of the plant itself, from its tyre forces.
+    """Curves of the plant itself, from its tyre forces."""
 
-    Args:
-        rational: fit of rational curves.
-        linear: fit of straight lines.
-        offsets: recording -> slip angle of the front and of the rear axle by its sensors where the axle makes no force, (2,) [rad].
-    """
-
-    rational: TyreFit
-    linear: TyreFit
+    rational: TyreFit  # fit of rational curves
+    linear: TyreFit  # fit of straight lines
+    # recording -> slip angle of the front and of the rear axle by its sensors where the axle makes no force, (2,) [rad]
     offsets: Mapping[str, FloatArray]
 
     @classmethod
@@ -79,8 +74,7 @@ def figure_3(fit: TyreFit, own: OwnCurves | None, name: str, data: str) -> Figur
     """Forces over slip angles with the fitted curve and its 95 % band, front and rear."""
     generator = np.random.default_rng(0)
     chosen = np.sort(generator.permutation(fit.slip.shape[1])[:DOTS])
-    with paper_style():
-        figure = new_figure(DOUBLE_COLUMN, 2.7)
+    with new_figure(DOUBLE_COLUMN, 2.7) as figure:
         panels = figure.subplots(1, 2, sharey=True)
         for row, (axes, axle) in enumerate(zip(panels, AXLES, strict=True)):
             slip, force = fit.slip[row], fit.force[row]
@@ -166,17 +160,13 @@ def parameters_figure(
     """Estimated tyre parameters over time, a line a kind of tyre, with the plant's own dashed: Figures 8 and 9.
 
     Args:
-        drives: kind of tyre -> drive.
         estimates: kind of tyre -> what the filter made of it.
         own: kind of tyre -> the plant's own curves; empty where they are not known.
         filter_name: of the filter.
-        name: of the figure.
-        caption: of it.
     """
     linear = filter_name == paper.LINT
     quantities = list(LINEAR_LABELS) if linear else list(QUANTITIES)
-    with paper_style():
-        figure = new_figure(DOUBLE_COLUMN, 2.3 if linear else 3.8)
+    with new_figure(DOUBLE_COLUMN, 2.3 if linear else 3.8) as figure:
         panels = figure.subplots(1 if linear else 2, 2, sharex=True, squeeze=False)
         for axes, quantity in zip(panels.flat, quantities, strict=True):
             _, label, scale = QUANTITIES[quantity]
@@ -215,8 +205,6 @@ def convergence_table(
     """Start, end and the plant's own value of every estimated parameter, and from when on it stays near.
 
     Args:
-        drives: test set -> drive.
-        estimates: test set -> filter -> estimate.
         own: kind of tyre -> the plant's own curves.
         names: filters whose parameters are states.
     """

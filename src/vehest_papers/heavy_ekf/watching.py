@@ -15,7 +15,7 @@ from vehest.data.recording import Recording
 from vehest.estimators.rational_ekf import RationalFilter
 from vehest.report.document import Block, Column, Figure, Table
 from vehest.report.figures import decimated
-from vehest.report.style import DOUBLE_COLUMN, MISSING, fixed, legend_above, listed, new_figure, paper_style
+from vehest.report.style import DOUBLE_COLUMN, MISSING, fixed, legend_above, listed, new_figure
 from vehest_papers.heavy_ekf.laps import POINTS
 from vehest_papers.heavy_ekf.subjects import LINES, Filter
 from vehest_papers.kit.observability import Observability, observability_along
@@ -50,8 +50,7 @@ def observability_blocks(filters: Mapping[str, Filter], drive: Recording, minimu
     """Smallest singular value along a drive, a line a filter, with the lateral acceleration; and in words."""
     found = {name: observability_of(own.fitted, drive, minimum_speed).smallest for name, own in filters.items()}
     cornering = np.abs(np.convolve(drive["ay"], np.full(11, 1 / 11), "same")) > CORNERING
-    with paper_style():
-        figure = new_figure(DOUBLE_COLUMN, 3.4)
+    with new_figure(DOUBLE_COLUMN, 3.4) as figure:
         top, below = figure.subplots(2, 1, sharex=True, height_ratios=(2, 1))
         for name, values in found.items():
             time = drive.time[: len(values)]

@@ -20,23 +20,14 @@ _COLUMNS = {"claim": "claim", "paper": "paper", "ours": "ours, with 95 % interva
 
 @dataclass(frozen=True)
 class Claim:
-    """One claim and what became of it.
+    """One claim and what became of it."""
 
-    Args:
-        claim: what is claimed, of what, in a few words.
-        paper: the paper's figure, in words.
-        ours: our figure with its interval, in words.
-        data: what ours comes from: ``real`` or ``simulated``, and which test.
-        verdict: whether the claim came out.
-        why: what decided, in a clause.
-    """
-
-    claim: str
-    paper: str
-    ours: str
-    data: str
-    verdict: Verdict
-    why: str
+    claim: str  # what is claimed, of what, in a few words
+    paper: str  # the paper's figure, in words
+    ours: str  # our figure with its interval, in words
+    data: str  # what ours comes from: ``real`` or ``simulated``, and which test
+    verdict: Verdict  # whether the claim came out
+    why: str  # what decided, in a clause
 
 
 def claims_table(claims: Sequence[Claim], note: str = "") -> Table:

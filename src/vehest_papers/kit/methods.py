@@ -54,14 +54,7 @@ def how_it_was_made(lines: Sequence[str]) -> str:
 
 
 def ranges_table(artefacts: StudyArtefacts, name: str, caption: str, tests: Mapping[str, str]) -> Table:
-    """Ranges of training, validation and tests, a row a part.
-
-    Args:
-        artefacts: of the study.
-        name: of the file.
-        caption: of the table.
-        tests: test set -> what it is called, where that is another name.
-    """
+    """Ranges of training, validation and tests, a row a part; ``tests``: test set -> what it is called, where that is another name."""
     rows = [
         {
             "part": artefacts.titles[key],

@@ -27,18 +27,13 @@ StateFunction = Callable[[Tensor, Tensor], Tensor]
 
 
 class Observability(NamedTuple):
-    """How well windows of measurements determine the state at their start; a row a window.
+    """How well windows of measurements determine the state at their start; a row a window."""
 
-    Attributes:
-        smallest: smallest singular value of the local observability matrix, (T - N + 1,).
-        deviation: standard deviation of each state from these measurements alone, in units of its size; infinite where they do not
-            determine it, (T - N + 1, n).
-        rank: of the local observability matrix, (T - N + 1,).
-    """
-
-    smallest: FloatArray
+    smallest: FloatArray  # smallest singular value of the local observability matrix, (T - N + 1,)
+    # standard deviation of each state from these measurements alone, in units of its size; infinite where they do not determine it, (T - N
+    # + 1, n)
     deviation: FloatArray
-    rank: NDArray[np.int64]
+    rank: NDArray[np.int64]  # of the local observability matrix, (T - N + 1,)
 
 
 def jacobians_along(

@@ -19,7 +19,6 @@ class SampledErrors:
     """Candidates on one test, all on the same resamples.
 
     Args:
-        candidates: that are there.
         paired: whether candidates are the same networks under other conditions, whose seeds are drawn together.
     """
 

@@ -23,17 +23,11 @@ THIRD_OCTAVE = 2.0 ** (1.0 / 6.0)
 
 @dataclass(frozen=True, eq=False)
 class Periodogram:
-    """One-sided power spectral density.
+    """One-sided power spectral density."""
 
-    Args:
-        frequency: lines from 0 to half the sampling rate [Hz], shape (F,).
-        density: [unit² / Hz], shape (F,).
-        n_segments: segments that were averaged.
-    """
-
-    frequency: FloatArray
-    density: FloatArray
-    n_segments: int
+    frequency: FloatArray  # lines from 0 to half the sampling rate [Hz], shape (F,)
+    density: FloatArray  # [unit² / Hz], shape (F,)
+    n_segments: int  # segments that were averaged
 
     @property
     def power(self) -> float:

@@ -22,21 +22,13 @@ Expected = Literal["lower", "higher"]
 
 @dataclass(frozen=True, eq=False)
 class Measured:
-    """A figure of one candidate over all its seeds.
+    """A figure of one candidate over all its seeds."""
 
-    Args:
-        value: an error of it, above zero.
-        draws: logarithm of it in each resample, blocks and seeds drawn anew, (n,).
-        of_each: its logarithm for each seed alone, (S,).
-        n_blocks: blocks of the drive, or drives, that were resampled.
-        paired: whether the seeds are the very networks of the others it is compared with, and were drawn together with theirs.
-    """
-
-    value: float
-    draws: FloatArray
-    of_each: FloatArray
-    n_blocks: int
-    paired: bool = False
+    value: float  # an error of it, above zero
+    draws: FloatArray  # logarithm of it in each resample, blocks and seeds drawn anew, (n,)
+    of_each: FloatArray  # its logarithm for each seed alone, (S,)
+    n_blocks: int  # blocks of the drive, or drives, that were resampled
+    paired: bool = False  # whether the seeds are the very networks of the others it is compared with, and were drawn together with theirs
 
     @property
     def interval(self) -> tuple[float, float]:
@@ -46,17 +38,11 @@ class Measured:
 
 @dataclass(frozen=True)
 class Change:
-    """How a figure stands to another one, or to a limit, as a ratio.
+    """How a figure stands to another one, or to a limit, as a ratio."""
 
-    Args:
-        log_ratio: its logarithm.
-        error: standard error of that.
-        dof: degrees of freedom of Student's t, by Welch and Satterthwaite from blocks and seeds.
-    """
-
-    log_ratio: float
-    error: float
-    dof: float
+    log_ratio: float  # its logarithm
+    error: float  # standard error of that
+    dof: float  # degrees of freedom of Student's t, by Welch and Satterthwaite from blocks and seeds
 
     @classmethod
     def of(cls, first: Measured, second: Measured | None, limit: float = 1.0) -> Change:
@@ -94,9 +80,9 @@ class Change:
         value = percent(math.exp(self.log_ratio))
         return f"{value} % [{percent(low)}, {percent(high)}]" if math.isfinite(low) else f"{value} %"
 
-    def as_ratio(self, confidence: float = CONFIDENCE) -> str:
+    def as_ratio(self) -> str:
         """The ratio in words: ``2.1 [1.7, 2.6]``."""
-        low, high = self.ends(confidence)
+        low, high = self.ends()
         value = math.exp(self.log_ratio)
         return f"{short(value)} [{short(low)}, {short(high)}]" if math.isfinite(low) else short(value)
 
@@ -126,23 +112,15 @@ def short(value: float) -> str:
 
 @dataclass(frozen=True)
 class Compared:
-    """One comparison.
+    """One comparison."""
 
-    Args:
-        label: which, in the cell of the table; several of one label show the first alone.
-        change: of what is claimed to be lower, or higher, to the other; none where there is nothing to compare.
-        expected: what is claimed of it.
-        beyond: relative change that it is claimed to lie below, or above.
-        shown: as a relative change, a ratio of powers in decibels, or a ratio, times ``limit`` where it was divided by that.
-        limit: see ``shown``.
-    """
-
-    label: str
-    change: Change | None
-    expected: Expected = "lower"
-    beyond: float = 0.0
+    label: str  # which, in the cell of the table; several of one label show the first alone
+    change: Change | None  # of what is claimed to be lower, or higher, to the other; none where there is nothing to compare
+    expected: Expected = "lower"  # what is claimed of it
+    beyond: float = 0.0  # relative change that it is claimed to lie below, or above
+    # as a relative change, a ratio of powers in decibels, or a ratio, times ``limit`` where it was divided by that
     shown: Literal["percent", "ratio", "decibels"] = "percent"
-    limit: float = 1.0
+    limit: float = 1.0  # see ``shown``
 
     def in_words(self, confidence: float) -> str:
         """Label and figure with its interval."""
@@ -161,21 +139,13 @@ class Compared:
 
 @dataclass(frozen=True)
 class Statement:
-    """A statement of the paper.
+    """A statement of the paper."""
 
-    Args:
-        claim: in a few words.
-        paper: its figures.
-        data: what ours come from.
-        tests: that must all come out as claimed.
-        missing: why it cannot be tested, where nothing is there to compare.
-    """
-
-    claim: str
-    paper: str
-    data: str
-    tests: Sequence[Compared]
-    missing: str = "no such candidates here"
+    claim: str  # in a few words
+    paper: str  # its figures
+    data: str  # what ours come from
+    tests: Sequence[Compared]  # that must all come out as claimed
+    missing: str = "no such candidates here"  # why it cannot be tested, where nothing is there to compare
 
 
 def outcomes(tests: Sequence[Compared]) -> list[tuple[Outcome, float]]:

@@ -10,7 +10,7 @@ from vehest.data.errors import ConfigurationError
 from vehest.data.recording import Recording
 from vehest.estimators.ksnn import Ksnn
 from vehest.report.document import Block, Figure
-from vehest.report.style import DOUBLE_COLUMN, fixed, listed, new_figure, paper_style
+from vehest.report.style import DOUBLE_COLUMN, fixed, listed, new_figure
 from vehest_papers.ksnn.linear_system import LocalModels
 from vehest_papers.ksnn.subjects import Trained, kinds_of
 
@@ -25,7 +25,6 @@ def activation(own: Trained, recordings: Sequence[Recording] = ()) -> list[Block
     """Activation functions of a trained network over |ω|, and how much of the drives lies where.
 
     Args:
-        own: a KS-NN.
         recordings: drives whose |ω| is counted; none if empty.
 
     Raises:
@@ -38,8 +37,7 @@ def activation(own: Trained, recordings: Sequence[Recording] = ()) -> list[Block
     end = BEYOND * float(own.estimator.weights()["yaw_rate_max"])
     grid = np.union1d(np.linspace(0.0, end, 400), models.centres)
     weights = models.activations(grid)
-    with paper_style():
-        figure = new_figure(DOUBLE_COLUMN * 0.75, 2.4)
+    with new_figure(DOUBLE_COLUMN * 0.75, 2.4) as figure:
         axes = figure.add_subplot()
         if len(size):
             counts, edges = np.histogram(np.minimum(size, end), np.linspace(0.0, end, BINS + 1))

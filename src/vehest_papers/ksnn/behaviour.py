@@ -51,10 +51,7 @@ def at_low_yaw_rate(scheme: Scheme, threshold: float, categories: Sequence[str],
     """SegmentErrors where |ω| lies below a threshold, and the share of such samples.
 
     Args:
-        scheme: a comparison.
         threshold: of the observer, below which it is reset [rad/s].
-        categories: of `Scheme.chosen`.
-        test: a test set.
     """
     part, rate = scheme.part, scheme.part.protocol.rate_hz
     recordings = [reference for reference, _ in pieces_of(part.split.tests[test], lambda span: _reference(scheme, span), part.protocol)]
@@ -119,7 +116,6 @@ def without_biases(scheme: Scheme, categories: Sequence[str], test: str) -> tupl
 
     Args:
         scheme: a comparison whose validation range is a set of the car that ``test`` is of.
-        categories: of networks.
         test: the other car's test set.
 
     Returns:

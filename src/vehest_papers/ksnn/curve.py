@@ -10,7 +10,7 @@ import pandas as pd
 
 from vehest.evaluation.blocks import Segments
 from vehest.report.document import Column, Figure, Table
-from vehest.report.style import DOUBLE_COLUMN, Line, legend_above, line_of, new_figure, paper_style
+from vehest.report.style import DOUBLE_COLUMN, Line, legend_above, line_of, new_figure
 from vehest.studies.kit.reference_minutes import minutes_of
 from vehest_papers.ksnn import paper
 from vehest_papers.ksnn.candidates import category_of
@@ -24,17 +24,11 @@ TESTS = {"own": "own car", "other": "other car"}
 
 @dataclass(frozen=True, eq=False)
 class Curve:
-    """Errors by category and amount.
+    """Errors by category and amount."""
 
-    Args:
-        errors: ``own`` or ``other`` -> errors of candidates called ``CATEGORY@MINUTES``.
-        minutes: amounts, from the least, as they are written in names.
-        lines: category -> estimator and variant.
-    """
-
-    errors: Mapping[str, SegmentErrors]
-    minutes: Sequence[str]
-    lines: Mapping[str, tuple[str, str]]
+    errors: Mapping[str, SegmentErrors]  # ``own`` or ``other`` -> errors of candidates called ``CATEGORY@MINUTES``
+    minutes: Sequence[str]  # amounts, from the least, as they are written in names
+    lines: Mapping[str, tuple[str, str]]  # category -> estimator and variant
 
 
 def curve_of(whole: Scheme, shorter: Mapping[str, Scheme]) -> Curve | None:
@@ -76,8 +70,7 @@ def curve_table(curve: Curve) -> Table:
 
 def curve_figure(curve: Curve) -> Figure:
     """Figure ``minutes``: FVU over minutes, a panel a car; of the baselines the static map, as a level that has no colour of its own."""
-    with paper_style():
-        figure = new_figure(DOUBLE_COLUMN, 2.6)
+    with new_figure(DOUBLE_COLUMN, 2.6) as figure:
         panels = figure.subplots(1, 2, sharey=True)
         for axes, (word, title) in zip(panels, TESTS.items(), strict=True):
             errors = curve.errors[word]

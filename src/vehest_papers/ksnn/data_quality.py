@@ -12,7 +12,7 @@ import pandas as pd
 from vehest.constants import FloatArray
 from vehest.data.recording import Recording
 from vehest.report.document import Block, Column, Figure, Table
-from vehest.report.style import DOUBLE_COLUMN, MISSING, fixed, legend_above, listed, new_figure, paper_style
+from vehest.report.style import DOUBLE_COLUMN, MISSING, fixed, legend_above, listed, new_figure
 from vehest_papers.kit.spectra import Periodogram, decibels, lateral_velocity_rate, mean_bias, periodogram, process_noise
 from vehest_papers.ksnn.subjects import car_colours, car_title, kinds_of, plain_frequencies
 
@@ -27,26 +27,17 @@ COMPARED_AY = 8.0
 
 @dataclass(frozen=True)
 class Statistics:
-    """A row of Table I.
+    """A row of Table I."""
 
-    Args:
-        u_min, u_max: forward speed [m/s].
-        v_low, v_high: 0.01 and 0.99 quantile of the lateral velocity [m/s].
-        yaw_rate_min, yaw_rate_max: [rad/s].
-        ay: 0.99 quantile of |a_y| [m/s²].
-        length_km: distance driven.
-        minutes: duration.
-    """
-
-    u_min: float
-    u_max: float
-    v_low: float
-    v_high: float
-    yaw_rate_min: float
-    yaw_rate_max: float
-    ay: float
-    length_km: float
-    minutes: float
+    u_min: float  # lowest forward speed [m/s]
+    u_max: float  # highest forward speed [m/s]
+    v_low: float  # 0.01 quantile of the lateral velocity [m/s]
+    v_high: float  # 0.99 quantile of the lateral velocity [m/s]
+    yaw_rate_min: float  # [rad/s]
+    yaw_rate_max: float  # [rad/s]
+    ay: float  # 0.99 quantile of |a_y| [m/s²]
+    length_km: float  # distance driven
+    minutes: float  # duration
 
 
 PUBLISHED: Mapping[str, Statistics] = {
@@ -155,8 +146,7 @@ def _figure_4(
     groups: Mapping[tuple[str, str], Sequence[Recording]], spectra: Mapping[tuple[str, str], tuple[Periodogram, Periodogram]], source: str
 ) -> Figure:
     colours = car_colours(groups)
-    with paper_style():
-        figure = new_figure(DOUBLE_COLUMN * 0.75, 0.6 + 1.75 * len(groups))
+    with new_figure(DOUBLE_COLUMN * 0.75, 0.6 + 1.75 * len(groups)) as figure:
         panels = figure.subplots(len(groups), 1, sharex=True, sharey=True, squeeze=False)[:, 0]
         lowest = np.inf
         for axes, ((vehicle, kind), (rate, noise)) in zip(panels, spectra.items(), strict=True):
@@ -219,8 +209,7 @@ def _noise_in_words(
 
 def _figure_5(groups: Mapping[tuple[str, str], Sequence[Recording]], source: str) -> Figure:
     colours = car_colours(groups)
-    with paper_style():
-        figure = new_figure(DOUBLE_COLUMN * 0.75, 3.4)
+    with new_figure(DOUBLE_COLUMN * 0.75, 3.4) as figure:
         axes = figure.add_subplot()
         reach, points, point_colours = 0.0, [], []
         for position, ((vehicle, kind), recordings) in enumerate(groups.items()):

@@ -7,7 +7,6 @@ from collections.abc import Mapping, Sequence
 import pandas as pd
 
 from vehest.data.errors import DataError
-from vehest.data.splits import Span
 from vehest.report.document import PATENT_NOTE, REPORT, Block, Document, Table, as_code, as_text
 from vehest.report.style import fixed, listed
 from vehest.studies.artefacts import StudyArtefacts
@@ -73,17 +72,14 @@ def scheme_of(artefacts: StudyArtefacts, name: str) -> Scheme:
     if {"c2", "f2"} <= set(tests):
         own = "c2" if name.endswith("_1") else "f2"
         return Scheme(name, title, part, own, "f2" if own == "c2" else "c2")
-    own = next((test for test in tests if _shares_a_car(part.split.tests[test], part.split.train)), tests[0])
+    learnt = {span.dataset for span in part.split.train}
+    own = next((test for test in tests if learnt & {span.dataset for span in part.split.tests[test]}), tests[0])
     return Scheme(name, title, part, own, next((test for test in tests if test != own), own))
 
 
 def _pairs(parts: Mapping[str, Scheme]) -> list[Scheme]:
     """Parts of small cars, which are called by both."""
     return [own for name, own in parts.items() if set(name.split("_")) <= set(SMALL)]
-
-
-def _shares_a_car(spans: Sequence[Span], others: Sequence[Span]) -> bool:
-    return bool({span.dataset for span in spans} & {span.dataset for span in others})
 
 
 def _entries(

@@ -22,7 +22,6 @@ from vehest.report.style import (
     legend_above,
     listed,
     new_figure,
-    paper_style,
     significant,
     with_unit,
 )
@@ -96,8 +95,7 @@ def gain_curves(models: Sequence[Trained]) -> list[Block]:
         "poles": ("larger pole", "smaller pole", "1"),
     }
     columns = math.ceil(len(panels) / 2)
-    with paper_style():
-        figure = new_figure(DOUBLE_COLUMN, 4.2)
+    with new_figure(DOUBLE_COLUMN, 4.2) as figure:
         grid = figure.subplots(2, columns, squeeze=False).ravel()
         for axes, panel in zip(grid, panels, strict=False):
             for position, (own, model) in enumerate(zip(models, linear, strict=True)):
@@ -127,11 +125,7 @@ def gain_curves(models: Sequence[Trained]) -> list[Block]:
 
 
 def gains_in_words(own: Trained) -> str:
-    """What the gains of a linear KS-NN mean, from their values.
-
-    Raises:
-        ConfigurationError: it is no linear KS-NN.
-    """
+    """What the gains of a linear KS-NN mean, from their values; raises `ConfigurationError` where it is no linear KS-NN."""
     model = _linear(own)
     sentences = [_of_the_leak(model), _of_the_slip_rate(model), _of_the_speed(model), _of_the_third(model), _of_the_poles(model)]
     if np.any(model.bias):
@@ -285,8 +279,7 @@ def _figure_of_parts(own: Trained, drive: Recording, parts: SubModels, stretch: 
     drive.cut(*stretch)
     first, last = drive.index_range(*stretch)
     shown, time = np.s_[first:last], drive.time[first:last]
-    with paper_style():
-        figure = new_figure(DOUBLE_COLUMN, 4.4)
+    with new_figure(DOUBLE_COLUMN, 4.4) as figure:
         top, middle, bottom = figure.subplots(3, 1, sharex=True, height_ratios=(1.5, 1.5, 0.6))
         top.plot(time, parts.total[shown], color="#c2182b", linewidth=1.3, label="KS-NN, sum of the parts")
         top.plot(time, drive["vy_ref"][shown], color=REFERENCE_COLOUR, linewidth=0.9, label="measured")
@@ -342,9 +335,7 @@ def feedback_functions(own: Trained, drive: Recording, source: str, *, name: str
 
     Args:
         own: a nonlinear KS-NN.
-        drive: at its rate.
         source: what the drive is, for the caption.
-        name: of the figure.
 
     Raises:
         ConfigurationError: it is no nonlinear KS-NN.
@@ -358,8 +349,7 @@ def feedback_functions(own: Trained, drive: Recording, source: str, *, name: str
     reach = 1.4 * max(abs(low), abs(high), 1e-3)
     grid = np.linspace(-reach, reach, 401)
     values, slopes = models.feedback(grid), models.slope(grid)
-    with paper_style():
-        figure = new_figure(DOUBLE_COLUMN, 4.0)
+    with new_figure(DOUBLE_COLUMN, 4.0) as figure:
         panels = figure.subplots(2, 2, sharex=True)
         for column in (0, 1):
             for axes, curves in ((panels[0, column], values), (panels[1, column], slopes)):

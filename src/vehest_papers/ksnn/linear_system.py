@@ -48,48 +48,28 @@ SMALL_ERROR = 1e-6
 
 @dataclass(frozen=True, eq=False)
 class Gains:
-    """Coefficients of the blended recursion (Eqs. 14, 15); the last axis of each is the equation, v̂ then û.
+    """Coefficients of the blended recursion (Eqs. 14, 15); the last axis of each is the equation, v̂ then û."""
 
-    Args:
-        gamma: γ₁, γ₂, shape (..., 2).
-        beta: β₁, β₂, shape (..., 2).
-        weight: w₁₁, w₁₂, shape (..., 2).
-        bias: b₁₁ [m/s], b₁₂ [m/s], shape (..., 2); b₁₁ still has to be multiplied with ω.
-    """
-
-    gamma: FloatArray
-    beta: FloatArray
-    weight: FloatArray
-    bias: FloatArray
+    gamma: FloatArray  # γ₁, γ₂, shape (..., 2)
+    beta: FloatArray  # β₁, β₂, shape (..., 2)
+    weight: FloatArray  # w₁₁, w₁₂, shape (..., 2)
+    bias: FloatArray  # b₁₁ [m/s], b₁₂ [m/s], shape (..., 2); b₁₁ still has to be multiplied with ω
 
 
 @dataclass(frozen=True, eq=False)
 class LocalModels:
-    """The modules M_p of a KS-NN as float64 arrays (Eqs. 7 to 9).
+    """The modules M_p of a KS-NN as float64 arrays (Eqs. 7 to 9)."""
 
-    Args:
-        centres: |ω| at which each is alone [rad/s], shape (P,).
-        gamma: γ₁, γ₂, shape (P, 2).
-        beta: β₁, β₂, shape (P, 2).
-        weight: slope of the linear branches of f₁, f₂, shape (P, 2).
-        bias: constants of f₁, f₂, shape (P, 2).
-        hidden_weight: w₂, shape (P, 2, Q).
-        hidden_bias: b₂, shape (P, 2, Q).
-        output_weight: w₃, shape (P, 2, Q).
-        step: τ [s].
-        n_window: samples N of a window.
-    """
-
-    centres: FloatArray
-    gamma: FloatArray
-    beta: FloatArray
-    weight: FloatArray
-    bias: FloatArray
-    hidden_weight: FloatArray
-    hidden_bias: FloatArray
-    output_weight: FloatArray
-    step: float
-    n_window: int
+    centres: FloatArray  # |ω| at which each is alone [rad/s], shape (P,)
+    gamma: FloatArray  # γ₁, γ₂, shape (P, 2)
+    beta: FloatArray  # β₁, β₂, shape (P, 2)
+    weight: FloatArray  # slope of the linear branches of f₁, f₂, shape (P, 2)
+    bias: FloatArray  # constants of f₁, f₂, shape (P, 2)
+    hidden_weight: FloatArray  # w₂, shape (P, 2, Q)
+    hidden_bias: FloatArray  # b₂, shape (P, 2, Q)
+    output_weight: FloatArray  # w₃, shape (P, 2, Q)
+    step: float  # τ [s]
+    n_window: int  # samples N of a window
 
     @classmethod
     def of(cls, estimator: Ksnn) -> LocalModels:
@@ -148,25 +128,15 @@ class LocalModels:
 
 @dataclass(frozen=True, eq=False)
 class LpvModel:
-    """A linear KS-NN: a linear system whose coefficients are piecewise linear in |ω| (Eqs. 14 and 15).
+    """A linear KS-NN: a linear system whose coefficients are piecewise linear in |ω| (Eqs. 14 and 15)."""
 
-    Args:
-        centres: breaks of the coefficients [rad/s], shape (P,).
-        gamma: γ₁, γ₂ at the breaks, shape (P, 2).
-        beta: β₁, β₂, shape (P, 2).
-        weight: w₁₁, w₁₂, shape (P, 2).
-        bias: b₁₁, b₁₂ [m/s], shape (P, 2).
-        step: τ [s].
-        n_window: samples N of a window.
-    """
-
-    centres: FloatArray
-    gamma: FloatArray
-    beta: FloatArray
-    weight: FloatArray
-    bias: FloatArray
-    step: float
-    n_window: int
+    centres: FloatArray  # breaks of the coefficients [rad/s], shape (P,)
+    gamma: FloatArray  # γ₁, γ₂ at the breaks, shape (P, 2)
+    beta: FloatArray  # β₁, β₂, shape (P, 2)
+    weight: FloatArray  # w₁₁, w₁₂, shape (P, 2)
+    bias: FloatArray  # b₁₁, b₁₂ [m/s], shape (P, 2)
+    step: float  # τ [s]
+    n_window: int  # samples N of a window
 
     def gains(self, yaw_rate: FloatArray | float) -> Gains:
         """Coefficients at yaw rates of any shape and sign [rad/s]; beyond the last break those of the last."""
@@ -184,21 +154,13 @@ class LpvModel:
 
 @dataclass(frozen=True, eq=False)
 class SubModels:
-    """Parts of v̂ by what drives them (Eq. 11); all of one shape [m/s].
+    """Parts of v̂ by what drives them (Eq. 11); all of one shape [m/s]."""
 
-    Args:
-        slip_rate: first sub-model: integrates a_y - ω u_m.
-        pseudo_measurement: second sub-model: (u̇_m - a_x), which is vω.
-        speed: third sub-model, its relation to ω at a forward speed.
-        bias: third sub-model, what its learned offsets make.
-        error: û - u_m along the way, for the gains that were in force.
-    """
-
-    slip_rate: FloatArray
-    pseudo_measurement: FloatArray
-    speed: FloatArray
-    bias: FloatArray
-    error: FloatArray
+    slip_rate: FloatArray  # first sub-model: integrates a_y - ω u_m
+    pseudo_measurement: FloatArray  # second sub-model: (u̇_m - a_x), which is vω
+    speed: FloatArray  # third sub-model, its relation to ω at a forward speed
+    bias: FloatArray  # third sub-model, what its learned offsets make
+    error: FloatArray  # û - u_m along the way, for the gains that were in force
 
     @property
     def third(self) -> FloatArray:
@@ -252,7 +214,6 @@ def decomposed_estimate(estimator: Ksnn, recording: Recording) -> SubModels:
     """The parts of the estimate of a recording: every sample by a window of its own, as the network sees it.
 
     Args:
-        estimator: trained.
         recording: at the estimator's rate.
 
     Returns:

@@ -41,21 +41,13 @@ LONGEST = 1_000_000
 
 @dataclass(frozen=True, eq=False)
 class NoiseSensitivity:
-    """Transfer functions from δa_y and δa_x [m/s²] to δv̂ [m/s] as polynomials in z, highest power first.
+    """Transfer functions from δa_y and δa_x [m/s²] to δv̂ [m/s] as polynomials in z, highest power first."""
 
-    Args:
-        numerator_ay: shape (3,).
-        numerator_ax: shape (3,).
-        denominator: shape (3,).
-        rate_hz: sampling rate [Hz].
-        memory: lags after which the response ends; none for one without end.
-    """
-
-    numerator_ay: FloatArray
-    numerator_ax: FloatArray
-    denominator: FloatArray
-    rate_hz: float
-    memory: int | None = None
+    numerator_ay: FloatArray  # shape (3,)
+    numerator_ax: FloatArray  # shape (3,)
+    denominator: FloatArray  # shape (3,)
+    rate_hz: float  # sampling rate [Hz]
+    memory: int | None = None  # lags after which the response ends; none for one without end
 
     def truncated(self, n_window: int) -> NoiseSensitivity:
         """The same for an estimator that sees windows of N samples: lags 0 to N of the impulse response."""

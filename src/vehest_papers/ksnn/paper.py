@@ -24,23 +24,14 @@ PLAIN = (GRU, LSTM)
 
 @dataclass(frozen=True)
 class Published:
-    """A row of Tables IV, V or VII.
+    """A row of Tables IV, V or VII."""
 
-    Args:
-        structure: hyperparameters as our report writes them.
-        n_parameters: as printed.
-        c2_fvu: fraction of variance unexplained on C-2 [1].
-        c2_rmse: RMSE of v on C-2 [m/s].
-        f2_fvu: on F-2 [1].
-        f2_rmse: on F-2 [m/s].
-    """
-
-    structure: str
-    n_parameters: int
-    c2_fvu: float
-    c2_rmse: float
-    f2_fvu: float
-    f2_rmse: float
+    structure: str  # hyperparameters as our report writes them
+    n_parameters: int  # as printed
+    c2_fvu: float  # fraction of variance unexplained on C-2 [1]
+    c2_rmse: float  # RMSE of v on C-2 [m/s]
+    f2_fvu: float  # on F-2 [1]
+    f2_rmse: float  # on F-2 [m/s]
 
     def fvu(self, test_set: str) -> float:
         """On ``c2`` or ``f2``."""
@@ -53,17 +44,11 @@ class Published:
 
 @dataclass(frozen=True)
 class Instances:
-    """A row of Table III.
+    """A row of Table III."""
 
-    Args:
-        variants: how many there are.
-        hyperparameters: in words.
-        n_parameters: smallest and largest.
-    """
-
-    variants: int
-    hyperparameters: str
-    n_parameters: tuple[int, int]
+    variants: int  # how many there are
+    hyperparameters: str  # in words
+    n_parameters: tuple[int, int]  # smallest and largest
 
 
 TABLE_III: Mapping[str, Instances] = {

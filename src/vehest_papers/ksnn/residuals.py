@@ -11,7 +11,7 @@ import pandas as pd
 
 from vehest.evaluation.metrics import Scored
 from vehest.report.document import Block, Column, Figure, Table
-from vehest.report.style import DOUBLE_COLUMN, REFERENCE_COLOUR, fixed, legend_above, lines_of, listed, new_figure, paper_style
+from vehest.report.style import DOUBLE_COLUMN, REFERENCE_COLOUR, fixed, legend_above, lines_of, listed, new_figure
 from vehest_papers.kit.spectra import SEGMENT_SECONDS, Periodogram, decibels, periodogram
 from vehest_papers.ksnn.subjects import plain_frequencies
 
@@ -23,38 +23,23 @@ PUBLISHED_ABOVE_KSNN = "7 dB at 0.1 Hz and 8 to 10 dB at 1 Hz"
 
 @dataclass(frozen=True, eq=False)
 class Residuals:
-    """Estimates of one estimator on a test set.
+    """Estimates of one estimator on a test set."""
 
-    Args:
-        estimator: name in conf/estimator.
-        variant: what the paper calls it.
-        title: for people, with the seed.
-        scored: estimate and reference, range by range.
-    """
-
-    estimator: str
-    variant: str
-    title: str
-    scored: Sequence[Scored]
+    estimator: str  # name in conf/estimator
+    variant: str  # what the paper calls it
+    title: str  # for people, with the seed
+    scored: Sequence[Scored]  # estimate and reference, range by range
 
 
 @dataclass(frozen=True, eq=False)
 class Panel:
-    """One panel of the figure.
+    """One panel of the figure."""
 
-    Args:
-        test: test set, for example ``Ferrari F-2``.
-        trained_on: training set, for example ``Corvette C-1``.
-        data: real or simulated, and which data set.
-        estimators: the KS-NN first: the others are compared with it.
-        rate_hz: rate of the scored samples [Hz].
-    """
-
-    test: str
-    trained_on: str
-    data: str
-    estimators: Sequence[Residuals]
-    rate_hz: float
+    test: str  # test set, for example ``Ferrari F-2``
+    trained_on: str  # training set, for example ``Corvette C-1``
+    data: str  # real or simulated, and which data set
+    estimators: Sequence[Residuals]  # the KS-NN first: the others are compared with it
+    rate_hz: float  # rate of the scored samples [Hz]
 
     @property
     def title(self) -> str:
@@ -62,32 +47,27 @@ class Panel:
         return f"{self.test}, trained on {self.trained_on}"
 
 
-def residuals(panels: Sequence[Panel], segment_seconds: float = SEGMENT_SECONDS) -> list[Block]:
+def residuals(panels: Sequence[Panel]) -> list[Block]:
     """Spectra of v and of the residuals, one panel a test set, and how far they lie apart.
-
-    Args:
-        panels: from top to bottom.
-        segment_seconds: length of a segment of the periodograms [s].
 
     Raises:
         DataError: a range is shorter than a segment.
     """
-    spectra = [_spectra(panel, segment_seconds) for panel in panels]
+    spectra = [_spectra(panel) for panel in panels]
     frame = pd.DataFrame([row for panel, own in zip(panels, spectra, strict=True) for row in _rows(panel, own)])
-    return [_figure(panels, spectra, segment_seconds), _in_words(panels, spectra), _table(frame, panels)]
+    return [_figure(panels, spectra), _in_words(panels, spectra), _table(frame, panels)]
 
 
-def _spectra(panel: Panel, segment_seconds: float) -> list[Periodogram]:
+def _spectra(panel: Panel) -> list[Periodogram]:
     """Of v, then of v̂ - v of each estimator."""
     reference = [part.vy_ref for part in panel.estimators[0].scored]
     errors = [[part.vy - part.vy_ref for part in own.scored] for own in panel.estimators]
-    return [periodogram(series, panel.rate_hz, segment_seconds) for series in (reference, *errors)]
+    return [periodogram(series, panel.rate_hz) for series in (reference, *errors)]
 
 
-def _figure(panels: Sequence[Panel], spectra: Sequence[Sequence[Periodogram]], segment_seconds: float) -> Figure:
+def _figure(panels: Sequence[Panel], spectra: Sequence[Sequence[Periodogram]]) -> Figure:
     lines = lines_of(dict.fromkeys((own.estimator, own.variant) for panel in panels for own in panel.estimators))
-    with paper_style():
-        figure = new_figure(DOUBLE_COLUMN * 0.85, 0.7 + 2.1 * len(panels))
+    with new_figure(DOUBLE_COLUMN * 0.85, 0.7 + 2.1 * len(panels)) as figure:
         grid = figure.subplots(len(panels), 1, sharex=True, squeeze=False)[:, 0]
         for axes, panel, (signal, *errors) in zip(grid, panels, spectra, strict=True):
             shown = (signal.frequency > 1.5 * signal.frequency[1]) & (signal.frequency <= min(HIGHEST_HZ, 0.4 * panel.rate_hz))
@@ -107,7 +87,7 @@ def _figure(panels: Sequence[Panel], spectra: Sequence[Sequence[Periodogram]], s
     models = ". ".join(f"{panel.title}: {'; '.join(own.title for own in panel.estimators)} ({panel.data})" for panel in panels)
     caption = (
         f"Power spectral densities of the lateral velocity and of the estimation errors, Figure 8 of the paper. {models}. Welch's method, "
-        f"Hann windows of {segment_seconds:g} s, {listed([str(own[0].n_segments) for own in spectra])} segments."
+        f"Hann windows of {SEGMENT_SECONDS:g} s, {listed([str(own[0].n_segments) for own in spectra])} segments."
     )
     return Figure("residual_spectra", caption, figure)
 
@@ -127,9 +107,9 @@ def _rows(panel: Panel, spectra: Sequence[Periodogram]) -> list[dict[str, object
     ]
 
 
-def exceeding(signal: Periodogram, error: Periodogram, highest_hz: float = HIGHEST_HZ) -> float:
+def exceeding(signal: Periodogram, error: Periodogram) -> float:
     """Frequency from which on the error has more power than the signal in every third of an octave; NaN if nowhere [Hz]."""
-    top = min(highest_hz, 0.8 * float(signal.frequency[-1]))
+    top = min(HIGHEST_HZ, 0.8 * float(signal.frequency[-1]))
     centres = [own for own in 10.0 ** (np.arange(-20, 21) / 10.0) if signal.frequency[2] <= own <= top]
     above = [error.level(hz) > signal.level(hz) for hz in centres]
     last_below = max((position for position, is_above in enumerate(above) if not is_above), default=-1)

@@ -8,7 +8,7 @@ from typing import Any
 import pandas as pd
 
 from vehest.report.document import Figure
-from vehest.report.style import DOUBLE_COLUMN, Line, line_of, new_figure, paper_style
+from vehest.report.style import DOUBLE_COLUMN, Line, line_of, new_figure
 from vehest_papers.ksnn import paper
 from vehest_papers.ksnn.candidates import chosen
 from vehest_papers.ksnn.schemes import Scheme
@@ -19,8 +19,7 @@ METRICS = {"r2": "R²", "rmse_vy": "RMSE(v) [m/s]"}
 
 def two_tests(schemes: Sequence[Scheme], caption: str) -> Figure:
     """R² above, RMSE of v below; one column a scheme, the car that was learnt on over the other one."""
-    with paper_style():
-        figure = new_figure(DOUBLE_COLUMN, 6.4)
+    with new_figure(DOUBLE_COLUMN, 6.4) as figure:
         axes = figure.subplots(2, len(schemes), squeeze=False)
         for column, scheme in enumerate(schemes):
             for row, (metric, label) in enumerate(METRICS.items()):

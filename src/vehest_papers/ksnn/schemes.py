@@ -41,23 +41,14 @@ def segments_on(model: EvaluatedModel, test: str) -> Segments:
 
 @dataclass(frozen=True, eq=False)
 class Scheme:
-    """One part, and which of its test sets is of which car.
+    """One part, and which of its test sets is of which car."""
 
-    Args:
-        name: of the part.
-        title: for people.
-        part: what was compared.
-        own: test set of the car that is learnt on.
-        other: test set of the car that is stopped on.
-        published: the paper's table of this scheme; empty where it has none.
-    """
-
-    name: str
-    title: str
-    part: PartArtefacts
-    own: str
-    other: str
-    published: Mapping[str, Published] = field(default_factory=dict)
+    name: str  # of the part
+    title: str  # for people
+    part: PartArtefacts  # what was compared
+    own: str  # test set of the car that is learnt on
+    other: str  # test set of the car that is stopped on
+    published: Mapping[str, Published] = field(default_factory=dict)  # the paper's table of this scheme; empty where it has none
 
     @cached_property
     def runs(self) -> pd.DataFrame:
@@ -116,13 +107,13 @@ class Scheme:
         """From one category to another on a test set."""
         return self.errors(test).change(self.name_of(first), self.name_of(second), metric)
 
-    def other_over_own(self, category: str, metric: str = "fvu") -> Change | None:
-        """How many times the figure on the own car is left on the other one."""
-        return self.ratio(self.name_of(category), metric)
+    def other_over_own(self, category: str) -> Change | None:
+        """How many times the FVU on the own car is left on the other one."""
+        return self.ratio(self.name_of(category))
 
-    def ratio(self, name: str, metric: str = "fvu") -> Change | None:
+    def ratio(self, name: str) -> Change | None:
         """The same of any structure."""
-        other, own = (self.errors(test).get(name, metric) for test in (self.other, self.own))
+        other, own = (self.errors(test).get(name, "fvu") for test in (self.other, self.own))
         return Change.of(other, own) if other is not None and own is not None else None
 
     def structures(self, categories: Iterable[str] = (*paper.CATEGORIES,)) -> dict[str, str]:

@@ -15,7 +15,7 @@ from vehest.estimators.base import Estimator
 from vehest.estimators.ksnn import Ksnn
 from vehest.estimators.luenberger import Luenberger
 from vehest.report.document import Block, Column, Figure, Table
-from vehest.report.style import DOUBLE_COLUMN, fixed, legend_above, line_of, listed, new_figure, paper_style, percent_below
+from vehest.report.style import DOUBLE_COLUMN, fixed, legend_above, line_of, listed, new_figure, percent_below
 from vehest_papers.ksnn.linear_system import LocalModels
 from vehest_papers.ksnn.noise_sensitivity import NoiseSensitivity, ksnn_sensitivity, luenberger_sensitivity
 from vehest_papers.ksnn.subjects import Trained
@@ -35,15 +35,10 @@ DASHES = ("solid", "dashed", "dashdot", "dotted")
 
 @dataclass(frozen=True)
 class Injected:
-    """Outcome of injecting white noise into one acceleration of an estimator in a steady turn.
+    """Outcome of injecting white noise into one acceleration of an estimator in a steady turn."""
 
-    Args:
-        gain: standard deviation of what is added to v̂, for noise of one m/s² a sample [m/s].
-        scatter: standard deviation of ``gain`` by chance, relative; successive outputs are correlated.
-    """
-
-    gain: float
-    scatter: float
+    gain: float  # standard deviation of what is added to v̂, for noise of one m/s² a sample [m/s]
+    scatter: float  # standard deviation of ``gain`` by chance, relative; successive outputs are correlated
 
 
 def sensitivity_of(estimator: Estimator, yaw_rate: float, error: float = 0.0) -> NoiseSensitivity:
@@ -69,7 +64,6 @@ def injected(
         yaw_rate: of the turn [rad/s].
         channel: ``ay`` or ``ax``.
         n_samples: length of the turn, of which the first `SETTLING_SAMPLES` do not count.
-        seed: of the noise.
         error: û - u_m at which the closed form, from which the scatter comes, linearises a nonlinear network [m/s].
     """
     constants = {"yaw_rate": yaw_rate, "vx": SPEED, "ay": yaw_rate * SPEED, "ax": 0.0}
@@ -148,8 +142,7 @@ def _table(frame: pd.DataFrame, n_samples: int) -> Table:
 
 def _figure(columns: Sequence[tuple[Trained, Trained]], error: float) -> Figure:
     frequency = np.geomspace(LOWEST_HZ, HIGHEST_HZ, 400)
-    with paper_style():
-        figure = new_figure(DOUBLE_COLUMN, 4.4)
+    with new_figure(DOUBLE_COLUMN, 4.4) as figure:
         grid = figure.subplots(2, len(columns), sharex=True, sharey="row", squeeze=False)
         for column, pair in zip(grid.T, columns, strict=True):
             for own in pair:

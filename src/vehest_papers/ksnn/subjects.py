@@ -28,19 +28,12 @@ CAR_TITLES = {
 
 @dataclass(frozen=True, eq=False)
 class Trained:
-    """A fitted estimator, and its description for captions.
+    """A fitted estimator, and its description for captions."""
 
-    Args:
-        estimator: fitted.
-        title: its structure, for people.
-        trained_on: data that it learned from, with real or simulated, for example ``Corvette C-1, simulated``.
-        seed: of its training; none where nothing is random.
-    """
-
-    estimator: Estimator
-    title: str
-    trained_on: str
-    seed: int | None = None
+    estimator: Estimator  # fitted
+    title: str  # its structure, for people
+    trained_on: str  # data that it learned from, with real or simulated, for example ``Corvette C-1, simulated``
+    seed: int | None = None  # of its training; none where nothing is random
 
     @classmethod
     def of(cls, model: EvaluatedModel, trained_on: str) -> Trained:

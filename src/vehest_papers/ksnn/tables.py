@@ -52,9 +52,6 @@ def across_cars(schemes: Sequence[Scheme], name: str, caption: str, without: Seq
     """Tables IV and V and Figure 6 in one: of each category the structure that validation chooses, over all its seeds, with 95 % intervals.
 
     Args:
-        schemes: comparisons.
-        name: of the file.
-        caption: of the table.
         without: categories that are left out.
     """
     rows = []
@@ -130,7 +127,7 @@ def small_cars(pairs: Sequence[Scheme]) -> Table:
     )
 
 
-def sideslip(schemes: pd.DataFrame, drive: pd.DataFrame | None, whole: pd.DataFrame | None, kind: str, name: str = "table_6") -> Table:
+def sideslip(schemes: pd.DataFrame, drive: pd.DataFrame | None, whole: pd.DataFrame | None, kind: str) -> Table:
     """Table VI: RMSE of the sideslip angle.
 
     Args:
@@ -138,7 +135,6 @@ def sideslip(schemes: pd.DataFrame, drive: pd.DataFrame | None, whole: pd.DataFr
         drive: runs of one drive of the real Ferrari, its test range ``test``.
         whole: runs on the whole drive of the real Ferrari, of estimators that learn nothing.
         kind: of the data of scheme 2, ``real`` or ``simulated``.
-        name: of the file.
     """
     rows = []
     lags = [name for name in dict.fromkeys(whole["category"]) if name.startswith(paper.FIXED_LAG)] if whole is not None else []
@@ -161,7 +157,7 @@ def sideslip(schemes: pd.DataFrame, drive: pd.DataFrame | None, whole: pd.DataFr
         "file the filter's noise levels are read off that file, and the graph is one batch. They need a car's parameters and were not run "
         "in scheme 2: no entry there."
     )
-    return Table(name, caption, pd.DataFrame(rows), columns)
+    return Table("table_6", caption, pd.DataFrame(rows), columns)
 
 
 def regularisation(with_it: pd.DataFrame, without: pd.DataFrame) -> Table:

@@ -54,7 +54,6 @@ def additions(name: str, part: PartArtefacts, beside: Mapping[str, PartArtefacts
         part: the main one.
         beside: parts of the same data, by name.
         errors: test set -> losses of the main part.
-        kind: real or simulated.
     """
     own, groups = Additions(), models_by_candidate(part)
     main = {title: Subject.of(part, title, errors=errors) for title in groups}

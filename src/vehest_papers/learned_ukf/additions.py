@@ -31,21 +31,13 @@ from vehest_papers.learned_ukf.errors import Losses
 
 @dataclass(frozen=True, eq=False)
 class Subject:
-    """One candidate of one part.
+    """One candidate of one part."""
 
-    Args:
-        title: in the report.
-        part: it belongs to.
-        models: its seeds, in order.
-        errors: test set -> losses of the part.
-        candidate: what the part calls it.
-    """
-
-    title: str
-    part: PartArtefacts
-    models: Sequence[EvaluatedModel]
-    errors: Mapping[str, Losses]
-    candidate: str
+    title: str  # in the report
+    part: PartArtefacts  # it belongs to
+    models: Sequence[EvaluatedModel]  # its seeds, in order
+    errors: Mapping[str, Losses]  # test set -> losses of the part
+    candidate: str  # what the part calls it
 
     @classmethod
     def of(cls, part: PartArtefacts, candidate: str, title: str = "", errors: Mapping[str, Losses] | None = None) -> Subject:
@@ -71,23 +63,14 @@ class Subject:
 
 @dataclass(frozen=True)
 class Comparison:
-    """One candidate against another.
+    """One candidate against another."""
 
-    Args:
-        lower: the one that is claimed to have the lower error.
-        higher: the other one.
-        claim: in a few words; empty where the paper claims nothing, and only the difference is shown.
-        paper: its words or figures.
-        tests: on which.
-        shared: whether seeds of one number share initial weights and pre-training, so that they are compared seed by seed.
-    """
-
-    lower: Subject
-    higher: Subject
-    claim: str = ""
-    paper: str = ""
-    tests: Sequence[str] = tuple(SETS)
-    shared: bool = True
+    lower: Subject  # the one that is claimed to have the lower error
+    higher: Subject  # the other one
+    claim: str = ""  # in a few words; empty where the paper claims nothing, and only the difference is shown
+    paper: str = ""  # its words or figures
+    tests: Sequence[str] = tuple(SETS)  # on which
+    shared: bool = True  # whether seeds of one number share initial weights and pre-training, so that they are compared seed by seed
 
     def difference(self, test: str) -> Interval:
         """Of the weighted MSE on a test."""
@@ -147,7 +130,6 @@ def minima_claim(scratch: Subject, trained: Subject, data: str, share: float) ->
     Args:
         scratch: those that ended.
         trained: with pre-training.
-        data: real or simulated.
         share: samples learnt from, of those of the pre-trained; below 1 a minimum cannot be distinguished from a training that is not over.
     """
     limit = float(trained.validation().max())

@@ -151,7 +151,6 @@ def instability_claims(lost: Mapping[str, Sequence[tuple[int, int]]], data: str)
 
     Args:
         lost: method -> of each seed, sequences that lose definiteness without repair, and all.
-        data: real or simulated.
     """
     claims = []
     for method, seeds in lost.items():
@@ -168,10 +167,7 @@ def states_claim(claim: str, words: str, expected: Mapping[str, tuple[Interval, 
     """About several states of Figure 5.
 
     Args:
-        claim: in a few words.
-        words: the paper's.
         expected: state -> difference of mean squares NNTF_U - NNTF, the error of NNTF, and whether the paper has it lower.
-        data: test.
     """
     verdicts, shown = [], []
     for state, (own, before, lower) in expected.items():

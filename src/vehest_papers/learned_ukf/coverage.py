@@ -20,9 +20,6 @@ def coverage_table(trained: Mapping[str, tuple[PartArtefacts, list[EvaluatedMode
 
     Args:
         trained: words for a training -> its part and the candidate's seeds.
-        candidate: that is compared.
-        name: of the file.
-        data: real or simulated.
     """
     rows: list[dict[str, object]] = []
     for test, tyre in SETS.items():

@@ -20,7 +20,7 @@ from vehest_papers.learned_ukf.ablations import CURVATURE, DIAGONAL, LENGTH, SCR
 from vehest_papers.learned_ukf.appendix import appendix_of_part, how_it_was_made, minutes
 from vehest_papers.learned_ukf.candidates import SETS, chosen, losses, models_by_candidate, runs_of
 from vehest_papers.learned_ukf.errors import Losses
-from vehest_papers.learned_ukf.filtering import definiteness, drives_of, filtered, loaded
+from vehest_papers.learned_ukf.filtering import drives_of, filtered, loaded, lost_sequences
 from vehest_papers.learned_ukf.oracle import EPOCHS, train_on
 
 MAIN = ("real", "simulated")
@@ -228,8 +228,7 @@ def _instability(own: Outcome, part: PartArtefacts, kind: str) -> None:
     for method, models in groups.items():
         filters = [loaded(model) for model in models]
         drives = drives_of(part, filters[0], "tyre_d")
-        counted = [definiteness(estimator, drives) for estimator in filters]
-        lost[method] = [(one.lost, one.sequences) for one in counted]
+        lost[method] = [lost_sequences(estimator, drives) for estimator in filters]
     own.claims += claims.instability_claims(lost, kind)
 
 
@@ -257,8 +256,8 @@ def _prediction(own: Outcome, name: str, part: PartArtefacts, where: str, kind: 
     data |= {f"figure_5_{name}": states, f"figure_6_{name}": swaps}
     own.appendix += [
         "## Appendix: what learning through the filter changes",
-        prediction.figure_5(states, name, where)[0],
-        prediction.figure_6(swaps, name, where)[0],
+        prediction.figure_5(states, name, where),
+        prediction.figure_6(swaps, name, where),
     ]
     for test, tyre in SETS.items():
         on = f"{kind}, {tyre}"

@@ -21,19 +21,12 @@ SAME_WEIGHTS = {paper.NNTF_UH, paper.NNTF_UH_LOW}
 
 @dataclass(frozen=True)
 class Losses:
-    """What the methods lose on a test, sample by sample.
+    """What the methods lose on a test, sample by sample."""
 
-    Args:
-        squared: method -> weighted squared error of each seed at each scored sample, (S, K).
-        absolute: method -> weighted absolute error, (S, K).
-        sequence: of each sample, (K,).
-        rate_hz: of the samples.
-    """
-
-    squared: dict[str, FloatArray]
-    absolute: dict[str, FloatArray]
-    sequence: NDArray[np.int64]
-    rate_hz: float
+    squared: dict[str, FloatArray]  # method -> weighted squared error of each seed at each scored sample, (S, K)
+    absolute: dict[str, FloatArray]  # method -> weighted absolute error, (S, K)
+    sequence: NDArray[np.int64]  # of each sample, (K,)
+    rate_hz: float  # of the samples
 
     def add(self, method: str, errors: FloatArray) -> None:
         """Take in one more method of one seed: its errors of vx, vy and yaw rate, (K, 3)."""

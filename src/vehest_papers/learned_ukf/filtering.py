@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -22,23 +21,6 @@ from vehest.vehicle.dynamics import STATES
 
 MOVING = STATES[:4]
 """States that are measured or referenced: all but the friction."""
-
-
-@dataclass(frozen=True)
-class Definiteness:
-    """What became of covariances on a test set.
-
-    Args:
-        sequences: how many there are.
-        lost: of them without repair, those that lose definiteness.
-        lost_steps: with repair, steps that needed one.
-        steps: all steps of all sequences.
-    """
-
-    sequences: int
-    lost: int
-    lost_steps: int
-    steps: int
 
 
 class Swapped(PointModel):
@@ -116,7 +98,6 @@ def filtered(
 
     Args:
         estimator: its noise is used, and its models unless another is given.
-        drives: from `drives_of`.
         model: that moves and observes points instead.
         repair: whether covariances that lose definiteness are repaired; otherwise their sequences become NaN.
         friction: that the filter starts from; none: as its settings say.
@@ -138,12 +119,10 @@ def filtered(
         own.repair = kept
 
 
-def definiteness(estimator: LearnedUkf, drives: Drive) -> Definiteness:
-    """Filter with and without repair, and count."""
-    repaired = filtered(estimator, drives).repaired
+def lost_sequences(estimator: LearnedUkf, drives: Drive) -> tuple[int, int]:
+    """Sequences whose covariances lose definiteness without repair, and all."""
     means = filtered(estimator, drives, repair=False).steps.filtered.mean
-    lost = int(torch.isnan(means).flatten(1).any(1).sum())
-    return Definiteness(len(means), lost, int(repaired.sum()), repaired.numel())
+    return int(torch.isnan(means).flatten(1).any(1).sum()), len(means)
 
 
 def swapped(predicting: LearnedUkf, observing: LearnedUkf, drives: Drive) -> NonlinearFiltered:

@@ -14,7 +14,7 @@ from vehest.estimators.learned_ukf import LearnedUkf
 from vehest.evaluation.metrics import Protocol
 from vehest.evaluation.significance import CONFIDENCE, Interval
 from vehest.report.document import Column, Figure, Table
-from vehest.report.style import DOUBLE_COLUMN, MISSING, fixed, legend_above, new_figure, paper_style
+from vehest.report.style import DOUBLE_COLUMN, MISSING, fixed, legend_above, new_figure
 from vehest.training.through_filter import Drive
 from vehest_papers.kit.reading import with_interval
 from vehest_papers.learned_ukf import paper
@@ -34,17 +34,11 @@ N_RESAMPLES = 2000
 
 @dataclass(frozen=True)
 class Tracks:
-    """The friction of all seeds on all sequences of a test.
+    """The friction of all seeds on all sequences of a test."""
 
-    Args:
-        mean: (S, B, T).
-        deviation: the filter's own, (S, B, T).
-        rate_hz: of the samples.
-    """
-
-    mean: FloatArray
-    deviation: FloatArray
-    rate_hz: float
+    mean: FloatArray  # (S, B, T)
+    deviation: FloatArray  # the filter's own, (S, B, T)
+    rate_hz: float  # of the samples
 
     @property
     def final(self) -> FloatArray:
@@ -76,9 +70,9 @@ def tracks_of(filters: Sequence[LearnedUkf], drives: Drive, start: float) -> Tra
     return Tracks(means, np.sqrt(np.maximum(variances, 0.0)), filters[0].settings.rate_hz)
 
 
-def interval_of(values: FloatArray, statistic: Callable[[FloatArray], float], seed: int = 0) -> Interval:
+def interval_of(values: FloatArray, statistic: Callable[[FloatArray], float]) -> Interval:
     """A statistic of values by seed and sequence (S, B), both resampled; Student's t with the degrees of freedom of the sequences."""
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(0)
     seeds, n = values.shape
     drawn = [
         statistic(values[np.ix_(rng.integers(seeds, size=max(seeds - 1, 1)), rng.integers(n, size=n - 1))]) for _ in range(N_RESAMPLES)
@@ -142,8 +136,7 @@ def convergence_table(tracks: Mapping[str, Mapping[float, Tracks]], skip_seconds
 
 def figure(tracks: Mapping[str, Mapping[float, Tracks]], skip_seconds: float, name: str, data: str) -> Figure:
     """Mean over sequences and seeds from each start, with the 95 % interval of that mean."""
-    with paper_style():
-        drawn = new_figure(DOUBLE_COLUMN, 2.8)
+    with new_figure(DOUBLE_COLUMN, 2.8) as drawn:
         grid = drawn.subplots(1, len(tracks), sharey=True, squeeze=False)[0]
         for axes, (test, by_start) in zip(grid, tracks.items(), strict=True):
             for (start, own), colour in zip(by_start.items(), COLOURS, strict=True):

@@ -11,7 +11,7 @@ import pandas as pd
 
 from vehest.data.errors import DataError
 from vehest.report.document import Column, Figure, Table
-from vehest.report.style import DOUBLE_COLUMN, OTHER_COLOURS, legend_above, listed, new_figure, paper_style
+from vehest.report.style import DOUBLE_COLUMN, OTHER_COLOURS, legend_above, listed, new_figure
 from vehest.studies.artefacts import PartArtefacts
 from vehest_papers.kit.claims import Claim
 from vehest_papers.kit.reading import lengths_of, with_interval
@@ -24,21 +24,13 @@ WAYS = {"batch": "constant batch", "samples": "constant samples a batch"}
 
 @dataclass(frozen=True)
 class Length:
-    """Trainings on sequences of one length.
+    """Trainings on sequences of one length."""
 
-    Args:
-        steps: samples of a sequence.
-        batch: sequences in a batch.
-        epochs: through the filter.
-        sequences: that an epoch goes through.
-        subject: the candidate, with its losses.
-    """
-
-    steps: int
-    batch: int
-    epochs: int
-    sequences: int
-    subject: Subject
+    steps: int  # samples of a sequence
+    batch: int  # sequences in a batch
+    epochs: int  # through the filter
+    sequences: int  # that an epoch goes through
+    subject: Subject  # the candidate, with its losses
 
     @property
     def batches(self) -> int:
@@ -47,11 +39,7 @@ class Length:
 
 
 def lengths(parts: Mapping[str, PartArtefacts]) -> list[Length]:
-    """By length, then batch.
-
-    Raises:
-        DataError: a model was not trained through the filter.
-    """
+    """By length, then batch; raises `DataError` where a model was not trained through the filter."""
     found = []
     for name, part in parts.items():
         for model in part.models:
@@ -87,8 +75,7 @@ def figure_7(found: Sequence[Length], data: str) -> tuple[Figure, Table]:
                 row[f"words.{test}"] = with_interval(mse.value, max(mse.low, 0.0), mse.high, 4)
             rows.append(row)
     frame, tests = pd.DataFrame(rows), list(SETS)
-    with paper_style():
-        figure = new_figure(DOUBLE_COLUMN, 2.7)
+    with new_figure(DOUBLE_COLUMN, 2.7) as figure:
         grid = figure.subplots(1, len(tests), squeeze=False)[0]
         for axes, test in zip(grid, tests, strict=True):
             for (_, words), colour, shift in zip(WAYS.items(), OTHER_COLOURS, (0.97, 1.03), strict=False):

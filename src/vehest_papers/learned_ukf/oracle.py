@@ -24,10 +24,7 @@ def train_on(estimator: LearnedUkf, drives: Drive, skip: int, training: ThroughF
     """Train a filter further, in place, on a test's own sequences (B, T, ...), and stop on them too; its friction is free.
 
     Args:
-        estimator: with a trained filter.
-        drives: the sequences.
         skip: first samples of each that are not scored.
-        training: how.
     """
     length = drives.states.shape[1]
     training = replace(training, steps=min(training.steps, length), validation_steps=length, validation_drop_steps=skip)

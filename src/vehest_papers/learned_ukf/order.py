@@ -21,6 +21,7 @@ AS_IN_THE_PAPER, TURNED, UNDECIDED, LEVEL, APART = (
     "level in the paper, not told apart here",
     "level in the paper, told apart here",
 )
+DECIMALS = 4
 
 
 def differences(
@@ -63,17 +64,17 @@ def differences(
     return pd.DataFrame(rows)
 
 
-def pairs_table(pairs: pd.DataFrame, name: str, caption: str, decimals: int = 4) -> Table:
+def pairs_table(pairs: pd.DataFrame, name: str, caption: str) -> Table:
     """Pairs of `differences`, in words."""
     own = pairs.copy()
     for kind, low, high in (("mean", "low", "high"), ("median", "median_low", "median_high")):
         own[f"{kind}_in_words"] = [
-            f"{fixed(row[kind], decimals)} [{fixed(row[low], decimals)}, {fixed(row[high], decimals)}]" for row in own.to_dict("records")
+            f"{fixed(row[kind], DECIMALS)} [{fixed(row[low], DECIMALS)}, {fixed(row[high], DECIMALS)}]" for row in own.to_dict("records")
         ]
     columns = {
         "first": Column("lower in the paper"),
         "second": Column("higher"),
-        "paper": Column("difference, paper", decimals=decimals),
+        "paper": Column("difference, paper", decimals=DECIMALS),
         "mean_in_words": Column("difference of means over seeds [95 % interval]"),
         "median_in_words": Column("of medians over seeds [95 % interval]"),
         "verdict": Column("here"),
@@ -81,17 +82,15 @@ def pairs_table(pairs: pd.DataFrame, name: str, caption: str, decimals: int = 4)
     return Table(name, caption, own.drop(columns="neighbours"), columns)
 
 
-def order_in_words(pairs: pd.DataFrame, medians: Mapping[str, float], where: str, decimals: int = 4) -> str:
+def order_in_words(pairs: pd.DataFrame, medians: Mapping[str, float], where: str) -> str:
     """How many pairs are as in the paper, which are the other way round, and which of its neighbours cannot be told apart.
 
     Args:
-        pairs: from `differences`.
         medians: candidate -> median over seeds of its mean loss, of all that are compared.
         where: on which data, and of what, for people: ``on tyre A``.
-        decimals: of the medians.
     """
     ours = sorted(medians, key=medians.__getitem__)
-    shown = ", ".join(f"{name} ({fixed(medians[name], decimals)})" for name in ours)
+    shown = ", ".join(f"{name} ({fixed(medians[name], DECIMALS)})" for name in ours)
     words = f"Order {where} by the median of seeds, best first: {shown}."
     if pairs.empty:
         return words

@@ -20,17 +20,11 @@ CANDIDATES = (PC, PCR, NN, NN_U, NNT, NNT_U, NNTF, NNTF_U, NNTF_UH, NNTF_UH_LOW,
 
 @dataclass(frozen=True)
 class Published:
-    """A column of Tables I or II.
+    """A column of Tables I or II."""
 
-    Args:
-        mse: mean weighted squared error.
-        mae: mean weighted absolute error.
-        ae99: 99th percentile of the weighted absolute error.
-    """
-
-    mse: float
-    mae: float
-    ae99: float
+    mse: float  # mean weighted squared error
+    mae: float  # mean weighted absolute error
+    ae99: float  # 99th percentile of the weighted absolute error
 
 
 TABLE_I: Mapping[str, Published] = {
@@ -83,6 +77,3 @@ NOMINAL_FRICTION: Mapping[str, float] = {"tyre_a": 0.65, "tyre_d": 0.45}
 
 SLIP_99 = 40.0
 """[deg] what the slip angle of the rear axle exceeds in the paper's whole data set, 99th percentile (Section III-C)."""
-
-SWAP_GAIN = 18.0
-"""[%] by how much the MSE falls where the model that predicts is learnt through the filter (Section IV-D)."""

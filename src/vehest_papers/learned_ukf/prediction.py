@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
@@ -13,8 +12,8 @@ from vehest.constants import FloatArray
 from vehest.estimators.learned_ukf import LearnedUkf
 from vehest.evaluation.metrics import Protocol
 from vehest.evaluation.significance import Interval, difference_of_blocks
-from vehest.report.document import Column, Figure, Table
-from vehest.report.style import DOUBLE_COLUMN, fixed, new_figure, paper_style
+from vehest.report.document import Figure
+from vehest.report.style import DOUBLE_COLUMN, new_figure
 from vehest.training.through_filter import Drive
 from vehest_papers.learned_ukf import paper
 from vehest_papers.learned_ukf.candidates import SETS
@@ -22,7 +21,6 @@ from vehest_papers.learned_ukf.filtering import MOVING, filtered, one_step_squar
 
 BEFORE, AFTER = paper.NNTF, paper.NNTF_U
 PLAIN_BLUE, THROUGH_RED = "#0b4f9c", "#b3122a"
-UNITS = {"vx": "(m/s)²", "vy": "(m/s)²", "yaw_rate": "(rad/s)²", "rim_speed": "(m/s)²"}
 TASKS = {"one_step": "one-step prediction", "estimation": "estimation"}
 
 Pair = tuple[LearnedUkf, LearnedUkf]
@@ -31,17 +29,11 @@ Pair = tuple[LearnedUkf, LearnedUkf]
 
 @dataclass(frozen=True)
 class Compared:
-    """NNTF and NNTF_U on a test set.
+    """NNTF and NNTF_U on a test set."""
 
-    Args:
-        one_step: of both, mean squared errors as predictors by seed, sequence and state, (2, S, B, 4).
-        estimation: the same of their filters.
-        swaps: (which predicts, which observes) -> weighted MSE by seed and sequence, (S, B); 0 is NNTF.
-    """
-
-    one_step: FloatArray
-    estimation: FloatArray
-    swaps: Mapping[tuple[int, int], FloatArray]
+    one_step: FloatArray  # of both, mean squared errors as predictors by seed, sequence and state, (2, S, B, 4)
+    estimation: FloatArray  # the same of their filters
+    swaps: Mapping[tuple[int, int], FloatArray]  # (which predicts, which observes) -> weighted MSE by seed and sequence, (S, B); 0 is NNTF
 
     def states(self, task: str, lower: Mapping[str, bool]) -> dict[str, tuple[Interval, float, bool]]:
         """State -> difference NNTF_U - NNTF of mean squares, the error of NNTF, and whether the paper has it lower."""
@@ -62,8 +54,6 @@ def compared(pairs: Mapping[int, Pair], drives: Mapping[str, Drive], protocol: P
     """Losses of both models as predictors and in their filters, and of all four filters that can be put together of them.
 
     Args:
-        pairs: seed -> NNTF and NNTF_U.
-        drives: test set -> its sequences.
         protocol: how much of each sequence is not scored.
     """
     skip = round(protocol.skip_seconds * protocol.rate_hz)
@@ -104,11 +94,10 @@ def frames(found: Mapping[str, Compared], seeds: Sequence[int]) -> tuple[pd.Data
     return pd.DataFrame(states), pd.DataFrame(swaps)
 
 
-def figure_5(states: pd.DataFrame, name: str, data: str) -> tuple[Figure, Table, str]:
+def figure_5(states: pd.DataFrame, name: str, data: str) -> Figure:
     """By how much learning through the filter lowers each state's error, as a predictor and as an estimator."""
     tests = list(dict.fromkeys(states["test_set"]))
-    with paper_style():
-        figure = new_figure(DOUBLE_COLUMN, 2.7)
+    with new_figure(DOUBLE_COLUMN, 2.7) as figure:
         grid = figure.subplots(1, len(tests), sharey=True, squeeze=False)[0]
         for axes, test in zip(grid, tests, strict=True):
             for offset, (task, label), colour in zip((-0.2, 0.2), TASKS.items(), (PLAIN_BLUE, THROUGH_RED), strict=True):
@@ -134,46 +123,14 @@ def figure_5(states: pd.DataFrame, name: str, data: str) -> tuple[Figure, Table,
         f"−100 %, the axis is logarithmic beyond. The paper draws differences; here they are divided by the error of {BEFORE}. "
         f"Data: {data}."
     )
-    rows = []
-    for test, state in itertools.product(tests, MOVING):
-        own = states[(states["test_set"] == test) & (states["state"] == state)]
-        row: dict[str, object] = {"test": SETS[test], "state": state, "unit": UNITS[state]}
-        for task in TASKS:
-            part = own[own["task"] == task]
-            row |= {f"{task}_{column}": float(part[column].median()) for column in ("before", "after", "decrease")}
-        rows.append(row)
-    columns = {"test": Column("test"), "state": Column("state"), "unit": Column("unit of MSE")}
-    for task, label in TASKS.items():
-        columns |= {f"{task}_before": Column(f"{label}, {BEFORE}", each=True), f"{task}_after": Column(f"{label}, {AFTER}", each=True)}
-        columns |= {f"{task}_decrease": Column("decrease [%]", decimals=1)}
-    table = Table(f"one_step_{name}", "Mean squared errors behind the figure, medians of seeds.", pd.DataFrame(rows), columns)
-    return Figure(f"figure_5_{name}", caption, figure), table, _figure_5_in_words(states, tests)
+    return Figure(f"figure_5_{name}", caption, figure)
 
 
-def _figure_5_in_words(states: pd.DataFrame, tests: Sequence[str]) -> str:
-    sentences = [
-        "The paper: as a predictor a little better for vx, as before for vy, worse for the others; as an estimator better for all."
-    ]
-    for test in tests:
-        own = states[states["test_set"] == test]
-        lower = {
-            task: [state for state in MOVING if own[(own["task"] == task) & (own["state"] == state)]["decrease"].median() > 0]
-            for task in TASKS
-        }
-        listed = [
-            f"as {'a predictor' if task == 'one_step' else 'an estimator'} lower errors for {_names(names)}"
-            for task, names in lower.items()
-        ]
-        sentences.append(f"Here, on {SETS[test]}: {'; '.join(listed)} (medians of seeds).")
-    return " ".join(sentences)
-
-
-def figure_6(swaps: pd.DataFrame, name: str, data: str) -> tuple[Figure, Table, str]:
+def figure_6(swaps: pd.DataFrame, name: str, data: str) -> Figure:
     """MSE of the four filters that can be put together of two models."""
     tests = list(dict.fromkeys(swaps["test_set"]))
     combinations = [(a, b) for a in (BEFORE, AFTER) for b in (BEFORE, AFTER)]
-    with paper_style():
-        figure = new_figure(DOUBLE_COLUMN, 2.8)
+    with new_figure(DOUBLE_COLUMN, 2.8) as figure:
         grid = figure.subplots(1, len(tests), squeeze=False)[0]
         for axes, test in zip(grid, tests, strict=True):
             for place, (predicts, observes) in enumerate(combinations):
@@ -193,37 +150,12 @@ def figure_6(swaps: pd.DataFrame, name: str, data: str) -> tuple[Figure, Table, 
         f"prediction step; hatching, that of the observation; blue {BEFORE}, red {AFTER}, of one seed each. Noise is that of the "
         f"filter whose model predicts. Bars: median of seeds, dots: seeds. Data: {data}."
     )
-    rows, sentences = [], [f"The paper: {AFTER} in the prediction step makes the MSE {paper.SWAP_GAIN:g} % lower."]
-    for test in tests:
-        middle = {pair: float(np.median(_of(swaps, test, *pair))) for pair in combinations}
-        rows += [{"test": SETS[test], "predicts": a, "observes": b, "mse": middle[a, b]} for a, b in combinations]
-        predicting = 100.0 * (1.0 - middle[AFTER, BEFORE] / middle[BEFORE, BEFORE])
-        observing = 100.0 * (1.0 - middle[BEFORE, AFTER] / middle[BEFORE, BEFORE])
-        sentences.append(
-            f"Here, on {SETS[test]}, against {BEFORE} in both: {AFTER} in the prediction step alone {_change(predicting)}, in the "
-            f"observation alone {_change(observing)}."
-        )
-    columns = {
-        "test": Column("test"),
-        "predicts": Column("predicts"),
-        "observes": Column("observes"),
-        "mse": Column("MSE (weighted)", decimals=4),
-    }
-    table = Table(f"swap_{name}", "The four filters, medians of seeds.", pd.DataFrame(rows), columns)
-    return Figure(f"figure_6_{name}", caption, figure), table, " ".join(sentences)
+    return Figure(f"figure_6_{name}", caption, figure)
 
 
 def _of(swaps: pd.DataFrame, test: str, predicts: str, observes: str) -> np.ndarray[tuple[int], np.dtype[np.float64]]:
     own = swaps[(swaps["test_set"] == test) & (swaps["predicts"] == predicts) & (swaps["observes"] == observes)]
     return own["mse"].to_numpy(dtype=np.float64)
-
-
-def _change(decrease: float) -> str:
-    return f"{fixed(abs(decrease), 0)} % {'lower' if decrease >= 0 else 'higher'}"
-
-
-def _names(names: Sequence[str]) -> str:
-    return ", ".join(name.replace("_", " ") for name in names) or "none"
 
 
 def _ticks(values: np.ndarray[tuple[int], np.dtype[np.float64]]) -> list[float]:

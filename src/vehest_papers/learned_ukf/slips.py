@@ -10,7 +10,7 @@ import pandas as pd
 from vehest.constants import FloatArray
 from vehest.data.recording import Recording
 from vehest.report.document import Column, Figure, Table
-from vehest.report.style import DOUBLE_COLUMN, OTHER_COLOURS, legend_above, new_figure, paper_style
+from vehest.report.style import DOUBLE_COLUMN, OTHER_COLOURS, legend_above, new_figure
 from vehest_papers.learned_ukf import paper
 
 LEAST_SPEED = 0.5  # [m/s] below which a slip angle is noise
@@ -42,13 +42,11 @@ def distribution(slips: Mapping[str, FloatArray], name: str, data: str, note: st
     Args:
         slips: set, for people -> slip angles [deg].
         name: of the files, ``slip_NAME``.
-        data: real or simulated, and what.
         note: sentence for the caption, such as where l_r is from.
     """
     edges = np.arange(-LIMIT, LIMIT + WIDTH, WIDTH)
     drawn = pd.DataFrame({"from_deg": edges[:-1], "to_deg": edges[1:]})
-    with paper_style():
-        figure = new_figure(DOUBLE_COLUMN * 0.8, 2.9)
+    with new_figure(DOUBLE_COLUMN * 0.8, 2.9) as figure:
         axes = figure.add_subplot()
         for (label, values), colour, dash in zip(slips.items(), OTHER_COLOURS, ("solid", "dashed", "dashdot"), strict=False):
             counts, _ = np.histogram(np.clip(values, -LIMIT, LIMIT), edges)

@@ -1,4 +1,4 @@
-"""Tables I and II of the paper beside ours, errors by state, consistency, definiteness and budget."""
+"""Tables I and II of the paper beside ours, errors by state, consistency and budget."""
 
 from __future__ import annotations
 
@@ -10,13 +10,12 @@ import pandas as pd
 
 from vehest.evaluation.consistency import COVERAGE
 from vehest.report.document import Column, Table
-from vehest.report.style import MISSING, fixed
+from vehest.report.style import fixed
 from vehest.studies.artefacts import PartArtefacts
 from vehest_papers.kit.reading import median_and_range, with_interval
 from vehest_papers.learned_ukf import paper
 from vehest_papers.learned_ukf.candidates import SETS, models_by_candidate, of_candidate
 from vehest_papers.learned_ukf.errors import Losses
-from vehest_papers.learned_ukf.filtering import Definiteness
 from vehest_papers.learned_ukf.paper import Published
 
 METRICS = {"mse": ("mse_weighted", "MSE (weighted)"), "mae": ("mae_weighted", "MAE"), "ae99": ("ae99_weighted", "99%-AE")}
@@ -26,14 +25,7 @@ STATES = {"vx": "m/s", "vy": "m/s", "yaw_rate": "rad/s"}
 
 
 def accuracy(errors: Losses, test: str, name: str, caption: str) -> Table:
-    """Table I or II: the paper's figures and ours, means over seeds with 95 % intervals over sequences and seeds.
-
-    Args:
-        errors: of all methods on the test.
-        test: test set.
-        name: of the file.
-        caption: of the table.
-    """
+    """Table I or II: the paper's figures and ours, means over seeds with 95 % intervals over sequences and seeds."""
     published = paper.TABLES[test]
     rows = []
     for candidate, squared in errors.squared.items():
@@ -122,38 +114,6 @@ def consistency(runs: pd.DataFrame, tests: Sequence[str], name: str, caption: st
 _CONSISTENT = {"nees": 1.0, "nis": 1.0, "coverage_1sigma": COVERAGE[1], "coverage_2sigma": COVERAGE[2]}
 _HEADERS = {"nees": "NEES", "nis": "NIS", "coverage_1sigma": "within 1σ", "coverage_2sigma": "within 2σ"}
 _DECIMALS = {"nees": 2, "nis": 2, "coverage_1sigma": 3, "coverage_2sigma": 3}
-
-
-def definiteness(
-    counted: Mapping[tuple[str, str], Sequence[Definiteness]], runs: pd.DataFrame, tests: Sequence[str], name: str, caption: str
-) -> Table:
-    """Sequences that lose definiteness without repair, and steps that are repaired.
-
-    Args:
-        counted: (candidate, test set) -> one a seed.
-        runs: from `candidates.runs_of`.
-        tests: test sets.
-        name: of the file.
-        caption: of the table.
-    """
-    rows = []
-    for candidate in dict.fromkeys(candidate for candidate, _ in counted):
-        row: dict[str, object] = {"candidate": candidate, "n_seeds": len(counted[candidate, tests[0]])}
-        for test in tests:
-            own = counted[candidate, test]
-            row[f"paper_{test}"] = "became unstable" if test == "tyre_d" and candidate in (paper.NNT, paper.NNT_U) else MISSING
-            row |= {f"lost_{test}": sum(one.lost for one in own), f"sequences_{test}": sum(one.sequences for one in own)}
-            row |= {f"lost_steps_{test}": sum(one.lost_steps for one in own), f"steps_{test}": sum(one.steps for one in own)}
-            row[f"shown_lost_{test}"] = f"{row[f'lost_{test}']} of {row[f'sequences_{test}']}"
-            row[f"shown_steps_{test}"] = f"{row[f'lost_steps_{test}']} of {row[f'steps_{test}']}"
-            row[f"mse_{test}"] = median_and_range(of_candidate(runs, candidate, f"mse_weighted.{test}"), 4)
-        rows.append(row)
-    columns = {"candidate": Column("method"), "paper_tyre_d": Column("paper, its unseen tyre")}
-    for test in tests:
-        columns[f"shown_lost_{test}"] = Column(f"sequences lost unrepaired, {SETS[test]}")
-        columns[f"shown_steps_{test}"] = Column(f"steps repaired, {SETS[test]}")
-        columns[f"mse_{test}"] = Column(f"MSE (weighted) repaired, {SETS[test]}")
-    return Table(name, caption, pd.DataFrame(rows), columns)
 
 
 def budget(part: PartArtefacts, runs: pd.DataFrame, name: str, caption: str) -> Table:

@@ -25,7 +25,6 @@ from vehest.report.style import (
     fixed,
     legend_above,
     new_figure,
-    paper_style,
 )
 from vehest.studies.artefacts import EvaluatedModel, PartArtefacts
 from vehest_papers.learned_ukf import paper
@@ -43,11 +42,7 @@ AXES = {"vx": "$v_x$ [m/s]", "vy": "$v_y$ [m/s]", "yaw_rate": "yaw rate [rad/s]"
 
 
 def hardest(errors: Sequence[Sequence[FloatArray]]) -> int:
-    """The sequence on which the models together err most.
-
-    Args:
-        errors: of each model its losses, sequence by sequence.
-    """
+    """The sequence on which the models together err most; ``errors``: of each model its losses, sequence by sequence."""
     return int(np.argmax([sum(float(own[position].mean()) for own in errors) for position in range(len(errors[0]))]))
 
 
@@ -55,13 +50,6 @@ def hard_sequence(
     part: PartArtefacts, models: Mapping[str, EvaluatedModel], test: str, name: str, data: str
 ) -> tuple[Figure, pd.DataFrame]:
     """Reference and estimates over the sequence on which the shown models together err most.
-
-    Args:
-        part: of the study.
-        models: candidate -> the seed that validation chooses.
-        test: test set.
-        name: of the file, ``figure_4_NAME``.
-        data: real or simulated, and what.
 
     Returns:
         The figure and its values.
@@ -97,8 +85,7 @@ def _values(reference: Recording, estimates: Mapping[str, Estimate], time: Float
 
 
 def _drawn(values: pd.DataFrame, candidates: Mapping[str, Estimate], skip_seconds: float, test: str) -> MatplotlibFigure:
-    with paper_style():
-        figure = new_figure(DOUBLE_COLUMN, 6.2)
+    with new_figure(DOUBLE_COLUMN, 6.2) as figure:
         grid = figure.subplots(4, 1, sharex=True)
         time = values["time_s"].to_numpy()
         for axes, (state, label) in zip(grid, AXES.items(), strict=False):

@@ -22,12 +22,7 @@ def step_size(model: EvaluatedModel) -> float:
 
 
 def trials_table(parts: Mapping[str, PartArtefacts], used: Mapping[str, float]) -> tuple[Table, list[str]]:
-    """A row a trial, and the candidates whose tables do not use what validation chose.
-
-    Args:
-        parts: of the trials.
-        used: candidate -> step size of the tables.
-    """
+    """A row a trial, and the candidates whose tables do not use what validation chose; ``used``: candidate -> step size of the tables."""
     rows = []
     for part in parts.values():
         values = metric_values(part)

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from vehest.constants import FloatArray
 from vehest.data.recording import Recording
 from vehest.report.figures import decimated
-from vehest.report.style import DOUBLE_COLUMN, LINEAR_BLUES, NONLINEAR_ORANGES, OTHER_COLOURS, new_figure, paper_style
+from vehest.report.style import DOUBLE_COLUMN, LINEAR_BLUES, NONLINEAR_ORANGES, OTHER_COLOURS, new_figure
 from vehest_papers.proving_ground import noise
 from vehest_papers.proving_ground.handling import ANGLE_EDGES, AY_EDGES
 from vehest_papers.proving_ground.noise_reading import NOISE_ABOVE
@@ -40,17 +40,11 @@ QUANTITIES = {
 
 @dataclass(frozen=True, eq=False)
 class Distribution:
-    """Counts in bins.
+    """Counts in bins."""
 
-    Args:
-        kind: ``real`` or ``simulated``.
-        edges: (B + 1,).
-        counts: (B,).
-    """
-
-    kind: str
-    edges: FloatArray
-    counts: NDArray[np.int64]
+    kind: str  # ``real`` or ``simulated``
+    edges: FloatArray  # (B + 1,)
+    counts: NDArray[np.int64]  # (B,)
 
 
 def shown_stretches(stretches: Mapping[str, Stretch]) -> list[Stretch]:
@@ -64,8 +58,7 @@ def traces(stretches: Sequence[Stretch]) -> MatplotlibFigure:
     """Speed, steering, yaw rate, lateral acceleration and sideslip, stretches side by side on one time axis with gaps between them."""
     shown = {name: QUANTITIES[name] for name in QUANTITIES if name in stretches[0].channels}
     total = sum(float(trace.time[-1] - trace.time[0]) for trace in stretches)
-    with paper_style():
-        figure = new_figure(DOUBLE_COLUMN, 0.6 + 0.85 * len(shown))
+    with new_figure(DOUBLE_COLUMN, 0.6 + 0.85 * len(shown)) as figure:
         rows = figure.subplots(len(shown), 1, sharex=True)
         offset = 0.0
         for trace in stretches:
@@ -103,8 +96,7 @@ def handling(page: VehiclePage) -> MatplotlibFigure:
     assert page.handling is not None
     edges, counts, curves = (AY_EDGES, ANGLE_EDGES), page.handling.everything, page.characteristics
     sources = {"simulated": page.handling, **({"real": page.real_handling} if page.real_handling is not None else {})}
-    with paper_style():
-        figure = new_figure(DOUBLE_COLUMN, 3.6)
+    with new_figure(DOUBLE_COLUMN, 3.6) as figure:
         axes = figure.add_subplot()
         greys = LinearSegmentedColormap.from_list("greys", ["#ececec", "#7d7d7d"], N=GREYS)
         shown = np.ma.masked_equal(counts.T, 0)
@@ -151,8 +143,7 @@ def distributions(page: VehiclePage, profile: Profile) -> MatplotlibFigure:
 
     kinds = [*(["simulated"] if page.simulated else []), *(["real"] if page.real else [])]
     sideslip, ay = ([Distribution(kind, *page.merged(kind).histogram(name, 1.0)) for kind in kinds] for name in ("sideslip", "ay"))
-    with paper_style():
-        figure = new_figure(DOUBLE_COLUMN, 2.7)
+    with new_figure(DOUBLE_COLUMN, 2.7) as figure:
         left, right = figure.subplots(1, 2, sharey=True)
         lowest = 1.0
         for axes, counted, limit in ((left, sideslip, profile.sideslip_limit), (right, ay, profile.ay_limit)):
@@ -189,8 +180,7 @@ def noise_spectra(samples: Mapping[str, Recording]) -> MatplotlibFigure:
     """Amplitude densities, one panel a channel."""
     spectra = noise.spectra(samples)
     columns = 3
-    with paper_style():
-        figure = new_figure(DOUBLE_COLUMN, 0.4 + 1.75 * -(-len(spectra) // columns))
+    with new_figure(DOUBLE_COLUMN, 0.4 + 1.75 * -(-len(spectra) // columns)) as figure:
         grid = figure.subplots(-(-len(spectra) // columns), columns, sharex=True, squeeze=False)
         for axes, (quantity, own) in zip(grid.flat, spectra.items(), strict=False):
             for spectrum in own:

@@ -17,7 +17,7 @@ from vehest.data.recording import Recording
 from vehest.data.transforms import Resample
 from vehest.estimators.static_map import StaticMap
 from vehest.report.document import Block, Column, Figure, Table
-from vehest.report.style import DOUBLE_COLUMN, fixed, legend_above, new_figure, paper_style
+from vehest.report.style import DOUBLE_COLUMN, fixed, legend_above, new_figure
 from vehest.studies.artefacts import StoredDataset
 from vehest_papers.kit.spectra import SEGMENT_SECONDS, decibels, mean_bias
 from vehest_papers.ksnn.data_quality import PUBLISHED, PUBLISHED_BIAS, Statistics, spectra_of, statistics
@@ -57,22 +57,14 @@ QUANTITIES = {
 
 @dataclass(frozen=True)
 class Gate:
-    """One quantity of one set of drives, and the range that it must lie in.
+    """One quantity of one set of drives, and the range that it must lie in."""
 
-    Args:
-        of: set or car.
-        quantity: in words, with its unit.
-        wanted: what the paper or the real recording has, in words.
-        low, high: the range, both ends included.
-        values: data set -> what it has; a data set without these drives is left out.
-    """
-
-    of: str
-    quantity: str
-    wanted: str
-    low: float
-    high: float
-    values: Mapping[str, float]
+    of: str  # set or car
+    quantity: str  # in words, with its unit
+    wanted: str  # what the paper or the real recording has, in words
+    low: float  # of the range, included
+    high: float  # likewise
+    values: Mapping[str, float]  # data set -> what it has; a data set without these drives is left out
 
     def met(self, dataset: str) -> bool:
         """Whether a data set's value lies in the range."""
@@ -294,8 +286,7 @@ def _figure(drives: Mapping[str, Mapping[str, Sequence[Recording]]], real: Seque
             own = _by_car(drives.get(name, {})).get(letter)
             if own:
                 panels.append((f"{car}, {when}", own))
-    with paper_style():
-        figure = new_figure(DOUBLE_COLUMN, 1.9 * ((len(panels) + 1) // 2) + 0.5)
+    with new_figure(DOUBLE_COLUMN, 1.9 * ((len(panels) + 1) // 2) + 0.5) as figure:
         grid = figure.subplots((len(panels) + 1) // 2, 2, sharex=True, sharey=True, squeeze=False)
         for axes in grid.flat[len(panels) :]:
             axes.set_visible(False)

@@ -68,21 +68,13 @@ class HandlingPoints:
 
 @dataclass(frozen=True, eq=False)
 class Characteristic:
-    """What the plant does in a slow ramp of the steering at constant speed, and what a linear single track would do.
+    """What the plant does in a slow ramp of the steering at constant speed, and what a linear single track would do."""
 
-    Args:
-        label: which car on which road.
-        speed: of the ramp [m/s].
-        ay: centripetal acceleration, from the right to the left limit (M,) [m/s²].
-        angle: understeer angle there (M,) [deg].
-        gradient: of the linear single track with the tyres' cornering stiffness at static load [deg/(m/s²)].
-    """
-
-    label: str
-    speed: float
-    ay: FloatArray
-    angle: FloatArray
-    gradient: float
+    label: str  # which car on which road
+    speed: float  # of the ramp [m/s]
+    ay: FloatArray  # centripetal acceleration, from the right to the left limit (M,) [m/s²]
+    angle: FloatArray  # understeer angle there (M,) [deg]
+    gradient: float  # of the linear single track with the tyres' cornering stiffness at static load [deg/(m/s²)]
 
 
 def vehicle_of(provenance: Mapping[str, Any], name: str) -> Vehicle:
@@ -100,7 +92,6 @@ def characteristic(vehicle: Vehicle, friction: float, label: str) -> Characteris
     """Ramps to either side up to the largest lateral acceleration.
 
     Args:
-        vehicle: the car.
         friction: scale of the tyres' friction.
         label: for the figure.
     """

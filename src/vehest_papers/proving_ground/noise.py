@@ -43,17 +43,11 @@ LEVELS = {
 
 @dataclass(frozen=True, eq=False)
 class Spectrum:
-    """Amplitude density of a channel.
+    """Amplitude density of a channel."""
 
-    Args:
-        kind: ``real`` or ``simulated``.
-        frequency: (F,) [Hz].
-        density: (F,) [unit/√Hz].
-    """
-
-    kind: str
-    frequency: FloatArray
-    density: FloatArray
+    kind: str  # ``real`` or ``simulated``
+    frequency: FloatArray  # (F,) [Hz]
+    density: FloatArray  # (F,) [unit/√Hz]
 
 
 def spectra(samples: Mapping[str, Recording]) -> dict[str, list[Spectrum]]:

@@ -28,19 +28,12 @@ WELCH_SECONDS = 20.0
 
 @dataclass(frozen=True)
 class SlowError:
-    """What a kinematic residual is made of below ``SLOW_BELOW``.
+    """What a kinematic residual is made of below ``SLOW_BELOW``."""
 
-    Args:
-        mean: of the whole residual.
-        slopes: of the residual over each explaining signal, by least squares.
-        std: of what the explaining signals and white noise leave.
-        time: after which the autocorrelation of that has fallen to 1/e [s].
-    """
-
-    mean: float
-    slopes: tuple[float, ...]
-    std: float
-    time: float
+    mean: float  # of the whole residual
+    slopes: tuple[float, ...]  # of the residual over each explaining signal, by least squares
+    std: float  # of what the explaining signals and white noise leave
+    time: float  # after which the autocorrelation of that has fallen to 1/e [s]
 
 
 def read_off(channels: Mapping[str, FloatArray], rate_hz: float) -> dict[str, float]:
@@ -75,13 +68,13 @@ def read_off(channels: Mapping[str, FloatArray], rate_hz: float) -> dict[str, fl
     return levels
 
 
-def noise_density(samples: FloatArray, rate_hz: float, above_hz: float = NOISE_ABOVE) -> float:
-    """Noise density [unit/√Hz] of samples (T,) between ``above_hz`` and the Nyquist frequency.
+def noise_density(samples: FloatArray, rate_hz: float) -> float:
+    """Noise density [unit/√Hz] of samples (T,) between `NOISE_ABOVE` and the Nyquist frequency.
 
     Medians over time and over frequency: neither a jolt nor a resonance of the body counts for much.
     """
     frequency, power = signal.welch(samples, rate_hz, nperseg=round(WELCH_SECONDS * rate_hz), average="median")
-    return float(np.sqrt(np.median(power[(frequency >= above_hz) & (frequency < rate_hz / 2.0)])))
+    return float(np.sqrt(np.median(power[(frequency >= NOISE_ABOVE) & (frequency < rate_hz / 2.0)])))
 
 
 def quantum(samples: FloatArray) -> float:

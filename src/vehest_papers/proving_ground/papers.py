@@ -15,46 +15,27 @@ TABLE_I = "Table I of Da Lio, Piccinini and Biral 2023"
 
 @dataclass(frozen=True)
 class PaperSet:
-    """One set of recordings in a paper.
+    """One set of recordings in a paper."""
 
-    Args:
-        name: in the paper.
-        drives: our set, a name of drives without their counter.
-        values: quantity of `tally.Tally.values` -> what the paper gives, in the same units.
-    """
-
-    name: str
-    drives: str
-    values: Mapping[str, float]
+    name: str  # in the paper
+    drives: str  # our set, a name of drives without their counter
+    values: Mapping[str, float]  # quantity of `tally.Tally.values` -> what the paper gives, in the same units
 
 
 @dataclass(frozen=True)
 class Profile:
-    """What stands on a vehicle's page besides its recordings.
+    """What stands on a vehicle's page besides its recordings."""
 
-    Args:
-        title: of the vehicle.
-        source: the paper, for the caption.
-        sets: what its tables give.
-        rate_hz: rate that its recordings were brought to, and ours before they are counted; none: as recorded.
-        cutoff_hz: of the zero-phase low-pass that its recordings went through; none: none.
-        prose: its text beside the figures, and how it was read.
-        ay_limit: marked in the distribution of the lateral acceleration [m/s²]: what the paper's 99 % or range are.
-        sideslip_limit: likewise, of the sideslip angle [deg].
-        limit_label: what those marks are.
-        counterpart: data set with a real recording of the same car.
-    """
-
-    title: str
-    source: str = ""
-    sets: tuple[PaperSet, ...] = ()
-    rate_hz: float | None = None
-    cutoff_hz: float | None = None
-    prose: str = ""
-    ay_limit: float | None = None
-    sideslip_limit: float | None = None
-    limit_label: str = ""
-    counterpart: str | None = None
+    title: str  # of the vehicle
+    source: str = ""  # the paper, for the caption
+    sets: tuple[PaperSet, ...] = ()  # what its tables give
+    rate_hz: float | None = None  # rate that its recordings were brought to, and ours before they are counted; none: as recorded
+    cutoff_hz: float | None = None  # of the zero-phase low-pass that its recordings went through; none: none
+    prose: str = ""  # its text beside the figures, and how it was read
+    ay_limit: float | None = None  # marked in the distribution of the lateral acceleration [m/s²]: what the paper's 99 % or range are
+    sideslip_limit: float | None = None  # likewise, of the sideslip angle [deg]
+    limit_label: str = ""  # what those marks are
+    counterpart: str | None = None  # data set with a real recording of the same car
 
     def prepared(self, recording: Recording) -> Recording:
         """The recording as the paper prepared its own, references included."""

@@ -21,15 +21,10 @@ FLAGS = ("spun", "left_road", "stood")
 
 @dataclass(frozen=True)
 class Grid:
-    """Equal bins from -limit to limit; what lies beyond counts in the outermost ones.
+    """Equal bins from -limit to limit; what lies beyond counts in the outermost ones."""
 
-    Args:
-        limit: a whole number of widths.
-        width: of a bin.
-    """
-
-    limit: float
-    width: float
+    limit: float  # a whole number of widths
+    width: float  # of a bin
 
     @property
     def size(self) -> int:

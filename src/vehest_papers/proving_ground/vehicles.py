@@ -33,55 +33,34 @@ ALL = "all"
 
 @dataclass(frozen=True, eq=False)
 class Stretch:
-    """A stretch of one drive.
+    """A stretch of one drive."""
 
-    Args:
-        recording: its name.
-        manoeuvre: what is driven.
-        time: on the recording's own clock (K,) [s].
-        channels: those of `TRACED` that it has (K,), SI units.
-        power: mean square of the lateral acceleration [m²/s⁴].
-    """
-
-    recording: str
-    manoeuvre: str
-    time: FloatArray
-    channels: Mapping[str, FloatArray]
-    power: float
+    recording: str  # its name
+    manoeuvre: str  # what is driven
+    time: FloatArray  # on the recording's own clock (K,) [s]
+    channels: Mapping[str, FloatArray]  # those of `TRACED` that it has (K,), SI units
+    power: float  # mean square of the lateral acceleration [m²/s⁴]
 
 
 @dataclass(frozen=True)
 class FlaggedDrive:
-    """A drive that went wrong by accident.
+    """A drive that went wrong by accident."""
 
-    Args:
-        dataset: its data set.
-        recording: its name.
-        vehicle: its car.
-        manoeuvre: what was to be driven.
-        stability_control: whether it was switched on.
-        flags: how it went.
-    """
-
-    dataset: str
-    recording: str
-    vehicle: str
-    manoeuvre: str
-    stability_control: bool
-    flags: Mapping[str, Any]
+    dataset: str  # its data set
+    recording: str  # its name
+    vehicle: str  # its car
+    manoeuvre: str  # what was to be driven
+    stability_control: bool  # whether it was switched on
+    flags: Mapping[str, Any]  # how it went
 
 
 @dataclass
 class DatasetTally:
-    """One data set's recordings of one page.
+    """One data set's recordings of one page."""
 
-    Args:
-        dataset: whose.
-        tallies: set -> its statistics: `ALL`, drives by their names without a counter, ``manoeuvre:NAME``, and the `ROLES`
-            that drives have by the beginning of their names.
-    """
-
-    dataset: StoredDataset
+    dataset: StoredDataset  # whose
+    # set -> its statistics: `ALL`, drives by their names without a counter, ``manoeuvre:NAME``, and the `ROLES` that drives have by the
+    # beginning of their names
     tallies: dict[str, Tally] = field(default_factory=dict)
 
     def add(self, recording: Recording) -> None:
@@ -97,28 +76,18 @@ class DatasetTally:
 
 @dataclass
 class VehiclePage:
-    """What a vehicle's page is drawn from.
+    """What a vehicle's page is drawn from."""
 
-    Args:
-        name: of the page.
-        simulated: by data set.
-        real: the same of the real recordings that stand beside.
-        handling: points of the simulated recordings.
-        real_handling: of the real ones.
-        characteristics: of the plant, one a variant and surface.
-        stretches: manoeuvre -> of all drives that went as planned, that with the most lateral acceleration.
-        flagged: drives that spun or left the road.
-        samples: one simulated and one real recording as they were recorded, to read noise from.
-    """
-
-    name: str
-    simulated: dict[str, DatasetTally] = field(default_factory=dict)
-    real: dict[str, DatasetTally] = field(default_factory=dict)
-    handling: HandlingPoints | None = None
-    real_handling: HandlingPoints | None = None
-    characteristics: list[Characteristic] = field(default_factory=list)
+    name: str  # of the page
+    simulated: dict[str, DatasetTally] = field(default_factory=dict)  # by data set
+    real: dict[str, DatasetTally] = field(default_factory=dict)  # the same of the real recordings that stand beside
+    handling: HandlingPoints | None = None  # points of the simulated recordings
+    real_handling: HandlingPoints | None = None  # of the real ones
+    characteristics: list[Characteristic] = field(default_factory=list)  # of the plant, one a variant and surface
+    # manoeuvre -> of all drives that went as planned, that with the most lateral acceleration
     stretches: dict[str, Stretch] = field(default_factory=dict)
-    flagged: list[FlaggedDrive] = field(default_factory=list)
+    flagged: list[FlaggedDrive] = field(default_factory=list)  # drives that spun or left the road
+    # one simulated and one real recording as they were recorded, to read noise from
     samples: dict[str, Recording] = field(default_factory=dict)
 
     def merged(self, kind: str) -> Tally:

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from vehest.report.style import DOUBLE_COLUMN, new_figure, paper_style
+from vehest.report.style import DOUBLE_COLUMN, new_figure
 from vehest_papers.real_cars.statistics import Statistics
 
 if TYPE_CHECKING:
@@ -24,8 +24,7 @@ def distributions(rows: Sequence[tuple[str, str, Statistics]]) -> MatplotlibFigu
     """
     from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
-    with paper_style():
-        figure = new_figure(DOUBLE_COLUMN, 0.6 + 0.3 * max(len(rows), 2))
+    with new_figure(DOUBLE_COLUMN, 0.6 + 0.3 * max(len(rows), 2)) as figure:
         left, right = figure.subplots(1, 2, sharey=True)
         for axes, name, label in ((left, "sideslip", "|β| [deg]"), (right, "ay", "|a_y| [m/s²]")):
             colour = COLOURS[name]

@@ -25,21 +25,13 @@ Change = Callable[[FloatArray, float], FloatArray]
 
 @dataclass(frozen=True)
 class Fault:
-    """One fault.
+    """One fault."""
 
-    Args:
-        name: what is done.
-        channels: to which channels; those that a recording does not have are left out, at least one must be there.
-        size: how much, with its unit.
-        checks: names of checks of which one must find it; empty where none can.
-        change: samples (T,) and sampling rate [Hz] to samples.
-    """
-
-    name: str
-    channels: tuple[str, ...]
-    size: str
-    checks: frozenset[str]
-    change: Change
+    name: str  # what is done
+    channels: tuple[str, ...]  # to which channels; those that a recording does not have are left out, at least one must be there
+    size: str  # how much, with its unit
+    checks: frozenset[str]  # names of checks of which one must find it; empty where none can
+    change: Change  # samples (T,) and sampling rate [Hz] to samples
 
     def __call__(self, recording: Recording) -> Recording:
         """The recording with the fault in it."""
@@ -85,15 +77,11 @@ def planted_faults() -> list[Fault]:
     return faults
 
 
-def detections(recording: Recording, faults: Sequence[Fault] | None = None) -> pd.DataFrame:
-    """Which faults the checks find.
+def detections(recording: Recording) -> pd.DataFrame:
+    """Which of `planted_faults` the checks find; those whose channels are missing are left out.
 
     Findings on the untouched recording do not count. A fault is found where one of its checks names one of its channels, or, where
     the channels contradict each other undecidedly, tells of it among the alternatives.
-
-    Args:
-        recording: as it was measured.
-        faults: all of `planted_faults` if not given; those whose channels are missing are left out.
 
     Returns:
         A row a fault: ``fault``, ``channel``, ``size``, ``decidable``, ``found``, ``reported`` (channels that its checks name),
@@ -101,7 +89,7 @@ def detections(recording: Recording, faults: Sequence[Fault] | None = None) -> p
     """
     own = {(finding.level, finding.check, finding.channel) for finding in _counted(recording)}
     rows = []
-    for fault in planted_faults() if faults is None else faults:
+    for fault in planted_faults():
         touched = [name for name in fault.channels if name in recording]
         if not touched:
             continue

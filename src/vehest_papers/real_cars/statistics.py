@@ -31,39 +31,22 @@ SHORTEST_PIECE = 3.0  # s
 
 @dataclass(frozen=True)
 class Statistics:
-    """Of one recording, or of several together; while it drives, at `RATE`. NaN where it has no reference, or not the channel.
+    """Of one recording, or of several together; while it drives, at `RATE`. NaN where it has no reference, or not the channel."""
 
-    Args:
-        seconds: in all [s].
-        driven: of it driven [s].
-        native_rate: [Hz].
-        speed: quantiles of vx at 1 and 99 % [m/s].
-        ay: quantiles of |ay| [m/s²].
-        sideslip: quantiles of the reference's |β| [deg].
-        rms: root mean square of the reference's β, the error of v = 0 [deg].
-        static_map: what v = r (b - k u²) leaves where both numbers are fitted on the recording itself, RMSE(β) [deg].
-        correlation: of v with the yaw rate.
-        noise: white noise of the reference [deg].
-        bound: posterior Cramér-Rao bound with every input that was measured, axles known [deg].
-        kinematic_bound: the same by kinematics alone, from u, ω, a_y and a_x where they are there [deg].
-        point: where the reference was measured, in words.
-        missing: the channel that is missing; empty where all are there.
-    """
-
-    seconds: float
-    driven: float
-    native_rate: float
-    speed: tuple[float, float]
-    ay: tuple[float, ...]
-    sideslip: tuple[float, ...]
-    rms: float
-    static_map: float
-    correlation: float
-    noise: float
-    bound: float
-    kinematic_bound: float
-    point: str
-    missing: str = ""
+    seconds: float  # in all [s]
+    driven: float  # of it driven [s]
+    native_rate: float  # [Hz]
+    speed: tuple[float, float]  # quantiles of vx at 1 and 99 % [m/s]
+    ay: tuple[float, ...]  # quantiles of |ay| [m/s²]
+    sideslip: tuple[float, ...]  # quantiles of the reference's |β| [deg]
+    rms: float  # root mean square of the reference's β, the error of v = 0 [deg]
+    static_map: float  # what v = r (b - k u²) leaves where both numbers are fitted on the recording itself, RMSE(β) [deg]
+    correlation: float  # of v with the yaw rate
+    noise: float  # white noise of the reference [deg]
+    bound: float  # posterior Cramér-Rao bound with every input that was measured, axles known [deg]
+    kinematic_bound: float  # the same by kinematics alone, from u, ω, a_y and a_x where they are there [deg]
+    point: str  # where the reference was measured, in words
+    missing: str = ""  # the channel that is missing; empty where all are there
 
     @property
     def reasons(self) -> list[str]:

@@ -34,21 +34,14 @@ MOST_RANGES = 6  # of a part, so that a set of many manoeuvres takes minutes
 
 @dataclass(frozen=True)
 class FaultTrials:
-    """Faults on the tests of a part.
+    """Faults on the tests of a part."""
 
-    Args:
-        part: its name.
-        data: data sets of the tests, and whether they are real.
-        rate_hz: of the samples [Hz].
-        table: a row a case: fault, channel, severity, onset [s], whether and when [s] the oracle sees it, whether and when health flags it.
-        nominal: flags without faults on every test range, (T,) each.
-    """
-
-    part: str
-    data: str
-    rate_hz: float
+    part: str  # its name
+    data: str  # data sets of the tests, and whether they are real
+    rate_hz: float  # of the samples [Hz]
+    # a row a case: fault, channel, severity, onset [s], whether and when [s] the oracle sees it, whether and when health flags it
     table: pd.DataFrame
-    nominal: list[NDArray[np.bool_]]
+    nominal: list[NDArray[np.bool_]]  # flags without faults on every test range, (T,) each
 
 
 def trials_of(name: str, part: PartArtefacts) -> FaultTrials:
@@ -138,8 +131,4 @@ def _tested(part: PartArtefacts) -> list[Span]:
 
 
 def _channels(recordings: Sequence[Recording]) -> tuple[str, ...]:
-    return tuple(channel for channel in WATCHED if all(_complete(recording, channel) for recording in recordings))
-
-
-def _complete(recording: Recording, channel: str) -> bool:
-    return channel in recording and bool(np.isfinite(recording[channel]).all())
+    return tuple(channel for channel in WATCHED if all(channel in own and np.isfinite(own[channel]).all() for own in recordings))

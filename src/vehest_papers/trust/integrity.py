@@ -29,19 +29,12 @@ NOMINAL, MISLEADING, HAZARDOUS, UNAVAILABLE = "nominal", "misleading", "hazardou
 
 @dataclass(frozen=True, eq=False)
 class Integrity:
-    """Errors and protection levels of samples, and where they lie in the Stanford diagram; arrays are (K,).
+    """Errors and protection levels of samples, and where they lie in the Stanford diagram; arrays are (K,)."""
 
-    Args:
-        error: size of the error [deg, or the unit of the levels].
-        level: protection level.
-        flagged: whether the estimate was flagged as invalid.
-        alert_limit: the same for all.
-    """
-
-    error: FloatArray
-    level: FloatArray
-    flagged: NDArray[np.bool_]
-    alert_limit: float = ALERT_LIMIT
+    error: FloatArray  # size of the error [deg, or the unit of the levels]
+    level: FloatArray  # protection level
+    flagged: NDArray[np.bool_]  # whether the estimate was flagged as invalid
+    alert_limit: float = ALERT_LIMIT  # the same for all
 
     def masks(self) -> dict[str, NDArray[np.bool_]]:
         """Region -> samples in it, (K,); each sample lies in one."""
@@ -70,20 +63,13 @@ def integrity_of(error: FloatArray, level: FloatArray, flagged: NDArray[np.bool_
 
 @dataclass(frozen=True)
 class AlarmRate:
-    """False alarms in so many hours.
+    """False alarms in so many hours."""
 
-    Args:
-        alarms: how many there were.
-        hours: of healthy driving.
-        per_hour: alarms an hour; NaN without any time.
-        low, high: 95 % interval of the rate, exact for a Poisson process.
-    """
-
-    alarms: int
-    hours: float
-    per_hour: float
-    low: float
-    high: float
+    alarms: int  # how many there were
+    hours: float  # of healthy driving
+    per_hour: float  # alarms an hour; NaN without any time
+    low: float  # of the 95 % interval of the rate, exact for a Poisson process
+    high: float  # likewise
 
 
 def false_alarms_per_hour(flagged: Sequence[NDArray[np.bool_]], rate_hz: float) -> AlarmRate:

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from vehest.report.style import DOUBLE_COLUMN, LINEAR_BLUES, NONLINEAR_ORANGES, REFERENCE, new_figure, paper_style, with_unit
+from vehest.report.style import DOUBLE_COLUMN, LINEAR_BLUES, NONLINEAR_ORANGES, REFERENCE, new_figure
 from vehest_papers.trust.integrity import HAZARDOUS, MISLEADING, NOMINAL, UNAVAILABLE, Integrity
 
 if TYPE_CHECKING:
@@ -21,22 +21,17 @@ LABELS = {NOMINAL: (0.25, 0.75), MISLEADING: (0.72, 0.42), HAZARDOUS: (1.5, 0.5)
 """Region -> where its share is written, in alert limits."""
 
 
-def stanford_figure(families: Mapping[str, Integrity], quantity: str = "sideslip", unit: str = "deg") -> MatplotlibFigure:
+def stanford_figure(families: Mapping[str, Integrity]) -> MatplotlibFigure:
     """A panel an estimate: how many samples have which error and protection level, on a logarithmic scale of grey.
 
     Samples beyond the axes are drawn at their ends. Where an estimate was flagged as invalid its level counts as beyond the axes.
 
-    Args:
-        families: title -> errors and levels.
-        quantity: that they are of.
-        unit: of errors, levels and limit.
     """
     from matplotlib.colors import LogNorm
 
     columns = min(len(families), COLUMNS)
     rows = -(-len(families) // columns)
-    with paper_style():
-        figure = new_figure(DOUBLE_COLUMN * columns / COLUMNS, 0.35 + 2.3 * rows)
+    with new_figure(DOUBLE_COLUMN * columns / COLUMNS, 0.35 + 2.3 * rows) as figure:
         panels = np.atleast_1d(figure.subplots(rows, columns, sharex=True, sharey=True, squeeze=False)).ravel()
         for axes, (title, own) in zip(panels, families.items(), strict=False):
             end = REACH * own.alert_limit
@@ -52,9 +47,9 @@ def stanford_figure(families: Mapping[str, Integrity], quantity: str = "sideslip
         for axes in panels[len(families) :]:
             axes.set_visible(False)
         for axes in panels[-columns:]:
-            axes.set_xlabel(with_unit(f"error of {quantity}", unit))
+            axes.set_xlabel("error of sideslip [deg]")
         for axes in panels[::columns]:
-            axes.set_ylabel(with_unit("protection level", unit))
+            axes.set_ylabel("protection level [deg]")
     return figure
 
 

@@ -32,51 +32,32 @@ N_LEVELS = 5  # speeds at which the noise is looked at
 HORIZON_SECONDS = 10.0  # after the onset, within which a fault has to be seen
 STARTS_SECONDS = 1.0  # between the places of healthy drives at which the test is tried
 MOTION_HZ = 4.0  # below which a car moves
+FALSE_ALARMS_PER_HOUR = 1.0  # that the test may have, as the detector that it is compared with
 MOST_DEVIATIONS = 1e3  # of an innovation, beyond which a signature is certain
 
 
 @dataclass(frozen=True)
 class Visibility:
-    """What the oracle makes of a fault.
+    """What the oracle makes of a fault."""
 
-    Args:
-        visible: whether it is seen within the horizon.
-        delay: from the onset to the alarm [s]; NaN if it is not seen.
-        threshold: log A.
-    """
-
-    visible: bool
-    delay: float
-    threshold: float
+    visible: bool  # whether it is seen within the horizon
+    delay: float  # from the onset to the alarm [s]; NaN if it is not seen
+    threshold: float  # log A
 
 
 @dataclass(frozen=True, eq=False)
 class Oracle:
-    """What the test knows of healthy drives.
+    """What the test knows of healthy drives."""
 
-    Args:
-        channels: that are measured.
-        rate_hz: [Hz].
-        relations: between channels.
-        least_speed: that goes with them.
-        model: of what they leave.
-        speed: channel that the noise goes by.
-        levels: speeds, and the noise at each.
-        healthy: innovations over their levels, of healthy drives on which the threshold is tried, (T, C) each.
-        false_alarms_per_hour: that the test may have.
-        reserve: how many times as large the innovations of healthy drives may be without an alarm, as with limits of the detector.
-    """
-
-    channels: tuple[str, ...]
-    rate_hz: float
-    relations: tuple[Relation, ...]
-    least_speed: float
-    model: Autoregression
-    speed: str | None
-    levels: tuple[FloatArray, FloatArray]
-    healthy: tuple[FloatArray, ...]
-    false_alarms_per_hour: float
-    reserve: float
+    channels: tuple[str, ...]  # that are measured
+    rate_hz: float  # [Hz]
+    relations: tuple[Relation, ...]  # between channels
+    least_speed: float  # that goes with them
+    model: Autoregression  # of what they leave
+    speed: str | None  # channel that the noise goes by
+    levels: tuple[FloatArray, FloatArray]  # speeds, and the noise at each
+    healthy: tuple[FloatArray, ...]  # innovations over their levels, of healthy drives on which the threshold is tried, (T, C) each
+    reserve: float  # how many times as large the innovations of healthy drives may be without an alarm, as with limits of the detector
 
     def sees(
         self,
@@ -123,7 +104,7 @@ class Oracle:
 
     def _threshold(self, test: Test, within: int) -> float:
         """log A: of the false alarms that it may have in a horizon, and not below what healthy drives reach."""
-        highest = -math.log(self.false_alarms_per_hour * HORIZON_SECONDS / 3600.0)
+        highest = -math.log(FALSE_ALARMS_PER_HOUR * HORIZON_SECONDS / 3600.0)
         step = max(round(STARTS_SECONDS * self.rate_hz), 1)
         for innovations in self.healthy:
             for begin in range(self.model.order, len(innovations) - within + 1, step):
@@ -151,12 +132,7 @@ def _random_test(signature: FloatArray, covariance: FloatArray) -> Test:
 
 
 def motion_of(samples: Mapping[str, FloatArray], rate_hz: float) -> dict[str, FloatArray]:
-    """What of the channels is the car's motion and not noise: all below `MOTION_HZ`, without a shift in time.
-
-    Args:
-        samples: channel -> (T,), finite.
-        rate_hz: [Hz].
-    """
+    """What of the channels is the car's motion and not noise: all below `MOTION_HZ`, without a shift in time."""
     if rate_hz <= 2.5 * MOTION_HZ:
         return {name: np.array(values) for name, values in samples.items()}
     band = signal.butter(2, MOTION_HZ, fs=rate_hz, output="sos")
@@ -168,7 +144,6 @@ def learn_oracle(
     validation: Sequence[Recording],
     channels: Sequence[str],
     rate_hz: float,
-    false_alarms_per_hour: float = 1.0,
 ) -> Oracle:
     """Fit relations and autoregression to training drives; healthy drives are these and those of validation.
 
@@ -176,7 +151,6 @@ def learn_oracle(
         train, validation: at ``rate_hz``.
         channels: that an estimator reads.
         rate_hz: [Hz].
-        false_alarms_per_hour: those of the detector that it is compared with.
 
     Raises:
         DataError: a channel is missing or there are too few samples.
@@ -193,7 +167,7 @@ def learn_oracle(
     levels = learn_noise_levels(np.concatenate(innovations[:seen]), model.covariance, np.concatenate(speeds[:seen]), N_LEVELS)
     reserve = margin(STARTS_SECONDS, sum(len(recording) for recording in (*train, *validation)) / rate_hz)
     healthy = tuple(own / levels_at(levels, at) for own, at in zip(innovations, speeds, strict=True))
-    return Oracle(names, rate_hz, relations, least_speed, model, speed, levels, healthy, false_alarms_per_hour, reserve)
+    return Oracle(names, rate_hz, relations, least_speed, model, speed, levels, healthy, reserve)
 
 
 def filtered(model: Autoregression, signature: FloatArray) -> FloatArray:

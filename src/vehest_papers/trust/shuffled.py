@@ -30,15 +30,10 @@ LEAST_MANOEUVRES = 3  # of a test, for an interval
 
 @dataclass(frozen=True)
 class Scores:
-    """Errors of β over the half width of the 90 % band, of all samples of some ranges.
+    """Errors of β over the half width of the 90 % band, of all samples of some ranges."""
 
-    Args:
-        values: (N,), 1 where an error ends on the band.
-        manoeuvres: which each sample belongs to, (N,), counted from 0.
-    """
-
-    values: FloatArray
-    manoeuvres: NDArray[np.int64]
+    values: FloatArray  # (N,), 1 where an error ends on the band
+    manoeuvres: NDArray[np.int64]  # which each sample belongs to, (N,), counted from 0
 
     @property
     def number(self) -> int:
@@ -83,8 +78,6 @@ def share_if_shuffled(calibration: Scores, test: Scores, draws: int = DRAWS, see
     Args:
         calibration: on the ranges that the band was calibrated on.
         test: on others.
-        draws: how often.
-        seed: of the draws.
 
     Returns:
         NaN where one of the two has too few manoeuvres.

@@ -39,39 +39,22 @@ POWER_SHARE = 0.9
 
 @dataclass(frozen=True)
 class Car:
-    """A car as its driver knows it, on a dry road.
+    """A car as its driver knows it, on a dry road."""
 
-    Args:
-        name: of the vehicle.
-        wheelbase: [m].
-        width: over all [m].
-        front_share: share of the weight on the front axle.
-        grip: largest steady lateral acceleration [m/s²].
-        driving_share: share of the grip that serves for accelerating straight ahead.
-        power_per_mass: used at most [W/kg].
-        top_speed: driven at most [m/s].
-        drag: deceleration by the air per square of the speed [1/m].
-        steering_rate: largest steering velocity of the road wheels [rad/s].
-        largest_steer: of the road wheels [rad].
-        lateral_acceleration: (M,), from 0 to the grip [m/s²].
-        excess_steer: (M,), road-wheel angle beyond wheelbase times curvature there [rad].
-        rear_slip: (M,), slip angle of the rear axle there, as a positive angle [rad].
-    """
-
-    name: str
-    wheelbase: float
-    width: float
-    front_share: float
-    grip: float
-    driving_share: float
-    power_per_mass: float
-    top_speed: float
-    drag: float
-    steering_rate: float
-    largest_steer: float
-    lateral_acceleration: tuple[float, ...]
-    excess_steer: tuple[float, ...]
-    rear_slip: tuple[float, ...]
+    name: str  # of the vehicle
+    wheelbase: float  # [m]
+    width: float  # over all [m]
+    front_share: float  # share of the weight on the front axle
+    grip: float  # largest steady lateral acceleration [m/s²]
+    driving_share: float  # share of the grip that serves for accelerating straight ahead
+    power_per_mass: float  # used at most [W/kg]
+    top_speed: float  # driven at most [m/s]
+    drag: float  # deceleration by the air per square of the speed [1/m]
+    steering_rate: float  # largest steering velocity of the road wheels [rad/s]
+    largest_steer: float  # of the road wheels [rad]
+    lateral_acceleration: tuple[float, ...]  # (M,), from 0 to the grip [m/s²]
+    excess_steer: tuple[float, ...]  # (M,), road-wheel angle beyond wheelbase times curvature there [rad]
+    rear_slip: tuple[float, ...]  # (M,), slip angle of the rear axle there, as a positive angle [rad]
 
     def steer_for(self, curvature: float, lateral_acceleration: float, friction: float = 1.0) -> float:
         """Road-wheel angle [rad] of a steady turn; beyond the grip as much as at the grip.

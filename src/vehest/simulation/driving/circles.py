@@ -33,26 +33,16 @@ from vehest.simulation.road.surface import Surface
 
 @dataclass(frozen=True)
 class SteadyCircle(Manoeuvre):
-    """Steady-state circle: constant radius, slowly increasing speed (ISO 4138, constant-radius test).
-
-    Args:
-        radius: [m]; the standard wants at least 30 m.
-        severity: share of the grip at which it ends.
-        ay_rate: by which the lateral acceleration grows [m/s³]; the standard's slow increase.
-        start_ay: at which the circle is entered [m/s²].
-        hold_time: at the final speed [s].
-        side: ``left``, ``right`` or ``either``.
-        half_width: distance from the circle beyond which the car has left it [m].
-    """
+    """Steady-state circle: constant radius, slowly increasing speed (ISO 4138, constant-radius test)."""
 
     name: ClassVar[str] = "skidpad"
-    radius: Range = (35.0, 60.0)
-    severity: Range = (0.7, 0.95)
-    ay_rate: float = 0.25
-    start_ay: float = 2.0
-    hold_time: float = 2.0
-    side: str = "either"
-    half_width: float = 4.0
+    radius: Range = (35.0, 60.0)  # [m]; the standard wants at least 30 m
+    severity: Range = (0.7, 0.95)  # share of the grip at which it ends
+    ay_rate: float = 0.25  # by which the lateral acceleration grows [m/s³]; the standard's slow increase
+    start_ay: float = 2.0  # at which the circle is entered [m/s²]
+    hold_time: float = 2.0  # at the final speed [s]
+    side: str = "either"  # ``left``, ``right`` or ``either``
+    half_width: float = 4.0  # distance from the circle beyond which the car has left it [m]
 
     def __post_init__(self) -> None:
         require(self, radius=(15.0, 500.0), severity=(0.1, 1.3), ay_rate=(0.02, 3.0), start_ay=(0.2, 8.0), hold_time=(0.0, 120.0))
@@ -90,28 +80,17 @@ class SteadyCircle(Manoeuvre):
 
 @dataclass(frozen=True)
 class BrakingInTurn(Manoeuvre):
-    """Braking on a circle with the steering held (ISO 7975, open loop).
-
-    Args:
-        radius: of the circle [m]; 100 m in the standard.
-        severity: share of the grip that the turn takes; the standard's 5 m/s² are about half of a dry road's.
-        deceleration: [m/s²].
-        turn_time: on the circle before the brakes [s].
-        steering: ``held`` or, for a driver who keeps to the circle, ``path``.
-        until_speed: at which the recording ends [m/s]; 0 is the stand.
-        side: ``left``, ``right`` or ``either``.
-        half_width: distance from the circle beyond which the car has left it [m]; counts for ``path`` only once it brakes.
-    """
+    """Braking on a circle with the steering held (ISO 7975, open loop)."""
 
     name: ClassVar[str] = "braking_in_turn"
-    radius: Range = (60.0, 100.0)
-    severity: Range = (0.4, 0.7)
-    deceleration: Range = (2.0, 5.0)
-    turn_time: Range = (3.0, 5.0)
-    steering: str = "held"
-    until_speed: float = 0.0
-    side: str = "either"
-    half_width: float = 4.0
+    radius: Range = (60.0, 100.0)  # of the circle [m]; 100 m in the standard
+    severity: Range = (0.4, 0.7)  # share of the grip that the turn takes; the standard's 5 m/s² are about half of a dry road's
+    deceleration: Range = (2.0, 5.0)  # [m/s²]
+    turn_time: Range = (3.0, 5.0)  # on the circle before the brakes [s]
+    steering: str = "held"  # ``held`` or, for a driver who keeps to the circle, ``path``
+    until_speed: float = 0.0  # at which the recording ends [m/s]; 0 is the stand
+    side: str = "either"  # ``left``, ``right`` or ``either``
+    half_width: float = 4.0  # distance from the circle beyond which the car has left it [m]; counts for ``path`` only once it brakes
 
     def __post_init__(self) -> None:
         require(self, radius=(15.0, 500.0), severity=(0.1, 1.3), deceleration=(0.5, 10.0), turn_time=(1.0, 60.0), until_speed=(0.0, 60.0))

@@ -38,21 +38,14 @@ class DoubleLaneChange(Manoeuvre):
     """To the neighbouring lane and back between cones, at a constant speed.
 
     Lengths and widths of the gates are those of ISO 3888-1 and ISO 3888-2; the offset of part 1 is taken between the lanes' middles.
-
-    Args:
-        layout: ``iso_3888_1`` (double lane change) or ``iso_3888_2`` (obstacle avoidance).
-        severity: share of the grip that the sharpest bend of the line takes; decides the speed.
-        speed: [m/s], instead of the severity.
-        side: of the neighbouring lane: ``left``, ``right`` or ``either``.
-        half_width: distance from the line beyond which the car has left the road [m].
     """
 
     name: ClassVar[str] = "double_lane_change"
-    layout: str = "iso_3888_1"
-    severity: Range = (0.5, 0.9)
-    speed: Range | None = None
-    side: str = "either"
-    half_width: float = 1.5
+    layout: str = "iso_3888_1"  # ``iso_3888_1`` (double lane change) or ``iso_3888_2`` (obstacle avoidance)
+    severity: Range = (0.5, 0.9)  # share of the grip that the sharpest bend of the line takes; decides the speed
+    speed: Range | None = None  # [m/s], instead of the severity
+    side: str = "either"  # of the neighbouring lane: ``left``, ``right`` or ``either``
+    half_width: float = 1.5  # distance from the line beyond which the car has left the road [m]
 
     def __post_init__(self) -> None:
         _require_cone_values(self)
@@ -82,24 +75,15 @@ class DoubleLaneChange(Manoeuvre):
 
 @dataclass(frozen=True)
 class Slalom(Manoeuvre):
-    """Around cones in a row, at a constant speed.
-
-    Args:
-        spacing: of the cones [m]; 18 m and 30 m are customary.
-        cones: how many.
-        severity: share of the grip that the sharpest bend of the line takes; decides the speed.
-        speed: [m/s], instead of the severity.
-        side: on which the first cone is passed: ``left``, ``right`` or ``either``.
-        half_width: distance from the line beyond which the car has left the road [m].
-    """
+    """Around cones in a row, at a constant speed."""
 
     name: ClassVar[str] = "slalom"
-    spacing: float = 18.0
-    cones: int = 8
-    severity: Range = (0.5, 0.9)
-    speed: Range | None = None
-    side: str = "either"
-    half_width: float = 2.0
+    spacing: float = 18.0  # of the cones [m]; 18 m and 30 m are customary
+    cones: int = 8  # how many
+    severity: Range = (0.5, 0.9)  # share of the grip that the sharpest bend of the line takes; decides the speed
+    speed: Range | None = None  # [m/s], instead of the severity
+    side: str = "either"  # on which the first cone is passed: ``left``, ``right`` or ``either``
+    half_width: float = 2.0  # distance from the line beyond which the car has left the road [m]
 
     def __post_init__(self) -> None:
         _require_cone_values(self)

@@ -32,30 +32,19 @@ WAVELENGTHS = (310.0, 470.0, 1130.0)
 
 @dataclass(frozen=True)
 class Driver:
-    """How a person drives; all values are assumed, chosen so that the shipped cars follow the shipped courses.
+    """How a person drives; all values are assumed, chosen so that the shipped cars follow the shipped courses."""
 
-    Args:
-        preview_time: how far ahead the driver looks for lateral errors [s].
-        steering_lag: time constant from the wanted to the actual steering angle [s].
-        response: by how much later a car answers per speed [s²/m]. The driver takes the road's curvature as far ahead as this lag and the
-            one of steering.
-        yaw_damping: steering angle per error of the yaw rate [s].
-        countersteer: steering angle per sideslip beyond that of the turn.
-        slide: sideslip beyond that of the turn from which on the driver countersteers and lifts [rad].
-        speed_gain: wanted acceleration per speed error [1/s].
-        braking_share: share of the grip that is used for braking straight ahead.
-        saturation: share of the grip up to which the driver asks for more lateral acceleration when off the line.
-    """
-
-    preview_time: float = 0.7
-    steering_lag: float = 0.1
+    preview_time: float = 0.7  # how far ahead the driver looks for lateral errors [s]
+    steering_lag: float = 0.1  # time constant from the wanted to the actual steering angle [s]
+    # by how much later a car answers per speed [s²/m]. The driver takes the road's curvature as far ahead as this lag and the one of
+    # steering.
     response: float = 3.5e-3
-    yaw_damping: float = 0.16
-    countersteer: float = 0.7
-    slide: float = 0.035
-    speed_gain: float = 1.5
-    braking_share: float = 0.75
-    saturation: float = 1.1
+    yaw_damping: float = 0.16  # steering angle per error of the yaw rate [s]
+    countersteer: float = 0.7  # steering angle per sideslip beyond that of the turn
+    slide: float = 0.035  # sideslip beyond that of the turn from which on the driver countersteers and lifts [rad]
+    speed_gain: float = 1.5  # wanted acceleration per speed error [1/s]
+    braking_share: float = 0.75  # share of the grip that is used for braking straight ahead
+    saturation: float = 1.1  # share of the grip up to which the driver asks for more lateral acceleration when off the line
 
 
 @dataclass(frozen=True)
@@ -64,24 +53,16 @@ class DrivingStyle:
 
     Both variations are sums of sines of the distance driven, whose wavelengths do not divide a lap.
 
-    Args:
-        grip_fraction: mean share of the grip that the speed profile uses, 0 … 1.
-        grip_ripple: amplitude of its variation.
-        line_offset: amplitude of the lateral offset of the line [m].
-        wavelengths: of the sines [m].
-        grip_phases: phase of each sine of the grip [rad].
-        line_phases: phase of each sine of the line [rad].
-
     Raises:
         ConfigurationError: the grip used is not between 0 and 1 all along.
     """
 
-    grip_fraction: float
-    grip_ripple: float
-    line_offset: float
-    wavelengths: tuple[float, ...]
-    grip_phases: tuple[float, ...]
-    line_phases: tuple[float, ...]
+    grip_fraction: float  # mean share of the grip that the speed profile uses, 0 … 1
+    grip_ripple: float  # amplitude of its variation
+    line_offset: float  # amplitude of the lateral offset of the line [m]
+    wavelengths: tuple[float, ...]  # of the sines [m]
+    grip_phases: tuple[float, ...]  # phase of each sine of the grip [rad]
+    line_phases: tuple[float, ...]  # phase of each sine of the line [rad]
 
     def __post_init__(self) -> None:
         low, high = self.grip_fraction - abs(self.grip_ripple), self.grip_fraction + abs(self.grip_ripple)
@@ -91,28 +72,17 @@ class DrivingStyle:
 
 @dataclass(frozen=True, eq=False)
 class Plan:
-    """Planned line and speed over the distance along the way; all arrays have shape (N,).
+    """Planned line and speed over the distance along the way; all arrays have shape (N,)."""
 
-    Args:
-        distance: [m], uniform from 0.
-        x, y: the line [m].
-        heading: of the line, not wrapped [rad].
-        curvature: of the line, positive to the left [1/m].
-        speed: [m/s].
-        friction: scale of the tyres' friction.
-        bank: positive with the left side higher [rad].
-        grade: positive downhill [rad].
-    """
-
-    distance: FloatArray
-    x: FloatArray
-    y: FloatArray
-    heading: FloatArray
-    curvature: FloatArray
-    speed: FloatArray
-    friction: FloatArray
-    bank: FloatArray
-    grade: FloatArray
+    distance: FloatArray  # [m], uniform from 0
+    x: FloatArray  # the line [m]
+    y: FloatArray  # the line [m]
+    heading: FloatArray  # of the line, not wrapped [rad]
+    curvature: FloatArray  # of the line, positive to the left [1/m]
+    speed: FloatArray  # [m/s]
+    friction: FloatArray  # scale of the tyres' friction
+    bank: FloatArray  # positive with the left side higher [rad]
+    grade: FloatArray  # positive downhill [rad]
 
     @cached_property
     def acceleration(self) -> FloatArray:
@@ -148,29 +118,17 @@ class Observation(NamedTuple):
 
 
 class Command(NamedTuple):
-    """The driver's command, and the road at the car.
+    """The driver's command, and the road at the car."""
 
-    Args:
-        steering_velocity: of the road wheels [rad/s].
-        acceleration: wanted [m/s²].
-        progress: distance along the way [m].
-        lateral_error: the car's place left of its line [m]; NaN where there is no line.
-        friction: scale of the tyres' friction at the car.
-        bank: of the road, positive with its left side higher [rad].
-        grade: of the road, positive downhill [rad].
-        heading: of the road, along which bank and grade are meant [rad].
-        finished: the manoeuvre is over.
-    """
-
-    steering_velocity: float
-    acceleration: float
-    progress: float = 0.0
-    lateral_error: float = math.nan
-    friction: float = 1.0
-    bank: float = 0.0
-    grade: float = 0.0
-    heading: float = 0.0
-    finished: bool = False
+    steering_velocity: float  # of the road wheels [rad/s]
+    acceleration: float  # wanted [m/s²]
+    progress: float = 0.0  # distance along the way [m]
+    lateral_error: float = math.nan  # the car's place left of its line [m]; NaN where there is no line
+    friction: float = 1.0  # scale of the tyres' friction at the car
+    bank: float = 0.0  # of the road, positive with its left side higher [rad]
+    grade: float = 0.0  # of the road, positive downhill [rad]
+    heading: float = 0.0  # of the road, along which bank and grade are meant [rad]
+    finished: bool = False  # the manoeuvre is over
 
 
 def draw_style(seed: int, grip_range: tuple[float, float], ripple: float, line_offset: float) -> DrivingStyle:
@@ -187,10 +145,7 @@ def plan_laps(
     """Line and speed profile over whole laps.
 
     Args:
-        course: where.
         car: whose limits are kept.
-        driver: its driver.
-        style: of driving.
         n_laps: at least one.
         friction: of one lap, on the course's samples, shape (N,).
         highest_speed: [m/s], one value or one for each of the n_laps·(N - 1) + 1 samples.
@@ -234,7 +189,6 @@ def speed_profile(
         used: (N,), grip that is used at most [m/s²]; braking gets ``driver.braking_share`` of it, driving ``car.driving_share``.
         spacing: distance between samples [m].
         car: whose power and top speed are used.
-        driver: its driver.
         highest_speed: limit of the driver [m/s].
         bank: of the road, positive with its left side higher [rad]; gravity helps or hinders.
         grade: of the road, positive downhill [rad].
@@ -281,9 +235,6 @@ class Follower:
     """Drives a car along a plan.
 
     Args:
-        plan: line and speed.
-        car: the car.
-        driver: its driver.
         progress: where on the plan the car starts [m].
         speed_at: wanted speed [m/s] and acceleration [m/s²] at a time [s]; by default the plan's, by place.
         hands: corrections beside the line; by default none.

@@ -33,25 +33,16 @@ class Freestyle:
 
     The driver holds the steering at a stop, half way or straight for a while, then goes on to the next; gives gas in bursts as long as the
     car is slower than wanted, coasts, brakes where it is much faster, and countersteers where it slides more than allowed.
-
-    Args:
-        duration: of the recording [s].
-        speed: lowest and highest wanted speed [m/s].
-        current: of a burst of gas, lowest and highest [A].
-        sideslip: beyond which the driver lifts and countersteers, drawn anew for each slide [rad].
-        brakes: share of the decisions that are a full braking.
-        kicks: share of the decisions that are a burst with the largest current.
-        straights: share of the steering decisions that are straight ahead.
     """
 
     name: ClassVar[str] = "freestyle"
-    duration: Range = (20.0, 40.0)
-    speed: tuple[float, float] = (1.4, 4.0)
-    current: tuple[float, float] = (10.0, 45.0)
-    sideslip: tuple[float, float] = (0.15, 0.35)
-    brakes: float = 0.02
-    kicks: float = 0.03
-    straights: float = 0.15
+    duration: Range = (20.0, 40.0)  # of the recording [s]
+    speed: tuple[float, float] = (1.4, 4.0)  # lowest and highest wanted speed [m/s]
+    current: tuple[float, float] = (10.0, 45.0)  # of a burst of gas, lowest and highest [A]
+    sideslip: tuple[float, float] = (0.15, 0.35)  # beyond which the driver lifts and countersteers, drawn anew for each slide [rad]
+    brakes: float = 0.02  # share of the decisions that are a full braking
+    kicks: float = 0.03  # share of the decisions that are a burst with the largest current
+    straights: float = 0.15  # share of the steering decisions that are straight ahead
 
     def __post_init__(self) -> None:
         require(self, duration=(1.0, 3600.0), speed=(0.5, 20.0), current=(0.0, 1000.0), sideslip=(0.05, math.pi))
@@ -74,14 +65,7 @@ class Freestyle:
 
 
 class FreestyleDriver:
-    """Drives one car for the time of one recording.
-
-    Args:
-        style: of driving.
-        car: the car.
-        area: with its friction.
-        generator: of the decisions.
-    """
+    """Drives one car for the time of one recording."""
 
     def __init__(self, style: Freestyle, car: PlanarCar, area: OpenArea, generator: np.random.Generator) -> None:
         self._style, self._car, self._area, self._generator = style, car, area, generator

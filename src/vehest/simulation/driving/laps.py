@@ -33,36 +33,21 @@ TRAFFIC_LENGTH = (50.0, 400.0)
 
 @dataclass(frozen=True)
 class Laps(Manoeuvre):
-    """Laps of a course at a share of the grip that varies along the way.
-
-    Args:
-        course: name of the course.
-        duration: of the recording [s]; none where ``laps`` is given.
-        laps: whole laps to record.
-        severity: mean share of the grip.
-        ripple: by which the share varies along the way.
-        line_offset: by which the line varies about the road's middle [m].
-        top_speed: that the driver does not exceed [m/s]; by default the car's.
-        flat: leaves out the course's bank and grade.
-        half_width: of the road, beyond which the car has left it [m].
-        corrections: of the driver's hands, see `Hands` [m/s²].
-        traffic: stretches per lap, on average, behind a slower car.
-        traffic_speed: of those, drawn for each [m/s].
-    """
+    """Laps of a course at a share of the grip that varies along the way."""
 
     name: ClassVar[str] = "laps"
-    course: str = "handling"
-    duration: float | None = None
-    laps: int | None = None
-    severity: Range = (0.65, 0.9)
-    ripple: float = 0.05
-    line_offset: float = 0.5
-    top_speed: float | None = None
-    flat: bool = False
-    half_width: float = 5.0
-    corrections: Range = 0.0
-    traffic: float = 0.0
-    traffic_speed: tuple[float, float] = (8.0, 30.0)
+    course: str = "handling"  # name of the course
+    duration: float | None = None  # of the recording [s]; none where ``laps`` is given
+    laps: int | None = None  # whole laps to record
+    severity: Range = (0.65, 0.9)  # mean share of the grip
+    ripple: float = 0.05  # by which the share varies along the way
+    line_offset: float = 0.5  # by which the line varies about the road's middle [m]
+    top_speed: float | None = None  # that the driver does not exceed [m/s]; by default the car's
+    flat: bool = False  # leaves out the course's bank and grade
+    half_width: float = 5.0  # of the road, beyond which the car has left it [m]
+    corrections: Range = 0.0  # of the driver's hands, see `Hands` [m/s²]
+    traffic: float = 0.0  # stretches per lap, on average, behind a slower car
+    traffic_speed: tuple[float, float] = (8.0, 30.0)  # of those, drawn for each [m/s]
 
     def __post_init__(self) -> None:
         require(self, severity=(0.05, 1.0), ripple=(0.0, 0.5), line_offset=(0.0, 3.0), half_width=(0.5, 50.0))
@@ -132,28 +117,17 @@ class Laps(Manoeuvre):
 
 @dataclass(frozen=True)
 class SpeedLaps(Manoeuvre):
-    """A lap at each of several speeds, then a stop, as the truck of Di Biase et al. 2020 drove them.
-
-    Args:
-        course: name of the course.
-        speeds: of the laps, one after the other [m/s]; 30, 40 and 45 km/h in the paper.
-        stop_time: from the last lap's speed to the stand [s]; 5 s in the paper.
-        severity: share of the grip that corners get at most.
-        change_rate: acceleration by which the speed changes from lap to lap [m/s²].
-        line_offset: by which the line varies about the road's middle [m].
-        flat: leaves out the course's bank and grade.
-        half_width: of the road, beyond which the car has left it [m].
-    """
+    """A lap at each of several speeds, then a stop, as the truck of Di Biase et al. 2020 drove them."""
 
     name: ClassVar[str] = "speed_laps"
-    course: str = "vairano_like"
-    speeds: tuple[float, ...] = (30.0 / 3.6, 40.0 / 3.6, 45.0 / 3.6)
-    stop_time: float = 5.0
-    severity: Range = 0.7
-    change_rate: float = 0.4
-    line_offset: float = 0.3
-    flat: bool = False
-    half_width: float = 5.0
+    course: str = "vairano_like"  # name of the course
+    speeds: tuple[float, ...] = (30.0 / 3.6, 40.0 / 3.6, 45.0 / 3.6)  # of the laps, in order [m/s]; 30, 40 and 45 km/h in the paper
+    stop_time: float = 5.0  # from the last lap's speed to the stand [s]; 5 s in the paper
+    severity: Range = 0.7  # share of the grip that corners get at most
+    change_rate: float = 0.4  # acceleration by which the speed changes from lap to lap [m/s²]
+    line_offset: float = 0.3  # by which the line varies about the road's middle [m]
+    flat: bool = False  # leaves out the course's bank and grade
+    half_width: float = 5.0  # of the road, beyond which the car has left it [m]
 
     def __post_init__(self) -> None:
         require(self, severity=(0.05, 0.95), stop_time=(1.0, 60.0), change_rate=(0.05, 3.0), line_offset=(0.0, 3.0))
@@ -186,24 +160,15 @@ class SpeedLaps(Manoeuvre):
 
 @dataclass(frozen=True)
 class FastLap(Manoeuvre):
-    """One lap of a given mean and top speed, as the truck of Di Biase et al. 2020 drove it.
-
-    Args:
-        course: name of the course.
-        mean_speed: length of the course over the time of the lap [m/s]; 76 km/h in the paper.
-        top_speed: that the driver does not exceed [m/s]; 115 km/h in the paper.
-        line_offset: by which the line varies about the road's middle [m].
-        flat: leaves out the course's bank and grade.
-        half_width: of the road, beyond which the car has left it [m].
-    """
+    """One lap of a given mean and top speed, as the truck of Di Biase et al. 2020 drove it."""
 
     name: ClassVar[str] = "fast_lap"
-    course: str = "vairano_like"
-    mean_speed: float = 76.0 / 3.6
-    top_speed: float = 115.0 / 3.6
-    line_offset: float = 0.3
-    flat: bool = False
-    half_width: float = 5.0
+    course: str = "vairano_like"  # name of the course
+    mean_speed: float = 76.0 / 3.6  # length of the course over the time of the lap [m/s]; 76 km/h in the paper
+    top_speed: float = 115.0 / 3.6  # that the driver does not exceed [m/s]; 115 km/h in the paper
+    line_offset: float = 0.3  # by which the line varies about the road's middle [m]
+    flat: bool = False  # leaves out the course's bank and grade
+    half_width: float = 5.0  # of the road, beyond which the car has left it [m]
 
     def __post_init__(self) -> None:
         require(self, mean_speed=(2.0, 60.0), top_speed=(self.mean_speed, 100.0), line_offset=(0.0, 3.0), half_width=(0.5, 50.0))
@@ -251,11 +216,8 @@ class LapDriver(Follower):
 
     Args:
         plan: of one lap more than is recorded.
-        car: the car.
-        driver: its driver.
         lap: length of a lap [m].
         end: distance at which the drive is over, or the stop begins [m].
-        drawn: values that the seed drew.
         stop_time: time from the end to the stand [s]; by default the drive is over at the end.
         end_time: at which the drive is over wherever the car is [s].
         hands: corrections beside the line; by default none.

@@ -57,11 +57,7 @@ class Manoeuvre(ABC):
 
     @abstractmethod
     def controller(self, car: Car, surface: Surface, seed: int) -> Controller:
-        """The controller of this car on this surface, as the seed draws it.
-
-        Raises:
-            ConfigurationError: the car cannot do this.
-        """
+        """The controller of this car on this surface, as the seed draws it; raises `ConfigurationError` where the car cannot do this."""
 
     def description(self) -> dict[str, Any]:
         """Name and parameters."""
@@ -76,10 +72,6 @@ class LineDriver(Follower):
     """Follows a line until its end.
 
     Args:
-        plan: line and speed.
-        car: the car.
-        driver: its driver.
-        drawn: values that the seed drew.
         end: distance at which the drive is over [m]; by default the plan's end.
         end_time: at which it is over at the latest [s].
         speed_at: see Follower.
@@ -106,12 +98,7 @@ class LineDriver(Follower):
 
 
 class OpenArea:
-    """Friction along the way on an open area.
-
-    Args:
-        surface: of the area.
-        seed: of the drive, for patches.
-    """
+    """Friction along the way on an open area; ``seed``: of the drive, for patches."""
 
     def __init__(self, surface: Surface, seed: int) -> None:
         self._friction = surface.along(np.arange(0.0, OPEN_AREA_LAP), seed, OPEN_AREA_LAP).tolist()

@@ -33,22 +33,14 @@ from vehest.simulation.road.surface import Surface
 
 @dataclass(frozen=True)
 class StepSteer(Manoeuvre):
-    """J-turn: straight ahead, then the steering wheel is turned quickly and held (ISO 7401, step input).
-
-    Args:
-        speed: [m/s]; the driver holds it as far as grip and power allow.
-        severity: share of the grip that the steady turn takes; beyond 1 the steering angle grows with its square.
-        steer_time: in which the angle is reached, unless the steering is slower [s].
-        turn_time: after the step [s].
-        side: ``left``, ``right`` or ``either``.
-    """
+    """J-turn: straight ahead, then the steering wheel is turned quickly and held (ISO 7401, step input)."""
 
     name: ClassVar[str] = "j_turn"
-    speed: Range = (15.0, 28.0)
-    severity: Range = (0.4, 1.0)
-    steer_time: Range = (0.15, 0.6)
-    turn_time: Range = (5.0, 8.0)
-    side: str = "either"
+    speed: Range = (15.0, 28.0)  # [m/s]; the driver holds it as far as grip and power allow
+    severity: Range = (0.4, 1.0)  # share of the grip that the steady turn takes; beyond 1 the steering angle grows with its square
+    steer_time: Range = (0.15, 0.6)  # in which the angle is reached, unless the steering is slower [s]
+    turn_time: Range = (5.0, 8.0)  # after the step [s]
+    side: str = "either"  # ``left``, ``right`` or ``either``
 
     def __post_init__(self) -> None:
         require(self, speed=(3.0, 70.0), severity=(0.05, 2.0), steer_time=(0.02, 10.0), turn_time=(0.5, 600.0))
@@ -77,24 +69,15 @@ class StepSteer(Manoeuvre):
 
 @dataclass(frozen=True)
 class Spiral(Manoeuvre):
-    """Spiral: at constant speed the steering angle grows slowly, then, in a second turn, to the other side.
-
-    Args:
-        speed: [m/s]; the driver holds it as far as grip and power allow.
-        severity: share of the grip that the tightest turn takes; beyond 1 the steering angle grows with its square.
-        ramp_time: in which the angle is reached [s].
-        hold_time: at the angle [s].
-        turns: 1, or 2 for a second turn to the other side.
-        side: of the first turn: ``left``, ``right`` or ``either``.
-    """
+    """Spiral: at constant speed the steering angle grows slowly, then, in a second turn, to the other side."""
 
     name: ClassVar[str] = "spiral"
-    speed: Range = (14.0, 25.0)
-    severity: Range = (0.7, 1.0)
-    ramp_time: Range = (6.0, 12.0)
-    hold_time: Range = (1.0, 2.0)
-    turns: int = 2
-    side: str = "either"
+    speed: Range = (14.0, 25.0)  # [m/s]; the driver holds it as far as grip and power allow
+    severity: Range = (0.7, 1.0)  # share of the grip that the tightest turn takes; beyond 1 the steering angle grows with its square
+    ramp_time: Range = (6.0, 12.0)  # in which the angle is reached [s]
+    hold_time: Range = (1.0, 2.0)  # at the angle [s]
+    turns: int = 2  # 1, or 2 for a second turn to the other side
+    side: str = "either"  # of the first turn: ``left``, ``right`` or ``either``
 
     def __post_init__(self) -> None:
         require(self, speed=(3.0, 70.0), severity=(0.05, 2.0), ramp_time=(0.5, 300.0), hold_time=(0.0, 300.0))
@@ -129,20 +112,13 @@ class Spiral(Manoeuvre):
 
 @dataclass(frozen=True)
 class RandomSteer(Manoeuvre):
-    """Random steering within a band of frequencies at roughly constant speed (in the manner of ISO 7401, random input).
-
-    Args:
-        speed: [m/s]; the driver holds it as far as grip and power allow.
-        severity: share of the grip that three standard deviations of the steering angle would take in a steady turn.
-        band: lowest and highest frequency [Hz].
-        duration: of the recording [s].
-    """
+    """Random steering within a band of frequencies at roughly constant speed (in the manner of ISO 7401, random input)."""
 
     name: ClassVar[str] = "random_steer"
-    speed: Range = (14.0, 30.0)
-    severity: Range = (0.5, 1.0)
-    band: tuple[float, float] = (0.1, 1.2)
-    duration: float = 30.0
+    speed: Range = (14.0, 30.0)  # [m/s]; the driver holds it as far as grip and power allow
+    severity: Range = (0.5, 1.0)  # share of the grip that three standard deviations of the steering angle would take in a steady turn
+    band: tuple[float, float] = (0.1, 1.2)  # lowest and highest frequency [Hz]
+    duration: float = 30.0  # of the recording [s]
 
     def __post_init__(self) -> None:
         require(self, speed=(3.0, 70.0), severity=(0.05, 2.0), duration=(1.0, 3600.0))
@@ -182,12 +158,9 @@ class OpenLoop:
     """Steers by the clock on an open area and holds the speed.
 
     Args:
-        car: the car.
-        area: with its friction.
         speed: [m/s].
         steer_at: road-wheel angle [rad] at a time [s].
         end_time: at which the drive is over [s].
-        drawn: values that the seed drew.
     """
 
     def __init__(

@@ -20,7 +20,6 @@ def ramp_steer(
     Towards the limit, where the lateral acceleration hardly grows any more, the steering angle grows up to ten times faster.
 
     Args:
-        plant: the car.
         speed: [m/s].
         ay_rate: by which the lateral acceleration of a neutral car would grow [m/s³].
         friction: scale of the tyres' friction.

@@ -18,51 +18,32 @@ class Motion:
 
     Axes are those of ISO 8855: x forward, y left, z up; a left turn has positive steer, yaw_rate and ay. They yaw with
     the car and stay level with the road; columns of (T, 4) arrays are WHEELS.
-
-    Args:
-        rate_hz: sampling rate [Hz].
-        x, y: position on the ground [m].
-        yaw: heading, counter-clockwise from the x axis, not wrapped [rad].
-        vx, vy: velocity [m/s].
-        yaw_rate: [rad/s].
-        ax, ay: acceleration, dvx/dt - vy·yaw_rate and dvy/dt + vx·yaw_rate [m/s²].
-        steer: road-wheel angle of the front axle [rad].
-        roll: of the body against the road, positive with the left side up, as in a left turn [rad].
-        pitch: of the body against its place at rest, positive with the nose down, as when braking [rad].
-        roll_rate, pitch_rate: their derivatives [rad/s].
-        wheel_speed: rotational speeds (T, 4) [rad/s].
-        tyre_fx, tyre_fy: forces of the road on the tyres, along and across the body, not the wheel (T, 4) [N].
-        tyre_fz: wheel loads, positive (T, 4) [N].
-        friction: scale of the tyres' friction in effect (T,), 1 for the vehicle's own tyres on a dry road.
-        bank: of the road, positive with its left side higher [rad].
-        grade: of the road, positive downhill [rad].
-        motor_speed: of an electric drive motor, referred to the wheels [rad/s]; none where the car has no such motor.
-        motor_current: its torque-producing current [A]; likewise.
     """
 
-    rate_hz: float
-    x: FloatArray
-    y: FloatArray
-    yaw: FloatArray
-    vx: FloatArray
-    vy: FloatArray
-    yaw_rate: FloatArray
-    ax: FloatArray
-    ay: FloatArray
-    steer: FloatArray
-    roll: FloatArray
-    pitch: FloatArray
-    roll_rate: FloatArray
-    pitch_rate: FloatArray
-    wheel_speed: FloatArray
-    tyre_fx: FloatArray
-    tyre_fy: FloatArray
-    tyre_fz: FloatArray
-    friction: FloatArray
-    bank: FloatArray
-    grade: FloatArray
+    rate_hz: float  # sampling rate [Hz]
+    x: FloatArray  # position on the ground [m]
+    y: FloatArray  # position on the ground [m]
+    yaw: FloatArray  # heading, counter-clockwise from the x axis, not wrapped [rad]
+    vx: FloatArray  # forward velocity [m/s]
+    vy: FloatArray  # lateral velocity [m/s]
+    yaw_rate: FloatArray  # [rad/s]
+    ax: FloatArray  # acceleration dvx/dt - vy·yaw_rate [m/s²]
+    ay: FloatArray  # acceleration dvy/dt + vx·yaw_rate [m/s²]
+    steer: FloatArray  # road-wheel angle of the front axle [rad]
+    roll: FloatArray  # of the body against the road, positive with the left side up, as in a left turn [rad]
+    pitch: FloatArray  # of the body against its place at rest, positive with the nose down, as when braking [rad]
+    roll_rate: FloatArray  # derivative of the roll [rad/s]
+    pitch_rate: FloatArray  # derivative of the pitch [rad/s]
+    wheel_speed: FloatArray  # rotational speeds (T, 4) [rad/s]
+    tyre_fx: FloatArray  # forces of the road on the tyres, along the body, not the wheel (T, 4) [N]
+    tyre_fy: FloatArray  # the same across the body (T, 4) [N]
+    tyre_fz: FloatArray  # wheel loads, positive (T, 4) [N]
+    friction: FloatArray  # scale of the tyres' friction in effect (T,), 1 for the vehicle's own tyres on a dry road
+    bank: FloatArray  # of the road, positive with its left side higher [rad]
+    grade: FloatArray  # of the road, positive downhill [rad]
+    # of an electric drive motor, referred to the wheels [rad/s]; none where the car has no such motor
     motor_speed: FloatArray | None = None
-    motor_current: FloatArray | None = None
+    motor_current: FloatArray | None = None  # its torque-producing current [A]; likewise
 
     def __len__(self) -> int:
         return len(self.x)

@@ -66,18 +66,12 @@ def _state(place: int, meaning: str) -> Any:
 
 @dataclass(frozen=True, eq=False)
 class PlantState:
-    """State of the car.
+    """State of the car."""
 
-    Args:
-        values: the library's states, (29,).
-        regime: which equations hold.
-        spun: whether the car has been in a spin since its start.
-        held: lateral forces over load that the tyres hold, (4,) in the library's order of wheels; of cars whose forces lag.
-    """
-
-    values: FloatArray
-    regime: Regime
-    spun: bool = False
+    values: FloatArray  # the library's states, (29,)
+    regime: Regime  # which equations hold
+    spun: bool = False  # whether the car has been in a spin since its start
+    # lateral forces over load that the tyres hold, (4,) in the library's order of wheels; of cars whose forces lag
     held: FloatArray = field(default_factory=lambda: np.zeros(4))
 
     x, y = _state(X, "Position on the ground [m]."), _state(Y, "Position on the ground [m].")
@@ -103,16 +97,12 @@ class MultiBodyPlant:
     The yaw moment brings its braking force |M|/(track/2) along. It does not use up the braked tyres' grip, and does
     nothing below about 1 m/s and in a spin.
 
-    Args:
-        vehicle: the car.
-        step: integration step [s]; where slow wheels need it, a step is made in parts.
-
     Raises:
         ConfigurationError: the step is not positive.
     """
 
-    vehicle: Vehicle
-    step: float = 1e-3
+    vehicle: Vehicle  # the car
+    step: float = 1e-3  # integration step [s]; where slow wheels need it, a step is made in parts
 
     def __post_init__(self) -> None:
         if not self.step > 0:
@@ -181,7 +171,6 @@ class MultiBodyPlant:
         """Derivatives of the states (T, 29), and tyre forces (T, 3, 4) along, across and up, for motion.WHEELS [N].
 
         Args:
-            states: T states.
             inputs: (T, 5).
             friction: scale of friction, (T,) or one for all.
         """
@@ -206,7 +195,6 @@ class MultiBodyPlant:
         """States sampled at ``rate_hz``, each with the inputs that hold from then on, as motion in ISO 8855 axes.
 
         Args:
-            states: T states.
             inputs: (T, 5).
             rate_hz: [Hz].
             friction: scale of friction, (T,) or one for all.

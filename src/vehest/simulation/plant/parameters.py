@@ -120,7 +120,6 @@ def loaded(vehicle: Vehicle, mass: float, forward: float, up: float) -> Vehicle:
     Unsprung masses are shared anew between the axles, so that body and car keep one centre of gravity in plan.
 
     Args:
-        vehicle: without it.
         mass: of the payload [kg].
         forward, up: its place from the centre of gravity [m].
 

@@ -132,24 +132,17 @@ def _advance(state, wanted_steer, wanted_current, scale, p, step, n_steps):  # t
 
 @dataclass(frozen=True, eq=False)
 class Inputs:
-    """Inputs of the car.
+    """Inputs of the car."""
 
-    Args:
-        steer: wanted road-wheel angle [rad].
-        current: wanted motor current [A].
-        friction: scale of the tyres' friction.
-    """
-
-    steer: float = 0.0
-    current: float = 0.0
-    friction: float = 1.0
+    steer: float = 0.0  # wanted road-wheel angle [rad]
+    current: float = 0.0  # wanted motor current [A]
+    friction: float = 1.0  # scale of the tyres' friction
 
 
 class PlanarPlant:
     """A car and its equations of motion.
 
     Args:
-        car: the car.
         step: of the integration [s].
 
     Raises:
@@ -175,11 +168,7 @@ class PlanarPlant:
         return _derivative(state, float(inputs.steer), float(inputs.current), float(inputs.friction), self._values, forces), forces
 
     def advance(self, state: FloatArray, inputs: Inputs, n_steps: int) -> FloatArray:
-        """The state after some steps with constant inputs, (22,).
-
-        Raises:
-            SimulationError: a state is not finite.
-        """
+        """The state after some steps with constant inputs, (22,); raises `SimulationError` where a state is not finite."""
         after: FloatArray = _advance(
             state, float(inputs.steer), float(inputs.current), float(inputs.friction), self._values, self.step, n_steps
         )

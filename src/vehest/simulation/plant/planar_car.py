@@ -21,72 +21,42 @@ PLANAR = "planar"
 
 @dataclass(frozen=True)
 class PlanarCar:
-    """A car that the planar plant can drive; a parameter of zero takes its effect away.
+    """A car that the planar plant can drive; a parameter of zero takes its effect away."""
 
-    Args:
-        name: in recordings.
-        mass: [kg].
-        yaw_inertia: about the vertical axis through the centre of gravity [kg m²].
-        cg_to_front_axle, cg_to_rear_axle: distances from the centre of gravity [m].
-        track: distance of left and right wheels, of both axles [m].
-        cg_height: [m].
-        wheel_radius: [m].
-        wheel_inertia: of one wheel with its shafts [kg m²].
-        motor_inertia: of the motor and the gears, referred to the wheels [kg m²].
-        torque_constant: torque at the wheels, all four together, per motor current [N m/A].
-        coulomb_torque: friction of motor and gears, referred to the wheels [N m].
-        viscous_torque: the same, proportional to the speed of the wheels [N m s/rad].
-        axle_lock: of the front and of the rear differential: torque per difference of a wheel's speed to its axle's mean [N m s/rad].
-        centre_lock: of the centre differential: torque on a wheel per difference of its axle's mean speed to that of all [N m s/rad].
-        air_drag: force per square of the speed [N s²/m²].
-        friction: peak friction of the tyres at a quarter of the weight [1].
-        load_sensitivity: relative loss of friction per relative gain of load [1].
-        stiffness_factor_front, stiffness_factor_rear: B of the magic formula sin(C atan(B s)), s the combined slip [1].
-        shape_factor: its C [1].
-        relaxation_length: of the tyres [m].
-        carcass_damping: share of the slip that acts at once, without relaxation [1].
-        roll_share_front: share of the lateral load transfer that the front axle takes [1].
-        load_time: time constant with which load transfer, roll and pitch follow the accelerations [s].
-        roll_gradient, pitch_gradient: angles of the body per acceleration [rad s²/m].
-        largest_steer: road-wheel angle at the stop [rad].
-        steering_rate: of the servo, largest [rad/s].
-        steering_time: time constant of the servo [s].
-        current_time: time constant of the motor's current [s].
-        largest_current: either sign [A].
-    """
-
-    name: str
-    mass: Positive
-    yaw_inertia: Positive
-    cg_to_front_axle: Positive
-    cg_to_rear_axle: Positive
-    track: Positive
-    cg_height: ZeroOrPositive
-    wheel_radius: Positive
-    wheel_inertia: Positive
-    motor_inertia: Positive
-    torque_constant: Positive
-    coulomb_torque: ZeroOrPositive
-    viscous_torque: ZeroOrPositive
+    name: str  # in recordings
+    mass: Positive  # [kg]
+    yaw_inertia: Positive  # about the vertical axis through the centre of gravity [kg m²]
+    cg_to_front_axle: Positive  # distance from the centre of gravity [m]
+    cg_to_rear_axle: Positive  # distance from the centre of gravity [m]
+    track: Positive  # distance of left and right wheels, of both axles [m]
+    cg_height: ZeroOrPositive  # [m]
+    wheel_radius: Positive  # [m]
+    wheel_inertia: Positive  # of one wheel with its shafts [kg m²]
+    motor_inertia: Positive  # of the motor and the gears, referred to the wheels [kg m²]
+    torque_constant: Positive  # torque at the wheels, all four together, per motor current [N m/A]
+    coulomb_torque: ZeroOrPositive  # friction of motor and gears, referred to the wheels [N m]
+    viscous_torque: ZeroOrPositive  # the same, proportional to the speed of the wheels [N m s/rad]
+    # of the front and of the rear differential: torque per difference of a wheel's speed to its axle's mean [N m s/rad]
     axle_lock: ZeroOrPositive
+    # of the centre differential: torque on a wheel per difference of its axle's mean speed to that of all [N m s/rad]
     centre_lock: ZeroOrPositive
-    air_drag: ZeroOrPositive
-    friction: Positive
-    load_sensitivity: Annotated[float, Field(ge=0.0, le=0.5)]
-    stiffness_factor_front: Positive
-    stiffness_factor_rear: Positive
-    shape_factor: Annotated[float, Field(gt=0.0, le=2.0)]
-    relaxation_length: Positive
-    carcass_damping: Share
-    roll_share_front: Share
-    load_time: Positive
-    roll_gradient: ZeroOrPositive
-    pitch_gradient: ZeroOrPositive
-    largest_steer: Positive
-    steering_rate: Positive
-    steering_time: Positive
-    current_time: Positive
-    largest_current: Positive
+    air_drag: ZeroOrPositive  # force per square of the speed [N s²/m²]
+    friction: Positive  # peak friction of the tyres at a quarter of the weight [1]
+    load_sensitivity: Annotated[float, Field(ge=0.0, le=0.5)]  # relative loss of friction per relative gain of load [1]
+    stiffness_factor_front: Positive  # B of the magic formula sin(C atan(B s)), s the combined slip [1]
+    stiffness_factor_rear: Positive  # B of the magic formula sin(C atan(B s)), s the combined slip [1]
+    shape_factor: Annotated[float, Field(gt=0.0, le=2.0)]  # its C [1]
+    relaxation_length: Positive  # of the tyres [m]
+    carcass_damping: Share  # share of the slip that acts at once, without relaxation [1]
+    roll_share_front: Share  # share of the lateral load transfer that the front axle takes [1]
+    load_time: Positive  # time constant with which load transfer, roll and pitch follow the accelerations [s]
+    roll_gradient: ZeroOrPositive  # angle of the body per acceleration [rad s²/m]
+    pitch_gradient: ZeroOrPositive  # angle of the body per acceleration [rad s²/m]
+    largest_steer: Positive  # road-wheel angle at the stop [rad]
+    steering_rate: Positive  # of the servo, largest [rad/s]
+    steering_time: Positive  # time constant of the servo [s]
+    current_time: Positive  # time constant of the motor's current [s]
+    largest_current: Positive  # either sign [A]
 
     @property
     def wheelbase(self) -> float:

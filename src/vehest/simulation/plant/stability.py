@@ -16,47 +16,29 @@ from vehest.simulation.plant.multi_body import MultiBodyPlant
 
 @dataclass(frozen=True)
 class StabilityState:
-    """State of the control.
+    """State of the control."""
 
-    Args:
-        reference: yaw rate that it follows [rad/s].
-        active: whether it intervenes.
-        moment: yaw moment that it asks for, positive to the left [N m]; the plant's third input.
-    """
-
-    reference: float = 0.0
-    active: bool = False
-    moment: float = 0.0
+    reference: float = 0.0  # yaw rate that it follows [rad/s]
+    active: bool = False  # whether it intervenes
+    moment: float = 0.0  # yaw moment that it asks for, positive to the left [N m]; the plant's third input
 
 
 @dataclass(frozen=True)
 class StabilityControl:
-    """A control fitted to a car; stability_control() makes one.
+    """A control fitted to a car; stability_control() makes one."""
 
-    Args:
-        wheelbase: [m].
-        understeer_gradient: of the linear single track [rad s²/m].
-        yaw_inertia: [kg m²].
-        grip: lateral acceleration that friction allows on a dry road [m/s²].
-        largest_moment: that braking one side may give on a dry road [N m].
-        gain: moment per error of the yaw rate and per inertia [1/s]; assumed: the car follows within 50 ms, and cars get all
-            of the moment at about 7 degrees a second. With half of it, a car whose rear slides is lost before the brakes are fully on.
-        on_above: error of the yaw rate at which it intervenes [rad/s]; assumed.
-        off_below: error at which it lets go again [rad/s]; assumed.
-        lag: time constant of the reference [s]; assumed.
-        slowest: speed below which it does nothing [m/s]; assumed.
-    """
-
-    wheelbase: float
-    understeer_gradient: float
-    yaw_inertia: float
-    grip: float
-    largest_moment: float
+    wheelbase: float  # [m]
+    understeer_gradient: float  # of the linear single track [rad s²/m]
+    yaw_inertia: float  # [kg m²]
+    grip: float  # lateral acceleration that friction allows on a dry road [m/s²]
+    largest_moment: float  # that braking one side may give on a dry road [N m]
+    # moment per error of the yaw rate and per inertia [1/s]; assumed: the car follows within 50 ms, and cars get all of the moment at about
+    # 7 degrees a second. With half of it, a car whose rear slides is lost before the brakes are fully on.
     gain: float = 20.0
-    on_above: float = 0.07
-    off_below: float = 0.03
-    lag: float = 0.1
-    slowest: float = 5.0
+    on_above: float = 0.07  # error of the yaw rate at which it intervenes [rad/s]; assumed
+    off_below: float = 0.03  # error at which it lets go again [rad/s]; assumed
+    lag: float = 0.1  # time constant of the reference [s]; assumed
+    slowest: float = 5.0  # speed below which it does nothing [m/s]; assumed
 
     def step(
         self, before: StabilityState, interval: float, *, steer: float, vx: float, yaw_rate: float, friction: float = 1.0

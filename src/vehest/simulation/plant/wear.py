@@ -16,20 +16,14 @@ class Stint:
 
     factor(t) = (1 - cold exp(-t/warm_time)) (1 - wear min(t/wear_time, 1))
 
-    Args:
-        cold: share that cold tyres lack at the first sample.
-        warm_time: time constant of warming up [s].
-        wear: share that is lost over ``wear_time``.
-        wear_time: [s].
-
     Raises:
         ConfigurationError: a share is not between 0 and 0.5, or a time not positive.
     """
 
-    cold: float = 0.0
-    warm_time: float = 120.0
-    wear: float = 0.0
-    wear_time: float = 1200.0
+    cold: float = 0.0  # share that cold tyres lack at the first sample
+    warm_time: float = 120.0  # time constant of warming up [s]
+    wear: float = 0.0  # share that is lost over ``wear_time``
+    wear_time: float = 1200.0  # [s]
 
     def __post_init__(self) -> None:
         for name in ("cold", "wear"):

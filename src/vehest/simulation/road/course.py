@@ -20,28 +20,17 @@ __all__ = ["Compound", "Corner", "Course", "Layout", "Straight", "build_course",
 
 @dataclass(frozen=True, eq=False)
 class Course:
-    """A closed centre line, sampled from arc length 0 to the full length; first and last sample are the same place.
+    """A closed centre line, sampled from arc length 0 to the full length; first and last sample are the same place."""
 
-    Args:
-        name: in recordings.
-        arc_length: (N,) [m], uniform.
-        x, y: (N,) [m].
-        heading: (N,), not wrapped [rad].
-        curvature: (N,), positive to the left [1/m].
-        bank: (N,), positive with the left side higher [rad].
-        grade: (N,), positive downhill [rad].
-        friction: (N,), scale of the tyres' friction on the dry road.
-    """
-
-    name: str
-    arc_length: FloatArray
-    x: FloatArray
-    y: FloatArray
-    heading: FloatArray
-    curvature: FloatArray
-    bank: FloatArray
-    grade: FloatArray
-    friction: FloatArray
+    name: str  # in recordings
+    arc_length: FloatArray  # (N,) [m], uniform
+    x: FloatArray  # (N,) [m]
+    y: FloatArray  # (N,) [m]
+    heading: FloatArray  # (N,), not wrapped [rad]
+    curvature: FloatArray  # (N,), positive to the left [1/m]
+    bank: FloatArray  # (N,), positive with the left side higher [rad]
+    grade: FloatArray  # (N,), positive downhill [rad]
+    friction: FloatArray  # (N,), scale of the tyres' friction on the dry road
 
     @property
     def length(self) -> float:
@@ -80,11 +69,7 @@ def build_course(name: str, segments: Sequence[Segment] | Layout, spacing: float
 
 
 def course_by_name(name: str) -> Course:
-    """One of the courses of the proving ground.
-
-    Raises:
-        ConfigurationError: there is no such course.
-    """
+    """One of the courses of the proving ground; raises `ConfigurationError` where there is no such course."""
     if name not in LAYOUTS:
         raise ConfigurationError(f"there is no course '{name}'; there are {', '.join(sorted(LAYOUTS))}")
     return _build_by_name(name)

@@ -24,17 +24,12 @@ _SMOOTH = 6.0
 
 @dataclass(frozen=True)
 class Gate:
-    """A stretch along the x axis between two rows of cones.
+    """A stretch along the x axis between two rows of cones."""
 
-    Args:
-        begin, end: of the stretch [m].
-        right, left: lateral places of the rows [m]; infinite where there is none.
-    """
-
-    begin: float
-    end: float
-    right: float = -math.inf
-    left: float = math.inf
+    begin: float  # of the stretch [m]
+    end: float  # of the stretch [m]
+    right: float = -math.inf  # lateral place of the row [m]; infinite where there is none
+    left: float = math.inf  # lateral place of the row [m]; infinite where there is none
 
 
 @dataclass(frozen=True, eq=False)

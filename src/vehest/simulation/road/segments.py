@@ -27,19 +27,12 @@ class Straight:
 
 @dataclass(frozen=True)
 class Corner:
-    """A corner: clothoid, circular arc, clothoid.
+    """A corner: clothoid, circular arc, clothoid."""
 
-    Args:
-        radius: of the arc [m].
-        angle: change of heading, positive to the left [rad].
-        transition: length of each clothoid [m].
-        banking: of the arc, growing along the clothoids; positive with the inner side lower [rad].
-    """
-
-    radius: float
-    angle: float
-    transition: float
-    banking: float = 0.0
+    radius: float  # of the arc [m]
+    angle: float  # change of heading, positive to the left [rad]
+    transition: float  # length of each clothoid [m]
+    banking: float = 0.0  # of the arc, growing along the clothoids; positive with the inner side lower [rad]
 
     @property
     def bank(self) -> float:
@@ -68,14 +61,11 @@ class Compound:
 
     Each part turns by its own angle, half of the clothoids on either side included.
 
-    Args:
-        parts: corners to the same side, with the same transition.
-
     Raises:
         ValueError: the parts do not agree.
     """
 
-    parts: tuple[Corner, ...]
+    parts: tuple[Corner, ...]  # corners to the same side, with the same transition
 
     def __post_init__(self) -> None:
         if len({(part.transition, part.angle > 0.0) for part in self.parts}) != 1:

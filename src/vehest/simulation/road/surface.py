@@ -24,22 +24,15 @@ class Surface:
     Either one scale all along or, with ``patches``, patches of which each has a scale drawn between ``patches`` and ``friction``,
     uniformly, and a length drawn from ``patch_length``, uniformly. Friction changes over two metres between them.
 
-    Args:
-        name: in recordings.
-        friction: scale of the tyres' friction; 1 is the dry road of the vehicle's tyre data.
-        patches: lowest scale of a patch.
-        patch_length: shortest and longest patch [m].
-        seed: of the patches; by default the drive's.
-
     Raises:
         ConfigurationError: a scale is outside 0.05 … 1.5 or a length makes no sense.
     """
 
-    name: str = "dry"
-    friction: float = 1.0
-    patches: float | None = None
-    patch_length: tuple[float, float] = (20.0, 80.0)
-    seed: Annotated[int, Field(ge=0), "a whole number, zero or positive"] | None = None
+    name: str = "dry"  # in recordings
+    friction: float = 1.0  # scale of the tyres' friction; 1 is the dry road of the vehicle's tyre data
+    patches: float | None = None  # lowest scale of a patch
+    patch_length: tuple[float, float] = (20.0, 80.0)  # shortest and longest patch [m]
+    seed: Annotated[int, Field(ge=0), "a whole number, zero or positive"] | None = None  # of the patches; by default the drive's
 
     def __post_init__(self) -> None:
         lowest = self.friction if self.patches is None else self.patches

@@ -10,18 +10,12 @@ from vehest.simulation.road.segments import Compound, Segment, Straight, left, r
 
 @dataclass(frozen=True)
 class Layout:
-    """Layout of a course.
+    """Layout of a course."""
 
-    Args:
-        segments: in the order they are driven.
-        crossfall: bank of the road all along, positive with the left side higher [rad]; corners add their own.
-        heights: (share of the lap, height [m]), in ascending order; none is a level course.
-        friction: (share of the lap where it begins, where it ends, scale of the tyres' friction); 1 elsewhere.
-    """
-
-    segments: tuple[Segment, ...]
-    crossfall: float = 0.0
-    heights: tuple[tuple[float, float], ...] = ()
+    segments: tuple[Segment, ...]  # in the order they are driven
+    crossfall: float = 0.0  # bank of the road all along, positive with the left side higher [rad]; corners add their own
+    heights: tuple[tuple[float, float], ...] = ()  # (share of the lap, height [m]), in ascending order; none is a level course
+    # (share of the lap where it begins, where it ends, scale of the tyres' friction); 1 elsewhere
     friction: tuple[tuple[float, float, float], ...] = ()
 
 

@@ -27,7 +27,6 @@ def switched_off(levels: SensorLevels, *names: str) -> SensorLevels:
     >>> levels = switched_off(SensorLevels(), "ay.noise", "tilt.bank", "reference", "*.drift")
 
     Args:
-        levels: to begin with.
         names: an error of a sensor (``ay.noise``, ``imu.lever_x``, ``reference.heading.drift``), all errors of one (``ay``, ``tilt``,
             ``reference``), or one kind of error of every sensor but the reference (``*.noise``), or all of them (``*``).
 

@@ -22,7 +22,6 @@ def shown(true: FloatArray, level: SensorLevel, rate_hz: float, seed: int, name:
         true: (T,), uniformly sampled.
         level: of its errors.
         rate_hz: sampling rate [Hz].
-        seed: of the drive.
         name: of the sensor; with the kind of error it chooses the random stream.
     """
     value = delayed(true, level.delay * rate_hz)

@@ -20,30 +20,19 @@ class SensorLevel:
     Noise is a density, so that a level means the same at every sampling rate: a sensor that is low-passed at half the sampling rate has
     samples of standard deviation noise·√(rate/2), which at 100 Hz is 7.07 times the density.
 
-    Args:
-        noise: density of the white noise [unit/√Hz].
-        offset: standard deviation of a constant that is drawn for each drive [unit].
-        drift: standard deviation of a first-order Gauss-Markov process that is stationary from the first sample on [unit].
-        drift_time: its correlation time [s].
-        quantisation: step of the values shown [unit].
-        delay: age of what is shown; the first value is held before the start [s].
-        scale: standard deviation of a relative error that is drawn for each drive [1].
-        gain: relative error of every drive [1].
-        bias: constant of every drive [unit].
-
     Raises:
         ConfigurationError: a value is not finite or, but for gain and bias, negative, or the correlation time is zero.
     """
 
-    noise: float = 0.0
-    offset: float = 0.0
-    drift: float = 0.0
-    drift_time: float = 300.0
-    quantisation: float = 0.0
-    delay: float = 0.0
-    scale: float = 0.0
-    gain: float = 0.0
-    bias: float = 0.0
+    noise: float = 0.0  # density of the white noise [unit/√Hz]
+    offset: float = 0.0  # standard deviation of a constant that is drawn for each drive [unit]
+    drift: float = 0.0  # standard deviation of a first-order Gauss-Markov process that is stationary from the first sample on [unit]
+    drift_time: float = 300.0  # its correlation time [s]
+    quantisation: float = 0.0  # step of the values shown [unit]
+    delay: float = 0.0  # age of what is shown; the first value is held before the start [s]
+    scale: float = 0.0  # standard deviation of a relative error that is drawn for each drive [1]
+    gain: float = 0.0  # relative error of every drive [1]
+    bias: float = 0.0  # constant of every drive [unit]
 
     def __post_init__(self) -> None:
         _require_finite(self, *(entry.name for entry in fields(self) if entry.name not in ("gain", "bias")))
@@ -64,22 +53,17 @@ def _require_finite(levels: Any, *not_negative: str) -> None:
 class Mounting:
     """Where the inertial unit sits and how it is turned against the body.
 
-    Args:
-        lever_x, lever_y, lever_z: its place forward, left and up of the centre of gravity [m].
-        roll, pitch, yaw: of its axes against the body's, right-handed about x, y and z, as a body's roll, pitch and yaw [rad].
-        misalignment: standard deviation of what is drawn for a drive and added to each of the three angles [rad].
-
     Raises:
         ConfigurationError: a value is not finite, or the misalignment is negative.
     """
 
-    lever_x: float = 0.0
-    lever_y: float = 0.0
-    lever_z: float = 0.0
-    roll: float = 0.0
-    pitch: float = 0.0
-    yaw: float = 0.0
-    misalignment: float = 0.0
+    lever_x: float = 0.0  # its place forward of the centre of gravity [m]
+    lever_y: float = 0.0  # its place left of the centre of gravity [m]
+    lever_z: float = 0.0  # its place above the centre of gravity [m]
+    roll: float = 0.0  # of its axes against the body's, right-handed [rad]
+    pitch: float = 0.0  # of its axes against the body's, right-handed [rad]
+    yaw: float = 0.0  # of its axes against the body's, right-handed [rad]
+    misalignment: float = 0.0  # standard deviation of what is drawn for a drive and added to each of the three angles [rad]
 
     def __post_init__(self) -> None:
         _require_finite(self, "misalignment")
@@ -89,20 +73,15 @@ class Mounting:
 class Tilt:
     """Which angles the inertial unit is tilted by, so that gravity leaks into the accelerometers; the others count as zero.
 
-    Args:
-        roll, pitch: of the body against the road. They also make the gyros measure about the body's axes instead of the road's.
-        bank, grade: of the road.
-        roll_share: of the body's roll that leaks; an installation that corrects for roll leaves less than 1, one that corrects too much
-            a negative share.
-
     Raises:
         ConfigurationError: the share is not finite.
     """
 
-    roll: bool = True
-    pitch: bool = True
-    bank: bool = True
-    grade: bool = True
+    roll: bool = True  # of the body against the road; also makes the gyros measure about the body's axes instead of the road's
+    pitch: bool = True  # likewise
+    bank: bool = True  # of the road
+    grade: bool = True  # of the road
+    # of the body's roll that leaks; an installation that corrects for roll leaves less than 1, one that corrects too much a negative share
     roll_share: float = 1.0
 
     def __post_init__(self) -> None:
@@ -113,17 +92,13 @@ class Tilt:
 class Vibration:
     """How the wheels' turning shakes the inertial unit: white noise whose standard deviation grows with their mean speed.
 
-    Args:
-        yaw_rate: standard deviation of a sample per speed of the wheels [1].
-        ax, ay: the same [m/s² per rad/s].
-
     Raises:
         ConfigurationError: a value is negative or not finite.
     """
 
-    yaw_rate: float = 0.0
-    ax: float = 0.0
-    ay: float = 0.0
+    yaw_rate: float = 0.0  # standard deviation of a sample per speed of the wheels [1]
+    ax: float = 0.0  # the same [m/s² per rad/s]
+    ay: float = 0.0  # the same [m/s² per rad/s]
 
     def __post_init__(self) -> None:
         _require_finite(self, "yaw_rate", "ax", "ay")
@@ -136,27 +111,20 @@ class Reference:
     It measures the velocity where it sits, in axes turned by the error ``heading``, and moves it to the centre of gravity with its
     own yaw rate and a lever that is known but for ``lever_error``. Roll and pitch rate are left out of that, as is usual.
 
-    Args:
-        kind: what it stands for, ``optical``, ``gnss``, ``motion_capture`` or ``ideal``.
-        vx, vy: errors of the velocity along its axes [m/s].
-        yaw_rate: errors of its gyro [rad/s].
-        heading: errors of its heading against the body's [rad]; delay, scale and quantisation have no meaning here.
-        lever_x, lever_y, lever_z: its place forward, left and up of the centre of gravity [m].
-        lever_error: standard deviation of what is drawn for a drive for lever_x and lever_y each [m].
-
     Raises:
         ConfigurationError: a lever is not finite, lever_error is negative, or heading has errors without a meaning.
     """
 
-    kind: str = "ideal"
-    vx: SensorLevel = SensorLevel()
-    vy: SensorLevel = SensorLevel()
-    yaw_rate: SensorLevel = SensorLevel()
+    kind: str = "ideal"  # what it stands for, ``optical``, ``gnss``, ``motion_capture`` or ``ideal``
+    vx: SensorLevel = SensorLevel()  # errors of the velocity along its x axis [m/s]
+    vy: SensorLevel = SensorLevel()  # along its y axis [m/s]
+    yaw_rate: SensorLevel = SensorLevel()  # errors of its gyro [rad/s]
+    # errors of its heading against the body's [rad]; delay, scale and quantisation have no meaning here
     heading: SensorLevel = SensorLevel()
-    lever_x: float = 0.0
-    lever_y: float = 0.0
-    lever_z: float = 0.0
-    lever_error: float = 0.0
+    lever_x: float = 0.0  # its place forward of the centre of gravity [m]
+    lever_y: float = 0.0  # its place left of the centre of gravity [m]
+    lever_z: float = 0.0  # its place above the centre of gravity [m]
+    lever_error: float = 0.0  # standard deviation of what is drawn for a drive for lever_x and lever_y each [m]
 
     def __post_init__(self) -> None:
         _require_finite(self, "lever_error")
@@ -282,7 +250,7 @@ def _gyros(level: SensorLevel) -> dict[str, Any]:
 
 
 # The Ferrari's figures are what noise_reading.read_off finds in 55,001 samples of Palm Beach 2014, 20140222_01_01_03; its sensors cannot
-# be told from the car and the road they shake with. What a recording without truth cannot show is assumed, or taken from ``default``.
+# be separated from the car and the road they shake with. What a recording without truth cannot show is assumed, or taken from ``default``.
 RACE = SensorLevels(
     vx=SensorLevel(noise=0.0017),  # read off; it is the reference's own speed
     **_gyros(SensorLevel(noise=6.5e-4, offset=5e-4, delay=0.0116, scale=0.003)),  # noise and delay read off; offset and scale assumed
@@ -301,7 +269,7 @@ RACE = SensorLevels(
 # ax, ay and yaw_rate by the spread of what they lack against the reference's derivatives, sorted by the motor's speed
 # (docs/compare_tyre_sets.py).
 SMALL_CAR = SensorLevels(
-    # vx stays: a planar drive shows the motor's speed at the rim instead. So do the tyres' forces, which nobody measures there.
+    # vx stays: a planar drive shows the motor's speed at the rim instead. So do the tyres' forces, which are not measured there.
     **_gyros(SensorLevel(noise=0.006, offset=0.0065, delay=0.005)),  # noise, offset read off; delay assumed
     ax=SensorLevel(noise=0.17, offset=0.1, delay=0.005),  # noise read off; offset and delay assumed
     ay=SensorLevel(noise=0.17, offset=0.15, delay=0.005),  # noise as ax; offset as docs/sources/f1tenth.md finds it; delay assumed

@@ -20,8 +20,6 @@ def measure(motion: Motion, levels: SensorLevels, seed: int) -> dict[str, FloatA
     """Channels (canonical name -> (T,), SI units) that the sensors show of a motion; the same arguments give the same samples.
 
     Args:
-        motion: true motion.
-        levels: of the sensors' errors.
         seed: of the errors; each error of each sensor draws from a stream of its own, so that changing one level leaves the rest alone.
     """
     speed = _speed_of_wheels(motion) if levels.speed_of_wheels else motion.vx

@@ -24,7 +24,7 @@ from vehest.sources.signals import Signal, SignalChannel, SignalOptions, SignalS
 
 @dataclass(frozen=True)
 class CanOptions(SignalOptions):
-    """Options of the source, by type; what is None is not said."""
+    """Options of the source, by type; None leaves an option open."""
 
     files: str = "*.asc"
     dbc: str | None = None
@@ -148,7 +148,7 @@ def is_on(frame: Any, bus: int | str | None) -> bool:
 
 
 def never_occurs(file: Path, channel: str, wanted: Wanted, count: int, bus: int | str | None) -> str:
-    """What is said of a signal that a log does not hold."""
+    """Error text for a signal that a log does not hold."""
     message = wanted.message
     often = "occurs once only" if count else "never occurs"
     on = "" if bus is None else f" on bus {bus}"

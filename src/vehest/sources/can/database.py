@@ -98,7 +98,6 @@ def read_database(file: Path, wanted: Sequence[str]) -> Database:
     """What a DBC says of wanted signals.
 
     Args:
-        file: the DBC.
         wanted: names, ``Message.Signal`` or ``Signal`` where only one message has it.
 
     Raises:

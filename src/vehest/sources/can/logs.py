@@ -37,7 +37,6 @@ def read_frames(file: Path, wanted: Collection[tuple[int, bool]] | None = None) 
     """Read a log.
 
     Args:
-        file: the log.
         wanted: identifiers of frames and whether they are extended; None for all.
 
     Raises:

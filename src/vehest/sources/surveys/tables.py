@@ -55,11 +55,7 @@ class Shape:
 
 
 def survey_table(file: Path) -> Log:
-    """What a table holds.
-
-    Raises:
-        DataError: it is no table, has no names, or holds no numbers.
-    """
+    """What a table holds; raises `DataError` where it is no table, has no names, or holds no numbers."""
     if is_parquet(file):
         with parquet_file(file) as table:
             names = [field.name for field in table.schema_arrow if _is_numeric(field.type)]

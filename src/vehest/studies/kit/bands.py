@@ -24,11 +24,7 @@ def band_blocks(
     """Table ``bands_FILE`` and figure ``reliability_FILE``; nothing where no estimator has bands.
 
     Args:
-        part: a comparison.
-        test_set: the test set.
         chosen: (estimator, variant) -> title and seed, in the order of the rows.
-        lines: looks of each.
-        file: end of their names.
     """
     values, lows, highs = (runs_of(part, column) for column in ("value", "low", "high"))
     rows, drawn = [], []

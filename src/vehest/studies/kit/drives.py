@@ -20,19 +20,12 @@ SYMBOLS = {"vx": "u", "yaw_rate": "ω", "ay": "a_y", "ax": "a_x", "steer": "δ"}
 
 @dataclass(frozen=True)
 class Row:
-    """A line of the table of floors.
+    """A line of the table of floors."""
 
-    Args:
-        what: for people.
-        inputs: that are read, in symbols.
-        floor: standard deviations.
-        share: of the mean square of v that it comes to.
-    """
-
-    what: str
-    inputs: str
-    floor: Floor
-    share: float
+    what: str  # for people
+    inputs: str  # that are read, in symbols
+    floor: Floor  # standard deviations
+    share: float  # of the mean square of v that it comes to
 
 
 def floors_of(part: PartArtefacts, test_set: str) -> list[Row]:
@@ -83,10 +76,7 @@ def regime_table(part: PartArtefacts, test_set: str, chosen: Mapping[Name, tuple
     """RMSE(β) of candidates by regime; None where metrics have no regimes.
 
     Args:
-        part: a comparison.
-        test_set: the test set.
         chosen: (estimator, variant) -> title and seed, in the order of the rows.
-        name: of the table.
     """
     metrics = part.metrics
     own = metrics[(metrics["test_set"] == test_set) & metrics["subset"].isin(REGIMES) & (metrics["condition"] == "nominal")]

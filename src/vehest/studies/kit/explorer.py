@@ -34,8 +34,6 @@ def explorer_of(
     """What the page draws of a test set.
 
     Args:
-        artefacts: of the comparison.
-        test_set: the test set.
         shown: (estimator, variant) -> model, title and looks, in the order of the board.
         scored: (estimator, variant) -> estimate and reference of each range, or sequence.
         axis: first time [s], label of the time axis, samples between two ranges, and a range that deserves a button [s].

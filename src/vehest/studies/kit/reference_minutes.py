@@ -21,7 +21,7 @@ from vehest.data.store import read_recording
 from vehest.evaluation.blocks import Segments
 from vehest.evaluation.ranking import BASELINES, Name, Ranking, rank
 from vehest.report.document import Block, Column, Figure, Table, as_text
-from vehest.report.style import DOUBLE_COLUMN, fixed, line_of, listed, new_figure, paper_style
+from vehest.report.style import DOUBLE_COLUMN, fixed, line_of, listed, new_figure
 from vehest.studies.artefacts import EvaluatedModel, PartArtefacts
 
 if TYPE_CHECKING:
@@ -43,23 +43,14 @@ NEARLY = 0.15  # of the minutes asked for, that ends of a few seconds may take o
 
 @dataclass(frozen=True)
 class Point:
-    """An estimator after so much reference.
+    """An estimator after so much reference."""
 
-    Args:
-        estimator: its name.
-        variant: its variant.
-        title: for people.
-        start: what its training starts from; `SCRATCH` for nothing.
-        minutes: with reference that it learnt and stopped on, as they were asked for.
-        n_trainings: stretches of the drive times seeds.
-    """
-
-    estimator: str
-    variant: str
-    title: str
-    start: str
-    minutes: float
-    n_trainings: int
+    estimator: str  # its name
+    variant: str  # its variant
+    title: str  # for people
+    start: str  # what its training starts from; `SCRATCH` for nothing
+    minutes: float  # with reference that it learnt and stopped on, as they were asked for
+    n_trainings: int  # stretches of the drive times seeds
 
     @property
     def name(self) -> Name:
@@ -69,19 +60,12 @@ class Point:
 
 @dataclass(frozen=True)
 class Curve:
-    """Learning curves on one test set.
+    """Learning curves on one test set."""
 
-    Args:
-        title: of the first of its parts.
-        test_set: that was tested on.
-        points: by estimator, start and minutes.
-        ranking: of all of them.
-    """
-
-    title: str
-    test_set: str
-    points: Sequence[Point]
-    ranking: Ranking
+    title: str  # of the first of its parts
+    test_set: str  # that was tested on
+    points: Sequence[Point]  # by estimator, start and minutes
+    ranking: Ranking  # of all of them
 
     def interval(self, point: Point) -> tuple[float, float]:
         """95 % interval of its RMSE(β) [deg]; NaN where the test is too short for one."""
@@ -217,11 +201,11 @@ def _in_words(curve: Curve) -> str:
     better = [f"{point.minutes:g}" for point in curve.points if _against_scratch(curve, point) == "lower"]
     worse = [f"{point.minutes:g}" for point in curve.points if _against_scratch(curve, point) == "higher"]
     if any(_against_scratch(curve, point) for point in curve.points):
-        told = [f"lower by more than chance with {listed(better)} min"] if better else []
-        told += [f"higher with {listed(worse)} min"] if worse else []
+        found = [f"lower by more than chance with {listed(better)} min"] if better else []
+        found += [f"higher with {listed(worse)} min"] if worse else []
         sentences.append(
-            f"Starting from another model, the error is {' and '.join(told)}."
-            if told
+            f"Starting from another model, the error is {' and '.join(found)}."
+            if found
             else "Starting from another model is not told apart from starting from scratch with any amount."
         )
     return f"**{curve.title}.** " + " ".join(sentences)
@@ -231,8 +215,7 @@ def _figure(curve: Curve) -> MatplotlibFigure:
     from matplotlib.ticker import FuncFormatter, NullFormatter
 
     ranking = curve.ranking
-    with paper_style():
-        figure = new_figure(DOUBLE_COLUMN, 3.2)
+    with new_figure(DOUBLE_COLUMN, 3.2) as figure:
         axes = figure.subplots()
         keys = list(
             dict.fromkeys((point.estimator, point.variant, point.start) for point in curve.points if point.estimator != BASELINES[0])

@@ -23,7 +23,6 @@ def runs_of(artefacts: PartArtefacts, column: str = "value") -> Runs:
     """The metrics of all samples under nominal conditions, by run and test set.
 
     Args:
-        artefacts: of a comparison.
         column: ``value``, or ``low`` or ``high`` for the ends of intervals.
 
     Raises:
@@ -57,8 +56,8 @@ def of_model(runs: Runs, name: Name, seed: int, metric: str) -> float:
     return next(known, math.nan)
 
 
-def chosen_seed(seeds: Sequence[int], name: Name, runs: Runs, metric: str = "rmse_vy") -> int:
-    """The seed with the lowest figure on the validation range, the lower one of equals: test data choose nothing.
+def chosen_seed(seeds: Sequence[int], name: Name, runs: Runs) -> int:
+    """The seed with the lowest RMSE(v) on the validation range, the lower one of equals: test data choose nothing.
 
     Raises:
         DataError: several seeds and no figures on the validation range.
@@ -67,7 +66,7 @@ def chosen_seed(seeds: Sequence[int], name: Name, runs: Runs, metric: str = "rms
         raise DataError(
             f"{name[0]}/{name[1]} has {len(seeds)} seeds and no metrics on the validation range to choose one by; evaluate it there"
         )
-    validation = values_of(runs, name, seeds, VALIDATION, metric)
+    validation = values_of(runs, name, seeds, VALIDATION, "rmse_vy")
     return seeds[int(np.argmin(np.where(np.isfinite(validation), validation, np.inf)))]
 
 

@@ -9,7 +9,7 @@ from typing import Any
 from vehest.evaluation.blocks import LEAST_BLOCKS
 from vehest.evaluation.ranking import BASELINES, Name, Ranking, rank
 from vehest.report.style import MISSING, fixed, listed
-from vehest.studies.artefacts import EvaluatedModel, PartArtefacts
+from vehest.studies.artefacts import PartArtefacts
 from vehest.studies.kit.runs import by_name
 
 BASELINE_TITLES = {"zero": "v = 0", "static_map": "the static map"}
@@ -18,21 +18,18 @@ BASELINE_TITLES = {"zero": "v = 0", "static_map": "the static map"}
 def ranking_of(
     artefacts: PartArtefacts,
     test_set: str,
-    models: Sequence[EvaluatedModel] | None = None,
     asked: Sequence[tuple[Name, Name]] = (),
 ) -> Ranking:
     """Candidates of a comparison, ranked on a test set by RMSE(β) over all their seeds; those with errors that are not finite are left out.
 
     Args:
-        artefacts: of the comparison.
         test_set: to rank on.
-        models: those to rank; all if not given.
         asked: pairs to compare beside those that any ranking compares.
 
     Raises:
         DataError: errors by segment are missing or damaged.
     """
-    segments = {name: [model.segments(test_set) for model in own] for name, own in by_name(models or artefacts.models).items()}
+    segments = {name: [model.segments(test_set) for model in own] for name, own in by_name(artefacts.models).items()}
     finite = {name: own for name, own in segments.items() if all(math.isfinite(float(part.squared_error_sideslip.sum())) for part in own)}
     return rank(finite, artefacts.protocol.rate_hz, asked=asked)
 
