@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -25,6 +25,25 @@ def _one_core() -> Iterator[None]:
     """Commands that name no number of jobs run them in this process."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(os, "sched_getaffinity", lambda _: {0})
+        yield
+
+
+@pytest.fixture(scope="session", autouse=True)
+def _composed_once() -> Iterator[None]:
+    """Hydra composes the same overrides over the same files in ./conf once, which takes it 0.1 s."""
+    from vehest.run import config
+
+    compose, composed = config.compose, {}
+
+    def kept(command: str, overrides: Sequence[str]) -> object:
+        files = [(str(file), file.read_bytes()) for file in sorted(Path("conf").rglob("*.yaml")) if file.is_file()]
+        key = (command, *overrides, *files)
+        if key not in composed:
+            composed[key] = compose(command, overrides=overrides)
+        return composed[key]
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(config, "compose", kept)
         yield
 
 

@@ -36,7 +36,7 @@ def _statuses(err: str) -> list[tuple[str, str]]:
 
 
 def test_pipeline_runs_then_skips_then_reruns_only_what_a_change_touches(place):
-    code, out, err = place("run", "small", "tracking=none")
+    code, out, err = place.once("run", "small", "tracking=none")
     assert code == 0, err
     assert "KS-NN linear no bias, P = 2" in out
     assert [stage for status, stage in _statuses(err) if status == "done"].count("train") == 4
@@ -97,7 +97,7 @@ def test_a_report_is_drawn_of_what_is_there_and_says_what_is_not(place):
     code, line = place.refused("report", "small", "tracking=none")
     assert code == 4
     assert "run 'vehest run" in line
-    code, _, err = place("run", "small", "tracking=none")
+    code, _, err = place.once("run", "small", "tracking=none")
     assert code == 0, err
     code, out, err = place("report", "small", "tracking=none", "--json")
     assert code == 0, err
@@ -325,7 +325,7 @@ def test_missing_root_missing_folder_and_unknown_words_are_one_clear_line(place,
 
 
 def test_estimate_refuses_a_recording_it_cannot_use(place):
-    place("train", "estimator=luenberger", "split=mine", "training.grid=1", "training.max_evaluations=5", "tracking=none")
+    place.once("train", "estimator=luenberger", "split=mine", "training.grid=1", "training.max_evaluations=5", "tracking=none")
     drive = planar_drive(10.0, 20.0).without_references()
     slow = pd.DataFrame({"time": drive.time, **drive.channels})
     slow.to_csv("slow.csv", index=False)
@@ -429,7 +429,7 @@ def test_splits_that_would_mix_test_and_validation_are_refused(place, tests, mes
 
 
 def test_a_model_is_not_tested_on_what_it_learnt_from(place):
-    model = json.loads(place("train", "split=mine", "training.max_epochs=1", "tracking=none", "--json")[1])["model"]
+    model = json.loads(place.once("train", "split=mine", "training.max_epochs=1", "tracking=none", "--json")[1])["model"]
     swapped = ("split.train=[{recording: three}]", "split.tests.test=[{recording: one, start: 5, stop: 20}]")
     code, line = place.refused("eval", "--model", model, "split=mine", *swapped, "tracking=none")
     assert code == 2
@@ -437,7 +437,7 @@ def test_a_model_is_not_tested_on_what_it_learnt_from(place):
 
 
 def test_estimate_neither_replaces_folders_nor_its_own_recording(place):
-    place("train", "estimator=luenberger", "split=mine", "training.grid=1", "training.max_evaluations=5", "tracking=none")
+    place.once("train", "estimator=luenberger", "split=mine", "training.grid=1", "training.max_evaluations=5", "tracking=none")
     drive = planar_drive(10.0, 100.0).without_references()
     pd.DataFrame({"time": drive.time, **drive.channels}).to_csv("lap.csv", index=False)
     Path("parts.parquet").mkdir()

@@ -42,7 +42,7 @@ def evaluated(place: Place, *overrides: str) -> tuple[Path, dict[str, Any]]:
 @pytest.fixture
 def trained(place: Place) -> Place:
     """A place with a model."""
-    code, _, err = place("train", *TRAINED)
+    code, _, err = place.once("train", *TRAINED)
     assert code == 0, err
     return place
 
