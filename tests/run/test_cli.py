@@ -190,35 +190,12 @@ def test_data_commands_list_show_and_check(place):
     assert "100 Hz, 0 s to 1 s from 2023-01-04 23:31:55 UTC on, 100 samples" in place("data", "show", "unix.csv")[1]
 
 
-def test_check_reports_a_reference_that_points_the_wrong_way(place):
-    (place.folder / "conf" / "dataset" / "mirrored.yaml").write_text(
-        yaml.safe_dump(
-            {**DATASET, "channels": {**DATASET["channels"], "vy_ref": {"column": "Vy", "unit": "m/s", "sign": -1}}}, allow_unicode=True
-        )
-    )
-    code, out, _ = place("data", "check", "mirrored")
-    assert code == 0
-    assert "d(vy_ref)/dt and ay - vx·yaw_rate disagree in sign" in out
-
-
-def test_config_prints_what_a_command_would_use(place):
-    shown = yaml.safe_load(place("config", "train", "estimator=lstm", "seed=4")[1])
-    assert shown["estimator"]["name"] == "lstm"
-    assert shown["seed"] == 4
-    assert json.loads(place("config", "ingest", "dataset=mine", "--json")[1])["dataset"]["source"] == "tabular"
-
-
-def test_doctor_finds_this_machine_fit(place):
-    code, out, _ = place("doctor", "--json")
-    assert code == 0
-    assert {item["name"]: item["level"] for item in json.loads(out)}["compiled recursions"] == "ok"
-
-
 def test_doctor_names_what_an_absent_extra_is_for(place, monkeypatch):
     find = importlib.util.find_spec
     monkeypatch.setattr(importlib.util, "find_spec", lambda name, *rest: None if name == "optuna" else find(name, *rest) or find("vehest"))
     code, out, _ = place("doctor", "--json")
     assert code == 0
+    assert {item["name"]: item["level"] for item in json.loads(out)}["compiled recursions"] == "ok"
     (extras,) = (item for item in json.loads(out) if item["name"] == "extras")
     assert (extras["level"], extras["message"]) == (
         "warning",
@@ -257,11 +234,7 @@ def _with(column, row, value):
 BAD_TABLES = {
     "missing column": (lambda t: t.drop(columns="Yaw"), r"has no column 'Yaw' \(it has Time, Speed"),
     "NaN": (_with("LatAcc", 500, np.nan), r"one\.csv.*channel 'ay' holds 1 NaN between 5 s and 5 s"),
-    "text": (_with("Speed", 41, "fast"), r"one\.csv': column 'Speed' holds the text 'fast' in data row 42"),
-    "repeated time": (_with("Time", 10, 0.09), r"one\.csv': time repeats 1 times, first at sample 10"),
-    "backward time": (_with("Time", 10, 0.05), r"one\.csv': time goes backwards 1 times"),
     "gap": (lambda t: t.drop(index=range(100, 200)), r"one\.csv': 1 gaps, the longest of 1\.01 s after 0\.99 s.*clock: interpolate"),
-    "header only": (lambda t: t.iloc[:0], r"one\.csv' has a header and no rows"),
 }
 
 
@@ -464,11 +437,8 @@ def test_a_model_remembers_how_its_recordings_were_prepared(place):
     "arguments",
     [
         ("train", "output=null"),
-        ("train", "output=''"),
         ("train", "seed=-1"),
-        ("train", "seed=1.5"),
         ("train", "training.max_epochs=.inf"),
-        ("train", "estimator.rate_hz=abc"),
         ("train", "estimator.rate_hz=200"),
         ("train", "downsample.transforms=[1]"),
         ("run", "small", "evaluation.rate_hz=abc"),

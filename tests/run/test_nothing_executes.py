@@ -214,9 +214,7 @@ def model_folder(honest: Path, hostile: Path) -> Callable[[Path], Any]:
 
 
 CASES = {
-    "mdf": Case(
-        mdf, needs="asammdf", refused=frozenset({*(f"formula{k}_4.10.mf4" for k in range(3)), "formula0_3.30.mf4", "nested.mf4"})
-    ),
+    "mdf": Case(mdf, needs="asammdf", refused=frozenset({*(f"formula{k}_4.10.mf4" for k in range(3)), "formula0_3.30.mf4", "nested.mf4"})),
     "mat": Case(mat, refused=frozenset({"text0.mat", "object0.mat", "pickle.mat", "text1.mat", "object1.mat"})),
     "rosbag": Case(rosbag, needs="rosbags", refused=frozenset({"view_load_extension", "view_writefile", "view_zeroblob", "endless"})),
     "vbo": Case(vbo, refused=frozenset({"cell3.vbo", "pickle.vbo"})),
