@@ -215,10 +215,7 @@ def test_registry_knows_names():
     ("name", "config", "message"),
     [
         ("ksnn", {"n_local": 0}, "n_local must be at least 1"),
-        ("ksnn", {"n_hidden": -1}, "n_hidden must be at least 0"),
-        ("ksnn", {"window": 0}, "window must be at least 1"),
         ("gru", {"n_states": 2.5}, "n_states must be a whole number"),
-        ("lstm", {"rate_hz": 0}, "rate_hz must be positive"),
         ("luenberger", {"gains": 3}, "gains is not an option"),
     ],
 )

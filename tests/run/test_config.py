@@ -55,7 +55,6 @@ def test_local_configuration_is_searched_first_and_adds_to_the_packaged_one(else
         (["estimator=ksn"], r"estimator=ksn is not there; did you mean ksnn\? choices: cnn_ukf, .*gru, kalman, kinematic, ksnn, "),
         (["split=nowhere_at_all"], "split=nowhere_at_all is not there; choices: .*ferrari_drive"),
         (["estimator.n_locals=3"], "unknown option 'estimator.n_locals'"),
-        (["colour=red"], "unknown option 'colour'"),
         (["seed=[1,"], r"override 'seed=\[1,' cannot be read"),
         (["quickly"], "'quickly' is not an override; write key=value"),
         (["seed=1,2"], "names several values"),
