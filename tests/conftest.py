@@ -96,18 +96,11 @@ def drawn() -> None:
 
 @pytest.fixture
 def place(request: pytest.FixtureRequest, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Place:
-    """A fresh place to work in, without a data root or a tracking server from outside.
-
-    Laying out the figures of a small study takes longer than all the rest of it: they are saved without their content unless the test
-    uses `drawn`.
-    """
-    from matplotlib.figure import Figure
-
-    from place import Place
+    """A fresh place to work in, without a data root or a tracking server from outside; figures are drawn for tests that use `drawn`."""
+    from place import Place, undrawn
 
     if "drawn" not in request.fixturenames:
-        save = Figure.savefig
-        monkeypatch.setattr(Figure, "savefig", lambda _, *arguments, **options: save(Figure((6, 4)), *arguments, **options))
+        undrawn(monkeypatch)
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("VEHEST_DATA", str(tmp_path / "raw"))
     monkeypatch.delenv("VEHEST_OUTPUT", raising=False)

@@ -13,6 +13,7 @@ import numpy as np
 import pandas as pd
 import pytest
 import yaml
+from matplotlib.figure import Figure
 
 from conftest import planar_drive
 from single_track_drive import linear_drive
@@ -74,6 +75,12 @@ DATASET = {
         "vy_ref": {"column": "Vy", "unit": "m/s"},
     },
 }
+
+
+def undrawn(patch: pytest.MonkeyPatch) -> None:
+    """Save figures without their content: laying out those of a small study takes longer than all the rest of it."""
+    save = Figure.savefig
+    patch.setattr(Figure, "savefig", lambda _, *arguments, **options: save(Figure((6, 4)), *arguments, **options))
 
 
 STEERED = {"vx": "m/s", "yaw_rate": "rad/s", "ay": "m/s²", "steer": "rad"}

@@ -58,7 +58,7 @@ def parts_place(place) -> Place:
     return place
 
 
-def test_parts_run_as_one_study_and_the_next_run_skips_all(parts_place, drawn):
+def test_parts_run_as_one_study_and_the_next_run_skips_all(parts_place):
     place = parts_place
     code, out, err = place("run", "both", "--json", "tracking=none")
     assert code == 0, err
