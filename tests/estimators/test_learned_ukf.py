@@ -255,15 +255,6 @@ def test_a_drive_without_what_it_learns_from_is_one_clear_error() -> None:
         estimator().fit(FitData([gappy], [gappy]), quick())
 
 
-def test_a_sample_that_is_infinite_is_refused_and_one_that_is_incomplete_too() -> None:
-    stepper = trained().online()
-    sample = dict.fromkeys((*SENSORS, "vx"), 0.5)
-    with pytest.raises(DataError, match="'ay' is inf"):
-        stepper.step(sample | {"ay": np.inf})
-    with pytest.raises(DataError, match="no channel 'ax'"):
-        stepper.step({"ay": 0.5, "vx": 0.5})
-
-
 @pytest.mark.parametrize(
     ("config", "message"),
     [
