@@ -281,6 +281,7 @@ CONDITION: dict[str, object] = {"magnitude": {"ay": {"at_most": 7.0}}}
         ({"keep": {"magnitude": {"lateral": {"at_most": 7.0}}}}, "there is no channel 'lateral'"),
         ({"keep": {"magnitude": {"ay": {"at_most": -7.0}}}}, "keep.magnitude.ay: no magnitude lies between 0 and -7"),
         ({"keep": {"magnitude": {"ay": {"at_least": 8.0, "at_most": 7.0}}}}, "keep.magnitude.ay: no magnitude lies between 8 and 7"),
+        ({"keep": {**CONDITION, "at_least_seconds": -1.0}}, "at_least_seconds: input should be greater than or equal to 0, not -1"),
         ({"keep": {**CONDITION, "at_least_seconds": 3.0}}, "the condition of train keeps nothing (0 <= |ay| <= 7, 3 s or longer)"),
     ],
 )
@@ -465,6 +466,7 @@ def test_folds_of_recordings_and_of_seconds_leave_nothing_out(of: str) -> None:
     ("changes", "what"),
     [
         ({"train": "70 %", "validation": "20 %", "tests": {"t": "20 %"}}, "the percentages come to 110 %"),
+        ({"train": [{"recording": "lap", "start": "150 %"}]}, "start and stop are a number of seconds or a percentage"),
         ({"train": [{"recording": "lap", "laps": "2 to 9"}]}, "has no '2 to 9': 4 complete laps were found; name times instead"),
         ({"train": [{"recording": "lap", "laps": "some"}]}, "laps are first, last, first 3"),
         ({"train": [{"recording": "lap", "laps": "1", "stop": 3}]}, "a range has laps, or start and stop, not both"),
