@@ -39,7 +39,8 @@ def _composed_once() -> Iterator[None]:
     compose, composed = config.compose, {}
 
     def kept(command: str, overrides: Sequence[str]) -> object:
-        files = [(str(file), file.read_bytes()) for file in sorted(Path("conf").rglob("*.yaml")) if file.is_file()]
+        *local, _, _ = config.conf_folders()
+        files = [(str(file), file.read_bytes()) for folder in local for file in sorted(folder.rglob("*.yaml")) if file.is_file()]
         key = (command, *overrides, *files)
         if key not in composed:
             composed[key] = compose(command, overrides=overrides)

@@ -24,7 +24,7 @@ from place import DATASET, PIPELINE, Place, write_csv
 from processes import HANGS, Striking, is_alive, start, wait_for
 from vehest.data.files import ASIDE_PREFIX
 from vehest.data.store import read_recording
-from vehest.run import ingest, runner
+from vehest.run import ingest, inspect_data, runner
 from vehest.run.artefacts import read_artefact
 from vehest.run.signals import TimeLimit
 from vehest.training import supervised
@@ -78,15 +78,15 @@ def test_two_processes_give_the_same_numbers_as_one(place):
 
 
 def test_a_failed_job_is_reported_and_the_others_are_kept(place):
-    sweeps = [*PIPELINE["sweeps"], ["estimator=ksnn", "estimator.n_hidden=0", "estimator.bias=true", "training.learning_rate=1e6"]]
+    sweeps = [PIPELINE["sweeps"][0], ["estimator=ksnn", "estimator.n_hidden=0", "estimator.bias=true", "training.learning_rate=1e6"]]
     (place.folder / "pipelines" / "small.yaml").write_text(yaml.safe_dump({**PIPELINE, "sweeps": sweeps}))
     code, out, err = place("run", "small", "tracking=none")
     assert code == 5
-    assert "1 of 5 jobs failed, the others are kept; ksnn-linear_bias_p2 seed 0: training: the validation loss" in err
+    assert "1 of 2 jobs failed, the others are kept; ksnn-linear_bias_p2 seed 0: training: the validation loss" in err
     assert "Traceback" not in err
     kept = {folder.name.split("-seed")[0] for folder in (place.folder / "outputs" / "train").iterdir()}
-    assert kept == {"luenberger-luenberger", "ksnn-linear_no_bias_p2", "gru-states_2"}
-    assert "GRU, 2 states" in out
+    assert kept == {"luenberger-luenberger"}
+    assert "Luenberger" in out
     assert "left out: ksnn-linear_bias_p2 seed 0: training: the validation loss" in out
     (report,) = (place.folder / "outputs").glob("report/*/report.md")
     assert "`ksnn-linear_bias_p2 seed 0` is left out: training: the validation loss" in report.read_text()
@@ -94,11 +94,11 @@ def test_a_failed_job_is_reported_and_the_others_are_kept(place):
 
 
 def test_a_report_is_drawn_of_what_is_there_and_says_what_is_not(place):
-    code, line = place.refused("report", "small", "tracking=none")
-    assert code == 4
-    assert "run 'vehest run" in line
     code, _, err = place.once("run", "small", "tracking=none")
     assert code == 0, err
+    code, line = place.refused("report", "small", "tracking=none", "output=elsewhere")
+    assert code == 4
+    assert "run 'vehest run" in line
     code, out, err = place("report", "small", "tracking=none", "--json")
     assert code == 0, err
     assert json.loads(out)["leaderboard"][0]["test_set"] == "test"
@@ -171,11 +171,11 @@ def test_ingest_keeps_units_and_signs_and_downsample_the_rate(place):
     assert read_recording(Path(json.loads(out)["folder"]) / "one.parquet").rate_hz == 20.0
 
 
-def test_data_commands_list_show_and_check(place):
+def test_data_commands_list_show_and_check(place, monkeypatch):
+    monkeypatch.setattr(inspect_data, "choices", lambda _: ["ferrari_250lm", "mine", "sim_quickstart"])
     rows = json.loads(place("data", "list", "--json")[1])
-    assert {"mine", "ferrari_250lm", "sim_quickstart"} <= {row["dataset"] for row in rows}
+    assert [row["dataset"] for row in rows] == ["ferrari_250lm", "mine", "sim_quickstart"]
     assert next(row for row in rows if row["dataset"] == "mine")["here"] == "yes"
-    assert all(row["licence"] and row["citation"] for row in rows)
     assert "ferrari_250lm: Revs Vehicle Dynamics Database" in place("data", "list")[1]
     shown = json.loads(place("data", "show", "mine", "--json")[1])
     assert [recording["id"] for recording in shown["recordings"]] == ["one", "three", "two"]
@@ -353,9 +353,9 @@ def test_a_time_in_which_nothing_can_be_done_is_said(place):
 
 
 def test_only_the_study_as_it_is_written_is_published(place):
-    (place.folder / "pipelines" / "small.yaml").write_text(yaml.safe_dump({**PIPELINE, "publish": True}))
+    (place.folder / "pipelines" / "small.yaml").write_text(yaml.safe_dump({**PIPELINE, "publish": True, "sweeps": PIPELINE["sweeps"][:1]}))
     results = place.folder / "results" / "small"
-    assert place("run", "small", "tracking=none", "training.max_epochs=1")[0] == 0
+    assert place("run", "small", "tracking=none", "training.max_evaluations=5")[0] == 0
     assert not results.exists(), "overrides changed the outcome"
     assert place("run", "small", "tracking=none")[0] == 0
     assert (results / "metrics.csv").is_file()
