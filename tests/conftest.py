@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator
+
+os.environ["OPENBLAS_NUM_THREADS"] = "1"  # the other core has tests of its own
+
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -25,6 +28,26 @@ def _one_core() -> Iterator[None]:
     """Commands that name no number of jobs run them in this process."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(os, "sched_getaffinity", lambda _: {0})
+        yield
+
+
+@pytest.fixture(scope="session", autouse=True)
+def _composed_once() -> Iterator[None]:
+    """Hydra composes the same overrides over the same files in ./conf once, which takes it 0.1 s."""
+    from vehest.run import config
+
+    compose, composed = config.compose, {}
+
+    def kept(command: str, overrides: Sequence[str]) -> object:
+        *local, _, _ = config.conf_folders()
+        files = [(str(file), file.read_bytes()) for folder in local for file in sorted(folder.rglob("*.yaml")) if file.is_file()]
+        key = (command, *overrides, *files)
+        if key not in composed:
+            composed[key] = compose(command, overrides=overrides)
+        return composed[key]
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(config, "compose", kept)
         yield
 
 
@@ -74,18 +97,11 @@ def drawn() -> None:
 
 @pytest.fixture
 def place(request: pytest.FixtureRequest, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Place:
-    """A fresh place to work in, without a data root or a tracking server from outside.
-
-    Laying out the figures of a small study takes longer than all the rest of it: they are saved without their content unless the test
-    uses `drawn`.
-    """
-    from matplotlib.figure import Figure
-
-    from place import Place
+    """A fresh place to work in, without a data root or a tracking server from outside; figures are drawn for tests that use `drawn`."""
+    from place import Place, undrawn
 
     if "drawn" not in request.fixturenames:
-        save = Figure.savefig
-        monkeypatch.setattr(Figure, "savefig", lambda _, *arguments, **options: save(Figure((6, 4)), *arguments, **options))
+        undrawn(monkeypatch)
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("VEHEST_DATA", str(tmp_path / "raw"))
     monkeypatch.delenv("VEHEST_OUTPUT", raising=False)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from copy import deepcopy
 from typing import Any
 
 from conftest import planar_drive
@@ -48,8 +49,18 @@ SAMPLED = {
 }
 
 
+_FITTED: dict[str, Estimator] = {}
+
+
 def fitted(name: str, dtype: str = "float64", **config: Any) -> Estimator:
-    """Fitted for a moment to a drive that it can learn from."""
+    """A copy of one that was fitted for a moment to a drive that it can learn from."""
+    key = repr((name, dtype, config))
+    if key not in _FITTED:
+        _FITTED[key] = _fit(name, dtype, config)
+    return deepcopy(_FITTED[key])
+
+
+def _fit(name: str, dtype: str, config: dict[str, Any]) -> Estimator:
     estimator = estimator_class(name).from_config(CONFIGS.get(name, {}) | config)
     estimator.seed(0)
     if estimator.training_type is NoTraining:

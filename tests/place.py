@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
+import shutil
 import sys
+from functools import cache
+from hashlib import sha256
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import numpy as np
 import pandas as pd
 import pytest
 import yaml
+from matplotlib.figure import Figure
 
 from conftest import planar_drive
 from single_track_drive import linear_drive
@@ -30,6 +35,13 @@ PIPELINE = {
 
 def write_csv(path: Path, seed: int, seconds: float = 30.0) -> pd.DataFrame:
     """A drive at 100 Hz as a table with columns of its own names and units."""
+    table, text = _table(seed, seconds)
+    path.write_text(text)
+    return table.copy()
+
+
+@cache
+def _table(seed: int, seconds: float) -> tuple[pd.DataFrame, str]:
     drive = planar_drive(seconds, 100.0, seed=seed, noise=0.02)
     table = pd.DataFrame(
         {
@@ -41,8 +53,7 @@ def write_csv(path: Path, seed: int, seconds: float = 30.0) -> pd.DataFrame:
             "Vy": drive["vy_ref"],
         }
     )
-    table.to_csv(path, index=False)
-    return table
+    return table, table.to_csv(index=False)
 
 
 DATASET = {
@@ -66,6 +77,12 @@ DATASET = {
 }
 
 
+def undrawn(patch: pytest.MonkeyPatch) -> None:
+    """Save figures without their content: laying out those of a small study takes longer than all the rest of it."""
+    save = Figure.savefig
+    patch.setattr(Figure, "savefig", lambda _, *arguments, **options: save(Figure((6, 4)), *arguments, **options))
+
+
 STEERED = {"vx": "m/s", "yaw_rate": "rad/s", "ay": "m/s²", "steer": "rad"}
 STEERED |= {"vx_ref": "m/s", "vy_ref": "m/s", "yaw_rate_ref": "rad/s"}
 
@@ -82,6 +99,10 @@ def run_vehest(capsys: pytest.CaptureFixture[str], *arguments: str) -> tuple[int
         sys.argv = former
     out, err = capsys.readouterr()
     return code, out, err
+
+
+_DONE: dict[tuple[object, ...], tuple[tuple[int, str, str], Path]] = {}
+_KEPT = TemporaryDirectory()
 
 
 class Place:
@@ -119,6 +140,17 @@ class Place:
     def __call__(self, *arguments: str) -> tuple[int, str, str]:
         """Exit code, standard output and standard error of a command."""
         return run_vehest(self._capsys, *arguments)
+
+    def once(self, *arguments: str) -> tuple[int, str, str]:
+        """The same, of a command that a test needs the outcome of: it runs once, later places like this one get a copy of what it made."""
+        files = [file for file in sorted(self.folder.rglob("*")) if file.is_file() and not file.is_symlink()]
+        key = (*arguments, *((file.relative_to(self.folder), sha256(file.read_bytes()).digest()) for file in files))
+        if key not in _DONE:
+            outcome, kept = self(*arguments), Path(_KEPT.name) / str(len(_DONE))
+            _DONE[key] = outcome, shutil.copytree(self.folder, kept)
+        else:
+            shutil.copytree(_DONE[key][1], self.folder, dirs_exist_ok=True)
+        return _DONE[key][0]
 
     def refused(self, *arguments: str) -> tuple[int, str]:
         """Exit code and the one line of a command that must fail and leave nothing behind."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from functools import cache
+from typing import Any
 
 import numpy as np
 
@@ -17,6 +18,7 @@ class Wave:
 
     def __init__(self, amplitudes: np.ndarray, omegas: np.ndarray, phases: np.ndarray, level: float = 0.0) -> None:
         self.amplitudes, self.omegas, self.phases, self.level = amplitudes, omegas, phases, level
+        self._known: dict[tuple[float, float, int, int], np.ndarray] = {}  # by uniform clock and order
 
     @classmethod
     def random(
@@ -34,8 +36,11 @@ class Wave:
         return cls(amplitudes, 2 * np.pi * frequencies, generator.uniform(0, 2 * np.pi, number), level)
 
     def __call__(self, time: np.ndarray, order: int = 0) -> np.ndarray:
-        angle = np.multiply.outer(time, self.omegas) + self.phases + order * np.pi / 2
-        return np.sin(angle) @ (self.amplitudes * self.omegas**order) + (self.level if order == 0 else 0.0)
+        key = time[0], time[-1], len(time), order
+        if key not in self._known:
+            angle = np.multiply.outer(time, self.omegas) + self.phases + order * np.pi / 2
+            self._known[key] = np.sin(angle) @ (self.amplitudes * self.omegas**order) + (self.level if order == 0 else 0.0)
+        return self._known[key]
 
     def low_passed(self, time_constant: float) -> Wave:
         """1 / (1 + iωT), in closed form."""
@@ -67,9 +72,9 @@ def _made(
     seconds: float, rate_hz: float, seed: int, late: tuple[tuple[str, float], ...], lever: float, slow_yaw_rate: float, noise: float
 ) -> Recording:
     """Made once; recordings cannot be written to."""
-    generator = np.random.default_rng(seed)
-    turn, slide = Wave.random(generator, 0.3, 0.05, 4.0), Wave.random(generator, 0.25, 0.05, 4.0)
-    speed = Wave.random(generator, 6.0, 0.01, 1.5, level=20.0, corner=0.15)
+    turn, slide, speed, state = _waves(seed)
+    generator = np.random.default_rng()
+    generator.bit_generator.state = state
     shown = turn.low_passed(slow_yaw_rate) if slow_yaw_rate else turn
     clock = np.arange(round(seconds * rate_hz)) / rate_hz
 
@@ -92,6 +97,15 @@ def _made(
         samples = quantity(clock - dict(late).get(name, 0.0))
         channels[name] = samples + noise * NOISE.get(name, 0.0) * generator.standard_normal(len(clock))
     return Recording("broadband", "car", rate_hz, 5.0, channels)
+
+
+@cache
+def _waves(seed: int) -> tuple[Wave, Wave, Wave, Any]:
+    """Waves of yaw rate, v and speed, and the generator's state after them."""
+    generator = np.random.default_rng(seed)
+    turn, slide = Wave.random(generator, 0.3, 0.05, 4.0), Wave.random(generator, 0.25, 0.05, 4.0)
+    speed = Wave.random(generator, 6.0, 0.01, 1.5, level=20.0, corner=0.15)
+    return turn, slide, speed, generator.bit_generator.state
 
 
 def without(recording: Recording, *names: str) -> Recording:

@@ -361,7 +361,6 @@ def test_gaps_short_recordings_and_slow_ones_are_refused() -> None:
         ({"estimate": ("colour",)}, "'colour' cannot be estimated; there are: lever_arm"),
         ({"estimate": ("steering_ratio",)}, "needs the wheelbase"),
         ({"estimate": ("delay",), "max_delay": math.nan}, "max_delay must be positive"),
-        ({"estimate": ("delay",), "tilt": -1.0}, "tilt must be zero or positive"),
     ],
 )
 def test_settings_that_make_no_sense_are_refused(arguments: dict[str, Any], what: str) -> None:
@@ -656,7 +655,6 @@ def test_steering_alone_has_a_figure_too(called: Called) -> None:
     ("arguments", "code", "what"),
     [
         (("weave.parquet",), 2, "say what to estimate: one or more of lever_arm, mounting, delay, offsets, steering_ratio"),
-        (("nothing.csv", "-e", "delay"), 2, "'nothing.csv' is neither a data set"),
         (("sim_quickstart", "-e", "delay"), 2, "3 (drive_1, drive_2, drive_3); choose one by --recording ID"),
         (("sim_quickstart", "-e", "delay", "-r", "drive_9"), 4, "no drive 'drive_9'"),
         (("weave.parquet", "-e", "delay", "-r", "other"), 2, "holds the recording 'weave', not 'other'"),

@@ -87,7 +87,6 @@ def test_samples_are_copied_and_cannot_be_written_to() -> None:
     ("changes", "what"),
     [
         ({"channels": {}}, "one common length"),
-        ({"channels": {"ay": np.zeros(0)}}, "one common length"),
         ({"channels": {"ay": np.zeros(3), "ax": np.zeros(2)}}, "one common length"),
         ({"channels": {"ay": np.zeros((3, 1))}}, "one common length"),
         ({"channels": {"vz": np.zeros(3)}}, "'vz' is not known"),
@@ -95,7 +94,6 @@ def test_samples_are_copied_and_cannot_be_written_to() -> None:
         ({"channels": {"ay": np.array([0.0, np.inf, 0.0])}}, "infinite"),
         ({"channels": {"ay": np.array([np.nan, -np.inf])}, "gappy": frozenset({"ay"})}, "holds 1 infinite values"),
         ({"rate_hz": 0.0}, "rate must lie between 1e-06 and 100000 Hz, not at 0 Hz"),
-        ({"rate_hz": math.nan}, "rate must lie between"),
         ({"start_time": math.nan}, "start time must be finite"),
         ({"kind": "reel"}, "real or simulated"),
     ],

@@ -288,10 +288,7 @@ def test_transforms_are_built_from_plain_values() -> None:
     ("config", "what"),
     [
         ({"name": "high_pass"}, "'high_pass' is not one of: resample"),
-        ({"name": ["resample"]}, "is not one of"),
         ({"name": "low_pass"}, "cutoff_hz"),
-        ({"name": "low_pass", "cutoff_hz": 5.0, "direction": "backward"}, "causal, zero_phase"),
-        ({"name": "resample", "rate_hz": 20, "method": "spline"}, "method 'spline' is not one of: polyphase, decimate"),
     ],
 )
 def test_a_misspelt_transform_is_refused_in_one_line(config: dict[str, object], what: str) -> None:

@@ -46,10 +46,8 @@ def test_plain_values_become_dataclasses():
     ("change", "message"),
     [
         ({"inner": {"gain": float("nan")}}, "'f': inner.gain must be a number, not nan"),
-        ({"inner": {"gain": 1, "steps": 1.5}}, "'f': inner.steps must be a whole number, not 1.5"),
         ({"inner": {"gain": 1, "stepz": 1}}, "'f': inner.stepz is not an option of inner; options: gain, steps"),
         ({"other": 1}, "'f': unknown key 'other'; there are: name, inner, many, bounds, on"),
-        ({"on": 1}, "'f': on must be true or false, not 1"),
         ({"name": {1, 2}}, "'f': name is no plain value but a set"),
     ],
 )
@@ -81,7 +79,6 @@ class Kinds:
         ({"pair": ["a", "b"]}, "it.pair.0 must be a number, not 'a'"),
         ({"files": 3}, "it.files must be text or a list, not 3"),
         ({"values": {"a": [1]}}, "it.values.a must be a whole number or a number or true or false or text, not [1]"),
-        ({"rate": "x"}, "it.rate must be a number up to 5, not 'x'"),
         ({"maps": {"a": {"b": 3}}}, "it.maps.a.b must be a group of options, not 3; options: gain, steps"),
     ],
 )

@@ -17,7 +17,7 @@ def _digest(tensors: Iterable[Tensor]) -> str:
 def _networks() -> None:
     from test_kernels import STRUCTURES, _problem
 
-    for estimator in STRUCTURES:
+    for estimator in STRUCTURES[2:5]:  # KS-NN and GRU; an LSTM is compiled as a GRU is
         print(estimator.name, estimator.variant, _digest(_problem(estimator, torch.float32)(True)))
 
 

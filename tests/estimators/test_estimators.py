@@ -8,7 +8,6 @@ from functools import cache
 
 import numpy as np
 import pytest
-import yaml
 
 from every_estimator import drive_for, fitted
 from vehest.data.errors import ConfigurationError, DataError, MissingError
@@ -97,34 +96,12 @@ def test_model_read_back_estimates_the_same(tmp_path, name):
     assert sorted(file.name for file in tmp_path.iterdir()) == ["model.safetensors", "model.yaml"]
 
 
-def test_model_files_execute_nothing(tmp_path):
-    save_model(known("luenberger", "float64"), tmp_path)
-    marker = tmp_path / "executed"
-    text = (tmp_path / "model.yaml").read_text()
-    (tmp_path / "model.yaml").write_text(text + f"evil: !!python/object/apply:os.mkdir ['{marker}']\n")
-    with pytest.raises(DataError, match="cannot be read as YAML"):
-        load_model(tmp_path)
-    assert not marker.exists()
-    (tmp_path / "model.yaml").write_text(text.replace("estimator: luenberger", "estimator: os.system"))
-    with pytest.raises(DataError, match=r"model\.yaml': estimator 'os\.system' is not one of"):
-        load_model(tmp_path)
-
-
 @pytest.mark.parametrize("size", [0, 40, -8])
 def test_truncated_weights_are_one_clear_error(tmp_path, size):
     save_model(known("ksnn", "float64"), tmp_path)
     weights = tmp_path / "model.safetensors"
     weights.write_bytes(weights.read_bytes()[:size])
     with pytest.raises(DataError, match="truncated or damaged"):
-        load_model(tmp_path)
-
-
-def test_weights_of_another_structure_are_refused(tmp_path):
-    save_model(known("ksnn", "float64"), tmp_path)
-    description = yaml.safe_load((tmp_path / "model.yaml").read_text())
-    description["settings"]["n_local"] = 4
-    (tmp_path / "model.yaml").write_text(yaml.safe_dump(description))
-    with pytest.raises(DataError, match="do not fit its settings"):
         load_model(tmp_path)
 
 
@@ -215,10 +192,7 @@ def test_registry_knows_names():
     ("name", "config", "message"),
     [
         ("ksnn", {"n_local": 0}, "n_local must be at least 1"),
-        ("ksnn", {"n_hidden": -1}, "n_hidden must be at least 0"),
-        ("ksnn", {"window": 0}, "window must be at least 1"),
         ("gru", {"n_states": 2.5}, "n_states must be a whole number"),
-        ("lstm", {"rate_hz": 0}, "rate_hz must be positive"),
         ("luenberger", {"gains": 3}, "gains is not an option"),
     ],
 )

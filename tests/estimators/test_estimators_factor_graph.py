@@ -135,7 +135,6 @@ def test_variants_say_how_it_is_solved():
     ("config", "message"),
     [
         ({"window": 0}, "window must be null or at least one sampling interval, 0.01 s, not 0.0 s"),
-        ({"window": "long"}, "window must be a number"),
         ({"noise": {"measured_ay": 0}}, r"estimator\.noise\.measured_ay must be positive"),
     ],
 )

@@ -390,13 +390,10 @@ def test_a_drive_without_a_reference_is_one_clear_error(drive):
     ("config", "message"),
     [
         ({"tyres": "square"}, "tyres 'square' is not one of: linear, rational"),
-        ({"filter": "particle"}, "filter 'particle' is not one of: extended, unscented"),
         ({"bound": 1.0}, "bound must be more than 1"),
-        ({"adapt_above": -1.0}, "adapt_above must be at least 0"),
         ({"largest_sideslip": 1.6}, r"largest_sideslip must lie between 0 and 1\.5 rad, not at 1\.6"),
         ({"noise": {"yaw_rate": 0.1}}, "estimator.noise: give all of yaw_rate, ay, steer, or none"),
         ({"curves": {"c1_front": 0.1}}, "estimator.curves: give all of c1_front, c2_front, c1_rear, c2_rear, or none"),
-        ({"noise": {"tyres": -1.0}}, r"estimator\.noise\.tyres must be positive"),
     ],
 )
 def test_settings_that_make_no_sense_are_refused(config, message):

@@ -52,10 +52,7 @@ def test_reference_state_is_that_of_the_first_sample():
     [
         ({"sequence_seconds": 2}, "sequence_seconds must be longer than skip_seconds"),
         ({"sequence_seconds": 10.005}, "a whole number of samples at 100 Hz"),
-        ({"sequence_seconds": "ten"}, r"evaluation\.sequence_seconds must be a number, not 'ten'"),
-        ({"initial_state": 1}, "initial_state must be true or false"),
         ({"warm_up_seconds": 1}, "set evaluation.warm_up_seconds=0"),
-        ({"sequence": 10}, r"evaluation\.sequence is not an option of evaluation; options: rate_hz, .*sequence_seconds"),
     ],
 )
 def test_a_protocol_that_makes_no_sense_is_refused(changes: Mapping[str, Any], message: str):

@@ -209,7 +209,6 @@ def test_a_reference_is_made_of_positions_and_yaw_where_there_is_no_other(tmp_pa
     [
         (b"", "is empty"),
         (b"speed\n" + b"1.0\n2.0\n" * 50, "no rows of two numbers"),
-        (b"a,b\n" + b"x" * 200_000 + b"\n", "no rows of two numbers"),
         (bytes(range(256)) * 40, "no table of text"),
         (b"1,2,3\n2,3,4\n3,4,5\n" * 20, "no line of names"),
         (b"t,v,v\n" + b"1,2,3\n2,3,4\n" * 20, "2 columns called 'v'"),

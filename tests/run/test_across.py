@@ -21,7 +21,7 @@ LACKING = ["estimator=kalman"]  # there is no steering angle
 
 
 @pytest.fixture
-def across(place, drawn) -> Place:
+def across(place) -> Place:
     """A place with a split in three folds, two vehicles, and a pipeline of either kind."""
     for seed, name in enumerate(("one", "two", "three"), 1):
         write_csv(place.folder / "raw" / f"{name}.csv", seed, 60.0)

@@ -38,9 +38,9 @@ def without_validation(place: Place) -> None:
 @pytest.fixture
 def evaluated(place) -> tuple[Place, Path, Path]:
     """A place, a model and its evaluation."""
-    _, out, err = place("train", *TRAIN, "--json")
+    _, out, err = place.once("train", *TRAIN, "--json")
     assert "calibrate  luenberger-luenberger-seed0-trust bands by" in err
-    return place, Path(json.loads(out)["model"]), Path(json.loads(place("eval", *TRAIN, "--json")[1])["folder"])
+    return place, Path(json.loads(out)["model"]), Path(json.loads(place.once("eval", *TRAIN, "--json")[1])["folder"])
 
 
 def test_training_alone_calibrates_and_evaluation_takes_it(evaluated):
@@ -95,7 +95,7 @@ def test_metrics_say_coverage_width_and_scores_with_intervals_and_by_acceleratio
 
 
 def test_a_run_calibrates_each_model_once_and_shows_it(place):
-    code, _, err = place("run", "small", "tracking=none")
+    code, _, err = place.once("run", "small", "tracking=none")
     assert code == 0, err
     assert [line.split()[0] for line in err.splitlines() if line.split()[1] == STAGE] == ["done"] * 4
     [report] = (place.folder / "outputs" / "report").iterdir()

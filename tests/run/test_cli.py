@@ -24,7 +24,7 @@ from place import DATASET, PIPELINE, Place, write_csv
 from processes import HANGS, Striking, is_alive, start, wait_for
 from vehest.data.files import ASIDE_PREFIX
 from vehest.data.store import read_recording
-from vehest.run import ingest, runner
+from vehest.run import ingest, inspect_data, runner
 from vehest.run.artefacts import read_artefact
 from vehest.run.signals import TimeLimit
 from vehest.training import supervised
@@ -36,7 +36,7 @@ def _statuses(err: str) -> list[tuple[str, str]]:
 
 
 def test_pipeline_runs_then_skips_then_reruns_only_what_a_change_touches(place):
-    code, out, err = place("run", "small", "tracking=none")
+    code, out, err = place.once("run", "small", "tracking=none")
     assert code == 0, err
     assert "KS-NN linear no bias, P = 2" in out
     assert [stage for status, stage in _statuses(err) if status == "done"].count("train") == 4
@@ -78,15 +78,15 @@ def test_two_processes_give_the_same_numbers_as_one(place):
 
 
 def test_a_failed_job_is_reported_and_the_others_are_kept(place):
-    sweeps = [*PIPELINE["sweeps"], ["estimator=ksnn", "estimator.n_hidden=0", "estimator.bias=true", "training.learning_rate=1e6"]]
+    sweeps = [PIPELINE["sweeps"][0], ["estimator=ksnn", "estimator.n_hidden=0", "estimator.bias=true", "training.learning_rate=1e6"]]
     (place.folder / "pipelines" / "small.yaml").write_text(yaml.safe_dump({**PIPELINE, "sweeps": sweeps}))
     code, out, err = place("run", "small", "tracking=none")
     assert code == 5
-    assert "1 of 5 jobs failed, the others are kept; ksnn-linear_bias_p2 seed 0: training: the validation loss" in err
+    assert "1 of 2 jobs failed, the others are kept; ksnn-linear_bias_p2 seed 0: training: the validation loss" in err
     assert "Traceback" not in err
     kept = {folder.name.split("-seed")[0] for folder in (place.folder / "outputs" / "train").iterdir()}
-    assert kept == {"luenberger-luenberger", "ksnn-linear_no_bias_p2", "gru-states_2"}
-    assert "GRU, 2 states" in out
+    assert kept == {"luenberger-luenberger"}
+    assert "Luenberger" in out
     assert "left out: ksnn-linear_bias_p2 seed 0: training: the validation loss" in out
     (report,) = (place.folder / "outputs").glob("report/*/report.md")
     assert "`ksnn-linear_bias_p2 seed 0` is left out: training: the validation loss" in report.read_text()
@@ -94,11 +94,11 @@ def test_a_failed_job_is_reported_and_the_others_are_kept(place):
 
 
 def test_a_report_is_drawn_of_what_is_there_and_says_what_is_not(place):
-    code, line = place.refused("report", "small", "tracking=none")
+    code, _, err = place.once("run", "small", "tracking=none")
+    assert code == 0, err
+    code, line = place.refused("report", "small", "tracking=none", "output=elsewhere")
     assert code == 4
     assert "run 'vehest run" in line
-    code, _, err = place("run", "small", "tracking=none")
-    assert code == 0, err
     code, out, err = place("report", "small", "tracking=none", "--json")
     assert code == 0, err
     assert json.loads(out)["leaderboard"][0]["test_set"] == "test"
@@ -171,11 +171,11 @@ def test_ingest_keeps_units_and_signs_and_downsample_the_rate(place):
     assert read_recording(Path(json.loads(out)["folder"]) / "one.parquet").rate_hz == 20.0
 
 
-def test_data_commands_list_show_and_check(place):
+def test_data_commands_list_show_and_check(place, monkeypatch):
+    monkeypatch.setattr(inspect_data, "choices", lambda _: ["ferrari_250lm", "mine", "sim_quickstart"])
     rows = json.loads(place("data", "list", "--json")[1])
-    assert {"mine", "ferrari_250lm", "sim_quickstart"} <= {row["dataset"] for row in rows}
+    assert [row["dataset"] for row in rows] == ["ferrari_250lm", "mine", "sim_quickstart"]
     assert next(row for row in rows if row["dataset"] == "mine")["here"] == "yes"
-    assert all(row["licence"] and row["citation"] for row in rows)
     assert "ferrari_250lm: Revs Vehicle Dynamics Database" in place("data", "list")[1]
     shown = json.loads(place("data", "show", "mine", "--json")[1])
     assert [recording["id"] for recording in shown["recordings"]] == ["one", "three", "two"]
@@ -190,35 +190,12 @@ def test_data_commands_list_show_and_check(place):
     assert "100 Hz, 0 s to 1 s from 2023-01-04 23:31:55 UTC on, 100 samples" in place("data", "show", "unix.csv")[1]
 
 
-def test_check_reports_a_reference_that_points_the_wrong_way(place):
-    (place.folder / "conf" / "dataset" / "mirrored.yaml").write_text(
-        yaml.safe_dump(
-            {**DATASET, "channels": {**DATASET["channels"], "vy_ref": {"column": "Vy", "unit": "m/s", "sign": -1}}}, allow_unicode=True
-        )
-    )
-    code, out, _ = place("data", "check", "mirrored")
-    assert code == 0
-    assert "d(vy_ref)/dt and ay - vx·yaw_rate disagree in sign" in out
-
-
-def test_config_prints_what_a_command_would_use(place):
-    shown = yaml.safe_load(place("config", "train", "estimator=lstm", "seed=4")[1])
-    assert shown["estimator"]["name"] == "lstm"
-    assert shown["seed"] == 4
-    assert json.loads(place("config", "ingest", "dataset=mine", "--json")[1])["dataset"]["source"] == "tabular"
-
-
-def test_doctor_finds_this_machine_fit(place):
-    code, out, _ = place("doctor", "--json")
-    assert code == 0
-    assert {item["name"]: item["level"] for item in json.loads(out)}["compiled recursions"] == "ok"
-
-
 def test_doctor_names_what_an_absent_extra_is_for(place, monkeypatch):
     find = importlib.util.find_spec
     monkeypatch.setattr(importlib.util, "find_spec", lambda name, *rest: None if name == "optuna" else find(name, *rest) or find("vehest"))
     code, out, _ = place("doctor", "--json")
     assert code == 0
+    assert {item["name"]: item["level"] for item in json.loads(out)}["compiled recursions"] == "ok"
     (extras,) = (item for item in json.loads(out) if item["name"] == "extras")
     assert (extras["level"], extras["message"]) == (
         "warning",
@@ -257,11 +234,7 @@ def _with(column, row, value):
 BAD_TABLES = {
     "missing column": (lambda t: t.drop(columns="Yaw"), r"has no column 'Yaw' \(it has Time, Speed"),
     "NaN": (_with("LatAcc", 500, np.nan), r"one\.csv.*channel 'ay' holds 1 NaN between 5 s and 5 s"),
-    "text": (_with("Speed", 41, "fast"), r"one\.csv': column 'Speed' holds the text 'fast' in data row 42"),
-    "repeated time": (_with("Time", 10, 0.09), r"one\.csv': time repeats 1 times, first at sample 10"),
-    "backward time": (_with("Time", 10, 0.05), r"one\.csv': time goes backwards 1 times"),
     "gap": (lambda t: t.drop(index=range(100, 200)), r"one\.csv': 1 gaps, the longest of 1\.01 s after 0\.99 s.*clock: interpolate"),
-    "header only": (lambda t: t.iloc[:0], r"one\.csv' has a header and no rows"),
 }
 
 
@@ -325,7 +298,7 @@ def test_missing_root_missing_folder_and_unknown_words_are_one_clear_line(place,
 
 
 def test_estimate_refuses_a_recording_it_cannot_use(place):
-    place("train", "estimator=luenberger", "split=mine", "training.grid=1", "training.max_evaluations=5", "tracking=none")
+    place.once("train", "estimator=luenberger", "split=mine", "training.grid=1", "training.max_evaluations=5", "tracking=none")
     drive = planar_drive(10.0, 20.0).without_references()
     slow = pd.DataFrame({"time": drive.time, **drive.channels})
     slow.to_csv("slow.csv", index=False)
@@ -380,9 +353,9 @@ def test_a_time_in_which_nothing_can_be_done_is_said(place):
 
 
 def test_only_the_study_as_it_is_written_is_published(place):
-    (place.folder / "pipelines" / "small.yaml").write_text(yaml.safe_dump({**PIPELINE, "publish": True}))
+    (place.folder / "pipelines" / "small.yaml").write_text(yaml.safe_dump({**PIPELINE, "publish": True, "sweeps": PIPELINE["sweeps"][:1]}))
     results = place.folder / "results" / "small"
-    assert place("run", "small", "tracking=none", "training.max_epochs=1")[0] == 0
+    assert place("run", "small", "tracking=none", "training.max_evaluations=5")[0] == 0
     assert not results.exists(), "overrides changed the outcome"
     assert place("run", "small", "tracking=none")[0] == 0
     assert (results / "metrics.csv").is_file()
@@ -429,7 +402,7 @@ def test_splits_that_would_mix_test_and_validation_are_refused(place, tests, mes
 
 
 def test_a_model_is_not_tested_on_what_it_learnt_from(place):
-    model = json.loads(place("train", "split=mine", "training.max_epochs=1", "tracking=none", "--json")[1])["model"]
+    model = json.loads(place.once("train", "split=mine", "training.max_epochs=1", "tracking=none", "--json")[1])["model"]
     swapped = ("split.train=[{recording: three}]", "split.tests.test=[{recording: one, start: 5, stop: 20}]")
     code, line = place.refused("eval", "--model", model, "split=mine", *swapped, "tracking=none")
     assert code == 2
@@ -437,7 +410,7 @@ def test_a_model_is_not_tested_on_what_it_learnt_from(place):
 
 
 def test_estimate_neither_replaces_folders_nor_its_own_recording(place):
-    place("train", "estimator=luenberger", "split=mine", "training.grid=1", "training.max_evaluations=5", "tracking=none")
+    place.once("train", "estimator=luenberger", "split=mine", "training.grid=1", "training.max_evaluations=5", "tracking=none")
     drive = planar_drive(10.0, 100.0).without_references()
     pd.DataFrame({"time": drive.time, **drive.channels}).to_csv("lap.csv", index=False)
     Path("parts.parquet").mkdir()
@@ -464,11 +437,8 @@ def test_a_model_remembers_how_its_recordings_were_prepared(place):
     "arguments",
     [
         ("train", "output=null"),
-        ("train", "output=''"),
         ("train", "seed=-1"),
-        ("train", "seed=1.5"),
         ("train", "training.max_epochs=.inf"),
-        ("train", "estimator.rate_hz=abc"),
         ("train", "estimator.rate_hz=200"),
         ("train", "downsample.transforms=[1]"),
         ("run", "small", "evaluation.rate_hz=abc"),

@@ -9,7 +9,6 @@ import pytest
 
 from place import Place
 from vehest.data.errors import DataError
-from vehest.data.store import read_recording
 from vehest.sources.tabular import TabularSource
 
 
@@ -64,16 +63,6 @@ def test_an_interruption_keeps_what_is_done(place: Place, slow: list[str], monke
         assert place("ingest", "mine")[0] == 130
     ingested(place)
     assert slow == ["one", "three", "two"], "each is read once"
-
-
-def test_side_by_side_makes_the_same_samples(place: Place, monkeypatch: pytest.MonkeyPatch) -> None:
-    plain = {file.name: read_recording(file) for file in ingested(place).glob("*.parquet")}
-    monkeypatch.setattr(TabularSource, "slow", True)
-    code, out, err = place("ingest", "mine", "--force", "--jobs", "2", "--json")
-    assert code == 0, err
-    for file in Path(json.loads(out)["folder"]).glob("*.parquet"):
-        again = read_recording(file)
-        assert all((again[name] == plain[file.name][name]).all() for name in again.channels)
 
 
 def test_a_part_of_other_settings_is_not_used(place: Place, slow: list[str], monkeypatch: pytest.MonkeyPatch) -> None:

@@ -45,19 +45,13 @@ def _shows_only_text(text: str) -> bool:
     [
         (("trian",), "no such command 'trian'; did you mean 'train'? 'vehest --help' lists commands and options"),
         (("train", "--nope"), "'vehest train --help' lists commands and options"),
-        (("data", "shwo"), "'vehest data --help' lists commands and options"),
         (("estimate",), "missing argument 'MODEL|FILE'; 'vehest estimate --help'"),
         (("run", "small", "--jobs", "0"), "invalid value for '--jobs'"),
-        (("run", "small", "--jobs", "many"), "invalid value for '--jobs'"),
-        (("train", "--quiet=3"), "option '--quiet' does not take a value"),
         (("train", "--seed", "3"), "written without dashes: seed=…"),
-        (("train", "--estimator=ksnn"), "written without dashes: estimator=…"),
-        (("train", "--training.patience=3"), "written without dashes: training.patience=…"),
         (("train", "jobs=3"), "an option is written --jobs"),
         (("run", "small", "dry_run=true"), "an option is written --dry-run"),
         (("train", "ksnn"), "write key=value"),
         (("config", "trian"), "is not one of: ingest, downsample, train, eval, estimate"),
-        (("train", "--\x1b[31mred"), r"--\x1b[31mred"),
         (("data", "show", "no\x1b[31m\u202efile"), r"no\x1b[31m\u202efile"),
     ],
 )
@@ -193,13 +187,9 @@ def test_a_data_set_whose_recordings_names_are_not_utf_8_makes_a_whole_study(pla
     [
         ("range(100000000)", "for at least 10001 jobs, more than the limit of 10000"),
         ("range(0,1e300,1e-300)", "more than the limit"),
-        ("range(1e300,0,-1e-300)", "more than the limit"),
         ("range(0,5,0)", "cannot be read"),
-        ("range(0,5.5,0.0)", "cannot be read"),
         ("range(1,inf)", "more than the limit"),
-        ("range(nan,5)", "cannot be read"),
         ("range(0)", "stands for no value"),
-        ("choice()", "cannot be read"),
         ("interval(0,1)", "cannot be read"),
         ("glob(*)", "stands for no value"),
         ("9" * 5000, "cannot be read"),
@@ -375,10 +365,8 @@ def _shell(place: Place, script: str, **environment: str) -> subprocess.Complete
     ("script", "code", "out", "err"),
     [
         ("vehest data channels >&-", 0, "", ""),
-        ("vehest data foo 2>&-", 2, "", ""),
         ("vehest data channels <&- >&- 2>&-", 0, "", ""),
         ("vehest data channels --json >/dev/full", 4, "", "error: cannot write to standard output (No space left on device)\n"),
-        ("vehest data foo 2>/dev/full", 2, "", ""),
         ("{ vehest data channels; echo $? >&2; } | true", 0, "", "141\n"),
         ("mkdir gone; cd gone; rmdir ../gone; vehest data channels >/dev/null", 0, "", ""),
         (
@@ -387,7 +375,6 @@ def _shell(place: Place, script: str, **environment: str) -> subprocess.Complete
             "",
             "error: the working folder has been removed; change to another\n",
         ),
-        ("cd /proc; vehest data channels >/dev/null", 0, "", ""),
     ],
 )
 def test_broken_streams_and_odd_folders_end_in_words(place, script, code, out, err):

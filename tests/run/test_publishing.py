@@ -12,7 +12,7 @@ import pandas as pd
 import pytest
 import yaml
 
-from place import PIPELINE, Place, run_vehest
+from place import PIPELINE, Place, run_vehest, undrawn
 from vehest.run import published as study_keys
 from vehest.run.artefacts import TIMINGS
 from vehest.run.publishing import PROVENANCE, published_content
@@ -37,6 +37,7 @@ def published(tmp_path_factory: pytest.TempPathFactory) -> Path:
         patch.chdir(folder)
         patch.setenv("VEHEST_DATA", str(folder / "raw"))
         patch.delenv("VEHEST_OUTPUT", raising=False)
+        undrawn(patch)
         place = Place(folder, _Silent())
         (folder / "pipelines" / "small.yaml").write_text(yaml.safe_dump(QUICK))
         assert place(*RUN)[0] == 0
@@ -116,6 +117,7 @@ def test_times_are_in_no_published_file_but_beside_the_page_and_on_it(published:
 
 
 def test_a_rerun_leaves_the_work_tree_clean(published: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    undrawn(monkeypatch)
     monkeypatch.chdir(published)
     monkeypatch.setenv("VEHEST_DATA", str(published / "raw"))
     monkeypatch.delenv("VEHEST_OUTPUT", raising=False)
@@ -255,7 +257,7 @@ def models(folder: Path) -> dict[str, dict[str, bytes]]:
     return {name: {file: own for file, own in files.items() if file not in (TIMINGS, "manifest.json")} for name, files in found.items()}
 
 
-def test_a_run_elsewhere_takes_the_published_weights_and_comes_to_the_same_results(drawn: None, published: Path, checked: Place) -> None:
+def test_a_run_elsewhere_takes_the_published_weights_and_comes_to_the_same_results(published: Path, checked: Place) -> None:
     before = contents(checked.folder / "results")
     code, _, said = checked(*RUN)
     assert code == 0

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 import sys
 import tempfile
 from collections.abc import Callable
@@ -81,19 +80,12 @@ def test_the_description_of_a_model_is_read_with_its_types(model: Path) -> None:
     [
         ({"format": 2}, "written by a newer vehest (format 2, this one knows 1)"),
         ({"format": 0}, "written by an older vehest (format 0"),
-        ({"format": "1"}, "format must be a whole number, not '1'"),
-        ({"format": 10**400}, "written by a newer vehest"),
-        ({"estimator": 3}, "estimator must be text, not 3"),
         ({"estimator": "os"}, "estimator 'os' is not one of"),
         ({"estimator": "vehest.estimators.ksnn"}, "is not one of"),
-        ({"estimator": "__init__"}, "is not one of"),
-        ({"settings": [1]}, "settings must be a mapping"),
         ({"settings": {"window": "30"}}, "settings.window must be a whole number, not '30'"),
-        ({"settings": {"windows": 30}}, "settings.windows is not an option of settings"),
         ({"settings": {"rate_hz": float("nan")}}, "settings.rate_hz must be a number, not nan"),
         ({"settings": {"n_local": 10**9}}, "settings.n_local is 1e+09, and model.safetensors holds"),
         ({"settings": {"n_local": 4000}}, "which do not fit its settings"),
-        ({"about": {"seed": "three"}}, "about.seed must be a whole number"),
         ({"about": {"downsample": {"method": "magic"}}}, "about.downsample.method 'magic' is not one of: polyphase, decimate"),
         ({"about": {"downsample": {"transforms": [{"name": "low_pass"}]}}}, "transform 'low_pass': cutoff_hz is missing"),
         ({"evil": 1}, "unknown key 'evil'"),
@@ -113,20 +105,6 @@ def test_a_description_that_is_none_is_one_line(model: Path, text: str | bytes) 
     (model / "model.yaml").write_bytes(text if isinstance(text, bytes) else text.encode())
     with pytest.raises(DataError, match=r"model\.yaml"):
         load_model(model)
-
-
-def test_a_description_that_is_a_pipe_does_not_block(model: Path) -> None:
-    (model / "model.yaml").unlink()
-    os.mkfifo(model / "model.yaml")
-    with pytest.raises(DataError, match="a pipe"):
-        load_model(model)
-
-
-def test_a_date_where_text_belongs_is_named_with_its_key(model: Path) -> None:
-    path = model / "model.yaml"
-    path.write_text(path.read_text().replace("step: any", "step: 2026-01-01"))
-    with pytest.raises(DataError, match=r"about\.step is no plain value but a date"):
-        read_description(model)
 
 
 def test_weights_that_are_not_finite_are_counted_by_tensor(model: Path) -> None:
@@ -166,13 +144,9 @@ def test_weights_of_a_type_that_numpy_does_not_know_are_refused(model: Path) -> 
     ("length", "header"),
     [
         (2**62, {}),
-        (10**6, {}),
         (None, {"a": {"dtype": "F64", "shape": [10**12], "data_offsets": [0, 8 * 10**12]}}),
-        (None, {"a": {"dtype": "F64", "shape": [2**40, 2**40], "data_offsets": [0, 16]}}),
         (None, {"a": {"dtype": "F64", "shape": [-1], "data_offsets": [0, 16]}}),
         (None, {"a": {"dtype": "F64", "shape": [2], "data_offsets": [-16, 0]}}),
-        (None, {"a": {"dtype": "F64", "shape": "2", "data_offsets": [0, 16]}}),
-        (None, [1]),
     ],
 )
 def test_a_header_that_lies_is_one_line(model: Path, length: int | None, header: Any) -> None:
@@ -207,17 +181,12 @@ def test_a_manifest_states_its_format_and_one_without_is_read_too(tmp_path: Path
     ("changes", "message"),
     [
         ({"format": 2}, "written by a newer vehest"),
-        ({"format": "x"}, "format must be a whole number"),
         ({"label": 3}, "label must be text"),
         ({"key": ...}, "key is missing"),
         ({"status": "done"}, "status 'done' is not one of: complete, interrupted"),
-        ({"outputs": []}, "outputs must be a mapping"),
         ({"outputs": {"a.txt": {"sha256": "0" * 64}}}, "outputs.a.txt.bytes is missing"),
-        ({"outputs": {"a.txt": {"sha256": "0" * 64, "bytes": "1"}}}, "outputs.a.txt.bytes must be a whole number"),
         ({"outputs": {"a.txt": {"sha256": "0", "bytes": 2}}}, "outputs.a.txt.sha256: string should match pattern"),
         ({"outputs": {"a.txt": {"sha256": "0" * 64, "bytes": 2}}}, "is gone or truncated"),
-        ({"config": "a"}, "config must be a mapping"),
-        ({"inputs": {"a": 3}}, "inputs.a must be text"),
         *[({"outputs": {name: {"sha256": "0" * 64, "bytes": 1}}}, "") for name in HOSTILE],
     ],
 )
@@ -288,18 +257,12 @@ def redescribed(path: Path, change: Callable[[dict[str, Any]], Any]) -> None:
     [
         ({"format": 2}, "written by a newer vehest"),
         ({"format": 0}, "written by an older vehest"),
-        ({"format": None}, "format must be a whole number"),
-        ({"id": 3}, "id must be text"),
         ({"id": ...}, "id is missing"),
-        ({"rate_hz": "fast"}, "rate_hz must be a number"),
         ({"rate_hz": -1.0}, "the sampling rate must lie between"),
         ({"rate_hz": float("nan")}, "rate_hz must be a number"),
-        ({"start_time": [0]}, "start_time must be a number"),
         ({"kind": "dreamt"}, "kind 'dreamt' is not one of"),
         ({"gappy": "vx"}, "gappy"),
-        ({"provenance": []}, "provenance must be a mapping"),
         ({"content": "estimate"}, "not a recording that vehest wrote"),
-        ({"content": ["recording"]}, "not a recording that vehest wrote"),
     ],
 )
 def test_what_a_recording_says_about_itself_is_checked(tmp_path: Path, changes: dict[str, Any], message: str) -> None:
@@ -322,21 +285,14 @@ def test_a_recording_whose_description_is_damaged_is_not_taken_for_a_table(tmp_p
             read(path)
 
 
-def test_provenance_comes_back_as_it_was(tmp_path: Path) -> None:
-    write_recording(recording(), tmp_path / "lap.parquet")
-    assert isinstance(read_recording(tmp_path / "lap.parquet").provenance["mass"], float)
-
-
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
         ({"n_states": 10**9}, "n_states is 1000000000, and there are 4 columns"),
         ({"n_states": -2}, "n_states is -2"),
         ({"n_states": 3}, "n_states is 3"),
-        ({"n_states": "2"}, "n_states must be a whole number"),
         ({"covariance_of": ["vy"]}, "covariance_of name n quantities, not (5, 2, 2) and (vy"),
         ({"covariance_of": ["vy", "luck"]}, "covariance_of name n quantities, not (5, 2, 2) and (vy"),
-        ({"covariance_of": 3}, "covariance_of must be a list"),
         ({"mode": "psychic"}, "mode 'psychic' is not one of"),
     ],
 )
@@ -369,10 +325,8 @@ def test_tables_that_are_damaged_are_one_line(tmp_path: Path) -> None:
     path = tmp_path / "fit.csv"
     for text in (
         "metric\n1\n",
-        "metric,value\nepochs\n",
         "metric,value\nepochs,many\n",
         'metric,value\n"open,1\n',
-        "metric,value\na,1,2\n",
     ):
         path.write_text(text)
         with pytest.raises(DataError, match=r"fit\.csv"):
@@ -437,23 +391,15 @@ PIPELINE = {"study": "mine", "report": "drive", "split": "quickstart", "sweeps":
         ({"study": 3}, "study must be text, not 3"),
         ({"study": "../evil"}, "must be made of letters"),
         ({"report": "../../evil"}, "there is no study module"),
-        ({"report": "os"}, "there is no study module"),
         ({"report": "drive.os"}, "there is no study module"),
-        ({"publish": "yes"}, "publish must be true or false"),
         ({"sweeps": "estimator=gru"}, "sweeps must be a list of lists of overrides, not 'estimator=gru'"),
         ({"sweeps": ["estimator=gru"]}, "sweeps.0 must be a list of overrides, not 'est"),
         ({"sweeps": []}, "sweeps must be a list of lists"),
-        ({"sweeps": [[]]}, "sweeps must be a list of lists"),
-        ({"sweeps": [[3]]}, "sweeps.0.0 must be text"),
-        ({"evaluation": [1]}, "evaluation must be a mapping"),
         ({"evaluation": {"rate_hz": [1]}}, "evaluation.rate_hz"),
-        ({"parts": {"a": 3}}, "parts.a must be a group of options"),
-        ({"datasets": "a"}, "datasets must be a list"),
         ({"title": __import__("datetime").date(2026, 1, 1)}, "title is no plain value but a date"),
         ({"unknown": 1}, "unknown key 'unknown'"),
         ({"split": ...}, "it needs split and sweeps"),
         ({"report": ...}, "it needs study, report and one of: split and sweeps"),
-        ({"based_on": 3}, "based_on must be text"),
     ],
 )
 def test_a_pipeline_that_does_not_fit_is_one_line(tmp_path: Path, changes: dict[str, Any], message: str) -> None:
@@ -493,11 +439,9 @@ def test_no_root_file_in_conf_reaches_hydras_search_path(conf: Path, text: str) 
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("'7'", "the configuration of 'ingest' cannot be read"),
         ("a: !!timestamp soon", "the configuration of 'ingest' cannot be read"),
         ("a: " + "[" * 2000 + "]" * 2000, "it nests too deep"),
         (b"a: \xff", "can't decode byte 0xff"),
-        ("a: &a {b: *a}", "it nests too deep"),
         ("a: ${b}", "dataset.a: Interpolation key 'b' not found"),
         ("# @package hydra\nsearchpath: [pkg://antigravity]", "only supported from the primary config"),
         ("defaults:\n  - /hydra/launcher@_global_: antigravity", "Could not find 'hydra/launcher/antigravity'"),
@@ -516,26 +460,15 @@ def test_shapes_of_shared_groups_are_checked() -> None:
     good = {"output": "o", "limits": {}, "downsample": {"method": "decimate"}, "tracking": {"name": "none"}, "seed": 0}
     validated(Root, good, "", error=ConfigurationError)
     for changes, message in (
-        ({"output": 3}, "output must be text, not 3"),
         ({"output": ""}, "output must name a folder"),
-        ({"root": ["a"]}, "root must be text"),
         ({"downsample": "polyphase"}, "downsample must be a group of options"),
         ({"downsample": {"method": "magic"}}, "downsample.method 'magic' is not one of: polyphase, decimate"),
-        ({"downsample": {"transforms": {}}}, "downsample.transforms must be a list"),
         ({"tracking": {"name": "mlflow", "uri": 3}}, "tracking.uri must be text"),
-        ({"tracking": "mlflow"}, "tracking must be a group of options"),
         ({"estimator": {}}, "estimator.name is missing"),
-        ({"limits": 3}, "limits must be a mapping"),
     ):
         with pytest.raises(ConfigurationError) as caught:
             validated(Root, {**good, **changes}, "", error=ConfigurationError)
         assert message in str(caught.value)
-
-
-def test_wrong_values_on_the_command_line_name_their_keys() -> None:
-    for override, message in (("tracking.uri=3", "tracking.uri must be text"), ("downsample.method=magic", "downsample.method 'magic'")):
-        with pytest.raises(ConfigurationError, match=message):
-            compose_config("train", [override])
 
 
 @pytest.mark.parametrize(
@@ -578,18 +511,10 @@ TABULAR = {"name": "mine", "source": "tabular", "rate_hz": 100}
     ("changes", "message"),
     [
         ({"rate_hz": "100"}, "dataset.rate_hz must be a number, not '100'"),
-        ({"rate_hz": float("nan")}, "dataset.rate_hz must be a number, not nan"),
         ({"clock": 3}, "dataset.clock '3' is not one of: strict, interpolate"),
         ({"gappy": "vx"}, "dataset.gappy must be a list"),
-        ({"files": 3}, "dataset.files must be text"),
-        ({"skip_rows": 1.5}, "dataset.skip_rows must be a whole number"),
-        ({"channels": [1]}, "dataset.channels must be a mapping"),
         ({"channels": {"vx": 3}}, "channel 'vx': it must be a group of options, not 3"),
-        ({"channels": {"vx": {"column": 3.5, "unit": "m/s"}}}, "channel 'vx': column must be text"),
         ({"channels": {"vx": {"column": "v"}}}, "channel 'vx': unit is missing"),
-        ({"channels": {"vx": {"column": "v", "unit": "m/s", "factor": True}}}, "factor must be a number"),
-        ({"title": 3}, "dataset.title must be text"),
-        ({"accept": "gap"}, "dataset.accept must be a list"),
         ({"kind": "dreamt"}, "dataset.kind 'dreamt' is not one of: real, simulated"),
         ({"name": "../evil"}, "must be made of letters"),
     ],

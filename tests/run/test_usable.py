@@ -110,12 +110,6 @@ def test_description_in_the_store_tells_channels_gaps_and_rate_as_the_samples_do
     )
 
 
-def test_table_of_someone_else_is_no_recording(tmp_path):
-    pd.DataFrame({"vx": [1.0]}).to_parquet(tmp_path / "other.parquet")
-    with pytest.raises(DataError, match="not a recording that vehest wrote"):
-        stored_summary(tmp_path / "other.parquet")
-
-
 # What estimators need
 
 

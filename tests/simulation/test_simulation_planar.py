@@ -314,11 +314,8 @@ def test_every_value_says_where_it_comes_from_or_that_it_is_assumed() -> None:
 @pytest.mark.parametrize(
     ("changes", "complaint"),
     [
-        ({"colour": "red"}, "unknown key 'colour'"),
         ({"parameters": {**CONFIGURATION["parameters"], "height": 1.0}}, "unknown key 'height'"),
-        ({"parameters": {"mass": 5.0}}, "is missing"),
         ({"parameters": {**CONFIGURATION["parameters"], "mass": -1.0}}, "mass: .* greater than 0, not -1"),
-        ({"parameters": {**CONFIGURATION["parameters"], "shape_factor": 3.0}}, "shape_factor: .* less than or equal to 2"),
     ],
 )
 def test_vehicle_that_makes_no_sense_names_the_value(changes: dict[str, Any], complaint: str) -> None:
@@ -332,7 +329,6 @@ def test_vehicle_that_makes_no_sense_names_the_value(changes: dict[str, Any], co
         ({"name": "slalom"}, "there is no manoeuvre 'slalom'; there are freestyle"),
         ({"name": "freestyle", "brakes": 2.0}, "brakes must lie between 0 and 1"),
         ({"name": "freestyle", "brakes": 0.6, "kicks": 0.6}, "shares of one"),
-        ({"name": "freestyle", "speed": 3.0}, "speed must be a list"),
     ],
 )
 def test_freestyle_that_makes_no_sense_is_refused(configuration: dict[str, Any], complaint: str) -> None:

@@ -469,20 +469,14 @@ def test_reference_kinds_are_different() -> None:
     ("spelt", "said"),
     [
         ("perfect", "sensors 'perfect' is not one of: default, race, ideal"),
-        ("[race]", "sensors is the name of a preset"),
         ("{az: {noise: 0}}", "sensors: 'az' is not one of: vx, yaw_rate"),
         ("{ay: {slope: 0}}", "sensors: ay: 'slope' is not one of: noise, offset"),
-        ("{ay: {noise: true}}", "sensors: ay.noise is a number, not True"),
         ("{ay: {noise: -1}}", "sensors: ay: noise must be zero or positive, not -1.0"),
-        ("{ay: {noise: .nan}}", "sensors: ay: noise must be finite, not nan"),
         ("{ay: {drift_time: 0}}", "drift_time must be positive"),
-        ("{ay: on}", "sensors: ay is a mapping of what changes, or off, not True"),
-        ("{tilt: {bank: 0}}", "sensors: tilt.bank is on or off, not 0"),
         ("{imu: {lever_x: .inf}}", "sensors: imu: lever_x must be finite"),
         ("{reference: radar}", "sensors: reference 'radar' is not one of: optical, gnss, motion_capture, ideal"),
         ("{reference: {heading: {delay: 1}}}", "sensors: reference: heading has noise, offset and drift only"),
         ("{switched_off: [ay.slope]}", "sensors: cannot switch off 'ay.slope': 'slope' is not one of: noise, offset"),
-        ("{switched_off: 3}", "switched_off is a list of names"),
     ],
 )
 def test_configuration_that_makes_no_sense_is_refused_in_one_line(spelt: str, said: str) -> None:

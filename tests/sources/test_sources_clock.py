@@ -88,7 +88,6 @@ def test_units_and_signs_are_applied() -> None:
     ("entries", "what"),
     [
         ({"vz": {"column": "a", "unit": "m/s"}}, "channel 'vz' is not known"),
-        ({"vx": {"column": "a", "unit": "furlong"}}, "unit 'furlong' is not known"),
         ({"vx": {"column": "a", "unit": "deg"}}, "unit 'deg' cannot be converted to 'm/s'"),
     ],
 )
@@ -119,7 +118,6 @@ EVEN = np.arange(1000) / 100.0
         (EVEN * 1e-4, "the time stamps lie 1e-06 s apart"),
         (EVEN * 1e8, "the time stamps lie 1e+06 s apart (from 0 s to 999000000 s); correct the unit of time"),
         (1.7e18 + EVEN * 1e9, "time stamp of sample 0 is 1.7e+18 s, which is no time of a drive"),
-        (np.append(EVEN, np.inf), "time stamp of sample 1000 is inf s"),
     ],
 )
 @pytest.mark.filterwarnings("error")

@@ -37,6 +37,8 @@ def drive(name: str, duration: float = 2.0, **more: object) -> dict[str, object]
 def test_every_data_set_that_is_shipped_opens(file: Path) -> None:
     config = compose_config("ingest", [f"dataset={file.stem}", "root=elsewhere"])["dataset"]
     assert config["name"] == file.stem
+    assert config["licence"]
+    assert config["citation"]
     if not missing_keys(config):
         assert open_source(config).name == file.stem
 

@@ -292,7 +292,6 @@ ENDLESS = "WITH RECURSIVE c(id) AS (SELECT 1 UNION ALL SELECT id + 1 FROM c) SEL
     [
         (["DROP TABLE messages", f"CREATE VIEW messages AS {ENDLESS}"], "missing tables"),
         (["UPDATE messages SET timestamp = -1 WHERE id = 5"], "at no time there is"),
-        (["UPDATE messages SET data = zeroblob(100000000) WHERE id = 5"], "is damaged"),
         (["UPDATE message_definitions SET encoded_message_definition = 'float64 __import__(\"os\")'"], "is damaged"),
     ],
 )
@@ -352,7 +351,6 @@ def test_a_bag_that_ros_compressed_is_read_up_to_the_limits(folder: Path) -> Non
         ),
         ({"channels": {"vx": CHANNELS["vx"] | {"field": "motor.name"}}}, "is not a number"),
         ({"topics": topic_options("servo", stamps="header")}, "have no header; set stamps: received"),
-        ({"messages": {}}, "is neither a standard one nor declared"),
     ],
 )
 def test_a_misspelt_declaration_is_refused(folder: Path, changes: dict[str, Any], said: str) -> None:

@@ -267,7 +267,6 @@ def test_trust_is_read_back_as_it_was_written(tmp_path):
         ("format: 1", "format: 2", "newer vehest"),
         ("floor: ", "floor: -", "floor must be positive"),
         ("n_blocks: 32", "n_blocks: many", "whole number"),
-        ("n_blocks: 32", "n_bricks: 32", "n_blocks is missing"),
     ],
 )
 def test_a_damaged_record_is_refused(tmp_path, old, new, message):

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import warnings
 from functools import cache
+from itertools import cycle
 
 import numpy as np
 import pytest
@@ -81,12 +82,13 @@ def test_one_bad_sample_does_no_lasting_harm(name):
     drive = drive_for(estimator)
     whole = online(estimator, columns(estimator, drive))
     at, later = len(drive) // 3, len(drive) // 3 + math.ceil(3.0 * estimator.settings.rate_hz)
-    for channel in estimator.channels:
-        for value in HOSTILE[:-1]:  # 0 is a value like any other
-            samples = columns(estimator, drive)
-            samples[channel][at] = value
-            difference = np.abs(online(estimator, samples) - whole)
-            assert np.nanmax(difference[later:]) < 0.05, (channel, value)
+    values = HOSTILE[:-1]  # 0 is a value like any other
+    channels = estimator.channels
+    for channel, value in {*((channels[0], value) for value in values), *zip(channels, cycle(values), strict=False)}:
+        samples = columns(estimator, drive)
+        samples[channel][at] = value
+        difference = np.abs(online(estimator, samples) - whole)
+        assert np.nanmax(difference[later:]) < 0.05, (channel, value)
 
 
 class Constant(Stepper):
