@@ -17,8 +17,6 @@ from vehest.evaluation.metrics import REFERENCES, sequences, weighted_squared_er
 from vehest.report.document import Figure, as_code
 from vehest.report.style import (
     DOUBLE_COLUMN,
-    GRU_PURPLE,
-    LSTM_PURPLE,
     NONLINEAR_ORANGES,
     REFERENCE,
     Line,
@@ -35,8 +33,8 @@ if TYPE_CHECKING:
 LINES = {
     paper.NNTF_UH: Line("#0b4f9c", "solid"),
     paper.NNTF_UH_LOW: Line(NONLINEAR_ORANGES[0], "dashed"),
-    paper.GRU: Line(GRU_PURPLE, "dashdot"),
-    paper.LSTM: Line(LSTM_PURPLE, "dotted"),
+    paper.GRU: Line("#8e24aa", "dashdot"),
+    paper.LSTM: Line("#c792dd", "dotted"),
 }
 AXES = {"vx": "$v_x$ [m/s]", "vy": "$v_y$ [m/s]", "yaw_rate": "yaw rate [rad/s]"}
 
