@@ -7,12 +7,14 @@ import zlib
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 from vehest.estimators.registry import estimator_class, estimator_names
 
 if TYPE_CHECKING:
-    from matplotlib.figure import Figure as MatplotlibFigure
+    from matplotlib.figure import Figure
+
+MatplotlibFigure: TypeAlias = "Figure"
 
 SINGLE_COLUMN = 3.5  # in, one column of a two-column journal
 DOUBLE_COLUMN = 7.16  # in, both columns

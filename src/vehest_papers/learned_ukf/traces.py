@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING
 
 import numpy as np
 import pandas as pd
@@ -20,15 +19,13 @@ from vehest.report.style import (
     NONLINEAR_ORANGES,
     REFERENCE,
     Line,
+    MatplotlibFigure,
     fixed,
     legend_above,
     new_figure,
 )
 from vehest.studies.artefacts import EvaluatedModel, PartArtefacts
 from vehest_papers.learned_ukf import paper
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure as MatplotlibFigure
 
 LINES = {
     paper.NNTF_UH: Line("#0b4f9c", "solid"),
