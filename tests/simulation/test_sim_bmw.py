@@ -21,12 +21,13 @@ from vehest.simulation.driving.car import car_of
 from vehest.simulation.driving.driver import Follower
 from vehest.simulation.driving.manoeuvre import Manoeuvre
 from vehest.simulation.driving.manoeuvres import manoeuvre_from_config
-from vehest.simulation.plant.handling import ramp_steer, understeer_angle
+from vehest.simulation.plant.handling import ramp_steer
 from vehest.simulation.plant.multi_body import MultiBodyPlant
 from vehest.simulation.plant.parameters import vehicle_from_configuration
 from vehest.simulation.road.course import course_by_name
 from vehest.simulation.road.surface import SURFACES
 from vehest.sources.simulated import SimulatedSource
+from vehest_papers.proving_ground.handling import understeer_angle
 
 CONFIGURATIONS = Path(__file__).parents[2] / "conf"
 

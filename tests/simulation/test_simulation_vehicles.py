@@ -13,11 +13,12 @@ import yaml
 
 from vehest.constants import GRAVITY
 from vehest.data.errors import ConfigurationError
-from vehest.simulation.plant.handling import ramp_steer, understeer_angle
+from vehest.simulation.plant.handling import ramp_steer
 from vehest.simulation.plant.motion import Motion
 from vehest.simulation.plant.multi_body import MultiBodyPlant, PlantState
 from vehest.simulation.plant.parameters import Vehicle, library_parameters, rear_tyre, vehicle_from_configuration
 from vehest.simulation.plant.regimes import HEAVE, PITCH, ROLL, ROLL_RATE, Regime
+from vehest_papers.proving_ground.handling import understeer_angle
 
 CONFIGURATIONS = Path(__file__).parents[2] / "conf" / "vehicle"
 OURS = ("corvette_grand_sport", "ferrari_250_lm", "bmw_545i", "heavy_truck")

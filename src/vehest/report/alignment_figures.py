@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import io
 import math
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from scipy import signal
@@ -19,15 +19,13 @@ from vehest.report.style import (
     LUENBERGER_GREY,
     NONLINEAR_ORANGES,
     REFERENCE,
+    MatplotlibFigure,
     fixed,
     new_figure,
     paper_style,
     significant,
     with_unit,
 )
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure as MatplotlibFigure
 
 POINTS = 2500
 SCATTER_POINTS = 1500

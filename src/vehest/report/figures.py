@@ -5,15 +5,12 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from vehest.constants import FloatArray
-from vehest.report.style import DOUBLE_COLUMN, REFERENCE, Line, new_figure, significant
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure as MatplotlibFigure
+from vehest.report.style import DOUBLE_COLUMN, REFERENCE, Line, MatplotlibFigure, new_figure, significant
 
 STATIC_POINTS = 500
 LEAST_SAMPLES = 20

@@ -5,15 +5,12 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from vehest.constants import FloatArray
-from vehest.report.style import DOUBLE_COLUMN, MISSING, SINGLE_COLUMN, decimals_for, fixed, new_figure
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure as MatplotlibFigure
+from vehest.report.style import DOUBLE_COLUMN, MISSING, SINGLE_COLUMN, MatplotlibFigure, decimals_for, fixed, new_figure
 
 LOGARITHMIC_FROM = 20.0
 MOST_COLUMNS_SIDE_BY_SIDE = 6

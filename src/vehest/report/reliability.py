@@ -4,15 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from vehest.constants import FloatArray
-from vehest.report.style import REFERENCE, SINGLE_COLUMN, Line, new_figure
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure as MatplotlibFigure
+from vehest.report.style import REFERENCE, SINGLE_COLUMN, Line, MatplotlibFigure, new_figure
 
 LABEL_STEP = 0.05  # least distance of two labels, as a part of the axis
 SIDESTEP = 0.005  # of intervals that would cover each other

@@ -7,12 +7,14 @@ import zlib
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 from vehest.estimators.registry import estimator_class, estimator_names
 
 if TYPE_CHECKING:
-    from matplotlib.figure import Figure as MatplotlibFigure
+    from matplotlib.figure import Figure
+
+MatplotlibFigure: TypeAlias = "Figure"
 
 SINGLE_COLUMN = 3.5  # in, one column of a two-column journal
 DOUBLE_COLUMN = 7.16  # in, both columns
@@ -22,8 +24,6 @@ REFERENCE_COLOUR = "#000000"
 LUENBERGER_GREY = "#767676"
 LINEAR_BLUES = ("#4aa5e0", "#0b4f9c")  # without and with bias
 NONLINEAR_ORANGES = ("#f59a23", "#b8480b")
-GRU_PURPLE = "#8e24aa"
-LSTM_PURPLE = "#c792dd"
 OTHER_COLOURS = ("#00876c", "#a6761d", "#d6336c", "#5b8c00", "#17a2b8", "#6d4c41")
 
 _DARK_PAPER, _DARK_INK = 0x1A, 0xE6  # as in templates/page.css
@@ -173,11 +173,6 @@ def decimals_for(values: Sequence[float], digits: int = 3) -> int:
 def fixed(value: float, decimals: int) -> str:
     """A number with a fixed count of decimals, thousands set apart; `MISSING` if it is not finite."""
     return _grouped(value, decimals) if math.isfinite(value) else MISSING
-
-
-def percent_below(value: float, other: float) -> str:
-    """By how much ``value`` lies below ``other``, in whole per cent, for example ``12 %``."""
-    return f"{100 * (1 - value / other):.0f} %"
 
 
 def listed(words: Sequence[str]) -> str:

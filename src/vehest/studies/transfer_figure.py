@@ -4,14 +4,10 @@ from __future__ import annotations
 
 import math
 import textwrap
-from typing import TYPE_CHECKING
 
 import pandas as pd
 
-from vehest.report.style import DOUBLE_COLUMN, lines_of, new_figure
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure as MatplotlibFigure
+from vehest.report.style import DOUBLE_COLUMN, MatplotlibFigure, lines_of, new_figure
 
 COLUMNS = 4
 TITLE_WIDTH = 24

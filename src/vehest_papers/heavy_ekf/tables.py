@@ -13,10 +13,11 @@ from vehest.data.estimate import Estimate
 from vehest.data.recording import Recording
 from vehest.estimators.filtering.tyre_fit import TyreFit
 from vehest.report.document import Column, Table
-from vehest.report.style import MISSING, fixed, listed, percent_below
+from vehest.report.style import MISSING, fixed, listed
 from vehest_papers.heavy_ekf import paper
 from vehest_papers.heavy_ekf.subjects import TYRES
 from vehest_papers.heavy_ekf.tyres import OwnCurves
+from vehest_papers.kit.reading import percent_below
 
 Rmse = Mapping[tuple[str, str], float]
 DRIVES = {"laps": "three laps", "fast": "fast lap"}

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import pandas as pd
 
 from vehest.constants import FloatArray
 from vehest.report.document import Block, Column, Figure, Table
-from vehest.report.style import DOUBLE_COLUMN, fixed, new_figure
+from vehest.report.style import DOUBLE_COLUMN, MatplotlibFigure, fixed, new_figure
 from vehest_papers.heavy_ekf import paper
 from vehest_papers.heavy_ekf.candidates import DATA_SHEET, DRAWN, FILTERS, ORACLE, REFINED, STATIC_MAP, WITH_STATE, ZERO, table_of
 from vehest_papers.heavy_ekf.factorial import (
@@ -34,9 +34,6 @@ from vehest_papers.heavy_ekf.factorial import (
 from vehest_papers.heavy_ekf.twin import CG_HEIGHT, NOISE, SECONDS, TRACK, Plant
 from vehest_papers.kit.claims import Claim
 from vehest_papers.kit.reading import with_interval
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure as MatplotlibFigure
 
 DATA = "SIMULATED, the paper's single track"
 LIMIT = 100.0  # %, where the colours end

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING
 
 import numpy as np
 import pandas as pd
@@ -17,11 +16,10 @@ from vehest.evaluation.metrics import REFERENCES, sequences, weighted_squared_er
 from vehest.report.document import Figure, as_code
 from vehest.report.style import (
     DOUBLE_COLUMN,
-    GRU_PURPLE,
-    LSTM_PURPLE,
     NONLINEAR_ORANGES,
     REFERENCE,
     Line,
+    MatplotlibFigure,
     fixed,
     legend_above,
     new_figure,
@@ -29,14 +27,11 @@ from vehest.report.style import (
 from vehest.studies.artefacts import EvaluatedModel, PartArtefacts
 from vehest_papers.learned_ukf import paper
 
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure as MatplotlibFigure
-
 LINES = {
     paper.NNTF_UH: Line("#0b4f9c", "solid"),
     paper.NNTF_UH_LOW: Line(NONLINEAR_ORANGES[0], "dashed"),
-    paper.GRU: Line(GRU_PURPLE, "dashdot"),
-    paper.LSTM: Line(LSTM_PURPLE, "dotted"),
+    paper.GRU: Line("#8e24aa", "dashdot"),
+    paper.LSTM: Line("#c792dd", "dotted"),
 }
 AXES = {"vx": "$v_x$ [m/s]", "vy": "$v_y$ [m/s]", "yaw_rate": "yaw rate [rad/s]"}
 

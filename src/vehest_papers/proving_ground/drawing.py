@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,15 +12,12 @@ from numpy.typing import NDArray
 from vehest.constants import FloatArray
 from vehest.data.recording import Recording
 from vehest.report.figures import decimated
-from vehest.report.style import DOUBLE_COLUMN, LINEAR_BLUES, NONLINEAR_ORANGES, OTHER_COLOURS, new_figure
+from vehest.report.style import DOUBLE_COLUMN, LINEAR_BLUES, NONLINEAR_ORANGES, OTHER_COLOURS, MatplotlibFigure, new_figure
 from vehest_papers.proving_ground import noise
 from vehest_papers.proving_ground.handling import ANGLE_EDGES, AY_EDGES
 from vehest_papers.proving_ground.noise_reading import NOISE_ABOVE
 from vehest_papers.proving_ground.papers import Profile
 from vehest_papers.proving_ground.vehicles import SHORTEST_TRACE, TRACE_SECONDS, Stretch, VehiclePage
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure as MatplotlibFigure
 
 POINTS = 1200
 GREYS = 12

@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 
 from vehest.constants import GRAVITY, FloatArray
 from vehest.data.recording import Recording
-from vehest.simulation.plant.handling import ramp_steer, understeer_angle
+from vehest.simulation.plant.handling import ramp_steer
+from vehest.simulation.plant.motion import Motion
 from vehest.simulation.plant.multi_body import MultiBodyPlant
 from vehest.simulation.plant.parameters import Vehicle, compiled_parameters
 
@@ -106,6 +107,11 @@ def characteristic(vehicle: Vehicle, friction: float, label: str) -> Characteris
     (right_ay, right_angle), (left_ay, left_angle) = halves
     ay, angle = np.append(right_ay[::-1], left_ay), np.append(right_angle[::-1], left_angle)
     return Characteristic(label, speed, ay, angle, single_track_gradient(vehicle))
+
+
+def understeer_angle(motion: Motion, wheelbase: float) -> FloatArray:
+    """Steering angle beyond that of the path's curvature without slip, positive in understeer to the left (T,) [rad]."""
+    return motion.steer - np.arctan(wheelbase * motion.yaw_rate / motion.vx)
 
 
 def single_track_gradient(vehicle: Vehicle) -> float:

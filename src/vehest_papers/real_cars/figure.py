@@ -3,15 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
 
 import numpy as np
 
-from vehest.report.style import DOUBLE_COLUMN, new_figure
+from vehest.report.style import DOUBLE_COLUMN, MatplotlibFigure, new_figure
 from vehest_papers.real_cars.statistics import Statistics
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure as MatplotlibFigure
 
 COLOURS = {"sideslip": "#b8480b", "ay": "#0b4f9c"}
 

@@ -47,8 +47,3 @@ def ramp_steer(
         except SimulationError:  # a rollover ends it too
             break
     return plant.motion(states, np.array(inputs), RATE_HZ, friction=friction)
-
-
-def understeer_angle(motion: Motion, wheelbase: float) -> FloatArray:
-    """Steering angle beyond that of the path's curvature without slip, positive in understeer to the left (T,) [rad]."""
-    return motion.steer - np.arctan(wheelbase * motion.yaw_rate / motion.vx)

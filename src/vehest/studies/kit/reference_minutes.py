@@ -12,7 +12,6 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import pandas as pd
 
@@ -21,11 +20,8 @@ from vehest.data.store import read_recording
 from vehest.evaluation.blocks import Segments
 from vehest.evaluation.ranking import BASELINES, Name, Ranking, rank
 from vehest.report.document import Block, Column, Figure, Table, as_text
-from vehest.report.style import DOUBLE_COLUMN, fixed, line_of, listed, new_figure
+from vehest.report.style import DOUBLE_COLUMN, MatplotlibFigure, fixed, line_of, listed, new_figure
 from vehest.studies.artefacts import EvaluatedModel, PartArtefacts
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure as MatplotlibFigure
 
 SCRATCH = "from scratch"
 COLUMNS = {
