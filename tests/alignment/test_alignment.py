@@ -17,6 +17,7 @@ from scipy.interpolate import CubicSpline
 from scipy.signal import lfilter
 
 from place import run_vehest
+from real_drives import real_drive
 from vehest.alignment.align import Alignment, align
 from vehest.alignment.imu import smoothing_of
 from vehest.alignment.settings import QUANTITIES, AlignmentSettings
@@ -33,7 +34,6 @@ from vehest.simulation.plant.multi_body import MultiBodyPlant
 from vehest.simulation.plant.parameters import vehicle_from_configuration
 from vehest.simulation.sensors.levels import SensorLevel, ideal_sensors
 from vehest.simulation.sensors.recording import measure, specific_force
-from vehest.sources.base import open_source
 
 IMU = ("lever_arm", "mounting", "delay", "offsets")
 PLANTED = {
@@ -680,9 +680,8 @@ def found_on_ferrari(ferrari: Recording) -> Alignment:
 
 
 @pytest.fixture(scope="module")
-def ferrari(request: pytest.FixtureRequest) -> Recording:
-    root = request.getfixturevalue("data_root")
-    return open_source(compose_config("ingest", ["dataset=ferrari_250lm", f"root={root}"])["dataset"]).read("20140222_01_01_03_250lm")
+def ferrari(data_root: Path) -> Recording:
+    return real_drive(data_root)
 
 
 def test_ferrari_shows_no_misalignment_that_its_intervals_do_not_contain(found_on_ferrari: Alignment) -> None:

@@ -11,13 +11,12 @@ import pytest
 from broadband_drive import Wave, broadband_drive, without
 from scipy import signal
 
+from real_drives import real_drive
 from vehest.alignment.checks import Finding, checks_of_recording
 from vehest.alignment.delays import Delay, delays_of, spectra_of
 from vehest.alignment.motion import motion_of
 from vehest.alignment.spectra import cross_spectra, lag_of
 from vehest.data.recording import Recording
-from vehest.run.config import compose_config
-from vehest.sources.base import open_source
 
 
 def delays(recording: Recording) -> list[Delay]:
@@ -149,11 +148,9 @@ def test_late_wheels_are_reported_once() -> None:
     assert "with the other wheels, 59 ms" in found.message
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture
 def ferrari(data_root: Path) -> Recording:
-    config = compose_config("ingest", ["dataset=ferrari_250lm", f"root={data_root}"])
-    (recording,) = open_source(config["dataset"]).recordings()
-    return recording
+    return real_drive(data_root)
 
 
 def test_the_ferraris_channels_are_not_reported(ferrari: Recording) -> None:

@@ -9,25 +9,22 @@ import numpy as np
 import pandas as pd
 import pytest
 
+from real_drives import FERRARI, real_drive
 from vehest.cli import main
 from vehest.data.splits import Span
 from vehest.data.transforms import Resample
 from vehest.estimators.base import FitData
 from vehest.estimators.registry import estimator_class
 from vehest.evaluation.metrics import Protocol, accuracy, score
-from vehest.run.config import compose_config
-from vehest.sources.base import open_source
 from vehest.training.search import DirectSearchSettings
 from vehest.training.supervised import SupervisedSettings
 
-SPAN = Span("ferrari_250lm", "20140222_01_01_03_250lm", 550.0, 700.0)
+SPAN = Span("ferrari_250lm", FERRARI, 550.0, 700.0)
 
 
-@pytest.fixture(scope="module")
-def ferrari(request):
-    root = request.getfixturevalue("data_root")
-    dataset = compose_config("ingest", ["dataset=ferrari_250lm", f"root={root}"])["dataset"]
-    return open_source(dataset).read(SPAN.recording)
+@pytest.fixture
+def ferrari(data_root):
+    return real_drive(data_root)
 
 
 def _tested(estimator, recording, reference):

@@ -15,6 +15,7 @@ from c_build import COMPILERS, OUTPUTS, Library, built
 from dugoff_drive import TYRES, dugoff_track
 from every_estimator import drive_for, fitted
 from example_package import forget_examples, install_examples
+from real_drives import real_drive
 from vehest.data.errors import ConfigurationError, DataError
 from vehest.data.transforms import Resample
 from vehest.estimators.base import Estimator, FitData
@@ -23,8 +24,6 @@ from vehest.estimators.network_ukf import NetworkUkf
 from vehest.estimators.networks.windowed import WindowedEstimator
 from vehest.estimators.registry import estimator_class, estimator_names
 from vehest.export.method import exportable, method_source
-from vehest.run.config import compose_config
-from vehest.sources.base import open_source
 from vehest.training.sequences import PhaseSettings
 from vehest.training.through_filter import ThroughFilterSettings
 
@@ -277,8 +276,7 @@ def test_a_covariance_that_is_not_positive_definite_is_repaired_as_in_python(tmp
 
 
 def ferrari_rows(data_root, estimator: Estimator, first: float = 550.0, last: float = 700.0) -> np.ndarray:
-    dataset = compose_config("ingest", ["dataset=ferrari_250lm", f"root={data_root}"])["dataset"]
-    recording = open_source(dataset).read("20140222_01_01_03_250lm").cut(first, last)
+    recording = real_drive(data_root).cut(first, last)
     if estimator.settings.rate_hz != recording.rate_hz:
         recording = Resample(estimator.settings.rate_hz)(recording)
     return recording.without_references().stack(estimator.channels)
@@ -317,8 +315,7 @@ def test_the_observer_agrees_over_the_real_ferraris_test_range(precision, larges
 @cache
 def small_car(data_root, dynamics: str) -> Case:
     """Trained on real drives of the small car, for seconds, and another drive of it."""
-    source = open_source(compose_config("ingest", ["dataset=f1tenth", f"root={data_root}"])["dataset"])
-    train, validation, test = (source.read(f"{name}") for name in DRIVES)
+    train, validation, test = (real_drive(data_root, name, "f1tenth") for name in DRIVES)
     estimator = estimator_class("learned_ukf").from_config({"dynamics": dynamics, "width": 8, "through_filter": False})
     estimator.seed(0)
     phases = [PhaseSettings(learning_rate=5e-3, max_epochs=5), *[PhaseSettings(learning_rate=1e-3, max_epochs=1)] * 2]

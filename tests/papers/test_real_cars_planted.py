@@ -7,9 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from real_drives import real_drive
 from vehest.data.recording import Recording
-from vehest.run.config import compose_config
-from vehest.sources.base import open_source
 from vehest_papers.real_cars.planted import Fault, detections, planted_faults
 
 LENGTH = 2000
@@ -53,9 +52,7 @@ def test_all_but_the_shortest_delays_of_the_reference_are_found_in_the_ferrari_w
     data_root: Path, start: float, stop: float, missed: set[int]
 ) -> None:
     """Its accelerometers are late by some 15 ms themselves, which a late reference makes good."""
-    config = compose_config("ingest", ["dataset=ferrari_250lm", f"root={data_root}"])
-    (ferrari,) = open_source(config["dataset"]).recordings()
-    table = detections(ferrari.cut(start, stop))
+    table = detections(real_drive(data_root).cut(start, stop))
     assert len(table) == len(planted_faults())
     lost = table[table["decidable"] & ~table["found"]]
     assert set(lost["channel"]) == {"vy_ref and sideslip_ref"}

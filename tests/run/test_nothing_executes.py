@@ -72,7 +72,7 @@ def mdf(honest: Path, hostile: Path) -> Callable[[Path], Any]:
             saved = Path(measurement.save(file, overwrite=True))
         saved.rename(file)
 
-    for version, lines in (("4.10", [f"X1 + {PAYLOAD}", "X1.__class__.__mro__", "9**9**9**X1"]), ("3.30", [PAYLOAD])):
+    for version, lines in (("4.10", [f"X1 + {PAYLOAD}", "9**9**9**X1"]), ("3.30", [PAYLOAD])):
         write(honest / f"a{version}.mf4", version, {"a": 2.0, "b": 1.0})
         for number, line in enumerate(lines):
             write(hostile / f"formula{number}_{version}.mf4", version, {"formula": line})
@@ -129,7 +129,7 @@ def rosbag(honest: Path, hostile: Path) -> Callable[[Path], Any]:
         database.commit()
         database.close()
 
-    for function in (f"load_extension('./{MARK}.so')", f"writefile('{MARK}', 'x')", "zeroblob(1000000000)"):
+    for function in (f"load_extension('./{MARK}.so')", "zeroblob(1000000000)"):
         name = function.split("(")[0]
         view = f"CREATE VIEW messages AS SELECT 1 AS id, 1 AS topic_id, 1 AS timestamp, {function} AS data"
         changed(f"view_{name}", "DROP TABLE messages", view)
@@ -141,11 +141,7 @@ def rosbag(honest: Path, hostile: Path) -> Callable[[Path], Any]:
     layout = f"float64 data\n{PAYLOAD}\nfloat64 x=__import__('os').system('touch {MARK}')\n"
     changed("layout", f"UPDATE message_definitions SET encoded_message_definition = '{layout.replace(chr(39), chr(39) * 2)}'")
     changed("quality", f"UPDATE topics SET offered_qos_profiles = '!!python/object/apply:os.system [touch {MARK}]'")
-    for name, tag in (
-        ("object", "!!python/object/apply:os.system"),
-        ("module", "!!python/module:antigravity"),
-        ("name", "!!python/name:os.system"),
-    ):
+    for name, tag in (("object", "!!python/object/apply:os.system"), ("module", "!!python/module:antigravity")):
         shutil.copytree(good, hostile / f"yaml_{name}")
         (hostile / f"yaml_{name}" / "metadata.yaml").write_text(f"rosbag2_bagfile_information: {tag} [touch {MARK}]\n")
     return by_source(
@@ -214,9 +210,9 @@ def model_folder(honest: Path, hostile: Path) -> Callable[[Path], Any]:
 
 
 CASES = {
-    "mdf": Case(mdf, needs="asammdf", refused=frozenset({*(f"formula{k}_4.10.mf4" for k in range(3)), "formula0_3.30.mf4", "nested.mf4"})),
+    "mdf": Case(mdf, needs="asammdf", refused=frozenset({*(f"formula{k}_4.10.mf4" for k in range(2)), "formula0_3.30.mf4", "nested.mf4"})),
     "mat": Case(mat, refused=frozenset({"text0.mat", "object0.mat", "pickle.mat", "text1.mat", "object1.mat"})),
-    "rosbag": Case(rosbag, needs="rosbags", refused=frozenset({"view_load_extension", "view_writefile", "view_zeroblob", "endless"})),
+    "rosbag": Case(rosbag, needs="rosbags", refused=frozenset({"view_load_extension", "view_zeroblob", "endless"})),
     "vbo": Case(vbo, refused=frozenset({"cell3.vbo", "pickle.vbo"})),
     "table": Case(table, refused=frozenset({"cell0.csv", "pickle.csv"})),
     "model": Case(model_folder, refused=frozenset({"tag0", "tag1", "tag2", "name0", "name1", "name2", "name3", "name4", "pickle"})),

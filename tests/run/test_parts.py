@@ -135,6 +135,8 @@ def test_a_study_of_real_cars_is_nowhere_called_simulated(parts_place):
         file.write_text(yaml.safe_dump({**yaml.safe_load(file.read_text()), "kind": "real"}, allow_unicode=True))
     file = place.folder / "pipelines" / "both.yaml"
     content = yaml.safe_load(file.read_text())
+    quick = [CANDIDATES[0], [*CANDIDATES[1][:2], "training.max_epochs=1"], CANDIDATES[2]]
+    content["parts"]["scheme_1"]["sweeps"] = content["parts"]["scheme_2"]["sweeps"] = quick
     content["parts"]["devbot_ferrari"] = content["parts"]["minutes_5_a"] = {"split": "back", "sweeps": CANDIDATES[::2]}
     file.write_text(yaml.safe_dump(content, sort_keys=False))
     code, _, err = place("run", "both", "tracking=none")

@@ -140,7 +140,7 @@ def test_a_report_of_simulated_drives_never_says_real(place: Place) -> None:
     study = {"study": "s", "title": "t", "report": "drive", "split": "sim"}
     study["sweeps"] = [["estimator=luenberger", "training.grid=1", "training.max_evaluations=5"]]
     (place.folder / "pipelines" / "sim.yaml").write_text(yaml.safe_dump(study))
-    code, out, err = place("run", "sim", "--json")
+    code, out, err = place("run", "sim", "tracking=none", "--json")
     assert code == 0, err
     report = Path(json.loads(out)["report"]).with_name("report.md").read_text()
     assert "**Simulated data:** every number here comes from simulated recordings" in report

@@ -8,18 +8,13 @@ import numpy as np
 import pandas as pd
 import pytest
 
+from real_drives import source_of
 from vehest.alignment.checks import checks_of_recording
-from vehest.run.config import compose_config
-from vehest.sources.base import Source, open_source
-
-
-def source_of(name: str, data_root: Path) -> Source:
-    return open_source(compose_config("ingest", [f"dataset={name}", f"root={data_root}"])["dataset"])
 
 
 @pytest.mark.parametrize("dataset", ["ferrari_250lm_unlabelled", "av21"])
 def test_drives_without_a_reference_or_without_lateral_acceleration_are_read(data_root: Path, dataset: str) -> None:
-    recordings = list(source_of(dataset, data_root).recordings())
+    recordings = list(source_of(data_root, dataset).recordings())
     assert not [f for recording in recordings for f in checks_of_recording(recording) if f.level == "error"]
     for recording in recordings:
         moving, angle = recording["vx"] > 8.0, "handwheel" if "handwheel" in recording else "steer"
@@ -31,7 +26,7 @@ def test_drives_without_a_reference_or_without_lateral_acceleration_are_read(dat
 
 
 def test_roboracer_runs_restart_and_are_scored_by_their_poses(data_root: Path) -> None:
-    recordings = {recording.id: recording for recording in source_of("roboracer", data_root).recordings()}
+    recordings = {recording.id: recording for recording in source_of(data_root, "roboracer").recordings()}
     table = pd.read_csv(data_root / "roboracer" / "ftg_stanley_total_training.csv").iloc[1639:2082]
     run = recordings["ftg_stanley_total_training_run_2"]
     np.testing.assert_allclose(run["yaw_rate"], np.radians(table["yaw_rate"]), rtol=1e-12)
@@ -46,7 +41,7 @@ def test_roboracer_runs_restart_and_are_scored_by_their_poses(data_root: Path) -
 
 
 def test_dart_sensors_agree_with_its_poses_once_held_values_and_latency_are_taken_off(data_root: Path) -> None:
-    source = source_of("dart", data_root)
+    source = source_of(data_root, "dart")
     recording = source.read("car_1_Datarecording_09_16_2024_10_02_28")
     assert recording.provenance["held"]["rate_hz"] == pytest.approx(10.0, abs=0.05)
     moving = recording["vx_ref"] > 0.3

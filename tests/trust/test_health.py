@@ -16,13 +16,12 @@ import pytest
 import yaml
 from measured_drive import CHANNELS, RATE, WHEELS, measured_drive
 
+from real_drives import real_drive
 from small_car_drive import small_car_drive
 from vehest.data.errors import DataError
 from vehest.data.recording import Recording
 from vehest.data.schema import validated
-from vehest.run.config import compose_config
 from vehest.run.downsample import transforms_of
-from vehest.sources.base import open_source
 from vehest.trust import health_kernel as kernel
 from vehest.trust.front_end import FrontEnd
 from vehest.trust.guard import usual_limits
@@ -257,8 +256,7 @@ def test_another_rate_is_refused() -> None:
 
 
 def ferrari(data_root: Path, start: float, stop: float) -> Recording:
-    source = open_source(compose_config("ingest", ["dataset=ferrari_250lm", f"root={data_root}"])["dataset"])
-    return source.read("20140222_01_01_03_250lm").cut(start, stop).without_references()
+    return real_drive(data_root).cut(start, stop).without_references()
 
 
 def test_the_ferrari_is_flagged_where_its_own_steering_angle_glitches_and_hardly_anywhere_else(data_root: Path) -> None:
@@ -274,8 +272,7 @@ def test_the_ferrari_is_flagged_where_its_own_steering_angle_glitches_and_hardly
 
 
 def test_f1tenth_runs_are_judged_without_a_measured_speed(data_root: Path) -> None:
-    source = open_source(compose_config("ingest", ["dataset=f1tenth", f"root={data_root}"])["dataset"])
-    runs = [source.read(f"iros_hoons_1_with_friction_run_{k}").without_references() for k in (1, 3, 4, 0)]
+    runs = [real_drive(data_root, f"iros_hoons_1_with_friction_run_{k}", "f1tenth").without_references() for k in (1, 3, 4, 0)]
     channels = ("ax", "ay", "yaw_rate", "steer", "motor_speed", "motor_current")
     model = learn_health(runs[:3], runs[3:], channels, 100.0)
     healthy = judged(model, runs[3])
@@ -290,11 +287,10 @@ def test_f1tenth_runs_are_judged_without_a_measured_speed(data_root: Path) -> No
 
 
 def test_a_steering_at_its_lock_is_not_frozen(data_root: Path) -> None:
-    source = open_source(compose_config("ingest", ["dataset=f1tenth", f"root={data_root}"])["dataset"])
-    runs = [source.read(f"iros_hoons_1_with_friction_run_{k}").without_references() for k in (1, 2, 3, 4, 0)]
+    runs = [real_drive(data_root, f"iros_hoons_1_with_friction_run_{k}", "f1tenth").without_references() for k in (1, 2, 3, 4, 0)]
     model = learn_health(runs[:4], runs[4:], ("ax", "ay", "yaw_rate", "steer", "motor_speed", "motor_current"), 100.0)
     assert model.stops[3] == pytest.approx((-0.531, 0.531), rel=3e-3)
-    at_lock = source.read("hoons_all_test_run_21").without_references()  # stays at full lock for 5 s
+    at_lock = real_drive(data_root, "hoons_all_test_run_21", "f1tenth").without_references()  # stays at full lock for 5 s
     found = judged(model, at_lock)
     assert kernel.FROZEN not in {reason_kind(code) for code, status in zip(found.reason, found.status, strict=True) if status > VALID}
     half = np.array(at_lock["steer"])
