@@ -8,7 +8,8 @@ from torch import Tensor, nn
 
 from vehest.data.errors import ConfigurationError
 from vehest.declared import setting
-from vehest.estimators.networks.windowed import StandardisedNetwork, WindowedEstimator
+from vehest.estimators.networks.standardised import StandardisedNetwork
+from vehest.estimators.networks.windowed import WindowedEstimator
 
 
 class TransformerNetwork(StandardisedNetwork):

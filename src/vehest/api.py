@@ -21,7 +21,7 @@ from vehest.data.files import written_aside
 from vehest.data.recording import Recording
 from vehest.estimators.base import Estimator
 from vehest.estimators.model_files import save_model as _save_model
-from vehest.run.estimate import PRETRAINED, estimate_recording, open_model, read_table, score_on, train_on, write_estimate_table
+from vehest.run.estimate import PRETRAINED, estimate_recording, open_model, read_table, write_estimate_table
 from vehest.trust.contract import GuardedStepper
 from vehest.trust.health import reason_in_words
 from vehest.trust.record import Trust, write_trust
@@ -81,6 +81,8 @@ def train(
         ConfigurationError: an unknown name or setting.
         DataError: a channel is missing, or the recordings are too short or sampled too slowly.
     """
+    from vehest.run.fitting import train_on
+
     model, _TRUST[model] = train_on(estimator, train, validation, overrides, seed)
     return model
 
@@ -95,6 +97,8 @@ def score(model: Estimator, recordings: Sequence[Recording]) -> dict[str, float]
     Raises:
         DataError: a channel is missing or has gaps, or a recording is too short or sampled too slowly.
     """
+    from vehest.run.fitting import score_on
+
     return score_on(model, recordings)
 
 

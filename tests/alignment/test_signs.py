@@ -9,8 +9,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from broadband_drive import broadband_drive, without
+from scipy import signal
 
+from vehest.alignment.band_pass import butterworth_band, without_phase
 from vehest.alignment.checks import Finding, checks_of_recording
+from vehest.alignment.signs import KINEMATIC_BAND_HZ
 from vehest.constants import GRAVITY
 from vehest.data.recording import Recording
 
@@ -33,6 +36,13 @@ def signs(recording: Recording) -> list[str]:
     found = warned(recording)
     assert {finding.check for finding in found} <= {"sign"}, found
     return [finding.channel for finding in found]
+
+
+@pytest.mark.parametrize("rate_hz", [5.5, 20.0, 125.0, 1000.0])
+def test_the_band_of_the_checks_is_butterworths(rate_hz: float):
+    samples, band = 30.0 + np.cumsum(np.random.default_rng(0).normal(size=3000)), KINEMATIC_BAND_HZ
+    expected = signal.sosfiltfilt(signal.butter(2, band, btype="bandpass", fs=rate_hz, output="sos"), samples)
+    np.testing.assert_allclose(without_phase(butterworth_band(*band, rate_hz), samples), expected, rtol=0, atol=1e-9 * expected.std())
 
 
 # --- signs -------------------------------------------------------------------------------------------------------------------------

@@ -10,10 +10,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
+from scipy import signal
 
 from vehest.data.errors import ConfigurationError, DataError
 from vehest.data.recording import Recording
-from vehest.data.transforms import Resample
+from vehest.data.transforms import Resample, windowed_sinc
 
 RATIOS = [(100.0, 20.0), (125.0, 20.0), (125.0, 100.0), (1000.0, 20.0), (20.0, 100.0), (50.0, 30.0), (1000.0 / 3.0, 20.0), (400.0, 100.0)]
 PROPERTY = settings(max_examples=60, deadline=None, derandomize=True, database=None)
@@ -43,6 +44,22 @@ def test_a_straight_line_stays_that_line(ratio: tuple[float, float], length: int
     line = offset + slope * np.arange(length)
     out = Resample(new_rate)(recorded(line, rate))
     np.testing.assert_allclose(out["ay"], offset + slope * out.time * rate, rtol=1e-11, atol=1e-9)
+
+
+@every_ratio
+@pytest.mark.parametrize("length", [1, 7, 40, 12_000])
+def test_filter_and_sums_are_those_of_scipy_to_the_bit(rate: float, new_rate: float, length: int) -> None:
+    ratio = Fraction(new_rate / rate).limit_denominator(1000)
+    up, down = ratio.numerator, ratio.denominator
+    samples, half = np.cumsum(np.random.default_rng(length).normal(size=length)), 16 * max(up, down)
+    sinc, window = windowed_sinc(half, 0.86 / max(up, down), 7.0)
+    np.testing.assert_array_equal(window, signal.windows.kaiser(2 * half + 1, 7.0))
+    np.testing.assert_array_equal(sinc, signal.firwin(2 * half + 1, 0.86 / max(up, down), window=("kaiser", 7.0)))
+    taps = Resample(new_rate)._taps(up, down)
+    margin = -(-(half // up + 1) // down) * down
+    extended = np.pad(samples, margin, mode="reflect", reflect_type="odd") if length > 1 else np.pad(samples, margin, mode="edge")
+    expected = signal.resample_poly(extended, up, down, window=taps)[margin * up // down :][: -(-length * up // down)]
+    np.testing.assert_array_equal(resampled(samples, rate, new_rate), expected)
 
 
 @every_ratio

@@ -204,7 +204,8 @@ def test_settings_that_make_no_sense_are_refused(name, config, message):
 def test_activations_partition_unity_and_end_with_the_last_model():
     import torch
 
-    from vehest.estimators.ksnn import KinematicsStructuredNetwork, Ksnn
+    from vehest.estimators.ksnn import Ksnn
+    from vehest.estimators.networks.ksnn import KinematicsStructuredNetwork
 
     network = KinematicsStructuredNetwork(Ksnn.settings_type(n_local=3), yaw_rate_max=0.6)
     phi = network.activations(torch.tensor([0.0, 0.15, -0.3, 0.6, 2.0]))

@@ -7,7 +7,16 @@ import pytest
 from scipy import signal, stats
 
 from vehest.data.errors import DataError
-from vehest.evaluation.significance import Difference, _degrees_of_freedom, paired_difference, sequence_labels
+from vehest.evaluation.significance import (
+    Difference,
+    _degrees_of_freedom,
+    difference_of_blocks,
+    differences_of_blocks,
+    paired_difference,
+    root_interval,
+    root_intervals,
+    sequence_labels,
+)
 
 N_SEQUENCES, LENGTH = 16, 100
 LABELS = sequence_labels([LENGTH] * N_SEQUENCES)
@@ -97,6 +106,16 @@ def test_a_sequence_ends_a_block_and_equal_losses_do_not_differ() -> None:
 def test_losses_that_cannot_be_compared_are_refused(first: np.ndarray, labels: list[int], message: str) -> None:
     with pytest.raises(DataError, match=message):
         paired_difference(first, np.zeros((1, 6)), sequence_labels(labels), rate_hz=10.0)
+
+
+def test_pairs_compared_together_see_the_draws_that_each_sees_alone(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("vehest.evaluation.significance.DRAWN_AT_ONCE", 1000)  # several turns
+    generator = np.random.default_rng(2)
+    sizes = generator.uniform(20.0, 40.0, 12)
+    sums = [sizes * generator.gamma(2.0, 1.0, (seeds, 12)) for seeds in (3, 3, 1, 2)]
+    pairs = [(sums[0], other) for other in (*sums[1:], 1.1 * sums[0])]
+    assert differences_of_blocks(pairs, sizes, n_resamples=400) == [difference_of_blocks(*pair, sizes, n_resamples=400) for pair in pairs]
+    assert root_intervals(sums, sizes) == [root_interval(own, sizes) for own in sums]
 
 
 def test_degrees_of_freedom_are_those_of_blocks_or_of_seeds_where_either_decides_alone() -> None:

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import torch
 
-from vehest.estimators.ksnn import KinematicsStructuredNetwork, Ksnn
+from vehest.estimators.ksnn import Ksnn
+from vehest.estimators.networks.ksnn import KinematicsStructuredNetwork
 
 
 def ksnn_with_weights(n_local=3, n_hidden=0, bias=False, seed=0, window=30, yaw_rate_max=0.6) -> Ksnn:

@@ -5,6 +5,8 @@ from __future__ import annotations
 import importlib.util
 import json
 import re
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -39,6 +41,16 @@ def test_estimate_without_a_model_takes_the_one_that_comes_with_vehest_and_says_
     bands = pd.read_csv("default.csv")["band_sideslip"].dropna()
     assert len(bands) > 50
     assert (bands > 0.0).all()
+
+
+def test_an_estimate_of_the_shipped_model_loads_no_torch_no_pandas_and_no_scipy_signal(place: Place):
+    write_csv(place.folder / "lap.csv", 9)
+    program = "import sys\nfrom vehest.cli import main\ntry: main()\nfinally: print(*sys.modules, file=sys.stderr)\n"
+    for out in ("lap.parquet", "estimate.csv"):
+        command = [sys.executable, "-c", program, "estimate", "lap.csv", "dataset=mine", "-o", out]
+        result = subprocess.run(command, capture_output=True, text=True, check=True, timeout=300)
+        assert "numba" in result.stderr.split()
+        assert not {"torch", "pandas", "scipy.signal", "scipy.stats", "matplotlib"} & set(result.stderr.split())
 
 
 def test_completion_of_the_first_word_offers_models_and_recordings(place: Place):

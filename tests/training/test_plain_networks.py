@@ -14,7 +14,8 @@ from conftest import planar_drive
 from vehest.data.errors import ConfigurationError
 from vehest.data.windows import windows_of
 from vehest.estimators.base import FitData
-from vehest.estimators.networks.windowed import StandardisedNetwork, WindowedEstimator
+from vehest.estimators.networks.standardised import StandardisedNetwork
+from vehest.estimators.networks.windowed import WindowedEstimator
 from vehest.training.context import FitContext
 from vehest.training.members import _ONE_BY_ONE
 from vehest.training.supervised import SupervisedSettings

@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Iterator
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy import ndimage
 
 from vehest.alignment.bandwidth import held_findings, low_pass_findings, low_passed
 from vehest.alignment.delays import delay_findings, delays_of, spectra_of
@@ -192,7 +192,7 @@ def _wheel_dropout(recording: Recording) -> Iterator[Finding]:
     rolling = recording["vx"] > DROPOUT_SPEED
     if "ax" in recording:
         around = 2 * min(round(DROPOUT_CLEAR_SECONDS * recording.rate_hz), len(recording)) + 1
-        rolling &= ~ndimage.maximum_filter1d(recording["ax"] < -DROPOUT_BRAKING, around)
+        rolling &= ~scipy.ndimage.maximum_filter1d(recording["ax"] < -DROPOUT_BRAKING, around)
     wheels = np.abs(recording.stack(WHEELS))
     for place, name in enumerate(WHEELS):
         others = np.median(np.delete(wheels, place, axis=1), axis=1)

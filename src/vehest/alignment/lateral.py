@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from scipy.interpolate import CubicSpline
+import scipy
 
 from vehest.alignment.motion import Motion
 from vehest.alignment.spectra import LARGEST_LAG, RATE_KEPT, ComplexArray, CrossSpectra, Measured, cross_spectra, jackknife, smoothed
@@ -64,8 +64,8 @@ def _spectra(motion: Motion, turning: float, sliding: float) -> CrossSpectra | N
     clock = np.arange(len(motion)) / motion.rate_hz
     ay, yaw_rate = motion["ay"], motion["yaw_rate"]
     if turning or sliding:
-        ay = CubicSpline(clock, ay)(np.clip(clock - sliding, 0.0, clock[-1]))
-        yaw_rate = CubicSpline(clock, yaw_rate)(np.clip(clock + turning - sliding, 0.0, clock[-1]))
+        ay = scipy.interpolate.CubicSpline(clock, ay)(np.clip(clock - sliding, 0.0, clock[-1]))
+        yaw_rate = scipy.interpolate.CubicSpline(clock, yaw_rate)(np.clip(clock + turning - sliding, 0.0, clock[-1]))
     shown = (ay, motion.vx * yaw_rate, motion.sliding, motion.derivative(yaw_rate), motion.derivative(motion.vx) * yaw_rate)
     if not all(0.0 < np.ptp(samples) < np.inf for samples in shown):
         return None

@@ -7,8 +7,8 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy import signal
 
+from vehest.alignment.band_pass import butterworth_band, without_phase
 from vehest.alignment.findings import Finding, Level, listed
 from vehest.alignment.motion import Motion, rms
 from vehest.alignment.standstill import BoolArray
@@ -175,8 +175,8 @@ def kinematic_band(motion: Motion) -> Callable[[FloatArray], FloatArray] | None:
     settled = settled_samples(motion)
     if settled is None:
         return None
-    design = signal.butter(2, KINEMATIC_BAND_HZ, btype="bandpass", fs=motion.rate_hz, output="sos")
-    return lambda samples: np.asarray(signal.sosfiltfilt(design, samples)[settled], dtype=np.float64)
+    sections = butterworth_band(*KINEMATIC_BAND_HZ, motion.rate_hz)
+    return lambda samples: without_phase(sections, samples)[settled]
 
 
 def settled_samples(motion: Motion) -> BoolArray | None:

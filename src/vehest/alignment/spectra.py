@@ -9,8 +9,8 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy import stats
 
 from vehest.alignment.standstill import BoolArray
 from vehest.constants import FloatArray
@@ -145,7 +145,7 @@ def jackknife(groups: NDArray[Any], fit: Callable[[NDArray[Any]], FloatArray]) -
 
 def student(freedom: float) -> float:
     """Half width of the 95 % interval in standard deviations."""
-    return float(stats.t.ppf(0.5 + 0.5 * CONFIDENCE, freedom))
+    return float(scipy.special.stdtrit(freedom, 0.5 + 0.5 * CONFIDENCE))
 
 
 @dataclass(frozen=True)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -62,8 +63,18 @@ def read_numbers(path: Path, file: pq.ParquetFile, names: Sequence[str]) -> dict
     done = 0
     for batch in file.iter_batches(ROWS_AT_A_TIME, columns=list(values)):
         for name, column in zip(batch.schema.names, batch.columns, strict=True):
-            values[name][done : done + len(column)] = column.cast(pa.float64(), safe=False).to_numpy(zero_copy_only=False)
+            values[name][done : done + len(column)] = numbers_of(column)
         done += batch.num_rows
     if done != n_rows:
         raise DataError(f"'{path}' is truncated or damaged: it says that it holds {n_rows} rows, and holds {done}; make it again")
     return values
+
+
+def numbers_of(column: pa.Array | pa.ChunkedArray) -> NDArray[np.float64]:
+    """Numbers of a column, (T,), NaN where one is missing; not by ``to_numpy``, which imports pandas."""
+    found = [np.empty(0)]
+    for chunk in column.chunks if isinstance(column, pa.ChunkedArray) else [column]:
+        numbers = chunk if chunk.type == pa.float64() else chunk.cast(pa.float64(), safe=False)
+        values = np.frombuffer(numbers.buffers()[1], np.float64, len(numbers), 8 * numbers.offset) if len(numbers) else np.empty(0)
+        found.append(np.where(np.from_dlpack(numbers.is_null().cast(pa.int8())), math.nan, values) if numbers.null_count else values)
+    return np.concatenate(found)

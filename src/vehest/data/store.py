@@ -159,7 +159,8 @@ def _write(path: Path, columns: Mapping[str, FloatArray], content: str, about: M
         described = json.dumps({"format": _FORMAT, "content": content, **about}).encode()
     except (TypeError, ValueError) as error:
         raise DataError(f"'{path}' cannot be written: the provenance holds more than JSON values ({first_line(error)})") from None
-    arrays = {name: pa.array(np.asarray(values, dtype=np.float64)) for name, values in columns.items()}
+    buffers = {name: pa.py_buffer(np.ascontiguousarray(values, dtype=np.float64)) for name, values in columns.items()}
+    arrays = {name: pa.Array.from_buffers(pa.float64(), own.size // 8, [None, own]) for name, own in buffers.items()}  # without pandas
     table = pa.table(arrays).replace_schema_metadata({_METADATA_KEY: described})
     with written_aside(path) as aside, open(aside, "wb") as stream:  # pyarrow itself takes no names that are not UTF-8
         try:

@@ -238,6 +238,10 @@ class Estimator(ABC):
             DataError: a channel is missing or the recordings are too short.
         """
 
+    def fewest_weights(self) -> int:
+        """How many numbers its settings ask for at least."""
+        return self.n_parameters
+
     def fit(self, data: FitData, training: Any, context: FitContext | None = None) -> FitRecord:
         """Fit this one alone."""
         return type(self).fit_members([self], data, training, context or FitContext())[0]

@@ -7,8 +7,7 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-from scipy.optimize import minimize_scalar
-from scipy.signal import lfilter
+import scipy
 
 from vehest.constants import FloatArray
 from vehest.data.recording import Recording
@@ -41,7 +40,9 @@ class Kinematic(Recursive):
         errors = [self._error_with(recordings, time_constant) for time_constant in grid]
         best = int(np.argmin(errors))
         bounds = (math.log(grid[max(best - 1, 0)]), math.log(grid[min(best + 1, N_STARTS - 1)]))
-        found = minimize_scalar(lambda logarithm: self._error_with(recordings, math.exp(logarithm)), bounds=bounds, method="bounded")
+        found = scipy.optimize.minimize_scalar(
+            lambda logarithm: self._error_with(recordings, math.exp(logarithm)), bounds=bounds, method="bounded"
+        )
         return {"time_constant": math.exp(found.x) if found.fun < errors[best] else float(grid[best])}
 
     def _error_with(self, recordings: Sequence[Recording], time_constant: float) -> float:
@@ -57,7 +58,7 @@ class Kinematic(Recursive):
         """v [m/s] at each sample, from that one sample before."""
         vx, yaw_rate, ay = samples.T
         gain, (start,) = (1.0 - self.kept) * self.time_constant, state
-        vy = lfilter([gain], [1.0, -self.kept], ay - vx * yaw_rate, zi=np.array([self.kept * start]))[0]
+        vy = scipy.signal.lfilter([gain], [1.0, -self.kept], ay - vx * yaw_rate, zi=np.array([self.kept * start]))[0]
         return {"vy": vy}, (float(vy[-1]),)
 
     def c_values(self) -> dict[str, Any]:

@@ -138,7 +138,6 @@ class LearnedUkf(Network, SigmaPointEstimator):
 
     def __init__(self, settings: Any) -> None:
         super().__init__(settings)
-        self.network = self.new_network()
 
     def check(self) -> None:
         """Raises:

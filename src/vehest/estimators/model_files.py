@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
 import yaml
 from safetensors import SafetensorError, safe_open
 from safetensors.numpy import save_file
@@ -139,8 +138,7 @@ def _built(kind: type[Estimator], settings: Mapping[str, Any], n_weights: int, p
     try:
         own = validated(kind.settings_type, dict(settings), f"'{path}'", group="settings")
         try:
-            with torch.device("meta"):
-                needed = kind(own).n_parameters
+            needed = kind(own).fewest_weights()
         except (RuntimeError, NotImplementedError, TypeError, ValueError, OverflowError):
             needed = 0  # building it needs values
         if needed > n_weights:

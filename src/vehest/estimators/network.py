@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from abc import abstractmethod
 from collections.abc import Mapping, Sequence
+from functools import cached_property
 from typing import Any
 
 import numpy as np
-import torch
 
 from vehest.data.errors import DataError
 from vehest.estimators.base import Estimator, FitData, FitRecord
@@ -20,11 +20,25 @@ class Network(Estimator):
     A family has either its own `run`, or is a `WindowedEstimator`; and either `fit_member` or its own `fit_members`.
     """
 
-    network: Any
-
     def __init__(self, settings: Any) -> None:
         super().__init__(settings)
         self._seed = 0
+        self._loaded: dict[str, np.ndarray[Any, Any]] = {}
+
+    @cached_property
+    def network(self) -> Any:
+        """Its network, built and loaded when it is first asked for, since it needs torch."""
+        import torch
+
+        from vehest.training.members import random_numbers
+
+        with random_numbers(0):
+            network = self.new_network()
+        if self._loaded:
+            tensors = {name: torch.from_numpy(values) for name, values in self._loaded.items()}
+            network = network.to(next(iter(tensors.values())).dtype)
+            network.load_state_dict(tensors)
+        return network
 
     @abstractmethod
     def new_network(self) -> Any:
@@ -48,8 +62,21 @@ class Network(Estimator):
         """Seed of initial weights, batches and dropout."""
         self._seed = seed
 
+    def fewest_weights(self) -> int:
+        """Its parameters, found without room for them."""
+        import torch
+
+        with torch.device("meta"):
+            return type(self)(self.settings).n_parameters
+
+    def weight_shapes(self) -> dict[str, tuple[int, ...]]:
+        """Shapes of what `weights` returns, by name."""
+        return {name: tuple(tensor.shape) for name, tensor in self.new_network().state_dict().items()}
+
     def weights(self) -> dict[str, np.ndarray[Any, Any]]:
         """Parameters and ranges (persistent buffers) of the network."""
+        if self._loaded and "network" not in vars(self):
+            return {name: values.copy() for name, values in self._loaded.items()}
         return {name: tensor.detach().numpy().copy() for name, tensor in self.network.state_dict().items()}
 
     def load_weights(self, weights: Mapping[str, np.ndarray[Any, Any]]) -> None:
@@ -58,13 +85,11 @@ class Network(Estimator):
         Raises:
             DataError: a name or shape does not fit the settings.
         """
-        network = self.new_network()
-        expected = {name: tuple(tensor.shape) for name, tensor in network.state_dict().items()}
+        expected = self.weight_shapes()
         found = {name: tuple(np.shape(values)) for name, values in weights.items()}
         if expected != found:
             differing = sorted(set(expected.items()) ^ set(found.items()))[0][0]
             raise DataError(f"weights of '{self.name}' do not fit its settings: '{differing}' is missing, unknown or of another shape")
-        tensors = {name: torch.from_numpy(np.array(values)) for name, values in weights.items()}
-        network = network.to(next(iter(tensors.values())).dtype)
-        network.load_state_dict(tensors)
-        self.network = network
+        dtype = next(iter(weights.values())).dtype
+        self._loaded = {name: np.array(weights[name], dtype=dtype) for name in expected}
+        vars(self).pop("network", None)

@@ -33,7 +33,6 @@ class NetworkUkf(SampleNetworkEstimator, DugoffUkf):
         super().__init__(settings)
         self.network_inputs = INPUTS[self.inputs]
         self.channels = tuple(dict.fromkeys((*CHANNELS[self.inputs], *self.network_inputs)))
-        self.network = self.new_network()
 
     @abstractmethod
     def pseudo_of(self, inputs: FloatArray) -> PseudoMeasurement:

@@ -33,7 +33,6 @@ class SideslipFfnn(SampleNetworkEstimator):
     def __init__(self, settings: Any) -> None:
         super().__init__(settings)
         self.channels = self.network_inputs = INPUTS[self.inputs]
-        self.network = self.new_network()
 
     def new_network(self) -> SampleNetwork:
         """From a sample to its sideslip angle."""

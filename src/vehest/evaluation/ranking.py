@@ -10,7 +10,7 @@ import numpy as np
 
 from vehest.constants import FloatArray
 from vehest.evaluation.blocks import LEAST_BLOCKS, Segments, block_labels, block_sums, effective_blocks
-from vehest.evaluation.significance import CONFIDENCE, difference_of_blocks, holm, root_interval
+from vehest.evaluation.significance import CONFIDENCE, Pair, differences_of_blocks, holm, root_intervals
 
 Name = tuple[str, str]
 """Estimator and variant."""
@@ -102,11 +102,12 @@ def rank(
     enough = len(sizes) >= LEAST_BLOCKS
     pairs = _pairs(order, asked) if enough else []
     compared = dict(zip(pairs, _corrected([(sums[one], sums[other]) for one, other in pairs], sizes), strict=True))
+    intervals = root_intervals([sums[name] for name in order], sizes) if enough else []
     best = order[0]
     return Ranking(
         order=order,
         rmse=rmse,
-        intervals={name: _interval_of(sums[name], sizes) for name in order} if enough else {},
+        intervals={name: (own.low, own.high) for name, own in zip(order, intervals, strict=True)} if enough else {},
         against_best={other: own for (one, other), own in compared.items() if one == best},
         against_baseline={pair: own for pair, own in compared.items() if pair[1][0] in BASELINES},
         pairs={key: own for (one, other), found in compared.items() for key, own in (((one, other), found), ((other, one), found.turned))},
@@ -126,9 +127,9 @@ def _pairs(order: Sequence[Name], asked: Sequence[tuple[Name, Name]]) -> list[tu
     return list(dict.fromkeys(pairs))
 
 
-def _corrected(pairs: Sequence[tuple[FloatArray, FloatArray]], sizes: FloatArray) -> list[Comparison]:
+def _corrected(pairs: Sequence[Pair], sizes: FloatArray) -> list[Comparison]:
     """Comparisons with Holm's correction: each interval at the level at which its own hypothesis is tested."""
-    differences = [difference_of_blocks(first, second, sizes).root for first, second in pairs]
+    differences = [own.root for own in differences_of_blocks(pairs, sizes)]
     adjusted = holm([own.p_value for own in differences])
     comparisons = []
     for own, p_value in zip(differences, adjusted, strict=True):
@@ -137,8 +138,3 @@ def _corrected(pairs: Sequence[tuple[FloatArray, FloatArray]], sizes: FloatArray
         verdict: Verdict = "not told apart" if p_value >= 1.0 - CONFIDENCE else ("lower" if own.value < 0 else "higher")
         comparisons.append(Comparison(own.value, low, high, p_value, verdict))
     return comparisons
-
-
-def _interval_of(sums: FloatArray, sizes: FloatArray) -> tuple[float, float]:
-    own = root_interval(sums, sizes)
-    return own.low, own.high

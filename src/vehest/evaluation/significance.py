@@ -13,20 +13,31 @@ from scipy import stats
 from vehest.constants import FloatArray
 from vehest.data.errors import DataError
 
+Pair = tuple[FloatArray, FloatArray]
+
 CONFIDENCE = 0.95
 DRAWN_AT_ONCE = 2_000_000  # block counts of so many resamples are held at once
 
 
 @dataclass(frozen=True)
 class Interval:
-    """A figure, or a difference first - second, and how well it is known."""
+    """A figure, or a difference first - second, and how well it is known.
 
-    value: float  # the figure; of a difference, negative where the first has the lower loss
-    low: float  # lower end of the 95 % interval
-    high: float  # its upper end
-    p_value: float  # two-sided, of the hypothesis that there is no difference; below 0.05 exactly if the interval leaves 0 out
-    error: float = 0.0  # standard error
-    dof: float = np.inf  # degrees of freedom of Student's t
+    Args:
+        value: the figure; of a difference, negative where the first has the lower loss.
+        low: lower end of the 95 % interval.
+        high: its upper end.
+        p_value: two-sided, of the hypothesis that there is no difference; below 0.05 exactly if the interval leaves 0 out.
+        error: standard error.
+        dof: degrees of freedom of Student's t.
+    """
+
+    value: float
+    low: float
+    high: float
+    p_value: float
+    error: float = 0.0
+    dof: float = np.inf
 
     def at(self, confidence: float) -> tuple[float, float]:
         """Both ends at another confidence than 95 %."""
@@ -36,15 +47,22 @@ class Interval:
 
 @dataclass(frozen=True)
 class Difference:
-    """How the losses of two estimators differ."""
+    """How the losses of two estimators differ.
 
-    mean: Interval  # of their mean losses over all seeds and samples
-    median: Interval  # of the medians over seeds of their mean losses over samples
-    # of the square roots of their mean losses over all seeds and samples, an RMSE where losses are squared errors; NaN where a loss is
-    # negative
+    Args:
+        mean: of their mean losses over all seeds and samples.
+        median: of the medians over seeds of their mean losses over samples.
+        root: of the square roots of their mean losses over all seeds and samples, an RMSE where losses are squared errors; NaN where a
+            loss is negative.
+        n_blocks: blocks that were resampled.
+        dof: degrees of freedom of Student's t behind both intervals.
+    """
+
+    mean: Interval
+    median: Interval
     root: Interval
-    n_blocks: int  # blocks that were resampled
-    dof: float  # degrees of freedom of Student's t behind both intervals
+    n_blocks: int
+    dof: float
 
 
 def paired_difference(
@@ -98,11 +116,15 @@ def paired_difference(
 
 
 def difference_of_blocks(first: FloatArray, second: FloatArray, sizes: FloatArray, *, n_resamples: int = 10_000) -> Difference:
-    """Compare two estimators on the same blocks, as `paired_difference` says.
+    """`differences_of_blocks` of one pair."""
+    return differences_of_blocks([(first, second)], sizes, n_resamples=n_resamples)[0]
+
+
+def differences_of_blocks(pairs: Sequence[Pair], sizes: FloatArray, *, n_resamples: int = 10_000) -> list[Difference]:
+    """Compare pairs of estimators on the same blocks, each as `paired_difference` says; all pairs see the same draws.
 
     Args:
-        first: sum of the losses of each seed over each block, shape (S, B).
-        second: shape (S', B).
+        pairs: sum of the losses of each seed over each block, shape (S, B) and (S', B).
         sizes: samples in each block, shape (B,).
 
     Raises:
@@ -110,37 +132,44 @@ def difference_of_blocks(first: FloatArray, second: FloatArray, sizes: FloatArra
     """
     if len(sizes) < 2:
         raise DataError(f"there are {len(sizes)} blocks to resample, at least two are needed")
-    sums = [first, second]
-    means = [own.sum(axis=1) / sizes.sum() for own in sums]
-    dof = _degrees_of_freedom(sums, sizes, means)
-    drawn = _resampled(sums, sizes, n_resamples, np.random.default_rng(0))
-    with np.errstate(invalid="ignore"):
-        root = float(np.sqrt(means[0].mean()) - np.sqrt(means[1].mean()))
-    return Difference(
-        mean=_interval(float(means[0].mean() - means[1].mean()), drawn[0], dof),
-        median=_interval(float(np.median(means[0]) - np.median(means[1])), drawn[1], dof),
-        root=_interval(root, drawn[2], dof),
-        n_blocks=len(sizes),
-        dof=dof,
-    )
+    found = []
+    for pair, drawn in zip(pairs, _resampled(pairs, sizes, n_resamples), strict=True):
+        means = [own.sum(axis=1) / sizes.sum() for own in pair]
+        dof = _degrees_of_freedom(pair, sizes, means)
+        with np.errstate(invalid="ignore"):
+            root = float(np.sqrt(means[0].mean()) - np.sqrt(means[1].mean()))
+        mean, median = float(means[0].mean() - means[1].mean()), float(np.median(means[0]) - np.median(means[1]))
+        intervals = [_interval(value, own, dof) for value, own in zip((mean, median, root), drawn, strict=True)]
+        found.append(Difference(*intervals, n_blocks=len(sizes), dof=dof))
+    return found
 
 
 def root_interval(sums: FloatArray, sizes: FloatArray, *, n_resamples: int = 4000) -> Interval:
+    """`root_intervals` of one estimator."""
+    return root_intervals([sums], sizes, n_resamples=n_resamples)[0]
+
+
+def root_intervals(candidates: Sequence[FloatArray], sizes: FloatArray, *, n_resamples: int = 4000) -> list[Interval]:
     """The square root of a mean loss over blocks and seeds, an RMSE where losses are squared errors, with its interval.
 
     Blocks and seeds are drawn as in `paired_difference`; the interval is symmetric on a logarithmic axis, on which the distribution of a
     root of few blocks is less skewed.
 
     Args:
-        sums: sum of the losses of each seed over each block, (S, B), none negative.
+        candidates: sum of the losses of each seed over each block, (S, B), none negative, of each estimator.
         sizes: samples in each block, (B,).
     """
-    value = float(np.sqrt(sums.sum(axis=1).mean() / sizes.sum()))
-    if not value > 0:
-        return Interval(value, value, value, 1.0)
     nothing = np.zeros((1, len(sizes)))
-    drawn = _resampled([sums, nothing], sizes, n_resamples, np.random.default_rng(0))[2]
-    return _logarithmic(value, drawn, _degrees_of_freedom([sums, nothing], sizes, [sums.sum(axis=1) / sizes.sum(), np.zeros(1)]))
+    pairs = [(sums, nothing) for sums in candidates]
+    found = []
+    for sums, drawn in zip(candidates, _resampled(pairs, sizes, n_resamples), strict=True):
+        value = float(np.sqrt(sums.sum(axis=1).mean() / sizes.sum()))
+        if value > 0:
+            dof = _degrees_of_freedom([sums, nothing], sizes, [sums.sum(axis=1) / sizes.sum(), np.zeros(1)])
+            found.append(_logarithmic(value, drawn[2], dof))
+        else:
+            found.append(Interval(value, value, value, 1.0))
+    return found
 
 
 def unexplained_interval(
@@ -200,27 +229,36 @@ def _counts(n_blocks: int, n: int, generator: np.random.Generator) -> FloatArray
     return counts
 
 
-def _resampled(sums: Sequence[FloatArray], sizes: FloatArray, n_resamples: int, generator: np.random.Generator) -> list[FloatArray]:
-    """Differences of means, of medians over seeds, and of roots of means of each resample, (n_resamples,) each."""
-    n_blocks = len(sizes)
-    at_once = max(DRAWN_AT_ONCE // n_blocks, 1)
-    drawn_of: list[list[FloatArray]] = [[], [], []]
-    for begin in range(0, n_resamples, at_once):
-        n = min(at_once, n_resamples - begin)
-        counts = _counts(n_blocks, n, generator)
-        mean, median = [], []
-        for own in sums:
-            losses = counts @ own.T / (counts @ sizes)[:, None]
-            n_seeds = len(own)
-            drawn = np.take_along_axis(losses, generator.integers(n_seeds, size=(n, n_seeds)), axis=1)
-            fewer = drawn[:, : max(n_seeds - 1, 1)]
-            mean.append(fewer.mean(axis=1))
-            median.append(np.median(drawn if n_seeds > 2 else fewer, axis=1))
-        drawn_of[0].append(mean[0] - mean[1])
-        drawn_of[1].append(median[0] - median[1])
-        with np.errstate(invalid="ignore"):
-            drawn_of[2].append(np.sqrt(mean[0]) - np.sqrt(mean[1]))
-    return [np.concatenate(parts) for parts in drawn_of]
+def _resampled(pairs: Sequence[Pair], sizes: FloatArray, n_resamples: int) -> FloatArray:
+    """Differences of means, of medians over seeds, and of roots of means of each resample, (pairs, 3, n_resamples).
+
+    Pairs of as many seeds share their draws, which are those of each pair alone.
+    """
+    at_once, drawn = max(DRAWN_AT_ONCE // len(sizes), 1), np.empty((len(pairs), 3, n_resamples))
+    for numbers in dict.fromkeys((len(first), len(second)) for first, second in pairs):
+        generator = np.random.default_rng(0)
+        for begin in range(0, n_resamples, at_once):
+            part = slice(begin, min(begin + at_once, n_resamples))
+            counts = _counts(len(sizes), part.stop - begin, generator)
+            seeds = [generator.integers(number, size=(len(counts), number)) for number in numbers]
+            known: dict[tuple[int, int], tuple[FloatArray, FloatArray]] = {}
+            for position, pair in enumerate(pairs):
+                if (len(pair[0]), len(pair[1])) != numbers:
+                    continue
+                for side, own in enumerate(pair):
+                    if (id(own), side) not in known:
+                        known[id(own), side] = _mean_and_median(counts @ own.T / (counts @ sizes)[:, None], seeds[side])
+                (first, first_median), (second, second_median) = (known[id(own), side] for side, own in enumerate(pair))
+                with np.errstate(invalid="ignore"):
+                    drawn[position, :, part] = first - second, first_median - second_median, np.sqrt(first) - np.sqrt(second)
+    return drawn
+
+
+def _mean_and_median(losses: FloatArray, seeds: NDArray[np.int64]) -> tuple[FloatArray, FloatArray]:
+    """Over the drawn seeds of each resample, (n,), of losses (n, S)."""
+    drawn = np.take_along_axis(losses, seeds, axis=1)
+    fewer = drawn[:, : max(losses.shape[1] - 1, 1)]
+    return fewer.mean(axis=1), np.median(drawn if losses.shape[1] > 2 else fewer, axis=1)
 
 
 def _degrees_of_freedom(sums: Sequence[FloatArray], sizes: FloatArray, means: Sequence[FloatArray]) -> float:

@@ -15,7 +15,7 @@ from torch import Tensor, nn
 from vehest.data.channels import channel
 from vehest.data.errors import ConfigurationError, MissingError
 from vehest.estimators.base import Estimator
-from vehest.estimators.ksnn import KinematicsStructuredNetwork
+from vehest.estimators.networks.ksnn import KinematicsStructuredNetwork
 from vehest.estimators.networks.sample_network import STEEPEST
 from vehest.estimators.networks.velocity_recurrent import RecurrentVelocityEstimator
 from vehest.estimators.networks.windowed import WindowedEstimator

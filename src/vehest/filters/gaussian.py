@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-from typing import Generic, NamedTuple, TypeVar
+from typing import TYPE_CHECKING, Generic, NamedTuple, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
-from torch import Tensor
 
-Array = TypeVar("Array", Tensor, NDArray[np.float64])
+if TYPE_CHECKING:
+    from torch import Tensor
+
+Array = TypeVar("Array", "Tensor", NDArray[np.float64])
 """A tensor where gradients are wanted, a NumPy array in compiled filters."""
 
 

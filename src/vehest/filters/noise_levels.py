@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from scipy import signal
+import scipy
 
 from vehest.constants import FloatArray
 
@@ -29,8 +29,8 @@ def high_passed_level(series: Sequence[FloatArray], cutoff: float) -> float:
     """
     if not 0.0 < cutoff < 0.8:
         raise ValueError(f"the cut-off must lie between 0 and 0.8 of the Nyquist frequency, not at {cutoff}")
-    count, shape = signal.kaiserord(STOP_BAND_DB, 0.5 * cutoff)
-    taps = signal.firwin(count | 1, cutoff, window=("kaiser", shape), pass_zero=False)
+    count, shape = scipy.signal.kaiserord(STOP_BAND_DB, 0.5 * cutoff)
+    taps = scipy.signal.firwin(count | 1, cutoff, window=("kaiser", shape), pass_zero=False)
     passed = [np.convolve(samples, taps, "valid") for samples in series if len(samples) >= len(taps)]
     known = np.concatenate([values[~np.isnan(values)] for values in passed]) if passed else np.empty(0)
     if not len(known):
@@ -65,6 +65,6 @@ def quiet_level(series: Sequence[FloatArray], activity: Sequence[FloatArray], le
     known = ~(np.isnan(own).any(1) | np.isnan(others).any(1))
     if not known.any():
         raise ValueError(f"no stretch of {least} samples without a gap")
-    left, moved = (np.square(signal.detrend(values[known], axis=1)).sum(1) / (least - 2) for values in (own, others))
+    left, moved = (np.square(scipy.signal.detrend(values[known], axis=1)).sum(1) / (least - 2) for values in (own, others))
     quietest = np.argsort(moved, kind="stable")[: max(1, round(share * len(moved)))]
     return float(np.sqrt(left[quietest].mean()))

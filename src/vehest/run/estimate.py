@@ -1,19 +1,18 @@
-"""Runs a trained model on a new recording that has no reference channels; trains and scores models on recordings of Python.
+"""Runs a trained model on a new recording that has no reference channels.
 
 model, recording -> checks -> the model's rate -> estimate with bands and health -> table, figures and a verdict
 """
 
 from __future__ import annotations
 
+import csv
 import hashlib
 import json
-import warnings
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pandas as pd
 
 from vehest.alignment.checks import checks_of_recording
 from vehest.data.channels import REFERENCE_SUFFIX
@@ -22,22 +21,17 @@ from vehest.data.estimate import QUANTITIES, Estimate
 from vehest.data.files import sha256_of, written_aside
 from vehest.data.limits import limits_from_config, use_limits
 from vehest.data.recording import Recording
-from vehest.data.schema import settings_from_config
-from vehest.data.splits import Span
 from vehest.data.store import write_estimate
 from vehest.data.transforms import OF_REFERENCES
-from vehest.estimators.base import Estimator, FitData
+from vehest.estimators.base import Estimator
 from vehest.estimators.model_files import DESCRIPTION, WEIGHTS, load_model, read_description
-from vehest.evaluation.metrics import accuracy, score
 from vehest.run.artefacts import MANIFEST, Artefact, read_artefact
-from vehest.run.calibrate import Stretch, learn_trust, trust_of
-from vehest.run.config import compose_config, key_of
+from vehest.run.calibrate import trust_of
+from vehest.run.config import Config, compose_config, key_of
 from vehest.run.config_files import is_file_name
 from vehest.run.downsample import resampled
-from vehest.run.evaluate import protocol_from_config
 from vehest.run.printing import complain, counted, note
 from vehest.run.train import STAGE as TRAIN
-from vehest.run.train import new_estimator
 from vehest.sources.base import read_single
 from vehest.trust.contract import estimate_guarded
 from vehest.trust.health import domain_verdict, reason_in_words
@@ -113,7 +107,7 @@ def estimate_file(words: Sequence[str], out: Path, *, strict: bool = False) -> d
     if any(key_of(override).split(".")[0] == "downsample" for override in overrides):
         model.preparation = config["downsample"]
     with use_limits(limits_from_config(config["limits"])):
-        drive = read_table(file, overrides)
+        drive = _read(config, file)
         findings = _findings(drive, model, config["dataset"].get("accept") or ())
         if strict and findings:
             raise DataError(f"'{file}': {findings[0]}")
@@ -155,7 +149,11 @@ def read_table(path: Path, overrides: Sequence[str] = (), *, references: bool = 
 
     Raises what `read_single` does, and `DataError` where a check finds an error that the data set does not accept.
     """
-    config = compose_config("estimate", overrides)
+    return _read(compose_config("estimate", overrides), path, references=references)
+
+
+def _read(config: Config, path: Path, *, references: bool = False) -> Recording:
+    """`read_table` by a configuration."""
     dataset = config["dataset"] if references else _without_references(config["dataset"])
     with use_limits(limits_from_config(config["limits"])):
         recording = read_single(dataset, path)
@@ -212,12 +210,13 @@ def write_estimate_table(estimate: Estimate, path: Path) -> None:
     if path.suffix.lower() == ".parquet":
         write_estimate(estimate, path)
         return
-    frame = pd.DataFrame({"time": estimate.time, **estimate.channels})
-    if "health" in frame:
-        frame["health"] = frame["health"].astype(int)
-        frame["health_reason"] = [reason_in_words(code) for code in frame["health_reason"]]
-    with written_aside(path) as aside:
-        frame.to_csv(aside, index=False, lineterminator="\n")
+    columns: dict[str, list[Any]] = {"time": estimate.time.tolist()}
+    columns |= {name: ["" if np.isnan(value) else value for value in values.tolist()] for name, values in estimate.channels.items()}
+    if "health" in columns:
+        columns["health"] = estimate["health"].astype(int).tolist()
+        columns["health_reason"] = [reason_in_words(code) for code in estimate["health_reason"]]
+    with written_aside(path) as aside, open(aside, "w", newline="", encoding="utf-8") as stream:
+        csv.writer(stream, lineterminator="\n").writerows([columns, *zip(*columns.values(), strict=True)])
 
 
 def _check_table_name(path: Path) -> None:
@@ -256,32 +255,3 @@ def _verdict(estimate: Estimate, recording: Recording, trust: Trust | None) -> s
     valid = f"valid in {share:.3g} % of the drive" + (f"; else: {', '.join(worst)}" if worst else "")
     outside = domain_verdict(trust.health, {name: recording[name] for name in trust.health.channels})
     return f"{outside}; {valid}" if outside else valid
-
-
-def train_on(
-    name: str, train: Sequence[Recording], validation: Sequence[Recording], overrides: Sequence[str], seed: int
-) -> tuple[Estimator, Trust]:
-    """Fit an estimator as conf/train.yaml and overrides describe it, and calibrate it; see `vehest.api.train`."""
-    config = compose_config("train", [f"estimator={name}", *overrides])
-    model, training = new_estimator(config["estimator"]), config["training"]
-    if training.get("start_from") is not None:
-        training["start_from"] = str(find_model(str(training["start_from"]), Path(config["output"]), warnings.warn))
-    settings: Any = settings_from_config(model.training_type, training, "training")
-    model.preparation = {"method": config["downsample"]["method"], "transforms": list(config["downsample"]["transforms"] or [])}
-    model.seed(seed)
-    parts = [[resampled(recording, model.settings.rate_hz, model.preparation) for recording in part] for part in (train, validation)]
-    model.fit(FitData(*parts), settings)
-    learnt, stopped = ([Stretch(recording, recording.start_time, "", recording.id) for recording in part] for part in parts)
-    return model, learn_trust(model, learnt, stopped)
-
-
-def score_on(model: Estimator, recordings: Sequence[Recording]) -> dict[str, float]:
-    """Metrics of a model on whole recordings under the protocol of conf/eval.yaml; see `vehest.api.score`."""
-    evaluation = compose_config("eval")["evaluation"]
-    protocol = protocol_from_config({**evaluation, "warm_up_seconds": 0.0, "sequence_seconds": None, "initial_state": False})
-    parts = []
-    for recording in recordings:
-        needed = prepared_recording(model, recording.without_references())
-        estimate = require_estimate(model, recording, model.estimate([needed])[0])
-        parts.append(score(estimate, resampled(recording, protocol.rate_hz, model.preparation), Span("", recording.id), protocol))
-    return accuracy(parts)

@@ -236,17 +236,24 @@ def source_class(dataset: Mapping[str, Any]) -> type[Source]:
         ConfigurationError: there is none of that name.
     """
     name = str(dataset.get("source"))
-    if name not in source_names():
+    found: type[Source] | None = _source_of(name) if name in _modules() else None
+    if found is None:
         raise ConfigurationError(f"data set '{dataset.get('name')}': source '{name}' is not one of: {', '.join(source_names())}")
-    found: type[Source] = importlib.import_module(f"{package.__name__}.{name}").SOURCE
     return found
 
 
 @cache
 def source_names() -> list[str]:
     """Names of all sources."""
-    modules = [module.name for module in pkgutil.iter_modules(package.__path__)]
-    return sorted(name for name in modules if hasattr(importlib.import_module(f"{package.__name__}.{name}"), "SOURCE"))
+    return sorted(name for name in _modules() if _source_of(name) is not None)
+
+
+def _modules() -> list[str]:
+    return [module.name for module in pkgutil.iter_modules(package.__path__)]
+
+
+def _source_of(module: str) -> type[Source] | None:
+    return getattr(importlib.import_module(f"{package.__name__}.{module}"), "SOURCE", None)
 
 
 def existing_folder(path: Any, dataset: str) -> Path:

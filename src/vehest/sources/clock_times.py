@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 import pyarrow as pa
-import pyarrow.compute as compute
 
 from vehest.constants import FloatArray
 
@@ -23,6 +22,8 @@ def seconds_of_text(column: pa.ChunkedArray) -> FloatArray | None:
     Args:
         column: strings, (N,).
     """
+    from pyarrow import compute
+
     found = compute.extract_regex(column.combine_chunks(), pattern=WRITTEN)
     if not len(found) or found.null_count:
         return None

@@ -8,7 +8,7 @@ from functools import partial
 from typing import Literal, get_args
 
 import numpy as np
-from scipy import signal
+import scipy
 
 from vehest.constants import FloatArray
 from vehest.data.errors import DataError
@@ -69,9 +69,9 @@ class PoseOptions:
         """
         if len(yaw) < self.window:
             raise DataError(f"{where}: {len(yaw)} poses are fewer than the {self.window} of the filter's window")
-        derivative = partial(signal.savgol_filter, window_length=self.window, polyorder=self.order, deriv=1, delta=interval)
+        derivative = partial(scipy.signal.savgol_filter, window_length=self.window, polyorder=self.order, deriv=1, delta=interval)
         velocity_x, velocity_y, yaw_rate = derivative(positions[:, 0]), derivative(positions[:, 1]), derivative(yaw)
-        heading = signal.savgol_filter(yaw, self.window, self.order) + turned
+        heading = scipy.signal.savgol_filter(yaw, self.window, self.order) + turned
         cosine, sine = np.cos(heading), np.sin(heading)
         return PlanarMotion(
             vx=cosine * velocity_x + sine * velocity_y - yaw_rate * self.lever_y,

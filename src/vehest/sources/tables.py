@@ -20,7 +20,7 @@ from vehest.constants import FloatArray
 from vehest.data.errors import DataError, printable
 from vehest.data.files import regular_file
 from vehest.data.limits import check_limit, check_unpacked
-from vehest.data.parquet import DAMAGE, parquet_file, read_numbers
+from vehest.data.parquet import DAMAGE, numbers_of, parquet_file, read_numbers
 from vehest.data.text_files import first_line
 from vehest.sources.clock_times import seconds_of_text
 
@@ -130,7 +130,7 @@ def read_columns(file: Path, wanted: Sequence[str], layout: TextLayout = TextLay
     check_limit("samples", table.num_rows, f"'{file}' has {table.num_rows} rows")
     columns = {name: table.column(name) for name in wanted}
     del table  # so that a column is dropped as soon as it is converted
-    return {name: _seconds(file, name, columns.pop(name)) if name == layout.clock else columns.pop(name).to_numpy() for name in wanted}
+    return {name: _seconds(file, name, columns.pop(name)) if name == layout.clock else numbers_of(columns.pop(name)) for name in wanted}
 
 
 def parse_table(opened: Callable[[], pa.NativeFile], layout: TextLayout, convert: pc.ConvertOptions, *, threads: bool = True) -> pa.Table:

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from typing import ClassVar, NamedTuple
 
 import numpy as np
-from scipy import optimize
+import scipy
 
 from vehest.constants import FloatArray
 from vehest.data.errors import MissingError
@@ -70,7 +70,7 @@ def nelder_mead_over_grid(
             break
         first = np.array(start) / scale
         options = {**limits, "initial_simplex": _simplex(first, bounds)}
-        result = optimize.minimize(lambda unit: cost(unit * scale), first, method="Nelder-Mead", bounds=bounds, options=options)
+        result = scipy.optimize.minimize(lambda unit: cost(unit * scale), first, method="Nelder-Mead", bounds=bounds, options=options)
         evaluations += result.nfev
         rows.append(np.concatenate([start, result.x * scale, [result.fun]]))
         context.on_progress(Progress(len(rows), len(starts), 1, 1, float(min(row[-1] for row in rows))))

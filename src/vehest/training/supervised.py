@@ -6,7 +6,6 @@ import math
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import ClassVar, Literal
 
 import numpy as np
 import torch
@@ -14,32 +13,10 @@ from torch import Tensor, nn
 
 from vehest.data.errors import DataError
 from vehest.data.windows import WindowSet
-from vehest.declared import Group, setting
 from vehest.training.checkpoints import Checkpoint, load_checkpoint, save_checkpoint
 from vehest.training.context import FitContext, FitRecord, Progress, record_of_epochs
 from vehest.training.members import FlatParameters, constrain, fixed_state, is_plain, predict_members, prepare
-
-
-@dataclass(frozen=True)
-class SupervisedSettings(Group):
-    """Supervised training of windowed networks (Da Lio et al. 2023, Section VI-B)."""
-
-    group = "training"
-    version: ClassVar[str] = "1"
-    learning_rate: float = setting(1e-3, "Adam's step size", positive=True)
-    batch_size: int = setting(64, "windows in a batch", least=1)
-    max_epochs: int = setting(1000, "epochs after which training ends in any case", least=1)
-    patience: int = setting(25, "epochs without a better validation loss after which a member stops", least=1)
-    averaging: float = setting(
-        0.0,
-        "decay a step of an exponential moving average of the weights, corrected for its start, which is then validated and kept; 0: none",
-        least=0.0,
-        below=1.0,
-    )
-    dtype: Literal["float32", "float64"] = setting("float32", "precision of the weights")
-    compiled: bool = setting(True, "use the compiled recursion where the network has one; plain PyTorch otherwise")
-    start_from: str | None = setting(None, "model to start from, by its folder or the start of its name, or pretrained")
-    checkpoint_seconds: float = setting(15.0, "time between two checkpoints", unit="s")
+from vehest.training.supervised_settings import SupervisedSettings
 
 
 def train_members(

@@ -24,8 +24,8 @@ from dataclasses import dataclass, replace
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy import optimize
 
 from vehest.constants import FloatArray
 from vehest.data.errors import DataError
@@ -298,7 +298,7 @@ def fitted_scale(terms: FloatArray, errors: FloatArray) -> tuple[FloatArray, flo
     for _ in range(FITS):
         whitened = squares / columns / predicted[:, None]
         triangle: FloatArray = np.asarray(np.linalg.qr(np.column_stack([whitened, targets / predicted]), mode="r"))  # few rows
-        weights = optimize.nnls(triangle[:, :-1], triangle[:, -1])[0] / columns
+        weights = scipy.optimize.nnls(triangle[:, :-1], triangle[:, -1])[0] / columns
         former, predicted = predicted, np.maximum(squares @ weights, floor**2)
         if np.allclose(predicted, former, rtol=1e-6):
             break

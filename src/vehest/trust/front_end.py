@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
-from scipy import signal
+import scipy
 
 from vehest.constants import FloatArray
 from vehest.data.errors import ConfigurationError
@@ -33,14 +33,14 @@ def behind_front_end(samples: FloatArray, rate_hz: float) -> FloatArray:
     known = [np.isfinite(column) for column in samples.T]
     full = [np.interp(at, at[own], column[own]) if own.any() else np.zeros(len(at)) for own, column in zip(known, samples.T, strict=True)]
     together = np.stack(full, axis=1)
-    fast = signal.resample_poly(together, USUAL_RATIO, 1, axis=0, padtype="line")
-    band = signal.butter(2, NOISE_BAND, btype="bandpass", fs=1.0, output="sos")
-    density = signal.sosfilt(band, together - together.mean(axis=0), axis=0).var(axis=0) / (NOISE_BAND[1] - NOISE_BAND[0])
+    fast = scipy.signal.resample_poly(together, USUAL_RATIO, 1, axis=0, padtype="line")
+    band = scipy.signal.butter(2, NOISE_BAND, btype="bandpass", fs=1.0, output="sos")
+    density = scipy.signal.sosfilt(band, together - together.mean(axis=0), axis=0).var(axis=0) / (NOISE_BAND[1] - NOISE_BAND[0])
     noise = np.sqrt(0.5 * USUAL_RATIO * density) * np.random.default_rng(0).standard_normal(fast.shape)
-    fast += signal.sosfilt(signal.butter(8, 0.5, btype="highpass", fs=USUAL_RATIO, output="sos"), noise, axis=0)
-    sections = signal.butter(ORDER, CUTOFF * rate_hz, fs=USUAL_RATIO * rate_hz, output="sos")
-    start = signal.sosfilt_zi(sections)[:, :, None] * fast[0]
-    found = signal.sosfilt(sections, fast, axis=0, zi=start)[0][::USUAL_RATIO]
+    fast += scipy.signal.sosfilt(scipy.signal.butter(8, 0.5, btype="highpass", fs=USUAL_RATIO, output="sos"), noise, axis=0)
+    sections = scipy.signal.butter(ORDER, CUTOFF * rate_hz, fs=USUAL_RATIO * rate_hz, output="sos")
+    start = scipy.signal.sosfilt_zi(sections)[:, :, None] * fast[0]
+    found = scipy.signal.sosfilt(sections, fast, axis=0, zi=start)[0][::USUAL_RATIO]
     return np.asarray(np.where(np.isnan(samples), np.nan, found), dtype=np.float64)
 
 
@@ -67,7 +67,7 @@ class FrontEnd:
         self._ratio = rate_hz / bus_rate_hz
         self._phase = 1.0 - self._ratio  # the first sample is passed on
         if bus_rate_hz > rate_hz * (1 + 1e-6):
-            self._sections = signal.butter(ORDER, CUTOFF * rate_hz, fs=bus_rate_hz, output="sos")
+            self._sections = scipy.signal.butter(ORDER, CUTOFF * rate_hz, fs=bus_rate_hz, output="sos")
         else:
             self._sections = np.zeros((0, 6))
         self._state = np.full((len(self._sections), len(channels), 2), math.nan)
@@ -78,8 +78,8 @@ class FrontEnd:
         """Of slow signals through the filter [s]."""
         if not len(self._sections):
             return 0.0
-        numerator, denominator = signal.sos2tf(self._sections)
-        return float(signal.group_delay((numerator, denominator), w=[1e-6])[1][0]) / self._guard.rate_hz
+        numerator, denominator = scipy.signal.sos2tf(self._sections)
+        return float(scipy.signal.group_delay((numerator, denominator), w=[1e-6])[1][0]) / self._guard.rate_hz
 
     def __call__(self, row: FloatArray) -> FloatArray | None:
         """Take one row, (1, C); returns a row for the estimator where one is due, NaN what was not measured."""

@@ -10,7 +10,7 @@ eighty arrays one by one takes longer than a row.
 from __future__ import annotations
 
 import math
-from functools import partial
+from functools import cache, partial
 from itertools import accumulate
 from typing import Any, get_args, get_type_hints
 
@@ -24,6 +24,7 @@ from vehest.constants import FloatArray
 SCALARS = {int: np.int64, float: np.float64}
 
 
+@cache
 def _fields(kind: Any) -> dict[str, Any]:
     """Field -> a named tuple, or data type and shape, which is None of a scalar."""
     found: dict[str, Any] = {}

@@ -17,7 +17,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from scipy import signal
+import scipy
 
 from vehest.constants import FloatArray
 from vehest.data.recording import Recording
@@ -171,7 +171,7 @@ def _held(samples: FloatArray) -> FloatArray:
 
 
 def _smoothed(values: FloatArray, forget: float) -> FloatArray:
-    return signal.lfilter([forget], [1.0, forget - 1.0], values, zi=[(1.0 - forget) * values[0]])[0]
+    return scipy.signal.lfilter([forget], [1.0, forget - 1.0], values, zi=[(1.0 - forget) * values[0]])[0]
 
 
 def _robust(design: FloatArray, target: FloatArray) -> FloatArray:

@@ -9,15 +9,17 @@ Da Lio et al. 2023, Eqs. 7 and 8.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
-import torch
-from torch import Tensor
+from numpy.typing import NDArray
 
 from vehest.estimators.kernels.activation import tanh
 from vehest.estimators.kernels.compiling import entry, part
 from vehest.estimators.kernels.threads import over_members
+
+Floats = NDArray[Any]
 
 LANES = 64
 LINEAR = 8  # parameters of a local model besides its neurons
@@ -26,8 +28,44 @@ YAW_RATE, SPEED, SLIP, ERROR, V, U, THRUST, POSITION, MODEL, F1, F2 = range(LINE
 NEURON = 3  # rows of a neuron: w₂ and w₃ of the lane's local model, and its output
 
 
-def predict(theta: Tensor, series: Tensor, starts: Tensor, yaw_rate_max: float, step: float, n_hidden: int, n_window: int) -> Tensor:
-    """Lateral velocity one step after each window, differentiable in ``theta``.
+def shapes_of(n_local: int, n_hidden: int, *, bias: bool) -> dict[str, tuple[int, ...]]:
+    """Parameters of a network by name, with their shapes."""
+    shapes: dict[str, tuple[int, ...]] = dict.fromkeys(("gamma", "beta", "linear_weight"), (n_local, 2))
+    shapes |= {"linear_bias": (n_local, 2)} if bias else {}
+    if n_hidden:
+        shapes |= dict.fromkeys(("hidden_weight", "output_weight"), (n_local, 2, n_hidden))
+        shapes |= {"hidden_bias": (n_local, 2, n_hidden), "output_bias": (n_local, 2)} if bias else {}
+    return shapes
+
+
+def packed(library: Any, parameters: Mapping[str, Any]) -> Any:
+    """Parameters by name, (..., P, 2) or (..., P, 2, Q), as rows of local models, (..., P, 8 + 6 Q).
+
+    ``library`` is the one whose arrays they are, NumPy or PyTorch.
+    """
+    p, gamma = parameters, parameters["gamma"]
+    bias = p.get("linear_bias", library.zeros_like(gamma))
+    if "output_bias" in p:
+        bias = bias + p["output_bias"]
+    pieces = [gamma, p["beta"], library.stack([p["linear_weight"], bias], -1).reshape(*gamma.shape[:-1], 4)]
+    if "hidden_weight" in p:
+        weight = p["hidden_weight"]
+        neurons = library.stack([weight, p.get("hidden_bias", library.zeros_like(weight)), p["output_weight"]], -1)
+        pieces.append(neurons.reshape(*gamma.shape[:-1], -1))
+    return library.concatenate(pieces, -1)
+
+
+def predictions(
+    theta: Floats,
+    series: Floats,
+    starts: NDArray[np.int64],
+    yaw_rate_max: float,
+    step: float,
+    n_window: int,
+    *,
+    differentiated: bool = False,
+) -> tuple[Floats, Floats]:
+    """Lateral velocity one step after each window.
 
     Args:
         theta: parameters, (M, P, 8 + 6 Q).
@@ -35,45 +73,31 @@ def predict(theta: Tensor, series: Tensor, starts: Tensor, yaw_rate_max: float, 
         starts: first row of each window, (M, B).
         yaw_rate_max: centre of the last local model [rad/s].
         step: sampling time [s].
-        n_hidden: neurons Q.
         n_window: samples N in a window.
+        differentiated: whether derivatives are wanted.
 
     Returns:
-        (M, B) [m/s].
+        (M, B) [m/s], and its derivatives by the parameters, in blocks of lanes, (M, blocks, P, (8 + 6 Q) · lanes); of no block otherwise.
     """
-    result: Tensor = _Predict.apply(theta, series, starts, yaw_rate_max, step, n_hidden, n_window)  # type: ignore[no-untyped-call]
-    return result
+    members, batch = starts.shape
+    blocks, scalar = -(-batch // LANES), theta.dtype.type
+    settings = (scalar(yaw_rate_max), scalar(step), (theta.shape[2] - LINEAR) // 6, n_window)
+    values = np.empty((members, blocks * LANES), theta.dtype)
+    jacobian = np.empty((members, blocks if differentiated else 0, theta.shape[1], theta.shape[2] * LANES), theta.dtype)
+
+    def work(m: int, end: int) -> None:
+        _recursion(theta[m:end], series, starts[m:end], *settings, values[m:end], jacobian[m:end])
+
+    over_members(work, members)
+    return values[:, :batch], jacobian
 
 
-class _Predict(torch.autograd.Function):
-    @staticmethod
-    def forward(
-        ctx: Any, theta: Tensor, series: Tensor, starts: Tensor, yaw_rate_max: float, step: float, n_hidden: int, n_window: int
-    ) -> Tensor:
-        rows, measured, first = theta.detach().contiguous().numpy(), series.contiguous().numpy(), starts.contiguous().numpy()
-        members, batch = first.shape
-        blocks = -(-batch // LANES)
-        wanted = bool(ctx.needs_input_grad[0])
-        values = np.empty((members, blocks * LANES), rows.dtype)
-        jacobian = np.empty((members, blocks if wanted else 0, rows.shape[1], rows.shape[2] * LANES), rows.dtype)
-        scalar = rows.dtype.type
-
-        def work(m: int, end: int) -> None:
-            _recursion(
-                rows[m:end], measured, first[m:end], scalar(yaw_rate_max), scalar(step), n_hidden, n_window, values[m:end], jacobian[m:end]
-            )
-
-        over_members(work, members)
-        ctx.jacobian = jacobian
-        return torch.from_numpy(values[:, :batch])
-
-    @staticmethod
-    def backward(ctx: Any, *upstream: Tensor) -> tuple[Tensor | None, ...]:
-        members, _, n_local, width = ctx.jacobian.shape
-        gradient = np.empty((members, n_local, width // LANES), ctx.jacobian.dtype)
-        weights = upstream[0].contiguous().numpy()
-        _weighted_sum(ctx.jacobian, weights, gradient)  # too little to share
-        return torch.from_numpy(gradient), None, None, None, None, None, None
+def weighted_sum(jacobian: Floats, weights: Floats) -> Floats:
+    """Derivatives of `predictions` summed over the windows with weights (M, B), (M, P, 8 + 6 Q)."""
+    members, _, n_local, width = jacobian.shape
+    gradient = np.empty((members, n_local, width // LANES), jacobian.dtype)
+    _weighted_sum(jacobian, weights, gradient)  # too little to share
+    return gradient
 
 
 @entry(fastmath=True, nogil=True)

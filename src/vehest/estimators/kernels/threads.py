@@ -7,8 +7,6 @@ from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from functools import cache
 
-import torch
-
 PIECES = 4  # for each thread, so that one that is held up leaves its share to the others
 
 
@@ -17,7 +15,11 @@ def over_members(work: Callable[[int, int], None], members: int, pieces: int = P
 
     They run side by side on as many threads as torch is allowed; what is computed does not depend on the number.
     """
-    threads = max(min(torch.get_num_threads(), members), 1)
+    threads = 1
+    if members > 1:
+        from torch import get_num_threads
+
+        threads = min(get_num_threads(), members)
     if threads == 1:
         work(0, members)
         return

@@ -13,7 +13,8 @@ from torch import Tensor, nn
 from vehest.declared import setting
 from vehest.estimators.base import Trial
 from vehest.estimators.network import Network
-from vehest.estimators.networks.windowed import StandardisedNetwork, WindowedEstimator
+from vehest.estimators.networks.standardised import StandardisedNetwork
+from vehest.estimators.networks.windowed import WindowedEstimator
 
 TRIAL = Trial(7, "recurrent networks; minutes", "estimator.n_states=5 training.max_epochs=100 seed=range(2)")
 

@@ -20,7 +20,7 @@ from vehest.data.recording import Recording
 from vehest.declared import Group, setting
 from vehest.estimators.base import FitData, FitRecord, Trial
 from vehest.estimators.networks.recurrent import HiddenStateEstimator
-from vehest.estimators.networks.windowed import StandardisedNetwork
+from vehest.estimators.networks.standardised import StandardisedNetwork
 from vehest.training.context import FitContext, record_of_epochs
 from vehest.training.sequences import Phase, PhaseSettings, drawn_starts, train_phases
 
@@ -144,7 +144,6 @@ class RecurrentVelocityEstimator(HiddenStateEstimator):
         super().__init__(settings)
         self.channels = tuple(dict.fromkeys(("vx", *self.inputs)))
         self.learns_from = tuple(REFERENCES[name] for name in self.outputs)
-        self.network = self.new_network()
         self._columns = np.array([self.channels.index(name) for name in self.inputs])
 
     def check(self) -> None:

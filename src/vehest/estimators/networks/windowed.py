@@ -6,11 +6,10 @@ from collections import deque
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import torch
-from torch import Tensor, nn
+from numpy.typing import NDArray
 
 from vehest.constants import FloatArray
 from vehest.data.errors import ConfigurationError
@@ -22,8 +21,11 @@ from vehest.estimators.base import FitData, FitRecord, Stepper, rate
 from vehest.estimators.model_files import load_model
 from vehest.estimators.network import Network
 from vehest.training.context import FitContext
-from vehest.training.members import predict_members, prepare, random_numbers
-from vehest.training.supervised import SupervisedSettings, train_members
+from vehest.training.supervised_settings import SupervisedSettings
+
+if TYPE_CHECKING:
+    import torch
+    from torch import nn
 
 TARGET = "vy_ref"
 
@@ -40,13 +42,10 @@ class WindowedEstimator(Network):
     rate_hz: float = rate(20.0)
     window: int = setting(30, "samples that it sees", least=1)
 
-    def __init__(self, settings: Any) -> None:
-        super().__init__(settings)
-        with random_numbers(0):
-            self.network = self.new_network()
-
     def network_for(self, train: list[Recording]) -> nn.Module:
         """A network that knows the ranges of the training recordings: means and deviations if it is a `StandardisedNetwork`."""
+        from vehest.estimators.networks.standardised import StandardisedNetwork
+
         network = self.new_network()
         if isinstance(network, StandardisedNetwork):
             network.standardise(train, self.channels)
@@ -70,6 +69,10 @@ class WindowedEstimator(Network):
             DataError: recordings are too short or have gaps, the loss is no longer finite, or a model to start from is damaged.
             ConfigurationError: the network cannot be trained so, or a model to start from is of another family or has other settings.
         """
+        import torch
+
+        from vehest.training.supervised import train_members
+
         first, dtype = members[0], getattr(torch, training.dtype)
         train, validation = (windows_of(part, first.channels, TARGET, first.window) for part in (data.train, data.validation))
         started = first._weights_of(Path(training.start_from)) if training.start_from is not None else {}
@@ -82,13 +85,17 @@ class WindowedEstimator(Network):
 
     def _seeded_network(self, train: list[Recording], dtype: torch.dtype) -> nn.Module:
         """A network to train, with initial weights from the member's seed."""
+        from torch import Generator
+
+        from vehest.training.members import random_numbers
+
         with random_numbers(self._seed):
             network = self.network_for(train)
         _check_state(network)
         network = network.to(dtype)
         reset = getattr(network, "reset", None)
         if reset is not None:
-            reset(torch.Generator().manual_seed(self._seed))
+            reset(Generator().manual_seed(self._seed))
         return network
 
     def _weights_of(self, folder: Path) -> dict[str, np.ndarray[Any, Any]]:
@@ -112,7 +119,12 @@ class WindowedEstimator(Network):
             vy[self.window :] = self._predict(recording.stack(self.channels), starts)
         return self._wrapped(recording, vy)
 
-    def _predict(self, series: np.ndarray[Any, Any], starts: np.ndarray[Any, Any]) -> np.ndarray[Any, Any]:
+    def _predict(self, series: FloatArray, starts: NDArray[np.int64]) -> FloatArray:
+        """Lateral velocity [m/s] one step after the windows of measurements (T, C) that begin at ``starts``, (B,)."""
+        import torch
+
+        from vehest.training.members import predict_members, prepare
+
         dtype = next(self.network.parameters()).dtype
         self.network.eval()
         with torch.no_grad():
@@ -120,7 +132,7 @@ class WindowedEstimator(Network):
             parameters = {name: parameter.unsqueeze(0) for name, parameter in self.network.named_parameters()}
             rows = torch.as_tensor(starts).unsqueeze(0)
             result = predict_members(self.network, parameters, prepared, rows, self.window, compiled=True)
-        return result[0].double().numpy()
+        return np.asarray(result[0].double().numpy())
 
     def online(self) -> WindowStepper:
         """A stepper with an empty window."""
@@ -158,38 +170,3 @@ def _check_state(network: nn.Module) -> None:
     for name, tensor in network.state_dict().items():
         if not tensor.is_floating_point():
             raise ConfigurationError(f"{kind}: buffer '{name}' is {tensor.dtype}, no floating point; register it with persistent=False")
-
-
-class StandardisedNetwork(nn.Module):
-    """Base of networks that see standardised measurements and predict standardised velocities.
-
-    Means and standard deviations are those of the training recordings; they are kept with the weights and are not parameters. `prepared`
-    standardises what ``forward`` sees; what it predicts goes back to SI units by ``output * self.output_scale + self.output_mean``.
-
-    Args:
-        n_channels: measured channels.
-        outputs: shape of what is predicted of one instant.
-    """
-
-    input_mean: Tensor
-    input_scale: Tensor
-    output_mean: Tensor
-    output_scale: Tensor
-
-    def __init__(self, n_channels: int, outputs: tuple[int, ...] = ()) -> None:
-        super().__init__()
-        for name, shape in (("input", (n_channels,)), ("output", outputs)):
-            self.register_buffer(f"{name}_mean", torch.zeros(shape))
-            self.register_buffer(f"{name}_scale", torch.ones(shape))
-
-    def standardise(self, train: Sequence[Recording], channels: Sequence[str], references: Sequence[str] = (TARGET,)) -> None:
-        """Take means and standard deviations from recordings."""
-        parts = ((self.input_mean, self.input_scale, channels), (self.output_mean, self.output_scale, references))
-        for mean, scale, names in parts:
-            samples = np.concatenate([recording.stack(names) for recording in train])
-            mean.copy_(torch.as_tensor(samples.mean(axis=0)).reshape(mean.shape))
-            scale.copy_(torch.as_tensor(np.maximum(samples.std(axis=0), 1e-6)).reshape(scale.shape))
-
-    def prepared(self, series: Tensor) -> Tensor:
-        """Standardised measurements."""
-        return (series - self.input_mean) / self.input_scale

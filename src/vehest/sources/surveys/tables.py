@@ -23,7 +23,7 @@ import pyarrow.csv as pc
 from vehest.constants import FloatArray
 from vehest.data.errors import DataError, printable
 from vehest.data.limits import check_limit
-from vehest.data.parquet import DAMAGE, parquet_file, read_numbers
+from vehest.data.parquet import DAMAGE, numbers_of, parquet_file, read_numbers
 from vehest.data.text_files import first_line
 from vehest.sources.clock_times import seconds_of_text
 from vehest.sources.surveys.clocks import NAMED, SPELLINGS, find_clock, plain_name
@@ -253,7 +253,7 @@ def _numbers(column: pa.ChunkedArray, decimal: str) -> tuple[FloatArray, set[str
     elif not _is_numeric(column.type):
         return None
     try:
-        return np.asarray(column.cast(pa.float64(), safe=False).to_numpy(), dtype=np.float64), marks
+        return numbers_of(column), marks
     except pa.ArrowException:
         return None
 

@@ -1,0 +1,131 @@
+"""The network of the KS-NN in PyTorch, with its compiled recursion (`vehest.estimators.kernels.ksnn`) differentiable."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from vehest.estimators.kernels import ksnn as kernel
+
+GAMMA_START = 0.98
+GAMMA_SPREAD = 0.01
+SMALL = 0.1
+
+
+class KinematicsStructuredNetwork(nn.Module):
+    """Bank of Luenberger-like observers blended by yaw rate (KS-NN).
+
+    v⁺ = γ₁v + β₁τ(a_y - u_m ω) - ω f₁(û - u_m)        (Da Lio et al. 2023, Eq. 7a)
+    û⁺ = γ₂û + β₂τ(a_x + vω) - f₂(û - u_m)             (Eq. 7b)
+    f(e) = w₁e + b₁ + Σⱼ w₃ⱼ tanh(w₂ⱼe + b₂ⱼ) + b₃      (Eq. 8, and the second layer's own bias)
+
+    Args:
+        settings: structure.
+        yaw_rate_max: centre of the last local model [rad/s]; the others are spaced evenly from 0 (Fig. 3).
+
+    Shapes:
+        measurements: (..., N, 4), channels yaw_rate [rad/s], vx [m/s], ay, ax [m/s²].
+        returns: (...) lateral velocity [m/s] one step after the window.
+    """
+
+    yaw_rate_max: Tensor
+    gamma: nn.Parameter
+    beta: nn.Parameter
+    linear_weight: nn.Parameter
+    linear_bias: nn.Parameter
+    hidden_weight: nn.Parameter
+    output_weight: nn.Parameter
+    hidden_bias: nn.Parameter
+    output_bias: nn.Parameter
+
+    def __init__(self, settings: Any, yaw_rate_max: float = 1.0) -> None:
+        super().__init__()
+        self.settings = settings
+        self.step = 1.0 / settings.rate_hz
+        self.register_buffer("yaw_rate_max", torch.tensor(float(yaw_rate_max)))
+        for name, shape in kernel.shapes_of(settings.n_local, settings.n_hidden, bias=settings.bias).items():
+            self.register_parameter(name, nn.Parameter(torch.zeros(shape)))
+
+    def reset(self, generator: torch.Generator) -> None:
+        """Draw initial weights near the kinematic observer: γ ≈ 0.98, β ≈ 1, small feedback."""
+        with torch.no_grad():
+            for name, parameter in self.named_parameters():
+                noise = torch.randn(parameter.shape, generator=generator, dtype=torch.float64).to(parameter.dtype)
+                if name == "gamma":
+                    parameter.copy_((GAMMA_START + GAMMA_SPREAD * noise).clamp(max=1.0))
+                elif name == "beta":
+                    parameter.copy_(1.0 + SMALL * noise)
+                elif name == "hidden_weight":
+                    parameter.copy_(noise)
+                elif name == "linear_weight":
+                    parameter.copy_(SMALL * noise.abs())
+                elif name == "output_weight":
+                    parameter.copy_(SMALL * noise)
+                else:
+                    parameter.copy_(0.01 * noise)
+
+    def constrain(self, parameters: Mapping[str, Tensor]) -> None:
+        """Keep γ₁ in (0, 1] (Section IV-A2)."""
+        parameters["gamma"][..., 0].clamp_(min=1e-3, max=1.0)
+
+    def activations(self, yaw_rate: Tensor) -> Tensor:
+        """Weights φ of the local models (Fig. 3), (...) -> (..., P); beyond the last centre the last one alone."""
+        position = (yaw_rate.abs() / self.yaw_rate_max * (self.settings.n_local - 1)).clamp(max=self.settings.n_local - 1)
+        centres = torch.arange(self.settings.n_local, dtype=yaw_rate.dtype)
+        return (1.0 - (position.unsqueeze(-1) - centres).abs()).clamp(min=0.0)
+
+    def feedback(self, error: Tensor) -> Tensor:
+        """f₁ and f₂ of every local model (Eq. 8), (...) -> (..., P, 2)."""
+        error = error[..., None, None]
+        value = self.linear_weight * error
+        if self.settings.bias:
+            value = value + self.linear_bias
+        if self.settings.n_hidden:
+            inner = self.hidden_weight * error.unsqueeze(-1)
+            if self.settings.bias:
+                inner = inner + self.hidden_bias
+            value = value + (self.output_weight * torch.tanh(inner)).sum(-1)
+            if self.settings.bias:
+                value = value + self.output_bias
+        return value
+
+    def forward(self, measurements: Tensor) -> Tensor:
+        """Run the recursion from v = 0, û = u_m over the window (Fig. 1)."""
+        yaw_rate, speed, ay, ax = measurements.unbind(-1)
+        weights = self.activations(yaw_rate)
+        v, u = torch.zeros_like(speed[..., 0]), speed[..., 0]
+        for k in range(measurements.shape[-2]):
+            omega, phi = yaw_rate[..., k], weights[..., k, :]
+            f = self.feedback(u - speed[..., k])
+            slip = self.step * (ay[..., k] - speed[..., k] * omega)
+            thrust = self.step * (ax[..., k] + v * omega)
+            v_local = self.gamma[:, 0] * v[..., None] + self.beta[:, 0] * slip[..., None] - omega[..., None] * f[..., 0]
+            u_local = self.gamma[:, 1] * u[..., None] + self.beta[:, 1] * thrust[..., None] - f[..., 1]
+            v, u = (phi * v_local).sum(-1), (phi * u_local).sum(-1)
+        return v
+
+    def compiled_members(self, parameters: Mapping[str, Tensor], prepared: Tensor, starts: Tensor) -> Tensor:
+        """The same for M members by the compiled recursion, (M, B)."""
+        theta = kernel.packed(torch, parameters)
+        result: Tensor = _Predict.apply(  # type: ignore[no-untyped-call]
+            theta, prepared, starts, float(self.yaw_rate_max), self.step, self.settings.window
+        )
+        return result
+
+
+class _Predict(torch.autograd.Function):
+    """`vehest.estimators.kernels.ksnn.predictions`, differentiable in the parameters."""
+
+    @staticmethod
+    def forward(ctx: Any, theta: Tensor, series: Tensor, starts: Tensor, yaw_rate_max: float, step: float, n_window: int) -> Tensor:
+        arrays = (theta.detach().contiguous().numpy(), series.contiguous().numpy(), starts.contiguous().numpy())
+        wanted = bool(ctx.needs_input_grad[0])
+        values, ctx.jacobian = kernel.predictions(*arrays, yaw_rate_max, step, n_window, differentiated=wanted)
+        return torch.from_numpy(values)
+
+    @staticmethod
+    def backward(ctx: Any, *upstream: Tensor) -> tuple[Tensor | None, ...]:
+        return torch.from_numpy(kernel.weighted_sum(ctx.jacobian, upstream[0].contiguous().numpy())), *[None] * 5

@@ -1,0 +1,46 @@
+"""Networks that see standardised measurements and predict standardised velocities."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from vehest.data.recording import Recording
+
+
+class StandardisedNetwork(nn.Module):
+    """Base of networks that see standardised measurements and predict standardised velocities.
+
+    Means and standard deviations are those of the training recordings; they are kept with the weights and are not parameters. `prepared`
+    standardises what ``forward`` sees; what it predicts goes back to SI units by ``output * self.output_scale + self.output_mean``.
+
+    Args:
+        n_channels: measured channels.
+        outputs: shape of what is predicted of one instant.
+    """
+
+    input_mean: Tensor
+    input_scale: Tensor
+    output_mean: Tensor
+    output_scale: Tensor
+
+    def __init__(self, n_channels: int, outputs: tuple[int, ...] = ()) -> None:
+        super().__init__()
+        for name, shape in (("input", (n_channels,)), ("output", outputs)):
+            self.register_buffer(f"{name}_mean", torch.zeros(shape))
+            self.register_buffer(f"{name}_scale", torch.ones(shape))
+
+    def standardise(self, train: Sequence[Recording], channels: Sequence[str], references: Sequence[str] = ("vy_ref",)) -> None:
+        """Take means and standard deviations from recordings."""
+        parts = ((self.input_mean, self.input_scale, channels), (self.output_mean, self.output_scale, references))
+        for mean, scale, names in parts:
+            samples = np.concatenate([recording.stack(names) for recording in train])
+            mean.copy_(torch.as_tensor(samples.mean(axis=0)).reshape(mean.shape))
+            scale.copy_(torch.as_tensor(np.maximum(samples.std(axis=0), 1e-6)).reshape(scale.shape))
+
+    def prepared(self, series: Tensor) -> Tensor:
+        """Standardised measurements."""
+        return (series - self.input_mean) / self.input_scale
