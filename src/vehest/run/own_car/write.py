@@ -10,6 +10,7 @@ from typing import Any
 
 import yaml
 
+from vehest.alignment.standstill import STANDSTILL_SPEED
 from vehest.constants import GRAVITY
 from vehest.data.channels import CHANNELS
 from vehest.data.errors import ConfigurationError, VehestError, printable
@@ -238,7 +239,7 @@ def _pipeline_of(name: str, plan: Plan, minutes: float) -> dict[str, Any]:
                 tuned = {"title": f"{part['title']}, trained on", "sweeps": [[*scratch, PRETRAINED]]}
                 parts[f"minutes_{own:g}_tuned"] = part | tuned
     study = {"study": name, "title": f"Which estimator to trust on {name}", "report": "own_car", "publish": False}
-    return study | {"evaluation": {"rate_hz": 20}, "parts": parts}
+    return study | {"evaluation": {"rate_hz": 20, "least_speed": STANDSTILL_SPEED}, "parts": parts}
 
 
 def _limits(own: Draft) -> list[str]:
