@@ -186,9 +186,9 @@ def _commands(part: PartArtefacts, study: str) -> list[str]:
     models = [own.model for own in (verdict_of(part, name) for name in part.split.tests) if own.model is not None]
     if not models:
         return []
-    name = models[0].model_folder.name
+    name, dataset = models[0].model_folder.name, next(iter(part.split.tests.values()))[0].dataset
     return [
-        f"vehest estimate {name} YOUR_LOG.csv   # v and β with bands and health, beside the log",
+        f"vehest estimate {name} YOUR_LOG dataset={dataset} -o beta.csv   # v, β, bands, health; beta.mf4, beta.mat: in the log",
         f"vehest export {name} -o on_the_car    # the same in C99",
         f"vehest report {study}                 # this report again",
     ]
