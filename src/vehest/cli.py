@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any, NoReturn
 
 import typer
 
-from vehest.data.errors import ConfigurationError, printable
+from vehest.data.errors import ConfigurationError, VehestError, printable
 from vehest.run.config_files import GROUPS, choices, is_simulated, pipeline_names, summary
 from vehest.run.launchers.base import LAUNCHERS, LauncherOptions
 from vehest.run.printing import OutputClosed, TerminalTable, as_json_text, complain, counted, echo, emit, note, open_streams, silence
@@ -38,6 +38,8 @@ app.add_typer(data_app, name="data")
 
 ROOT_KEYS = ("root", "output", "seed", "rate_hz")
 LONGEST_LINE = 4_000
+STAGES = "Single stages, which `run` goes through by itself"
+CLUSTER = "On a cluster"
 COMMANDS = ("ingest", "downsample", "train", "eval", "estimate")
 
 
@@ -108,6 +110,7 @@ LauncherName = Annotated[
         "--launcher",
         help="Where trainings run: local, on this machine's cores; ray, on a Ray cluster; slurm, as SLURM jobs (docs/many_machines.md).",
         autocompletion=lambda incomplete: [name for name in LAUNCHERS if name.startswith(incomplete)],
+        rich_help_panel=CLUSTER,
     ),
 ]
 Address = Annotated[
@@ -117,6 +120,7 @@ Address = Annotated[
         help="With --launcher ray: HOST:PORT of the cluster, or auto for the one this machine is part of. "
         "By default RAY_ADDRESS, else a Ray of its own on this machine. With --launcher slurm: local, to try it here.",
         show_default=False,
+        rich_help_panel=CLUSTER,
     ),
 ]
 Slurm = Annotated[
@@ -126,6 +130,7 @@ Slurm = Annotated[
         help="With --launcher slurm, NAME=VALUE of what a job asks for: partition, account, qos, constraint, minutes (60), memory_gb (2). "
         "Repeatable.",
         show_default=False,
+        rich_help_panel=CLUSTER,
     ),
 ]
 Dataset = Annotated[str, typer.Argument(help="Name of a file in conf/dataset.", autocompletion=_complete_dataset)]
@@ -156,6 +161,10 @@ def new_car(
     wheelbase: Annotated[float | None, typer.Option("--wheelbase", min=0.0, help="Of the car [m].")] = None,
     mass: Annotated[float | None, typer.Option("--mass", min=0.0, help="Of the car [kg].")] = None,
     steering_ratio: Annotated[float | None, typer.Option("--steering-ratio", help="Steering wheel's angle to the road wheels'.")] = None,
+    own: Annotated[
+        list[str] | None,
+        typer.Option("--with", metavar="PACKAGE.MODULE:CLASS", help="Compare also an installed estimator of your own; repeatable."),
+    ] = None,
     as_json: AsJson = False,
 ) -> None:
     """Begin with logs of your own car: `vehest new my_car lap*.csv`.
@@ -164,17 +173,24 @@ def new_car(
     conf/dataset, conf/split and pipelines/my_car.yaml. Reads tables, Parquet, MDF, VBO and ROS 2 bags. With --json nothing is asked.
     """
     from vehest.run.own_car.inspect import inspect
-    from vehest.run.own_car.questions import ask
-    from vehest.run.own_car.write import write
 
     vehicle = {"wheelbase": wheelbase, "mass": mass, "steering_ratio": steering_ratio}
-    examined = inspect(name, files, vehicle, force=force)
+    examined = inspect(name, files, vehicle, force=force or dry_run)
     emit(False, None, [] if as_json else examined.in_words())
-    examined, left = ask(examined, answer or [], interactive=not (yes or as_json))
-    emit(as_json, *write(examined, left, dry_run=dry_run))
+    from vehest.run.own_car.questions import ask
+    from vehest.run.own_car.write import found_in, registered, write  # with torch: a file that is refused is so without it
+
+    try:
+        further = [registered(word) for word in own or []]
+        examined, left = ask(examined, answer or [], interactive=not (yes or as_json))
+        outcome = write(examined, left, further, dry_run=dry_run)
+    except VehestError as error:
+        emit(as_json, {**found_in(examined), "stopped": str(error)}, [])
+        raise
+    emit(as_json, *outcome)
 
 
-@app.command(epilog=_offered("dataset"))
+@app.command(epilog=_offered("dataset"), rich_help_panel=STAGES)
 def ingest(
     dataset: Dataset,
     overrides: Annotated[list[str] | None, _overrides("ingest")] = None,
@@ -200,7 +216,7 @@ def ingest(
     emit(as_json, {"folder": str(made.folder), "recordings": sorted(Path(n).stem for n in made.outputs), "skipped": made.skipped})
 
 
-@app.command()
+@app.command(rich_help_panel=STAGES)
 def simulate(
     dataset: Annotated[str, typer.Argument(help="Name of a simulated data set in conf/dataset.", autocompletion=_complete_simulated)],
     overrides: Annotated[list[str] | None, _overrides("simulate")] = None,
@@ -228,7 +244,7 @@ def simulate(
     emit(as_json, {"folder": str(artefact.folder), **outcome, "skipped": artefact.skipped})
 
 
-@app.command(epilog=_offered("dataset"))
+@app.command(epilog=_offered("dataset"), rich_help_panel=STAGES)
 def downsample(
     dataset: Dataset,
     overrides: Annotated[list[str] | None, _overrides("downsample")] = None,
@@ -249,7 +265,7 @@ def downsample(
     emit(as_json, {"folder": str(artefact.folder), "rate_hz": rate, "skipped": artefact.skipped})
 
 
-@app.command(epilog=_offered("split", "estimator", "training", "tracking"))
+@app.command(epilog=_offered("split", "estimator", "training", "tracking"), rich_help_panel=STAGES)
 def train(
     overrides: Annotated[list[str] | None, _overrides("train")] = None,
     dry_run: DryRun = False,
@@ -267,7 +283,7 @@ def train(
     emit(as_json, train_one(overrides or [], RunOptions(force, dry_run, quiet, track=True)))
 
 
-@app.command("eval", epilog=_offered("split", "estimator", "fault"))
+@app.command("eval", epilog=_offered("split", "estimator", "fault"), rich_help_panel=STAGES)
 def evaluate(
     overrides: Annotated[list[str] | None, _overrides("eval")] = None,
     model: Annotated[
@@ -314,7 +330,9 @@ def estimate(
         ),
     ] = None,
     overrides: Annotated[list[str] | None, _overrides("estimate")] = None,
-    out: Annotated[Path, typer.Option("--out", "-o", help="Where to write the estimate: .parquet or .csv.")] = Path("estimate.parquet"),
+    out: Annotated[
+        Path, typer.Option("--out", "-o", help="Where to write the estimate: .parquet, .csv, or the log with it: .mf4, .mat.")
+    ] = Path("estimate.parquet"),
     strict: Annotated[
         bool, typer.Option("--strict", help="Exit code 3 and no file where a check finds something in the channels read.")
     ] = False,
@@ -322,7 +340,8 @@ def estimate(
 ) -> None:
     """Run a trained model on a new recording: `vehest estimate MODEL lap.csv -o out.parquet`.
 
-    The table holds v, β, half widths of their calibrated 90 % bands, and the health of each sample: 0 valid, 1 degraded, 2 invalid.
+    The table holds v, β, half widths of their calibrated 90 % bands, and the health of each sample: 0 valid, 1 degraded, 2 invalid. An .mf4
+    is the log, MDF 4, with these as channels of their own, a .mat the log's channels and these.
 
     For a car without a model of its own, leave the model out: `vehest estimate lap.csv` takes the one that comes with vehest, with a note.
 
@@ -426,6 +445,11 @@ def export(
     elsewhere: Annotated[
         bool, typer.Option("--elsewhere", help="For a car or tyres that the model was not calibrated on: bands twice as wide.")
     ] = False,
+    vectors: Annotated[
+        Path | None,
+        typer.Option("--vectors", metavar="LOG", help="Recording for the test vectors, read as by `vehest estimate`.", show_default=False),
+    ] = None,
+    overrides: Annotated[list[str] | None, _overrides("estimate")] = None,
     onnx: Annotated[
         bool,
         typer.Option("--onnx", help="Write a network as one step in ONNX instead, with its state going in and out; -o names the file."),
@@ -438,17 +462,18 @@ def export(
     file, test vectors, and a README with units and the bytes that it takes.
     """
     from vehest.export.folder import export_model
-    from vehest.run.estimate import open_model
+    from vehest.run.estimate import open_model, prepared_recording, read_table
 
-    output = Path(_compose("estimate", [])["output"])
+    output = Path(_compose("estimate", overrides or [])["output"])
     folder, fitted, trust = open_model(model, output, note)
+    drive = None if vectors is None else prepared_recording(fitted, read_table(vectors, overrides or []), bus_rate)
     if onnx:
         from vehest.export.onnx_model import write_onnx
 
         write_onnx(fitted, out)
         emit(as_json, {"out": str(out), "model": str(folder)})
         return
-    found = export_model(fitted, trust, out, precision, bus_rate, elsewhere=elsewhere)
+    found = export_model(fitted, trust, out, precision, bus_rate, elsewhere=elsewhere, drive=drive)
     emit(as_json, {"out": str(out), "model": str(folder), **{name: value for own in found for name, value in own.figures().items()}})
 
 
@@ -609,7 +634,7 @@ def sweep(
     _print_ran(ran, as_json, sweep=True)
 
 
-@app.command("config")
+@app.command("config", rich_help_panel=STAGES)
 def show_config(
     command: Annotated[str, typer.Argument(help="ingest, downsample, train, eval or estimate.", autocompletion=_complete_command)],
     overrides: Annotated[list[str] | None, _overrides("train")] = None,
@@ -624,7 +649,7 @@ def show_config(
     echo(as_json_text(config) if as_json else as_yaml(config).rstrip(), keep="\n")
 
 
-@app.command()
+@app.command(rich_help_panel=STAGES)
 def prune(
     overrides: Annotated[list[str] | None, _overrides("estimate")] = None,
     yes: Annotated[bool, typer.Option("--yes", "-y", help="Remove without asking.")] = False,

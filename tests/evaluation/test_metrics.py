@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -106,6 +107,18 @@ def test_sideslip_uses_the_measured_forward_velocity():
     vx = drive["vx"][30:]
     assert np.allclose(scored.sideslip_ref, np.arctan2(drive["vy_ref"][30:], vx))
     assert np.allclose(scored.sideslip, np.arctan2(drive["vy_ref"][30:] + 1.0, vx))
+
+
+def test_standstill_has_no_sideslip(drive):
+    """Half a second at 0.0003 m/s: 0.1 m/s of v would be a sideslip of 90 degrees there."""
+    vx, vy = drive["vx"].copy(), drive["vy_ref"].copy()
+    vx[500:510], vy[500:510] = 0.0003, 0.0
+    own = replace(drive, channels={**drive.channels, "vx": vx, "vy_ref": vy})
+    estimate = _estimate(own.time, vy + np.where(vx < 1.0, 0.1, 0.0), 20.0, 0.0)
+    counted, without = (
+        accuracy([score(estimate, own, Span("d", "drive"), Protocol(least_speed=least))])["max_error_sideslip"] for least in (0.0, 0.1)
+    )
+    assert (counted > 80.0, without) == (True, 0.0)
 
 
 def test_estimate_with_holes_is_an_error_not_a_better_score(drive):

@@ -46,9 +46,37 @@ def test_two_that_are_alike_are_not_told_apart(part):
     rows = part.metrics[part.metrics["estimator"] == "gru"].assign(variant="twin")
     own = without(part, "ksnn", "luenberger")
     words = said(replace(own, models=[*own.models, *twins], metrics=pd.concat([part.metrics, rows], ignore_index=True)))
-    assert "**No estimator can be called best.**" in words
-    assert "is not told apart from" in words
+    assert words.startswith("**Take ")
+    assert "**No estimator can be called best:** it is not told apart from " in words
     assert "**Use" not in words
+
+
+def test_the_one_that_is_named_is_the_one_whose_error_is_given_and_that_the_commands_take(part):
+    """Luenberger comes first in the list, and GRU, alike on the test, has the lowest error on validation."""
+    metrics = part.metrics.copy()
+    metrics.loc[(metrics["estimator"] == "gru") & (metrics["test_set"] == "validation") & (metrics["metric"] == "rmse_vy"), "value"] = 0.01
+    gru = next(model for model in part.models if model.estimator == "gru")
+    alike = [replace(model, evaluation_folder=gru.evaluation_folder) for model in part.models if model.estimator == "luenberger"]
+    own = replace(without(part, "ksnn", "luenberger"), metrics=metrics)
+    found = verdict_of(replace(own, models=[*own.models, *alike]), "test")
+    assert found.model is not None
+    assert found.model.estimator == "gru"
+    assert found.sentences[0].startswith("**Take GRU")
+    assert " not told apart from Luenberger;" in found.sentences[0]
+
+
+def test_share_that_is_scored_and_sideslip_hidden_in_the_start_of_a_range(part, tmp_path):
+    """25 s of which 1.5 s are left out: 94 %; a slide at the start of the range, a stop at its end."""
+    recording = drive()
+    vx, vy = recording["vx"].copy(), recording["vy_ref"].copy()
+    vy[round(60.5 * 20)] = 10.0
+    vx[round(84.0 * 20) : round(84.5 * 20)], vy[round(84.0 * 20) : round(84.5 * 20)] = 0.0003, 0.02
+    file = tmp_path / "lap.parquet"
+    write_recording(replace(recording, channels={**recording.channels, "vx": vx, "vy_ref": vy}), file)
+    words = said(replace(part, references={("toy", "lap"): file}))
+    assert "The score counts 94 % of the test, without the first 1.5 s of its 1 range, **which hide the largest sideslip** (" in words
+    assert "; 2.1 % of what is scored is standstill, with a sideslip of 0." in words
+    assert "hide" not in said(part)
 
 
 def test_nothing_is_recommended_that_does_not_beat_the_static_map(part):

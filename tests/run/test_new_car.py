@@ -11,6 +11,7 @@ import yaml
 from planted_logs import drive, usual, write
 from typer.testing import CliRunner
 
+from example_package import forget_examples, install_examples
 from place import run_vehest
 from vehest.cli import app
 from vehest.data.files import ASIDE_PREFIX
@@ -197,3 +198,36 @@ def test_short_recordings_stay_whole_and_too_little_stops_with_what_to_record(tm
     assert code == 0
     assert "16 s in 2 recordings are too short to train, stop and test on: record two minutes or more" in out
     assert "vehest run" not in out
+
+
+def test_force_takes_away_split_and_pipeline_that_the_new_logs_do_not_allow(tmp_path, capsys, log) -> None:
+    assert run_vehest(capsys, "new", "my_car", "lap.csv", "--yes")[0] == 0
+    write(tmp_path / "bare.csv", usual(drive()).drop(columns="Beta"))
+    assert run_vehest(capsys, "new", "my_car", "bare.csv", "--yes", "--force")[0] == 0
+    assert [Path(file).exists() for file in FILES] == [True, False, False]
+
+
+def test_a_stop_gives_in_json_what_was_found_and_a_dry_run_needs_no_force(capsys, log) -> None:
+    assert run_vehest(capsys, "new", "my_car", "lap.csv", "--yes")[0] == 0
+    before = [Path(file).read_text() for file in FILES]
+    code, out, err = run_vehest(capsys, "new", "my_car", "lap.csv", "--json", "--dry-run", "--answer", "gear=3")
+    found = json.loads(out)
+    assert (code, err) == (2, f"error: {found['stopped']}\n")
+    assert "vx" in [one["channel"] for one in found["channels"]]
+    code, out, _ = run_vehest(capsys, "new", "my_car", "lap.csv", "--json", "--dry-run")
+    assert (code, json.loads(out)["dry_run"]) == (0, True)
+    assert [Path(file).read_text() for file in FILES] == before
+
+
+def test_an_estimator_of_ones_own_is_compared_too(tmp_path, capsys, log, monkeypatch) -> None:
+    code, _, err = run_vehest(capsys, "new", "my_car", "lap.csv", "--yes", "--with", "sliding_mode:SlidingMode")
+    assert code == 2
+    assert '[project.entry-points."vehest.estimators"], NAME = "sliding_mode:SlidingMode"; then install it with pip' in err
+    install_examples(tmp_path / "installed", monkeypatch)
+    try:
+        code, _, err = run_vehest(capsys, "new", "my_car", "lap.csv", "--yes", "--with", "sliding_mode:SlidingMode")
+        assert code == 0, err
+        sweeps = yaml.safe_load(Path(FILES[2]).read_text(encoding="utf-8"))["parts"]["all"]["sweeps"]
+        assert ["estimator=sliding_mode"] in sweeps
+    finally:
+        forget_examples()

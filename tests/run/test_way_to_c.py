@@ -49,7 +49,7 @@ def test_two_commands_lead_to_a_verdict_and_those_it_names_to_an_estimate_and_to
     assert report.index("## Verdict") < report.index("## How much reference is needed") < report.index("## Test set `test`")
     assert "lacks" in report, "families that were not compared are named"
 
-    estimate = re.search(r"vehest estimate (\S+) YOUR_LOG.csv", said)
+    estimate = re.search(r"vehest estimate (\S+) YOUR_LOG dataset=my_car -o beta.csv", said)
     assert estimate is not None, said
     code, out, err = run_vehest(capsys, "estimate", estimate[1], "lap.csv", "dataset=my_car", "-o", "out.csv", "--json")
     assert code == 0, err
@@ -57,5 +57,10 @@ def test_two_commands_lead_to_a_verdict_and_those_it_names_to_an_estimate_and_to
     assert np.isfinite(pd.read_csv(log / "out.csv")["sideslip"].iloc[60:]).all()
     export = re.search(r"vehest export (\S+) -o (\S+)", said)
     assert export is not None
-    assert run_vehest(capsys, "export", export[1], "-o", export[2])[0] == 0
+    words = ("export", export[1], "-o", export[2], "--vectors", "lap.csv", "dataset=my_car")
+    assert run_vehest(capsys, *words)[0] == 0
+    online, batch = pd.read_csv(log / export[2] / "expected.csv"), pd.read_csv(log / "out.csv")
+    assert np.isfinite(online["sideslip"]).sum() > 4000
+    steps = len(online) - len(batch) + round(20 * (batch["time"][0] - 0.0))
+    assert np.allclose(online["sideslip"].iloc[100:4000], batch["sideslip"].iloc[100 - steps : 4000 - steps], atol=1e-4)
     assert {"main.c", "vehest_estimator.c", "vehest_method.c", "README.md"} <= {path.name for path in (log / export[2]).iterdir()}

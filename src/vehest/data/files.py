@@ -139,7 +139,7 @@ def is_left_over(path: Path) -> bool:
     if not path.name.startswith(ASIDE_PREFIX):
         return False
     process, host = found.groups() if (found := _ASIDE.match(path.name)) else ("0", None)
-    if host in (None, _host()):
+    if host in (None, _host()) and os.name == "posix":  # elsewhere os.kill would end what it asks for
         return not _is_alive(int(process))
     try:
         return time.time() - path.lstat().st_mtime > FOREIGN_SECONDS
@@ -181,7 +181,7 @@ def _is_alive(process: int) -> bool:
 
 def _flush(path: Path) -> None:
     for file in [own for own in path.rglob("*") if own.is_file()] if path.is_dir() else [path]:
-        descriptor = os.open(file, os.O_RDONLY)
+        descriptor = os.open(file, os.O_RDWR)  # Windows flushes no file that is open for reading alone
         try:
             os.fsync(descriptor)
         finally:

@@ -37,13 +37,16 @@ def point_is_unknown(reference: Recording) -> bool:
     return isinstance(derived, dict) and derived.get("reference_point") == "unknown"
 
 
-def best_lever_arm(parts: Sequence[Scored], yaw_rates: Sequence[FloatArray], speeds: Sequence[FloatArray]) -> LeverArm:
+def best_lever_arm(
+    parts: Sequence[Scored], yaw_rates: Sequence[FloatArray], speeds: Sequence[FloatArray], least_speed: float = 0.0
+) -> LeverArm:
     """The lever arm x that leaves the least error: argmin of the mean of (v̂ - v - x·r)², that is Σ(v̂ - v)r / Σr², within `LONGEST`.
 
     Args:
         parts: estimate and reference, of all ranges of a test set.
         yaw_rates: r [rad/s] at the same samples.
         speeds: u [m/s], by which sideslip is made of v.
+        least_speed: see `Protocol`.
     """
     error = np.concatenate([part.vy - part.vy_ref for part in parts])
     turning = np.concatenate(list(yaw_rates))
@@ -52,7 +55,8 @@ def best_lever_arm(parts: Sequence[Scored], yaw_rates: Sequence[FloatArray], spe
     moved = []
     for part, yaw_rate, speed in zip(parts, yaw_rates, speeds, strict=True):
         vy = part.vy - x * yaw_rate
-        moved.append(replace(part, vy=vy, sideslip=np.arctan2(vy, speed)))
+        standing = np.hypot(speed, part.vy_ref) < least_speed
+        moved.append(replace(part, vy=vy, sideslip=np.where(standing, 0.0, np.arctan2(vy, speed))))
     return LeverArm(x, tuple(moved))
 
 
@@ -78,6 +82,6 @@ def lever_arm_figures(parts: Sequence[Scored], pieces: Iterable[tuple[Recording,
             return {}
     if not yaw_rates:
         return {}
-    best = best_lever_arm(parts, yaw_rates, speeds)
+    best = best_lever_arm(parts, yaw_rates, speeds, protocol.least_speed)
     figures = accuracy(best.parts)
     return {**{name: figures[name] for name in METRICS}, "lever_arm": best.x}

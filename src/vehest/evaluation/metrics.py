@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from functools import lru_cache
+from typing import Any
 
 import numpy as np
 
@@ -86,6 +87,7 @@ class Protocol:
         initial_state: whether estimates start at the reference state of the first sample.
         elsewhere: test sets, with commas between them, of another car or tyre than the training's that the recordings do not tell apart by
             their vehicle: bands are wider there by their rule.
+        least_speed: of the car by its reference [m/s]; slower samples have no direction, and count as a sideslip of 0 without error.
     """
 
     rate_hz: float = 20.0
@@ -94,6 +96,12 @@ class Protocol:
     sequence_seconds: float | None = None
     initial_state: bool = False
     elsewhere: str | None = None
+    least_speed: float = 0.0
+
+    @property
+    def plain(self) -> dict[str, Any]:
+        """For a key; without a least speed it is that of a protocol that knows none."""
+        return {name: value for name, value in asdict(self).items() if name != "least_speed" or value}
 
     @property
     def sets_elsewhere(self) -> frozenset[str]:
@@ -256,7 +264,7 @@ def score(estimate: Estimate, reference: Recording, span: Span, protocol: Protoc
         _require_all(values, f"estimator '{estimate.estimator}' has no estimate{'' if name == 'vy' else f' of {name}'}", span)
         return values
 
-    vy = held("vy")
+    vy, standing = held("vy"), np.hypot(scored["vx"], scored["vy_ref"]) < protocol.least_speed
     others = {name: (held(name), scored[reference_name]) for name, reference_name in REFERENCES.items() if _has(estimate, scored, name)}
     covariance_of = tuple(name for name in REFERENCES if name in estimate.covariance_of and (name == "vy" or name in others))
     covariance = estimate.covariance_at(scored.time, covariance_of) if covariance_of else None
@@ -268,8 +276,8 @@ def score(estimate: Estimate, reference: Recording, span: Span, protocol: Protoc
         time=scored.time,
         vy=vy,
         vy_ref=scored["vy_ref"],
-        sideslip=np.arctan2(vy, scored["vx"]),
-        sideslip_ref=np.arctan2(scored["vy_ref"], scored["vx"]),
+        sideslip=np.where(standing, 0.0, np.arctan2(vy, scored["vx"])),
+        sideslip_ref=np.where(standing, 0.0, np.arctan2(scored["vy_ref"], scored["vx"])),
         ay=scored["ay"] if "ay" in scored else np.full(len(scored), np.nan),
         others=others,
         covariance=covariance,

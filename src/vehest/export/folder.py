@@ -11,6 +11,7 @@ import numpy as np
 from vehest.data.channels import CHANNELS
 from vehest.data.errors import ConfigurationError, printable
 from vehest.data.files import written_aside
+from vehest.data.recording import Recording
 from vehest.estimators.base import Estimator
 from vehest.export.measure import STRICT, TARGETS, Footprint, footprint
 from vehest.export.program import TOLERANCES, context_of, program_files, vector_files
@@ -40,6 +41,7 @@ def export_model(
     bus_rate_hz: float | None = None,
     *,
     elsewhere: bool = False,
+    drive: Recording | None = None,
 ) -> list[Footprint]:
     """Write a fitted estimator as C99 into a folder of its own; an earlier export there is replaced.
 
@@ -50,6 +52,7 @@ def export_model(
         precision: of all numbers in C, ``double`` or ``float``.
         bus_rate_hz: rate at which samples come, if it is not the estimator's [Hz]; a causal low-pass leads down to that.
         elsewhere: whether the car or its tyres are others than those that were calibrated on; bands are twice as wide then.
+        drive: recorded, at the rate at which samples come, for the test vectors; else they are `SECONDS` of a drive with every fault.
 
     Returns:
         What it takes, one for each compiler that was found.
@@ -68,8 +71,8 @@ def export_model(
         refuse_unresolved(trust)
     files = program_files(stepper, kind, estimator.full_title)
     found = [own for own in (footprint(files, target) for target in TARGETS) if own is not None]
-    files["README.md"] = readme(stepper, kind, found, has_trust=trust is not None, elsewhere=elsewhere)
-    files |= vector_files(GuardedStepper(in_float64(estimator), trust, bus_rate_hz, elsewhere=elsewhere))
+    files["README.md"] = readme(stepper, kind, found, drive, has_trust=trust is not None, elsewhere=elsewhere)
+    files |= vector_files(GuardedStepper(in_float64(estimator), trust, bus_rate_hz, elsewhere=elsewhere), drive)
     with written_aside(out, replace_folder=True) as aside:
         aside.mkdir()
         for name, text in files.items():
@@ -81,6 +84,7 @@ def readme(
     stepper: GuardedStepper,
     precision: Precision,
     footprints: Sequence[Footprint],
+    drive: Recording | None = None,
     *,
     has_trust: bool,
     elsewhere: bool,
@@ -96,7 +100,7 @@ def readme(
         "trust": has_trust,
         "elsewhere": elsewhere,
         "version": __version__,
-        "seconds": SECONDS,
+        "vectors": f"{SECONDS:g} s of a drive with faults of every kind" if drive is None else f"{drive.duration:g} s of a recorded drive",
         "tolerance": f"{TOLERANCES[precision]:.0e}",
         "kind": precision,
     }

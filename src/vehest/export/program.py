@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from vehest.data.channels import CHANNELS
+from vehest.data.recording import Recording
 from vehest.export.method import method_source
 from vehest.export.rendering import Precision, ascii_only, braced, limit, render, truths, whole
 from vehest.export.tables import band_table, front_end_table, guard_table, health_table
@@ -121,9 +122,10 @@ def context_of(stepper: GuardedStepper, precision: Precision, title: str) -> dic
     }
 
 
-def vector_files(stepper: GuardedStepper) -> dict[str, str]:
-    """Test vectors, and what Python says of them; name -> text. The stepper is in its initial state, and is used up."""
-    times, samples = drive_for(stepper)
+def vector_files(stepper: GuardedStepper, drive: Recording | None = None) -> dict[str, str]:
+    """Test vectors, of a drive or made up, and what Python says of them; name -> text. A stepper in its initial state is used up."""
+    given = None if drive is None else (drive.time, {name: drive[name] for name in stepper._channels})
+    times, samples = given or drive_for(stepper)
     rows = np.column_stack([times, *samples.values()])
     return {
         "test_vectors.csv": table_text(("time", *samples), rows),

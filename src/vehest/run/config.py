@@ -88,8 +88,8 @@ class _LocalFirst(SearchPathPlugin):  # type: ignore[misc]
     def manipulate_search_path(self, search_path: ConfigSearchPath) -> None:
         *local, _, papers = conf_folders()
         for folder in local:
-            search_path.prepend("local", folder.resolve().as_uri())
-        search_path.append("papers", papers.as_uri())
+            search_path.prepend("local", f"file://{folder.resolve()}")  # Hydra takes it literally, spaces too
+        search_path.append("papers", f"file://{papers}")
 
 
 def compose_config(command: str, overrides: Sequence[str] = ()) -> Config:

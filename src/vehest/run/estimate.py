@@ -30,6 +30,7 @@ from vehest.run.calibrate import trust_of
 from vehest.run.config import Config, compose_config, key_of
 from vehest.run.config_files import is_file_name
 from vehest.run.downsample import resampled
+from vehest.run.estimate_log import LOGS, check_log_name, write_log
 from vehest.run.printing import complain, counted, note
 from vehest.run.train import STAGE as TRAIN
 from vehest.sources.base import read_single
@@ -87,7 +88,7 @@ def estimate_file(words: Sequence[str], out: Path, *, strict: bool = False) -> d
 
     Args:
         words: a model, which may be left out, a recording and overrides of conf/estimate.yaml.
-        out: table to write.
+        out: table to write, or the log with further channels (`estimate_log`).
         strict: whether findings in the channels are an error; else they are printed as warnings.
 
     Raises:
@@ -97,7 +98,10 @@ def estimate_file(words: Sequence[str], out: Path, *, strict: bool = False) -> d
     name, file, overrides = (words[0] if n_names == 2 else PRETRAINED), Path(words[n_names - 1]), words[n_names:]
     if n_names == 1 and file.is_dir():
         raise ConfigurationError(f"'{file}' is a folder; a recording is a file, and comes after the model: vehest estimate MODEL lap.csv")
-    _check_table_name(out)
+    if out.suffix.lower() in LOGS:
+        check_log_name(file, out)
+    else:
+        _check_table_name(out)
     if out.is_dir():
         raise ConfigurationError(f"'{out}' is a folder; name a file")
     if out.exists() and file.exists() and out.samefile(file):
@@ -114,7 +118,10 @@ def estimate_file(words: Sequence[str], out: Path, *, strict: bool = False) -> d
         result = estimate_recording(model, drive, trust)
     for finding in findings:
         complain(f"warning: {finding}")
-    write_estimate_table(result, out)
+    if out.suffix.lower() in LOGS:
+        write_log(result, drive, file, out)
+    else:
+        write_estimate_table(result, out)
     return {
         "out": str(out),
         "model": PRETRAINED if name == PRETRAINED else str(folder),
@@ -192,9 +199,9 @@ def estimate_recording(model: Estimator, recording: Recording, trust: Trust | No
     return require_estimate(model, recording, estimate)
 
 
-def prepared_recording(model: Estimator, recording: Recording) -> Recording:
-    """The channels that a model reads, at its rate; raises as `estimate_recording` does."""
-    return resampled(recording.select(model.channels), model.settings.rate_hz, model.preparation)
+def prepared_recording(model: Estimator, recording: Recording, rate_hz: float | None = None) -> Recording:
+    """The channels that a model reads, at its rate or another one [Hz]; raises as `estimate_recording` does."""
+    return resampled(recording.select(model.channels), rate_hz or model.settings.rate_hz, model.preparation)
 
 
 def require_estimate(model: Estimator, recording: Recording, estimate: Estimate) -> Estimate:
@@ -221,7 +228,7 @@ def write_estimate_table(estimate: Estimate, path: Path) -> None:
 
 def _check_table_name(path: Path) -> None:
     if path.suffix.lower() not in SUFFIXES:
-        raise ConfigurationError(f"'{path}' must end in {' or '.join(SUFFIXES)}")
+        raise ConfigurationError(f"'{path}' must end in {', '.join(SUFFIXES)} or, as a log with further channels, {' or '.join(LOGS)}")
 
 
 def _summary(estimate: Estimate) -> dict[str, Any]:

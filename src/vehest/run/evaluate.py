@@ -70,8 +70,8 @@ ALL_UNITS = UNITS | UNITS_UNDER_FAULT
 def protocol_from_config(config: Mapping[str, Any]) -> Protocol:
     """How estimates are scored; raises `ConfigurationError` for a value that makes no sense."""
     protocol = settings_from_config(Protocol, config, "evaluation")
-    if protocol.rate_hz <= 0 or protocol.warm_up_seconds < 0 or protocol.skip_seconds < 0:
-        raise ConfigurationError("evaluation.rate_hz must be positive, warm_up_seconds and skip_seconds must not be negative")
+    if protocol.rate_hz <= 0 or min(protocol.warm_up_seconds, protocol.skip_seconds, protocol.least_speed) < 0:
+        raise ConfigurationError("evaluation.rate_hz must be positive, warm_up_seconds, skip_seconds and least_speed must not be negative")
     if protocol.sequence_seconds is not None:
         samples = protocol.sequence_seconds * protocol.rate_hz
         if not protocol.sequence_seconds > protocol.skip_seconds or abs(samples - round(samples)) > 1e-6:
@@ -130,7 +130,7 @@ class EvaluateJob:
         inputs |= {f"reference of {span.dataset}/{span.recording}": file_digest(how.references[span.dataset], span) for span in compared}
         config: dict[str, Any] = {
             "sets": {name: [str(span) for span in spans] for name, spans in test_sets(how.split).items()},
-            "protocol": asdict(how.protocol),
+            "protocol": how.protocol.plain,
             "kinds": dict(how.kinds),
             "split": how.split.name,
         }

@@ -109,7 +109,7 @@ def _plan(
                 "training": list(part.facts),
                 "failed": part.failed,
                 "data_titles": part.data_titles,
-                "protocol": asdict(part.protocol),
+                "protocol": part.protocol.plain,
             }
             for name, part in artefacts.parts.items()
         },
@@ -260,7 +260,7 @@ def draw_sweep(study: Study, comparison: Comparison, runner: Runner) -> tuple[Ar
             "keys": artefacts.keys,
             "jobs": artefacts.jobs[["combination", "title", *artefacts.keys, "seed", "status"]].astype(object).to_dict("records"),
             "failures": artefacts.failures,
-            "protocol": asdict(artefacts.protocol),
+            "protocol": artefacts.protocol.plain,
             "kinds": artefacts.kinds,
             "data_titles": artefacts.data_titles,
             "facts": artefacts.facts,

@@ -13,12 +13,14 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from vehest.alignment.standstill import STANDSTILL_SPEED
 from vehest.constants import FloatArray
 from vehest.data.files import file_name
 from vehest.data.splits import Span
 from vehest.data.store import read_recording
 from vehest.estimators.registry import estimator_class, estimator_names
 from vehest.evaluation.blocks import LEAST_BLOCKS
+from vehest.evaluation.metrics import pieces_of, scored_range
 from vehest.evaluation.ranking import BASELINES, Ranking
 from vehest.report.document import REPORT, Block, Document, as_code, as_text
 from vehest.report.style import fixed, listed
@@ -35,7 +37,7 @@ HARD = 4.0  # m/s², from which on driving says something of the tyres
 PLAIN = (*BASELINES, "kinematic", "data_sheet")
 """Estimators that others have to beat."""
 
-VERSION = "2"
+VERSION = "3"
 leaderboard = drive.leaderboard
 
 
@@ -81,8 +83,9 @@ def _verdicts(part: PartArtefacts) -> list[tuple[str, str]]:
 def verdict_of(part: PartArtefacts, test_set: str) -> Verdict:
     """Which estimator to trust on a test set and how far; that none can be recommended, and why.
 
-    A winner is named only where it lies below every other candidate, v = 0 and the static map by more than chance (`Ranking.winner`). Of
-    those that are not told apart the one with the lowest RMSE(v) on validation is what the next commands take.
+    One estimator is named, whose error is given and which the next commands take: the winner, which lies below every other candidate, v = 0
+    and the static map by more than chance (`Ranking.winner`); else a plain one that nothing beats; else, of those that are not told apart
+    from the lowest error, the one with the lowest RMSE(v) on validation.
     """
     ranking = ranking_of(part, test_set)
     titles = {name: as_text(models[0].title) for name, models in by_name(part.models).items()}
@@ -93,25 +96,24 @@ def verdict_of(part: PartArtefacts, test_set: str) -> Verdict:
         silent = [f"the test ranges hold {ranking.n_blocks} independent stretches of driving, and {LEAST_BLOCKS} is the least", *silent]
     if silent:
         return Verdict((f"**These recordings cannot rank estimators**, because {listed(silent)}.", _wanted(part)), None)
-    best = ranking.order[0]
-    reach = f" for {_reach(part, test_set)}"
-    expected = f"RMSE(β) {_figure(ranking, best)}{reach}"
-    if ranking.winner is not None:
-        words = [f"**Use {titles[best]}.** Expected {expected}."]
-    elif best[0] in PLAIN:
-        words = [f"**Nothing beats {titles[best]} here**, which has {expected}: no estimator that learns is worth its while on these data."]
-    else:
-        level = [titles[name] for name in ranking.not_told_apart]
-        apart = (
-            f" **{titles[best]}** is not told apart from {listed(level) if len(level) <= 6 else f'{len(level)} others'};" if level else ""
-        )
-        words = [f"**No estimator can be called best.**{apart} it has the lowest error, {expected}."]
     model = _to_go_on_with(part, ranking)
-    chosen = ""
-    if ranking.winner is None and ranking.not_told_apart and model is not None:
-        chosen = f"Of these, {as_text(model.title)} has the lowest RMSE(v) on validation; the commands below take it."
-    words += [_beaten(ranking, best, titles), chosen, _wanted(part)]
-    return Verdict(tuple(word for word in words if word), model)
+    name = (model.estimator, model.variant)
+    expected = f"RMSE(β) {_figure(ranking, name)} for {_reach(part, test_set)}"
+    level = [titles[own] for own in (ranking.order[0], *ranking.not_told_apart) if own != name]
+    if ranking.winner is not None:
+        words = f"**Use {titles[name]}.** Expected {expected}."
+    elif ranking.order[0][0] in PLAIN:
+        words = f"**Nothing beats {titles[name]} here**, which has {expected}: no estimator that learns is worth its while on these data."
+    elif level:
+        others = listed(level) if len(level) <= 6 else f"{len(level)} others"
+        words = (
+            f"**Take {titles[name]}**, expected {expected}. **No estimator can be called best:** it is not told apart from {others}; "
+            "of these it has the lowest RMSE(v) on validation."
+        )
+    else:
+        words = f"**Take {titles[name]}**, which has the lowest error, {expected}. **No estimator can be called best.**"
+    sentences = (words, _beaten(ranking, name, titles), _counted(part, test_set), _wanted(part))
+    return Verdict(tuple(sentence for sentence in sentences if sentence), model)
 
 
 def _figure(ranking: Ranking, name: Name) -> str:
@@ -120,24 +122,23 @@ def _figure(ranking: Ranking, name: Name) -> str:
     return f"{size}° ({fixed(low, 2)} to {fixed(high, 2)})" if math.isfinite(low) else f"{size}°"
 
 
-def _beaten(ranking: Ranking, best: Name, titles: Mapping[Name, str]) -> str:
-    """Which of the plain estimators are beaten by more than chance, and which are not."""
-    if best[0] in PLAIN:
-        return ""
+def _beaten(ranking: Ranking, name: Name, titles: Mapping[Name, str]) -> str:
+    """Which of the plain estimators that it was compared with are beaten by more than chance, and which are not."""
     beats: list[str] = []
     level: list[str] = []
-    for name in (name for name in ranking.order if name[0] in PLAIN):
-        own = ranking.against_best.get(name)
-        called = BASELINE_TITLES.get(name[0], titles[name])
-        (beats if own is not None and own.verdict == "lower" else level).append(called)
+    for other in (other for other in ranking.order if other[0] in PLAIN and name[0] not in PLAIN):
+        if (name, other) in ranking.pairs:
+            called = BASELINE_TITLES.get(other[0], titles[other])
+            (beats if ranking.pairs[name, other].verdict == "lower" else level).append(called)
     sentences = [f"It beats {listed(beats)}."] if beats else []
     sentences += [f"It is not told apart from {listed(level)}."] if level else []
     return " ".join(sentences)
 
 
-def _to_go_on_with(part: PartArtefacts, ranking: Ranking) -> EvaluatedModel | None:
-    """The winner, or of those that are not told apart from the lowest error the one with the lowest RMSE(v) on validation."""
-    names = [ranking.winner] if ranking.winner is not None else [ranking.order[0], *ranking.not_told_apart]
+def _to_go_on_with(part: PartArtefacts, ranking: Ranking) -> EvaluatedModel:
+    """The winner, or a plain estimator of the lowest error; else the lowest RMSE(v) on validation of those level with the lowest error."""
+    alone = ranking.winner is not None or ranking.order[0][0] in PLAIN
+    names = [ranking.order[0], *([] if alone else ranking.not_told_apart)]
     runs, groups = runs_of(part), by_name(part.models)
     chosen = []
     for name in names:
@@ -148,14 +149,37 @@ def _to_go_on_with(part: PartArtefacts, ranking: Ranking) -> EvaluatedModel | No
     return min(chosen, key=lambda pair: pair[0])[1]
 
 
+def _counted(part: PartArtefacts, test_set: str) -> str:
+    """How much of a test the score counts, and the sideslip that the start of each range hides."""
+    protocol, scored, hidden, standing = part.protocol, list[FloatArray](), list[FloatArray](), 0
+    ranges = pieces_of(part.split.tests[test_set], lambda span: read_recording(part.references[span.dataset, span.recording]), protocol)
+    for recording, piece in ranges:
+        begin, (first, end) = recording.index_range(piece.start, piece.stop)[0], scored_range(recording, piece, protocol)
+        still = np.hypot(recording["vx"], recording["vy_ref"]) < STANDSTILL_SPEED
+        sideslip = np.degrees(np.where(still, 0.0, np.abs(np.arctan2(recording["vy_ref"], recording["vx"]))))
+        standing += int(still[first:end].sum())
+        hidden.append(sideslip[begin:first])
+        scored.append(sideslip[first:end])
+    counted, left_out = np.concatenate(scored), np.concatenate(hidden)
+    share = 100.0 * len(counted) / max(len(counted) + len(left_out), 1)
+    most, most_hidden = (float(np.nanmax(own)) if np.isfinite(own).any() else 0.0 for own in (counted, left_out))
+    words = f"The score counts {fixed(share, 0)} % of the test"
+    words += f", without the first {protocol.skip_seconds:g} s of its {len(scored)} {protocol.piece}{'s' if len(scored) > 1 else ''}"
+    if most_hidden > most:
+        words += f", **which hide the largest sideslip** ({fixed(most_hidden, 1)}°; scored: up to {fixed(most, 1)}°)"
+    if standing:
+        words += f"; {fixed(100.0 * standing / len(counted), 1)} % of what is scored is standstill, with a sideslip of 0"
+    return f"{words}."
+
+
 def _commands(part: PartArtefacts, study: str) -> list[str]:
     """What to run next, with the model of the first test set that has a verdict."""
     models = [own.model for own in (verdict_of(part, name) for name in part.split.tests) if own.model is not None]
     if not models:
         return []
-    name = models[0].model_folder.name
+    name, dataset = models[0].model_folder.name, next(iter(part.split.tests.values()))[0].dataset
     return [
-        f"vehest estimate {name} YOUR_LOG.csv   # v and β with bands and health, beside the log",
+        f"vehest estimate {name} YOUR_LOG dataset={dataset} -o beta.csv   # v, β, bands, health; beta.mf4, beta.mat: in the log",
         f"vehest export {name} -o on_the_car    # the same in C99",
         f"vehest report {study}                 # this report again",
     ]

@@ -6,17 +6,20 @@ import itertools
 from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import asdict, dataclass, field
+from importlib.metadata import entry_points
 from typing import Any
 
 import yaml
 
+from vehest.alignment.standstill import STANDSTILL_SPEED
 from vehest.constants import GRAVITY
 from vehest.data.channels import CHANNELS
 from vehest.data.errors import ConfigurationError, VehestError, printable
 from vehest.data.files import written_aside
 from vehest.data.limits import limits_from_config, use_limits
 from vehest.data.recording_summary import RecordingSummary
-from vehest.estimators.registry import estimator_class, estimator_names
+from vehest.estimators.base import Trial
+from vehest.estimators.registry import ENTRY_POINTS, estimator_class, estimator_names
 from vehest.run.config import compose_config
 from vehest.run.config_files import choices
 from vehest.run.own_car.dataset import Draft, draft
@@ -35,6 +38,7 @@ STIFFNESS = 10.0  # cornering stiffness of an axle over its load [1/rad], as the
 HEIGHT = 0.2  # of the centre of gravity over the wheelbase; assumed
 PRETRAINED = "training.start_from=pretrained"
 PRETRAINED_HZ = 20.0
+GIVEN = Trial(1, "given by --with")
 MINUTES = (0.5, 1.0, 2.0, 5.0)
 """Of reference, parts of the pipeline where there are more."""
 DATASET_COMMENTS = {
@@ -70,12 +74,34 @@ class Plan:
     lacking: dict[str, str] = field(default_factory=dict)
 
 
-def write(examined: Examined, left: Sequence[Question] = (), *, dry_run: bool = False) -> tuple[dict[str, Any], list[str]]:
+def registered(word: str) -> str:
+    """The name of an estimator that is given by its name or as ``package.module:Class``.
+
+    Raises:
+        ConfigurationError: no installed package declares it, or it has no file in conf/estimator.
+    """
+    name = next((point.name for point in entry_points(group=ENTRY_POINTS) if point.value == word), word)
+    if name not in estimator_names():
+        declared = f'NAME = "{word if ":" in word else "package.module:Class"}"'
+        raise ConfigurationError(
+            f"no installed package declares the estimator '{word}'; its pyproject.toml needs, under "
+            f'[project.entry-points."{ENTRY_POINTS}"], '
+            f"{declared}; then install it with pip"
+        )
+    if name not in choices("estimator"):
+        raise ConfigurationError(f"there is no conf/estimator/{name}.yaml; write one with the line 'name: {name}', and a line a setting")
+    return name
+
+
+def write(
+    examined: Examined, left: Sequence[Question] = (), further: Sequence[str] = (), *, dry_run: bool = False
+) -> tuple[dict[str, Any], list[str]]:
     """Write data set, split and pipeline, all or none; the data set alone where nothing can be trained.
 
     Args:
         examined: logs after the answers.
         left: questions without an answer.
+        further: estimators to compare beside those that every new car gets.
         dry_run: whether to write nothing.
 
     Returns:
@@ -88,7 +114,7 @@ def write(examined: Examined, left: Sequence[Question] = (), *, dry_run: bool = 
     name = examined.name
     with use_limits(limits_from_config(compose_config("estimate")["limits"])):
         made = draft(examined)
-    plan = _plan_of(made.contents, examined.vehicle) if "vy_ref" in made.channels and not _is_too_short(made) else Plan()
+    plan = _plan_of(made.contents, examined.vehicle, further) if "vy_ref" in made.channels and not _is_too_short(made) else Plan()
     texts = [_dataset_text(made, left)]
     if plan.sweeps:
         texts += [_split_text(made), _pipeline_text(name, plan, LEARNT * made.seconds / 60.0)]
@@ -97,6 +123,8 @@ def write(examined: Examined, left: Sequence[Question] = (), *, dry_run: bool = 
         with ExitStack() as stack:
             for file, text in files.items():
                 stack.enter_context(written_aside(file)).write_text(text, encoding="utf-8")
+        for file in paths_of(name)[len(files) :]:  # of an earlier one by --force, which these recordings do not allow
+            file.unlink(missing_ok=True)
     following = _next_commands(made, plan)
     plain = _plain(made, plan, left) | {"written": [str(file) for file in files], "next": following, "dry_run": dry_run}
     purposes = ("channels, units and signs of the columns", "ranges for training, validation and test")
@@ -140,23 +168,29 @@ def _next_commands(made: Draft, plan: Plan) -> list[str]:
     return [*commands, f"vehest estimate pretrained {file} dataset={name} -o estimate.parquet"]
 
 
-def _plain(made: Draft, plan: Plan, left: Sequence[Question]) -> dict[str, Any]:
-    examined, found = made.examined, made.examined.proposals
+def found_in(examined: Examined) -> dict[str, Any]:
+    """What the files hold, for JSON."""
+    found = examined.proposals
     channels = [{key: value for key, value in asdict(one).items() if key != "gappy"} for one in found.channels]
     return {
         "name": examined.name,
         "files": [str(file) for file in examined.files],
         "source": examined.log.source,
-        "recordings": [one.id for one in made.contents],
-        "rate_hz": min(one.rate_hz for one in made.contents),
-        "seconds": made.seconds,
         "time": None if examined.log.clock is None else asdict(examined.log.clock),
         "channels": [one | {"asked": one["asked"] or None} for one in channels],
         "left_right": found.left_right or None,
         "pose": {part: {"column": column, "unit": unit} for part, column, unit in found.pose},
         "unused": list(found.unused),
-        "open": [question.as_plain() for question in left],
         "vehicle": dict(examined.vehicle),
+    }
+
+
+def _plain(made: Draft, plan: Plan, left: Sequence[Question]) -> dict[str, Any]:
+    return found_in(made.examined) | {
+        "recordings": [one.id for one in made.contents],
+        "rate_hz": min(one.rate_hz for one in made.contents),
+        "seconds": made.seconds,
+        "open": [question.as_plain() for question in left],
         "steering_ratio_found": None if made.ratio is None else {"value": made.ratio[0], "uncertainty": made.ratio[1]},
         "has_reference": "vy_ref" in made.channels,
         "estimators": plan.estimators,
@@ -181,10 +215,11 @@ def _words(made: Draft, plan: Plan, left: Sequence[Question]) -> list[str]:
     return [*lines, *_limits(made), *(f"left out: {name}: {lack}" for name, lack in plan.lacking.items())]
 
 
-def _plan_of(contents: Sequence[RecordingSummary], vehicle: Mapping[str, float | None]) -> Plan:
+def _plan_of(contents: Sequence[RecordingSummary], vehicle: Mapping[str, float | None], further: Sequence[str]) -> Plan:
     """Sweeps over the families that recordings and known values of the car allow; an empty plan where they allow none."""
     plan, values = Plan(), _car(vehicle)
-    trials = sorted((trial, name) for name in estimator_names() for trial in estimator_class(name).trials)
+    own = [(GIVEN, name) for name in further if not estimator_class(name).trials]
+    trials = sorted([*own, *((trial, name) for name in estimator_names() for trial in estimator_class(name).trials)])
     sweeps: dict[tuple[str, str], list[str]] = {}
     for trial, name in trials:
         sweeps.setdefault(trial[1:], []).append(name)
@@ -202,7 +237,7 @@ def _plan_of(contents: Sequence[RecordingSummary], vehicle: Mapping[str, float |
             plan.estimators.extend(tried)
     known = {name for names in sweeps.values() for name in names} | {"learned_ukf_variant"}  # which only a paper's study compares
     others = [name for name in (*choices("estimator"), *estimator_names()) if name not in known]
-    plan.lacking.update(dict.fromkeys(others, "none of the families tried by default; add it as you need it"))
+    plan.lacking.update(dict.fromkeys(others, "none of the families tried by default; --with adds it"))
     return plan if plan.sweeps else Plan()
 
 
@@ -238,7 +273,7 @@ def _pipeline_of(name: str, plan: Plan, minutes: float) -> dict[str, Any]:
                 tuned = {"title": f"{part['title']}, trained on", "sweeps": [[*scratch, PRETRAINED]]}
                 parts[f"minutes_{own:g}_tuned"] = part | tuned
     study = {"study": name, "title": f"Which estimator to trust on {name}", "report": "own_car", "publish": False}
-    return study | {"evaluation": {"rate_hz": 20}, "parts": parts}
+    return study | {"evaluation": {"rate_hz": 20, "least_speed": STANDSTILL_SPEED}, "parts": parts}
 
 
 def _limits(own: Draft) -> list[str]:

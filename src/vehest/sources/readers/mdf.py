@@ -86,6 +86,41 @@ def read(file: Path, wanted: Mapping[str, tuple[str, int | str | None]] | None) 
         return arrays, {"version": measurement.version, "start": start.isoformat(), "signals": signals, "skipped": skipped}
 
 
+def with_signals(
+    file: Path, seconds: list[float], signals: list[tuple[str, list[float], str, str, dict[str, str]]]
+) -> tuple[Arrays, dict[str, Any]]:
+    """A measurement of version 4 with a group of signals more.
+
+    Args:
+        file: the measurement.
+        seconds: times of the new group [s].
+        signals: name, values, unit, comment and, where values are codes, the text of each.
+
+    Returns:
+        ``content``: bytes of the new file.
+
+    Raises:
+        DataError: it is of another version.
+    """
+    forbid_evaluation()
+    with open(file, "rb") as stream:
+        measurement, new = asammdf.MDF(io.BytesIO(stream.read()), **OPTIONS), io.BytesIO()
+        if measurement.version < "4":
+            raise DataError(
+                f"'{file}' is of MDF {measurement.version}, which gets no channels; write a .mat file, or save the log as MDF 4"
+            )
+        group = []
+        for name, values, unit, comment, texts in signals:
+            table: dict[str, object] = {
+                key: own for k, (code, text) in enumerate(texts.items()) for key, own in ((f"val_{k}", int(code)), (f"text_{k}", text))
+            }
+            samples = np.array(values, dtype=np.int32 if texts else np.float64)
+            group.append(asammdf.Signal(samples, np.array(seconds), unit, name, table or None, comment))
+        measurement.append(group, acq_name="vehest", common_timebase=True)
+        measurement.save(new)
+        return {"content": np.frombuffer(new.getvalue(), dtype=np.uint8)}, {}
+
+
 @contextmanager
 def _or_skip(skipped: list[str] | None, file: Path) -> Iterator[None]:
     """Keep an error as a line of ``skipped``, where there is one."""

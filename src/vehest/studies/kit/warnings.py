@@ -7,6 +7,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from vehest.alignment.standstill import STANDSTILL_SPEED
 from vehest.constants import FloatArray
 from vehest.data.splits import Span
 from vehest.data.store import read_recording
@@ -134,7 +135,7 @@ def _epoch_limits(artefacts: PartArtefacts) -> list[str]:
 
 
 def _reference(artefacts: PartArtefacts, spans: Sequence[Span]) -> dict[str, FloatArray]:
-    """Sideslip [rad], vx [m/s] and, where all have it, ay [m/s²] of ranges, end to end, samples without reference left out."""
+    """Sideslip [rad], vx [m/s] and, where all have it, ay [m/s²] of ranges, end to end, without standstill and gaps of the reference."""
     parts: dict[str, list[FloatArray]] = {"sideslip": [], "vx": [], "ay": []}
     for span in spans:
         if (span.dataset, span.recording) not in artefacts.references:
@@ -143,9 +144,10 @@ def _reference(artefacts: PartArtefacts, spans: Sequence[Span]) -> dict[str, Flo
         own = recording.cut(max(span.start, -math.inf), span.stop)
         if "ay" not in own:
             parts.pop("ay", None)
-        known = np.logical_and.reduce([np.isfinite(own[name]) for name in ("vy_ref", "vx", *(["ay"] if "ay" in parts else []))])
+        known = np.hypot(own["vx"], own["vy_ref"]) >= STANDSTILL_SPEED
+        known &= np.isfinite(own["ay"]) if "ay" in parts else True
         if "ay" in parts:
             parts["ay"].append(own["ay"][known])
         parts["vx"].append(own["vx"][known])
         parts["sideslip"].append(np.arctan2(own["vy_ref"], own["vx"])[known])
-    return {name: np.concatenate(values) if values else np.zeros(1) for name, values in parts.items()}
+    return {name: np.concatenate([*values, np.zeros(0 if any(map(len, values)) else 1)]) for name, values in parts.items()}

@@ -1,0 +1,69 @@
+"""Writes an estimate back into the log that it was made of, as channels of their own, for the viewer that the log came from."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from vehest.constants import FloatArray
+from vehest.data.channels import CHANNELS
+from vehest.data.errors import ConfigurationError
+from vehest.data.estimate import QUANTITIES, Estimate
+from vehest.data.files import written_aside
+from vehest.data.recording import Recording
+from vehest.sources.limited import read_limited
+from vehest.trust.health import reason_in_words
+
+PREFIX = "vehest_"
+LOGS = (".mf4", ".mat")
+HEALTH = ("valid", "degraded", "invalid")
+
+
+def check_log_name(log: Path, out: Path) -> None:
+    """Raises `ConfigurationError` where a log cannot be written in the format that a name asks for."""
+    if out.suffix.lower() == ".mf4" != log.suffix.lower():
+        raise ConfigurationError(f"'{out}' would be '{log}' with further channels, which is no .mf4; name a .mat, .csv or .parquet file")
+
+
+def write_log(estimate: Estimate, recording: Recording, log: Path, out: Path) -> None:
+    """Write a log with the estimate in it: ``vehest_vy`` [m/s], ``vehest_sideslip`` [rad], their bands, health and its reason.
+
+    As MDF 4, the log as it is with one group more, on the estimate's clock. As MAT 5, the channels of the recording in SI units and the
+    estimate, held, on the clock ``time`` of the recording.
+
+    Args:
+        estimate: of the recording.
+        recording: as it was read from the log.
+        log: its file.
+        out: `LOGS`; see `check_log_name`.
+
+    Raises:
+        DataError: the log is of an older version of MDF.
+        MissingError: there is no room, or a folder cannot be written to.
+    """
+    if out.suffix.lower() == ".mat":
+        from scipy.io import savemat
+
+        own = {f"{PREFIX}{name}": estimate.held_at(recording.time, name) for name in estimate.channels}
+        with written_aside(out) as aside, open(aside, "wb") as stream:
+            savemat(stream, {"time": recording.time, **recording.channels, **own}, oned_as="column", do_compression=True)
+        return
+    signals = []
+    for name, values in estimate.channels.items():
+        about = CHANNELS[name].meaning if name in CHANNELS else name.replace("_", " ")
+        signals.append(
+            (f"{PREFIX}{name}", values.tolist(), QUANTITIES[name], f"estimated by {estimate.estimator}: {about}", _texts(name, values))
+        )
+    content = read_limited("vehest.sources.readers.mdf:with_signals", log, seconds=estimate.time.tolist(), signals=signals).arrays[
+        "content"
+    ]
+    with written_aside(out) as aside:
+        aside.write_bytes(content.tobytes())
+
+
+def _texts(name: str, values: FloatArray) -> dict[int, str]:
+    """Texts of the codes of health and its reason."""
+    if name == "health":
+        return dict(enumerate(HEALTH))
+    return {int(code): reason_in_words(code) or "-" for code in np.unique(values)} if name == "health_reason" else {}

@@ -1,0 +1,75 @@
+"""`vehest estimate` gives a log back with the estimate as channels of its own."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+from mdf_log import write_mdf
+from scipy.io import loadmat
+
+from conftest import planar_drive
+from place import Place
+from vehest.data.recording import Recording
+
+asammdf = pytest.importorskip("asammdf", reason="the measurements of these tests are written by asammdf")
+COLUMNS = ("vx", "yaw_rate", "ay", "ax")
+DESCRIBED = "dataset=mine"
+
+
+@pytest.fixture
+def described(place: Place) -> tuple[Place, Recording]:
+    """A measurement of 30 s, its times from 5 s on, and a data set that describes it."""
+    drive = planar_drive(30.0, 100.0, seed=4, noise=0.02)
+    stamps = 5.0 + np.arange(len(drive)) / 100.0
+    groups = {
+        "bus": [asammdf.Signal(drive[name], stamps, name=f"Veh_{name}") for name in COLUMNS],
+        "temperature": [asammdf.Signal(stamps, stamps, name="T")],
+    }
+    write_mdf(Path("my drive.mf4"), groups)
+    units = {"vx": "m/s", "yaw_rate": "rad/s", "ay": "m/s²", "ax": "m/s²"}
+    channels = "".join(f"  {name}: {{column: Veh_{name}, unit: {unit}}}\n" for name, unit in units.items())
+    Path("conf/dataset/mine.yaml").write_text(f"name: mine\nsource: mdf\nrate_hz: 100\nchannels:\n{channels}")
+    return place, drive
+
+
+def test_a_measurement_comes_back_with_the_table_s_numbers_in_a_group_of_their_own(described: tuple[Place, Recording]):
+    place, drive = described
+    assert place("estimate", "my drive.mf4", DESCRIBED, "-o", "beta.mf4")[0] == 0
+    assert place("estimate", "my drive.mf4", DESCRIBED, "-o", "beta.csv")[0] == 0
+    table = pd.read_csv("beta.csv")
+    with asammdf.MDF("beta.mf4") as measurement:
+        assert np.array_equal(measurement.get("Veh_ay").samples, drive["ay"])
+        assert np.array_equal(measurement.get("T").samples, measurement.get("T").timestamps)
+        vy, words = measurement.get("vehest_vy"), measurement.get("vehest_health_reason")
+        assert np.allclose(vy.timestamps, table["time"], atol=1e-9)
+        assert np.array_equal(vy.samples, table["vy"], equal_nan=True)
+        assert (vy.unit, measurement.get("vehest_sideslip").unit) == ("m/s", "rad")
+        assert np.array_equal(measurement.get("vehest_health", raw=True).samples, table["health"])
+        assert [text.decode().removeprefix("-") for text in words.samples] == table["health_reason"].fillna("").tolist()
+
+
+def test_a_mat_file_holds_the_log_and_the_estimate_on_one_clock(described: tuple[Place, Recording]):
+    place, drive = described
+    assert place("estimate", "my drive.mf4", DESCRIBED, "-o", "beta.mat")[0] == 0
+    assert place("estimate", "my drive.mf4", DESCRIBED, "-o", "beta.csv")[0] == 0
+    found, table = loadmat("beta.mat", squeeze_me=True), pd.read_csv("beta.csv")
+    assert np.allclose(found["ay"], drive["ay"])
+    every = round(100.0 * (table["time"][1] - table["time"][0]))
+    assert np.array_equal(found["vehest_vy"][::every][: len(table)], table["vy"], equal_nan=True)
+    assert len(found["vehest_band_sideslip"]) == len(found["time"]) == len(drive)
+
+
+def test_a_table_does_not_become_a_measurement(place: Place):
+    code, line = place.refused("estimate", "lap.csv", "-o", "beta.mf4")
+    assert (code, "'lap.csv' with further channels, which is no .mf4" in line) == (2, True)
+
+
+def test_an_older_measurement_is_refused_before_anything_is_written(described: tuple[Place, Recording]):
+    place, drive = described
+    write_mdf(Path("old.mf4"), {"bus": [asammdf.Signal(drive[name], drive.time, name=f"Veh_{name}") for name in COLUMNS]}, "3.30")
+    code, line = place.refused("estimate", "old.mf4", DESCRIBED, "-o", "beta.mf4")
+    assert (code, "is of MDF 3.30" in line) == (3, True)
+    assert not Path("beta.mf4").exists()
