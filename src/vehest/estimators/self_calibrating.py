@@ -1,0 +1,201 @@
+"""Self-calibrating filter: finds the rear axle, roll leakage and offsets of a car on the drive, without any reference."""
+
+from __future__ import annotations
+
+import math
+from collections import namedtuple
+from collections.abc import Mapping, Sequence
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+import vehest
+from vehest.constants import FloatArray
+from vehest.data.errors import ConfigurationError, DataError
+from vehest.declared import setting
+from vehest.estimators.base import rate
+from vehest.estimators.kernels import self_calibrating as kernel
+from vehest.estimators.ksnn import Ksnn
+from vehest.estimators.model_files import load_model
+from vehest.estimators.recursive import Recursive
+
+TYPICAL_WHEELBASE = 2.7  # m: time constants grow with the square root of the wheelbase over it
+TYPICAL_REAR = 0.48  # of the wheelbase, where the centre of gravity is not given
+WINDOW = 30  # samples that the network sees
+UNMEASURED = 20.0  # m/s per √s: process noise of u where ax is not measured
+
+
+class SelfCalibrating(Recursive):
+    """A bank of Kalman filters over grip limits of the rear axle, weighed against a network and steady cornering.
+
+    v' = (1 - κ) ay - β_y - ω u,   u' = ax - β_x + ω v,   u measured,
+    0 = v - b ω + C u φ(a_r) + s e,   a_r = (1 - κ)(ay - β_y) - b ω',   φ(a) = a_m (1 - (1 - |a|/a_m)^p)/p sign(a),   a_m² = a_max² - ax²
+
+    with offsets β, roll leakage κ, distance b and compliance C of the rear axle, and its correlated error e. Filters differ in a_max and
+    count by the likelihood of their innovations. Their mean, the network that comes with vehest and v = ω (b - C u²) with the priors of b
+    and C count by how well each explains v' and u' on the drive so far, which needs no reference.
+    """
+
+    name, title = "self_calibrating", "Self-calibrating filter"
+    covariance_of = ("vy",)
+    channels: tuple[str, ...] = ("yaw_rate", "vx", "ay", "ax")  # type: ignore[misc]  # ax may be absent
+    notice = Ksnn.notice
+    rate_hz: float = rate(20.0)
+    wheelbase: float = setting(TYPICAL_WHEELBASE, "wheelbase", unit="m", positive=True)
+    cg_to_rear_axle: float = setting(None, "distance of the centre of gravity from the rear axle; null: 0.48 wheelbases", unit="m")
+    measured_ax: bool = setting(True, "whether ax is measured; else the longitudinal equation tells nothing")
+    grips: tuple[float, ...] = setting((4.5, 6.0, 7.5, 9.0, 10.5, 12.0, 14.0, 17.0, 25.0), "grip limits a_max of the bank [m/s²]")
+    grip: float = setting(16.0, "median of the prior of a_max", unit="m/s²", positive=True)
+    grip_deviation: float = setting(0.55, "deviation of its logarithm", positive=True)
+    exponent: float = setting(0.25, "p of the axle's curve", above=0.0, most=1.0)
+    largest_share: float = setting(0.98, "of the grip limit at which the curve is cut off", above=0.0, below=1.0)
+    compliance: float = setting(0.0051, "prior of C", unit="rad s²/m", positive=True)
+    compliance_deviation: float = setting(0.3, "its deviation over C", positive=True)
+    leakage: float = setting(0.015, "prior of κ", least=-0.5, most=0.5)
+    leakage_deviation: float = setting(0.03, "its deviation", positive=True)
+    rear_deviation: float = setting(0.1, "deviation of b over the wheelbase where the centre of gravity is not given", positive=True)
+    imu_deviation: float = setting(0.05, "deviation of the inertial unit's place over the wheelbase, where it is", positive=True)
+    rear_share: float = setting(
+        0.5, "of b found over typical by which vy is moved to the typical point, where it is not given", least=0.0, most=1.0
+    )
+    offset_ay: float = setting(0.65, "deviation of β_y", unit="m/s²", positive=True)
+    offset_ay_time: float = setting(20.0, "time constant of β_y", unit="s", positive=True)
+    offset_ax: float = setting(0.2, "deviation of β_x", unit="m/s²", positive=True)
+    offset_ax_time: float = setting(15.0, "time constant of β_x", unit="s", positive=True)
+    noise_vy: float = setting(0.05, "process noise of v over a second", unit="m/s", positive=True)
+    noise_delay: float = setting(0.05, "process noise of v over a second, over what u ω changes in it", unit="s", least=0.0)
+    noise_vx: float = setting(0.1, "process noise of u over a second", unit="m/s", positive=True)
+    noise_speed: float = setting(0.15, "deviation of the measured speed", unit="m/s", positive=True)
+    axle_lag: float = setting(0.25, "low-pass of v, ω and ay in the axle's equation", unit="s", positive=True)
+    axle_error_time: float = setting(1.0, "time constant of e", unit="s", positive=True)
+    axle_constant: float = setting(0.007, "size s of the axle's error: constant", unit="m/s", positive=True)
+    axle_per_speed: float = setting(0.0009, "size over speed", least=0.0)
+    axle_per_slip: float = setting(0.03, "size over speed, prior of C and |φ|", least=0.0)
+    axle_per_bend: float = setting(1.5, "size over speed and prior of C, times φ' - 1", unit="m/s²", least=0.0)
+    axle_per_slope: float = setting(0.05, "size over speed and prior of C, times φ'", unit="m/s²", least=0.0)
+    axle_white: float = setting(0.03, "white error of the axle", unit="m/s", positive=True)
+    axle_white_share: float = setting(0.3, "white share of its variance", least=0.0)
+    gate: float = setting(3.0, "deviations at which an innovation is cut off", positive=True)
+    memory: float = setting(150.0, "time after which the drive counts e times less in all weights", unit="s", positive=True)
+    minimum_speed: float = setting(3.0, "speed below which v = b ω and parameters stay", unit="m/s", positive=True)
+    angle_floor: float = setting(0.0035, "least deviation of the sideslip angle", unit="rad", least=0.0)
+    residual_time: float = setting(1.0, "high-pass of v in the candidates' residuals", unit="s", positive=True)
+    slow_time: float = setting(20.0, "high-pass of the residuals", unit="s", positive=True)
+    residual_floor: float = setting(0.03, "residual below which candidates are alike", unit="m/s", positive=True)
+    lateral_power: float = setting(5.0, "power by which the residual of v' counts", least=0.0)
+    longitudinal_power: float = setting(3.0, "power by which the residual of u' counts", least=0.0)
+    decision_time: float = setting(10.0, "driving after which residuals count", unit="s", positive=True)
+    network_odds: float = setting(1.2, "weight of the network over the bank's at the start", positive=True)
+    steady_odds: float = setting(0.2, "weight of steady cornering over the bank's at the start", positive=True)
+
+    def __init__(self, settings: Any) -> None:
+        super().__init__(settings)
+        self.channels = type(self).channels if self.measured_ax else type(self).channels[:3]
+        self._network, self._width = _shipped_network()
+
+    def check(self) -> None:
+        """Raises:
+        ConfigurationError: a centre of gravity outside of the wheelbase, or grip limits that are none.
+        """
+        if self.cg_to_rear_axle is not None and not 0.0 < self.cg_to_rear_axle < self.wheelbase:
+            raise ConfigurationError(
+                f"estimator.cg_to_rear_axle must lie between 0 and the wheelbase ({self.wheelbase} m), not at {self.cg_to_rear_axle}"
+            )
+        if not self.grips or not all(limit > 0.0 for limit in self.grips):
+            raise ConfigurationError(f"estimator.grips must be positive accelerations, not {list(self.grips)}")
+
+    @property
+    def rear(self) -> float:
+        """Distance of the rear axle behind the reference point [m], as given or typical."""
+        return TYPICAL_REAR * self.wheelbase if self.cg_to_rear_axle is None else float(self.cg_to_rear_axle)
+
+    @property
+    def prior(self) -> tuple[FloatArray, FloatArray]:
+        """Mean and standard deviation of the states at the start, (8,) each."""
+        rear_deviation = self.rear_deviation if self.cg_to_rear_axle is None else self.imu_deviation
+        mean = np.array([0.0, 0.0, 0.0, 0.0, self.leakage, self.rear, self.compliance, 0.0])
+        own = (self.leakage_deviation, rear_deviation * self.wheelbase, self.compliance_deviation * self.compliance, 1.0)
+        return mean, np.array([0.3, self.noise_speed, self.offset_ay, self.offset_ax, *own])
+
+    @property
+    def time_scale(self) -> float:
+        """√(wheelbase / 2.7 m), by which time constants are multiplied."""
+        return math.sqrt(self.wheelbase / TYPICAL_WHEELBASE)
+
+    def numbers(self) -> Any:
+        """What the compiled recursion takes: numeric settings, times scaled, and what follows from them."""
+        own = {name: float(value) for name, value in vars(self.settings).items() if isinstance(value, int | float)}
+        own |= {"dt": 1.0 / self.rate_hz, "rear": self.rear, "rear_known": 1.0 if self.cg_to_rear_axle is not None else self.rear_share}
+        own |= {"axle_lag": self.axle_lag * self.time_scale, "yaw_rate_max": self._width, "without_ax": float(not self.measured_ax)}
+        own.pop("cg_to_rear_axle", None)
+        if not self.measured_ax:
+            own |= {"noise_vx": UNMEASURED, "longitudinal_power": 0.0}
+        return _numbers_type(tuple(own))(*own.values())
+
+    def first_state(self, sample: FloatArray, given: Mapping[str, float]) -> kernel.State:
+        """The priors, v = 0 or what is given, and the measured speed."""
+        mean, deviation = self.prior
+        mean[kernel.V], mean[kernel.U] = given.get("vy", 0.0), sample[1]
+        filters, lags = len(self.grips), np.zeros(kernel.LAGS)
+        first = self._four(sample[None])[0]
+        lags[[kernel.YAW_RATE, kernel.AY, kernel.AX, kernel.SPEED, kernel.AX_OF_SPEED]] = *first[[0, 2, 3]], sample[1], sample[1]
+        weights = -0.5 * np.square(np.log(np.array(self.grips) / self.grip) / self.grip_deviation)
+        covariances = np.repeat(np.diag(np.square(deviation))[None], filters, axis=0)
+        window, candidates = np.full((WINDOW, 4), np.nan), np.zeros((kernel.CANDIDATES, 8))
+        return kernel.State(
+            np.repeat(mean[None], filters, axis=0), covariances, weights, lags, candidates, np.ones(kernel.CANDIDATES), first, window
+        )
+
+    def run(self, samples: FloatArray, state: kernel.State) -> tuple[dict[str, Any], kernel.State]:
+        """vy [m/s] and its variance."""
+        found, _, state = self.trace(samples, state)
+        return {"vy": found[:, 0].copy(), "covariance": found[:, 1].reshape(-1, 1, 1).copy()}, state
+
+    def trace(self, samples: FloatArray, state: kernel.State) -> tuple[FloatArray, FloatArray, kernel.State]:
+        """vy and its variance, (T, 2), means and variances of the states over the bank, (T, 16), and the state after the last sample."""
+        state = kernel.State(*(part.copy() for part in state))
+        mean, deviation = self.prior
+        times = np.array([np.inf, np.inf, self.offset_ay_time, self.offset_ax_time, np.inf, np.inf, np.inf, self.axle_error_time])
+        decay = np.exp(-1.0 / (self.rate_hz * times * self.time_scale))
+        found, parameters = np.empty((len(samples), 2)), np.empty((len(samples), 2 * kernel.STATES))
+        grips = np.array(self.grips, dtype=np.float64)
+        kernel.scan(self.numbers(), grips, mean, deviation, decay, self._network, state, self._four(samples), found, parameters)
+        return found, parameters, state
+
+    def _four(self, samples: FloatArray) -> FloatArray:
+        """Samples with a column for ax, also where it is not measured."""
+        return np.ascontiguousarray(samples if self.measured_ax else np.column_stack([samples, np.zeros(len(samples))]))
+
+    def weights(self) -> dict[str, np.ndarray[Any, Any]]:
+        """The network's rows, and the yaw rate of its last local model."""
+        return {"network": self._network, "yaw_rate_max": np.array([self._width])}
+
+    def load_weights(self, weights: Mapping[str, np.ndarray[Any, Any]]) -> None:
+        """Take the network back.
+
+        Raises:
+            DataError: a part is missing, or has another shape.
+        """
+        expected = self.weights()
+        if {name: values.shape for name, values in weights.items()} != {name: values.shape for name, values in expected.items()}:
+            raise DataError(f"weights of '{self.name}' must be {', '.join(expected)} of the network that comes with vehest")
+        self._network, self._width = np.ascontiguousarray(weights["network"]), float(weights["yaw_rate_max"][0])
+
+
+@cache
+def _numbers_type(names: Sequence[str]) -> Any:
+    return namedtuple("SelfCalibratingNumbers", names)
+
+
+@cache
+def _shipped_network() -> tuple[FloatArray, float]:
+    """Rows of the network that comes with vehest, (P, 8 + 6 Q), and the yaw rate of its last local model [rad/s]."""
+    model = load_model(Path(vehest.__file__).parent / "pretrained")
+    network = model.network  # type: ignore[attr-defined]
+    rows = network._packed(dict(network.named_parameters())).detach().double().numpy()
+    return np.ascontiguousarray(rows), float(network.yaw_rate_max)
+
+
+ESTIMATOR = SelfCalibrating

@@ -1,0 +1,177 @@
+"""The self-calibrating filter against a plain filter in NumPy, the network itself, and cars whose numbers are known."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+
+from vehest.data.errors import ConfigurationError, DataError
+from vehest.data.recording import Recording
+from vehest.estimators.kernels import self_calibrating as kernel
+from vehest.estimators.model_files import load_model
+from vehest.estimators.self_calibrating import SelfCalibrating
+from vehest.run.estimate import pretrained_folder
+
+ROOT = Path(__file__).resolve().parents[2]
+RATE = 20.0
+
+
+def drive(seconds=60.0, seed=0, compliance=0.006, rear=1.3, leakage=0.02, offset=0.1, noise=1.0, delay=0.0, angle=1.0):
+    """A car whose rear axle is as the filter assumes, below the limit, at a changing speed: samples (T, 4) and vy (T,)."""
+    fine, rng = 10, np.random.default_rng(seed)
+    dt, t = 1.0 / (RATE * fine), np.arange(round(seconds * RATE * fine)) / (RATE * fine)
+    speed = 22.0 + 6.0 * np.sin(2.0 * np.pi * t / 37.0)
+    force = angle * (4.0 * np.sin(2.0 * np.pi * t / 7.0) + 2.0 * np.sin(2.0 * np.pi * t / 3.1 + seed))  # acceleration of the rear axle
+    slip = np.vectorize(lambda a: np.sign(a) * 14.0 * (1.0 - (1.0 - abs(a) / 14.0) ** 0.25) / 0.25)(force)
+    v, yaw_rate = np.zeros(len(t)), np.zeros(len(t))
+    for k in range(1, len(t)):  # a_r = v' + ω u - b ω', v = b ω - C u φ: solved for ω
+        v_rear = -compliance * speed[k] * slip[k]
+        before = v[k - 1] - rear * yaw_rate[k - 1]
+        yaw_rate[k] = (force[k] - (v_rear - before) / dt) / speed[k]
+        v[k] = rear * yaw_rate[k] + v_rear
+    ay, ax = np.gradient(v, dt) + yaw_rate * speed, np.gradient(speed, dt) - yaw_rate * v
+    measured = np.column_stack([yaw_rate, speed, (ay + offset) / (1.0 - leakage), ax + 0.05])
+    measured = np.column_stack([np.convolve(one, np.ones(fine) / fine, mode="same") for one in measured.T])
+    late = np.interp(t - delay, t, measured[:, 0])
+    samples = np.column_stack([late, measured[:, 1:]])[::fine]
+    samples += noise * rng.normal(size=samples.shape) * [0.002, 0.05, 0.05, 0.05]
+    return np.ascontiguousarray(samples), v[::fine]
+
+
+def plain_filter(model, samples):
+    """One filter of the bank with matrices, its axle's derivatives by central differences; the size of its error from itself alone."""
+    n, (mean, deviation) = model.numbers(), model.prior
+    (grip,) = model.grips
+    x, p = mean.copy(), np.diag(deviation**2)
+    x[1] = samples[0, 1]
+    times = np.array([np.inf, np.inf, model.offset_ay_time, model.offset_ax_time, np.inf, np.inf, np.inf, model.axle_error_time])
+    decay, g = np.exp(-n.dt / (times * model.time_scale)), 1.0 - np.exp(-n.dt / n.axle_lag)
+    smooth, sums, last, found = samples[0].copy(), np.zeros(3), samples[0], np.empty((len(samples), 8))
+
+    def curve(force):
+        limit = np.sqrt(max(grip**2 - smooth[3] ** 2, (0.3 * grip) ** 2))
+        share = min(abs(force) / limit, n.largest_share)
+        return np.sign(force) * limit * (1.0 - (1.0 - share) ** n.exponent) / n.exponent, (1.0 - share) ** (n.exponent - 1.0)
+
+    for t, sample in enumerate(samples):
+        before = smooth[0]
+        smooth = smooth + g * (sample - smooth)
+        turning = (smooth[0] - before) / n.dt
+        r, ay, ax = ((last + sample) / 2.0)[[0, 2, 3]]
+        turn, speed = (last[0] * last[1] + sample[0] * sample[1]) / 2.0, sample[1]
+        sums = (1.0 - g) * (sums + n.dt * np.array([ay, turn, 1.0]))
+        phi, slope = curve((smooth[2] - x[2]) * (1.0 - x[4]) - x[5] * turning)
+        bent = n.axle_per_slip * abs(phi) + n.axle_per_bend * (slope - 1.0) + n.axle_per_slope * slope
+        size = n.axle_constant + speed * (n.axle_per_speed + n.compliance * bent)
+        a = np.eye(8)
+        a[0, 2], a[0, 4], a[1, 0], a[1, 3] = -n.dt, -n.dt * ay, n.dt * r, -n.dt
+        x, p = a @ x + np.array([n.dt * (ay - turn), n.dt * ax, *np.zeros(6)]), a @ p @ a.T
+        f, q = np.diag(decay), deviation**2 * (1.0 - decay**2)
+        x, p = mean * (1.0 - decay) + f @ x, f @ p @ f + np.diag(q)
+        p += np.diag([n.dt * (n.noise_vy**2 + (n.noise_delay * turning * speed) ** 2), n.dt * n.noise_vx**2, *np.zeros(6)])
+
+        def axle(x, smooth=smooth, sums=sums, turning=turning, size=size, speed=speed):
+            phi = curve((smooth[2] - x[2]) * (1.0 - x[4]) - x[5] * turning)[0]
+            return x[0] - (sums[0] * (1.0 - x[4]) - x[2] * sums[2] - sums[1]) - x[5] * smooth[0] + x[6] * speed * phi + size * x[7]
+
+        variance = n.axle_white**2 + n.axle_white_share * size**2
+        for measured, modelled, r_ in ((speed, lambda x: x[1], n.noise_speed**2), (0.0, axle, variance)):
+            row = np.array([(modelled(x + d) - modelled(x - d)) / 2e-6 for d in np.eye(8) * 1e-6])
+            residual, s = measured - modelled(x), row @ p @ row + r_
+            residual *= min(1.0, n.gate * np.sqrt(s) / max(abs(residual), 1e-300))
+            gain = p @ row / s
+            x, p = x + gain * residual, p - np.outer(gain, row @ p)
+        found[t], last = x, sample
+    return found
+
+
+def model_of(**settings):
+    return SelfCalibrating.from_config({"wheelbase": 2.7, "cg_to_rear_axle": 1.3} | settings)
+
+
+def test_filter_of_one_grip_limit_matches_plain_matrices():
+    samples, _ = drive(20.0)
+    model = model_of(grips=[12.0])
+    _, states, _ = model.trace(samples, model.first_state(samples[0], {}))
+    expected = plain_filter(model, samples)
+    largest = np.abs(expected).max(axis=0)
+    np.testing.assert_allclose(states[:, :8] / largest, expected / largest, rtol=0.0, atol=1e-6)
+
+
+def test_network_inside_is_the_one_that_comes_with_vehest():
+    samples, _ = drive(10.0)
+    recording = Recording("a", "a", RATE, 0.0, dict(zip(("yaw_rate", "vx", "ay", "ax"), samples.T, strict=True)))
+    expected = load_model(pretrained_folder()).estimate([recording])[0]["vy"]
+    model = model_of(network_odds=1e12, lateral_power=0.0, longitudinal_power=0.0, minimum_speed=1.0)
+    vy = model.estimate([recording])[0]["vy"]
+    np.testing.assert_allclose(vy[30:], expected[30:], atol=2e-5)  # its weights and arithmetic are single there
+
+
+def test_finds_the_rear_axle_and_tells_how_well():
+    z_scores = []
+    for seed in range(6):
+        truth = {"compliance": 0.004 + 0.0008 * seed, "leakage": 0.06 - 0.02 * seed, "offset": 0.1 * (seed - 2)}
+        samples, vy = drive(90.0, seed, **truth)
+        model = model_of()
+        found, states, _ = model.trace(samples, model.first_state(samples[0], {}))
+        last = states[-1]
+        z_scores.append((last[kernel.COMPLIANCE] - truth["compliance"]) / np.sqrt(last[8 + kernel.COMPLIANCE]))
+        late = slice(round(30.0 * RATE), None)
+        assert np.std(states[late, kernel.V] - vy[late]) < 0.3 * np.std(vy[late])
+        assert np.std(found[late, 0] - vy[late]) < 0.4 * np.std(vy[late])
+        assert abs(states[-1, kernel.LEAKAGE] - truth["leakage"]) < 2.0 * np.sqrt(states[-1, 8 + kernel.LEAKAGE])
+    assert np.sqrt(np.mean(np.square(z_scores))) < 2.0
+
+
+def test_keeps_priors_and_a_wide_band_where_nothing_tells_them():
+    straight = np.column_stack([np.zeros(1200), np.full(1200, 30.0), np.zeros(1200), np.zeros(1200)])
+    straight += np.random.default_rng(0).normal(size=straight.shape) * [0.001, 0.05, 0.03, 0.03]
+    model = model_of()
+    mean, deviation = model.prior
+    found, states, _ = model.trace(straight, model.first_state(straight[0], {}))
+    for state in (kernel.LEAKAGE, kernel.REAR, kernel.COMPLIANCE):
+        assert abs(states[-1, state] - mean[state]) < 0.5 * deviation[state]
+        assert np.sqrt(states[-1, 8 + state]) > 0.7 * deviation[state]
+    assert np.abs(found[:, 0]).max() < np.radians(0.3) * 30.0
+
+
+def test_standstill_has_no_lateral_velocity_and_teaches_nothing():
+    samples, _ = drive(20.0)
+    parked = np.column_stack([np.zeros((400, 2)), np.full(400, 0.3), np.full(400, 0.2)])
+    model = model_of()
+    _, moved, state = model.trace(samples, model.first_state(samples[0], {}))
+    found, states, _ = model.trace(parked, state)
+    assert np.abs(found[40:, 0]).max() < 0.02
+    np.testing.assert_array_equal(states[40:, kernel.COMPLIANCE], states[40, kernel.COMPLIANCE])
+    assert states[-1, kernel.COMPLIANCE] == pytest.approx(moved[-1, kernel.COMPLIANCE], rel=1e-9)
+
+
+def test_goes_without_ax():
+    samples, vy = drive(60.0)
+    model = model_of(measured_ax=False)
+    assert model.channels == ("yaw_rate", "vx", "ay")
+    found, _, _ = model.trace(samples[:, :3], model.first_state(samples[0, :3], {}))
+    assert np.std(found[400:, 0] - vy[400:]) < 0.5 * np.std(vy[400:])
+
+
+def test_file_of_choices_holds_every_setting():
+    written = yaml.safe_load((ROOT / "conf/estimator/self_calibrating.yaml").read_text(encoding="utf-8"))["estimator"]
+    assert written.pop("name") == "self_calibrating"
+    assert SelfCalibrating.from_config(written).settings == SelfCalibrating.from_config({}).settings
+    assert set(written) == set(vars(SelfCalibrating.from_config({}).settings))
+
+
+def test_refuses_a_centre_of_gravity_outside_of_the_wheelbase():
+    with pytest.raises(ConfigurationError, match="cg_to_rear_axle must lie between 0 and the wheelbase"):
+        model_of(cg_to_rear_axle=3.0)
+    with pytest.raises(ConfigurationError, match="grips must be positive"):
+        model_of(grips=[9.0, -1.0])
+
+
+def test_refuses_weights_of_another_network():
+    model = model_of()
+    with pytest.raises(DataError, match="weights of 'self_calibrating' must be network, yaw_rate_max"):
+        model.load_weights({"network": np.zeros((3, 20)), "yaw_rate_max": np.ones(1)})
