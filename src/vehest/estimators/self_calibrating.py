@@ -11,12 +11,12 @@ from typing import Any
 
 import numpy as np
 
-import vehest
 from vehest.constants import FloatArray
 from vehest.data.errors import ConfigurationError, DataError
 from vehest.declared import setting
 from vehest.estimators.base import rate
 from vehest.estimators.kernels import self_calibrating as kernel
+from vehest.estimators.kernels.ksnn import packed
 from vehest.estimators.ksnn import Ksnn
 from vehest.estimators.model_files import load_model
 from vehest.estimators.recursive import Recursive
@@ -192,10 +192,8 @@ def _numbers_type(names: Sequence[str]) -> Any:
 @cache
 def _shipped_network() -> tuple[FloatArray, float]:
     """Rows of the network that comes with vehest, (P, 8 + 6 Q), and the yaw rate of its last local model [rad/s]."""
-    model = load_model(Path(vehest.__file__).parent / "pretrained")
-    network = model.network  # type: ignore[attr-defined]
-    rows = network._packed(dict(network.named_parameters())).detach().double().numpy()
-    return np.ascontiguousarray(rows), float(network.yaw_rate_max)
+    weights = load_model(Path(__file__).parents[1] / "pretrained").weights()
+    return packed(np, {name: values.astype(np.float64) for name, values in weights.items()}), float(weights["yaw_rate_max"])
 
 
 ESTIMATOR = SelfCalibrating

@@ -138,9 +138,15 @@ def differences_of_blocks(pairs: Sequence[Pair], sizes: FloatArray, *, n_resampl
         dof = _degrees_of_freedom(pair, sizes, means)
         with np.errstate(invalid="ignore"):
             root = float(np.sqrt(means[0].mean()) - np.sqrt(means[1].mean()))
-        mean, median = float(means[0].mean() - means[1].mean()), float(np.median(means[0]) - np.median(means[1]))
-        intervals = [_interval(value, own, dof) for value, own in zip((mean, median, root), drawn, strict=True)]
-        found.append(Difference(*intervals, n_blocks=len(sizes), dof=dof))
+        found.append(
+            Difference(
+                mean=_interval(float(means[0].mean() - means[1].mean()), drawn[0], dof),
+                median=_interval(float(np.median(means[0]) - np.median(means[1])), drawn[1], dof),
+                root=_interval(root, drawn[2], dof),
+                n_blocks=len(sizes),
+                dof=dof,
+            )
+        )
     return found
 
 
