@@ -45,10 +45,9 @@ RENAMED = {
     STANDARD: {paper.DATA: paper.Z_SCORES},
 }
 """Part -> what its candidates are called beside those of the full set."""
-ORACLES = (paper.ORACLE_FILTER, paper.ORACLE_DISTRUST)
 NETWORKS = (paper.DATA, paper.Z_SCORES, paper.RECURRENT)
 """Networks without a filter, in a table of their own."""
-IN_TABLE_II = tuple(name for name in paper.CANDIDATES if name not in ORACLES)
+IN_TABLE_II = tuple(name for name in paper.CANDIDATES if name not in tables.ORACLES)
 
 
 def documents(artefacts: StudyArtefacts) -> dict[str, Document]:
@@ -339,7 +338,7 @@ def _networks_and_oracles(parts: Mapping[str, Runs], prepared: Mapping[str, Prep
         blocks.append(tables.accuracy(ManoeuvreErrors(known | also, "test"), {}, training, "networks_alone", caption))
     if any(map(search.is_point, parts)):
         blocks.append(search.search_table(parts, parts[FULL], words))
-    oracles_alone = ManoeuvreErrors({name: main.runs[name] for name in (*ORACLES, paper.CNN) if name in main}, "test")
+    oracles_alone = ManoeuvreErrors({name: main.runs[name] for name in (*tables.ORACLES, paper.CNN) if name in main}, "test")
     caption = f"Oracles, which know the test: what better constants and a perfect distrust would be worth. Data: {words}."
     return [*blocks, "## Appendix: oracles", tables.accuracy(oracles_alone, {}, {}, "oracles", caption)]
 

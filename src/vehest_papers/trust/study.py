@@ -22,6 +22,7 @@ from vehest.report.reliability import Reliability, reliability_figure
 from vehest.report.style import lines_of, listed
 from vehest.studies.artefacts import PartArtefacts, StudyArtefacts
 from vehest.studies.drive import appendix_of
+from vehest.studies.kit.bands import COVERAGES
 from vehest.studies.kit.runs import by_name
 from vehest.trust.bands import LEVELS, OTHER_VEHICLE
 from vehest_papers.kit.reading import sideslip_error
@@ -35,7 +36,6 @@ SHOWS_FAILED = True
 
 OTHER = "another"
 FIGURES = ("coverage_90_p10", "coverage_90_p90", "width_90", "interval_score", "error_icc", "band_blocks", "rmse_sideslip")
-COVERAGES = tuple(f"coverage_{100 * level:.0f}" for level in LEVELS)
 SHOWN = ("ksnn", "gru", "kalman", "rational_ekf", "static_map")
 """Families of the figures."""
 
