@@ -147,7 +147,7 @@ def differences_of_blocks(pairs: Sequence[Pair], sizes: FloatArray, *, n_resampl
             root = float(np.sqrt(means[0].mean()) - np.sqrt(means[1].mean()))
         mean, median = float(means[0].mean() - means[1].mean()), float(np.median(means[0]) - np.median(means[1]))
         intervals = [_interval(value, own, dof) for value, own in zip((mean, median, root), drawn, strict=True)]
-        found.append(Difference(*intervals, n_blocks=len(sizes), dof=dof))
+        found.append(Difference(intervals[0], intervals[1], intervals[2], n_blocks=len(sizes), dof=dof))
     return found
 
 
