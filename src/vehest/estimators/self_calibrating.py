@@ -42,6 +42,8 @@ class SelfCalibrating(Recursive):
     covariance_of = ("vy",)
     channels: tuple[str, ...] = ("yaw_rate", "vx", "ay", "ax")  # type: ignore[misc]  # ax may be absent
     notice = Ksnn.notice
+    template = "self_calibrating"
+    refuses = ("NaN", "infinite")
     rate_hz: float = rate(20.0)
     wheelbase: float = setting(TYPICAL_WHEELBASE, "wheelbase", unit="m", positive=True)
     cg_to_rear_axle: float = setting(None, "distance of the centre of gravity from the rear axle; null: 0.48 wheelbases", unit="m")
@@ -120,6 +122,12 @@ class SelfCalibrating(Recursive):
         return mean, np.array([0.3, self.noise_speed, self.offset_ay, self.offset_ax, *own])
 
     @property
+    def decay(self) -> FloatArray:
+        """Factors by which states return to the prior in a sample, (8,)."""
+        times = np.array([np.inf, np.inf, self.offset_ay_time, self.offset_ax_time, np.inf, np.inf, np.inf, self.axle_error_time])
+        return np.exp(-1.0 / (self.rate_hz * times * self.time_scale))
+
+    @property
     def time_scale(self) -> float:
         """√(wheelbase / 2.7 m), by which time constants are multiplied."""
         return math.sqrt(self.wheelbase / TYPICAL_WHEELBASE)
@@ -157,16 +165,35 @@ class SelfCalibrating(Recursive):
         """vy and its variance, (T, 2), means and variances of the states over the bank, (T, 16), and the state after the last sample."""
         state = kernel.State(*(part.copy() for part in state))
         mean, deviation = self.prior
-        times = np.array([np.inf, np.inf, self.offset_ay_time, self.offset_ax_time, np.inf, np.inf, np.inf, self.axle_error_time])
-        decay = np.exp(-1.0 / (self.rate_hz * times * self.time_scale))
         found, parameters = np.empty((len(samples), 2)), np.empty((len(samples), 2 * kernel.STATES))
         grips = np.array(self.grips, dtype=np.float64)
-        kernel.scan(self.numbers(), grips, mean, deviation, decay, self._network, state, self._four(samples), found, parameters)
+        kernel.scan(self.numbers(), grips, mean, deviation, self.decay, self._network, state, self._four(samples), found, parameters)
         return found, parameters, state
 
     def _four(self, samples: FloatArray) -> FloatArray:
         """Samples with a column for ax, also where it is not measured."""
         return np.ascontiguousarray(samples if self.measured_ax else np.column_stack([samples, np.zeros(len(samples))]))
+
+    def c_values(self) -> dict[str, Any]:
+        """Numbers, priors and the network."""
+        n, (mean, deviation), grips = self.numbers(), self.prior, np.array(self.grips)
+        gains = {"g": n.axle_lag, "g_1": n.residual_time, "g_slow": n.slow_time}
+        numbers = n._asdict() | {name: -math.expm1(-n.dt / time) for name, time in gains.items()}
+        return {
+            "numbers": numbers,
+            "grips": grips,
+            "start": -0.5 * np.square(np.log(grips / n.grip) / n.grip_deviation),
+            "prior": mean,
+            "spread": deviation,
+            "decay": self.decay,
+            "odds": np.log([1.0, n.network_odds, n.steady_odds]),
+            "theta": self._network,
+            "window": WINDOW,
+            "measured_ax": self.measured_ax,
+            "least_limit": kernel.LEAST_LIMIT,
+            "largest_leakage": kernel.LARGEST_LEAKAGE,
+            "rolling": kernel.ROLLING,
+        }
 
     def weights(self) -> dict[str, np.ndarray[Any, Any]]:
         """The network's rows, and the yaw rate of its last local model."""
