@@ -28,7 +28,7 @@ SCALED = {
     **dict.fromkeys(("minimum_speed", "noise_speed", "axle_constant", "axle_white", "residual_floor"), 0.5),
     **{"noise_vy": 0.25, "noise_vx": 0.25, "noise_delay": 0.75},
 }
-"""Powers of the wheelbase over the typical one by which settings are scaled: times and speeds go with its root where accelerations are alike."""
+"""Powers of the wheelbase over the typical one that scale settings: times and speeds go with its root, accelerations are alike."""
 WINDOW = 30  # samples that the network sees
 UNMEASURED = 20.0  # m/s per √s: process noise of u where ax is not measured
 
