@@ -23,7 +23,7 @@ from vehest.data.recording import Recording
 from vehest.data.store import read_recording
 from vehest.estimators.base import Estimator
 from vehest.estimators.data_sheet import DataSheet
-from vehest.estimators.self_calibrating import TYPICAL_REAR, SelfCalibrating
+from vehest.estimators.self_calibrating import TYPICAL_REAR, TYPICAL_WHEELBASE, SelfCalibrating
 from vehest.report.style import fixed
 from vehest.run.config import compose_config
 from vehest.run.console import Messages
@@ -40,6 +40,7 @@ BLOCK = round(10.0 * RATE)  # samples of a block of the bootstrap
 CHANNELS = ("yaw_rate", "vx", "ay", "ax")
 ABLATIONS: dict[str, dict[str, Any]] = {
     "cold": {},
+    "car not given": {"wheelbase": TYPICAL_WHEELBASE, "cg_to_rear_axle": None},
     "bank alone": {"network_odds": 1e-9, "steady_odds": 1e-9},
     "no saturation": {"grips": [1000.0]},
     "no longitudinal equation": {"measured_ax": False},
@@ -146,12 +147,10 @@ def rmse(drives: Sequence[Errors], name: str) -> float:
     return float(np.sqrt(np.mean(np.concatenate([drive.sideslip[name] for drive in drives]))))
 
 
-def ratio_interval(drives: Sequence[Errors], rounds: int = 4000) -> tuple[float, float]:
-    """95 % interval of RMSE(β) cold over shipped, by a bootstrap over blocks of 10 s."""
+def ratio_interval(drives: Sequence[Errors], name: str = "cold", rounds: int = 4000) -> tuple[float, float]:
+    """95 % interval of RMSE(β) over that of the shipped model, by a bootstrap over blocks of 10 s."""
     sums = [
-        [part.sum() for part in np.array_split(d.sideslip[name], max(1, len(d.time) // BLOCK))]
-        for name in ("cold", "shipped")
-        for d in drives
+        [part.sum() for part in np.array_split(d.sideslip[one], max(1, len(d.time) // BLOCK))] for one in (name, "shipped") for d in drives
     ]
     own, shipped = (np.concatenate([np.array(row) for row in part]) for part in (sums[: len(drives)], sums[len(drives) :]))
     drawn = np.random.default_rng(0).integers(0, len(own), (rounds, len(own)))
@@ -193,7 +192,8 @@ def report(found: Mapping[Car, Sequence[Errors]]) -> str:
     """The page."""
     ratios = {car: ratio_interval(drives) for car, drives in found.items() if np.isfinite(rmse(drives, "shipped"))}
     judged = [car for car in ratios if car.title in SHIPS_ON]
-    ships = len(judged) == len(SHIPS_ON) and all(ratios[car][1] <= LARGEST_RATIO for car in judged)
+    limits = {car.title: ratio_interval(found[car], "car not given")[1] for car in judged}
+    ships = len(judged) == len(SHIPS_ON) and max(limits.values()) <= LARGEST_RATIO
     methods = ["v = 0", "data sheet", "shipped", "self-calibrating", "map with reference"]
     heads = ["car", "choices", *methods, "over shipped", "FVU, median (worst)", "band holds"]
     rows, drives_below = [], []
@@ -218,12 +218,12 @@ def report(found: Mapping[Car, Sequence[Errors]]) -> str:
         [
             "# A car that nobody has trained on",
             "",
-            f"Self-calibrating filter with the choices of [one file](../../{CHOICES}), started cold on every drive. It {verdict} the rule",
-            f"for `vehest estimate`: the upper 95 % limit of its RMSE(β) over the shipped model's is at most {LARGEST_RATIO} on each of",
-            f"{', '.join(SHIPS_ON)}. It is better than v = 0 on {sum(drives_below)} of {len(drives_below)} drives.",
-            "Figures are RMSE(β) [deg] where the car moves; intervals are a bootstrap over blocks of 10 s; the map v = r(b - k u²) was fitted",
-            "to the reference of the same drive. Cars on which choices were made are development cars: their figures are no evidence for",
-            "another car.",
+            f"Self-calibrating filter with the choices of [one file](../../{CHOICES}), started cold on every drive. It {verdict}",
+            "the rule for `vehest estimate`: without wheelbase, the upper 95 % limit of its RMSE(β) over the shipped model's is at most",
+            f"{LARGEST_RATIO} on each of {', '.join(f'{name} ({fixed(limit, 2)})' for name, limit in limits.items())}.",
+            f"With wheelbase it is better than v = 0 on {sum(drives_below)} of {len(drives_below)} drives. Figures are RMSE(β) [deg] where",
+            "the car moves; intervals are a bootstrap over blocks of 10 s; the map v = r(b - k u²) was fitted to the reference of the same",
+            "drive. Cars on which choices were made are development cars: their figures are no evidence for another car.",
             "",
             *table(heads, rows),
             "",
