@@ -48,7 +48,7 @@ def plain_filter(model, samples):
     x, p = mean.copy(), np.diag(deviation**2)
     x[1] = samples[0, 1]
     times = np.array([np.inf, np.inf, model.offset_ay_time, model.offset_ax_time, np.inf, np.inf, np.inf, model.axle_error_time])
-    decay, g = np.exp(-n.dt / (times * model.time_scale)), 1.0 - np.exp(-n.dt / n.axle_lag)
+    decay, g = np.exp(-n.dt / times), 1.0 - np.exp(-n.dt / n.axle_lag)
     smooth, sums, last, found = samples[0].copy(), np.zeros(3), samples[0], np.empty((len(samples), 8))
 
     def curve(force):

@@ -21,8 +21,14 @@ from vehest.estimators.ksnn import Ksnn
 from vehest.estimators.model_files import load_model
 from vehest.estimators.recursive import Recursive
 
-TYPICAL_WHEELBASE = 2.7  # m: time constants grow with the square root of the wheelbase over it
+TYPICAL_WHEELBASE = 2.7  # m
 TYPICAL_REAR = 0.48  # of the wheelbase, where the centre of gravity is not given
+SCALED = {
+    **dict.fromkeys(("axle_lag", "residual_time", "slow_time", "memory", "decision_time"), 0.5),
+    **dict.fromkeys(("minimum_speed", "noise_speed", "axle_constant", "axle_white", "residual_floor"), 0.5),
+    **{"noise_vy": 0.25, "noise_vx": 0.25, "noise_delay": 0.75},
+}
+"""Powers of the wheelbase over the typical one that scale settings: times and speeds go with its root, accelerations are alike."""
 WINDOW = 30  # samples that the network sees
 UNMEASURED = 20.0  # m/s per √s: process noise of u where ax is not measured
 
@@ -42,6 +48,8 @@ class SelfCalibrating(Recursive):
     covariance_of = ("vy",)
     channels: tuple[str, ...] = ("yaw_rate", "vx", "ay", "ax")  # type: ignore[misc]  # ax may be absent
     notice = Ksnn.notice
+    template = "self_calibrating"
+    refuses = ("NaN", "infinite")
     rate_hz: float = rate(20.0)
     wheelbase: float = setting(TYPICAL_WHEELBASE, "wheelbase", unit="m", positive=True)
     cg_to_rear_axle: float = setting(None, "distance of the centre of gravity from the rear axle; null: 0.48 wheelbases", unit="m")
@@ -52,23 +60,23 @@ class SelfCalibrating(Recursive):
     exponent: float = setting(0.25, "p of the axle's curve", above=0.0, most=1.0)
     largest_share: float = setting(0.98, "of the grip limit at which the curve is cut off", above=0.0, below=1.0)
     compliance: float = setting(0.0051, "prior of C", unit="rad s²/m", positive=True)
-    compliance_deviation: float = setting(0.3, "its deviation over C", positive=True)
+    compliance_deviation: float = setting(0.4, "its deviation over C", positive=True)
     leakage: float = setting(0.015, "prior of κ", least=-0.5, most=0.5)
     leakage_deviation: float = setting(0.03, "its deviation", positive=True)
     rear_deviation: float = setting(0.1, "deviation of b over the wheelbase where the centre of gravity is not given", positive=True)
     imu_deviation: float = setting(0.05, "deviation of the inertial unit's place over the wheelbase, where it is", positive=True)
     rear_share: float = setting(
-        0.5, "of b found over typical by which vy is moved to the typical point, where it is not given", least=0.0, most=1.0
+        0.3, "of b found over typical by which vy is moved to the typical point, where it is not given", least=0.0, most=1.0
     )
     offset_ay: float = setting(0.65, "deviation of β_y", unit="m/s²", positive=True)
     offset_ay_time: float = setting(20.0, "time constant of β_y", unit="s", positive=True)
     offset_ax: float = setting(0.2, "deviation of β_x", unit="m/s²", positive=True)
     offset_ax_time: float = setting(15.0, "time constant of β_x", unit="s", positive=True)
     noise_vy: float = setting(0.05, "process noise of v over a second", unit="m/s", positive=True)
-    noise_delay: float = setting(0.05, "process noise of v over a second, over what u ω changes in it", unit="s", least=0.0)
+    noise_delay: float = setting(0.03, "process noise of v for each m/s³ by which u ω changes", unit="√s³", least=0.0)
     noise_vx: float = setting(0.1, "process noise of u over a second", unit="m/s", positive=True)
     noise_speed: float = setting(0.15, "deviation of the measured speed", unit="m/s", positive=True)
-    axle_lag: float = setting(0.25, "low-pass of v, ω and ay in the axle's equation", unit="s", positive=True)
+    axle_lag: float = setting(0.3, "low-pass of v, ω and ay in the axle's equation", unit="s", positive=True)
     axle_error_time: float = setting(1.0, "time constant of e", unit="s", positive=True)
     axle_constant: float = setting(0.007, "size s of the axle's error: constant", unit="m/s", positive=True)
     axle_per_speed: float = setting(0.0009, "size over speed", least=0.0)
@@ -84,8 +92,8 @@ class SelfCalibrating(Recursive):
     residual_time: float = setting(1.0, "high-pass of v in the candidates' residuals", unit="s", positive=True)
     slow_time: float = setting(20.0, "high-pass of the residuals", unit="s", positive=True)
     residual_floor: float = setting(0.03, "residual below which candidates are alike", unit="m/s", positive=True)
-    lateral_power: float = setting(5.0, "power by which the residual of v' counts", least=0.0)
-    longitudinal_power: float = setting(3.0, "power by which the residual of u' counts", least=0.0)
+    lateral_power: float = setting(6.0, "power by which the residual of v' counts", least=0.0)
+    longitudinal_power: float = setting(4.0, "power by which the residual of u' counts", least=0.0)
     decision_time: float = setting(10.0, "driving after which residuals count", unit="s", positive=True)
     network_odds: float = setting(1.2, "weight of the network over the bank's at the start", positive=True)
     steady_odds: float = setting(0.2, "weight of steady cornering over the bank's at the start", positive=True)
@@ -120,16 +128,18 @@ class SelfCalibrating(Recursive):
         return mean, np.array([0.3, self.noise_speed, self.offset_ay, self.offset_ax, *own])
 
     @property
-    def time_scale(self) -> float:
-        """√(wheelbase / 2.7 m), by which time constants are multiplied."""
-        return math.sqrt(self.wheelbase / TYPICAL_WHEELBASE)
+    def decay(self) -> FloatArray:
+        """Factors by which states return to the prior in a sample, (8,)."""
+        times = np.array([np.inf, np.inf, self.offset_ay_time, self.offset_ax_time, np.inf, np.inf, np.inf, self.axle_error_time])
+        return np.exp(-1.0 / (self.rate_hz * times * math.sqrt(self.wheelbase / TYPICAL_WHEELBASE)))
 
     def numbers(self) -> Any:
         """What the compiled recursion takes: numeric settings, times scaled, and what follows from them."""
         own = {name: float(value) for name, value in vars(self.settings).items() if isinstance(value, int | float)}
         own |= {"dt": 1.0 / self.rate_hz, "rear": self.rear, "rear_known": 1.0 if self.cg_to_rear_axle is not None else self.rear_share}
-        own |= {"axle_lag": self.axle_lag * self.time_scale, "yaw_rate_max": self._width, "without_ax": float(not self.measured_ax)}
+        own |= {"yaw_rate_max": self._width, "without_ax": float(not self.measured_ax)}
         own.pop("cg_to_rear_axle", None)
+        own |= {name: own[name] * (self.wheelbase / TYPICAL_WHEELBASE) ** power for name, power in SCALED.items()}
         if not self.measured_ax:
             own |= {"noise_vx": UNMEASURED, "longitudinal_power": 0.0}
         return _numbers_type(tuple(own))(*own.values())
@@ -157,16 +167,35 @@ class SelfCalibrating(Recursive):
         """vy and its variance, (T, 2), means and variances of the states over the bank, (T, 16), and the state after the last sample."""
         state = kernel.State(*(part.copy() for part in state))
         mean, deviation = self.prior
-        times = np.array([np.inf, np.inf, self.offset_ay_time, self.offset_ax_time, np.inf, np.inf, np.inf, self.axle_error_time])
-        decay = np.exp(-1.0 / (self.rate_hz * times * self.time_scale))
         found, parameters = np.empty((len(samples), 2)), np.empty((len(samples), 2 * kernel.STATES))
         grips = np.array(self.grips, dtype=np.float64)
-        kernel.scan(self.numbers(), grips, mean, deviation, decay, self._network, state, self._four(samples), found, parameters)
+        kernel.scan(self.numbers(), grips, mean, deviation, self.decay, self._network, state, self._four(samples), found, parameters)
         return found, parameters, state
 
     def _four(self, samples: FloatArray) -> FloatArray:
         """Samples with a column for ax, also where it is not measured."""
         return np.ascontiguousarray(samples if self.measured_ax else np.column_stack([samples, np.zeros(len(samples))]))
+
+    def c_values(self) -> dict[str, Any]:
+        """Numbers, priors and the network."""
+        n, (mean, deviation), grips = self.numbers(), self.prior, np.array(self.grips)
+        gains = {"g": n.axle_lag, "g_1": n.residual_time, "g_slow": n.slow_time}
+        numbers = n._asdict() | {name: -math.expm1(-n.dt / time) for name, time in gains.items()}
+        return {
+            "numbers": numbers,
+            "grips": grips,
+            "start": -0.5 * np.square(np.log(grips / n.grip) / n.grip_deviation),
+            "prior": mean,
+            "spread": deviation,
+            "decay": self.decay,
+            "odds": np.log([1.0, n.network_odds, n.steady_odds]),
+            "theta": self._network,
+            "window": WINDOW,
+            "measured_ax": self.measured_ax,
+            "least_limit": kernel.LEAST_LIMIT,
+            "largest_leakage": kernel.LARGEST_LEAKAGE,
+            "rolling": kernel.ROLLING,
+        }
 
     def weights(self) -> dict[str, np.ndarray[Any, Any]]:
         """The network's rows, and the yaw rate of its last local model."""

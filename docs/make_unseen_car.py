@@ -1,0 +1,273 @@
+"""Write results/unseen_car: the self-calibrating filter on cars on which nothing was trained, beside the model that comes with vehest.
+
+Run by ``make unseen_car``. It refuses choices that are not committed, and appends to openings.csv which cars were scored.
+"""
+
+from __future__ import annotations
+
+import argparse
+import csv
+import os
+import subprocess
+from collections.abc import Iterator, Mapping, Sequence
+from fnmatch import fnmatchcase
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import scipy.io
+
+from vehest.constants import FloatArray
+from vehest.data.errors import MissingError
+from vehest.data.recording import Recording
+from vehest.data.store import read_recording
+from vehest.estimators.base import Estimator
+from vehest.estimators.data_sheet import DataSheet
+from vehest.estimators.self_calibrating import TYPICAL_REAR, TYPICAL_WHEELBASE, SelfCalibrating
+from vehest.report.style import fixed
+from vehest.run.config import compose_config
+from vehest.run.console import Messages
+from vehest.run.downsample import resampled
+from vehest.run.estimate import open_model
+from vehest.run.runner import Runner
+from vehest.run.signals import StopSignals
+
+ROOT = Path(__file__).resolve().parents[1]
+CHOICES = "conf/estimator/self_calibrating.yaml"
+TARGET = ROOT / "results" / "unseen_car"
+RATE = 20.0
+BLOCK = round(10.0 * RATE)  # samples of a block of the bootstrap
+CHANNELS = ("yaw_rate", "vx", "ay", "ax")
+ABLATIONS: dict[str, dict[str, Any]] = {
+    "cold": {},
+    "car not given": {"wheelbase": TYPICAL_WHEELBASE, "cg_to_rear_axle": None},
+    "bank alone": {"network_odds": 1e-9, "steady_odds": 1e-9},
+    "no saturation": {"grips": [1000.0]},
+    "no longitudinal equation": {"measured_ax": False},
+    "fixed rear axle": {"grips": [14.0], "compliance_deviation": 1e-3},
+    "no roll leakage": {"leakage": 0.0, "leakage_deviation": 1e-4},
+}
+
+
+class Car(NamedTuple):
+    """A car with its drives."""
+
+    title: str
+    origin: str  # real | simulated
+    development: bool  # whether choices were made on it
+    wheelbase: float
+    cg_to_rear_axle: float | None
+    dataset: str
+    drives: str = "*"
+    overrides: tuple[str, ...] = ()
+    slowest: float = 5.0  # m/s, below which nothing is scored
+
+
+FIRST = tuple(f"dataset.drives.{at}.count=1" for at in range(5))
+CARS = (
+    Car("Ferrari 250 LM", "real", True, 2.4, 1.07, "ferrari_250lm"),
+    Car("Volvo S90", "real", True, 2.941, 1.291, "s90"),
+    Car("Audi TTS, no ax", "real", True, 2.468, 1.45, "stanford_tts"),
+    Car("DevBot, by TUM", "simulated", True, 3.0, None, "tum"),
+    Car("Corvette Grand Sport", "simulated", True, 2.49, 1.19, "sim_race_cars", "c*", FIRST),
+    Car("Ferrari 250 LM-like", "simulated", True, 2.4, 1.07, "sim_race_cars", "f*", FIRST),
+    Car("Jaguar E-type-like", "simulated", True, 2.44, None, "sim_race_cars", "j*", FIRST),
+    Car("BMW 545i", "simulated", False, 2.88, 1.41, "sim_bmw_unseen", "unseen_*"),
+    Car("F1TENTH, 1:8", "real", False, 0.33, 0.115, "f1tenth", slowest=1.0),
+    Car("DART, 1:10", "real", False, 0.175, 0.094, "dart", slowest=0.5),
+    Car("RoboRacer, 1:10", "real", False, 0.33, None, "roboracer", slowest=0.5),
+)
+SHIPS_ON = ("Ferrari 250 LM", "DevBot, by TUM", "Corvette Grand Sport", "BMW 545i")
+LARGEST_RATIO = 1.1
+
+
+class Errors(NamedTuple):
+    """Of one drive: squared errors of β and v by method, (T,), shares within the 90 % band, and the reference."""
+
+    drive: str
+    sideslip: Mapping[str, FloatArray]
+    vy: Mapping[str, FloatArray]
+    within: FloatArray
+    reference: FloatArray
+    time: FloatArray
+
+
+def drives_of(car: Car, runner: Runner, root: str) -> Iterator[Recording]:
+    """Its recordings at the filter's rate, with the reference."""
+    if car.dataset == "stanford_tts":
+        for file in sorted((Path(root) / "stanford_tts").glob("*.mat")):
+            held = {name: np.ravel(values).astype(float) for name, values in scipy.io.loadmat(file).items() if not name.startswith("_")}
+            speed, yaw_rate = held["Speed_mps"], held["YawRate_radps"]
+            ay = held["LateralAcceleration_mps2"] + 1.43 * np.gradient(
+                yaw_rate, 0.005
+            )  # measured that far behind the point of the sideslip
+            channels = {"yaw_rate": yaw_rate, "vx": speed, "ay": ay, "vy_ref": speed * np.tan(held["Sideslip_rad"])}
+            yield resampled(Recording(file.stem, "audi_tts", 200.0, 0.0, channels), RATE, {"method": "polyphase", "transforms": []})
+        return
+    made = runner.ingest(compose_config("ingest", [f"dataset={car.dataset}", f"root={root}", f"output={runner.output}", *car.overrides]))
+    for name in made.outputs:
+        if fnmatchcase(Path(name).stem, car.drives):
+            recording = read_recording(made.folder / name)
+            if {"yaw_rate", "vx", "ay", "vy_ref"} <= set(recording.channels) and recording.duration > 5.0:
+                yield resampled(recording, min(RATE, recording.rate_hz), {"method": "polyphase", "transforms": []})
+
+
+def models_of(car: Car, rate_hz: float, has_ax: bool) -> dict[str, Estimator]:
+    """The methods that are compared, by title."""
+    own = {"wheelbase": car.wheelbase, "cg_to_rear_axle": car.cg_to_rear_axle, "rate_hz": rate_hz}
+    sheet = {"wheelbase": car.wheelbase, "cg_to_rear_axle": car.cg_to_rear_axle or TYPICAL_REAR * car.wheelbase, "rate_hz": rate_hz}
+    filters = {name: SelfCalibrating.from_config(own | {"measured_ax": has_ax} | changed) for name, changed in ABLATIONS.items()}
+    return {"data sheet": DataSheet.from_config(sheet), **filters}
+
+
+def errors_of(car: Car, recording: Recording, shipped: Estimator) -> Errors:
+    """Squared errors of every method where the car moves; the map is v = r (b - k u²), fitted to this drive's own reference."""
+    speed, truth, has_ax = recording["vx"], recording["vy_ref"], "ax" in recording
+    ax = recording["ax"] if has_ax else np.gradient(speed, 1.0 / recording.rate_hz)
+    inputs = {"yaw_rate": recording["yaw_rate"], "vx": speed, "ay": recording["ay"], "ax": ax}
+    plain = Recording(recording.id, recording.vehicle, recording.rate_hz, 0.0, inputs)
+    moving = (speed > car.slowest) & np.isfinite(truth)
+    columns = np.column_stack([inputs["yaw_rate"], -inputs["yaw_rate"] * speed**2])
+    found = {"v = 0": np.zeros(len(speed)), "map": columns @ np.linalg.lstsq(columns[moving], truth[moving], rcond=None)[0]}
+    found["shipped"] = np.nan_to_num(shipped.estimate([plain])[0]["vy"]) if abs(plain.rate_hz - RATE) < 1e-9 else found["v = 0"] * np.nan
+    variance = np.zeros(len(speed))
+    for name, model in models_of(car, plain.rate_hz, has_ax).items():
+        estimate = model.estimate([plain.select(model.channels)])[0]
+        found[name] = estimate["vy"]
+        if name == "cold" and estimate.covariance is not None:
+            variance = estimate.covariance[:, 0, 0]
+    angle = {name: np.degrees(np.arctan2(vy, speed) - np.arctan2(truth, speed))[moving] ** 2 for name, vy in found.items()}
+    within = (np.abs(found["cold"] - truth) < 1.645 * np.sqrt(variance))[moving]
+    time = np.arange(len(speed))[moving] / plain.rate_hz
+    return Errors(recording.id, angle, {name: (vy - truth)[moving] ** 2 for name, vy in found.items()}, within, truth[moving], time)
+
+
+def rmse(drives: Sequence[Errors], name: str) -> float:
+    """Of β over all samples of some drives [deg]."""
+    return float(np.sqrt(np.mean(np.concatenate([drive.sideslip[name] for drive in drives]))))
+
+
+def ratio_interval(drives: Sequence[Errors], name: str = "cold", rounds: int = 4000) -> tuple[float, float]:
+    """95 % interval of RMSE(β) over that of the shipped model, by a bootstrap over blocks of 10 s."""
+    sums = [
+        [part.sum() for part in np.array_split(d.sideslip[one], max(1, len(d.time) // BLOCK))] for one in (name, "shipped") for d in drives
+    ]
+    own, shipped = (np.concatenate([np.array(row) for row in part]) for part in (sums[: len(drives)], sums[len(drives) :]))
+    drawn = np.random.default_rng(0).integers(0, len(own), (rounds, len(own)))
+    low, high = np.quantile(np.sqrt(own[drawn].sum(1) / shipped[drawn].sum(1)), [0.025, 0.975])
+    return float(low), float(high)
+
+
+def fvu(drive: Errors, name: str) -> float:
+    """Share of the variance of v that is left."""
+    return float(np.mean(drive.vy[name]) / np.var(drive.reference))
+
+
+def git(*words: str) -> str:
+    """What git answers, without the last line break."""
+    return subprocess.run(["git", *words], cwd=ROOT, check=True, capture_output=True, text=True).stdout.strip()
+
+
+def open_cars(cars: Sequence[str]) -> None:
+    """Append what is scored to openings.csv; raises SystemExit where the choices are not committed."""
+    if git("status", "--porcelain", "--", CHOICES, "src/vehest/estimators"):
+        raise SystemExit(f"{CHOICES} or the estimators have changes that are not committed; commit them, then open the cars")
+    file, commit = TARGET / "openings.csv", git("rev-parse", "HEAD")
+    rows = list(csv.DictReader(file.open(encoding="utf-8"))) if file.exists() else []
+    changed = git("diff", "-U0", rows[-1]["commit"], commit, "--", CHOICES).splitlines() if rows else []
+    names = sorted({line[1:].split(":")[0].strip() for line in changed if line[:1] == "+" and line[1:2] == " "})
+    rows.append({"commit": commit, "cars": "; ".join(cars), "chosen_since": " ".join(names) if rows else "everything"})
+    with file.open("w", encoding="utf-8", newline="") as out:
+        writer = csv.DictWriter(out, list(rows[-1]), lineterminator="\n")
+        writer.writeheader()
+        writer.writerows(rows)
+
+
+def table(heads: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str]:
+    """A Markdown table."""
+    return [f"| {' | '.join(row)} |" for row in (heads, [":--", *["--:"] * (len(heads) - 1)], *rows)]
+
+
+def report(found: Mapping[Car, Sequence[Errors]]) -> str:
+    """The page."""
+    ratios = {car: ratio_interval(drives) for car, drives in found.items() if np.isfinite(rmse(drives, "shipped"))}
+    judged = [car for car in ratios if car.title in SHIPS_ON]
+    limits = {car.title: ratio_interval(found[car], "car not given")[1] for car in judged}
+    ships = len(judged) == len(SHIPS_ON) and max(limits.values()) <= LARGEST_RATIO
+    methods = ["v = 0", "data sheet", "shipped", "self-calibrating", "map with reference"]
+    heads = ["car", "choices", *methods, "over shipped", "FVU, median (worst)", "band holds"]
+    rows, drives_below = [], []
+    for car, drives in found.items():
+        shares = [fvu(drive, "cold") for drive in drives]
+        drives_below += [rmse([drive], "cold") < rmse([drive], "v = 0") for drive in drives]
+        over, errors = "–", [rmse(drives, name) for name in ("v = 0", "data sheet", "shipped", "cold", "map")]
+        if car in ratios:
+            over = f"{fixed(errors[3] / errors[2], 2)} [{fixed(ratios[car][0], 2)}, {fixed(ratios[car][1], 2)}]"
+        figures = [fixed(error, 2) if np.isfinite(error) else "–" for error in errors]
+        band = fixed(float(np.mean(np.concatenate([drive.within for drive in drives]))), 2)
+        about = [f"{car.title} ({car.origin})", "made on it" if car.development else "not", *figures, over]
+        rows.append([*about, f"{fixed(float(np.median(shares)), 3)} ({fixed(max(shares), 2)})", band])
+    early = ((0.0, 10.0), (10.0, 30.0), (30.0, 60.0), (60.0, 300.0), (300.0, 1e9))
+    by_time = []
+    for car, drives in found.items():
+        parts = [np.concatenate([d.sideslip["cold"][(d.time >= low) & (d.time < high)] for d in drives]) for low, high in early]
+        by_time.append([car.title, *[fixed(float(np.sqrt(part.mean())), 2) if len(part) > BLOCK // 4 else "–" for part in parts]])
+    ablated = [[car.title, *[fixed(rmse(drives, name), 2) for name in ABLATIONS]] for car, drives in found.items()]
+    verdict = "meets" if ships else "does not meet"
+    return "\n".join(
+        [
+            "# A car that nobody has trained on",
+            "",
+            f"Self-calibrating filter with the choices of [one file](../../{CHOICES}), started cold on every drive. It {verdict}",
+            "the rule for `vehest estimate`: without wheelbase, the upper 95 % limit of its RMSE(β) over the shipped model's is at most",
+            f"{LARGEST_RATIO} on each of {', '.join(f'{name} ({fixed(limit, 2)})' for name, limit in limits.items())}.",
+            f"With wheelbase it is better than v = 0 on {sum(drives_below)} of {len(drives_below)} drives. Figures are RMSE(β) [deg] where",
+            "the car moves; intervals are a bootstrap over blocks of 10 s; the map v = r(b - k u²) was fitted to the reference of the same",
+            "drive. Cars on which choices were made are development cars: their figures are no evidence for another car.",
+            "",
+            *table(heads, rows),
+            "",
+            "## Over the drive",
+            "",
+            *table(["car", "0 to 10 s", "10 to 30 s", "30 to 60 s", "60 to 300 s", "later"], by_time),
+            "",
+            "## Without its parts",
+            "",
+            *table(["car", *ABLATIONS], ablated),
+            "",
+            "Small cars are seen at their wheelbase: times and speeds scale with its root.",
+            "",
+        ]
+    )
+
+
+def main() -> None:
+    """Command line."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument(
+        "--output", type=Path, default=Path(os.environ.get("VEHEST_OUTPUT", "outputs")), help="output root, for ingested drives"
+    )
+    parser.add_argument("--development", action="store_true", help="development cars alone, printed and not published")
+    given, root = parser.parse_args(), os.environ.get("VEHEST_DATA", "")
+    if not root:
+        raise SystemExit("set VEHEST_DATA to the folder of the recordings")
+    cars = [car for car in CARS if car.development or not given.development]
+    if not given.development:
+        TARGET.mkdir(parents=True, exist_ok=True)
+        open_cars([car.title for car in cars if not car.development])
+    runner, (_, shipped, _) = Runner(given.output, Messages(), StopSignals()), open_model("pretrained", given.output, print)
+    found: dict[Car, list[Errors]] = {}
+    for car in cars:
+        try:
+            found[car] = [errors_of(car, recording, shipped) for recording in drives_of(car, runner, root)]
+        except MissingError as error:
+            print(f"left out: {car.title}: {error}")
+    page = report({car: [drive for drive in drives if len(drive.time)] for car, drives in found.items() if drives})
+    if given.development:
+        print(page)
+    else:
+        (TARGET / "report.md").write_text(page, encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main()
