@@ -25,6 +25,7 @@ def measured_drive(seed: int = 0, seconds: float = 120.0) -> Recording:
     generator = np.random.default_rng(seed + 1000)
     drive = linear_drive(seconds, RATE, seed, QUIET)[0]
     channels = {name: np.array(drive[name]) for name in CHANNELS}
+    channels["ax"] -= drive["vy_ref"] * drive["yaw_rate_ref"]
     side = {name: HALF_TRACK if name.endswith("r") else -HALF_TRACK for name in WHEELS}
     for name in WHEELS:
         channels[name] = (channels["vx"] + side[name] * channels["yaw_rate"]) / RADIUS + WHEEL_NOISE * generator.standard_normal(len(drive))

@@ -109,6 +109,26 @@ def test_without_a_steering_angle_ay_and_yaw_rate_contradict_each_other() -> Non
     assert reason_in_words(reason) == "ay and yaw_rate contradict each other"
 
 
+def sliding(seed: int, slide: float = 0.0) -> Recording:
+    """A drive in which v grows by ``slide`` [m/s] and back within 2 s while the car turns, without a change of r or u."""
+    drive, ramp = measured_drive(seed), np.zeros(len(measured_drive(seed)))
+    first = ONSET + int(np.argmax(np.abs(drive["yaw_rate"][ONSET : ONSET + 1000]))) - 50
+    ramp[first : first + 100] = slide * np.sin(np.linspace(0.0, np.pi, 100)) ** 2
+    ax, ay = drive["ax"] - ramp * drive["yaw_rate"], drive["ay"] + np.gradient(ramp, 1.0 / RATE)
+    return replace(drive, channels={**drive.channels, "ax": ax, "ay": ay})
+
+
+@pytest.mark.parametrize(("channels", "accused"), [(("yaw_rate", "vx", "ay", "ax"), False), (("yaw_rate", "vx", "ax"), True)])
+def test_a_slide_does_not_accuse_the_longitudinal_acceleration_where_ay_tells_of_it(channels: tuple[str, ...], accused: bool) -> None:
+    """v r of a slide of 3 m/s is in ax. It is known from ay; without ay it has to go with r², which it does in grip alone."""
+    model = learn_health([sliding(0), sliding(1)], [sliding(2)], channels, RATE)
+    rows = np.ascontiguousarray(sliding(3, 3.0).stack(channels))
+    statistics = np.empty((len(rows), len(model.statistics)))
+    kernel.health_kernel(rows, np.isfinite(rows), model.packed(), model.start(), np.empty((3, len(rows))), statistics)
+    at = [k for k, one in enumerate(model.statistics) if (one.kind, one.channel) == (kernel.CONTRADICTION, "ax")]
+    assert bool((statistics[:, at] > np.array(model.limits)[at]).any()) is accused
+
+
 def test_a_channel_that_is_lost_degrades_at_once_and_invalidates_after_half_a_second() -> None:
     drive = measured_drive(3)
     found = judged(model_of(), drive, ay=after(drive["ay"], math.nan))

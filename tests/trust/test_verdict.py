@@ -9,7 +9,7 @@ import pytest
 
 from vehest.trust import health_kernel as kernel
 from vehest.trust.guard import RESTART, USE
-from vehest.trust.health import BEYOND_SPEED, NO_ESTIMATE, NUMBERS, reason_in_words
+from vehest.trust.health import BEYOND_SPEED, NO_ESTIMATE, NUMBERS, TOO_WIDE, reason_in_words
 from vehest.trust.verdict import (
     isolate_rows,
     verdict_rows,
@@ -104,6 +104,16 @@ def test_the_verdict_names_what_guard_and_watch_know():
 def test_a_band_is_wider_the_less_an_estimate_is_worth():
     bands = np.full((4, 2), 0.1)
     marks = np.array([0, 0, 0, EXTRAPOLATED], np.int8)
-    widen_rows(np.array([0.0, 1.0, 2.0, 2.0]), marks, np.full(4, 0.5), np.full(4, 20.0), 1.5, bands)
+    widen_rows(np.array([0.0, 1.0, 2.0, 2.0]), np.zeros(4), marks, np.full(4, 0.5), np.full(4, 20.0), 1.5, bands)
     assert bands[:3, 0].tolist() == pytest.approx([0.1, 0.2, 0.4])
     assert bands[3].tolist() == pytest.approx([2.0, max(0.4, math.atan(2.0 / 20.0))])  # as far as |v| and the farthest in training
+
+
+def test_a_band_of_more_than_six_degrees_is_invalid_and_not_degraded():
+    """Half widths of 2, 2, 4 and 7 degrees, the second and third twice as wide since they are degraded."""
+    status, reason = np.array([0.0, 1.0, 1.0, 0.0]), np.array([0.0, 40_200.0, 40_200.0, 0.0])
+    bands = np.radians([[2.0, 2.0], [2.0, 2.0], [4.0, 4.0], [7.0, 7.0]])
+    widen_rows(status, reason, np.zeros(4, np.int8), np.full(4, 0.5), np.full(4, 20.0), 1.5, bands)
+    assert status.tolist() == [0.0, 1.0, 2.0, 2.0]
+    assert reason.tolist() == [0.0, 40_200.0, 40_200.0, TOO_WIDE * 10_000.0]
+    assert reason_in_words(reason[3]) == "the band of sideslip exceeds 6 degrees"

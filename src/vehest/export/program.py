@@ -35,7 +35,6 @@ KINDS = (
     "SPIN",
     "LOCKED",
     "DROPOUT",
-    "LATE",
 )
 
 

@@ -7,7 +7,7 @@ import io
 import math
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias
 
@@ -94,6 +94,7 @@ class Document:
     blocks: Sequence[Block]  # Markdown text (headings from ``##`` down), tables and figures, in reading order
     # name -> table that is written beside the others without being shown; text may link to ``tables/NAME.csv``
     data: Mapping[str, pd.DataFrame] = field(default_factory=dict)
+    open_blocks: int | None = None  # how many of the first blocks the page shows; sections after them are folded, with None none
 
     def __post_init__(self) -> None:
         for kind in (Table, Figure):
@@ -151,7 +152,7 @@ def write_document(
             (folder / "figures" / f"{block.name}.svg").write_bytes(images[block.name])
     _write_text(folder / f"{name}.md", _markdown(document, numbers))
     if page:
-        whole = Document(document.title, [*document.blocks, *on_page], document.data)
+        whole = replace(document, blocks=[*document.blocks, *on_page])
         _write_text(folder / f"{name}.html", _page(whole, _numbers(whole), images))
 
 
@@ -335,6 +336,7 @@ def _page(document: Document, numbers: Mapping[int, str], images: Mapping[str, b
     return environment.get_template("page.html.j2").render(
         title=printable(document.title),
         blocks=blocks,
+        open_blocks=document.open_blocks,
         style=Markup(_packaged("page.css")),
         script=Markup(_packaged("page.js")),
         plots=Markup(_packaged("uplot.js") + _packaged("explorer.js")) if interactive else "",

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -48,8 +48,12 @@ def documents(artefacts: StudyArtefacts) -> dict[str, Document]:
     return {REPORT: comparison(artefacts.only)}
 
 
-def comparison(artefacts: PartArtefacts) -> Document:
+def comparison(artefacts: PartArtefacts, named: Mapping[str, Name] | None = None) -> Document:
     """The report of a comparison: headline, then each test set, then the training; how it was made is the appendix.
+
+    Args:
+        artefacts: of the comparison.
+        named: test set -> estimator that its traces begin with.
 
     Raises:
         DataError: metrics are missing or ambiguous, or an estimate does not cover its range.
@@ -58,7 +62,7 @@ def comparison(artefacts: PartArtefacts) -> Document:
     lines = lines_of(dict.fromkeys((model.estimator, model.variant) for model in artefacts.models))
     blocks: list[Block] = [*_headline(artefacts)]
     for test_set in artefacts.split.tests:
-        blocks += _test_set(artefacts, board[board["test_set"] == test_set], test_set, lines)
+        blocks += _test_set(artefacts, board[board["test_set"] == test_set], test_set, lines, (named or {}).get(test_set))
     blocks += [*_training(artefacts, board, lines), *how_it_was_made(artefacts)]
     if any(model.estimator == "ksnn" for model in artefacts.models):
         blocks.append(PATENT_NOTE)
@@ -280,8 +284,13 @@ def _plural(word: str, count: int) -> str:
 # One test set
 
 
-def _test_set(artefacts: PartArtefacts, board: pd.DataFrame, test_set: str, lines: dict[Name, Line]) -> list[Block]:
-    file = re.sub(r"[^a-z0-9_.-]", "_", test_set.lower())
+def file_of(test_set: str) -> str:
+    """A test set as the end of the names of its tables and figures."""
+    return re.sub(r"[^a-z0-9_.-]", "_", test_set.lower())
+
+
+def _test_set(artefacts: PartArtefacts, board: pd.DataFrame, test_set: str, lines: dict[Name, Line], named: Name | None) -> list[Block]:
+    file = file_of(test_set)
     blocks: list[Block] = [f"## Test set `{test_set}`", *_leaderboard_table(artefacts, board, f"leaderboard_{file}", test_set)]
     lost = board[~np.isfinite(board["rmse_sideslip"])]
     if len(lost):
@@ -295,7 +304,7 @@ def _test_set(artefacts: PartArtefacts, board: pd.DataFrame, test_set: str, line
     if by_regime is not None:
         blocks.append(by_regime)
     blocks.append(_spread(artefacts, finite, test_set, f"spread_{file}", lines))
-    shown = _shown(finite)
+    shown = _shown(finite, named)
     drive = _Drive.of(artefacts, shown, test_set, lines)
     if len(shown) < len(finite):
         blocks.append(
@@ -376,10 +385,11 @@ def _spread(artefacts: PartArtefacts, board: pd.DataFrame, test_set: str, name: 
     )
 
 
-def _shown(board: pd.DataFrame) -> pd.DataFrame:
-    """At most `MOST_SHOWN` rows, picked by validation; in the order of the board."""
-    kept = board["rmse_vy_validation"].sort_values(kind="stable", na_position="last").index[:MOST_SHOWN]
-    return board.loc[sorted(kept)]
+def _shown(board: pd.DataFrame, named: Name | None = None) -> pd.DataFrame:
+    """At most `MOST_SHOWN` rows, picked by validation; in the order of the board, but for the one that is ``named``, which comes first."""
+    ours = (board["estimator"] == named[0]) & (board["variant"] == named[1]) if named else board["seed"].isna()
+    kept = board["rmse_vy_validation"].where(~ours, -math.inf).sort_values(kind="stable", na_position="last").index[:MOST_SHOWN]
+    return board.loc[sorted(kept, key=lambda row: (not ours[row], row))]
 
 
 @dataclass(frozen=True, eq=False)

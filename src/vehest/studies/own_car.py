@@ -22,7 +22,7 @@ from vehest.estimators.registry import estimator_class, estimator_names
 from vehest.evaluation.blocks import LEAST_BLOCKS
 from vehest.evaluation.metrics import pieces_of, scored_range
 from vehest.evaluation.ranking import BASELINES, Ranking
-from vehest.report.document import REPORT, Block, Document, as_code, as_text
+from vehest.report.document import REPORT, Block, Document, Figure, Table, as_code, as_text
 from vehest.report.style import fixed, listed
 from vehest.studies import drive
 from vehest.studies.artefacts import EvaluatedModel, PartArtefacts, StudyArtefacts
@@ -50,22 +50,35 @@ class Verdict:
 
 
 def documents(artefacts: StudyArtefacts) -> dict[str, Document]:
-    """The verdict, then the report of the comparison."""
+    """Verdict, errors as bars, traces with the estimator that is named and the next commands; folded on the page: the whole comparison."""
     part = artefacts.first
-    compared = drive.comparison(part)
+    models = {name: verdict_of(part, name).model for name in part.split.tests}
+    compared = drive.comparison(part, {name: (own.estimator, own.variant) for name, own in models.items() if own is not None})
     verdicts = [f"{'**On test set ' + as_code(name) + ':** ' if len(part.split.tests) > 1 else ''}{text}" for name, text in _verdicts(part)]
+    first, rest = _first_screen(compared.blocks, drive.file_of(next(iter(part.split.tests))))
+    blocks: list[Block] = ["## Verdict\n\n" + "\n\n".join(verdicts), *first]
     commands = "\n".join(_commands(part, artefacts.study))
-    absent = not_compared(part)
-    blocks = ["## Verdict\n\n" + "\n\n".join(verdicts)]
     if commands:
         blocks.append(f"What to do next:\n\n```sh\n{commands}\n```")
-    if absent:
-        blocks.append("Not compared:\n\n" + "\n".join(f"- {as_text(line)}" for line in absent))
+    absent = not_compared(part)
+    folded: list[Block] = ["## Not compared\n\n" + "\n".join(f"- {as_text(line)}" for line in absent)] if absent else []
     curves = curves_of(list(artefacts.parts.values()))
     learnt = [block for curve in curves for block in blocks_of_curve(curve, file_name(curve.test_set.lower()))]
     needed: list[Block] = ["## How much reference is needed", *learnt] if learnt else []
     further = [block for name, other in list(artefacts.parts.items())[1:] for block in drive.appendix_of(name, other)]
-    return {REPORT: replace(compared, title=artefacts.title, blocks=[*blocks, *needed, *compared.blocks, *further])}
+    whole = [*blocks, *folded, *needed, "## The comparison", *rest, *further]
+    return {REPORT: replace(compared, title=artefacts.title, blocks=whole, open_blocks=len(blocks))}
+
+
+def _first_screen(blocks: Sequence[Block], file: str) -> tuple[list[Block], list[Block]]:
+    """Errors as bars and traces of the first test set, taken out of a comparison's blocks, and the others."""
+    bars: list[Block] = []
+    traces = [block for block in blocks if isinstance(block, Figure) and block.name == f"traces_{file}"]
+    for board in (block for block in blocks if isinstance(block, Table) and block.name == f"leaderboard_{file}"):
+        columns = {name: board.columns[name] for name in ("title", "rmse_sideslip", "interval", "beats_zero", "beats_static_map")}
+        caption = "RMSE(β) of every estimator with its 95 % interval over all seeds; v = 0 and the static map are what any has to beat."
+        bars = [replace(board, name=f"bars_{file}", caption=caption, columns=columns, links=())]
+    return [*bars, *traces], [block for block in blocks if block not in traces]
 
 
 def verdict(artefacts: StudyArtefacts) -> list[str]:

@@ -38,10 +38,9 @@ SPIN_SECONDS = 0.3
 SETTLE_SECONDS = 0.5  # after a start, before predictions count
 SHARE_SECONDS = 0.5  # over which equal samples are counted
 BRAKING_SECONDS = 0.2  # over which ax is averaged
-LATE_SECONDS = 0.05  # of the low-pass that stands for a delay
-ENERGY_SECONDS = (0.1, 0.5, 2.0)
+ENERGY_SECONDS = (0.1, 0.5)
 RATIO_SECONDS = (0.25, 1.0, 4.0, 12.0)
-RELATION_SECONDS = (0.25, 1.0, 4.0, 12.0)
+RELATION_SECONDS = (0.25, 1.0, 12.0)
 
 BLOCK_SECONDS = 5.0  # whose largest values set the limits
 HOURS = 100.0  # in which healthy drives are to exceed a limit about once
@@ -68,7 +67,7 @@ NUMBERS = {name: number for number, name in enumerate(CHANNELS, start=1)}
 """Number of a channel in a reason's code."""
 _NAMES = {number: name for name, number in NUMBERS.items()}
 
-NO_ESTIMATE, BEYOND_SPEED = 30, 31
+NO_ESTIMATE, BEYOND_SPEED, TOO_WIDE = 30, 31, 32
 """Kinds of reasons that follow from an estimate and not from its channels (`vehest.trust.verdict`)."""
 
 REASONS: dict[int, tuple[str, float]] = {
@@ -91,8 +90,9 @@ REASONS: dict[int, tuple[str, float]] = {
     kernel.LATE: ("{channel} comes late", 4.0),
     NO_ESTIMATE: ("there is no estimate", 0.0),
     BEYOND_SPEED: ("the estimate exceeds what the speed allows", 0.0),
+    TOO_WIDE: ("the band of sideslip exceeds 6 degrees", 0.0),
 }
-"""Kind of a reason -> text, and priority over others: the most specific is given.
+"""Kind of a reason -> text, and priority over others: the most specific is given. SMOOTH and LATE are of earlier versions.
 
 A code is 10000 times the kind, 100 times the channel's number, and the partner's.
 """
@@ -141,11 +141,19 @@ class HealthModel:
     spin: tuple[float, float]  # yaw rate, and its product with the speed, beyond which the car spins if they rise without a jump
     speeds: tuple[float, ...]  # at which the noise was looked at [unit of the speed channel]
     levels: tuple[tuple[float, ...], ...]  # size of the innovations at these speeds, in their deviations, one row a speed
-    healthy: tuple[tuple[float, ...], ...] = ()  # offset, scale and delay that the likelihood ratios find in each channel of healthy drives
+    healthy: tuple[tuple[float, ...], ...] = ()  # offset and scale that the likelihood ratios find in each channel of healthy drives
     heaviest: tuple[tuple[float, ...], ...] = ()  # weight that one sample may have in them
     limits: tuple[float, ...] = ()  # of every statistic, in the order of `statistics`
     stops: tuple[tuple[float, float], ...] = ()  # of each channel, between which alone it is expected to move
     limits_behind_front_end: tuple[float, ...] = ()  # the same for samples that a filter from a faster bus has passed (`front_end`)
+
+    def __post_init__(self) -> None:
+        channels, relations = len(self.channels), len(self.relations)
+        for name in ("healthy", "heaviest"):
+            object.__setattr__(self, name, getattr(self, name)[:N_FORMS])
+        for name in ("limits", "limits_behind_front_end"):
+            if len(getattr(self, name)) == 23 * channels + 4 * relations:
+                object.__setattr__(self, name, _earlier_limits(getattr(self, name), channels, relations))
 
     @property
     def layout(self) -> Layout:
@@ -168,9 +176,8 @@ class HealthModel:
         add(kernel.JUMP, "normal")
         add(kernel.JUMP, "normal")
         add(kernel.NOISE, "largest", ENERGY_SECONDS)
-        add(kernel.SMOOTH, "largest", ENERGY_SECONDS[-1:])
         add(kernel.JUMP, "normal")
-        for kind in (kernel.OFFSET, kernel.SCALE, kernel.LATE):
+        for kind in (kernel.OFFSET, kernel.SCALE):
             add(kind, "normal", RATIO_SECONDS)
         add(kernel.FROZEN, "run")
         add(kernel.HELD, "share")
@@ -201,7 +208,7 @@ class HealthModel:
         def forgetting(*seconds: float) -> FloatArray:
             return 1.0 - np.exp(-step / np.array(seconds))
 
-        settings = [*self.standstill, step, *self.spin, *forgetting(SHARE_SECONDS, BRAKING_SECONDS, LATE_SECONDS)]
+        settings = [*self.standstill, step, *self.spin, *forgetting(SHARE_SECONDS, BRAKING_SECONDS)]
         for place, value in zip((*model.layout, *model.settings), (*layout, *settings), strict=True):
             place[...] = value
         for row, relation in enumerate(self.relations):
@@ -242,6 +249,13 @@ class HealthModel:
         coefficients, precision = np.array(self.coefficients), np.array(self.precision)
         left = np.eye(len(self.channels)) - np.concatenate([np.zeros((1, *coefficients.shape[1:])), coefficients[:-1]]).cumsum(0)
         return (precision @ left)[::-1].transpose(0, 2, 1), np.einsum("jqm,qr,jrn->mn", left, precision, left)
+
+
+def _earlier_limits(limits: Sequence[float], channels: int, relations: int) -> tuple[float, ...]:
+    """Limits of earlier versions without those of retired statistics: energy over 2 s, its inverse, delays, relations over 4 s."""
+    jump, calm, energy, _, step, *forms, values, means = np.split(np.array(limits), channels * np.cumsum([1, 1, 3, 1, 1, 4, 4, 4, 4]))
+    kept = [jump, calm, energy.reshape(channels, 3)[:, :2], step, *forms[:2], values]
+    return tuple(np.concatenate([part.ravel() for part in (*kept, means.reshape(relations, 4)[:, [0, 1, 3]])]).tolist())
 
 
 def health_rows(packed: FloatArray, rows: FloatArray, measured: NDArray[np.bool_], state: FloatArray) -> Health:
@@ -330,7 +344,7 @@ def _plain(values: FloatArray) -> Any:
 
 
 def _with_healthy(model: HealthModel, recordings: Sequence[Recording]) -> HealthModel:
-    """With the offset, scale and delay that the likelihood ratios find over all of training, and `HEAVIEST` times their mean weight."""
+    """With the offset and scale that the likelihood ratios find over all of training, and `HEAVIEST` times their mean weight."""
     packed = replace(model, limits=(), healthy=()).packed(forgets=False)
     total, weight = np.zeros((2, len(model.channels), N_FORMS))
     for recording in recordings:

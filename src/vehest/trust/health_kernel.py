@@ -4,10 +4,9 @@ rows -> x, y -> innovations ε -> statistics -> status, reason; the model and th
 
 With φ(x) features of yaw rate and speed, channels x become y = x - W φ(x), of which an autoregression predicts the next sample; ε is its
 error, in units of the noise at that speed, and S its covariance. A fault that adds b to channel i moves y by J b, J = ∂y/∂xᵢ, and the
-innovations by h b; one that multiplies it by s moves them by (s - 1)/s of what the channel, as it is measured, puts into them; one that
-makes it late moves them by what a low-pass would:
+innovations by h b; one that multiplies it by s moves them by (s - 1)/s of what the channel, as it is measured, puts into them:
 
-    offset   h = J - Σ_l A_l J           scale   h_k = J x_k - Σ_l A_l J x_{k-l}           delay   the same of x̄ - x, x̄ low-passed
+    offset   h = J - Σ_l A_l J           scale   h_k = J x_k - Σ_l A_l J x_{k-l}
 
 x_k being taken as predicted, which keeps the noise in ε out of h. Each form is looked for by its likelihood ratio over exponentially
 forgotten samples, z = Σ λʲ hᵀS⁻¹ε / √(Σ λ²ʲ hᵀS⁻¹h), which is N(0, 1) without a fault (Willsky & Jones, A generalized likelihood ratio
@@ -40,12 +39,14 @@ BRAKING = 2.0  # m/s², beyond which a wheel that stands still is locked rather 
 SLIPPING = 0.3  # share by which a second wheel is slow, which makes both locked
 LOST = 0.5  # share by which a wheel is slow that is locked or lost
 REVERSED, HOLDS = -0.5, 0.7  # correlations below which a relation is one of the wrong sign, above which it holds
+SLIDE_SECONDS = 4.0  # for which a change of the lateral velocity is remembered
 LARGER = 2.5  # factor, either way, that makes a relation one of the wrong unit
 
 INSTANT_FEATURES = 6  # that relations which hold for each sample may use
-N_FEATURES = 12  # this and the next two stand as digits in the shapes below
+FIRST_SMALL = 9  # of features: those of drag, which say nothing of signs and units
+N_FEATURES = 13  # this and the next two stand as digits in the shapes below
 N_LEVELS = 5  # speeds at which the noise is known
-N_FORMS = 3  # offset, scale, delay
+N_FORMS = 2  # offset, scale
 
 FREE, MISSING, FROZEN, HELD, JUMP, NOISE, SMOOTH, OFFSET, SCALE, SIGN, UNIT, CONTRADICTION, OUTSIDE, SPIN, LOCKED, DROPOUT, LATE = range(17)
 """Kinds of reasons."""
@@ -82,7 +83,6 @@ class Settings(NamedTuple):
     spin_turning: float
     forget_share: float
     forget_ax: float
-    forget_late: float
 
 
 class Statistics(NamedTuple):
@@ -92,9 +92,8 @@ class Statistics(NamedTuple):
     jump: Annotated[FloatArray, "channels"]
     calm: Annotated[FloatArray, "channels"]  # jumps against the energy of the last half second
     energy: Annotated[FloatArray, "channels energies"]
-    smooth: Annotated[FloatArray, "channels"]  # inverse of the energy
     step: Annotated[FloatArray, "channels"]  # likelihood ratio of a step that began p samples ago
-    form: Annotated[FloatArray, "3 channels ratios"]  # likelihood ratios of offset, scale, delay
+    form: Annotated[FloatArray, "2 channels ratios"]  # likelihood ratios of offset and scale
     run: Annotated[FloatArray, "channels"]  # equal samples in a row
     share: Annotated[FloatArray, "channels"]  # of equal samples
     domain: Annotated[FloatArray, "channels"]  # size over the largest in training
@@ -111,8 +110,8 @@ class Model(NamedTuple):
     lags: Annotated[FloatArray, "order channels channels"]  # A [lag, m, q]
     precision: Annotated[FloatArray, "channels channels"]  # S⁻¹
     deviation: Annotated[FloatArray, "channels"]  # of the innovations
-    instant: Annotated[FloatArray, "channels 12"]  # W
-    average: Annotated[FloatArray, "relations 12"]  # coefficients of relations
+    instant: Annotated[FloatArray, "channels 13"]  # W
+    average: Annotated[FloatArray, "relations 13"]  # coefficients of relations
     rate_gain: Annotated[FloatArray, "relations"]  # of du/dt in them
     usual: Annotated[FloatArray, "channels"]  # medians
     largest: Annotated[FloatArray, "channels"]  # in training
@@ -121,8 +120,8 @@ class Model(NamedTuple):
     settled_gain: Annotated[FloatArray, "channels channels"]  # 1 - Σ A_l [m, q]
     steps: Annotated[FloatArray, "order channels channels"]  # weight of a former innovation in q on a step in m [lag, m, q]
     step_power: Annotated[FloatArray, "channels channels"]
-    healthy: Annotated[FloatArray, "3 channels"]  # likelihood ratios of healthy drives
-    heaviest: Annotated[FloatArray, "3 channels"]  # largest weight of one sample in them
+    healthy: Annotated[FloatArray, "2 channels"]  # likelihood ratios of healthy drives
+    heaviest: Annotated[FloatArray, "2 channels"]  # largest weight of one sample in them
     forget_energy: Annotated[FloatArray, "energies"]
     forget_ratio: Annotated[FloatArray, "ratios"]
     forget_average: Annotated[FloatArray, "averages"]
@@ -153,18 +152,17 @@ class State(NamedTuple):
     spinning: Annotated[FloatArray, "1"]  # rows of spin
     since_jump: Annotated[FloatArray, "1"]  # rows since the yaw rate jumped
     mean_ax: Annotated[FloatArray, "1"]
+    drift: Annotated[FloatArray, "1"]  # lateral velocity, as far as it changed within `SLIDE_SECONDS`
     last: Annotated[FloatArray, "channels"]  # measured value
     gap: Annotated[FloatArray, "channels"]  # rows without a sample; below zero while predictions settle again
     run: Annotated[FloatArray, "channels"]  # equal samples in a row
     share: Annotated[FloatArray, "channels"]  # of equal samples
-    low_passed: Annotated[FloatArray, "channels"]
     past_x: Annotated[FloatArray, "order channels"]
-    past_late: Annotated[FloatArray, "order channels"]  # low-passed value less x
     past_y: Annotated[FloatArray, "order channels"]
     innovation: Annotated[FloatArray, "order channels"]
     energy: Annotated[FloatArray, "channels energies"]
-    ratio_sum: Annotated[FloatArray, "channels ratios 3"]  # Σ hᵀS⁻¹ε
-    ratio_weight: Annotated[FloatArray, "channels ratios 3"]  # Σ hᵀS⁻¹h
+    ratio_sum: Annotated[FloatArray, "channels ratios 2"]  # Σ hᵀS⁻¹ε
+    ratio_weight: Annotated[FloatArray, "channels ratios 2"]  # Σ hᵀS⁻¹h
     average: Annotated[FloatArray, "relations averages"]  # means of the residuals of relations
     mean_speed: Annotated[FloatArray, "averages"]
     left: Annotated[FloatArray, "relations"]  # short mean of the residual
@@ -180,11 +178,10 @@ class State(NamedTuple):
     score: Annotated[FloatArray, "channels"]  # S⁻¹ε
     clipped_score: Annotated[FloatArray, "channels"]
     stepped: Annotated[FloatArray, "channels"]  # sum over a step
-    late: Annotated[FloatArray, "channels"]  # low-passed value less x
     level: Annotated[FloatArray, "channels"]  # of the noise
-    feature: Annotated[FloatArray, "12"]
-    by_yaw_rate: Annotated[FloatArray, "12"]  # derivatives of the features
-    by_speed: Annotated[FloatArray, "12"]
+    feature: Annotated[FloatArray, "13"]
+    by_yaw_rate: Annotated[FloatArray, "13"]  # derivatives of the features
+    by_speed: Annotated[FloatArray, "13"]
     slope: Annotated[FloatArray, "channels"]  # J
     effect: Annotated[FloatArray, "channels"]  # h
     statistics: Statistics
@@ -230,7 +227,6 @@ def _receive(k, rows, measured, model, state):  # type: ignore[no-untyped-def]
         known = measured[k, i] and abs(value) <= PLAUSIBLE * model.largest[i]  # false for NaN
         if first:
             state.last[i] = value if known else model.usual[i]
-            state.low_passed[i] = state.last[i]
         if known:
             same = model.stops[0, i] < value < model.stops[1, i] and value == state.last[i] and not first
             state.run[i] = state.run[i] + 1.0 if same else 0.0
@@ -260,7 +256,7 @@ def _describe(model, state):  # type: ignore[no-untyped-def]
     speed, turning = abs(u), u * r
     w, bent = max(speed, settings.least_speed), 0.03 * turning * turning
     values = (1.0, r, u, turning, 0.01 * turning * turning * turning, r / w, ay, ay / (w * w), 0.01 * ay * ay * ay, r * r, u * u, ax)
-    for f in range(N_FEATURES):
+    for f in range(N_FEATURES - 1):
         state.feature[f] = values[f]
     by_yaw_rate = (0.0, 1.0, 0.0, u, bent * u, 1.0 / w)
     by_speed = (0.0, 0.0, 1.0, r, bent * r, -r / (u * speed) if speed > settings.least_speed else 0.0)
@@ -277,6 +273,10 @@ def _describe(model, state):  # type: ignore[no-untyped-def]
         for f in range(INSTANT_FEATURES):
             total -= model.instant[i, f] * state.feature[f]
         state.y[i] = total
+    if columns.ay >= 0:  # less u r it is the change of v
+        drift = state.drift[0] + settings.step * (state.y[columns.ay] - state.drift[0] / SLIDE_SECONDS)
+        state.drift[0] = min(max(drift, -speed), speed)
+    state.feature[N_FEATURES - 1] = state.drift[0] * r
     return speed < settings.least_speed and abs(r) < settings.still_yaw_rate and abs(ay) < settings.still_ay
 
 
@@ -319,8 +319,6 @@ def _predict(model, state):  # type: ignore[no-untyped-def]
         state.scaled[i] = own
         state.clipped[i] = min(max(own, -CLIP * deviation), CLIP * deviation)
         state.innovation[0, i] = min(max(own, -STEP_CLIP * deviation), STEP_CLIP * deviation)
-        state.late[i] = state.low_passed[i] - (state.x[i] - state.error[i])
-        state.low_passed[i] += model.settings.forget_late * (state.x[i] - state.low_passed[i])
     for i in range(C):
         score, clipped, stepped = 0.0, 0.0, 0.0
         for j in range(C):
@@ -334,7 +332,7 @@ def _predict(model, state):  # type: ignore[no-untyped-def]
 
 @part()
 def _look_at_innovations(model, state):  # type: ignore[no-untyped-def]
-    """Jumps, jumps out of calm, and energy, high and low."""
+    """Jumps, jumps out of calm, and energy."""
     E, found = model.layout.energies, state.statistics
     for i in range(model.layout.channels):
         z = abs(state.score[i]) / math.sqrt(model.precision[i, i]) if model.modelled[i] == 1 else 0.0
@@ -349,7 +347,6 @@ def _look_at_innovations(model, state):  # type: ignore[no-untyped-def]
             own = min(own, roof * roof)
             state.energy[i, e] = own
             found.energy[i, e] = math.sqrt(own)
-        found.smooth[i] = 1.0 / math.sqrt(state.energy[i, E - 1] + 1e-12) if model.modelled[i] == 1 else 0.0
 
 
 @part()
@@ -370,7 +367,7 @@ def _effect(i, form, model, state):  # type: ignore[no-untyped-def]
     C = model.layout.channels
     for j in range(C):
         state.effect[j] = 0.0
-    now = state.x[i] - state.error[i] if form == 1 else state.late[i]
+    now = state.x[i] - state.error[i]
     for m in range(C):
         slope = state.slope[m]
         if slope == 0.0:
@@ -382,7 +379,7 @@ def _effect(i, form, model, state):  # type: ignore[no-untyped-def]
         else:
             state.effect[m] += slope * now
             for lag in range(model.layout.order):
-                past = slope * (state.past_x[lag, i] if form == 1 else state.past_late[lag, i])
+                past = slope * state.past_x[lag, i]
                 for j in range(C):
                     state.effect[j] -= model.lags[lag, m, j] * past
     for j in range(C):
@@ -426,7 +423,7 @@ def _look_for_form(i, form, counts, model, state):  # type: ignore[no-untyped-de
 
 @part()
 def _look_for_forms(model, state):  # type: ignore[no-untyped-def]
-    """Steps, offsets, scales and delays of each channel."""
+    """Steps, offsets and scales of each channel."""
     C, found = model.layout.channels, state.statistics.form
     for i in range(C):
         _slope(i, model, state)
@@ -480,14 +477,16 @@ def _look_at_relations(still, model, state):  # type: ignore[no-untyped-def]
         state.mean_speed[t] += forgetting[t] * (u - state.mean_speed[t])
     for j in range(model.layout.relations):
         target = state.x[model.target[j]]
-        left = target
+        left, small = target, 0.0
         for f in range(N_FEATURES):
-            left -= model.average[j, f] * state.feature[f]
+            own = model.average[j, f] * state.feature[f]
+            left -= own
+            small += own if f >= FIRST_SMALL else 0.0
         if still:
-            left = 0.0
+            left, small = 0.0, 0.0
         gain = 0.0 if still else model.rate_gain[j]
         if complete:
-            state.left[j] += short * (left - state.left[j])
+            state.left[j] += short * (left + small - state.left[j])  # a fault of r or ay is no sign or unit of ax
             state.smooth[j] += short * (target - state.smooth[j])
         shown = state.smooth[j]
         expected = shown - state.left[j] + gain * (u - state.mean_speed[0]) * short / ((1.0 - short) * step)
@@ -535,7 +534,7 @@ def _find_reason(slow, model, state):  # type: ignore[no-untyped-def]
 
 @part()
 def _is_form(kind):  # type: ignore[no-untyped-def]
-    return kind in (OFFSET, SCALE, LATE)
+    return kind in (OFFSET, SCALE)
 
 
 @part()
@@ -569,7 +568,7 @@ def _decide(absent, slow, model, state):  # type: ignore[no-untyped-def]
 def _likeliest(best, model, state):  # type: ignore[no-untyped-def]
     """The form and channel with the largest likelihood ratio over the time of one that was exceeded."""
     C, G, every = model.layout.channels, model.layout.ratios, state.statistics.every
-    first, found = C * (4 + model.layout.energies), best
+    first, found = C * (3 + model.layout.energies), best
     for n in range(N_FORMS * C):
         m = first + n * G + (best - first) % G
         if every[m] > every[found]:
@@ -633,6 +632,5 @@ def _remember(model, state):  # type: ignore[no-untyped-def]
         for lag in range(model.layout.order - 1, 0, -1):
             state.past_y[lag, i] = state.past_y[lag - 1, i]
             state.past_x[lag, i] = state.past_x[lag - 1, i]
-            state.past_late[lag, i] = state.past_late[lag - 1, i]
-        state.past_y[0, i], state.past_x[0, i], state.past_late[0, i] = state.y[i], state.x[i], state.late[i]
+        state.past_y[0, i], state.past_x[0, i] = state.y[i], state.x[i]
     state.rows[0] += 1.0

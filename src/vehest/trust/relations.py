@@ -5,7 +5,8 @@ With yaw rate r, speed u (measured, or that of the motor or a wheel) and a = u r
     lateral         ay = k u r + c                              what is left is the change of v, which returns to zero, and bank
     steering        δ = c₁ r/u + c₂ u r + c₃ (u r)³ + c         wheelbase, understeer gradient, tyres that give way
                     δ = c₁ ay/u² + c₂ ay + c₃ ay³ + c           the same without the yaw rate
-    longitudinal    ax = k du/dt + c₁ r² + c₂ u² + c            drag; v r goes with r² as long as v goes with r
+    longitudinal    ax = k du/dt - v r + c₁ r² + c₂ u² + c      drag; v is what the lateral relation leaves, integrated with leakage: its
+                                                                changes, as in a slide, while the rest of v goes with r
     wheels, motor   ω = u/R + c r                               radius and half the track
 
 Coefficients are those of least squares on signals that are low-passed alike, reweighted by Huber's function.
@@ -21,15 +22,21 @@ import scipy
 
 from vehest.constants import FloatArray
 from vehest.data.recording import Recording
+from vehest.trust.health_kernel import SLIDE_SECONDS
 
 SPEEDS = ("vx", "motor_speed", "wheel_speed_rl", "wheel_speed_rr", "wheel_speed_fl", "wheel_speed_fr")
 """Channels that serve as the speed u, the first that is there."""
 
-FEATURES = ("1", "r", "u", "u r", "(u r)³/100", "r/u", "ay", "ay/u²", "ay³/100", "r²", "u²", "ax")
+FEATURES = ("1", "r", "u", "u r", "(u r)³/100", "r/u", "ay", "ay/u²", "ay³/100", "r²", "u²", "ax", "v r")
 RATE = "du/dt"
-DRAG = ("r²", "u²")
+SLIDE = "v r"
+DRAG = ("r²", "u²", SLIDE)
 _SYMBOLS = dict(
-    zip(FEATURES, ("", "r", "u", ("u", "r"), ("u", "r"), ("r", "u"), ("ay",), ("ay", "u"), ("ay",), "r", "u", ("ax",)), strict=True)
+    zip(
+        FEATURES,
+        ("", "r", "u", ("u", "r"), ("u", "r"), ("r", "u"), ("ay",), ("ay", "u"), ("ay",), "r", "u", ("ax",), "r"),
+        strict=True,
+    )
 )
 _SYMBOLS[RATE] = "u"
 
@@ -78,7 +85,8 @@ def relations_among(channels: Sequence[str]) -> list[tuple[str, str, tuple[str, 
         if angle in has and "ay" in has:
             found.append((angle, "ay", ("ay/u²", "ay", "ay³/100", "1"), False))
     if "ax" in has:
-        found.append(("ax", speed, (RATE, *(("r²",) if "yaw_rate" in has else ()), "u²", "1"), False))
+        slide = (SLIDE,) if {"ay", "yaw_rate"} <= has else ()
+        found.append(("ax", speed, (RATE, *slide, *(("r²",) if "yaw_rate" in has else ()), "u²", "1"), False))
     for wheel in channels:
         if wheel.startswith(("wheel_speed", "motor_speed")) and wheel != speed:
             found.append((wheel, speed, ("u", *(("r",) if "yaw_rate" in has else ())), True))
@@ -93,7 +101,14 @@ def features_of(samples: Mapping[str, FloatArray], least_speed: float) -> dict[s
     u = samples[speed] if speed else np.zeros_like(some)
     w = np.maximum(np.abs(u), least_speed)
     values = (np.ones_like(some), r, u, u * r, 0.01 * (u * r) ** 3, r / w, ay, ay / w**2, 0.01 * ay**3, r * r, u * u, ax)
-    return dict(zip(FEATURES, values, strict=True))
+    return dict(zip(FEATURES[:-1], values, strict=True))
+
+
+def slide_of(features: Mapping[str, FloatArray], lateral: Relation, rate_hz: float) -> FloatArray:
+    """v r, (T,): v is what the relation of ay leaves, integrated with the leakage of `SLIDE_SECONDS`, at most the speed."""
+    left = features["ay"] - sum(value * features[name] for name, value in lateral.terms.items())
+    drift = signal.lfilter([1.0 / rate_hz], [1.0, 1.0 / (SLIDE_SECONDS * rate_hz) - 1.0], left)
+    return np.asarray(np.clip(drift, -np.abs(features["u"]), np.abs(features["u"])) * features["r"])
 
 
 def without_spikes(samples: FloatArray) -> FloatArray:
@@ -142,7 +157,7 @@ def learn_relations(recordings: Sequence[Recording], channels: Sequence[str], ra
     """Coefficients of every relation, from drives at one rate [Hz]; NaN and samples below ``least_speed`` are left out."""
     forget = 1.0 - np.exp(-1.0 / (LOW_PASS_SECONDS * rate_hz))
     speed = speed_channel(channels)
-    parts = []
+    parts, used = [], []
     for recording in recordings:
         own = {name: _held(recording[name]) for name in channels}
         known = np.isfinite(recording.stack(channels)).all(1)
@@ -150,14 +165,24 @@ def learn_relations(recordings: Sequence[Recording], channels: Sequence[str], ra
         if speed:
             known &= np.abs(own[speed]) >= least_speed
             columns[RATE] = np.concatenate([[0.0], np.diff(own[speed])]) * rate_hz
-        smooth = {name: _smoothed(values, forget) for name, values in columns.items()}
-        parts.append({name: values[known] for name, values in smooth.items()})
-    joined = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
-    found = []
+        parts.append(columns)
+        used.append(known)
+
+    def smoothed(name: str) -> FloatArray:
+        return np.concatenate([_smoothed(part[name], forget)[known] for part, known in zip(parts, used, strict=True)])
+
+    joined = {name: smoothed(name) for name in parts[0]}
+    found: list[Relation] = []
     for target, partner, features, instant in relations_among(channels):
-        design, wanted = np.stack([joined[name] for name in features], axis=1), joined[f"channel {target}"]
+        if SLIDE in features:
+            for part in parts:
+                part[SLIDE] = slide_of(part, found[0], rate_hz) if found else np.zeros_like(part["r"])
+            joined[SLIDE] = smoothed(SLIDE)
+        free = [name for name in features if name != SLIDE]
+        wanted = joined[f"channel {target}"] + (joined[SLIDE] if SLIDE in features else 0.0)
         if len(wanted) >= LEAST_ROWS:
-            found.append(Relation(target, partner, dict(zip(features, _robust(design, wanted).tolist(), strict=True)), instant))
+            terms = dict(zip(free, _robust(np.stack([joined[name] for name in free], axis=1), wanted).tolist(), strict=True))
+            found.append(Relation(target, partner, terms | ({SLIDE: -1.0} if SLIDE in features else {}), instant))
     return found
 
 

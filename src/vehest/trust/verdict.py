@@ -20,12 +20,15 @@ from vehest.estimators.kernels.compiling import entry
 from vehest.trust import health_kernel as kernel
 from vehest.trust.bands import band_rows
 from vehest.trust.guard import RESTART, USE, WAIT, Cleaned
-from vehest.trust.health import BEYOND_SPEED, DEGRADED, INVALID, NO_ESTIMATE, NUMBERS, VALID, Health, health_rows
+from vehest.trust.health import BEYOND_SPEED, DEGRADED, INVALID, NO_ESTIMATE, NUMBERS, TOO_WIDE, VALID, Health, health_rows
 from vehest.trust.record import Trust
 from vehest.trust.watch import CLIPPED, EXTRAPOLATED, SPINNING, Watched
 
 BAND_FACTORS = (1.0, 2.0, 4.0)
 """Factor of the band of a valid, a degraded, an invalid estimate."""
+
+WIDEST = math.radians(6.0)
+"""Half width of the band of β beyond which an estimate is invalid: what it says of the car is no more than v = 0 does."""
 
 ROLLED_BACK_SECONDS = 1.0
 
@@ -79,7 +82,7 @@ class Monitor:
         bands = np.full((len(watched.vy), 2), np.nan)
         if self._bands is not None:
             band_rows(cleaned.rows, watched.vy, variance, *self._bands, bands)
-            widen_rows(verdict.status, watched.marks, watched.vy, vx, self._farthest, bands)
+            widen_rows(verdict.status, verdict.reason, watched.marks, watched.vy, vx, self._farthest, bands)
         return bands
 
 
@@ -137,8 +140,8 @@ def verdict_rows(vy, marks, flow, measured, needed, numbers, status, reason):  #
 
 
 @entry(nogil=True)
-def widen_rows(status, marks, vy, vx, farthest, bands):  # type: ignore[no-untyped-def]
-    """Widen ``bands`` of v [m/s] and β [rad], (T, 2), of estimates that are not valid, in place.
+def widen_rows(status, reason, marks, vy, vx, farthest, bands):  # type: ignore[no-untyped-def]
+    """Widen ``bands`` of v [m/s] and β [rad], (T, 2), of estimates that are not valid, in place; wider than `WIDEST` is invalid.
 
     ``farthest`` is the 99.9th percentile of |v| of estimates in training, ``vx`` the speed of the estimate [m/s].
     """
@@ -152,3 +155,5 @@ def widen_rows(status, marks, vy, vx, farthest, bands):  # type: ignore[no-untyp
             bands[k, 0] = max(bands[k, 0], reach)
             if math.isfinite(speed):
                 bands[k, 1] = max(bands[k, 1], min(math.atan(reach / speed), math.pi))
+        if bands[k, 1] > WIDEST:
+            status[k], reason[k] = INVALID, TOO_WIDE * 10000 if reason[k] == 0.0 else reason[k]

@@ -34,6 +34,11 @@ function element(tag, properties = {}, ...children) {
   return made;
 }
 
+// A line breaks where there is no value: between two recordings.
+function broken(values) {
+  return Array.from(values, (value) => (Number.isNaN(value) ? null : value));
+}
+
 function colourOf(name) {
   return getComputedStyle(page).getPropertyValue(`--${name}`).trim();
 }
@@ -279,13 +284,13 @@ class Explorer {
     if (band) {
       for (const edge of [band.high, band.low]) {
         series.push({ stroke: "transparent", width: 0, points: { show: false } });
-        data.push(edge);
+        data.push(broken(edge));
       }
       bands.push({ series: [1, 2], fill: band.fill });
     }
     for (const line of lines) {
       series.push({ label: line.label, stroke: line.colour, width: line.width, dash: line.dash, points: { show: false } });
-      data.push(line.values);
+      data.push(broken(line.values));
     }
     const settings = {
       width: this.width(),

@@ -31,6 +31,19 @@ function isDark() {
   show();
 }
 
+// Sections below the fold: closed until their heading is pressed, all open in print.
+for (const node of document.querySelectorAll("#fold ~ *")) {
+  const heading = node.querySelector(":scope > h2");
+  if (heading) {
+    const [section, summary] = ["details", "summary"].map((name) => document.createElement(name));
+    summary.append(heading);
+    section.append(summary);
+    node.before(section);
+  }
+  node.previousElementSibling?.matches("details") && node.previousElementSibling.append(node);
+}
+window.addEventListener("beforeprint", () => document.querySelectorAll("details").forEach((section) => (section.open = true)));
+
 // Contents: headings, and the traces.
 {
   const nav = document.querySelector("nav");
@@ -39,6 +52,7 @@ function isDark() {
     const link = document.createElement("a");
     link.href = `#${target.id}`;
     link.textContent = target.tagName === "H2" ? target.textContent : "traces, course, filter";
+    link.addEventListener("click", () => target.closest("details")?.setAttribute("open", ""));
     nav.append(link);
   });
   nav.hidden = nav.children.length < 2;
