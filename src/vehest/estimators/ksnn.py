@@ -16,14 +16,16 @@ from vehest.data.recording import Recording
 from vehest.declared import setting
 from vehest.estimators.base import Trial
 from vehest.estimators.kernels import ksnn as kernel
+from vehest.estimators.kernels.recursion import CompiledNetwork, Recursion
 from vehest.estimators.networks.windowed import WindowedEstimator
+from vehest.training.members import FlatParameters
 
 GAMMA_START = 0.98
 GAMMA_SPREAD = 0.01
 SMALL = 0.1
 
 
-class KinematicsStructuredNetwork(nn.Module):
+class KinematicsStructuredNetwork(CompiledNetwork, nn.Module):
     """Bank of Luenberger-like observers blended by yaw rate (KS-NN).
 
     v⁺ = γ₁v + β₁τ(a_y - u_m ω) - ω f₁(û - u_m)        (Da Lio et al. 2023, Eq. 7a)
@@ -117,11 +119,12 @@ class KinematicsStructuredNetwork(nn.Module):
             v, u = (phi * v_local).sum(-1), (phi * u_local).sum(-1)
         return v
 
-    def compiled_members(self, parameters: Mapping[str, Tensor], prepared: Tensor, starts: Tensor) -> Tensor:
-        """The same for M members by the compiled recursion, (M, B)."""
-        theta = self._packed(parameters)
-        yaw_rate_max = float(self.yaw_rate_max)
-        return kernel.predict(theta, prepared, starts, yaw_rate_max, self.step, self.settings.n_hidden, self.settings.window)
+    def recursion(self) -> Recursion:
+        """The compiled recursion."""
+        layout, own = FlatParameters(self), self.settings
+        slots = self._packed(layout.views(torch.eye(layout.size))).flatten(1).argmax(1).numpy()
+        per_width = (own.n_local - 1) / float(self.yaw_rate_max)
+        return Recursion(kernel.loop, lambda number: (slots, own.n_local, own.n_hidden, own.window, number(self.step), number(per_width)))
 
     def _packed(self, parameters: Mapping[str, Tensor]) -> Tensor:
         gamma = parameters["gamma"]
