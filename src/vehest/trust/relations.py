@@ -107,7 +107,7 @@ def features_of(samples: Mapping[str, FloatArray], least_speed: float) -> dict[s
 def slide_of(features: Mapping[str, FloatArray], lateral: Relation, rate_hz: float) -> FloatArray:
     """v r, (T,): v is what the relation of ay leaves, integrated with the leakage of `SLIDE_SECONDS`, at most the speed."""
     left = features["ay"] - sum(value * features[name] for name, value in lateral.terms.items())
-    drift = signal.lfilter([1.0 / rate_hz], [1.0, 1.0 / (SLIDE_SECONDS * rate_hz) - 1.0], left)
+    drift = scipy.signal.lfilter([1.0 / rate_hz], [1.0, 1.0 / (SLIDE_SECONDS * rate_hz) - 1.0], left)
     return np.asarray(np.clip(drift, -np.abs(features["u"]), np.abs(features["u"])) * features["r"])
 
 
