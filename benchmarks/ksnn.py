@@ -1,4 +1,4 @@
-"""Training speed of many seeds: 64 of one KS-NN trained together against one after another by a plain PyTorch loop, in the same run.
+"""Training speed of many seeds: of a KS-NN, GRU or LSTM trained together against one after another by a plain PyTorch loop, in one run.
 
 Writes results/benchmarks/ksnn.json. Both ways train on the same random numbers in the shape of five minutes at 20 Hz (the time does not
 depend on values), in float32, batches of 64 windows, with the validation loss after every epoch. The plain loop is the readable module with
@@ -25,13 +25,15 @@ import numpy as np
 
 RESULT = Path(__file__).parents[1] / "results" / "benchmarks" / "ksnn.json"
 SAMPLES, VALIDATION_SECONDS, WINDOW, BATCH = 6000, 30.0, 30, 64
-SEEDS, PLAIN_SEEDS, EPOCHS, ROUNDS = 64, 1, 4, 3
+PLAIN_SEEDS, EPOCHS, ROUNDS = 1, 4, 3
 THREADS = 2
-STRUCTURES = {  # settings and the ratio that is asked for
-    "no bias, (P, Q) = (2, 0)": ({"n_local": 2, "n_hidden": 0, "bias": False}, 100),
-    "bias, (P, Q) = (2, 0)": ({"n_local": 2, "n_hidden": 0, "bias": True}, 100),
-    "no bias, (P, Q) = (3, 2)": ({"n_local": 3, "n_hidden": 2, "bias": False}, 30),
-    "bias, (P, Q) = (3, 2)": ({"n_local": 3, "n_hidden": 2, "bias": True}, 30),
+STRUCTURES = {  # family, settings, seeds, and the ratio that is asked for
+    "ksnn no bias, (P, Q) = (2, 0)": ("ksnn", {"n_local": 2, "n_hidden": 0, "bias": False}, 64, 900),
+    "ksnn bias, (P, Q) = (2, 0)": ("ksnn", {"n_local": 2, "n_hidden": 0, "bias": True}, 64, 900),
+    "ksnn no bias, (P, Q) = (3, 2)": ("ksnn", {"n_local": 3, "n_hidden": 2, "bias": False}, 64, 280),
+    "ksnn bias, (P, Q) = (3, 2)": ("ksnn", {"n_local": 3, "n_hidden": 2, "bias": True}, 64, 280),
+    "gru, 5 states": ("gru", {"n_states": 5}, 20, 40),
+    "lstm, 5 states": ("lstm", {"n_states": 5}, 20, 40),
 }
 Figures = tuple[float, float, list[float]]
 
@@ -47,12 +49,12 @@ def drives() -> tuple[Any, Any]:
     return drive, drive.cut(0.0, VALIDATION_SECONDS)
 
 
-def together(config: dict[str, Any]) -> Figures:
+def together(name: str, config: dict[str, Any], seeds: int) -> Figures:
     """Training steps · seeds a second of all seeds together, peak memory [MB], first validation losses."""
     import torch
 
     from vehest.estimators.base import FitData
-    from vehest.estimators.ksnn import Ksnn
+    from vehest.estimators.registry import estimator_class
     from vehest.training.context import FitContext
     from vehest.training.supervised import SupervisedSettings
 
@@ -60,46 +62,47 @@ def together(config: dict[str, Any]) -> Figures:
     train, validation = drives()
 
     def fit(epochs: int) -> tuple[float, list[float]]:
-        members = [Ksnn.from_config(config) for _ in range(SEEDS)]
+        members = [estimator_class(name).from_config(config) for _ in range(seeds)]
         for seed, member in enumerate(members):
             member.seed(seed)
         ends: list[float] = []
         settings = SupervisedSettings(max_epochs=epochs, patience=epochs, batch_size=BATCH)
         context = FitContext(on_progress=lambda progress: ends.append(time.perf_counter()))
-        records = Ksnn.fit_members(members, FitData([train], [validation]), settings, context)
+        records = estimator_class(name).fit_members(members, FitData([train], [validation]), settings, context)
         return ends[-1] - ends[0], [float(record.history["validation_loss"][0]) for record in records]
 
     seconds, losses = fit(EPOCHS + 1)  # from the end of the first epoch to that of the last
-    return EPOCHS * SEEDS * _steps() / seconds, _peak(), losses
+    return EPOCHS * seeds * _steps() / seconds, _peak(), losses
 
 
-def plain(config: dict[str, Any]) -> Figures:
+def plain(name: str, config: dict[str, Any], seeds: int) -> Figures:
     """The same for a few seeds one after another."""
     import torch
 
     torch.set_num_threads(THREADS)
-    plain_epoch(config, 0, batches=10)
+    plain_epoch(name, config, 0, batches=10)
     started = time.perf_counter()
-    losses = [plain_epoch(config, seed) for seed in range(PLAIN_SEEDS)]
+    losses = [plain_epoch(name, config, seed) for seed in range(PLAIN_SEEDS)]
     return PLAIN_SEEDS * _steps() / (time.perf_counter() - started), _peak(), losses
 
 
-def plain_epoch(config: dict[str, Any], seed: int, batches: int | None = None) -> float:
+def plain_epoch(name: str, config: dict[str, Any], seed: int, batches: int | None = None) -> float:
     """Train one network for an epoch as one would write it down; its validation loss [m²/s²]."""
     import torch
 
     from vehest.data.windows import windows_of
-    from vehest.estimators.ksnn import Ksnn
+    from vehest.estimators.registry import estimator_class
+    from vehest.training.members import constrain, prepare
     from vehest.training.supervised import _shuffle_seed
 
-    estimator = Ksnn.from_config(config)
+    estimator = estimator_class(name).from_config(config)
     train, validation = drives()
     network = estimator.network_for([train])
     network.reset(torch.Generator().manual_seed(seed))
     optimiser = torch.optim.Adam(network.parameters(), lr=1e-3)
     learnt, held_out = (windows_of([part], estimator.channels, "vy_ref", WINDOW) for part in (train, validation))
     series, targets, starts = (torch.as_tensor(values) for values in (learnt.series, learnt.targets, learnt.starts))
-    series, targets, rows = series.float(), targets.float(), torch.arange(WINDOW)
+    series, targets, rows = prepare(network, series.float()), targets.float(), torch.arange(WINDOW)
     order = torch.randperm(len(starts), generator=torch.Generator().manual_seed(_shuffle_seed(seed)))
     for batch in order.split(BATCH)[:batches]:
         optimiser.zero_grad()
@@ -107,9 +110,9 @@ def plain_epoch(config: dict[str, Any], seed: int, batches: int | None = None) -
         loss.backward()
         optimiser.step()
         with torch.no_grad():
-            network.constrain(dict(network.named_parameters()))
+            constrain(network, dict(network.named_parameters()))
     with torch.no_grad():
-        windows = torch.as_tensor(held_out.series).float()[torch.as_tensor(held_out.starts).unsqueeze(-1) + rows]
+        windows = prepare(network, torch.as_tensor(held_out.series).float())[torch.as_tensor(held_out.starts).unsqueeze(-1) + rows]
         return float((network(windows).double() - torch.as_tensor(held_out.targets)).square().mean())
 
 
@@ -122,9 +125,11 @@ def _peak() -> float:
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
 
 
-def measured(config: dict[str, Any], pools: list[ProcessPoolExecutor]) -> list[Figures]:
+def measured(name: str, config: dict[str, Any], seeds: int, pools: list[ProcessPoolExecutor]) -> list[Figures]:
     """Best rounds of the plain loop and of all seeds together."""
-    rounds = [[pool.submit(way, config).result() for pool, way in zip(pools, (plain, together), strict=True)] for _ in range(ROUNDS)]
+    rounds = [
+        [pool.submit(way, name, config, seeds).result() for pool, way in zip(pools, (plain, together), strict=True)] for _ in range(ROUNDS)
+    ]
     ways = zip(*rounds, strict=True)
     return [(max(run[0] for run in way), max(run[1] for run in way), way[0][2]) for way in ways]
 
@@ -135,16 +140,16 @@ def main() -> None:
 
     with ExitStack() as stack:
         pools = [stack.enter_context(ProcessPoolExecutor(1, mp_context=get_context("spawn"))) for _ in range(2)]
-        figures = {structure: measured(config, pools) for structure, (config, _) in STRUCTURES.items()}
+        figures = {structure: measured(*asked[:3], pools) for structure, asked in STRUCTURES.items()}
     cases = []
     for structure, (baseline, ours) in figures.items():
-        least = STRUCTURES[structure][1]
+        *_, seeds, least = STRUCTURES[structure]
         difference = max(abs(one - other) / other for one, other in zip(ours[2], baseline[2], strict=False))
         assert difference < 1e-4, f"the two ways learn different things: {difference}"
-        steps = SEEDS * _steps()
+        steps = seeds * _steps()
         cases.append(
             {
-                "case": f"ksnn {structure}: one epoch of {SEEDS} seeds, plain PyTorch one after another against together",
+                "case": f"{structure}: one epoch of {seeds} seeds, plain PyTorch one after another against together",
                 "baseline_seconds": round(steps / baseline[0], 4),
                 "ours_seconds": round(steps / ours[0], 4),
                 "ratio": round(ours[0] / baseline[0], 2),

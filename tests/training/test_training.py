@@ -15,6 +15,7 @@ from vehest.data.schema import settings_from_config
 from vehest.data.windows import windows_of
 from vehest.estimators.base import FitData
 from vehest.estimators.registry import estimator_class
+from vehest.training import supervised
 from vehest.training.checkpoints import resume_epoch
 from vehest.training.context import FitContext
 from vehest.training.search import DirectSearchSettings, nelder_mead_over_grid
@@ -22,6 +23,11 @@ from vehest.training.supervised import SupervisedSettings, _shuffle_seed
 
 DATA = FitData([planar_drive(30.0, seed=1, noise=0.05)], [planar_drive(15.0, seed=2, noise=0.05)])
 SHAPES = [("ksnn", {"n_hidden": 1, "bias": True}), ("gru", {"n_states": 2}), ("lstm", {"n_states": 2})]
+
+
+@pytest.fixture(autouse=True)
+def _looks_up_after_every_batch(monkeypatch):
+    monkeypatch.setattr(supervised, "BATCHES", 1)
 
 
 def _fit(name, config, seeds, settings, context=None, data=DATA):
@@ -106,6 +112,14 @@ class _StopAfter:
     def __call__(self) -> bool:
         self.left -= 1
         return self.left < 0
+
+
+@pytest.mark.parametrize(("name", "config"), SHAPES)
+def test_how_many_batches_are_taken_together_changes_no_bit(name, config, monkeypatch):
+    (one,), _ = _fit(name, config, [0], SupervisedSettings(max_epochs=3))
+    monkeypatch.setattr(supervised, "BATCHES", 4)  # of nine
+    (other,), _ = _fit(name, config, [0], SupervisedSettings(max_epochs=3))
+    assert np.array_equal(_weights(one), _weights(other))
 
 
 @pytest.mark.parametrize(("name", "config"), SHAPES)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from vehest.estimators.kernels import gru as kernel
 from vehest.estimators.networks.recurrent import TRIAL, RecurrentEstimator, RecurrentNetwork
 
 
@@ -19,7 +18,6 @@ class GruNetwork(RecurrentNetwork):
     """
 
     n_gates = 3
-    compiled_last_state = staticmethod(kernel.last_state)
 
     def last_state(self, prepared_windows: Tensor) -> Tensor:
         """Hidden state after the window, from zero."""

@@ -90,12 +90,10 @@ class Ksnn(WindowedEstimator):
 
     def _predict(self, series: FloatArray, starts: NDArray[np.int64]) -> FloatArray:
         """By the compiled recursion alone."""
-        weights = self.weights()
-        theta = kernel.packed(np, weights)
-        samples = np.ascontiguousarray(series, dtype=theta.dtype)
-        yaw_rate_max = float(weights["yaw_rate_max"])
-        values, _ = kernel.predictions(theta[None], samples, starts[None], yaw_rate_max, 1.0 / self.rate_hz, self.window)
-        return values[0].astype(np.float64)
+        weights, own = self.weights(), self.settings
+        flat = np.concatenate([weights[name].ravel() for name in kernel.shapes_of(own.n_local, own.n_hidden, bias=own.bias)])
+        samples = np.ascontiguousarray(series, dtype=flat.dtype)
+        return kernel.recursion_of(own, float(weights["yaw_rate_max"])).values(flat[None], samples, starts[None])[0].astype(np.float64)
 
     def c_values(self) -> dict[str, Any]:
         """Its local models and their neurons."""

@@ -9,7 +9,8 @@ A network is any ``nn.Module`` whose forward maps prepared windows to the latera
 - ``prepared(series)``: the series as it consumes it (scaled, say), (T, C) -> (T, C), asked for once; else as it was measured, in SI;
 - ``reset(generator)``: draws initial weights; else they are those that torch draws when it is built, under the member's seed;
 - ``constrain(parameters)``: brings parameters (M, ...) back into their admissible range, in place; else all are admissible;
-- ``compiled_members(parameters, prepared, starts)``: forward of M members on their own windows, (M, B), by a compiled recursion.
+- ``compiled_members(parameters, prepared, starts)``: forward of M members on their own windows, (M, B), by a compiled recursion;
+- ``compiled_descent(...)``: several steps of Adam on the mean squared error, see `vehest.estimators.networks.compiled.CompiledNetwork`.
 """
 
 from __future__ import annotations
@@ -65,6 +66,7 @@ class FlatParameters:
 
     def __init__(self, module: nn.Module) -> None:
         self.shapes = {name: parameter.shape for name, parameter in _trained(module)}
+        self.size = sum(shape.numel() for shape in self.shapes.values())
 
     def pack(self, modules: Sequence[nn.Module]) -> Tensor:
         """Rows of parameters, shape (M, K)."""

@@ -18,6 +18,8 @@ from vehest.training.context import FitContext, FitRecord, Progress, record_of_e
 from vehest.training.members import FlatParameters, constrain, fixed_state, is_plain, predict_members, prepare
 from vehest.training.supervised_settings import SupervisedSettings
 
+BATCHES = 64  # that compiled networks take before a training looks whether it should stop
+
 
 def train_members(
     networks: Sequence[nn.Module],
@@ -107,24 +109,44 @@ class _Run:
         order = torch.stack([torch.randperm(len(self.train), generator=self.generators[m]) for m in self.active.tolist()])
         total = torch.zeros(len(self.active), dtype=torch.float64)
         self.network.train()
-        for batch in order.split(self.settings.batch_size, dim=1):
+        compiled = self.settings.compiled and hasattr(self.network, "compiled_descent")
+        for batches in order.split(self.settings.batch_size * (BATCHES if compiled else 1), dim=1):
             if self.context.should_stop():
                 self.interrupted = True
                 self._save(before)
                 return
-            self.adam.zero_grad(set_to_none=True)
-            views = self.layout.views(self.flat)
-            error = self._predict(views, self.train, self.train.starts[batch], self._batch_seeds()) - self.train.targets[batch]
-            losses = error.square().mean(dim=1)
-            losses.sum().backward()
-            self.adam.step()
-            with torch.no_grad():
-                constrain(self.network, self.layout.views(self.flat.detach()))
-            if self.settings.averaging:
-                self._average()
-            total += losses.detach().double() * batch.shape[1]
+            total += self._descend(batches) if compiled else self._step(batches)
         self.epoch += 1
         self._judge(total / len(self.train))
+
+    def _step(self, batch: Tensor) -> Tensor:
+        """One step of Adam; sums of squared errors of the members, (M,)."""
+        self.adam.zero_grad(set_to_none=True)
+        views = self.layout.views(self.flat)
+        error = self._predict(views, self.train, self.train.starts[batch], self._batch_seeds()) - self.train.targets[batch]
+        losses = error.square().mean(dim=1)
+        losses.sum().backward()
+        self.adam.step()
+        with torch.no_grad():
+            constrain(self.network, self.layout.views(self.flat.detach()))
+        if self.settings.averaging:
+            self._average()
+        return losses.detach().double() * batch.shape[1]
+
+    def _descend(self, batches: Tensor) -> Tensor:
+        """The same for several batches by compiled code."""
+        own, flat, state = self.settings, self.flat.detach(), self.adam.state[self.flat]
+        if not state:
+            state |= {"step": torch.tensor(0.0), "exp_avg": torch.zeros_like(flat), "exp_avg_sq": torch.zeros_like(flat)}
+        if own.averaging and self.average is None:
+            self.average = torch.zeros_like(flat)
+        moments = state | ({"average": self.average} if own.averaging else {})
+        bounds = flat.new_tensor([[-math.inf], [math.inf]]).repeat(1, flat.shape[1])
+        constrain(self.network, self.layout.views(bounds))
+        starts, targets = self.train.starts[batches], self.train.targets[batches]
+        numbers = own.batch_size, own.learning_rate, bounds, own.averaging
+        losses: Tensor = self.network.compiled_descent(flat, moments, self.train.series, starts, targets, *numbers)  # type: ignore[operator]
+        return losses
 
     def _average(self) -> None:
         """Take the weights after this step into their average, θ̄ₜ = (1 − a)/(1 − aᵗ)·Σᵢ aᵗ⁻ⁱ θᵢ over the steps i = 1 … t.

@@ -20,7 +20,6 @@ from vehest.constants import GRAVITY
 from vehest.estimators.kernels.activation import sigmoid, tanh
 from vehest.estimators.kernels.blas import one_blas_thread
 from vehest.estimators.kernels.compiling import entry, part
-from vehest.estimators.kernels.lanes import copy_rows
 from vehest.filters.unscented_scan import Array, PointModel
 from vehest.vehicle.dynamics import TURN, UNSCALED, Dynamics, NeuralCar, PacejkaCar, Perceptron, ResidualCar, TyreNetworkCar, physical_of
 from vehest.vehicle.tyres import STILL
@@ -31,6 +30,14 @@ FRICTION_SCALED, UNSCALED_FORCES, PACEJKA_FORCES, PACEJKA_AND_RATES, RATES = ran
 _FAST = {"nogil": True, "fastmath": {"reassoc", "contract", "arcp", "nsz", "afn"}}
 compiled = entry(**_FAST)
 piece = part(**_FAST)
+
+
+@piece
+def copy_rows(rows, out):  # type: ignore[no-untyped-def]
+    """The first rows of ``out`` become ``rows``. An assignment would take longer to compile: it checks shapes and words a message."""
+    for i in range(rows.shape[0]):
+        for p in range(rows.shape[1]):
+            out[i, p] = rows[i, p]
 
 
 class CompiledPlanarCar(PointModel):

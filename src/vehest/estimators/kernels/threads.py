@@ -42,4 +42,5 @@ def _pool(threads: int) -> ThreadPoolExecutor:
     return ThreadPoolExecutor(threads, thread_name_prefix="vehest-members")
 
 
-os.register_at_fork(after_in_child=_pool.cache_clear)  # a forked process does not inherit the threads
+if hasattr(os, "register_at_fork"):  # a forked process does not inherit the threads; Windows forks none
+    os.register_at_fork(after_in_child=_pool.cache_clear)

@@ -9,13 +9,15 @@ import torch
 from torch import Tensor, nn
 
 from vehest.estimators.kernels import ksnn as kernel
+from vehest.estimators.kernels.recursion import Recursion
+from vehest.estimators.networks.compiled import CompiledNetwork
 
 GAMMA_START = 0.98
 GAMMA_SPREAD = 0.01
 SMALL = 0.1
 
 
-class KinematicsStructuredNetwork(nn.Module):
+class KinematicsStructuredNetwork(CompiledNetwork, nn.Module):
     """Bank of Luenberger-like observers blended by yaw rate (KS-NN).
 
     v⁺ = γ₁v + β₁τ(a_y - u_m ω) - ω f₁(û - u_m)        (Da Lio et al. 2023, Eq. 7a)
@@ -107,25 +109,6 @@ class KinematicsStructuredNetwork(nn.Module):
             v, u = (phi * v_local).sum(-1), (phi * u_local).sum(-1)
         return v
 
-    def compiled_members(self, parameters: Mapping[str, Tensor], prepared: Tensor, starts: Tensor) -> Tensor:
-        """The same for M members by the compiled recursion, (M, B)."""
-        theta = kernel.packed(torch, parameters)
-        result: Tensor = _Predict.apply(  # type: ignore[no-untyped-call]
-            theta, prepared, starts, float(self.yaw_rate_max), self.step, self.settings.window
-        )
-        return result
-
-
-class _Predict(torch.autograd.Function):
-    """`vehest.estimators.kernels.ksnn.predictions`, differentiable in the parameters."""
-
-    @staticmethod
-    def forward(ctx: Any, theta: Tensor, series: Tensor, starts: Tensor, yaw_rate_max: float, step: float, n_window: int) -> Tensor:
-        arrays = (theta.detach().contiguous().numpy(), series.contiguous().numpy(), starts.contiguous().numpy())
-        wanted = bool(ctx.needs_input_grad[0])
-        values, ctx.jacobian = kernel.predictions(*arrays, yaw_rate_max, step, n_window, differentiated=wanted)
-        return torch.from_numpy(values)
-
-    @staticmethod
-    def backward(ctx: Any, *upstream: Tensor) -> tuple[Tensor | None, ...]:
-        return torch.from_numpy(kernel.weighted_sum(ctx.jacobian, upstream[0].contiguous().numpy())), *[None] * 5
+    def recursion(self) -> Recursion:
+        """The compiled recursion."""
+        return kernel.recursion_of(self.settings, float(self.yaw_rate_max))

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from abc import abstractmethod
-from collections.abc import Callable, Mapping
 from typing import Any, ClassVar
 
 import numpy as np
@@ -12,7 +11,10 @@ from torch import Tensor, nn
 
 from vehest.declared import setting
 from vehest.estimators.base import Trial
+from vehest.estimators.kernels.recurrent import loop
+from vehest.estimators.kernels.recursion import Recursion
 from vehest.estimators.network import Network
+from vehest.estimators.networks.compiled import CompiledNetwork
 from vehest.estimators.networks.standardised import StandardisedNetwork
 from vehest.estimators.networks.windowed import WindowedEstimator
 
@@ -40,7 +42,7 @@ class HiddenStateEstimator(Network):
         return f"{self.title}, {self.n_states} states"
 
 
-class RecurrentNetwork(StandardisedNetwork):
+class RecurrentNetwork(CompiledNetwork, StandardisedNetwork):
     """One recurrent layer, one bias a gate, and a linear read-out of the last hidden state.
 
     Args:
@@ -48,7 +50,6 @@ class RecurrentNetwork(StandardisedNetwork):
 
     Attributes:
         n_gates: gates of the cell.
-        compiled_last_state: `last_state` as a compiled recursion, see `vehest.estimators.kernels.lanes.last_state`.
 
     Shapes:
         prepared windows: (..., N, C), standardised.
@@ -56,7 +57,6 @@ class RecurrentNetwork(StandardisedNetwork):
     """
 
     n_gates: ClassVar[int]
-    compiled_last_state: ClassVar[Callable[..., Tensor]]
 
     def __init__(self, settings: Any) -> None:
         channels, states = len(RecurrentEstimator.channels), settings.n_states
@@ -86,16 +86,13 @@ class RecurrentNetwork(StandardisedNetwork):
 
     def forward(self, prepared_windows: Tensor) -> Tensor:
         """Lateral velocity from the hidden state after the window."""
-        return self._read_out(self.last_state(prepared_windows), self.output_weight, self.output_bias)
+        output = (self.last_state(prepared_windows) * self.output_weight).sum(-1) + self.output_bias
+        return output * self.output_scale + self.output_mean
 
-    def _read_out(self, state: Tensor, weight: Tensor, bias: Tensor) -> Tensor:
-        return ((state * weight).sum(-1) + bias) * self.output_scale + self.output_mean
-
-    def compiled_members(self, parameters: Mapping[str, Tensor], prepared: Tensor, starts: Tensor) -> Tensor:
-        """The same for M members by the compiled recursion, (M, B)."""
-        weights = [parameters[name] for name in ("input_weight", "state_weight", "gate_bias")]
-        state = self.compiled_last_state(*weights, prepared, starts, self.settings.window)
-        return self._read_out(state, parameters["output_weight"].unsqueeze(1), parameters["output_bias"].unsqueeze(1))
+    def recursion(self) -> Recursion:
+        """The compiled recursion."""
+        gates, own, mean, scale = self.n_gates, self.settings, float(self.output_mean), float(self.output_scale)
+        return Recursion(loop, lambda number: (gates, own.n_states, own.window, number(mean), number(scale)))
 
 
 class RecurrentEstimator(HiddenStateEstimator, WindowedEstimator):

@@ -1,0 +1,248 @@
+"""The GRU and LSTM recursions with their read-out, compiled; equations in `vehest.estimators.gru` and `vehest.estimators.lstm`.
+
+Parameters of a member are those of `RecurrentNetwork` in their order: weights of inputs (G, H, C), of states (G, H, H), biases (G, H), and
+weight (H,) and offset of the read-out. Windows lie side by side in lanes.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from vehest.estimators.kernels.activation import sigmoid, tanh
+from vehest.estimators.kernels.compiling import entry, part
+from vehest.estimators.kernels.recursion import gather, slopes_of, squared_error, step_of_adam
+from vehest.lanes import load, store, total, width
+
+GRU, LSTM = 3, 4  # gates
+KEPT = 6  # rows of the hidden state's size that a step leaves: the gates and two more
+BLOCK = 4  # inputs whose weights' gradients are summed together
+
+
+@entry(nogil=True)
+def loop(flat, given, series, starts, targets, batch, values, gradient, losses, adam):  # type: ignore[no-untyped-def]
+    """See `vehest.estimators.kernels.recursion.Recursion`."""
+    gates, states, n_window, mean, scale = given
+    lanes, channels = width(series), series.shape[1]
+    measured, rows, scratch = series.ravel(), np.empty(lanes, np.int64), np.empty(lanes, flat.dtype)
+    inputs = channels + states  # rows of ``seen`` a sample: measurements, and the state before
+    seen, state = np.empty(n_window * inputs * lanes, flat.dtype), np.empty(2 * states * lanes, flat.dtype)
+    kept, sums = np.empty(n_window * KEPT * states * lanes, flat.dtype), np.empty(flat.shape[1] * lanes, flat.dtype)
+    size, room = (gates, states, channels), (seen, kept, state)
+    read = gates * states * (inputs + 1)  # where the read-out's weights begin
+    for m in range(flat.shape[0]):
+        own = flat[m]
+        for number, start in enumerate(range(0, starts.shape[1], batch)):
+            end = min(start + batch, starts.shape[1])
+            out = values[m, start:end]
+            sums[:] = 0
+            for first in range(0, out.size, lanes):
+                gather(measured, channels, starts[m, start:end], first, rows, seen, inputs)
+                state[:] = 0
+                for k in range(n_window):
+                    if gates == GRU:
+                        _gru(own, size, room, k)
+                    else:
+                        _lstm(own, size, room, k)
+                value = load(state, 0) * 0 + own[read + states]
+                for i in range(states):
+                    value = value + own[read + i] * load(state, i * lanes)
+                store(scratch, 0, value * scale + mean)
+                for lane in range(min(lanes, out.size - first)):
+                    out[first + lane] = scratch[lane]
+                if gradient.size:
+                    slopes_of(out, targets[m, start:end], first, losses.size > 0, scratch)
+                    slope = load(scratch, 0) * scale
+                    _add(sums, (read + states) * lanes, slope)
+                    for i in range(states):
+                        _add(sums, (read + i) * lanes, slope * load(state, i * lanes))
+                        store(state, i * lanes, slope * own[read + i])  # from here on the adjoint of the state
+                        store(state, (states + i) * lanes, slope * 0)
+                    for k in range(n_window - 1, -1, -1):
+                        if gates == GRU:
+                            _gru_adjoint(own, size, room, k)
+                        else:
+                            _lstm_adjoint(own, size, room, k)
+                    _sum(size, room, sums)
+            if gradient.size:
+                for j in range(own.size):
+                    gradient[m, j] = total(load(sums, j * lanes))
+            if losses.size:
+                losses[m] += squared_error(out, targets[m, start:end])
+                step_of_adam(own, gradient[m], adam, m, number + 1)
+
+
+@part()
+def _arguments(flat, size, room, k):  # type: ignore[no-untyped-def]
+    """Arguments of the gates at step k; a candidate's is without U_n h, which is one row later. Returns where they are kept."""
+    gates, states, channels = size
+    seen, kept, state = room
+    lanes, row = width(flat), states * width(flat)
+    now, at = k * (channels + states) * lanes, k * KEPT * row
+    for i in range(states):
+        store(seen, now + (channels + i) * lanes, load(state, i * lanes))
+    biases, weights = gates * states * (channels + states), gates * states * channels
+    for unit in range(gates * states):
+        recurrent = load(seen, now) * 0
+        driven = recurrent + flat[biases + unit]
+        for c in range(channels):
+            driven = driven + flat[unit * channels + c] * load(seen, now + c * lanes)
+        for j in range(states):
+            recurrent = recurrent + flat[weights + unit * states + j] * load(state, j * lanes)
+        if gates == GRU and unit >= 2 * states:
+            store(kept, at + unit * lanes, driven)
+            store(kept, at + unit * lanes + row, recurrent)
+        else:
+            store(kept, at + unit * lanes, driven + recurrent)
+    return at
+
+
+@part()
+def _gru(flat, size, room, k):  # type: ignore[no-untyped-def]
+    """One step; leaves reset, update, candidate and U_n h."""
+    _, states, _ = size
+    _, kept, state = room
+    lanes, row = width(flat), states * width(flat)
+    first = _arguments(flat, size, room, k)
+    for at in range(first, first + 2 * row, lanes):
+        store(kept, at, sigmoid(load(kept, at)))
+    for unit in range(0, row, lanes):
+        at = first + unit
+        candidate = tanh(load(kept, at + 2 * row) + load(kept, at) * load(kept, at + 3 * row))
+        store(kept, at + 2 * row, candidate)
+        store(state, unit, candidate + load(kept, at + row) * (load(state, unit) - candidate))
+
+
+@part()
+def _lstm(flat, size, room, k):  # type: ignore[no-untyped-def]
+    """One step; leaves the four gates, tanh of the new cell, and the cell before."""
+    _, states, _ = size
+    _, kept, state = room
+    lanes, row = width(flat), states * width(flat)
+    first = _arguments(flat, size, room, k)
+    for at in range(first, first + 3 * row, lanes):
+        store(kept, at, sigmoid(load(kept, at)))
+    for unit in range(0, row, lanes):
+        at = first + unit
+        offer, before = tanh(load(kept, at + 3 * row)), load(state, row + unit)
+        cell = load(kept, at + row) * before + load(kept, at) * offer
+        shown = tanh(cell)
+        store(kept, at + 3 * row, offer)
+        store(kept, at + 4 * row, shown)
+        store(kept, at + 5 * row, before)
+        store(state, row + unit, cell)
+        store(state, unit, load(kept, at + 2 * row) * shown)
+
+
+@part()
+def _gru_adjoint(flat, size, room, k):  # type: ignore[no-untyped-def]
+    """Adjoint of one step: ``state`` is that of the state after it, then before it; what is kept becomes the arguments' adjoints."""
+    _, states, channels = size
+    seen, kept, state = room
+    lanes, row = width(flat), states * width(flat)
+    now, first = k * (channels + states) * lanes, k * KEPT * row
+    for i in range(states):
+        at, unit = first + i * lanes, i * lanes
+        reset, update, candidate, recurrent = load(kept, at), load(kept, at + row), load(kept, at + 2 * row), load(kept, at + 3 * row)
+        bar = load(state, unit)
+        inner = bar * (1 - update) * (1 - candidate * candidate)
+        store(kept, at, inner * recurrent * reset * (1 - reset))
+        store(kept, at + row, bar * (load(seen, now + (channels + i) * lanes) - candidate) * update * (1 - update))
+        store(kept, at + 2 * row, inner)
+        store(kept, at + 3 * row, inner * reset)
+        store(state, unit, bar * update)
+    _to_state(flat, size, kept, first, state)
+
+
+@part()
+def _lstm_adjoint(flat, size, room, k):  # type: ignore[no-untyped-def]
+    """The same; the second half of ``state`` is that of the cell."""
+    _, states, _ = size
+    _, kept, state = room
+    lanes, row = width(flat), states * width(flat)
+    first = k * KEPT * row
+    for i in range(states):
+        at, unit = first + i * lanes, i * lanes
+        admit, keep, show, offer = load(kept, at), load(kept, at + row), load(kept, at + 2 * row), load(kept, at + 3 * row)
+        shown, bar = load(kept, at + 4 * row), load(state, unit)
+        cell = load(state, row + unit) + bar * show * (1 - shown * shown)
+        store(kept, at, cell * offer * admit * (1 - admit))
+        store(kept, at + row, cell * load(kept, at + 5 * row) * keep * (1 - keep))
+        store(kept, at + 2 * row, bar * shown * show * (1 - show))
+        store(kept, at + 3 * row, cell * admit * (1 - offer * offer))
+        store(state, row + unit, cell * keep)
+        store(state, unit, bar * 0)
+    _to_state(flat, size, kept, first, state)
+
+
+@part()
+def _row_of_state(gates, g):  # type: ignore[no-untyped-def]
+    """Which kept row is the adjoint of what the state adds to gate g's argument: a candidate's is its own times the reset."""
+    return 3 if gates == GRU and g == 2 else g
+
+
+@part()
+def _to_state(flat, size, kept, first, state):  # type: ignore[no-untyped-def]
+    """Add what goes through the gates' arguments to the adjoint of the state before."""
+    gates, states, channels = size
+    lanes, row = width(flat), states * width(flat)
+    for j in range(states):
+        bar = load(state, j * lanes)
+        for g in range(gates):
+            weights, at = gates * states * channels + g * states * states + j, first + _row_of_state(gates, g) * row
+            for i in range(states):
+                bar = bar + flat[weights + i * states] * load(kept, at + i * lanes)
+        store(state, j * lanes, bar)
+
+
+@part()
+def _sum(size, room, sums):  # type: ignore[no-untyped-def]
+    """Gradients by the weights: products of the arguments' adjoints and the inputs, over all steps, a few inputs at a time in registers."""
+    gates, states, channels = size
+    seen, kept, _ = room
+    lanes = width(sums)
+    row, inputs = states * lanes, (channels + states) * lanes
+    steps = seen.size // inputs
+    for g in range(gates):
+        for i in range(states):
+            unit = g * states + i
+            at = g * row + i * lanes
+            offset = load(sums, (gates * states * (channels + states) + unit) * lanes)
+            for k in range(steps):
+                offset = offset + load(kept, k * KEPT * row + at)
+            store(sums, (gates * states * (channels + states) + unit) * lanes, offset)
+            _sum_block(seen, kept, sums, at, 0, channels, (steps, row, inputs), unit * channels * lanes)
+            at = _row_of_state(gates, g) * row + i * lanes
+            weights = (gates * states * channels + unit * states) * lanes
+            _sum_block(seen, kept, sums, at, channels, states, (steps, row, inputs), weights)
+
+
+@part()
+def _sum_block(seen, kept, sums, at, first, count, strides, weights):  # type: ignore[no-untyped-def]
+    """Of ``count`` inputs from ``first`` on, with one row of adjoints; the last block may overlap the one before."""
+    steps, row, inputs = strides
+    lanes = width(sums)
+    for block in range(0, count, BLOCK):
+        c = (first + block) * lanes
+        one, two, three, four = load(sums, 0) * 0, load(sums, 0) * 0, load(sums, 0) * 0, load(sums, 0) * 0
+        left = count - block
+        for k in range(steps):
+            bar, x = load(kept, k * KEPT * row + at), k * inputs + c
+            one = one + bar * load(seen, x)
+            if left > 1:
+                two = two + bar * load(seen, x + lanes)
+            if left > 2:
+                three = three + bar * load(seen, x + 2 * lanes)
+            if left > 3:
+                four = four + bar * load(seen, x + 3 * lanes)
+        _add(sums, weights + block * lanes, one)
+        if left > 1:
+            _add(sums, weights + (block + 1) * lanes, two)
+        if left > 2:
+            _add(sums, weights + (block + 2) * lanes, three)
+        if left > 3:
+            _add(sums, weights + (block + 3) * lanes, four)
+
+
+@part()
+def _add(sums, at, value):  # type: ignore[no-untyped-def]
+    store(sums, at, load(sums, at) + value)

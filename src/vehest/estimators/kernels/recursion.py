@@ -1,0 +1,151 @@
+"""Compiled recursions over windows, for members together: predictions, gradients, and epochs of training without a barrier between steps.
+
+A network's module supplies one compiled loop over members and batches (`Recursion.loop`); windows lie side by side in `vehest.lanes`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vehest.estimators.kernels.compiling import part
+from vehest.estimators.kernels.threads import over_members
+
+Floats = NDArray[Any]
+
+DECAYS, EPSILON = (0.9, 0.999), 1e-8  # of Adam
+
+
+class Recursion(NamedTuple):
+    """A network's compiled recursion.
+
+    Attributes:
+        loop: ``loop(flat, given, series, starts, targets, batch, values, gradient, losses, adam)``: for each member, a row of every
+            array but ``series``, predictions of its windows in batches. Where ``gradient`` (M, K) has rows, it becomes that of
+            Σ targets · values; if ``losses`` (M,) has, the squared error to the targets is added to it, and the parameters ``flat`` (M, K)
+            take a step of Adam after every batch.
+        given: what else it is called with, for arrays of a precision.
+    """
+
+    loop: Callable[..., None]
+    given: Callable[[Any], tuple[Any, ...]]
+
+    def values(self, flat: Floats, series: Floats, starts: NDArray[np.int64]) -> Floats:
+        """Predictions of parameters (M, K) after windows that begin at rows ``starts`` (M, B) of a series (T, C), (M, B)."""
+        none = np.empty((0, 0), flat.dtype)
+        return self._over(flat, series, starts, none, starts.shape[1], none, np.empty(0))
+
+    def gradient(self, flat: Floats, series: Floats, starts: NDArray[np.int64], weights: Floats) -> Floats:
+        """Derivatives of the `values`, summed with weights (M, B), by the parameters, (M, K)."""
+        gradient = np.empty_like(flat)
+        self._over(flat, series, starts, weights, starts.shape[1], gradient, np.empty(0))
+        return gradient
+
+    def descend(
+        self,
+        flat: Floats,
+        moments: tuple[Floats, Floats, Floats],
+        steps: float,
+        series: Floats,
+        starts: NDArray[np.int64],
+        targets: Floats,
+        batch: int,
+        rate: float,
+        bounds: Floats,
+        averaging: float,
+    ) -> Floats:
+        """Steps of Adam on mean squared errors, in place.
+
+        Args:
+            flat: parameters, (M, K).
+            moments: averages of the gradient and of its square, and of the parameters, which is used with averaging alone.
+            steps: number of steps before these.
+            series: measurements as the network takes them, (T, C).
+            starts: first row of each window in the order of the batches, (M, B).
+            targets: values to learn of each, (M, B).
+            batch: windows in a batch.
+            rate: step size.
+            bounds: least and largest admissible value of each parameter, (2, K).
+            averaging: see `vehest.training.supervised_settings.SupervisedSettings`.
+
+        Returns:
+            Sums of squared errors, (M,), float64.
+        """
+        losses = np.zeros(len(flat))
+        adam = (*moments, bounds, steps, rate, *DECAYS, EPSILON, averaging)
+        self._over(flat, series, starts, targets, batch, np.empty_like(flat), losses, adam)
+        return losses
+
+    def _over(
+        self, flat: Floats, series: Floats, starts: Any, targets: Floats, batch: int, gradient: Floats, losses: Floats, adam: Any = None
+    ) -> Floats:
+        """Values, (M, B), by all threads."""
+        values, given = np.empty(starts.shape, flat.dtype), self.given(flat.dtype.type)
+        if adam is None:
+            adam = (flat, flat, flat, flat, *[0.0] * 6)
+
+        def work(m: int, end: int) -> None:
+            own = (*(rows[m:end] for rows in adam[:3]), *adam[3:])
+            parts = (starts[m:end], targets[m:end], batch, values[m:end], gradient[m:end], losses[m:end], own)
+            self.loop(flat[m:end], given, series, *parts)
+
+        over_members(work, len(flat))
+        return values
+
+
+@part()
+def gather(series, channels, starts, first, rows, seen, stride):  # type: ignore[no-untyped-def]
+    """Windows ``first`` and later of a series, (T · channels,), side by side, ``stride`` rows of lanes a sample, as many as fit.
+
+    Lanes without a window repeat the last one.
+    """
+    for lane in range(rows.size):
+        rows[lane] = starts[min(first + lane, starts.size - 1)] * channels
+    for k in range(seen.size // (stride * rows.size)):
+        for c in range(channels):
+            at = (k * stride + c) * rows.size
+            for lane in range(rows.size):
+                seen[at + lane] = series[rows[lane] + k * channels + c]
+
+
+@part()
+def slopes_of(values, targets, first, squared, scratch):  # type: ignore[no-untyped-def]
+    """Derivatives of what is minimised by the predictions of a block of lanes into ``scratch``; 0 in lanes without a window."""
+    count = values.size
+    for lane in range(scratch.size):
+        at, slope = first + lane, scratch.dtype.type(0)
+        if at < count:
+            slope = (values[at] - targets[at]) * scratch.dtype.type(2 / count) if squared else targets[at]
+        scratch[lane] = slope
+
+
+@part()
+def squared_error(values, targets):  # type: ignore[no-untyped-def]
+    """Sum of squared errors, in double precision."""
+    result = 0.0
+    for at in range(values.size):
+        error = values[at] - targets[at]
+        result += float(error) * float(error)
+    return result
+
+
+@part()
+def step_of_adam(flat, gradient, adam, m, batches):  # type: ignore[no-untyped-def]
+    """Step ``batches`` of this call for member m, as `torch.optim.Adam` takes it, back into the bounds (Kingma & Ba 2015, Algorithm 1).
+
+    The average of the parameters is θ̄ₜ = (1 − a)/(1 − aᵗ)·Σᵢ aᵗ⁻ⁱ θᵢ over the steps i = 1 … t (Section 7.2).
+    """
+    first, second, average, bounds, before, rate, decay, decay_of_squares, epsilon, averaging = adam
+    number, t = flat.dtype.type, before + batches
+    size, root = number(rate / (1 - decay**t)), number(np.sqrt(1 - decay_of_squares**t))
+    for j in range(flat.size):
+        g = gradient[j]
+        first[m, j] += (g - first[m, j]) * number(1 - decay)
+        second[m, j] = second[m, j] * number(decay_of_squares) + g * g * number(1 - decay_of_squares)
+        moved = flat[j] - size * first[m, j] / (np.sqrt(second[m, j]) / root + number(epsilon))
+        flat[j] = min(max(moved, bounds[0, j]), bounds[1, j])
+        if averaging:
+            average[m, j] += (flat[j] - average[m, j]) * number((1 - averaging) / (1 - averaging**t))

@@ -1,0 +1,49 @@
+"""Compiled recursions (`vehest.estimators.kernels.recursion`) as torch uses them: differentiable, and trained several steps at a time."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Mapping
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from vehest.estimators.kernels.recursion import Recursion
+
+
+class CompiledNetwork(ABC):
+    """What a network with a `recursion` has for `vehest.training.members`."""
+
+    @abstractmethod
+    def recursion(self) -> Recursion:
+        """The compiled recursion."""
+
+    def compiled_members(self, parameters: Mapping[str, Tensor], prepared: Tensor, starts: Tensor) -> Tensor:
+        """Predictions of M members, each on its own windows, (M, B)."""
+        flat = torch.cat([values.reshape(len(values), -1) for values in parameters.values()], 1)
+        result: Tensor = _Predict.apply(flat, prepared, starts, self.recursion())  # type: ignore[no-untyped-call]
+        return result
+
+    def compiled_descent(
+        self, flat: Tensor, moments: Mapping[str, Tensor], prepared: Tensor, starts: Tensor, targets: Tensor, batch: int, *rest: Any
+    ) -> Tensor:
+        """See `Recursion.descend`; ``moments`` are Adam's ``step``, ``exp_avg`` and ``exp_avg_sq`` as torch names them, and ``average``."""
+        rate, bounds, averaging = rest
+        own = (moments["exp_avg"].numpy(), moments["exp_avg_sq"].numpy(), moments["average" if "average" in moments else "exp_avg"].numpy())
+        series, rows, wanted = (tensor.contiguous().numpy() for tensor in (prepared, starts, targets))
+        numbers = float(rate), bounds.numpy(), float(averaging)
+        losses = self.recursion().descend(flat.numpy(), own, float(moments["step"]), series, rows, wanted, batch, *numbers)
+        moments["step"] += -(-starts.shape[1] // batch)
+        return torch.from_numpy(losses)
+
+
+class _Predict(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, flat: Tensor, prepared: Tensor, starts: Tensor, recursion: Recursion) -> Tensor:
+        ctx.recursion, ctx.arrays = recursion, [tensor.detach().contiguous().numpy() for tensor in (flat, prepared, starts)]
+        return torch.from_numpy(recursion.values(*ctx.arrays))
+
+    @staticmethod
+    def backward(ctx: Any, *upstream: Tensor) -> tuple[Tensor | None, ...]:
+        return torch.from_numpy(ctx.recursion.gradient(*ctx.arrays, upstream[0].contiguous().numpy())), None, None, None

@@ -1,0 +1,217 @@
+"""Vectors in registers for compiled code: what reads like code for one window or sequence runs on many at once.
+
+`load` makes a vector of 64 bytes of an array. Operators, comparisons, `abs` and the functions below work on it lane by lane, with a number
+as the same in every lane; a product and a sum are fused where the processor can. Without compilation vectors are arrays.
+"""
+
+from __future__ import annotations
+
+import operator
+from typing import Any
+
+import numpy as np
+from llvmlite import ir
+from numba import types
+from numba.core.typing.templates import AbstractTemplate, infer_global, signature
+from numba.extending import intrinsic, lower_builtin, models, overload, register_model
+
+BYTES = 64
+_FUSED = ("contract",)
+
+
+class Lanes(types.Type):  # type: ignore[misc]
+    """Type of a vector of numbers, or of truth values."""
+
+    def __init__(self, dtype: Any, count: int) -> None:
+        super().__init__(f"lanes({dtype}, {count})")
+        self.dtype, self.count = dtype, count
+
+
+@register_model(Lanes)
+class _Model(models.PrimitiveModel):  # type: ignore[misc]
+    def __init__(self, manager: Any, kind: Lanes) -> None:
+        bits = {types.float32: ir.FloatType(), types.float64: ir.DoubleType(), types.boolean: ir.IntType(1)}
+        super().__init__(manager, kind, ir.VectorType(bits[kind.dtype], kind.count))
+
+
+def width(array: Any) -> int:
+    """Lanes of a vector of an array's precision."""
+    return BYTES // array.itemsize
+
+
+def load(array: Any, at: int) -> Any:
+    """The vector that begins at index ``at`` of a contiguous array, (N,)."""
+    return array[at : at + width(array)].copy()
+
+
+def store(array: Any, at: int, vector: Any) -> None:
+    """Write a vector to where `load` reads it."""
+    array[at : at + width(array)] = vector
+
+
+def choose(condition: Any, one: Any, other: Any) -> Any:
+    """``one`` in the lanes where the condition holds, ``other`` in the rest; one of both may be a number."""
+    return np.where(condition, one, other)
+
+
+def least(one: Any, other: Any) -> Any:
+    """The smaller one of each lane."""
+    return np.minimum(one, other)
+
+
+def most(one: Any, other: Any) -> Any:
+    """The larger one of each lane."""
+    return np.maximum(one, other)
+
+
+def total(vector: Any) -> Any:
+    """Sum over the lanes."""
+    return vector.sum()
+
+
+def each(function: Any, vector: Any) -> Any:
+    """What a function of a number gives for each lane."""
+    return np.array([function(value) for value in vector], vector.dtype)
+
+
+def _vector(context: Any, builder: Any, value: Any, kind: Any, wanted: Any) -> Any:
+    """A value as a vector: itself, or a number in every lane."""
+    if isinstance(kind, Lanes):
+        return value
+    number = context.cast(builder, value, kind, wanted.dtype)
+    first = builder.insert_element(ir.Constant(context.get_value_type(wanted), ir.Undefined), number, ir.Constant(ir.IntType(32), 0))
+    mask = ir.Constant(ir.VectorType(ir.IntType(32), wanted.count), [0] * wanted.count)
+    return builder.shuffle_vector(first, first, mask)
+
+
+def _pair(one: Any, other: Any) -> Lanes | None:
+    """Type of the vectors that two operands become; none if neither is one."""
+    kinds = [kind for kind in (one, other) if isinstance(kind, Lanes)]
+    numbers = [kind for kind in (one, other) if isinstance(kind, types.Number)]
+    return kinds[0] if len(kinds) + len(numbers) == 2 and kinds and kinds[0] == kinds[-1] else None
+
+
+def _between(function: Any, write: Any, truth: bool = False) -> None:
+    """Let compiled code apply a function of two operands to vectors; ``write(builder, one, other)`` writes its instruction."""
+
+    @infer_global(function)
+    class _Typing(AbstractTemplate):  # type: ignore[misc]
+        def generic(self, args: Any, kws: Any) -> Any:
+            kind = _pair(*args) if len(args) == 2 else None
+            return kind and signature(Lanes(types.boolean, kind.count) if truth else kind, *args)
+
+    def lower(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+        kind = _pair(*sig.args)
+        return write(builder, *(_vector(context, builder, value, own, kind) for value, own in zip(args, sig.args, strict=True)))
+
+    for one, other in ((Lanes, Lanes), (Lanes, types.Number), (types.Number, Lanes)):
+        lower_builtin(function, one, other)(lower)
+
+
+for _function, _name in ((operator.add, "fadd"), (operator.sub, "fsub"), (operator.mul, "fmul"), (operator.truediv, "fdiv")):
+    _between(_function, lambda builder, one, other, name=_name: getattr(builder, name)(one, other, flags=_FUSED))
+for _function, _name in ((operator.iadd, "fadd"), (operator.isub, "fsub"), (operator.imul, "fmul")):
+    _between(_function, lambda builder, one, other, name=_name: getattr(builder, name)(one, other, flags=_FUSED))
+for _function, _sign in ((operator.lt, "<"), (operator.le, "<="), (operator.gt, ">"), (operator.ge, ">="), (operator.eq, "==")):
+    _between(_function, lambda builder, one, other, sign=_sign: builder.fcmp_ordered(sign, one, other), truth=True)
+_between(least, lambda builder, one, other: builder.select(builder.fcmp_ordered("<", one, other), one, other))
+_between(most, lambda builder, one, other: builder.select(builder.fcmp_ordered(">", one, other), one, other))
+
+
+@infer_global(abs)
+@infer_global(operator.neg)
+class _Own(AbstractTemplate):  # type: ignore[misc]
+    def generic(self, args: Any, kws: Any) -> Any:
+        return signature(args[0], *args) if isinstance(args[0], Lanes) else None
+
+
+@lower_builtin(abs, Lanes)  # type: ignore[untyped-decorator]
+def _abs(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+    own = args[0].type
+    return builder.call(builder.module.declare_intrinsic(f"llvm.fabs.{_name_of(sig.args[0])}", (), ir.FunctionType(own, [own])), args)
+
+
+@lower_builtin(operator.neg, Lanes)  # type: ignore[untyped-decorator]
+def _neg(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+    return builder.fneg(args[0])
+
+
+def _pointer(context: Any, builder: Any, kind: Any, place: Any, vector: Lanes) -> Any:
+    data = context.make_array(kind)(context, builder, place[0]).data
+    return builder.bitcast(builder.gep(data, [place[1]]), context.get_value_type(vector).as_pointer())
+
+
+def _name_of(vector: Lanes) -> str:
+    return f"v{vector.count}f{vector.dtype.bitwidth}"
+
+
+def _of(array: Any) -> Lanes:
+    return Lanes(array.dtype, BYTES * 8 // array.dtype.bitwidth)
+
+
+@intrinsic  # type: ignore[untyped-decorator]
+def _load(typing: Any, array: Any, at: Any) -> Any:
+    def lower(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+        return builder.load(_pointer(context, builder, array, args, _of(array)), align=array.dtype.bitwidth // 8)
+
+    return _of(array)(array, types.intp), lower
+
+
+@intrinsic  # type: ignore[untyped-decorator]
+def _store(typing: Any, array: Any, at: Any, vector: Any) -> Any:
+    def lower(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+        value = _vector(context, builder, args[2], vector, _of(array))
+        builder.store(value, _pointer(context, builder, array, args, _of(array)), align=array.dtype.bitwidth // 8)
+        return context.get_dummy_value()
+
+    return types.void(array, types.intp, vector), lower
+
+
+@intrinsic  # type: ignore[untyped-decorator]
+def _choose(typing: Any, condition: Any, one: Any, other: Any) -> Any:
+    kind = _pair(one, other)
+
+    def lower(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+        return builder.select(args[0], *(_vector(context, builder, v, own, kind) for v, own in zip(args[1:], (one, other), strict=True)))
+
+    return kind and kind(condition, one, other), lower
+
+
+@intrinsic  # type: ignore[untyped-decorator]
+def _total(typing: Any, vector: Any) -> Any:
+    def lower(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+        number = context.get_value_type(vector.dtype)
+        function = ir.FunctionType(number, [number, args[0].type])
+        add = builder.module.declare_intrinsic(f"llvm.vector.reduce.fadd.{_name_of(vector)}", (), function)
+        return builder.call(add, [ir.Constant(number, -0.0), args[0]], fastmath=("reassoc",))
+
+    return vector.dtype(vector), lower
+
+
+@intrinsic  # type: ignore[untyped-decorator]
+def _each(typing: Any, function: Any, vector: Any) -> Any:
+    own = typing.resolve_function_type(function, (vector.dtype,), {})
+
+    def lower(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+        compute, result = context.get_function(function, own), args[1]
+        for lane in range(vector.count):
+            at = ir.Constant(ir.IntType(32), lane)
+            result = builder.insert_element(result, compute(builder, [builder.extract_element(args[1], at)]), at)
+        return result
+
+    return vector(function, vector), lower
+
+
+@overload(width, inline="always")
+def _compiled_width(array):  # type: ignore[no-untyped-def]
+    count = _of(array).count
+    return lambda array: count
+
+
+overload(load, inline="always")(lambda array, at: lambda array, at: _load(array, at))
+overload(store, inline="always")(lambda array, at, vector: lambda array, at, vector: _store(array, at, vector))
+overload(choose, inline="always")(lambda condition, one, other: lambda condition, one, other: _choose(condition, one, other))
+overload(least)(lambda one, other: None if _pair(one, other) else lambda one, other: min(one, other))
+overload(most)(lambda one, other: None if _pair(one, other) else lambda one, other: max(one, other))
+overload(total, inline="always")(lambda vector: lambda vector: _total(vector))
+overload(each, inline="always")(lambda function, vector: lambda function, vector: _each(function, vector))
