@@ -27,7 +27,7 @@ ROOT = Path(__file__).parents[1]
 RESULT = ROOT / "results" / "benchmarks" / "workflow.json"
 REPEATS = 5
 RATE, MINUTE, LONG = 100.0, 60.0, 15 * 3600.0
-LIBRARIES = "import torch, numba, scipy.signal, pandas, pyarrow.parquet"
+LIBRARIES = "import numba, scipy.special, pyarrow.parquet, hydra"
 
 
 def measured(command: Sequence[str], folder: Path, repeats: int = REPEATS, source: Path | None = None) -> dict[str, float]:

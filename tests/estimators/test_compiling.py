@@ -13,20 +13,23 @@ import pytest
 
 import vehest
 from vehest.estimators.kernels import planar_car
-from vehest.run.train import has_to_compile
+from vehest.run.train import compiles_slowly
 
 
 def test_a_learned_filter_has_to_compile_until_its_code_is_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(planar_car, "_transition", SimpleNamespace(stats=SimpleNamespace(cache_path=str(tmp_path))))
-    assert has_to_compile("learned_ukf")
-    assert not has_to_compile("luenberger")
+    assert compiles_slowly("learned_ukf")
+    assert not compiles_slowly("luenberger")
     (tmp_path / "planar_car._transition-1.py311.nbi").touch()
-    assert not has_to_compile("learned_ukf")
+    os.utime(tmp_path / "planar_car._transition-1.py311.nbi", (0.0, 0.0))
+    assert compiles_slowly("learned_ukf")  # of an earlier installation
+    (tmp_path / "planar_car._transition-1.py311.nbi").touch()
+    assert not compiles_slowly("learned_ukf")
 
 
 def test_nothing_has_to_compile_where_compilation_is_off(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(planar_car, "_transition", lambda: None)
-    assert not has_to_compile("learned_ukf")
+    assert not compiles_slowly("learned_ukf")
 
 
 @pytest.mark.parametrize("kernels", ["networks", pytest.param("cars", marks=pytest.mark.slow)])

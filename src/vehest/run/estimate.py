@@ -24,6 +24,7 @@ from vehest.data.recording import Recording
 from vehest.data.store import write_estimate
 from vehest.data.transforms import OF_REFERENCES
 from vehest.estimators.base import Estimator
+from vehest.estimators.kernels.compiling import has_to_compile
 from vehest.estimators.model_files import DESCRIPTION, WEIGHTS, load_model, read_description
 from vehest.run.artefacts import MANIFEST, Artefact, read_artefact
 from vehest.run.calibrate import trust_of
@@ -34,6 +35,7 @@ from vehest.run.estimate_log import LOGS, check_log_name, write_log
 from vehest.run.printing import complain, counted, note
 from vehest.run.train import STAGE as TRAIN
 from vehest.sources.base import read_single
+from vehest.trust import health_kernel
 from vehest.trust.contract import estimate_guarded
 from vehest.trust.health import domain_verdict, reason_in_words
 from vehest.trust.record import Trust, is_other_vehicle
@@ -108,6 +110,8 @@ def estimate_file(words: Sequence[str], out: Path, *, strict: bool = False) -> d
         raise ConfigurationError(f"'{out}' is the recording itself; name another file")
     config = compose_config("estimate", overrides)
     folder, model, trust = open_model(name, Path(config["output"]), note)
+    if trust is not None and has_to_compile(health_kernel, "health_kernel"):
+        note("compiling once, about 20 s")
     if any(key_of(override).split(".")[0] == "downsample" for override in overrides):
         model.preparation = config["downsample"]
     with use_limits(limits_from_config(config["limits"])):

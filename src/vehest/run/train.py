@@ -19,6 +19,7 @@ from vehest.data.splits import Span, Split
 from vehest.data.store import read_recording
 from vehest.data.text_files import first_line, number_in, read_rows
 from vehest.estimators.base import Estimator, FitData, FitRecord
+from vehest.estimators.kernels.compiling import has_to_compile
 from vehest.estimators.model_files import save_model
 from vehest.estimators.registry import estimator_class
 from vehest.run.artefacts import MANIFEST, TIMINGS, Artefact, StagePlan
@@ -98,16 +99,10 @@ def code_of_training(estimator: str) -> str:
     return f"train={VERSION} {estimator}={kind.version} training={getattr(kind.training_type, 'version', '1')}"
 
 
-def has_to_compile(estimator: str) -> bool:
-    """Whether an estimator's training compiles on this machine before it starts; later ones load the result."""
+def compiles_slowly(estimator: str) -> bool:
+    """Whether an estimator's training compiles on this machine for tens of seconds before it starts; later ones load the result."""
     name = estimator_class(estimator).slow_kernel
-    if not name:
-        return False
-    kernel = importlib.import_module(name)
-    if not hasattr(kernel._transition, "stats"):  # NUMBA_DISABLE_JIT
-        return False
-    folder = kernel._transition.stats.cache_path
-    return folder is not None and not any(Path(folder).glob(f"{kernel.__name__.rpartition('.')[2]}._transition-*.nbi"))
+    return bool(name) and has_to_compile(importlib.import_module(name), "_transition")
 
 
 def fit_jobs(jobs: Sequence[TrainJob], context: FitContext) -> list[tuple[Estimator, FitRecord]]:

@@ -8,6 +8,7 @@ digits differ. So a callee is made part of its callers, and exists nowhere else.
 from __future__ import annotations
 
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import numba
@@ -23,3 +24,13 @@ def part(**options: Any) -> Callable[[Callable[..., Any]], Any]:
     return numba.njit(  # type: ignore[no-any-return]
         forceinline=True, no_cpython_wrapper=True, no_cfunc_wrapper=True, error_model="numpy", **options
     )
+
+
+def has_to_compile(module: Any, name: str) -> bool:
+    """Whether a module's entry compiles on this machine before it first runs; later runs load the result."""
+    function = getattr(module, name)
+    if not hasattr(function, "stats"):  # NUMBA_DISABLE_JIT
+        return False
+    folder, source = function.stats.cache_path, Path(module.__file__)
+    kept = [] if folder is None else Path(folder).glob(f"{source.stem}.{name}-*.nbi")
+    return folder is not None and not any(index.stat().st_mtime >= source.stat().st_mtime for index in kept)
