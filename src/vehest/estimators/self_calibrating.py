@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 
 import vehest
 from vehest.constants import FloatArray
@@ -221,7 +222,8 @@ def _numbers_type(names: Sequence[str]) -> Any:
 @cache
 def _shipped_network() -> tuple[FloatArray, float]:
     """Rows of the network that comes with vehest, (P, 8 + 6 Q), and the yaw rate of its last local model [rad/s]."""
-    model = load_model(Path(vehest.__file__).parent / "pretrained")
+    with torch.device("cpu"):
+        model = load_model(Path(vehest.__file__).parent / "pretrained")
     network = model.network  # type: ignore[attr-defined]
     rows = network._packed(dict(network.named_parameters())).detach().double().numpy()
     return np.ascontiguousarray(rows), float(network.yaw_rate_max)
