@@ -2,7 +2,7 @@
 
 Run by ``make pretrained``, after the study sim_to_real, which has chosen the network's seed, with the study's output root. Bands and
 health are learnt from the simulated drives that the network was trained on and from the other simulated cars on which its training was
-stopped, those of the filter from 30 other simulated cars; ``--trust`` makes them anew for the models as they are.
+stopped, bands of the filter from 30 other simulated cars; ``--trust`` makes them anew for the models as they are.
 """
 
 from __future__ import annotations
@@ -90,7 +90,7 @@ def write_its_trust(step: str, output: Path, target: Path = TARGET) -> None:
 
 
 def write_filter(output: Path, target: Path = FILTER) -> None:
-    """The self-calibrating filter, with bands and health from 30 simulated cars: limits from one half, factors from the other."""
+    """The self-calibrating filter, with bands from 30 simulated cars, scaled on one half and calibrated on the other."""
     counts = [f"dataset.drives.{at}.count=5" for at in range(6)]
     made = Runner(output, Messages(), StopSignals()).ingest(
         compose_config("ingest", ["dataset=sim_fleet_real", *counts, f"output={output}"])
@@ -100,7 +100,8 @@ def write_filter(output: Path, target: Path = FILTER) -> None:
     stretches = [Stretch(drive, drive.start_time, "sim_fleet_real", drive.id) for drive in drives]
     target.mkdir(exist_ok=True)
     save_model(estimator, target, {"n_parameters": 0, "downsample": dict(estimator.preparation), "note": FILTER_NOTE})
-    write_trust(replace(learn_trust(estimator, stretches[::2], stretches[1::2]), guard=None), target)
+    health = read_trust(TARGET).health  # of the same channels, from more cars
+    write_trust(replace(learn_trust(estimator, stretches[::2], stretches[1::2]), guard=None, health=health), target)
 
 
 def main() -> None:

@@ -49,6 +49,9 @@ def test_wheel_holds_configuration_pipelines_and_templates(installed):
         "pretrained/model.safetensors",
         "pretrained/model.yaml",
         "pretrained/trust.yaml",
+        "pretrained_filter/model.safetensors",
+        "pretrained_filter/model.yaml",
+        "pretrained_filter/trust.yaml",
     } <= names
     splits = {file.name for file in (ROOT / "src" / "vehest_papers" / "conf" / "split").glob("*.yaml")}
     assert len(splits) > 20
@@ -73,7 +76,7 @@ def test_installed_wheel_runs_a_pipeline_from_an_empty_folder(installed, tmp_pat
     (recording,) = (tmp_path / "outputs" / "ingest").glob("*/drive_3.parquet")
     result = _vehest(installed, tmp_path, "estimate", str(recording), "--json")
     assert result.returncode == 0, result.stderr
-    assert json.loads(result.stdout)["model"] == "pretrained"
+    assert json.loads(result.stdout)["model"] == "self_calibrating"
     code = "import vehest, pathlib; print(pathlib.Path(vehest.__file__).parent)"
     environment = {**os.environ, "PYTHONPATH": str(installed)}
     where = subprocess.run([sys.executable, "-c", code], cwd=tmp_path, env=environment, capture_output=True, text=True)

@@ -317,7 +317,7 @@ def estimate(
         str,
         typer.Argument(
             metavar="MODEL|FILE",
-            help="A model's folder, or the start of its name; or the recording at once, for the pre-trained model.",
+            help="A model's folder, or the start of its name; or the recording at once, for the filter that comes with vehest.",
             autocompletion=_complete_model_or_file,
         ),
     ],
@@ -343,7 +343,7 @@ def estimate(
     The table holds v, β, half widths of their calibrated 90 % bands, and the health of each sample: 0 valid, 1 degraded, 2 invalid. An .mf4
     is the log, MDF 4, with these as channels of their own, a .mat the log's channels and these.
 
-    For a car without a model of its own, leave the model out: `vehest estimate lap.csv` takes the one that comes with vehest, with a note.
+    For a car without a model of its own, leave the model out: `vehest estimate lap.csv` takes the filter of vehest's own, with a note.
 
     Columns named like channels, in SI units, need no more; for others, describe them in conf/dataset/NAME.yaml and add `dataset=NAME`.
     """

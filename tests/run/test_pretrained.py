@@ -33,10 +33,10 @@ def test_estimate_without_a_model_takes_the_one_that_comes_with_vehest_and_says_
     code, out, err = place("estimate", "lap.csv", "dataset=mine", "-o", "default.csv", "--json")
     assert code == 0, err
     said = json.loads(out)
-    assert said["model"] == "pretrained"
-    for what in ("simulated cars and not on this one", "real Ferrari", "PCT/IT2023/050058"):
+    assert said["model"] == said["estimator"] == "self_calibrating"
+    for what in ("simulated cars and not on this one", "results/unseen_car", "PCT/IT2023/050058"):
         assert what in said["note"]
-    assert place("estimate", "pretrained", "lap.csv", "dataset=mine", "-o", "named.csv")[0] == 0
+    assert place("estimate", "self_calibrating", "lap.csv", "dataset=mine", "-o", "named.csv")[0] == 0
     assert Path("default.csv").read_bytes() == Path("named.csv").read_bytes()
     bands = pd.read_csv("default.csv")["band_sideslip"].dropna()
     assert len(bands) > 50

@@ -42,30 +42,31 @@ from vehest.trust.record import Trust, is_other_vehicle
 
 SUFFIXES = (".parquet", ".csv")
 CONTRADICTIONS = ("sign", "unit")  # checks that compare channels with each other
-PRETRAINED = "pretrained"
-"""Name of the model that comes with vehest, for cars without a model of their own."""
+PRETRAINED, SELF_CALIBRATING = "pretrained", "self_calibrating"
+"""Names of the models that come with vehest, for cars without a model of their own: a network, and the filter around it."""
+WITH_VEHEST = {PRETRAINED: "pretrained", SELF_CALIBRATING: "pretrained_filter"}
 
 
-def pretrained_folder() -> Path:
-    """The folder of the model that comes with vehest."""
-    return Path(__file__).resolve().parents[1] / PRETRAINED
+def pretrained_folder(name: str = PRETRAINED) -> Path:
+    """The folder of a model that comes with vehest."""
+    return Path(__file__).resolve().parents[1] / WITH_VEHEST[name]
 
 
-def pretrained_note() -> str:
-    """The caution that goes with estimates of the model that comes with vehest."""
-    return " ".join(read_description(pretrained_folder()).about.note.split())
+def pretrained_note(name: str = PRETRAINED) -> str:
+    """The caution that goes with estimates of a model that comes with vehest."""
+    return " ".join(read_description(pretrained_folder(name)).about.note.split())
 
 
 def find_model(name: str, output: Path, say: Callable[[str], None]) -> Path:
-    """A model's folder, by path or by the start of its name in the output root; ``pretrained`` is the one that comes with vehest.
+    """A model's folder, by path or by the start of its name in the output root; those of `WITH_VEHEST` come with vehest.
 
     Of several models the newest is taken, with a remark to ``say``; `MissingError` where there is none.
     """
     given = Path(name)
     if given.is_dir():
         return given
-    if name == PRETRAINED:
-        return pretrained_folder()
+    if name in WITH_VEHEST:
+        return pretrained_folder(name)
     models = [folder for folder in sorted(output.glob("train/[!.]*")) if folder.is_dir()]
     found = [folder for folder in models if folder.match(f"{given.name}*")]
     if not found:
@@ -97,7 +98,7 @@ def estimate_file(words: Sequence[str], out: Path, *, strict: bool = False) -> d
         VehestError: model, recording or table cannot be used.
     """
     n_names = 2 if len(words) > 1 and is_file_name(words[1]) else 1
-    name, file, overrides = (words[0] if n_names == 2 else PRETRAINED), Path(words[n_names - 1]), words[n_names:]
+    name, file, overrides = (words[0] if n_names == 2 else SELF_CALIBRATING), Path(words[n_names - 1]), words[n_names:]
     if n_names == 1 and file.is_dir():
         raise ConfigurationError(f"'{file}' is a folder; a recording is a file, and comes after the model: vehest estimate MODEL lap.csv")
     if out.suffix.lower() in LOGS:
@@ -128,11 +129,11 @@ def estimate_file(words: Sequence[str], out: Path, *, strict: bool = False) -> d
         write_estimate_table(result, out)
     return {
         "out": str(out),
-        "model": PRETRAINED if name == PRETRAINED else str(folder),
+        "model": name if name in WITH_VEHEST else str(folder),
         **_summary(result),
         "verdict": _verdict(result, drive, trust),
         "findings": findings,
-        **({"note": pretrained_note()} if name == PRETRAINED else {}),
+        **({"note": pretrained_note(name)} if name in WITH_VEHEST else {}),
     }
 
 
