@@ -16,9 +16,12 @@ from hour import hour_of_driving
 from test_report import FAMILIES, drive, study
 
 from chromium import WIDTHS, axe_violations, browser, complaints, opened
+from vehest.data.splits import Span
 from vehest.report.document import Document, write_document
 from vehest.report.explorer import unpacked
+from vehest.studies.artefacts import StudyArtefacts
 from vehest.studies.drive import comparison, leaderboard
+from vehest.studies.own_car import documents
 
 pytestmark = pytest.mark.page
 
@@ -179,6 +182,35 @@ def test_page_is_accessible_fits_its_width_and_complains_of_nothing(chromium: An
         assert axe_violations(chromium) == []
         assert chromium.execute_script("return document.documentElement.scrollWidth") <= width
         assert complaints(chromium) == []
+
+
+CUT = """return [...document.querySelectorAll("main *")].filter(
+  (own) => own.clientWidth > 0 && own.scrollWidth > own.clientWidth + 1 && getComputedStyle(own).overflowX !== "visible"
+).map((own) => own.ariaLabel ?? own.tagName)"""
+
+
+def test_page_of_an_own_car_opens_with_verdict_bars_and_traces_the_rest_folded(chromium: Any, tmp_path: Path) -> None:
+    """Two test ranges: nothing is cut at 1280 px, folded or not, the page does not scroll sideways at 390, traces break between ranges."""
+    tests = {"test": (Span("toy", "lap", 60.0, 72.0), Span("toy", "lap", 74.0, 85.0))}
+    document = documents(
+        StudyArtefacts("toy", "A toy study", "", "vehest run toy", {"": ""}, {"": study(tmp_path / "study", tests)}, [], [], [])
+    )
+    write_document(document["report"], tmp_path)
+    opened(chromium, tmp_path / "report.html", width=390)
+    assert chromium.execute_script("return document.documentElement.scrollWidth <= innerWidth")
+    opened(chromium, tmp_path / "report.html", width=1280)
+    shown = chromium.execute_script("return document.querySelector('main').innerText")
+    assert all(words in shown for words in ("Verdict", "Use KS-NN", "95 % interval", "vehest export"))
+    assert "FVU" not in shown
+    assert len(shown.split()) <= 1500
+    assert chromium.execute_script(CUT) == []
+    gaps = "return document.querySelector('figure.live').explorer.plots[0].data.slice(1).map((line) => line.includes(null))"
+    assert all(chromium.execute_script(gaps))
+    first = "return document.querySelector('figure.live').explorer.detail.label"
+    assert f"Use {chromium.execute_script(first)}." in shown
+    chromium.execute_script("document.querySelectorAll('details').forEach((section) => (section.open = true))")
+    assert "FVU" in chromium.execute_script("return document.querySelector('main').innerText")
+    assert chromium.execute_script(CUT) == []
 
 
 def test_page_shows_the_figure_where_scripts_may_not_run(chromium: Any, toy: tuple[Path, Any, Document]) -> None:

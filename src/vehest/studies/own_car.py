@@ -22,7 +22,7 @@ from vehest.estimators.registry import estimator_class, estimator_names
 from vehest.evaluation.blocks import LEAST_BLOCKS
 from vehest.evaluation.metrics import pieces_of, scored_range
 from vehest.evaluation.ranking import BASELINES, Ranking
-from vehest.report.document import REPORT, Block, Document, Figure, Table, as_code, as_text
+from vehest.report.document import REPORT, Block, Column, Document, Figure, Table, as_code, as_text
 from vehest.report.style import fixed, listed
 from vehest.studies import drive
 from vehest.studies.artefacts import EvaluatedModel, PartArtefacts, StudyArtefacts
@@ -55,7 +55,7 @@ def documents(artefacts: StudyArtefacts) -> dict[str, Document]:
     models = {name: verdict_of(part, name).model for name in part.split.tests}
     compared = drive.comparison(part, {name: (own.estimator, own.variant) for name, own in models.items() if own is not None})
     verdicts = [f"{'**On test set ' + as_code(name) + ':** ' if len(part.split.tests) > 1 else ''}{text}" for name, text in _verdicts(part)]
-    first, rest = _first_screen(compared.blocks, drive.file_of(next(iter(part.split.tests))))
+    first, rest = _first_screen(compared.blocks, part, next(iter(part.split.tests)))
     blocks: list[Block] = ["## Verdict\n\n" + "\n\n".join(verdicts), *first]
     commands = "\n".join(_commands(part, artefacts.study))
     if commands:
@@ -70,14 +70,17 @@ def documents(artefacts: StudyArtefacts) -> dict[str, Document]:
     return {REPORT: replace(compared, title=artefacts.title, blocks=whole, open_blocks=len(blocks))}
 
 
-def _first_screen(blocks: Sequence[Block], file: str) -> tuple[list[Block], list[Block]]:
-    """Errors as bars and traces of the first test set, taken out of a comparison's blocks, and the others."""
+def _first_screen(blocks: Sequence[Block], part: PartArtefacts, test_set: str) -> tuple[list[Block], list[Block]]:
+    """Errors as bars and traces of a test set, taken out of a comparison's blocks, and the others."""
+    file, rmse = drive.file_of(test_set), ranking_of(part, test_set).rmse
     bars: list[Block] = []
     traces = [block for block in blocks if isinstance(block, Figure) and block.name == f"traces_{file}"]
     for board in (block for block in blocks if isinstance(block, Table) and block.name == f"leaderboard_{file}"):
-        columns = {name: board.columns[name] for name in ("title", "rmse_sideslip", "interval", "beats_zero", "beats_static_map")}
-        caption = "RMSE(β) of every estimator with its 95 % interval over all seeds; v = 0 and the static map are what any has to beat."
-        bars = [replace(board, name=f"bars_{file}", caption=caption, columns=columns, links=())]
+        names = zip(board.frame["estimator"], board.frame["variant"], strict=True)
+        frame = board.frame.assign(rmse=[rmse.get(name, math.nan) for name in names])
+        bar = Column("95 % interval [deg]", bar=("rmse", "rmse_sideslip_low", "rmse_sideslip_high"))
+        columns = {"title": Column("estimator"), "rmse": Column("RMSE(β) [deg]"), "interval": bar}
+        bars = [Table(f"bars_{file}", "RMSE(β) of every estimator over all its seeds, with its 95 % interval.", frame, columns)]
     return [*bars, *traces], [block for block in blocks if block not in traces]
 
 

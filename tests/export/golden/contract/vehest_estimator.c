@@ -394,6 +394,8 @@ static void conclude(vehest_estimate *estimate, const cleaned_sample *cleaned)
 static const vehest_real WEIGHT_VY[TERMS] = { 1.20000005f, 0.00999999978f, 9.99999975e-06f, 0.0f, 0.00100000005f, 0.00100000005f, 0.0f, 0.0199999996f }; /* P, 1, vx, ax, ay, yaw rate vx, steer vx, vy */
 static const vehest_real WEIGHT_SIDESLIP[TERMS] = { 1.20000005f, 0.00999999978f, 9.99999975e-06f, 0.0f, 0.00100000005f, 0.00100000005f, 0.0f, 0.0199999996f };
 static const vehest_real LARGEST[TERMS] = { 0.0f, 0.0f, 20.0f, 3.0f, 5.0f, 5.0f, 1.0f, 0.5f }; /* 99.9th percentile of each in training */
+#define TOO_WIDE 32
+static const vehest_real WIDEST = 0.104719758f; /* [rad] half width of the band of sideslip, beyond which an estimate is invalid */
 static const vehest_real WIDER[3] = { 1.0f, 2.0f, 4.0f }; /* while valid, degraded, invalid */
 
 /* Half widths from what the method read, its estimate and its own variance. */
@@ -432,7 +434,7 @@ static void find_bands(const cleaned_sample *cleaned, vehest_real variance, vehe
     }
 }
 
-/* Widen the band of an estimate that is not valid; vx is the speed that goes with it. */
+/* Widen the band of an estimate that is not valid, and make one invalid whose band is too wide; vx is the speed that goes with it. */
 static void widen(vehest_real vx, vehest_estimate *estimate)
 {
     const vehest_real wider = WIDER[estimate->health];
@@ -445,6 +447,10 @@ static void widen(vehest_real vx, vehest_estimate *estimate)
         if (is_finite(speed)) {
             estimate->band_sideslip = larger(estimate->band_sideslip, smaller(VEHEST_ATAN(reach / speed), PI));
         }
+    }
+    if (estimate->band_sideslip > WIDEST) {
+        estimate->health = VEHEST_INVALID;
+        estimate->reason = (estimate->reason == 0) ? (TOO_WIDE * 10000) : estimate->reason;
     }
 }
 

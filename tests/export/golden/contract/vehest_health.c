@@ -26,10 +26,9 @@
 #define AT_JUMP 0
 #define AT_CALM C
 #define AT_ENERGY (2 * C)
-#define AT_SMOOTH ((2 + E) * C)
-#define AT_STEP ((3 + E) * C)
-#define AT_FORM ((4 + E) * C)
-#define AT_RUN ((4 + E + (FORMS * G)) * C)
+#define AT_STEP ((2 + E) * C)
+#define AT_FORM ((3 + E) * C)
+#define AT_RUN ((3 + E + (FORMS * G)) * C)
 #define AT_SHARE (AT_RUN + C)
 #define AT_DOMAIN (AT_RUN + (2 * C))
 #define AT_SLIP (AT_RUN + (3 * C))
@@ -50,7 +49,6 @@
 #define SPIN 13
 #define LOCKED 14
 #define DROPOUT 15
-#define LATE 16
 #define NONE (-1)
 
 #define VALID 0U
@@ -81,7 +79,6 @@ static const vehest_real SPIN_YAW_RATE = 0.800000012f;
 static const vehest_real SPIN_TURNING = 12.0f; /* yaw rate times speed */
 static const vehest_real FORGET_SHARE = 0.0198013261f; /* of the share of equal samples */
 static const vehest_real FORGET_AX = 0.0487705767f;
-static const vehest_real FORGET_LATE = 0.181269243f; /* of the low-pass that stands for a delay */
 
 static const vehest_real USUAL[C] = { 20.0f, 0.0f, 0.0f }; /* medians */
 static const vehest_real LARGEST[C] = { 40.0f, 0.600000024f, 9.0f }; /* sizes in training */
@@ -104,9 +101,9 @@ static const vehest_real NOISE_LEVEL[LEVELS][C] = {
     { 1.5f, 1.5f, 1.5f }
 };
 static const vehest_real INSTANT[C][FEATURES] = {
-    { 0.0f, 0.0f, 0.0f, 0.0f, 0.0f, 0.0f, 0.0f, 0.0f, 0.0f, 0.0f, 0.0f, 0.0f },
-    { 0.0f, 0.0f, 0.0f, 0.0f, 0.0f, 0.0f, 0.0f, 0.0f, 0.0f, 0.0f, 0.0f, 0.0f },
-    { 0.0500000007f, 0.0f, 0.0f, 1.0f, 0.0f, 0.0f, 0.0f, 0.0f, 0.0f, 0.0f, 0.0f, 0.0f }
+    { 0.0f, 0.0f, 0.0f, 0.0f, 0.0f, 0.0f, 0.0f, 0.0f, 0.0f, 0.0f, 0.0f, 0.0f, 0.0f },
+    { 0.0f, 0.0f, 0.0f, 0.0f, 0.0f, 0.0f, 0.0f, 0.0f, 0.0f, 0.0f, 0.0f, 0.0f, 0.0f },
+    { 0.0500000007f, 0.0f, 0.0f, 1.0f, 0.0f, 0.0f, 0.0f, 0.0f, 0.0f, 0.0f, 0.0f, 0.0f, 0.0f }
 }; /* W */
 static const vehest_real LAG[P][C][C] = {
     {
@@ -139,19 +136,17 @@ static const vehest_real STEP_POWER[C][C] = {
 };
 static const vehest_real HEALTHY[FORMS][C] = {
     { 0.00999999978f, 0.0f, 0.0199999996f },
-    { 0.0f, 0.00999999978f, 0.0f },
-    { 0.0f, 0.0f, 0.00999999978f }
+    { 0.0f, 0.00999999978f, 0.0f }
 }; /* likelihood ratios of healthy drives */
 static const vehest_real HEAVIEST[FORMS][C] = {
     { 10.0f, 20.0f, 30.0f },
-    { 10.0f, 20.0f, 30.0f },
     { 10.0f, 20.0f, 30.0f }
 }; /* largest weight of one sample in them */
-static const vehest_real FORGET_ENERGY[E] = { 0.0951625854f, 0.0198013261f, 0.00498752063f };
+static const vehest_real FORGET_ENERGY[E] = { 0.0951625854f, 0.0198013261f };
 static const vehest_real FORGET_RATIO[G] = { 0.0392105617f, 0.00995016657f, 0.00249687769f, 0.000832986203f };
-static const vehest_real FORGET_AVERAGE[A] = { 0.0392105617f, 0.00995016657f, 0.00249687769f, 0.000832986203f };
+static const vehest_real FORGET_AVERAGE[A] = { 0.0392105617f, 0.00995016657f, 0.000832986203f };
 static const vehest_real RELATION[R][FEATURES] = {
-    { 0.0500000007f, 0.0f, 0.0f, 1.0f, 0.0f, 0.0f, 0.0f, 0.0f, 0.0f, 0.0f, 0.0f, 0.0f }
+    { 0.0500000007f, 0.0f, 0.0f, 1.0f, 0.0f, 0.0f, 0.0f, 0.0f, 0.0f, 0.0f, 0.0f, 0.0f, 0.0f }
 };
 static const vehest_real RATE_GAIN[R] = { 0.0f }; /* of du/dt */
 static const int32_t TARGET[R] = { 2 }; /* channels that relations explain */
@@ -163,8 +158,7 @@ static const vehest_real LIMIT[STATISTICS] = {
     4.0f, 4.25f, 4.5f, 4.75f, 5.0f, 5.25f, 5.5f, 5.75f, 6.0f, 6.25f, 6.5f, 6.75f, 7.0f, 7.25f, 7.5f, 7.75f, 8.0f, 8.25f, 8.5f, 8.75f,
     9.0f, 9.25f, 9.5f, 9.75f, 10.0f, 10.25f, 10.5f, 10.75f, 11.0f, 11.25f, 11.5f, 11.75f, 12.0f, 12.25f, 12.5f, 12.75f, 13.0f,
     13.25f, 13.5f, 13.75f, 14.0f, 14.25f, 14.5f, 14.75f, 15.0f, 15.25f, 15.5f, 15.75f, 16.0f, 16.25f, 16.5f, 16.75f, 17.0f,
-    17.25f, 17.5f, 17.75f, 18.0f, 18.25f, 18.5f, 18.75f, 19.0f, 19.25f, 19.5f, 19.75f, 20.0f, 20.25f, 20.5f, 20.75f, 21.0f,
-    21.25f, 21.5f, 21.75f, 22.0f
+    17.25f
 };
 static const vehest_real INVERSE[STATISTICS] = {
     0.25f, 0.235294119f, 0.222222224f, 0.210526317f, 0.200000003f, 0.190476194f, 0.181818187f, 0.173913047f, 0.166666672f,
@@ -173,31 +167,24 @@ static const vehest_real INVERSE[STATISTICS] = {
     0.095238097f, 0.0930232555f, 0.0909090936f, 0.088888891f, 0.0869565234f, 0.0851063803f, 0.0833333358f, 0.0816326514f,
     0.0799999982f, 0.0784313753f, 0.0769230798f, 0.0754716992f, 0.0740740746f, 0.0727272704f, 0.0714285746f,
     0.0701754391f, 0.068965517f, 0.0677966103f, 0.0666666701f, 0.0655737668f, 0.0645161271f, 0.0634920672f, 0.0625f,
-    0.0615384616f, 0.0606060624f, 0.0597014911f, 0.0588235296f, 0.0579710156f, 0.0571428575f, 0.0563380271f,
-    0.055555556f, 0.0547945201f, 0.0540540554f, 0.0533333346f, 0.0526315793f, 0.0519480519f, 0.051282052f, 0.0506329127f,
-    0.0500000007f, 0.0493827164f, 0.048780486f, 0.0481927693f, 0.0476190485f, 0.0470588244f, 0.0465116277f,
-    0.0459770113f, 0.0454545468f
+    0.0615384616f, 0.0606060624f, 0.0597014911f, 0.0588235296f, 0.0579710156f
 }; /* of the limits */
 static const vehest_real PRIORITY[STATISTICS] = {
-    2.0f, 2.0f, 2.0f, 2.0f, 2.0f, 2.0f, 2.5f, 2.5f, 2.5f, 2.5f, 2.5f, 2.5f, 2.5f, 2.5f, 2.5f, 1.5f, 1.5f, 1.5f, 2.0f, 2.0f, 2.0f, 4.0f,
-    4.0f, 4.0f, 4.0f, 4.0f, 4.0f, 4.0f, 4.0f, 4.0f, 4.0f, 4.0f, 4.0f, 4.0f, 4.0f, 4.0f, 4.0f, 4.0f, 4.0f, 4.0f, 4.0f, 4.0f, 4.0f, 4.0f,
-    4.0f, 4.0f, 4.0f, 4.0f, 4.0f, 4.0f, 4.0f, 4.0f, 4.0f, 4.0f, 4.0f, 4.0f, 4.0f, 8.0f, 8.0f, 8.0f, 7.0f, 7.0f, 7.0f, 1.0f, 1.0f, 1.0f,
-    9.0f, 9.0f, 9.0f, 3.0f, 3.0f, 3.0f, 3.0f
+    2.0f, 2.0f, 2.0f, 2.0f, 2.0f, 2.0f, 2.5f, 2.5f, 2.5f, 2.5f, 2.5f, 2.5f, 2.0f, 2.0f, 2.0f, 4.0f, 4.0f, 4.0f, 4.0f, 4.0f, 4.0f, 4.0f,
+    4.0f, 4.0f, 4.0f, 4.0f, 4.0f, 4.0f, 4.0f, 4.0f, 4.0f, 4.0f, 4.0f, 4.0f, 4.0f, 4.0f, 4.0f, 4.0f, 4.0f, 8.0f, 8.0f, 8.0f, 7.0f, 7.0f,
+    7.0f, 1.0f, 1.0f, 1.0f, 9.0f, 9.0f, 9.0f, 3.0f, 3.0f, 3.0f
 }; /* of reasons */
 static const int32_t KIND[STATISTICS] = {
-    4, 4, 4, 4, 4, 4, 5, 5, 5, 5, 5, 5, 5, 5, 5, 6, 6, 6, 4, 4, 4, 7, 7, 7, 7, 7, 7, 7, 7, 7, 7, 7, 7, 8, 8, 8,
-    8, 8, 8, 8, 8, 8, 8, 8, 8, 16, 16, 16, 16, 16, 16, 16, 16, 16, 16, 16, 16, 2, 2, 2, 3, 3, 3, 12, 12, 12, 14,
-    14, 14, 11, 11, 11, 11
+    4, 4, 4, 4, 4, 4, 5, 5, 5, 5, 5, 5, 4, 4, 4, 7, 7, 7, 7, 7, 7, 7, 7, 7, 7, 7, 7, 8, 8, 8, 8, 8, 8, 8, 8, 8,
+    8, 8, 8, 2, 2, 2, 3, 3, 3, 12, 12, 12, 14, 14, 14, 11, 11, 11
 };
 static const int32_t ACCUSED[STATISTICS] = {
-    0, 1, 2, 0, 1, 2, 0, 0, 0, 1, 1, 1, 2, 2, 2, 0, 1, 2, 0, 1, 2, 0, 0, 0, 0, 1, 1, 1, 1, 2, 2, 2, 2, 0, 0, 0,
-    0, 1, 1, 1, 1, 2, 2, 2, 2, 0, 0, 0, 0, 1, 1, 1, 1, 2, 2, 2, 2, 0, 1, 2, 0, 1, 2, 0, 1, 2, 0, 1, 2, 2, 2, 2,
-    2
+    0, 1, 2, 0, 1, 2, 0, 0, 1, 1, 2, 2, 0, 1, 2, 0, 0, 0, 0, 1, 1, 1, 1, 2, 2, 2, 2, 0, 0, 0, 0, 1, 1, 1, 1, 2,
+    2, 2, 2, 0, 1, 2, 0, 1, 2, 0, 1, 2, 0, 1, 2, 2, 2, 2
 }; /* channels */
 static const int32_t PARTNER[STATISTICS] = {
     -1, -1, -1, -1, -1, -1, -1, -1, -1, -1, -1, -1, -1, -1, -1, -1, -1, -1, -1, -1, -1, -1, -1, -1, -1, -1, -1,
-    -1, -1, -1, -1, -1, -1, -1, -1, -1, -1, -1, -1, -1, -1, -1, -1, -1, -1, -1, -1, -1, -1, -1, -1, -1, -1, -1,
-    -1, -1, -1, -1, -1, -1, -1, -1, -1, -1, -1, -1, -1, -1, -1, 1, 1, 1, 1
+    -1, -1, -1, -1, -1, -1, -1, -1, -1, -1, -1, -1, -1, -1, -1, -1, -1, -1, -1, -1, -1, -1, -1, -1, 1, 1, 1
 }; /* channels; -1: none */
 
 typedef struct {
@@ -245,7 +232,6 @@ static int32_t receive(vehest_health *h, const vehest_real row[C], const bool me
         const bool known = measured[i] && (VEHEST_ABS(value) <= (PLAUSIBLE * LARGEST[i])); /* false for NaN */
         if (first) {
             h->last[i] = known ? value : USUAL[i];
-            h->low_passed[i] = h->last[i];
         }
         if (known) {
             const bool same = (value > STOP[0][i]) && (value < STOP[1][i]) && (value == h->last[i]) && !first;
@@ -323,6 +309,9 @@ static bool describe(vehest_health *h)
         }
         h->y[i] = total;
     }
+    h->drift += 0.00999999978f * (h->y[2] - (h->drift / 4.0f));
+    h->drift = smaller(larger(h->drift, -speed), speed);
+    h->feature[12] = h->drift * yaw_rate;
     return (speed < LEAST_SPEED) && (VEHEST_ABS(yaw_rate) < STILL_YAW_RATE) && (VEHEST_ABS(ay) < STILL_AY);
 }
 
@@ -375,8 +364,6 @@ static void predict(vehest_health *h)
         h->scaled[i] = own;
         h->clipped[i] = smaller(larger(own, -CLIP * DEVIATION[i]), CLIP * DEVIATION[i]);
         h->innovation[0][i] = smaller(larger(own, -STEP_CLIP * DEVIATION[i]), STEP_CLIP * DEVIATION[i]);
-        h->late[i] = h->low_passed[i] - (h->x[i] - h->error[i]);
-        h->low_passed[i] += FORGET_LATE * (h->x[i] - h->low_passed[i]);
     }
     for (int32_t i = 0; i < C; i++) { /* S^-1 e, and the sum over a step that began P samples ago */
         vehest_real score = 0.0f;
@@ -397,7 +384,7 @@ static void predict(vehest_health *h)
     }
 }
 
-/* Jumps, jumps out of calm, and energy, high and low. */
+/* Jumps, jumps out of calm, and energy. */
 static void look_at_innovations(vehest_health *h)
 {
     for (int32_t i = 0; i < C; i++) {
@@ -416,7 +403,6 @@ static void look_at_innovations(vehest_health *h)
             h->energy[i][e] = own;
             h->statistic[at] = VEHEST_SQRT(own);
         }
-        h->statistic[AT_SMOOTH + i] = MODELLED[i] ? (1.0f / VEHEST_SQRT(h->energy[i][E - 1] + 1e-12f)) : 0.0f;
     }
 }
 
@@ -439,10 +425,10 @@ static void find_slope(vehest_health *h, int32_t i)
     }
 }
 
-/* h: effect of one unit of a form of fault in channel i on the scaled innovations; form 0 offset, 1 scale, 2 delay. */
+/* h: effect of one unit of a form of fault in channel i on the scaled innovations; form 0 offset, 1 scale. */
 static void find_effect(vehest_health *h, int32_t i, int32_t form)
 {
-    const vehest_real now = (form == 1) ? (h->x[i] - h->error[i]) : h->late[i];
+    const vehest_real now = h->x[i] - h->error[i];
     for (int32_t j = 0; j < C; j++) {
         h->effect[j] = 0.0f;
     }
@@ -459,7 +445,7 @@ static void find_effect(vehest_health *h, int32_t i, int32_t form)
         } else {
             h->effect[m] += slope * now;
             for (int32_t lag = 0; lag < P; lag++) {
-                const vehest_real past = slope * ((form == 1) ? h->past_x[lag][i] : h->past_late[lag][i]);
+                const vehest_real past = slope * h->past_x[lag][i];
                 for (int32_t j = 0; j < C; j++) {
                     h->effect[j] -= LAG[lag][m][j] * past;
                 }
@@ -517,7 +503,7 @@ static void look_for_form(vehest_health *h, int32_t i, int32_t form, bool counts
     }
 }
 
-/* Steps, offsets, scales and delays of each channel. */
+/* Steps, offsets and scales of each channel. */
 static void look_for_forms(vehest_health *h)
 {
     for (int32_t i = 0; i < C; i++) {
@@ -565,16 +551,20 @@ static void look_at_relation(vehest_health *h, int32_t j, bool still, bool compl
     const vehest_real longer = FORGET_AVERAGE[1];
     const vehest_real gain = still ? 0.0f : RATE_GAIN[j];
     vehest_real left = h->x[TARGET[j]];
+    vehest_real small = 0.0f; /* terms of drag: a fault of the yaw rate or ay is no sign or unit of ax */
     vehest_real shown;
     vehest_real expected;
     for (int32_t f = 0; f < FEATURES; f++) {
-        left -= RELATION[j][f] * h->feature[f];
+        const vehest_real own = RELATION[j][f] * h->feature[f];
+        left -= own;
+        small += (f >= 9) ? own : 0.0f;
     }
     if (still) {
         left = 0.0f;
+        small = 0.0f;
     }
     if (complete) {
-        h->left[j] += shortest * (left - h->left[j]);
+        h->left[j] += shortest * ((left + small) - h->left[j]);
         h->smooth[j] += shortest * (h->x[TARGET[j]] - h->smooth[j]);
     }
     shown = h->smooth[j];
@@ -622,7 +612,7 @@ static void look_at_relations(vehest_health *h, bool still)
 
 static bool is_form(int32_t kind)
 {
-    return (kind == OFFSET) || (kind == SCALE) || (kind == LATE);
+    return (kind == OFFSET) || (kind == SCALE);
 }
 
 /* The form and channel with the largest likelihood ratio over the time of one that was exceeded. */
@@ -795,13 +785,11 @@ static void remember(vehest_health *h)
         for (int32_t i = 0; i < C; i++) {
             h->past_y[lag][i] = h->past_y[lag - 1][i];
             h->past_x[lag][i] = h->past_x[lag - 1][i];
-            h->past_late[lag][i] = h->past_late[lag - 1][i];
         }
     }
     for (int32_t i = 0; i < C; i++) {
         h->past_y[0][i] = h->y[i];
         h->past_x[0][i] = h->x[i];
-        h->past_late[0][i] = h->late[i];
     }
     h->rows = counted(h->rows);
 }

@@ -7,12 +7,12 @@
 
 #define VEHEST_HEALTH_LAGS 1 /* p of the autoregression */
 #define VEHEST_HEALTH_RELATIONS 1
-#define VEHEST_HEALTH_ENERGIES 3 /* times over which innovations are averaged */
+#define VEHEST_HEALTH_ENERGIES 2 /* times over which innovations are averaged */
 #define VEHEST_HEALTH_RATIOS 4 /* times over which likelihood ratios are summed */
-#define VEHEST_HEALTH_AVERAGES 4 /* times over which relations are averaged */
-#define VEHEST_HEALTH_FORMS 3 /* offset, scale, delay */
-#define VEHEST_HEALTH_FEATURES 12
-#define VEHEST_HEALTH_STATISTICS 73
+#define VEHEST_HEALTH_AVERAGES 3 /* times over which relations are averaged */
+#define VEHEST_HEALTH_FORMS 2 /* offset, scale */
+#define VEHEST_HEALTH_FEATURES 13
+#define VEHEST_HEALTH_STATISTICS 54
 
 typedef struct {
     vehest_real sum; /* of h' S^-1 e */
@@ -28,13 +28,12 @@ typedef struct {
     int32_t reason; /* last one */
     uint8_t status; /* last one */
     vehest_real mean_ax;
+    vehest_real drift; /* lateral velocity, as far as it changed lately */
     vehest_real last[VEHEST_CHANNELS];
     int32_t gap[VEHEST_CHANNELS]; /* rows without a sample; below zero while predictions settle again */
     uint32_t run[VEHEST_CHANNELS]; /* equal samples in a row */
     vehest_real share[VEHEST_CHANNELS]; /* of equal samples */
-    vehest_real low_passed[VEHEST_CHANNELS];
     vehest_real past_x[VEHEST_HEALTH_LAGS][VEHEST_CHANNELS];
-    vehest_real past_late[VEHEST_HEALTH_LAGS][VEHEST_CHANNELS]; /* low-passed value less x */
     vehest_real past_y[VEHEST_HEALTH_LAGS][VEHEST_CHANNELS];
     vehest_real innovation[VEHEST_HEALTH_LAGS][VEHEST_CHANNELS];
     vehest_real energy[VEHEST_CHANNELS][VEHEST_HEALTH_ENERGIES];
@@ -55,7 +54,6 @@ typedef struct {
     vehest_real score[VEHEST_CHANNELS]; /* S^-1 e */
     vehest_real clipped_score[VEHEST_CHANNELS];
     vehest_real stepped[VEHEST_CHANNELS]; /* sum over a step */
-    vehest_real late[VEHEST_CHANNELS];
     vehest_real level[VEHEST_CHANNELS];
     vehest_real feature[VEHEST_HEALTH_FEATURES];
     vehest_real by_yaw_rate[VEHEST_HEALTH_FEATURES]; /* derivatives of the features */
