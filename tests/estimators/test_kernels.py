@@ -5,6 +5,7 @@ from __future__ import annotations
 import threading
 from types import SimpleNamespace
 
+import numba
 import numpy as np
 import pytest
 import torch
@@ -13,7 +14,7 @@ from threadpoolctl import threadpool_info, threadpool_limits
 from conftest import planar_drive
 from vehest.data.windows import windows_of
 from vehest.estimators.gru import Gru
-from vehest.estimators.kernels.activation import rational_tanh
+from vehest.estimators.kernels.activation import arctan, rational_tanh, softplus
 from vehest.estimators.kernels.luenberger import implicit_euler_observer, observe
 from vehest.estimators.kernels.threads import over_members
 from vehest.estimators.ksnn import Ksnn
@@ -164,6 +165,20 @@ def test_lstm_equals_the_library_lstm():
 def test_rational_tanh_is_within_2e_7_of_tanh():
     x = np.linspace(-12.0, 12.0, 20001).astype(np.float32)
     assert np.abs(np.array([rational_tanh(value) for value in x]) - np.tanh(x.astype(np.float64))).max() < 2e-7
+
+
+def test_softplus_and_arctan_in_single_precision_are_within_rounding_of_the_exact_ones():
+    @numba.njit(error_model="numpy")
+    def apply(x, above, angle):
+        for i in range(x.size):
+            above[i], angle[i] = softplus(x[i]), arctan(x[i])
+
+    x = np.concatenate([np.linspace(-80.0, 80.0, 20001), np.linspace(-2.0, 2.0, 20001)]).astype(np.float32)
+    above, angle = np.empty_like(x), np.empty_like(x)
+    apply(x, above, angle)
+    exact = x.astype(np.float64)
+    assert (np.abs(above / np.logaddexp(0.0, exact) - 1.0) <= 6e-8 * (4.0 + np.abs(exact))).all(), "the argument of exp is rounded once"
+    assert np.allclose(angle, np.arctan(exact), rtol=3e-7, atol=0)
 
 
 def test_compiled_observer_equals_the_readable_one():

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -55,6 +56,10 @@ class PointModel(ABC):
 
     parameters: Sequence[Tensor] = ()
     lower: Sequence[float] | None = None
+
+    def working(self) -> AbstractContextManager[object]:
+        """What the methods below are called within, by one thread for all."""
+        return nullcontext()
 
     @abstractmethod
     def transition(self, points: Array, inputs: Array) -> Array:
@@ -320,11 +325,13 @@ class UnscentedStepper:
     def predict(self, inputs: Array, process_noise: Array | NoiseAt) -> None:
         """Move the state to the next sample by inputs of this one."""
         before = self._tape.post_mean[0].copy(), self._tape.post_covariance[0].copy()
-        _predict(self._setting, self._tape, 0, self._points, *before, inputs[None], process_noise)
+        with self._setting.model.working():
+            _predict(self._setting, self._tape, 0, self._points, *before, inputs[None], process_noise)
 
     def update(self, measurement: Array, inputs: Array, observation_noise: Array | NoiseAt) -> None:
         """Take in the measurement."""
-        _update(self._setting, self._tape, 0, self._points, measurement[None].copy(), inputs[None], observation_noise, self._refused)
+        with self._setting.model.working():
+            _update(self._setting, self._tape, 0, self._points, measurement[None].copy(), inputs[None], observation_noise, self._refused)
 
 
 def moved(model: PointModel, states: Tensor, inputs: Tensor) -> Tensor:
@@ -337,13 +344,15 @@ class _Moved(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, model: PointModel, states: Tensor, inputs: Tensor, *parameters: Tensor) -> Tensor:
         ctx.kept = (model, states.detach().unsqueeze(1).contiguous().numpy(), inputs.contiguous().numpy())
-        return torch.from_numpy(model.transition(*ctx.kept[1:])[:, 0])
+        with model.working():
+            return torch.from_numpy(model.transition(*ctx.kept[1:])[:, 0])
 
     @staticmethod
     def backward(ctx: Any, *upstream: Tensor) -> tuple[Tensor | None, ...]:
         model, points, inputs = ctx.kept
         gradients = [np.zeros(tuple(parameter.shape), points.dtype) for parameter in model.parameters]
-        model.transition_adjoint(points, inputs, upstream[0].unsqueeze(1).contiguous().numpy(), gradients)
+        with model.working():
+            model.transition_adjoint(points, inputs, upstream[0].unsqueeze(1).contiguous().numpy(), gradients)
         return (None, None, None, *(torch.from_numpy(gradient) for gradient in gradients))
 
 
@@ -378,7 +387,8 @@ class _Scan(torch.autograd.Function):
             if part is not tape:
                 tape.put(start, end, part)
 
-        share(work, y.shape[1])
+        with setting.model.working():
+            share(work, y.shape[1])
         ctx.kept = (setting, share, tape, functions, y, u)
         return torch.from_numpy(tape.post_mean), torch.from_numpy(tape.post_covariance)
 
@@ -409,7 +419,8 @@ class _Scan(torch.autograd.Function):
                 for piece, bar in zip(wanted, bars, strict=False):
                     piece[:, start:end] = bar
 
-        share(work, sequences)
+        with setting.model.working():
+            share(work, sequences)
         summed = [torch.from_numpy(np.asarray(sum(parts))) for parts in zip(*(gradients[key] for key in sorted(gradients)), strict=True)]
         y_bar, *noise = (torch.from_numpy(bar).transpose(0, 1) for bar in (measured, process, observation))
         return (None, None, None, None, y_bar, None, torch.from_numpy(mean), torch.from_numpy(covariance), *noise, *summed)

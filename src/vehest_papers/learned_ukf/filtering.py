@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from contextlib import AbstractContextManager
 
 import numpy as np
 import torch
@@ -34,6 +35,10 @@ class Swapped(PointModel):
     def __init__(self, predicting: PointModel, observing: PointModel) -> None:
         self._predicting, self._observing = predicting, observing
         self.lower = predicting.lower
+
+    def working(self) -> AbstractContextManager[object]:
+        """Of the one that predicts."""
+        return self._predicting.working()
 
     def transition(self, points: Array, inputs: Array) -> Array:
         """Of the one that predicts."""

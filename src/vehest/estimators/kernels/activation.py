@@ -1,4 +1,4 @@
-"""Hyperbolic tangent and logistic function for compiled loops, of numbers and of `vehest.lanes`."""
+"""Functions for compiled loops that become vector instructions in float32; tanh and the logistic function also of `vehest.lanes`."""
 
 from __future__ import annotations
 
@@ -6,8 +6,10 @@ import math
 from typing import Any
 
 import numba
+import numpy as np
+from llvmlite import ir
 from numba import types
-from numba.extending import overload
+from numba.extending import intrinsic, overload
 
 from vehest.lanes import Lanes, each, least, most
 
@@ -22,6 +24,16 @@ def tanh(x: Any) -> Any:
 def sigmoid(x: Any) -> Any:
     """1 / (1 + exp(-x)), computed as (1 + tanh(x/2)) / 2."""
     return 0.5 + 0.5 * tanh(0.5 * x)
+
+
+def softplus(x: Any) -> Any:
+    """log(1 + exp(x))."""
+    return max(x, x * 0) + math.log1p(math.exp(-abs(x)))
+
+
+def arctan(x: Any) -> Any:
+    """The principal arc tangent."""
+    return math.atan(x)
 
 
 def rational_tanh(x: Any) -> Any:
@@ -52,3 +64,48 @@ def _compiled_sigmoid(x):  # type: ignore[no-untyped-def]
     if types.float32 in (x, getattr(x, "dtype", None)):
         return lambda x: _F(0.5) + _F(0.5) * _rational_tanh(_F(0.5) * x)
     return lambda x: 0.5 + 0.5 * tanh(0.5 * x)
+
+
+@intrinsic  # type: ignore[untyped-decorator]
+def _of_bits(typing: Any, bits: Any) -> Any:
+    """The float32 with the bits of an int32."""
+    return types.float32(types.int32), lambda context, builder, sig, args: builder.bitcast(args[0], ir.FloatType())
+
+
+@overload(softplus)
+def _compiled_softplus(x):  # type: ignore[no-untyped-def]
+    """exp(-|x|) = 2ⁿ exp(r) with |r| < 0.35 (polynomial of Cephes' expf), and log(1 + e) = 2 artanh(e/(2 + e)) by its series."""
+    if x != types.float32:
+        return lambda x: max(x, x * 0) + math.log1p(math.exp(-abs(x)))
+
+    def compute(x):  # type: ignore[no-untyped-def]
+        y = max(-abs(x), _F(-87.0))
+        n = np.floor(y * _F(1.44269504) + _F(0.5))
+        r = y - n * _F(0.693147181)
+        p = _F(8.3334519e-3) + r * (_F(1.3981999e-3) + r * _F(1.9875692e-4))
+        p = _F(0.5) + r * (_F(0.16666665) + r * (_F(4.1665796e-2) + r * p))
+        e = (_F(1.0) + r + r * r * p) * _of_bits((np.int32(n) + np.int32(127)) << np.int32(23))
+        z = e / (_F(2.0) + e)
+        s = z * z
+        p = _F(1 / 9) + s * (_F(1 / 11) + s * (_F(1 / 13) + s * _F(1 / 15)))
+        return max(x, _F(0.0)) + _F(2.0) * z * (_F(1.0) + s * (_F(1 / 3) + s * (_F(1 / 5) + s * (_F(1 / 7) + s * p))))
+
+    return compute
+
+
+@overload(arctan)
+def _compiled_arctan(x):  # type: ignore[no-untyped-def]
+    """Abramowitz & Stegun, equation 4.4.49, and π/2 - arctan(1/x) beyond 1."""
+    if x != types.float32:
+        return lambda x: math.atan(x)
+
+    def compute(x):  # type: ignore[no-untyped-def]
+        a = abs(x)
+        y = min(a, _F(1.0)) / max(a, _F(1.0))
+        s = y * y
+        p = _F(-0.0752896400) + s * (_F(0.0429096138) + s * (_F(-0.0161657367) + s * _F(0.0028662257)))
+        p = _F(-0.3333314528) + s * (_F(0.1999355085) + s * (_F(-0.1420889944) + s * (_F(0.1065626393) + s * p)))
+        angle = y + y * s * p
+        return math.copysign(_F(1.57079633) - angle if a > _F(1.0) else angle, x)
+
+    return compute

@@ -11,13 +11,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from contextlib import AbstractContextManager
 from typing import Any
 
 import numpy as np
 import torch
 
 from vehest.constants import GRAVITY
-from vehest.estimators.kernels.activation import sigmoid, tanh
+from vehest.estimators.kernels.activation import arctan, sigmoid, softplus, tanh
 from vehest.estimators.kernels.blas import one_blas_thread
 from vehest.estimators.kernels.compiling import entry, part
 from vehest.filters.unscented_scan import Array, PointModel
@@ -74,18 +75,20 @@ class CompiledPlanarCar(PointModel):
         numbers = [physical.mass, physical.wheelbase, physical.wheel_radius, step, TURN, UNSCALED, STILL, flat, GRAVITY]
         self._car = (tuple(arrays[:6]), arrays[6], np.array(numbers, scalar), kind)
 
+    def working(self) -> AbstractContextManager[object]:
+        """With matrix products on their thread."""
+        return one_blas_thread()
+
     def transition(self, points: Array, inputs: Array) -> Array:
         """See `PointModel`."""
         out = np.empty_like(points)
-        with one_blas_thread():
-            _transition(points, inputs, self._car, BLOCK, out)
+        _transition(points, inputs, self._car, BLOCK, out)
         return out
 
     def observation(self, points: Array, inputs: Array) -> Array:
         """See `PointModel`."""
         out = np.empty((*points.shape[:2], 4), points.dtype)
-        with one_blas_thread():
-            _observation(points, inputs, self._car, BLOCK, out)
+        _observation(points, inputs, self._car, BLOCK, out)
         return out
 
     def transition_adjoint(self, points: Array, inputs: Array, upstream: Array, gradients: Sequence[Array]) -> Array:
@@ -100,8 +103,7 @@ class CompiledPlanarCar(PointModel):
         out = np.empty_like(points)
         learning = bool(self.parameters)
         own = tuple(gradients) if learning else (*self._car[0], self._car[1])  # never written to without learning
-        with one_blas_thread():
-            adjoint(points, inputs, self._car, BLOCK, upstream, out, learning, own)
+        adjoint(points, inputs, self._car, BLOCK, upstream, out, learning, own)
         return out
 
 
@@ -225,8 +227,8 @@ def _seen(x, u, car, f, slips):  # type: ignore[no-untyped-def]
     lf = constants[1] - lr
     for p in range(x.shape[1]):
         along = x[0, p] + still
-        slips[0, p] = math.atan((x[1, p] + lf * x[2, p]) / along) - u[0, p]
-        slips[1, p] = math.atan((x[1, p] - lr * x[2, p]) / along)
+        slips[0, p] = arctan((x[1, p] + lf * x[2, p]) / along) - u[0, p]
+        slips[1, p] = arctan((x[1, p] - lr * x[2, p]) / along)
         slips[2, p] = (x[3, p] - x[0, p]) / along
     if kind in (FRICTION_SCALED, UNSCALED_FORCES):
         copy_rows(x[:5], f)
@@ -243,7 +245,7 @@ def _seen(x, u, car, f, slips):  # type: ignore[no-untyped-def]
 @piece
 def _curve(slip, stiffness, shape):  # type: ignore[no-untyped-def]
     """Pacejka's curve for a peak of 1, and its slopes along slip, stiffness and shape."""
-    angle = math.atan(stiffness * slip)
+    angle = arctan(stiffness * slip)
     slope = math.cos(shape * angle)
     steep = slope * shape / (1 + stiffness * slip * stiffness * slip)
     return math.sin(shape * angle), steep * stiffness, steep * slip, slope * angle
@@ -266,10 +268,8 @@ def _forces(x, car, slips, o, forces):  # type: ignore[no-untyped-def]
         for k in range(2):
             for p in range(points):
                 forces[k, p] = x[4, p] * o[k, p]
-                value = o[2 + k, p]
                 forces[4 + k, p] = tanh(turn * slips[1 - k, p])
-                forces[2 + k, p] = -x[4, p] * (max(value, value * 0) + math.log1p(math.exp(-abs(value))))
-                forces[2 + k, p] *= forces[4 + k, p]
+                forces[2 + k, p] = -x[4, p] * softplus(o[2 + k, p]) * forces[4 + k, p]
     elif kind == UNSCALED_FORCES:
         for k in range(4):
             for p in range(points):
@@ -297,7 +297,7 @@ def _forces_adjoint(x, car, slips, o, forces, slope, o_bar, slips_bar, x_bar, le
                 o_bar[k, p] = slope[k, p] * x[4, p]
                 direction = forces[4 + k, p]
                 value = o[2 + k, p]
-                size = max(value, value * 0) + math.log1p(math.exp(-abs(value)))
+                size = softplus(value)
                 through = -slope[2 + k, p] * x[4, p]
                 o_bar[2 + k, p] = through * direction * sigmoid(value)
                 slips_bar[1 - k, p] = through * size * turn * _rise(1 - direction, 1 + direction, flat)
