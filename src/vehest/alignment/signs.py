@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from functools import cache
 
 import numpy as np
 from scipy import signal
@@ -175,8 +176,14 @@ def kinematic_band(motion: Motion) -> Callable[[FloatArray], FloatArray] | None:
     settled = settled_samples(motion)
     if settled is None:
         return None
-    design = signal.butter(2, KINEMATIC_BAND_HZ, btype="bandpass", fs=motion.rate_hz, output="sos")
+    design = _band_pass(motion.rate_hz)
     return lambda samples: np.asarray(signal.sosfiltfilt(design, samples)[settled], dtype=np.float64)
+
+
+@cache
+def _band_pass(rate_hz: float) -> FloatArray:
+    """Sections of the band-pass at a rate."""
+    return np.asarray(signal.butter(2, KINEMATIC_BAND_HZ, btype="bandpass", fs=rate_hz, output="sos"))
 
 
 def settled_samples(motion: Motion) -> BoolArray | None:
