@@ -13,6 +13,8 @@ from place import run_vehest
 from vehest.data.store import read_estimate, read_recording
 from vehest.estimators.model_files import load_model
 from vehest.run.estimate import estimate_recording, open_model
+from vehest.trust.health import INVALID, TOO_WIDE
+from vehest.trust.verdict import WIDEST
 
 HERE = Path(__file__).parent
 MODELS = sorted(folder.name for folder in (HERE / "models").iterdir())
@@ -31,7 +33,11 @@ def test_a_model_of_yesterday_estimates_as_it_did(name: str) -> None:
     then = read_estimate(folder / "estimate.parquet")
     now = estimate_recording(model, drive, trust)
     assert set(now.channels) == set(then.channels)
-    for channel, values in then.channels.items():
+    expected, wide = dict(then.channels), np.nan_to_num(then["band_sideslip"]) > WIDEST  # then valid or degraded, now invalid
+    unexplained = wide & (then["health_reason"] == 0.0)
+    expected["health"] = np.where(wide, INVALID, then["health"])
+    expected["health_reason"] = np.where(unexplained, TOO_WIDE * 10_000.0, then["health_reason"])
+    for channel, values in expected.items():
         np.testing.assert_allclose(now[channel], values, rtol=0.0, atol=TOLERANCE, equal_nan=True, err_msg=f"{name}: {channel}")
 
 

@@ -142,7 +142,7 @@ def _excess(scale: float) -> str:
 def _stands(columns: Sequence[Candidate]) -> bool:
     """Whether every column that is named as a speed, in a unit that the header gives, shows a car that stands."""
     speeds = [one for one in columns if "vx" in one.hints and one.unit and one.measures("vx")]
-    return bool(speeds) and all(largest(one.slow) * si_factor(one.unit, "vx") < STANDING for one in speeds)
+    return bool(speeds) and all(one.size * si_factor(one.unit, "vx") < STANDING for one in speeds)
 
 
 def _search(columns: Sequence[Candidate], turning: Sequence[Turning], rate_hz: float) -> Search | None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -54,12 +55,17 @@ class Candidate:
         """Whether its name suggests the speed of a wheel."""
         return any(role.startswith("wheel_speed") for role in self.hints)
 
-    @property
+    @cached_property
+    def size(self) -> float:
+        """99th percentile of the magnitude, of what is slow, in the file's unit; thousands of triples of columns ask for it."""
+        return largest(self.slow)
+
+    @cached_property
     def is_reference(self) -> bool:
         """Whether the reference measured it, by the file or else by its name."""
         return self.device == "reference" or (not self.device and is_reference(self.name))
 
-    @property
+    @cached_property
     def is_of_bus(self) -> bool:
         """Whether it comes from the car's own bus, by the file or else by its name."""
         return self.device == "car" or (not self.device and is_of_bus(self.name) and not is_reference(self.name))

@@ -130,7 +130,7 @@ def is_evident(ay: Candidate, scale: float) -> bool:
 
 def _is_plausible(column: Candidate, channel: str, unit: str) -> bool:
     low, high = RANGES[channel]
-    return low <= largest(column.slow) * si_factor(unit, channel) <= high
+    return low <= column.size * si_factor(unit, channel) <= high
 
 
 def _scored(columns: Sequence[Candidate], named: Mapping[str, Candidate], agreeing: float, scale: float) -> Turning:
