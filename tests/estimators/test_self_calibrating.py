@@ -25,6 +25,7 @@ def drive(seconds=60.0, seed=0, compliance=0.006, rear=1.3, leakage=0.02, offset
     dt, t = 1.0 / (RATE * fine), np.arange(round(seconds * RATE * fine)) / (RATE * fine)
     speed = 22.0 + 6.0 * np.sin(2.0 * np.pi * t / 37.0)
     force = angle * (4.0 * np.sin(2.0 * np.pi * t / 7.0) + 2.0 * np.sin(2.0 * np.pi * t / 3.1 + seed))  # acceleration of the rear axle
+    force *= np.minimum(t / 3.0, 1.0)
     slip = np.vectorize(lambda a: np.sign(a) * 14.0 * (1.0 - (1.0 - abs(a) / 14.0) ** 0.25) / 0.25)(force)
     v, yaw_rate = np.zeros(len(t)), np.zeros(len(t))
     for k in range(1, len(t)):  # a_r = v' + ω u - b ω', v = b ω - C u φ: solved for ω
@@ -126,6 +127,17 @@ def test_finds_the_rear_axle_and_tells_how_well():
     assert np.sqrt(np.mean(np.square(z_scores))) < 2.0
     assert np.median(shares) < 0.6 * np.median(of_priors)
     assert max(shares) < 0.4
+
+
+def test_a_kick_leaves_the_grip_limit_open():
+    samples, vy = drive(90.0, 3, compliance=0.007)
+    kicked = samples.copy()
+    kicked[100:102, 2] += 40.0
+    model = model_of()
+    _, states, state = model.trace(kicked, model.first_state(kicked[0], {}))
+    best = model.grips[int(np.argmax(state.log_weights))]
+    assert best > 6.0  # which the axle reaches below the limit
+    assert np.std(states[600:, kernel.V] - vy[600:]) < 0.4 * np.std(vy[600:])
 
 
 def test_keeps_priors_and_a_wide_band_where_nothing_tells_them():

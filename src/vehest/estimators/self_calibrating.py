@@ -57,6 +57,7 @@ class SelfCalibrating(Recursive):
     grips: tuple[float, ...] = setting((4.5, 6.0, 7.5, 9.0, 10.5, 12.0, 14.0, 17.0, 25.0), "grip limits a_max of the bank [m/s²]")
     grip: float = setting(16.0, "median of the prior of a_max", unit="m/s²", positive=True)
     grip_deviation: float = setting(0.55, "deviation of its logarithm", positive=True)
+    grip_excess: float = setting(2.0, "deviation over a second of accelerations beyond a grip limit", unit="m/s²", positive=True)
     exponent: float = setting(0.25, "p of the axle's curve", above=0.0, most=1.0)
     largest_share: float = setting(0.98, "of the grip limit at which the curve is cut off", above=0.0, below=1.0)
     compliance: float = setting(0.0051, "prior of C", unit="rad s²/m", positive=True)

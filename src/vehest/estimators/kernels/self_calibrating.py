@@ -122,7 +122,9 @@ def _axle(x, p, limit, n, lags, turning, speed, size, row, scratch):  # type: ig
     row[REAR] = -lags[YAW_RATE] - gain * turning
     row[COMPLIANCE] = speed * slip
     row[ERROR] = size
-    return _update(x, p, row, residual, n.axle_white**2 + n.axle_white_share * size**2, n.gate, True, scratch)
+    excess = max(abs(force) - limit, 0.0) / n.grip_excess  # which the grip limit rules out
+    surplus = 0.5 * min(excess * excess, n.gate * n.gate) * n.dt
+    return _update(x, p, row, residual, n.axle_white**2 + n.axle_white_share * size**2, n.gate, True, scratch) - surplus
 
 
 @part()
