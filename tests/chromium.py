@@ -1,13 +1,8 @@
 """Headless Chromium for tests of pages: starting it, opening a page at a width and in a scheme, what it and axe complain of."""
 
-from __future__ import annotations
-
 import shutil
-from collections.abc import Iterator
 from contextlib import contextmanager
 from importlib.resources import files
-from pathlib import Path
-from typing import Any
 
 import pytest
 
@@ -26,7 +21,7 @@ READY_SECONDS = 60.0
 
 
 @contextmanager
-def browser(profile: Path) -> Iterator[Any]:
+def browser(profile):
     """A browser with a profile of its own; the test is skipped where there is none.
 
     Args:
@@ -50,7 +45,7 @@ def browser(profile: Path) -> Iterator[Any]:
         started.quit()
 
 
-def opened(driver: Any, path: Path, *, width: int = 1280, scheme: str = "light") -> None:
+def opened(driver, path, *, width=1280, scheme="light"):
     """Open a page and wait until all that it draws by itself is drawn.
 
     Args:
@@ -70,12 +65,12 @@ def opened(driver: Any, path: Path, *, width: int = 1280, scheme: str = "light")
     WebDriverWait(driver, READY_SECONDS, 0.1).until(lambda own: own.execute_script(drawn))
 
 
-def complaints(driver: Any) -> list[str]:
+def complaints(driver):
     """What the browser has written to its console since the page was opened."""
     return [f"{entry['level']}: {entry['message']}" for entry in driver.get_log("browser")]
 
 
-def axe_violations(driver: Any, within: str = "html") -> list[str]:
+def axe_violations(driver, within="html"):
     """What axe finds on the page that is open, or in a part of it, a line each: rule, and the first element."""
     pytest.importorskip("axe_core_python", reason="axe-core-python is not installed: pip install 'vehest[dev]'")
     driver.execute_script((files("axe_core_python") / "axe.min.js").read_text(encoding="utf-8"))

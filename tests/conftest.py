@@ -1,14 +1,10 @@
 """Small recordings that are quick to learn from, and where the real ones are."""
 
-from __future__ import annotations
-
 import os
 
 os.environ["OPENBLAS_NUM_THREADS"] = "1"  # the other core has tests of its own
 
-from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
@@ -17,14 +13,11 @@ import torch
 import processes
 from vehest.data.recording import Recording
 
-if TYPE_CHECKING:
-    from place import Place
-
 torch.set_num_threads(1)
 
 
 @pytest.fixture(scope="session", autouse=True)
-def _one_core() -> Iterator[None]:
+def _one_core():
     """Commands that name no number of jobs run them in this process."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(os, "sched_getaffinity", lambda _: {0})
@@ -32,7 +25,7 @@ def _one_core() -> Iterator[None]:
 
 
 @pytest.fixture(scope="session", autouse=True)
-def _composed_once() -> Iterator[None]:
+def _composed_once():
     """Hydra composes the same overrides over the same files of ./conf once, which takes it 0.1 s.
 
     A file of ./conf alone that no override and no defaults list can name does not count.
@@ -41,7 +34,7 @@ def _composed_once() -> Iterator[None]:
 
     compose, composed = config.compose, {}
 
-    def kept(command: str, overrides: Sequence[str]) -> object:
+    def kept(command, overrides):
         *local, packaged, _ = config.conf_folders()
         found = {file: file.read_bytes() for folder in local for file in sorted(folder.rglob("*.yaml")) if file.is_file()}
         all_count, words = any(b"defaults" in text for text in found.values()), " ".join(overrides)
@@ -57,13 +50,13 @@ def _composed_once() -> Iterator[None]:
 
 
 @pytest.fixture(autouse=True)
-def _processes_end_with_their_test() -> Iterator[None]:
+def _processes_end_with_their_test():
     yield
     processes.end_all()
 
 
 @pytest.fixture(scope="session")
-def data_root() -> Path:
+def data_root():
     """Folder of the real recordings; tests that need it are skipped where it is not set."""
     root = os.environ.get("VEHEST_DATA")
     if not root:
@@ -71,7 +64,7 @@ def data_root() -> Path:
     return Path(root)
 
 
-def planar_drive(seconds: float = 60.0, rate_hz: float = 20.0, seed: int = 0, noise: float = 0.0, name: str = "drive") -> Recording:
+def planar_drive(seconds=60.0, rate_hz=20.0, seed=0, noise=0.0, name="drive"):
     """A drive that obeys planar kinematics exactly (up to noise): smooth vx, yaw rate and vy, accelerations derived from them."""
     generator = np.random.default_rng(seed)
     time = np.arange(round(seconds * rate_hz)) / rate_hz
@@ -90,18 +83,18 @@ def planar_drive(seconds: float = 60.0, rate_hz: float = 20.0, seed: int = 0, no
 
 
 @pytest.fixture
-def drive() -> Recording:
+def drive():
     """One minute at 20 Hz without noise."""
     return planar_drive()
 
 
 @pytest.fixture
-def drawn() -> None:
+def drawn():
     """Figures of a `place` are drawn as users see them."""
 
 
 @pytest.fixture
-def place(request: pytest.FixtureRequest, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Place:
+def place(request, tmp_path, monkeypatch, capsys):
     """A fresh place to work in, without a data root or a tracking server from outside; figures are drawn for tests that use `drawn`."""
     from place import Place, undrawn
 

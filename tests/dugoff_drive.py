@@ -1,7 +1,5 @@
 """Drives of the single track on Dugoff's tyres itself, with known tyres and sensors."""
 
-from __future__ import annotations
-
 import numpy as np
 import torch
 
@@ -13,11 +11,11 @@ TYRES = {f"{name}_{axle}": value for axle, own in (("front", FRONT), ("rear", RE
 NOISE = {"ay": 0.06, "yaw_rate": 0.002, "fy": 70.0}
 
 
-def dugoff_track(tyres: str = "plain", *, sees_sideslip: bool = False) -> DugoffTrack:
-    return DugoffTrack(LoadedCar(), FRONT, REAR, 0.01, tyres, 3.0, sees_sideslip)  # type: ignore[arg-type]
+def dugoff_track(tyres="plain", *, sees_sideslip=False):
+    return DugoffTrack(LoadedCar(), FRONT, REAR, 0.01, tyres, 3.0, sees_sideslip)
 
 
-def dugoff_drive(seconds: float = 20.0, seed: int = 0, noise: float = 1.0, name: str = "drive", *, straight: float = 0.0) -> Recording:
+def dugoff_drive(seconds=20.0, seed=0, noise=1.0, name="drive", *, straight=0.0):
     """A drive up to the limit at 100 Hz, with accelerations and all four lateral forces; its last seconds lead straight ahead."""
     generator = np.random.default_rng(seed)
     time = np.arange(round(seconds * 100)) / 100
@@ -34,7 +32,7 @@ def dugoff_drive(seconds: float = 20.0, seed: int = 0, noise: float = 1.0, name:
         states[k + 1] = track.transition(states[k], inputs[k])
     ay, yaw_rate, front, rear = track.observation(states, inputs).T.numpy()
 
-    def shown(values: np.ndarray, level: float) -> np.ndarray:
+    def shown(values, level):
         return values + noise * level * generator.standard_normal(len(time))
 
     channels = {

@@ -1,16 +1,12 @@
 """Every estimator that vehest has, fitted for a moment, and a drive for each: what holds for all families is tested on all."""
 
-from __future__ import annotations
-
 from copy import deepcopy
-from typing import Any
 
 from conftest import planar_drive
 from dugoff_drive import TYRES
 from single_track_drive import linear_drive
 from small_car_drive import small_car_drive
-from vehest.data.recording import Recording
-from vehest.estimators.base import Estimator, FitData
+from vehest.estimators.base import FitData
 from vehest.estimators.cnn_ukf import EndToEndSettings
 from vehest.estimators.ensemble_ukf import EnsembleSettings
 from vehest.estimators.networks.velocity_recurrent import SequenceSettings
@@ -49,10 +45,10 @@ SAMPLED = {
 }
 
 
-_FITTED: dict[str, Estimator] = {}
+_FITTED = {}
 
 
-def fitted(name: str, dtype: str = "float64", **config: Any) -> Estimator:
+def fitted(name, dtype="float64", **config):
     """A copy of one that was fitted for a moment to a drive that it can learn from."""
     key = repr((name, dtype, config))
     if key not in _FITTED:
@@ -60,7 +56,7 @@ def fitted(name: str, dtype: str = "float64", **config: Any) -> Estimator:
     return deepcopy(_FITTED[key])
 
 
-def _fit(name: str, dtype: str, config: dict[str, Any]) -> Estimator:
+def _fit(name, dtype, config):
     estimator = estimator_class(name).from_config(CONFIGS.get(name, {}) | config)
     estimator.seed(0)
     if estimator.training_type is NoTraining:
@@ -88,7 +84,7 @@ def _fit(name: str, dtype: str, config: dict[str, Any]) -> Estimator:
     return estimator
 
 
-def drive_for(estimator: Estimator) -> Recording:
+def drive_for(estimator):
     """A drive that it has not seen, of a car that it can estimate."""
     if "motor_current" in estimator.channels:
         return small_car_drive(3.0, 4).without_references()

@@ -1,13 +1,10 @@
 """The worked examples of docs/adding_an_estimator.md as a package of their own, installed into a folder."""
 
-from __future__ import annotations
-
 import shutil
 import sys
 from pathlib import Path
 
 import pandas as pd
-import pytest
 
 from conftest import planar_drive
 from vehest.estimators.registry import estimator_class, estimator_names
@@ -17,7 +14,7 @@ CLASSES = {"saturating_ekf": "SaturatingEkf", "sliding_mode": "SlidingMode", "wi
 NAMES = tuple(CLASSES)
 
 
-def install_examples(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def install_examples(folder, monkeypatch):
     """Put modules and entry points, as pip would install them, into a new folder on sys.path, and the configuration into ./conf."""
     about = folder / "vehest_examples-1.0.dist-info"
     about.mkdir(parents=True)
@@ -35,7 +32,7 @@ def install_examples(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     forget_examples()
 
 
-def forget_examples() -> None:
+def forget_examples():
     """Let names be looked for anew."""
     estimator_names.cache_clear()
     estimator_class.cache_clear()
@@ -43,7 +40,7 @@ def forget_examples() -> None:
         sys.modules.pop(name, None)
 
 
-def write_laps() -> None:
+def write_laps():
     """Three drives with their reference, lap1.csv to lap3.csv in the current folder."""
     for number in (1, 2, 3):
         drive = planar_drive(25.0, 100.0, seed=number, noise=0.02)

@@ -1,7 +1,5 @@
 """A small data set with a configuration and a pipeline of its own, and the command line run on it."""
 
-from __future__ import annotations
-
 import shutil
 import sys
 from functools import cache
@@ -11,7 +9,6 @@ from tempfile import TemporaryDirectory
 
 import numpy as np
 import pandas as pd
-import pytest
 import yaml
 from matplotlib.figure import Figure
 
@@ -33,7 +30,7 @@ PIPELINE = {
 }
 
 
-def write_csv(path: Path, seed: int, seconds: float = 30.0) -> pd.DataFrame:
+def write_csv(path, seed, seconds=30.0):
     """A drive at 100 Hz as a table with columns of its own names and units."""
     table, text = _table(seed, seconds)
     path.write_text(text)
@@ -41,7 +38,7 @@ def write_csv(path: Path, seed: int, seconds: float = 30.0) -> pd.DataFrame:
 
 
 @cache
-def _table(seed: int, seconds: float) -> tuple[pd.DataFrame, str]:
+def _table(seed, seconds):
     drive = planar_drive(seconds, 100.0, seed=seed, noise=0.02)
     table = pd.DataFrame(
         {
@@ -77,7 +74,7 @@ DATASET = {
 }
 
 
-def undrawn(patch: pytest.MonkeyPatch) -> None:
+def undrawn(patch):
     """Save figures without their content: laying out those of a small study takes longer than all the rest of it."""
     save = Figure.savefig
     patch.setattr(Figure, "savefig", lambda _, *arguments, **options: save(Figure((6, 4)), *arguments, **options))
@@ -87,7 +84,7 @@ STEERED = {"vx": "m/s", "yaw_rate": "rad/s", "ay": "m/s²", "steer": "rad"}
 STEERED |= {"vx_ref": "m/s", "vy_ref": "m/s", "yaw_rate_ref": "rad/s"}
 
 
-def run_vehest(capsys: pytest.CaptureFixture[str], *arguments: str) -> tuple[int, str, str]:
+def run_vehest(capsys, *arguments):
     """Exit code, standard output and standard error of a command."""
     former, code = sys.argv, 0
     sys.argv = ["vehest", *arguments]
@@ -101,14 +98,14 @@ def run_vehest(capsys: pytest.CaptureFixture[str], *arguments: str) -> tuple[int
     return code, out, err
 
 
-_DONE: dict[tuple[object, ...], tuple[tuple[int, str, str], Path]] = {}
+_DONE = {}
 _KEPT = TemporaryDirectory()
 
 
 class Place:
     """A working folder with data, configuration and a pipeline of its own."""
 
-    def __init__(self, folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    def __init__(self, folder, capsys):
         self.folder, self._capsys = folder, capsys
         for name, seed in (("one", 1), ("two", 2), ("three", 3)):
             (folder / "raw").mkdir(exist_ok=True)
@@ -126,7 +123,7 @@ class Place:
         (folder / "pipelines").mkdir()
         (folder / "pipelines" / "small.yaml").write_text(yaml.safe_dump(PIPELINE))
 
-    def add_steered(self) -> None:
+    def add_steered(self):
         """A data set ``steered``: drives of 30 s, ``first`` and ``second``, of a linear single track with a steering angle."""
         (self.folder / "raw" / "steered").mkdir()
         for name, seed in (("first", 1), ("second", 2)):
@@ -137,11 +134,11 @@ class Place:
         dataset = DATASET | {"name": "steered", "path": "${root}/steered", "time": {"column": "t", "unit": "s"}, "channels": channels}
         (self.folder / "conf" / "dataset" / "steered.yaml").write_text(yaml.safe_dump(dataset, allow_unicode=True))
 
-    def __call__(self, *arguments: str) -> tuple[int, str, str]:
+    def __call__(self, *arguments):
         """Exit code, standard output and standard error of a command."""
         return run_vehest(self._capsys, *arguments)
 
-    def once(self, *arguments: str) -> tuple[int, str, str]:
+    def once(self, *arguments):
         """The same, of a command that a test needs the outcome of: it runs once, later places like this one get a copy of what it made."""
         files = [file for file in sorted(self.folder.rglob("*")) if file.is_file() and not file.is_symlink()]
         key = (*arguments, *((file.relative_to(self.folder), sha256(file.read_bytes()).digest()) for file in files))
@@ -152,7 +149,7 @@ class Place:
             shutil.copytree(_DONE[key][1], self.folder, dirs_exist_ok=True)
         return _DONE[key][0]
 
-    def refused(self, *arguments: str) -> tuple[int, str]:
+    def refused(self, *arguments):
         """Exit code and the one line of a command that must fail and leave nothing behind."""
         before = self.files()
         code, _, err = self(*arguments)
@@ -164,7 +161,7 @@ class Place:
         assert not any(ASIDE_PREFIX in name for name in self.files())
         return code, lines[0]
 
-    def files(self) -> set[str]:
+    def files(self):
         """Every file in the output root but the locks, which stay where they are and are empty."""
         outputs = self.folder / "outputs"
         return {str(file) for file in outputs.rglob("*") if file.is_file() and outputs / "locks" not in file.parents}

@@ -7,7 +7,6 @@ import os
 import signal
 import subprocess
 import time
-from collections.abc import Callable, Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
@@ -16,28 +15,28 @@ HANGS = 900.0  # s after which a test fails; until then it waits for what happen
 MOMENT = 0.02  # s between two looks
 PR_SET_PDEATHSIG = 1  # of Linux's prctl
 _libc = ctypes.CDLL(None)
-_started: list[subprocess.Popen[Any]] = []
+_started = []
 
 
-def start(command: Sequence[object], **options: Any) -> subprocess.Popen[Any]:
+def start(command, **options):
     """Start a process that leads a session of its own; see `end_all`."""
     process = subprocess.Popen(list(map(str, command)), start_new_session=True, preexec_fn=_end_with_parent, **options)
     _started.append(process)
     return process
 
 
-def _end_with_parent() -> None:
+def _end_with_parent():
     _libc.prctl(PR_SET_PDEATHSIG, signal.SIGKILL)
 
 
-def end_all() -> None:
+def end_all():
     """Kill what `start` has started, with everything in the same process groups."""
     while _started:
         with _started.pop() as process, suppress(ProcessLookupError):
             os.killpg(process.pid, signal.SIGKILL)
 
 
-def wait_for(event: Callable[[], Any], process: subprocess.Popen[Any] | None = None, said: Callable[[], object] | None = None) -> Any:
+def wait_for(event, process=None, said=None):
     """Wait for an event and return what it says; a process that ends before it fails the test.
 
     Args:
@@ -51,7 +50,7 @@ def wait_for(event: Callable[[], Any], process: subprocess.Popen[Any] | None = N
     return found
 
 
-def is_alive(pid: int) -> bool:
+def is_alive(pid):
     try:
         state = Path(f"/proc/{pid}/stat").read_text(encoding="utf-8").rpartition(")")[2].split()[0]
     except (FileNotFoundError, ProcessLookupError):
@@ -62,11 +61,11 @@ def is_alive(pid: int) -> bool:
 class Striking:
     """A function that sends its process a signal once it is through for the n-th time; keeps its arguments."""
 
-    def __init__(self, function: Callable[..., Any], call: int = 0, number: int = 0) -> None:
+    def __init__(self, function, call=0, number=0):
         self.function, self.call, self.number = function, call, number
         self.calls: list[tuple[Any, ...]] = []
 
-    def __call__(self, *arguments: Any, **options: Any) -> Any:
+    def __call__(self, *arguments, **options):
         result = self.function(*arguments, **options)
         self.calls.append(arguments)
         if len(self.calls) == self.call:

@@ -1,7 +1,5 @@
 """Drives of a single track with rational tyres, integrated finely, with known curves, states and noise."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from vehest.data.recording import Recording
@@ -13,7 +11,7 @@ NOISE = {"yaw_rate": 0.005, "ay": 0.1}
 FINER = 20
 
 
-def rational_drive(seconds: float = 60.0, seed: int = 0, stiffness: float = 1.0, friction: float = 1.0, rate_hz: float = 20.0) -> Recording:
+def rational_drive(seconds=60.0, seed=0, stiffness=1.0, friction=1.0, rate_hz=20.0):
     """A lively drive; both cornering stiffnesses are multiplied by a factor."""
     generator = np.random.default_rng(seed)
     time = np.arange(round(seconds * rate_hz * FINER)) / (rate_hz * FINER)
@@ -45,7 +43,7 @@ def rational_drive(seconds: float = 60.0, seed: int = 0, stiffness: float = 1.0,
     return Recording(f"rational{seed}", "rational single track", rate_hz, 0.0, channels, "simulated")
 
 
-def changed(drive: Recording, channels: dict[str, np.ndarray]) -> Recording:
+def changed(drive, channels):
     """The same drive with other samples of some channels; NaN is not measured."""
     return Recording(
         drive.id, drive.vehicle, drive.rate_hz, drive.start_time, {**drive.channels, **channels}, drive.kind, frozenset(("ay", "yaw_rate"))

@@ -5,9 +5,8 @@ Names of columns, structs and parameters are those that public programs read fro
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 import pyarrow as pa
@@ -15,7 +14,6 @@ import pyarrow.csv as pc
 from scipy.io import savemat
 
 from vehest.constants import FloatArray
-from vehest.data.recording import Recording
 
 CSV_RATE_HZ, INS_RATE_HZ, GPS_RATE_HZ = 1000, 100, 10
 PREAMBLE = (
@@ -30,7 +28,7 @@ PREAMBLE = (
     "Remark: made for tests, 25 °C",
     "",
 )
-PARAMETERS: dict[str, tuple[str, Sequence[float]]] = {
+PARAMETERS = {
     "mass": ("kg", [982.0]),
     "wheelbase": ("m", [2.4]),
     "diffRatio": ("-", [4.2]),
@@ -45,7 +43,7 @@ _INS = "insData"
 _TYRE = "tireData"
 
 
-def _columns() -> dict[str, tuple[str, int, str]]:
+def _columns():
     """The 55 columns in order: name -> (unit, rate of its sensor [Hz], struct of the MAT file)."""
     columns = {"time": ("s", CSV_RATE_HZ, "")}
     for name, unit in {"handwheelAngle": "°", "throttle": "%", "brake": "%", "clutch": "%", "engineSpeed": "rpm", "PPS": "-"}.items():
@@ -62,11 +60,7 @@ def _columns() -> dict[str, tuple[str, int, str]]:
     for what, unit, axes in (("pos", "m", "north east down"), ("vel", "m/s", "north east down"), ("orient", "°", "heading pitch roll")):
         for axis in axes.split():
             columns[f"{what}Accuracy_{axis}"] = (unit, GPS_RATE_HZ, _INS)
-    for what, unit, corners in (
-        ("chassisAccel", "g", "FL FR RL RR"),
-        ("deflection", "mm", "FL FR RR"),
-        ("wheelAccel", "g", "FL FR RL RR"),
-    ):
+    for what, unit, corners in (("chassisAccel", "g", "FL FR RL RR"), ("deflection", "mm", "FL FR RR"), ("wheelAccel", "g", "FL FR RL RR")):
         for corner in corners.split():
             columns[f"{what}{corner}"] = (unit, CSV_RATE_HZ, _TYRE)
     return columns
@@ -90,12 +84,12 @@ class Drive:
     signals: Mapping[str, FloatArray]
     start_time: float = 0.0
 
-    def rows(self) -> int:
+    def rows(self):
         """Rows of the CSV file."""
         return round(self.seconds * CSV_RATE_HZ)
 
 
-def smooth_drive(seconds: float, start_time: float = 0.0, decimals: int | None = None) -> tuple[Drive, dict[str, FloatArray]]:
+def smooth_drive(seconds, start_time=0.0, decimals=None):
     """A drive that obeys planar kinematics exactly, and its channels in SI units at 1 kHz, with nothing held.
 
     Args:
@@ -137,7 +131,7 @@ def smooth_drive(seconds: float, start_time: float = 0.0, decimals: int | None =
     return Drive(seconds, signals, start_time), truth
 
 
-def drive_of(recording: Recording) -> Drive:
+def drive_of(recording):
     """A recording at 100 Hz as the sensors of Revs would have delivered it; its road-wheel angle is held at 1 kHz."""
     assert recording.rate_hz == INS_RATE_HZ
     signals = _ins_signals(recording.channels)
@@ -146,15 +140,7 @@ def drive_of(recording: Recording) -> Drive:
     return Drive(len(recording) / INS_RATE_HZ, signals, recording.start_time)
 
 
-def write_csv(
-    path: Path,
-    drive: Drive,
-    *,
-    blank_rows: Mapping[str, int] | int = 37,
-    preamble: Sequence[str] = PREAMBLE,
-    encoding: str = "latin-1",
-    newline: str = "\r\n",
-) -> None:
+def write_csv(path, drive, *, blank_rows=37, preamble=PREAMBLE, encoding="latin-1", newline="\r\n"):
     """One official CSV file: lines about the drive, names, units, a row a millisecond; slower sensors' values are held.
 
     Args:
@@ -177,7 +163,7 @@ def write_csv(
         pc.write_csv(pa.table(arrays, names=list(COLUMNS)), stream, options)
 
 
-def write_mat(path: Path, drive: Drive, *, compressed: bool = True, late: Mapping[str, int] | None = None) -> None:
+def write_mat(path, drive, *, compressed=True, late=None):
     """One official MAT file: structs of channels, each a struct of value and time.
 
     Args:
@@ -186,7 +172,7 @@ def write_mat(path: Path, drive: Drive, *, compressed: bool = True, late: Mappin
         compressed: as MATLAB's -v7 does.
         late: samples that a channel lacks at its head.
     """
-    structs: dict[str, dict[str, dict[str, FloatArray]]] = {_INS: {}, _TYRE: {}, _DRIVER: {}}
+    structs = {_INS: {}, _TYRE: {}, _DRIVER: {}}
     for name, values in drive.signals.items():
         _, rate, struct = COLUMNS.get(name, ("°", CSV_RATE_HZ, _TYRE))
         first = (late or {}).get(name, 0)
@@ -196,7 +182,7 @@ def write_mat(path: Path, drive: Drive, *, compressed: bool = True, late: Mappin
     savemat(path, {**structs, "params": parameters}, do_compression=compressed, oned_as="column")
 
 
-def write_vehicle_parameters(path: Path, parameters: Mapping[str, tuple[str, Sequence[float]]] = PARAMETERS) -> None:
+def write_vehicle_parameters(path, parameters=PARAMETERS):
     """One table of vehicle parameters: names, units, values; short columns end in blanks."""
     longest = max(len(values) for _, values in parameters.values())
     lines = [",".join(parameters), ",".join(unit for unit, _ in parameters.values())]
@@ -205,7 +191,7 @@ def write_vehicle_parameters(path: Path, parameters: Mapping[str, tuple[str, Seq
     path.write_bytes(("\r\n".join(lines) + "\r\n").encode("latin-1"))
 
 
-def _ins_signals(channels: Mapping[str, FloatArray]) -> dict[str, FloatArray]:
+def _ins_signals(channels):
     """Columns of the INS from channels in SI units."""
     plain = {"vx": "vxCG", "ax": "axCG", "ay": "ayCG", "vy_ref": "vyCG"}
     angular = {"yaw_rate": "yawRate", "roll": "rollAngle", "pitch": "pitchAngle", "roll_rate": "rollRate"}
@@ -214,7 +200,7 @@ def _ins_signals(channels: Mapping[str, FloatArray]) -> dict[str, FloatArray]:
     return signals | {column: np.rad2deg(channels[name]) for name, column in angular.items() if name in channels}
 
 
-def _held(drive: Drive, name: str, rate: int) -> FloatArray:
+def _held(drive, name, rate):
     """A column of the CSV file, held between the samples of its sensor."""
     if name == "time":
         return np.round(drive.start_time + np.arange(drive.rows()) / CSV_RATE_HZ, 3)

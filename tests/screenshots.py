@@ -1,13 +1,10 @@
 """Pictures of a report's page and of the site as they look in Chromium: `make screenshots`."""
 
-from __future__ import annotations
-
 import base64
 import io
 import sys
 import tempfile
 from pathlib import Path
-from typing import Any
 
 from PIL import Image
 
@@ -19,7 +16,7 @@ SCHEMES = ("light", "dark")
 SITE = {"site": "docs/index.html", "site_estimator": "docs/estimators/ksnn.html"}
 
 
-def picture(driver: Any, top: float, width: int, path: Path) -> None:
+def picture(driver, top, width, path):
     """A part of the page that is open, from ``top`` down, in few colours."""
     clip = {"x": 0, "y": top, "width": width, "height": HEIGHTS[width], "scale": LOOKS[width]}
     shot = driver.execute_cdp_cmd("Page.captureScreenshot", {"captureBeyondViewport": True, "clip": clip})["data"]
@@ -27,7 +24,7 @@ def picture(driver: Any, top: float, width: int, path: Path) -> None:
         image.convert("RGB").quantize(128, dither=Image.Dither.NONE).save(path, optimize=True)
 
 
-def main(report: Path, site: Path, out: Path) -> None:
+def main(report, site, out):
     """Write ``report_*`` (leaderboard), ``traces_*`` (traces, course, filter) and ``site_*`` at both widths, light and dark."""
     out.mkdir(exist_ok=True)
     with tempfile.TemporaryDirectory() as profile, browser(Path(profile)) as driver:

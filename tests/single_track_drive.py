@@ -1,7 +1,5 @@
 """Drives of a car that is the linear single track itself, noise included, with known states."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from vehest.data.recording import Recording
@@ -11,9 +9,7 @@ from vehest.vehicle.single_track import lateral_model
 NOISE = {"yaw_rate": 0.01, "ay": 0.5, "steer": 0.01}
 
 
-def linear_drive(
-    seconds: float = 20.0, rate_hz: float = 100.0, seed: int = 0, noise: dict[str, float] = NOISE
-) -> tuple[Recording, np.ndarray]:
+def linear_drive(seconds=20.0, rate_hz=100.0, seed=0, noise=NOISE):
     """A recording of the model's own equations and its states (β, r), (T, 2).
 
     The steering angle that acts between samples is the measured one plus white noise; ay and yaw rate are measured with noise.
@@ -41,7 +37,7 @@ def linear_drive(
     return Recording("linear", "single track", rate_hz, 0.0, channels, "simulated"), states
 
 
-def with_gaps(drive: Recording, gaps: dict[str, slice]) -> Recording:
+def with_gaps(drive, gaps):
     """The same drive where some samples of some channels were not measured."""
     channels = {name: samples.copy() for name, samples in drive.channels.items()}
     for name, where in gaps.items():

@@ -1,7 +1,5 @@
 """Drives of a small car that slides, with the channels of the F1TENTH recordings."""
 
-from __future__ import annotations
-
 import math
 from functools import cache
 
@@ -16,7 +14,7 @@ NOISE = {"ax": 0.4, "ay": 0.4, "yaw_rate": 0.02, "motor_speed": 0.4}
 
 
 @cache
-def small_car_drive(seconds: float = 4.0, seed: int = 0, noise: float = 1.0) -> Recording:
+def small_car_drive(seconds=4.0, seed=0, noise=1.0):
     """Swerves at 2 to 4 m/s, tyres that saturate; measurements with noise of a small car's sensors."""
     generator = np.random.default_rng(seed)
     time = np.arange(round(seconds * RATE)) / RATE
@@ -38,7 +36,7 @@ def small_car_drive(seconds: float = 4.0, seed: int = 0, noise: float = 1.0) -> 
     return Recording(f"small car {seed}", "small car", RATE, 0.0, {**channels, **references}, "simulated")
 
 
-def _motion(state: tuple[float, ...], steer: float, current: float) -> tuple[tuple[float, ...], tuple[float, float]]:
+def _motion(state, steer, current):
     """Rates of vx, vy, yaw rate and rim speed; ax and ay."""
     vx, vy, turning, rim = state
     driving = 12.5 * math.tanh(4.0 * (rim - vx) / vx)

@@ -1,7 +1,5 @@
 """Functions stay short."""
 
-from __future__ import annotations
-
 import ast
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """The lock of versions: what is installed is what it says, and published results name it."""
 
-from __future__ import annotations
-
 import re
 import tomllib
 from importlib import metadata

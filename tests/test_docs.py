@@ -5,10 +5,8 @@ from __future__ import annotations
 import importlib.util
 import re
 import shlex
-from collections.abc import Iterator
 from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -47,19 +45,19 @@ PLACEHOLDER = re.compile(r"\b[A-Z]{3,}\b|…")
 STUDY = ROOT / "results" / "ferrari_drive"
 
 
-def page(name: str) -> str:
+def page(name):
     return (ROOT / name).read_text(encoding="utf-8")
 
 
-def fences(text: str, language: str) -> list[str]:
+def fences(text, language):
     return re.findall(rf"^```{language}\n(.*?)^```$", text, re.MULTILINE | re.DOTALL)
 
 
-def without_fences(text: str) -> str:
+def without_fences(text):
     return re.sub(r"^\s*```.*?^\s*```$", "", text, flags=re.MULTILINE | re.DOTALL)
 
 
-def of_pages(found: Any) -> list[Any]:
+def of_pages(found):
     """Parameters from all pages, each named by its page."""
     return [pytest.param(file, item, id=f"{file.name}: {item}") for file in PAGES for item in found(file)]
 
@@ -67,7 +65,7 @@ def of_pages(found: Any) -> list[Any]:
 # Generated pages
 
 
-def generator() -> Any:
+def generator():
     spec = importlib.util.spec_from_file_location("make_reference", ROOT / "docs" / "make_reference.py")
     assert spec is not None
     assert spec.loader is not None
@@ -100,13 +98,13 @@ def test_a_part_without_results_stays_as_it_is(tmp_path, monkeypatch):
 # Links
 
 
-def links(file: Path) -> list[str]:
+def links(file):
     text = without_fences(file.read_text(encoding="utf-8"))
     found = re.findall(r"!?\[[^\]]*\]\(([^)\s]+)\)", text)
     return [target for target in dict.fromkeys(found) if not target.startswith(("https://", "http://"))]
 
 
-def anchors(file: Path) -> set[str]:
+def anchors(file):
     """Anchors of a page's headings, as they are made from their text."""
     headings = re.findall(r"^#+ (.*)$", without_fences(file.read_text(encoding="utf-8")), re.MULTILINE)
     return {re.sub(r"[^\w\- ]", "", heading.lower()).replace(" ", "-") for heading in headings}
@@ -127,7 +125,7 @@ def test_relative_links_and_images_resolve(file, target):
 
 
 @pytest.fixture
-def workplace(tmp_path, monkeypatch) -> Path:
+def workplace(tmp_path, monkeypatch):
     """An empty folder with the configuration files that the pages show, each under the name in its first line."""
     for file in PAGES:
         for block in fences(file.read_text(encoding="utf-8"), "yaml"):
@@ -185,7 +183,7 @@ class Given:
     overrides: list[str]
 
 
-def command_lines(file: Path) -> list[str]:
+def command_lines(file):
     """Every line of a shell block that calls vehest, and every such call in running text."""
     text = file.read_text(encoding="utf-8")
     lines = [line.strip() for block in fences(text, "sh") for line in block.splitlines() if line.strip().startswith("vehest ")]
@@ -193,15 +191,15 @@ def command_lines(file: Path) -> list[str]:
     return list(dict.fromkeys(lines))
 
 
-def taken_apart(line: str) -> Given | None:
+def taken_apart(line):
     """Command, arguments and overrides; none where only a command is named. Unknown commands and options fail."""
     words = shlex.split(line, comments=True)[1:]
-    command: Any = typer.main.get_command(app)
+    command = typer.main.get_command(app)
     options = {option: parameter for parameter in command.params for option in parameter.opts}
     if words[0].startswith("-"):
         assert words[0] in {*options, "-h", "--help"}, f"vehest has no option {words[0]}"
         return None
-    path: list[str] = []
+    path = []
     while hasattr(command, "commands"):
         if not words:
             return None
@@ -210,7 +208,7 @@ def taken_apart(line: str) -> Given | None:
         command, words = command.commands[path[-1]], words[1:]
     options = {option: parameter for parameter in command.params for option in parameter.opts if parameter.param_type_name == "option"}
     fixed = [parameter for parameter in command.params if parameter.param_type_name == "argument" and parameter.nargs == 1]
-    positional: list[str] = []
+    positional = []
     waiting = iter(words)
     for word in waiting:
         if word.startswith("-") and word != "-":
@@ -230,7 +228,7 @@ def taken_apart(line: str) -> Given | None:
     return Given(tuple(path), positional[: len(fixed)], positional[len(fixed) :])
 
 
-def overrides_of(given: Given) -> Iterator[tuple[str, list[str]]]:
+def overrides_of(given):
     """The root configuration and overrides that a command composes; nothing where placeholders stand."""
     first = given.arguments[0] if given.arguments else ""
     match given.command:
@@ -280,10 +278,7 @@ def test_make_targets_exist():
     assert {"run", "test", "ui"} <= named <= targets
 
 
-@pytest.mark.parametrize(
-    "line",
-    ["vehest trian", "vehest train --fast", "vehest doctor now", "vehest data look", "vehest --quick"],
-)
+@pytest.mark.parametrize("line", ["vehest trian", "vehest train --fast", "vehest doctor now", "vehest data look", "vehest --quick"])
 def test_wrong_command_lines_would_be_noticed(line):
     with pytest.raises(AssertionError):
         taken_apart(line)
@@ -340,7 +335,7 @@ def test_page_of_the_python_interface_has_every_public_name():
     assert documented == set(vehest.__all__) - {"__version__"}
 
 
-def class_of(source: str) -> Any:
+def class_of(source):
     return importlib.import_module(f"vehest.sources.{source}").SOURCE
 
 

@@ -1,9 +1,6 @@
 """The worked examples of docs/adding_an_estimator.md: found through entry points, trained, run online, saved, compared."""
 
-from __future__ import annotations
-
 import re
-from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -14,7 +11,6 @@ import yaml
 import vehest
 from conftest import planar_drive
 from example_package import EXAMPLES, NAMES, forget_examples, install_examples, write_laps
-from place import Place
 from single_track_drive import linear_drive, with_gaps
 from vehest.data.errors import ConfigurationError, DataError
 from vehest.data.recording import Recording
@@ -36,7 +32,7 @@ QUICK = {
 
 
 @pytest.fixture
-def examples(place: Place, tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPatch) -> Iterator[Place]:
+def examples(place, tmp_path_factory, monkeypatch):
     """A place to work in where the examples are installed."""
     install_examples(tmp_path_factory.mktemp("examples") / "site", monkeypatch)
     place.add_steered()
@@ -52,7 +48,7 @@ def examples(place: Place, tmp_path_factory: pytest.TempPathFactory, monkeypatch
     forget_examples()
 
 
-def drive_for(name: str, seconds: float = 8.0) -> Recording:
+def drive_for(name, seconds=8.0):
     kind = estimator_class(name)
     drive = linear_drive(seconds, seed=7)[0] if "steer" in kind.channels else planar_drive(seconds, 100.0, seed=7, noise=0.02)
     return drive.without_references()
@@ -124,7 +120,7 @@ def test_example_that_was_trained_is_not_trained_again_unless_a_setting_changes(
     assert len(list((examples.folder / "outputs" / "train").iterdir())) == 2
 
 
-def block_with(words: str) -> str:
+def block_with(words):
     """The Python block of the page that has these words."""
     blocks = re.findall(r"^```python\n(.*?)^```$", PAGE.read_text(encoding="utf-8"), re.MULTILINE | re.DOTALL)
     (found,) = (block for block in blocks if words in block)

@@ -1,7 +1,5 @@
 """docs/many_machines.md quotes results/benchmarks/launchers.json."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 
@@ -12,7 +10,7 @@ MEASURED = json.loads((ROOT / "results" / "benchmarks" / "launchers.json").read_
 TEXT = " ".join((ROOT / "docs" / "many_machines.md").read_text(encoding="utf-8").split())
 
 
-def quoted() -> dict[str, str]:
+def quoted():
     """What is measured or follows from it -> how the documentation says it."""
     own, pays = MEASURED["launchers"], MEASURED["second_node_pays_from_s"]
     plain, tracked = MEASURED["sweep"]["none"], MEASURED["sweep"]["mlflow"]
@@ -41,7 +39,7 @@ def quoted() -> dict[str, str]:
 
 
 @pytest.mark.parametrize("name", quoted())
-def test_figures_are_those_that_were_measured(name: str):
+def test_figures_are_those_that_were_measured(name):
     assert quoted()[name] in TEXT
 
 

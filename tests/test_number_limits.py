@@ -1,7 +1,5 @@
 """What makes no sense is refused in one line that says what to do: numbers without physical sense, spreadsheets; and text is no formula."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np
@@ -20,7 +18,7 @@ from vehest.trust.contract import GuardedStepper
 from vehest.trust.record import read_trust
 
 
-def test_settings_and_rates_have_upper_limits() -> None:
+def test_settings_and_rates_have_upper_limits():
     with pytest.raises(ConfigurationError, match=r"training\.learning_rate must be a number of at most 1e\+12, not 1e\+300"):
         SupervisedSettings(learning_rate=1e300)
     with pytest.raises(ConfigurationError, match=r"estimator\.rate_hz must be at most 100000, not 1000000\.0"):
@@ -30,23 +28,23 @@ def test_settings_and_rates_have_upper_limits() -> None:
             GuardedStepper(fitted("luenberger"), None, rate)
 
 
-def test_a_time_that_is_no_number_counts_as_unknown() -> None:
+def test_a_time_that_is_no_number_counts_as_unknown():
     model = fitted("luenberger")
     drive = drive_for(model)
     rows = [{name: float(drive[name][k]) for name in model.channels} for k in range(5)]
     timed, untimed = GuardedStepper(model), GuardedStepper(model)
     for row in rows:
-        assert timed.step(row, time="x") == untimed.step(row)  # type: ignore[arg-type]
+        assert timed.step(row, time="x") == untimed.step(row)
 
 
-def test_two_rows_a_minute_apart_are_no_drive() -> None:
+def test_two_rows_a_minute_apart_are_no_drive():
     channels = {"vx": np.full(2, 20.0), "vy_ref": np.zeros(2)}
     recording = Recording("two", "a car", 1.0 / 60.0, 0.0, channels)
     with pytest.raises(DataError, match=r"'two' is sampled at 0\.0167 Hz; scores need 1 Hz or more"):
         compare_estimates(recording, {"mine": Luenberger.from_config({})._wrapped(recording, np.zeros(2))})
 
 
-def test_a_damaged_calibration_names_its_file(tmp_path: Path) -> None:
+def test_a_damaged_calibration_names_its_file(tmp_path):
     text = (Path(read_trust.__code__.co_filename).parents[1] / "pretrained" / "trust.yaml").read_text(encoding="utf-8")
     (tmp_path / "trust.yaml").write_text(text.replace("yaw_rate", "foreign"), encoding="utf-8")
     with pytest.raises(DataError, match=r"trust\.yaml'"):
@@ -64,11 +62,11 @@ def test_a_damaged_calibration_names_its_file(tmp_path: Path) -> None:
         (-0.5, -0.5),
     ],
 )
-def test_tables_to_download_start_no_formula(cell: object, written: object) -> None:
+def test_tables_to_download_start_no_formula(cell, written):
     assert _no_formula(cell) == written
 
 
-def test_a_spreadsheet_and_a_measurement_are_refused_with_what_to_do(tmp_path: Path) -> None:
+def test_a_spreadsheet_and_a_measurement_are_refused_with_what_to_do(tmp_path):
     for name in ("lap.xlsx", "drive.mf4"):
         (tmp_path / name).write_bytes(b"PK")
     for read in (survey, lambda file: read_single({"name": "mine", "source": "tabular"}, file)):

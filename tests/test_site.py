@@ -1,13 +1,9 @@
 """The documentation site: it builds without a warning, its links lead somewhere, and it reads well in a browser."""
 
-from __future__ import annotations
-
 import importlib.util
 import subprocess
 import sys
-from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
 import pytest
 
@@ -17,7 +13,7 @@ ROOT = Path(__file__).resolve().parents[1]
 SHOWN = ("docs/index.html", "docs/api.html", "docs/estimators.html", "docs/estimators/ksnn.html", "results/ferrari_drive/report.html")
 
 
-def broken_links(site: Path) -> list[str]:
+def broken_links(site):
     spec = importlib.util.spec_from_file_location("check_site", ROOT / "docs" / "check_site.py")
     assert spec is not None
     assert spec.loader is not None
@@ -27,7 +23,7 @@ def broken_links(site: Path) -> list[str]:
 
 
 @pytest.fixture(scope="module")
-def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def site(tmp_path_factory):
     pytest.importorskip("furo", reason="the site's tools are not installed: pip install 'vehest[docs]'")
     folder = tmp_path_factory.mktemp("site")
     strict = [sys.executable, "-m", "sphinx", "-q", "-W", "--keep-going", "-b", "html", "-c", str(ROOT / "docs")]
@@ -37,12 +33,12 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def chromium(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Any]:
+def chromium(tmp_path_factory):
     with browser(tmp_path_factory.mktemp("profile")) as driver:
         yield driver
 
 
-def test_links_to_no_file_no_anchor_and_out_of_the_site_are_found(tmp_path: Path) -> None:
+def test_links_to_no_file_no_anchor_and_out_of_the_site_are_found(tmp_path):
     folder = tmp_path / "site"
     folder.mkdir()
     (tmp_path / "outside.html").write_text("", encoding="utf-8")
@@ -54,13 +50,13 @@ def test_links_to_no_file_no_anchor_and_out_of_the_site_are_found(tmp_path: Path
 
 
 @pytest.mark.page
-def test_every_local_link_of_the_site_leads_somewhere(site: Path) -> None:
+def test_every_local_link_of_the_site_leads_somewhere(site):
     assert len(list(site.rglob("*.html"))) > 40
     assert broken_links(site) == []
 
 
 @pytest.mark.page
-def test_every_equation_of_the_pages_is_mathml(site: Path) -> None:
+def test_every_equation_of_the_pages_is_mathml(site):
     for source in sorted((ROOT / "docs").rglob("*.md")):
         equations = source.read_text(encoding="utf-8").count("```math\n")
         page = (site / source.relative_to(ROOT)).with_suffix(".html").read_text(encoding="utf-8")
@@ -71,7 +67,7 @@ def test_every_equation_of_the_pages_is_mathml(site: Path) -> None:
 @pytest.mark.page
 @pytest.mark.parametrize(("width", "scheme"), zip(WIDTHS, ("light", "dark"), strict=True))
 @pytest.mark.parametrize("name", SHOWN)
-def test_pages_are_accessible_and_fit_their_width(chromium: Any, site: Path, name: str, scheme: str, width: int) -> None:
+def test_pages_are_accessible_and_fit_their_width(chromium, site, name, scheme, width):
     opened(chromium, site / name, width=width, scheme=scheme)
     assert axe_violations(chromium, "article") == []  # what stands around it is the theme's
     assert chromium.execute_script("return document.documentElement.scrollWidth") <= width

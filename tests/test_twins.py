@@ -4,10 +4,6 @@ Each pair is tried on one stretch with gaps of one sensor, of all sensors, and o
 tested by itself (`test_planar_car`, `test_dugoff`, `test_filters_unscented_scan`, `test_kernels`).
 """
 
-from __future__ import annotations
-
-from collections.abc import Callable
-
 import pytest
 import torch
 from readable_filters import NonlinearModel, extended_filter, gated, rational_model, unscented_filter
@@ -27,10 +23,10 @@ from vehest.estimators.kernels.planar_car import CompiledPlanarCar
 from vehest.estimators.rational_ekf import KINDS
 from vehest.filters.extended_scan import extended_scan
 from vehest.filters.gating import Gate
-from vehest.filters.gaussian import Filtered, Gaussian
+from vehest.filters.gaussian import Gaussian
 from vehest.filters.kalman_scan import kalman_scan
 from vehest.filters.sigma_points import symmetric_rule
-from vehest.filters.unscented_scan import PointModel, unscented_scan
+from vehest.filters.unscented_scan import unscented_scan
 
 STEPS = 60
 GATE = Gate(4.0, 5)
@@ -38,7 +34,7 @@ Forms = tuple[list[Tensor], list[Tensor]]
 """What the readable form gives, and what the compiled one does."""
 
 
-def with_gaps(measurements: Tensor) -> Tensor:
+def with_gaps(measurements):
     y = measurements.clone()
     y[..., 5:9, 0] = torch.nan
     y[..., 12:15, :] = torch.nan
@@ -46,7 +42,7 @@ def with_gaps(measurements: Tensor) -> Tensor:
     return y
 
 
-def with_outliers(measurements: Tensor, size: float = 1e3) -> Tensor:
+def with_outliers(measurements, size=1000.0):
     """Gaps, one outlier, and at the end more of them than a gate is patient."""
     y = with_gaps(measurements)
     y[..., 10, 1] += size
@@ -54,16 +50,16 @@ def with_outliers(measurements: Tensor, size: float = 1e3) -> Tensor:
     return y
 
 
-def of_the_same_numbers(values: object) -> list[Tensor]:
-    return [torch.as_tensor(value) for value in values]  # type: ignore[attr-defined]
+def of_the_same_numbers(values):
+    return [torch.as_tensor(value) for value in values]
 
 
-def behind(gate: Gate | None, run: Callable[[Tensor], Filtered[Tensor]], y: Tensor) -> Filtered[Tensor]:
+def behind(gate, run, y):
     return run(y) if gate is None else gated(run, y, gate)
 
 
-def kalman(gate: Gate | None = None) -> Callable[[], Forms]:
-    def forms() -> Forms:
+def kalman(gate=None):
+    def forms():
         model, measurements, initial = example(STEPS, seed=1)
         y = (with_gaps if gate is None else with_outliers)(torch.from_numpy(measurements))
         readable, number = linear_as_nonlinear(tensors(model)), torch.arange(STEPS, dtype=torch.float64).unsqueeze(-1)
@@ -73,7 +69,7 @@ def kalman(gate: Gate | None = None) -> Callable[[], Forms]:
     return forms
 
 
-def extended() -> Forms:
+def extended():
     measurements, inputs, initial = measured_pendulum(STEPS)
     y = with_gaps(measurements[0])
     readable = extended_filter(pendulum_with_radar(), y, inputs[0], initial)
@@ -81,8 +77,8 @@ def extended() -> Forms:
     return list(readable.filtered), of_the_same_numbers(compiled.filtered)
 
 
-def rational_with(gate: Gate | None = None, **config: object) -> Callable[[], Forms]:
-    def forms() -> Forms:
+def rational_with(gate=None, **config):
+    def forms():
         estimator = rational(**config)
         spoilt = with_gaps if gate is None else with_outliers
         samples = rational_drive(STEPS / 20.0, seed=1).stack(estimator.channels)
@@ -97,15 +93,7 @@ def rational_with(gate: Gate | None = None, **config: object) -> Callable[[], Fo
     return forms
 
 
-def unscented(
-    readable: NonlinearModel,
-    compiled: PointModel,
-    y: Tensor,
-    u: Tensor,
-    first: Gaussian[Tensor],
-    noises: list[Tensor],
-    gate: Gate | None = None,
-) -> Forms:
+def unscented(readable, compiled, y, u, first, noises, gate=None):
     n = first.mean.shape[-1]
     rule = symmetric_rule(n, 3.0 - n)
     with torch.no_grad():
@@ -114,16 +102,16 @@ def unscented(
     return list(theirs), list(ours)
 
 
-def constant(matrix: Tensor) -> Callable[[Tensor, Tensor], Tensor]:
+def constant(matrix):
     return lambda states, inputs: matrix.expand(*states.shape[:-1], *matrix.shape)
 
 
-def diagonal(*deviations: float) -> Tensor:
+def diagonal(*deviations):
     return torch.tensor(deviations, dtype=torch.float64).square().diag()
 
 
-def planar(kind: str, gate: Gate | None = None) -> Callable[[], Forms]:
-    def forms() -> Forms:
+def planar(kind, gate=None):
+    def forms():
         car, lower = a_car(kind), torch.tensor(LOWER, dtype=torch.float64)
         noises = [diagonal(0.03, 0.03, 0.1, 0.1, 0.01), diagonal(7.0, 7.0, 0.3, 0.3)]
         limited = lambda states: torch.maximum(states, lower)  # noqa: E731
@@ -137,8 +125,8 @@ def planar(kind: str, gate: Gate | None = None) -> Callable[[], Forms]:
     return forms
 
 
-def dugoff(tyres: str, gate: Gate | None = None) -> Callable[[], Forms]:
-    def forms() -> Forms:
+def dugoff(tyres, gate=None):
+    def forms():
         track = dugoff_track(tyres, sees_sideslip=True)
         sizes = torch.tensor([0.3, 0.02, 300.0, 300.0, 0.02])
         noises = [diagonal(0.05, 0.02), diagonal(*sizes.tolist())]
@@ -153,15 +141,15 @@ def dugoff(tyres: str, gate: Gate | None = None) -> Callable[[], Forms]:
     return forms
 
 
-def network(estimator: object) -> Callable[[], Forms]:
-    def forms() -> Forms:
+def network(estimator):
+    def forms():
         value_and_gradient = _problem(estimator, torch.float64)
         return list(value_and_gradient(compiled=False)), list(value_and_gradient(compiled=True))
 
     return forms
 
 
-PAIRS: dict[str, Callable[[], Forms]] = {
+PAIRS = {
     "Kalman": kalman(),
     "extended": extended,
     **{f"rational_ekf {tyres}": rational_with(tyres=tyres) for tyres in KINDS},
@@ -177,7 +165,7 @@ PAIRS: dict[str, Callable[[], Forms]] = {
 
 
 @pytest.mark.parametrize("pair", PAIRS)
-def test_readable_and_compiled_form_agree_through_gaps_limits_and_gates(pair: str) -> None:
+def test_readable_and_compiled_form_agree_through_gaps_limits_and_gates(pair):
     readable, compiled = PAIRS[pair]()
     for expected, found in zip(readable, compiled, strict=True):
         assert torch.isfinite(found).all()

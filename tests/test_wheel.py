@@ -1,7 +1,5 @@
 """The wheel carries its configuration and works from an empty folder elsewhere."""
 
-from __future__ import annotations
-
 import json
 import os
 import subprocess
@@ -17,7 +15,7 @@ ROOT = Path(__file__).parents[1]
 
 
 @pytest.fixture(scope="module")
-def installed(tmp_path_factory) -> Path:
+def installed(tmp_path_factory):
     """A folder into which a freshly built wheel was installed."""
     folder = tmp_path_factory.mktemp("wheel")
     build = [sys.executable, "-m", "build", "--wheel", "--no-isolation", "--outdir", str(folder), str(ROOT)]
@@ -29,7 +27,7 @@ def installed(tmp_path_factory) -> Path:
     return folder / "site"
 
 
-def _vehest(installed: Path, cwd: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
+def _vehest(installed, cwd, *arguments):
     environment = {**os.environ, "PYTHONPATH": str(installed)}
     environment.pop("VEHEST_OUTPUT", None)
     return subprocess.run([sys.executable, "-m", "vehest", *arguments], cwd=cwd, env=environment, capture_output=True, text=True)

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from functools import cache
-from typing import Any
 
 import numpy as np
 
@@ -16,47 +14,30 @@ NOISE = {"vx": 0.01, "yaw_rate": 0.002, "ax": 0.05, "ay": 0.05, "steer": 0.001}
 class Wave:
     """A sum of sines that can be taken at any time, derived, delayed and sent through a first-order low-pass."""
 
-    def __init__(self, amplitudes: np.ndarray, omegas: np.ndarray, phases: np.ndarray, level: float = 0.0) -> None:
+    def __init__(self, amplitudes, omegas, phases, level=0.0):
         self.amplitudes, self.omegas, self.phases, self.level = amplitudes, omegas, phases, level
         self._known: dict[tuple[float, float, int, int], np.ndarray] = {}  # by uniform clock and order
 
     @classmethod
-    def random(
-        cls,
-        generator: np.random.Generator,
-        size: float,
-        low: float,
-        high: float,
-        number: int = 120,
-        level: float = 0.0,
-        corner: float = 0.5,
-    ) -> Wave:
+    def random(cls, generator, size, low, high, number=120, level=0.0, corner=0.5):
         frequencies = generator.uniform(low, high, number)
         amplitudes = size * np.sqrt(2.0 / number) / (1.0 + np.square(frequencies / corner))
         return cls(amplitudes, 2 * np.pi * frequencies, generator.uniform(0, 2 * np.pi, number), level)
 
-    def __call__(self, time: np.ndarray, order: int = 0) -> np.ndarray:
+    def __call__(self, time, order=0):
         key = time[0], time[-1], len(time), order
         if key not in self._known:
             angle = np.multiply.outer(time, self.omegas) + self.phases + order * np.pi / 2
             self._known[key] = np.sin(angle) @ (self.amplitudes * self.omegas**order) + (self.level if order == 0 else 0.0)
         return self._known[key]
 
-    def low_passed(self, time_constant: float) -> Wave:
+    def low_passed(self, time_constant):
         """1 / (1 + iωT), in closed form."""
         response = 1.0 / (1.0 + 1j * self.omegas * time_constant)
         return Wave(self.amplitudes * np.abs(response), self.omegas, self.phases + np.angle(response), self.level)
 
 
-def broadband_drive(
-    seconds: float = 120.0,
-    rate_hz: float = 100.0,
-    seed: int = 0,
-    late: Mapping[str, float] | None = None,
-    lever: float = 0.0,
-    slow_yaw_rate: float = 0.0,
-    noise: float = 1.0,
-) -> Recording:
+def broadband_drive(seconds=120.0, rate_hz=100.0, seed=0, late=None, lever=0.0, slow_yaw_rate=0.0, noise=1.0):
     """d(vy)/dt = ay - vx·yaw_rate and d(vx)/dt = ax + vy·yaw_rate hold at each instant, but for noise and what is asked for.
 
     Args:
@@ -68,9 +49,7 @@ def broadband_drive(
 
 
 @cache
-def _made(
-    seconds: float, rate_hz: float, seed: int, late: tuple[tuple[str, float], ...], lever: float, slow_yaw_rate: float, noise: float
-) -> Recording:
+def _made(seconds, rate_hz, seed, late, lever, slow_yaw_rate, noise):
     """Made once; recordings cannot be written to."""
     turn, slide, speed, state = _waves(seed)
     generator = np.random.default_rng()
@@ -78,7 +57,7 @@ def _made(
     shown = turn.low_passed(slow_yaw_rate) if slow_yaw_rate else turn
     clock = np.arange(round(seconds * rate_hz)) / rate_hz
 
-    def vy(time: np.ndarray) -> np.ndarray:
+    def vy(time):
         return -0.9 * turn(time) + slide(time)
 
     exact = {
@@ -100,7 +79,7 @@ def _made(
 
 
 @cache
-def _waves(seed: int) -> tuple[Wave, Wave, Wave, Any]:
+def _waves(seed):
     """Waves of yaw rate, v and speed, and the generator's state after them."""
     generator = np.random.default_rng(seed)
     turn, slide = Wave.random(generator, 0.3, 0.05, 4.0), Wave.random(generator, 0.25, 0.05, 4.0)
@@ -108,6 +87,6 @@ def _waves(seed: int) -> tuple[Wave, Wave, Wave, Any]:
     return turn, slide, speed, generator.bit_generator.state
 
 
-def without(recording: Recording, *names: str) -> Recording:
+def without(recording, *names):
     """The same drive without some channels."""
     return recording.select([name for name in recording.channels if name not in names])

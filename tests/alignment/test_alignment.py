@@ -1,14 +1,11 @@
 """Alignment of a measuring set-up: what was planted comes back, with intervals that hold, and nothing happens unasked."""
 
-from __future__ import annotations
-
 import csv
 import json
 import math
 import re
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -18,7 +15,7 @@ from scipy.signal import lfilter
 
 from place import run_vehest
 from real_drives import real_drive
-from vehest.alignment.align import Alignment, align
+from vehest.alignment.align import align
 from vehest.alignment.imu import smoothing_of
 from vehest.alignment.settings import QUANTITIES, AlignmentSettings
 from vehest.data.derived import SteeringCurve, SteeringRatio
@@ -29,7 +26,6 @@ from vehest.data.transforms import DelayCorrection, OffsetCorrection, transform_
 from vehest.run.align import FILES, override_of
 from vehest.run.config import compose_config
 from vehest.run.downsample import transforms_of
-from vehest.simulation.plant.motion import Motion
 from vehest.simulation.plant.multi_body import MultiBodyPlant
 from vehest.simulation.plant.parameters import vehicle_from_configuration
 from vehest.simulation.sensors.levels import SensorLevel, ideal_sensors
@@ -70,7 +66,7 @@ CONFIGURATION = Path(__file__).parents[2] / "conf" / "vehicle" / "bmw_320i_low.y
 
 
 @pytest.fixture(scope="module")
-def motion() -> Motion:
+def motion():
     """150 s of a multi-body car that weaves between 12 and 28 m/s: its steering is three sines, its speed another."""
     vehicle = vehicle_from_configuration(yaml.safe_load(CONFIGURATION.read_text(encoding="utf-8")))
     plant = MultiBodyPlant(vehicle)
@@ -86,7 +82,7 @@ def motion() -> Motion:
     return plant.motion(states, np.array(inputs), 100.0)
 
 
-def recorded(motion: Motion, planted: dict[str, float], *, leaning: bool = False, reference_rate: bool = False) -> Recording:
+def recorded(motion, planted, *, leaning=False, reference_rate=False):
     """A recording of a motion by a sensor that is misplaced, turned, late and off.
 
     Written with rotation matrices and cross products, on the true motion, before noise; the plane as complex numbers is the code's way.
@@ -117,7 +113,7 @@ def recorded(motion: Motion, planted: dict[str, float], *, leaning: bool = False
     return Recording("planted", "car", 100.0, 5.0, channels, "simulated")
 
 
-def assert_recovered(found: Alignment, truth: dict[str, float], names: tuple[str, ...]) -> None:
+def assert_recovered(found, truth, names):
     for name in names:
         parameter = found[name]
         assert parameter.value == pytest.approx(truth.get(name, 0.0), abs=TOLERANCE[name]), name
@@ -129,7 +125,7 @@ def assert_recovered(found: Alignment, truth: dict[str, float], names: tuple[str
 
 
 @pytest.mark.parametrize("reference_rate", [False, True])
-def test_planted_set_up_comes_back_from_a_simulated_drive(motion: Motion, reference_rate: bool) -> None:
+def test_planted_set_up_comes_back_from_a_simulated_drive(motion, reference_rate):
     truth = PLANTED | {"delay": 0.037}
     found = align(recorded(motion, truth, reference_rate=reference_rate), AlignmentSettings(IMU))
     assert_recovered(found, truth, tuple(PLANTED))
@@ -137,14 +133,14 @@ def test_planted_set_up_comes_back_from_a_simulated_drive(motion: Motion, refere
 
 
 @pytest.mark.parametrize("reference_rate", [False, True])
-def test_cross_correlation_finds_a_delay_alone(motion: Motion, reference_rate: bool) -> None:
+def test_cross_correlation_finds_a_delay_alone(motion, reference_rate):
     found = align(recorded(motion, {"delay": 0.040}, reference_rate=reference_rate), AlignmentSettings(("delay",)))
     assert found.correlation is not None
     assert found.correlation.peak == pytest.approx(0.040, abs=0.010)
 
 
 @pytest.mark.parametrize("reference_rate", [False, True])
-def test_planted_set_up_comes_back_from_a_car_that_rolls_and_pitches(motion: Motion, reference_rate: bool) -> None:
+def test_planted_set_up_comes_back_from_a_car_that_rolls_and_pitches(motion, reference_rate):
     """Gravity through roll is 6 % of ay here, through pitch 4 % of ax: taken for motion it would shift rotation and offset of ay."""
     recording = recorded(motion, PLANTED, leaning=True, reference_rate=reference_rate)
     found = align(recording, AlignmentSettings(IMU))
@@ -158,7 +154,7 @@ def test_planted_set_up_comes_back_from_a_car_that_rolls_and_pitches(motion: Mot
         assert level["offset_ay"].value > PLANTED["offset_ay"] + 0.05
 
 
-def test_measured_roll_and_pitch_take_gravity_off(motion: Motion) -> None:
+def test_measured_roll_and_pitch_take_gravity_off(motion):
     recording = recorded(motion, PLANTED, leaning=True, reference_rate=True)
     recording = replace(recording, channels={**recording.channels, "roll": motion.roll, "pitch": motion.pitch})
     found = align(recording, AlignmentSettings(IMU))
@@ -167,7 +163,7 @@ def test_measured_roll_and_pitch_take_gravity_off(motion: Motion) -> None:
     assert any(re.search(r"shows -?0\.[01] % of it in ax", note) for note in found.notes)
 
 
-def test_its_transforms_bring_the_residuals_down_to_those_of_a_drive_that_was_aligned(motion: Motion) -> None:
+def test_its_transforms_bring_the_residuals_down_to_those_of_a_drive_that_was_aligned(motion):
     clean = align(recorded(motion, {}), AlignmentSettings(("delay",)))
     found = align(recorded(motion, PLANTED), AlignmentSettings(IMU))
     for aligned, residual in zip(clean.residuals, found.residuals, strict=True):
@@ -176,7 +172,7 @@ def test_its_transforms_bring_the_residuals_down_to_those_of_a_drive_that_was_al
     assert [transform["name"] for transform in found.transforms] == ["delay_correction", "offset_correction", "mounting_correction"]
 
 
-def test_aligning_what_the_transforms_have_corrected_finds_nothing_more(motion: Motion) -> None:
+def test_aligning_what_the_transforms_have_corrected_finds_nothing_more(motion):
     recording = recorded(motion, PLANTED, reference_rate=True)
     for config in align(recording, AlignmentSettings(IMU)).transforms:
         recording = transform_from_config(config)(recording)
@@ -186,7 +182,7 @@ def test_aligning_what_the_transforms_have_corrected_finds_nothing_more(motion: 
 
 
 @pytest.mark.parametrize("quantity", IMU)
-def test_each_comes_back_alone_and_brings_no_other_transform(motion: Motion, quantity: str) -> None:
+def test_each_comes_back_alone_and_brings_no_other_transform(motion, quantity):
     truth = {name: PLANTED[name] for name in QUANTITIES[quantity]}
     found = align(recorded(motion, truth), AlignmentSettings((quantity,)))
     assert tuple(parameter.name for parameter in found.parameters) == QUANTITIES[quantity]
@@ -198,7 +194,7 @@ def test_each_comes_back_alone_and_brings_no_other_transform(motion: Motion, qua
     assert not any("residuals suggest" in note for note in found.notes)
 
 
-def test_what_was_not_asked_for_is_pointed_out_but_not_estimated(motion: Motion) -> None:
+def test_what_was_not_asked_for_is_pointed_out_but_not_estimated(motion):
     found = align(recorded(motion, PLANTED, reference_rate=True), AlignmentSettings(("lever_arm", "offsets")))
     (note,) = [note for note in found.notes if "residuals suggest" in note]
     assert re.search(r"yaw (2\.9|3\.0|3)\d* deg ±", note)
@@ -207,7 +203,7 @@ def test_what_was_not_asked_for_is_pointed_out_but_not_estimated(motion: Motion)
     assert "Not asked for and taken as zero: mounting, delay." in found.notes
 
 
-def test_sensor_mounted_crosswise_is_found(motion: Motion) -> None:
+def test_sensor_mounted_crosswise_is_found(motion):
     truth = PLANTED | {"yaw": math.radians(-90.0)}
     found = align(recorded(motion, truth, reference_rate=True), AlignmentSettings(IMU))
     assert_recovered(found, truth, tuple(PLANTED))
@@ -219,23 +215,21 @@ RATE = 50.0
 COVERED = AlignmentSettings(IMU, cutoff_hz=1.5, max_delay=0.2, tilt=0.0)
 
 
-def weaving(seed: int, *, correlated: float = 0.5, noise: float = 0.1, turning: bool = True, varying: bool = True) -> Recording:
+def weaving(seed, *, correlated=0.5, noise=0.1, turning=True, varying=True):
     """100 s of a made-up motion in closed form, with `PLANTED` and noise that remembers for ``correlated`` seconds."""
     generator = np.random.default_rng(seed)
     time = np.arange(5000) / RATE
     phases = generator.uniform(0.0, 2.0 * np.pi, (3, 3))
 
-    def wave(
-        row: int, at: np.ndarray, order: int, mean: float, amplitudes: tuple[float, ...], frequencies: tuple[float, ...]
-    ) -> np.ndarray:
+    def wave(row, at, order, mean, amplitudes, frequencies):
         omega = 2.0 * np.pi * np.array(frequencies)
         angles = np.outer(at, omega) + phases[row] + order * np.pi / 2.0
         return np.sin(angles) @ (np.array(amplitudes) * omega**order) + (mean if order == 0 else 0.0)
 
-    def turn(at: np.ndarray, order: int = 0) -> np.ndarray:
+    def turn(at, order=0):
         return wave(0, at, order, 0.05 if turning else 0.4, tuple(turning * a for a in (0.3, 0.15, 0.05)), (0.07, 0.23, 0.6))
 
-    def velocity(at: np.ndarray, order: int = 0) -> np.ndarray:
+    def velocity(at, order=0):
         ahead = wave(1, at, order, 25.0, tuple(varying * a for a in (4.0, 1.5, 0.4)), (0.02, 0.09, 0.21))
         return ahead + 1j * wave(2, at, order, 0.0, tuple(turning * a for a in (0.5, 0.2, 0.05)), (0.05, 0.19, 0.7))
 
@@ -244,7 +238,7 @@ def weaving(seed: int, *, correlated: float = 0.5, noise: float = 0.1, turning: 
     force = velocity(at, 1) + 1j * r * velocity(at) + (1j * turn(at, 1) - r**2) * lever
     force = np.exp(-1j * PLANTED["yaw"]) * force + PLANTED["offset_ax"] + 1j * PLANTED["offset_ay"]
 
-    def coloured(size: float) -> np.ndarray:
+    def coloured(size):
         memory = math.exp(-1.0 / (correlated * RATE))
         return lfilter([size * math.sqrt(1.0 - memory**2)], [1.0, -memory], generator.standard_normal(6000))[1000:]
 
@@ -260,7 +254,7 @@ def weaving(seed: int, *, correlated: float = 0.5, noise: float = 0.1, turning: 
 
 
 @pytest.mark.parametrize("correlated", [0.05, 2.0])
-def test_intervals_contain_the_truth_about_as_often_as_they_say(correlated: float) -> None:
+def test_intervals_contain_the_truth_about_as_often_as_they_say(correlated):
     """Thirty drives, whose noise remembers for 0.05 s and for 2 s: by a binomial law of 95 % fewer than 25 of 30 have a chance of 0.3 %."""
     found = [align(weaving(seed, correlated=correlated), COVERED) for seed in range(30)]
     inside = np.array([[p.low <= PLANTED[p.name] <= p.high for p in each.parameters] for each in found])
@@ -272,12 +266,12 @@ def test_intervals_contain_the_truth_about_as_often_as_they_say(correlated: floa
     assert ratio.max() < 1.4  # the standard deviation of 30 values is itself known to 13 %
 
 
-def test_noise_that_remembers_longer_makes_the_uncertainty_larger() -> None:
+def test_noise_that_remembers_longer_makes_the_uncertainty_larger():
     short, long = (align(weaving(0, correlated=seconds), COVERED) for seconds in (0.05, 2.0))
     assert long["offset_ax"].uncertainty > 3 * short["offset_ax"].uncertainty
 
 
-def test_unmeasured_tilt_adds_to_the_uncertainty() -> None:
+def test_unmeasured_tilt_adds_to_the_uncertainty():
     recording = weaving(0)
     level, tilted = (align(recording, replace(COVERED, tilt=tilt)) for tilt in (0.0, 0.002))
     assert level["offset_ax"].tilt == 0.0
@@ -285,7 +279,7 @@ def test_unmeasured_tilt_adds_to_the_uncertainty() -> None:
     assert tilted["offset_yaw_rate"].tilt < 1e-4  # its reference is a gyroscope
 
 
-def test_effects_that_a_drive_cannot_tell_apart_are_refused() -> None:
+def test_effects_that_a_drive_cannot_tell_apart_are_refused():
     circle = weaving(0, turning=False, varying=False, noise=0.02)
     with pytest.raises(DataError, match=r"cannot tell lever_y and offset_ay apart \(condition number"):
         align(circle, AlignmentSettings(("lever_arm", "offsets")))
@@ -295,27 +289,27 @@ def test_effects_that_a_drive_cannot_tell_apart_are_refused() -> None:
         align(constant, AlignmentSettings(("offsets",)))
 
 
-def test_straight_driving_says_nothing_about_the_lever_arm(motion: Motion) -> None:
+def test_straight_driving_says_nothing_about_the_lever_arm(motion):
     still = replace(motion, yaw_rate=np.zeros(len(motion)), ax=np.zeros(len(motion)), ay=np.zeros(len(motion)))
     straight = replace(still, vx=np.full(len(motion), 25.0), vy=np.zeros(len(motion)))
     with pytest.raises(DataError, match=r"lever_x cannot be estimated: .* % of its effect in this drive is noise"):
         align(recorded(straight, {}), AlignmentSettings(("lever_arm",)))
 
 
-def test_unrelated_sensor_and_reference_have_no_delay() -> None:
+def test_unrelated_sensor_and_reference_have_no_delay():
     ours, other = weaving(0), weaving(1)
     mixed = replace(ours, channels={**ours.channels, "yaw_rate_ref": other["yaw_rate_ref"]})
     with pytest.raises(DataError, match=r"correlate by .* at most"):
         align(mixed, AlignmentSettings(("delay",), cutoff_hz=1.5))
 
 
-def test_delay_beyond_the_search_is_refused(motion: Motion) -> None:
+def test_delay_beyond_the_search_is_refused(motion):
     with pytest.raises(DataError, match="raise max_delay"):
         align(recorded(motion, {"delay": 0.3}, reference_rate=True), AlignmentSettings(("delay",), max_delay=0.1))
 
 
 @pytest.mark.parametrize("order", [0, 1, 2, 3])
-def test_low_pass_differentiates_and_keeps_the_right_samples(order: int) -> None:
+def test_low_pass_differentiates_and_keeps_the_right_samples(order):
     time, omega = np.arange(3001) / 100.0, 2.0 * np.pi * 0.8
     smoothing = smoothing_of(Recording("sine", "car", 100.0, 0.0, {"ay": time}), 2.0)
     out = smoothing(np.sin(omega * time), order, margin=50)
@@ -328,20 +322,20 @@ def test_low_pass_differentiates_and_keeps_the_right_samples(order: int) -> None
 
 
 @pytest.mark.parametrize("missing", ["vy_ref", "ax", "ay", "yaw_rate"])
-def test_missing_channel_is_one_clear_line(motion: Motion, missing: str) -> None:
+def test_missing_channel_is_one_clear_line(motion, missing):
     recording = recorded(motion, {})
     with pytest.raises(DataError, match=f"no (reference )?channel '{missing}'") as error:
         align(recording.select([name for name in recording.channels if name != missing]), AlignmentSettings(IMU))
     assert "\n" not in str(error.value)
 
 
-def test_forward_speed_stands_in_for_its_reference_and_the_report_says_so(motion: Motion) -> None:
+def test_forward_speed_stands_in_for_its_reference_and_the_report_says_so(motion):
     recording = recorded(motion, PLANTED)
     found = align(recording.select([name for name in recording.channels if name != "vx_ref"]), AlignmentSettings(("offsets", "mounting")))
     assert any("no vx_ref" in note for note in found.notes)
 
 
-def test_gaps_short_recordings_and_slow_ones_are_refused() -> None:
+def test_gaps_short_recordings_and_slow_ones_are_refused():
     recording = weaving(0)
     gap = recording["ax"].copy()
     gap[100] = np.nan
@@ -363,12 +357,12 @@ def test_gaps_short_recordings_and_slow_ones_are_refused() -> None:
         ({"estimate": ("delay",), "max_delay": math.nan}, "max_delay must be positive"),
     ],
 )
-def test_settings_that_make_no_sense_are_refused(arguments: dict[str, Any], what: str) -> None:
+def test_settings_that_make_no_sense_are_refused(arguments, what):
     with pytest.raises(ConfigurationError, match=what):
         AlignmentSettings(**arguments)
 
 
-def test_nothing_is_applied_and_the_recording_stays_as_it_is() -> None:
+def test_nothing_is_applied_and_the_recording_stays_as_it_is():
     recording = weaving(0)
     before = {name: samples.copy() for name, samples in recording.channels.items()}
     align(recording, COVERED)
@@ -383,7 +377,7 @@ WHEELBASE, LF, LR, MASS, INERTIA, FRONT, REAR = 2.6, 1.2, 1.4, 1500.0, 2500.0, 1
 GRADIENT = MASS * (LR * REAR - LF * FRONT) / (WHEELBASE * FRONT * REAR)  # steady state: δ = L/R + K·ay
 
 
-def single_track(ratio: float, offset: float, seed: int = 0) -> Recording:
+def single_track(ratio, offset, seed=0):
     """Calm country-road driving of the linear single-track model, integrated with its lags, seen by noisy sensors."""
     generator, step = np.random.default_rng(seed), 0.01
     time = np.arange(20000) * step
@@ -402,7 +396,7 @@ def single_track(ratio: float, offset: float, seed: int = 0) -> Recording:
 
 
 @pytest.mark.parametrize(("ratio", "offset"), [(15.5, 0.05), (-1.0, -0.01)])
-def test_steering_ratio_offset_and_understeer_gradient_come_back(ratio: float, offset: float) -> None:
+def test_steering_ratio_offset_and_understeer_gradient_come_back(ratio, offset):
     found = align(single_track(ratio, offset), AlignmentSettings(("steering_ratio",), wheelbase=WHEELBASE))
     assert found["steering_ratio"].value == pytest.approx(ratio, rel=0.02)
     assert found["steering_offset"].value == pytest.approx(offset, abs=0.003)
@@ -414,14 +408,14 @@ def test_steering_ratio_offset_and_understeer_gradient_come_back(ratio: float, o
     assert found.residuals == ()
 
 
-def test_its_transform_makes_the_steering_angle() -> None:
+def test_its_transform_makes_the_steering_angle():
     recording = single_track(15.5, 0.05)
     (config,) = align(recording, AlignmentSettings(("steering_ratio",), wheelbase=WHEELBASE)).transforms
     steer = transform_from_config(config)(recording)["steer"]
     np.testing.assert_allclose(steer, (recording["handwheel"] - 0.05) / 15.5, atol=5e-4)
 
 
-def test_steering_intervals_contain_the_truth() -> None:
+def test_steering_intervals_contain_the_truth():
     """Twenty drives: by a binomial law of 95 % fewer than 16 have a chance of 0.3 %."""
     road = single_track(15.5, 0.05)
     generator = np.random.default_rng(0)
@@ -434,7 +428,7 @@ def test_steering_intervals_contain_the_truth() -> None:
     assert inside >= 16
 
 
-def test_steering_without_calm_driving_without_a_channel_or_without_relation_is_refused() -> None:
+def test_steering_without_calm_driving_without_a_channel_or_without_relation_is_refused():
     road = single_track(15.5, 0.0)
     settings = AlignmentSettings(("steering_ratio",), wheelbase=WHEELBASE)
     with pytest.raises(DataError, match=r"only .* s are above 40 m/s"):
@@ -451,7 +445,7 @@ def test_steering_without_calm_driving_without_a_channel_or_without_relation_is_
 # --- transforms
 
 
-def sine(delay: float, frequency: float, rate: float = 100.0) -> Recording:
+def sine(delay, frequency, rate=100.0):
     time = np.arange(1000) / rate
     return Recording(
         "sine", "car", rate, 2.0, {"ay": np.sin(2.0 * np.pi * frequency * (time - delay)), "vy_ref": np.sin(2.0 * np.pi * frequency * time)}
@@ -460,13 +454,13 @@ def sine(delay: float, frequency: float, rate: float = 100.0) -> Recording:
 
 @pytest.mark.parametrize("delay", [0.037, -0.0123, 0.0005, 0.5049])
 @pytest.mark.parametrize("frequency", [0.3, 5.0, 25.0, 40.0])
-def test_delayed_sine_comes_back_between_samples(delay: float, frequency: float) -> None:
+def test_delayed_sine_comes_back_between_samples(delay, frequency):
     corrected = DelayCorrection(delay)(sine(delay, frequency))
     np.testing.assert_allclose(corrected["ay"], corrected["vy_ref"], atol=1e-3)  # up to 0.8 of the Nyquist frequency
 
 
 @pytest.mark.parametrize("delay", [0.04, -0.04])
-def test_delay_of_whole_samples_is_a_shift_and_the_recording_is_cut(delay: float) -> None:
+def test_delay_of_whole_samples_is_a_shift_and_the_recording_is_cut(delay):
     recording = sine(delay, 3.0)
     corrected = DelayCorrection(delay, ("ay",))(recording)
     assert len(corrected) == len(recording) - 4
@@ -475,7 +469,7 @@ def test_delay_of_whole_samples_is_a_shift_and_the_recording_is_cut(delay: float
     np.testing.assert_array_equal(corrected["vy_ref"], recording["vy_ref"][:-4] if delay > 0 else recording["vy_ref"][4:])
 
 
-def test_delay_correction_cuts_what_the_interpolation_cannot_reach_and_keeps_the_clock() -> None:
+def test_delay_correction_cuts_what_the_interpolation_cannot_reach_and_keeps_the_clock():
     recording = sine(0.0, 1.0)
     corrected = DelayCorrection(0.037)(recording)
     assert corrected.start_time == pytest.approx(recording.start_time + 0.12)  # 16 samples of reach less the 4 that the delay gives
@@ -490,12 +484,12 @@ def test_delay_correction_cuts_what_the_interpolation_cannot_reach_and_keeps_the
         DelayCorrection(0.013)(holed)
 
 
-def test_a_constant_stays_that_constant_whatever_the_delay() -> None:
+def test_a_constant_stays_that_constant_whatever_the_delay():
     recording = Recording("flat", "car", 100.0, 0.0, {"ay": np.full(100, 9.81)})
     np.testing.assert_allclose(DelayCorrection(0.0137)(recording)["ay"], 9.81, rtol=1e-14)
 
 
-def test_offsets_are_taken_off_exactly_and_gaps_stay_gaps() -> None:
+def test_offsets_are_taken_off_exactly_and_gaps_stay_gaps():
     recording = Recording("lap", "car", 10.0, 0.0, {"ax": np.array([1.0, np.nan]), "ay": np.array([1.0, 2.0])}, gappy=frozenset({"ax"}))
     corrected = OffsetCorrection({"ax": 0.25, "ay": -1.0})(recording)
     np.testing.assert_array_equal(corrected["ax"], [0.75, np.nan])
@@ -504,7 +498,7 @@ def test_offsets_are_taken_off_exactly_and_gaps_stay_gaps() -> None:
         OffsetCorrection({"yaw_rate": 0.1})(recording)
 
 
-def test_steering_ratio_makes_steer_of_any_channel() -> None:
+def test_steering_ratio_makes_steer_of_any_channel():
     recording = Recording(
         "lap", "car", 10.0, 0.0, {"handwheel": np.array([1.6, np.nan]), "steer": np.zeros(2)}, gappy=frozenset({"handwheel"})
     )
@@ -516,7 +510,7 @@ def test_steering_ratio_makes_steer_of_any_channel() -> None:
         SteeringRatio(15.0, channel="roll")(recording)
 
 
-def test_a_steering_curve_runs_straight_between_its_corners_and_flat_beyond() -> None:
+def test_a_steering_curve_runs_straight_between_its_corners_and_flat_beyond():
     recording = Recording("a", "car", 100.0, 0.0, {"steer": np.array([-2.0, -0.5, 0.0, 0.5, 2.0])})
     curve = SteeringCurve((-1.0, 0.0, 1.0), (-0.4, 0.0, 0.3))
     np.testing.assert_allclose(curve(recording)["steer"], [-0.4, -0.2, 0.0, 0.15, 0.3])
@@ -525,7 +519,7 @@ def test_a_steering_curve_runs_straight_between_its_corners_and_flat_beyond() ->
             SteeringCurve(inputs, angles)
 
 
-def test_transforms_of_an_alignment_are_built_from_plain_values() -> None:
+def test_transforms_of_an_alignment_are_built_from_plain_values():
     assert transform_from_config({"name": "delay_correction", "delay": 0.04, "channels": ["ax", "ay"]}) == DelayCorrection(
         0.04, ("ax", "ay")
     )
@@ -545,7 +539,7 @@ def test_transforms_of_an_alignment_are_built_from_plain_values() -> None:
         {"name": "steering_ratio", "ratio": 15.0, "channel": "rudder"},
     ],
 )
-def test_transforms_that_make_no_sense_are_refused_in_one_line(config: dict[str, Any]) -> None:
+def test_transforms_that_make_no_sense_are_refused_in_one_line(config):
     with pytest.raises(ConfigurationError) as error:
         transform_from_config(config)
     assert "\n" not in str(error.value)
@@ -557,18 +551,18 @@ def test_transforms_that_make_no_sense_are_refused_in_one_line(config: dict[str,
 class Called:
     """Runs `vehest data align` in a folder of its own."""
 
-    def __init__(self, folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    def __init__(self, folder, capsys):
         self.folder, self._capsys = folder, capsys
 
-    def __call__(self, *arguments: str) -> tuple[int, str, str]:
+    def __call__(self, *arguments):
         return run_vehest(self._capsys, "data", "align", *arguments)
 
-    def files(self) -> dict[str, bytes]:
+    def files(self):
         return {str(file.relative_to(self.folder)): file.read_bytes() for file in self.folder.rglob("*") if file.is_file()}
 
 
 @pytest.fixture
-def called(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Called:
+def called(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     monkeypatch.delenv("VEHEST_OUTPUT", raising=False)
     write_recording(weaving(0), tmp_path / "weave.parquet")
@@ -578,7 +572,7 @@ def called(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.Captu
 ASKED = ("weave.parquet", "--estimate", "lever_arm,mounting,delay,offsets", "--cutoff", "1.5", "--max-delay", "0.2")
 
 
-def test_command_prints_table_residuals_notes_and_override_and_touches_nothing(called: Called) -> None:
+def test_command_prints_table_residuals_notes_and_override_and_touches_nothing(called):
     before = called.files()
     code, out, err = called(*ASKED)
     assert (code, err) == (0, "")
@@ -594,7 +588,7 @@ def test_command_prints_table_residuals_notes_and_override_and_touches_nothing(c
     assert called.files() == before
 
 
-def test_printed_override_is_one_that_downsample_takes(called: Called) -> None:
+def test_printed_override_is_one_that_downsample_takes(called):
     _, out, _ = called(*ASKED)
     override = out.splitlines()[-1].removeprefix("to correct it: ").strip("'")
     composed = compose_config("downsample", ["dataset=sim_quickstart", "rate_hz=20", override])["downsample"]
@@ -607,7 +601,7 @@ def test_printed_override_is_one_that_downsample_takes(called: Called) -> None:
     assert composed["transforms"] == [{"name": "offset_correction", "offsets": {"ax": -1e-07, "ay": 1e16}}]
 
 
-def test_command_gives_json_in_si_units(called: Called) -> None:
+def test_command_gives_json_in_si_units(called):
     code, out, _ = called(*ASKED, "--json")
     assert code == 0
     told = json.loads(out)
@@ -619,7 +613,7 @@ def test_command_gives_json_in_si_units(called: Called) -> None:
     assert {residual["channel"] for residual in told["residuals"]} == {"ax", "ay", "yaw_rate"}
 
 
-def test_command_writes_a_folder_whole_and_replaces_its_own_only(called: Called) -> None:
+def test_command_writes_a_folder_whole_and_replaces_its_own_only(called):
     assert called(*ASKED, "-o", "found")[0] == 0
     folder = called.folder / "found"
     assert {file.name for file in folder.iterdir()} == set(FILES)
@@ -641,7 +635,7 @@ def test_command_writes_a_folder_whole_and_replaces_its_own_only(called: Called)
     assert called.files() == before
 
 
-def test_steering_alone_has_a_figure_too(called: Called) -> None:
+def test_steering_alone_has_a_figure_too(called):
     write_recording(single_track(15.5, 0.05), called.folder / "road.parquet")
     for _ in range(2):  # its own files may be replaced
         code, out, _ = called("road.parquet", "-e", "steering_ratio", "--wheelbase", "2.6", "-o", "found")
@@ -661,7 +655,7 @@ def test_steering_alone_has_a_figure_too(called: Called) -> None:
         (("weave.parquet", "-e", "delay", "-o", "weave.parquet"), 2, "is not a folder"),
     ],
 )
-def test_command_refuses_in_one_line_and_writes_nothing(called: Called, arguments: tuple[str, ...], code: int, what: str) -> None:
+def test_command_refuses_in_one_line_and_writes_nothing(called, arguments, code, what):
     before = called.files()
     left, out, err = called(*arguments)
     assert (left, out) == (code, "")
@@ -675,16 +669,16 @@ def test_command_refuses_in_one_line_and_writes_nothing(called: Called, argument
 
 
 @pytest.fixture(scope="module")
-def found_on_ferrari(ferrari: Recording) -> Alignment:
+def found_on_ferrari(ferrari):
     return align(ferrari, AlignmentSettings(IMU))
 
 
 @pytest.fixture(scope="module")
-def ferrari(data_root: Path) -> Recording:
+def ferrari(data_root):
     return real_drive(data_root)
 
 
-def test_ferrari_shows_no_misalignment_that_its_intervals_do_not_contain(found_on_ferrari: Alignment) -> None:
+def test_ferrari_shows_no_misalignment_that_its_intervals_do_not_contain(found_on_ferrari):
     """Its publishers give accelerations at the centre of gravity: lever arm, rotation and offsets should be near zero."""
     found = found_on_ferrari
     for name in ("lever_x", "lever_y", "yaw"):
@@ -694,7 +688,7 @@ def test_ferrari_shows_no_misalignment_that_its_intervals_do_not_contain(found_o
     assert abs(found["delay"].value) < 0.05
 
 
-def test_yaw_rate_offset_on_the_ferrari_agrees_with_the_turns_of_its_laps(ferrari: Recording, found_on_ferrari: Alignment) -> None:
+def test_yaw_rate_offset_on_the_ferrari_agrees_with_the_turns_of_its_laps(ferrari, found_on_ferrari):
     """Between two passes of one place the car has turned by whole circles: what is left over of the integrated yaw rate is its offset."""
     path = np.cumsum(ferrari["vx"]) / ferrari.rate_hz
     curvature = np.interp(np.arange(0.0, path[-1], 10.0), path, ferrari["yaw_rate"] / ferrari["vx"])

@@ -1,29 +1,25 @@
 """Low-passed and held channels: time constants and rates in closed form, and the real cars that have them."""
 
-from __future__ import annotations
-
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
 from broadband_drive import Wave, broadband_drive, without
 
 from vehest.alignment.bandwidth import held_rate
-from vehest.alignment.checks import Finding, checks_of_recording
+from vehest.alignment.checks import checks_of_recording
 from vehest.alignment.spectra import cross_spectra, lag_of
-from vehest.data.recording import Recording
 from vehest.run.config import compose_config
 from vehest.sources.base import open_source
 
 
-def found_by(check: str, recording: Recording) -> dict[str, Finding]:
+def found_by(check, recording):
     return {finding.channel: finding for finding in checks_of_recording(recording) if finding.check == check}
 
 
 @pytest.mark.parametrize("time_constant", [0.2, 0.4, 1.0])
 @pytest.mark.parametrize("late", [0.0, 0.05])
-def test_delay_and_time_constant_are_told_apart(time_constant: float, late: float) -> None:
+def test_delay_and_time_constant_are_told_apart(time_constant, late):
     generator = np.random.default_rng(1)
     wave, clock = Wave.random(generator, 1.0, 0.05, 4.0), np.arange(12000) / 100.0
     signals = {"source": wave(clock), "follower": wave.low_passed(time_constant)(clock - late)}
@@ -37,7 +33,7 @@ def test_delay_and_time_constant_are_told_apart(time_constant: float, late: floa
 
 
 @pytest.mark.parametrize("missing", [(), ("yaw_rate_ref",)])
-def test_a_low_passed_yaw_rate_is_found_and_is_not_late_besides(missing: tuple[str, ...]) -> None:
+def test_a_low_passed_yaw_rate_is_found_and_is_not_late_besides(missing):
     slow = without(broadband_drive(slow_yaw_rate=0.4), *missing)
     found = [finding for finding in checks_of_recording(slow) if finding.level != "note"]
     assert [(one.check, one.channel) for one in found] == [("bandwidth", "yaw_rate")]
@@ -45,11 +41,11 @@ def test_a_low_passed_yaw_rate_is_found_and_is_not_late_besides(missing: tuple[s
 
 
 @pytest.mark.parametrize("channel", ["yaw_rate", "ax", "ay"])
-def test_a_channel_that_is_only_late_is_not_low_passed(channel: str) -> None:
+def test_a_channel_that_is_only_late_is_not_low_passed(channel):
     assert not found_by("bandwidth", broadband_drive(late={channel: 0.15}))
 
 
-def test_a_yaw_rate_that_only_steering_can_judge_is_judged_by_what_cars_can_do() -> None:
+def test_a_yaw_rate_that_only_steering_can_judge_is_judged_by_what_cars_can_do():
     alone = ("ay", "yaw_rate_ref", "vy_ref", "sideslip_ref")
     assert not found_by("bandwidth", without(broadband_drive(), *alone))
     found = found_by("bandwidth", without(broadband_drive(slow_yaw_rate=0.5), *alone))
@@ -60,33 +56,33 @@ def test_a_yaw_rate_that_only_steering_can_judge_is_judged_by_what_cars_can_do()
 
 
 @pytest.mark.parametrize("step", [2, 5, 10, 33])
-def test_a_held_channel_changes_at_its_own_rate(step: int) -> None:
+def test_a_held_channel_changes_at_its_own_rate(step):
     samples = np.repeat(np.random.default_rng(0).standard_normal(4000 // step + 1), step)[:4000]
     assert held_rate(samples, 100.0) == pytest.approx(100.0 / step)
 
 
-def test_a_sensor_on_a_clock_of_its_own_is_held_for_two_or_three_rows() -> None:
+def test_a_sensor_on_a_clock_of_its_own_is_held_for_two_or_three_rows():
     newest = (np.arange(4000) * 0.4).astype(int)
     assert held_rate(np.random.default_rng(0).standard_normal(2000)[newest], 100.0) == pytest.approx(45.0, abs=6.0)
 
 
-def test_a_quantised_channel_that_moves_slowly_is_not_held() -> None:
+def test_a_quantised_channel_that_moves_slowly_is_not_held():
     time = np.arange(6000) / 100.0
     for resolution in (0.05, 0.2):
         assert held_rate(np.round(np.sin(0.3 * time) / resolution) * resolution, 100.0) is None
 
 
-def test_noise_and_constants_are_not_held() -> None:
+def test_noise_and_constants_are_not_held():
     assert held_rate(np.random.default_rng(0).standard_normal(1000), 100.0) is None
     assert held_rate(np.ones(1000), 100.0) is None
     assert held_rate(np.full(1000, np.nan), 100.0) is None
     assert held_rate(np.ones(0), 100.0) is None
 
 
-def test_channels_held_together_are_told_of_together_by_what_it_delays() -> None:
+def test_channels_held_together_are_told_of_together_by_what_it_delays():
     drive = broadband_drive()
 
-    def held(step: int) -> Recording:
+    def held(step):
         changed = {name: np.repeat(drive[name][::step], step)[: len(drive)] for name in ("ax", "ay")}
         return replace(drive, channels={**drive.channels, **changed})
 
@@ -103,11 +99,11 @@ def test_channels_held_together_are_told_of_together_by_what_it_delays() -> None
 # --- real cars ---------------------------------------------------------------------------------------------------------------------
 
 
-def recordings_of(name: str, data_root: Path) -> list[Recording]:
+def recordings_of(name, data_root):
     return list(open_source(compose_config("ingest", [f"dataset={name}", f"root={data_root}"])["dataset"]).recordings())
 
 
-def test_the_dallaras_ax_has_a_time_constant_of_two_to_three_seconds(data_root: Path) -> None:
+def test_the_dallaras_ax_has_a_time_constant_of_two_to_three_seconds(data_root):
     for recording in recordings_of("av21", data_root):
         found = found_by("bandwidth", recording)
         assert set(found) == {"ax", "yaw_rate"}
@@ -115,6 +111,6 @@ def test_the_dallaras_ax_has_a_time_constant_of_two_to_three_seconds(data_root: 
 
 
 @pytest.mark.parametrize("name", ["ferrari_250lm", "f1tenth", "ferrari_250lm_unlabelled", "tum"])
-def test_no_other_cars_channels_are_low_passed_held_or_of_another_sign(data_root: Path, name: str) -> None:
+def test_no_other_cars_channels_are_low_passed_held_or_of_another_sign(data_root, name):
     found = [finding for recording in recordings_of(name, data_root) for finding in checks_of_recording(recording)]
     assert not [finding for finding in found if finding.check in ("bandwidth", "held", "sign", "unit", "delay")]

@@ -1,21 +1,18 @@
 """Checks: each one fires on the fault it is for, and a clean drive gets none of them."""
 
-from __future__ import annotations
-
-from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from vehest.alignment.checks import Finding, checks_of_recording
+from vehest.alignment.checks import checks_of_recording
 from vehest.data.recording import Recording
 
 RATE = 100.0
 LENGTH = 6000
 
 
-def clean_drive(rate: float = RATE, seconds: float = 60.0, noise: float = 1.0, seed: int = 0) -> Recording:
+def clean_drive(rate=RATE, seconds=60.0, noise=1.0, seed=0):
     """A car that obeys d(vy)/dt = ay - vx·yaw_rate and d(vx)/dt = ax + vy·yaw_rate, seen by sensors with a little noise."""
     time = np.arange(round(seconds * rate)) / rate
     generator = np.random.default_rng(seed)
@@ -31,11 +28,11 @@ def clean_drive(rate: float = RATE, seconds: float = 60.0, noise: float = 1.0, s
     return Recording("lap", "car", rate, 10.0, {**channels, **references})
 
 
-def changed(recording: Recording, **changes: Callable[[np.ndarray], np.ndarray]) -> Recording:
+def changed(recording, **changes):
     return replace(recording, channels={**recording.channels, **{name: change(recording[name]) for name, change in changes.items()}})
 
 
-def with_standstill(recording: Recording, start: float, stop: float, **resting: float) -> Recording:
+def with_standstill(recording, start, stop, **resting):
     """The car stands for a while: speeds and angles rest, the inertial sensors show their noise."""
     inside = slice(*recording.index_range(start, stop))
     channels = {name: samples.copy() for name, samples in recording.channels.items()}
@@ -46,16 +43,16 @@ def with_standstill(recording: Recording, start: float, stop: float, **resting: 
     return replace(recording, channels=channels)
 
 
-def stuck(value: float, start: int, stop: int) -> Callable[[np.ndarray], np.ndarray]:
+def stuck(value, start, stop):
     """What a channel becomes that shows one value from one sample to another."""
     return lambda samples: np.where((np.arange(LENGTH) >= start) & (np.arange(LENGTH) < stop), value, samples)
 
 
-def complaints(recording: Recording) -> list[tuple[str, str, str]]:
+def complaints(recording):
     return [(finding.level, finding.check, finding.channel) for finding in checks_of_recording(recording) if finding.level != "note"]
 
 
-def only_complaint(recording: Recording) -> Finding:
+def only_complaint(recording):
     findings = [finding for finding in checks_of_recording(recording) if finding.level != "note"]
     assert len(findings) == 1, findings
     assert "\n" not in findings[0].message
@@ -64,17 +61,17 @@ def only_complaint(recording: Recording) -> Finding:
 
 @pytest.mark.parametrize("rate", [20.0, 100.0, 1000.0 / 3.0])
 @pytest.mark.parametrize("seconds", [0.01, 0.1, 1.0, 60.0])
-def test_a_clean_drive_gets_no_complaint_at_any_rate_and_length(rate: float, seconds: float) -> None:
+def test_a_clean_drive_gets_no_complaint_at_any_rate_and_length(rate, seconds):
     recording = clean_drive(rate, max(seconds, 3.0 / rate))
     assert complaints(recording) == []
 
 
-def test_a_clean_drive_is_noted_to_follow_the_kinematics() -> None:
+def test_a_clean_drive_is_noted_to_follow_the_kinematics():
     notes = [finding for finding in checks_of_recording(clean_drive()) if finding.level == "note"]
     assert [(note.check, note.channel) for note in notes] == [("kinematics", "vy_ref")]
 
 
-def test_the_noted_bias_is_that_of_the_accelerometer() -> None:
+def test_the_noted_bias_is_that_of_the_accelerometer():
     note = checks_of_recording(changed(clean_drive(noise=0.0), ay=lambda ay: ay + 0.25))[0]
     assert "mean bias -0.250 m/s²" in note.message
 
@@ -82,20 +79,20 @@ def test_the_noted_bias_is_that_of_the_accelerometer() -> None:
 # --- impossible values and units ---------------------------------------------------------------------------------------------------
 
 
-def test_an_impossible_value_is_found_with_its_time() -> None:
+def test_an_impossible_value_is_found_with_its_time():
     found = only_complaint(changed(clean_drive(), ay=stuck(500.0, 1234, 1235)))
     assert (found.level, found.check, found.channel) == ("error", "impossible", "ay")
     assert "1 samples" in found.message
     assert "500 m/s² at 22.34 s" in found.message
 
 
-def test_large_angular_rates_in_degrees_are_impossible_and_the_hint_says_degrees() -> None:
+def test_large_angular_rates_in_degrees_are_impossible_and_the_hint_says_degrees():
     found = checks_of_recording(changed(clean_drive(), yaw_rate=np.rad2deg))
     assert (found[0].level, found[0].check, found[0].channel) == ("error", "impossible", "yaw_rate")
     assert "degrees" in found[0].message
 
 
-def test_steering_wheel_degrees_are_impossible_road_wheel_angles() -> None:
+def test_steering_wheel_degrees_are_impossible_road_wheel_angles():
     found = only_complaint(changed(clean_drive(), steer=lambda steer: np.rad2deg(15 * steer)))
     assert (found.check, found.channel) == ("impossible", "steer")
     assert "degrees" in found.message
@@ -104,25 +101,25 @@ def test_steering_wheel_degrees_are_impossible_road_wheel_angles() -> None:
 # --- signs -------------------------------------------------------------------------------------------------------------------------
 
 
-def test_ay_and_yaw_rate_turned_together_leave_two_explanations() -> None:
+def test_ay_and_yaw_rate_turned_together_leave_two_explanations():
     found = only_complaint(changed(clean_drive(), ay=np.negative, yaw_rate=np.negative))
     assert (found.level, found.check, found.channel) == ("warning", "sign", "")
     assert "either ay and yaw_rate together or sideslip_ref, steer and vy_ref together point the other way" in found.message
 
 
-def test_a_reference_that_does_not_follow_the_kinematics_is_reported() -> None:
+def test_a_reference_that_does_not_follow_the_kinematics_is_reported():
     found = only_complaint(changed(clean_drive(), vy_ref=lambda vy: np.roll(vy, round(0.9 * RATE))))
     assert (found.level, found.check, found.channel) == ("warning", "kinematics", "vy_ref")
 
 
-def test_kinematics_are_not_judged_on_a_parked_car() -> None:
+def test_kinematics_are_not_judged_on_a_parked_car():
     generator = np.random.default_rng(0)
     parked = {"vx": 0.01, "yaw_rate": 0.002, "ax": 0.05, "ay": 0.05, "vy_ref": 0.01}
     channels = {name: level * generator.standard_normal(LENGTH) for name, level in parked.items()}
     assert complaints(Recording("parked", "car", RATE, 0.0, channels)) == []
 
 
-def test_channels_with_gaps_are_noted_and_keep_the_checks_that_need_all_samples_silent() -> None:
+def test_channels_with_gaps_are_noted_and_keep_the_checks_that_need_all_samples_silent():
     recording = clean_drive()
     slow = np.where(np.arange(LENGTH) % 5 == 0, recording["vy_ref"], np.nan)
     gappy = replace(recording, channels={**recording.channels, "vy_ref": slow}, gappy=frozenset({"vy_ref"}))
@@ -134,27 +131,27 @@ def test_channels_with_gaps_are_noted_and_keep_the_checks_that_need_all_samples_
 # --- stuck channels and standstill -------------------------------------------------------------------------------------------------
 
 
-def test_a_stuck_channel_is_found_with_value_time_and_duration() -> None:
+def test_a_stuck_channel_is_found_with_value_time_and_duration():
     found = only_complaint(changed(clean_drive(), ay=stuck(1.5, 2000, 2250)))
     assert (found.level, found.check, found.channel) == ("warning", "stuck", "ay")
     assert "stays at 1.5 m/s² for 2.5 s from 30 s" in found.message
 
 
-def test_a_channel_that_never_changes_is_found() -> None:
+def test_a_channel_that_never_changes_is_found():
     found = only_complaint(changed(clean_drive(), steer=lambda steer: np.full_like(steer, 0.02)))
     assert (found.check, found.channel) == ("stuck", "steer")
     assert "never changes: 0.02 rad" in found.message
 
 
-def test_a_gap_of_half_a_second_is_not_stuck() -> None:
+def test_a_gap_of_half_a_second_is_not_stuck():
     assert complaints(changed(clean_drive(), ay=stuck(1.5, 2000, 2050))) == []
 
 
-def test_a_slow_channel_held_between_its_samples_is_not_stuck() -> None:
+def test_a_slow_channel_held_between_its_samples_is_not_stuck():
     assert complaints(changed(clean_drive(), steer=lambda steer: np.repeat(steer[::10], 10))) == [("warning", "held", "steer")]
 
 
-def test_a_stuck_channel_with_gaps_is_found() -> None:
+def test_a_stuck_channel_with_gaps_is_found():
     recording = clean_drive()
     slow = np.where(np.arange(LENGTH) % 5 == 0, recording["steer"], np.nan)
     slow[2000:2500:5] = 0.03
@@ -164,17 +161,17 @@ def test_a_stuck_channel_with_gaps_is_found() -> None:
 
 
 @pytest.mark.parametrize("steer", [0.0, 0.4])
-def test_a_car_at_standstill_may_rest_its_steering_wheel_at_any_angle(steer: float) -> None:
+def test_a_car_at_standstill_may_rest_its_steering_wheel_at_any_angle(steer):
     assert complaints(with_standstill(clean_drive(), 20.0, 35.0, steer=steer)) == []
 
 
-def test_a_speed_that_reads_zero_while_the_car_turns_is_stuck() -> None:
+def test_a_speed_that_reads_zero_while_the_car_turns_is_stuck():
     found = [one for one in checks_of_recording(changed(clean_drive(), vx=stuck(0.0, 2000, 3000))) if one.check == "stuck"]
     assert [finding.channel for finding in found] == ["vx"]
     assert "stays at 0 m/s for 10 s from 30 s" in found[0].message
 
 
-def test_a_standstill_does_not_hide_a_channel_that_is_stuck_later() -> None:
+def test_a_standstill_does_not_hide_a_channel_that_is_stuck_later():
     found = only_complaint(changed(with_standstill(clean_drive(), 20.0, 35.0), steer=stuck(0.03, 4000, 4200)))
     assert (found.check, found.channel) == ("stuck", "steer")
     assert "0.03 rad for 2 s from 50 s" in found.message
@@ -184,7 +181,7 @@ def test_a_standstill_does_not_hide_a_channel_that_is_stuck_later() -> None:
 
 
 @pytest.mark.parametrize(("low", "high", "sides"), [(-4.0, 4.0, 2), (-100.0, 4.0, 1), (-2.5, 100.0, 1), (-100.0, 2.0, 1), (-0.8, 0.8, 2)])
-def test_a_saturated_channel_is_found_on_the_side_where_it_is(low: float, high: float, sides: int) -> None:
+def test_a_saturated_channel_is_found_on_the_side_where_it_is(low, high, sides):
     found = [one for one in checks_of_recording(changed(clean_drive(), ay=lambda ay: ay.clip(low, high))) if one.level != "note"]
     assert {(one.level, one.check, one.channel) for one in found if one.check == "saturated"} == {("warning", "saturated", "ay")}
     assert sum(one.check == "saturated" for one in found) == sides
@@ -193,7 +190,7 @@ def test_a_saturated_channel_is_found_on_the_side_where_it_is(low: float, high: 
             assert ("highest" in one.message) == (f", {high:g} m/s²" in one.message)
 
 
-def test_a_quantised_channel_is_not_saturated() -> None:
+def test_a_quantised_channel_is_not_saturated():
     for step in (0.05, 0.5):
         assert complaints(changed(clean_drive(), ay=lambda ay, step=step: np.round(ay / step) * step)) == []
     time = np.arange(LENGTH) / RATE
@@ -201,34 +198,34 @@ def test_a_quantised_channel_is_not_saturated() -> None:
     assert complaints(Recording("r", "car", RATE, 0.0, {"ay": sine})) == []
 
 
-def test_a_quantised_and_saturated_channel_is_saturated() -> None:
+def test_a_quantised_and_saturated_channel_is_saturated():
     found = checks_of_recording(changed(clean_drive(), ay=lambda ay: (np.round(ay / 0.05) * 0.05).clip(-4, 4)))
     assert sum(one.check == "saturated" for one in found) == 2
 
 
-def test_resting_values_are_not_saturated() -> None:
+def test_resting_values_are_not_saturated():
     recording = with_standstill(clean_drive(), 20.0, 35.0)
     assert complaints(changed(recording, vx=lambda vx: vx.clip(0.0, None))) == []
 
 
-def test_a_manoeuvre_of_one_exact_step_is_not_saturated() -> None:
+def test_a_manoeuvre_of_one_exact_step_is_not_saturated():
     steer = np.where(np.arange(400) < 350, 0.01 * np.sin(np.arange(400)), 0.1)
     assert complaints(Recording("step", "car", RATE, 0.0, {"steer": steer})) == []
 
 
-def with_wheels(recording: Recording) -> Recording:
+def with_wheels(recording):
     """The same drive with four wheels that roll."""
     wheels = {f"wheel_speed_{wheel}": recording["vx"] / 0.3 for wheel in ("fl", "fr", "rl", "rr")}
     return replace(recording, channels={**recording.channels, **wheels})
 
 
-def test_a_steering_offset_shows_straight_ahead() -> None:
+def test_a_steering_offset_shows_straight_ahead():
     whole = clean_drive()
     assert complaints(changed(whole, steer=lambda samples: samples + np.deg2rad(1.0))) == []
     assert complaints(changed(whole, steer=lambda samples: samples - np.deg2rad(5.0))) == [("warning", "offset", "steer")]
 
 
-def test_a_wheel_that_drops_out_is_named_and_one_that_locks_is_not() -> None:
+def test_a_wheel_that_drops_out_is_named_and_one_that_locks_is_not():
     whole = with_wheels(clean_drive())
     assert not complaints(whole)
     dropped = changed(whole, wheel_speed_rl=stuck(0.0, 2000, 2060))
@@ -236,7 +233,7 @@ def test_a_wheel_that_drops_out_is_named_and_one_that_locks_is_not() -> None:
     assert "dropout" not in {check for _, check, _ in complaints(changed(dropped, ax=stuck(-7.0, 2000, 2060)))}
 
 
-def backwards(recording: Recording, *stretches: tuple[int, int], speed: float = -2.0) -> Recording:
+def backwards(recording, *stretches, speed=-2.0):
     """The same drive, with stretches of samples in which its speed and its reference's are negative."""
     slow = {name: recording[name].copy() for name in ("vx", "vx_ref")}
     for samples in slow.values():
@@ -245,11 +242,11 @@ def backwards(recording: Recording, *stretches: tuple[int, int], speed: float = 
     return replace(recording, channels={**recording.channels, **slow})
 
 
-def reversing(recording: Recording) -> list[Finding]:
+def reversing(recording):
     return [finding for finding in checks_of_recording(recording) if finding.check == "reverse"]
 
 
-def test_driving_backwards_is_noted_with_its_longest_stretch_and_its_lowest_speed() -> None:
+def test_driving_backwards_is_noted_with_its_longest_stretch_and_its_lowest_speed():
     (found,) = reversing(backwards(clean_drive(), (1000, 1150), (3000, 3250)))
     assert (found.level, found.channel) == ("note", "vx")
     assert "goes backwards 2 times" in found.message
@@ -258,13 +255,13 @@ def test_driving_backwards_is_noted_with_its_longest_stretch_and_its_lowest_spee
     assert "sign: -1" in found.message
 
 
-def test_a_drive_with_the_other_sign_of_vx_goes_backwards_throughout() -> None:
+def test_a_drive_with_the_other_sign_of_vx_goes_backwards_throughout():
     (found,) = reversing(changed(clean_drive(), vx=np.negative))
     assert "goes backwards 1 times" in found.message
     assert "for 60 s from 10 s" in found.message
 
 
-def test_the_reference_tells_of_driving_backwards_only_where_there_is_no_measured_speed() -> None:
+def test_the_reference_tells_of_driving_backwards_only_where_there_is_no_measured_speed():
     drive = backwards(clean_drive(), (1000, 1150))
     forwards = changed(drive, vx=np.abs)
     assert not reversing(forwards)
@@ -274,5 +271,5 @@ def test_the_reference_tells_of_driving_backwards_only_where_there_is_no_measure
 
 
 @pytest.mark.parametrize(("length", "speed", "noted"), [(99, -2.0, 0), (100, -2.0, 1), (200, -0.5, 0), (200, -0.9, 1)])
-def test_rolling_back_slowly_or_shortly_is_not_driving_backwards(length: int, speed: float, noted: int) -> None:
+def test_rolling_back_slowly_or_shortly_is_not_driving_backwards(length, speed, noted):
     assert len(reversing(backwards(clean_drive(), (1000, 1000 + length), speed=speed))) == noted

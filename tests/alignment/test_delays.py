@@ -1,10 +1,7 @@
 """Delays: a channel that is late is named with an interval that holds the truth, and nothing else is."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from itertools import product
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -12,30 +9,29 @@ from broadband_drive import Wave, broadband_drive, without
 from scipy import signal
 
 from real_drives import real_drive
-from vehest.alignment.checks import Finding, checks_of_recording
-from vehest.alignment.delays import Delay, delays_of, spectra_of
+from vehest.alignment.checks import checks_of_recording
+from vehest.alignment.delays import delays_of, spectra_of
 from vehest.alignment.motion import motion_of
 from vehest.alignment.spectra import cross_spectra, lag_of
-from vehest.data.recording import Recording
 
 
-def delays(recording: Recording) -> list[Delay]:
+def delays(recording):
     motion = motion_of(recording)
     spectra = spectra_of(motion)
     return [] if spectra is None else delays_of(motion, spectra)
 
 
-def between(recording: Recording, channel: str, against: str) -> Delay:
+def between(recording, channel, against):
     (found,) = [delay for delay in delays(recording) if (delay.channel, delay.against) == (channel, against)]
     return found
 
 
-def reported(recording: Recording) -> dict[str, Finding]:
+def reported(recording):
     return {finding.channel: finding for finding in checks_of_recording(recording) if finding.check == "delay"}
 
 
 @pytest.mark.parametrize(("rate", "seed"), [*((25.0, seed) for seed in range(5)), (100.0, 0)])
-def test_channels_on_one_clock_get_no_report(rate: float, seed: int) -> None:
+def test_channels_on_one_clock_get_no_report(rate, seed):
     assert [finding for finding in checks_of_recording(broadband_drive(rate_hz=rate, seed=seed)) if finding.level != "note"] == []
 
 
@@ -43,7 +39,7 @@ LATE = (("yaw_rate",), ("ay",), ("ax",), ("vy_ref", "sideslip_ref"), ("vx",))
 
 
 @pytest.mark.parametrize(("late", "rate"), [*product(LATE, (25.0, 100.0)), (("yaw_rate",), 1000.0 / 3.0)])
-def test_the_late_channel_is_named_and_no_other(late: tuple[str, ...], rate: float) -> None:
+def test_the_late_channel_is_named_and_no_other(late, rate):
     found = reported(broadband_drive(rate_hz=rate, late=dict.fromkeys(late, 0.04)))
     assert set(found) == {late[0]}
     assert "\n" not in found[late[0]].message
@@ -53,41 +49,41 @@ def test_the_late_channel_is_named_and_no_other(late: tuple[str, ...], rate: flo
 
 
 @pytest.mark.parametrize("late", [0.0333, 0.1, 0.25])
-def test_a_delay_is_measured_between_samples(late: float) -> None:
+def test_a_delay_is_measured_between_samples(late):
     delay = between(broadband_drive(rate_hz=25.0, late={"yaw_rate": late}), "yaw_rate", "yaw_rate_ref").delay
     assert delay.value == pytest.approx(late, abs=2e-3)
     assert delay.low < late < delay.high
 
 
-def test_an_inertial_unit_that_is_late_as_a_whole_is_not_taken_for_a_reference_that_is_early() -> None:
+def test_an_inertial_unit_that_is_late_as_a_whole_is_not_taken_for_a_reference_that_is_early():
     late = broadband_drive(late=dict.fromkeys(("ax", "ay", "yaw_rate"), 0.05))
     assert set(reported(late)) == {"ax", "ay", "yaw_rate"}
 
 
-def test_without_yaw_rate_ref_three_accelerations_still_tell_who_is_late() -> None:
+def test_without_yaw_rate_ref_three_accelerations_still_tell_who_is_late():
     for channel in ("ay", "yaw_rate", "vy_ref"):
         drive = without(broadband_drive(late={channel: 0.04}), "yaw_rate_ref", "sideslip_ref")
         assert set(reported(drive)) == {channel}
 
 
-def test_a_sideslip_angle_serves_where_there_is_no_lateral_velocity() -> None:
+def test_a_sideslip_angle_serves_where_there_is_no_lateral_velocity():
     assert set(reported(without(broadband_drive(late={"sideslip_ref": 0.06}), "vy_ref"))) == {"sideslip_ref"}
     assert set(reported(without(broadband_drive(late={"ay": 0.06}), "vy_ref"))) == {"ay"}
 
 
-def test_ay_against_turning_alone_tells_no_delay() -> None:
+def test_ay_against_turning_alone_tells_no_delay():
     """d(vy)/dt follows the yaw acceleration, as a delay does."""
     assert not reported(without(broadband_drive(late={"ay": 0.06}), "vy_ref", "sideslip_ref"))
 
 
-def test_a_lever_arm_is_no_delay() -> None:
+def test_a_lever_arm_is_no_delay():
     drive = without(broadband_drive(lever=1.5), "yaw_rate_ref")
     assert not reported(drive)
     found = between(drive, "yaw_rate", "ay").delay
     assert found.low < 0.0 < found.high
 
 
-def test_a_delay_is_found_in_channels_of_the_wrong_sign_and_unit() -> None:
+def test_a_delay_is_found_in_channels_of_the_wrong_sign_and_unit():
     late = broadband_drive(late={"ay": 0.06})
     spoilt = replace(late, channels={**late.channels, "ay": -late["ay"], "vy_ref": 3.6 * late["vy_ref"]})
     found = checks_of_recording(spoilt)
@@ -95,14 +91,14 @@ def test_a_delay_is_found_in_channels_of_the_wrong_sign_and_unit() -> None:
 
 
 @pytest.mark.parametrize("time_constant", [0.005, 0.01])
-def test_a_channel_low_passed_by_a_sample_or_two_is_as_late_as_the_filter(time_constant: float) -> None:
+def test_a_channel_low_passed_by_a_sample_or_two_is_as_late_as_the_filter(time_constant):
     """The phase of 1/(1 + iωT) is -ωT as long as ωT is small."""
     plain = broadband_drive()
     slow = replace(plain, channels={**plain.channels, "yaw_rate": broadband_drive(slow_yaw_rate=time_constant)["yaw_rate"]})
     assert between(slow, "yaw_rate", "yaw_rate_ref").delay.value == pytest.approx(time_constant, abs=1e-3)
 
 
-def test_the_delay_is_that_of_the_peak_of_the_cross_correlation() -> None:
+def test_the_delay_is_that_of_the_peak_of_the_cross_correlation():
     generator = np.random.default_rng(3)
     low_pass = signal.butter(2, 2.0, fs=100.0, output="sos")
     source = signal.sosfiltfilt(low_pass, generator.standard_normal(12000))
@@ -116,7 +112,7 @@ def test_the_delay_is_that_of_the_peak_of_the_cross_correlation() -> None:
     assert lag.delay.value == pytest.approx(0.07, abs=2e-3)
 
 
-def test_intervals_hold_the_truth_as_often_as_they_promise() -> None:
+def test_intervals_hold_the_truth_as_often_as_they_promise():
     """95 % of 60, less three standard deviations of that number."""
     inside = 0
     for seed in range(60):
@@ -132,7 +128,7 @@ def test_intervals_hold_the_truth_as_often_as_they_promise() -> None:
     assert inside >= 52
 
 
-def test_wheels_that_slip_lead_and_are_not_reported() -> None:
+def test_wheels_that_slip_lead_and_are_not_reported():
     """Slip in proportion to the acceleration: r·ω = v + 0.1 s · dv/dt."""
     drive = broadband_drive()
     slipping = drive["vx_ref"] + 0.1 * np.gradient(drive["vx_ref"]) * drive.rate_hz
@@ -140,7 +136,7 @@ def test_wheels_that_slip_lead_and_are_not_reported() -> None:
     assert not reported(replace(drive, channels={**drive.channels, "vx": slipping}))
 
 
-def test_late_wheels_are_reported_once() -> None:
+def test_late_wheels_are_reported_once():
     drive = broadband_drive(noise=0.0)
     late = np.interp(drive.time - 0.06, drive.time, drive["vx_ref"]) / 0.3
     wheels = {f"wheel_speed_{wheel}": late for wheel in ("fl", "fr", "rl", "rr")}
@@ -149,16 +145,16 @@ def test_late_wheels_are_reported_once() -> None:
 
 
 @pytest.fixture
-def ferrari(data_root: Path) -> Recording:
+def ferrari(data_root):
     return real_drive(data_root)
 
 
-def test_the_ferraris_channels_are_not_reported(ferrari: Recording) -> None:
+def test_the_ferraris_channels_are_not_reported(ferrari):
     for start, stop in ((150.0, 450.0), (450.0, 550.0), (550.0, 700.0)):
         assert not reported(ferrari.cut(start, stop))
 
 
-def test_the_ferraris_accelerometers_are_a_sample_or_two_late(ferrari: Recording) -> None:
+def test_the_ferraris_accelerometers_are_a_sample_or_two_late(ferrari):
     """`vehest data align` finds 0.2 to 22.6 ms by another method: the intervals meet."""
     drive = ferrari.cut(150.0, 450.0)
     for delay in (between(drive, "ax", "vx_ref").delay, between(drive, "vy_ref", "ay").turned.delay):
@@ -167,7 +163,7 @@ def test_the_ferraris_accelerometers_are_a_sample_or_two_late(ferrari: Recording
 
 @pytest.mark.parametrize("late", [0.04, 0.1])
 @pytest.mark.parametrize("channel", ["yaw_rate", "ay", "ax", "vy_ref"])
-def test_a_delay_planted_into_the_ferrari_is_found_where_it_is(ferrari: Recording, channel: str, late: float) -> None:
+def test_a_delay_planted_into_the_ferrari_is_found_where_it_is(ferrari, channel, late):
     drive = ferrari.cut(150.0, 450.0)
     shifted = np.interp(drive.time - late, drive.time, drive[channel])
     names = {"vy_ref", "sideslip_ref"} if channel == "vy_ref" else {channel}

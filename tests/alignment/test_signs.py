@@ -1,9 +1,6 @@
 """Signs, units and offsets: what contradicts what, and a channel only where the others decide."""
 
-from __future__ import annotations
-
 import warnings
-from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -12,7 +9,7 @@ from broadband_drive import broadband_drive, without
 from scipy import signal
 
 from vehest.alignment.band_pass import butterworth_band, without_phase
-from vehest.alignment.checks import Finding, checks_of_recording
+from vehest.alignment.checks import checks_of_recording
 from vehest.alignment.signs import KINEMATIC_BAND_HZ
 from vehest.constants import GRAVITY
 from vehest.data.recording import Recording
@@ -20,26 +17,26 @@ from vehest.data.recording import Recording
 REFERENCES = ("vy_ref", "sideslip_ref", "yaw_rate_ref", "vx_ref")
 
 
-def changed(recording: Recording, **changes: Callable[[np.ndarray], np.ndarray]) -> Recording:
+def changed(recording, **changes):
     return replace(recording, channels={**recording.channels, **{name: change(recording[name]) for name, change in changes.items()}})
 
 
-def turned(recording: Recording, *names: str) -> Recording:
+def turned(recording, *names):
     return changed(recording, **dict.fromkeys(names, np.negative))
 
 
-def warned(recording: Recording) -> list[Finding]:
+def warned(recording):
     return [finding for finding in checks_of_recording(recording) if finding.level != "note"]
 
 
-def signs(recording: Recording) -> list[str]:
+def signs(recording):
     found = warned(recording)
     assert {finding.check for finding in found} <= {"sign"}, found
     return [finding.channel for finding in found]
 
 
 @pytest.mark.parametrize("rate_hz", [5.5, 20.0, 125.0, 1000.0])
-def test_the_band_of_the_checks_is_butterworths(rate_hz: float):
+def test_the_band_of_the_checks_is_butterworths(rate_hz):
     samples, band = 30.0 + np.cumsum(np.random.default_rng(0).normal(size=3000)), KINEMATIC_BAND_HZ
     expected = signal.sosfiltfilt(signal.butter(2, band, btype="bandpass", fs=rate_hz, output="sos"), samples)
     np.testing.assert_allclose(without_phase(butterworth_band(*band, rate_hz), samples), expected, rtol=0, atol=1e-9 * expected.std())
@@ -50,15 +47,15 @@ def test_the_band_of_the_checks_is_butterworths(rate_hz: float):
 
 @pytest.mark.parametrize("rate", [25.0, 100.0])
 @pytest.mark.parametrize("channel", ["ay", "yaw_rate", "ax", "steer", "vy_ref", "sideslip_ref", "yaw_rate_ref"])
-def test_one_reversed_channel_is_named(channel: str, rate: float) -> None:
+def test_one_reversed_channel_is_named(channel, rate):
     assert signs(turned(broadband_drive(rate_hz=rate), channel)) == [channel]
 
 
-def test_a_reversed_reference_sensor_is_named_with_both_its_channels() -> None:
+def test_a_reversed_reference_sensor_is_named_with_both_its_channels():
     assert signs(turned(broadband_drive(), "vy_ref", "sideslip_ref")) == ["sideslip_ref", "vy_ref"]
 
 
-def test_the_message_says_which_products_contradict_and_which_agree() -> None:
+def test_the_message_says_which_products_contradict_and_which_agree():
     (found,) = warned(turned(without(broadband_drive(), *REFERENCES), "ay"))
     assert found.channel == "ay"
     assert found.message.startswith("ay and vx·yaw_rate disagree in sign (correlation -")
@@ -67,37 +64,37 @@ def test_the_message_says_which_products_contradict_and_which_agree() -> None:
 
 
 @pytest.mark.parametrize("channel", ["ay", "yaw_rate"])
-def test_without_steering_and_heading_no_channel_is_named(channel: str) -> None:
+def test_without_steering_and_heading_no_channel_is_named(channel):
     (found,) = warned(turned(without(broadband_drive(), *REFERENCES, "steer"), channel))
     assert (found.check, found.channel) == ("sign", "")
     assert "either ay or yaw_rate point the other way, which a steering angle or yaw_rate_ref would decide" in found.message
 
 
-def test_a_lateral_velocity_alone_does_not_decide() -> None:
+def test_a_lateral_velocity_alone_does_not_decide():
     """A unit and a slip sensor whose y axes point to the right are as likely as one whose yaw rate counts clockwise."""
     (found,) = warned(turned(without(broadband_drive(), "sideslip_ref", "yaw_rate_ref", "steer"), "yaw_rate"))
     assert found.channel == ""
     assert "either yaw_rate or ay and vy_ref together point the other way" in found.message
 
 
-def test_steering_may_be_the_angle_of_the_steering_wheel() -> None:
+def test_steering_may_be_the_angle_of_the_steering_wheel():
     drive = broadband_drive()
     drive = replace(drive, channels={**without(drive, "steer").channels, "handwheel": 15.0 * drive["steer"]})
     assert signs(turned(drive, "ay")) == ["ay"]
     assert signs(turned(drive, "handwheel")) == ["handwheel"]
 
 
-def test_two_reversed_channels_are_both_named() -> None:
+def test_two_reversed_channels_are_both_named():
     assert signs(turned(broadband_drive(), "ax", "ay")) == ["ax", "ay"]
 
 
-def test_counter_steering_is_no_reversed_steering() -> None:
+def test_counter_steering_is_no_reversed_steering():
     drive = broadband_drive()
     drifting = changed(drive, vy_ref=lambda vy: vy - 12.0 * np.sign(drive["yaw_rate_ref"]), steer=np.negative)
     assert "steer" not in [finding.channel for finding in warned(drifting)]
 
 
-def test_a_late_or_slow_yaw_rate_is_not_taken_for_a_reversed_one() -> None:
+def test_a_late_or_slow_yaw_rate_is_not_taken_for_a_reversed_one():
     assert "sign" not in {finding.check for finding in warned(broadband_drive(late={"yaw_rate": 0.1}))}
     assert "sign" not in {finding.check for finding in warned(broadband_drive(slow_yaw_rate=0.4))}
 
@@ -117,18 +114,18 @@ def test_a_late_or_slow_yaw_rate_is_not_taken_for_a_reversed_one() -> None:
         ("yaw_rate", np.pi / 180.0, "rad/s taken for deg/s", "warning"),
     ],
 )
-def test_a_wrong_unit_is_named(channel: str, factor: float, unit: str, level: str) -> None:
+def test_a_wrong_unit_is_named(channel, factor, unit, level):
     found = [one for one in warned(changed(broadband_drive(), **{channel: lambda samples: factor * samples})) if one.check != "impossible"]
     assert [(one.level, one.check, one.channel) for one in found] == [(level, "unit", channel)]
     assert f"{channel} is in {unit}; set its unit" in found[0].message
 
 
-def test_two_wrong_units_are_both_named() -> None:
+def test_two_wrong_units_are_both_named():
     found = warned(changed(broadband_drive(), ay=lambda ay: ay / GRAVITY, vy_ref=lambda vy: 3.6 * vy))
     assert {(one.check, one.channel) for one in found} == {("unit", "ay"), ("unit", "vy_ref")}
 
 
-def test_where_nothing_decides_between_units_all_are_listed() -> None:
+def test_where_nothing_decides_between_units_all_are_listed():
     """ay is a tenth of vx·yaw_rate: no factor of vx alone does that; a ninth of km/h and g together is not looked for."""
     found = warned(changed(without(broadband_drive(), *REFERENCES, "ax"), vx=lambda vx: vx * 3.6))
     assert [(one.check, one.channel) for one in found] == [("unit", "vx")]
@@ -136,7 +133,7 @@ def test_where_nothing_decides_between_units_all_are_listed() -> None:
     assert "about 1 is expected: check the units of ay, yaw_rate and vx" in odd[0].message
 
 
-def test_spinning_wheels_are_no_wrong_unit() -> None:
+def test_spinning_wheels_are_no_wrong_unit():
     drive = broadband_drive()
     spinning = drive["vx"] * (1.0 + 6.0 * (np.sin(0.5 * drive.time) > 0.3))
     assert "unit" not in {finding.check for finding in warned(changed(drive, vx=lambda _: spinning))}
@@ -147,7 +144,7 @@ def test_spinning_wheels_are_no_wrong_unit() -> None:
 
 @pytest.mark.parametrize(("offset", "level"), [(0.1, None), (0.3, "note"), (-0.3, "note"), (1.0, "warning"), (-1.0, "warning")])
 @pytest.mark.parametrize("missing", [(), ("vy_ref", "sideslip_ref")])
-def test_an_offset_of_ay_is_found_with_its_size(offset: float, level: str | None, missing: tuple[str, ...]) -> None:
+def test_an_offset_of_ay_is_found_with_its_size(offset, level, missing):
     drive = without(changed(broadband_drive(), ay=lambda ay: ay + offset), *missing)
     found = [finding for finding in checks_of_recording(drive) if finding.check == "offset"]
     assert [(one.level, one.channel) for one in found] == ([(level, "ay")] if level else [])
@@ -155,7 +152,7 @@ def test_an_offset_of_ay_is_found_with_its_size(offset: float, level: str | None
         assert float(found[0].message.split()[1]) == pytest.approx(offset, abs=0.03)
 
 
-def test_gravity_that_roll_lets_in_is_no_offset_in_a_drive_of_left_turns() -> None:
+def test_gravity_that_roll_lets_in_is_no_offset_in_a_drive_of_left_turns():
     drive = broadband_drive()
     left = changed(drive, yaw_rate=lambda r: r + 0.4, yaw_rate_ref=lambda r: r + 0.4, ay=lambda ay: 1.06 * (ay + 0.4 * drive["vx_ref"]))
     assert np.mean(left["ay"] - left["vx_ref"] * left["yaw_rate"]) > 0.4
@@ -166,7 +163,7 @@ def test_gravity_that_roll_lets_in_is_no_offset_in_a_drive_of_left_turns() -> No
 
 
 @pytest.mark.parametrize("seed", range(50))
-def test_no_recording_raises_or_warns(seed: int) -> None:
+def test_no_recording_raises_or_warns(seed):
     generator = np.random.default_rng(seed)
     length, rate = int(generator.choice([1, 2, 3, 50, 400, 4000])), float(generator.choice([0.01, 5.0, 25.0, 100.0, 1e5]))
     walk = 0.02 * np.cumsum(generator.standard_normal(length))
@@ -196,7 +193,7 @@ def test_no_recording_raises_or_warns(seed: int) -> None:
             assert "\n" not in finding.message
 
 
-def test_a_drive_backwards_is_left_to_the_check_of_it() -> None:
+def test_a_drive_backwards_is_left_to_the_check_of_it():
     drive = without(broadband_drive(), "vx_ref", "vy_ref", "sideslip_ref", "yaw_rate_ref")
     assert not warned(turned(drive, "vx"))
     assert [finding.check for finding in checks_of_recording(turned(drive, "vx"))] == ["reverse"]

@@ -3,15 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 import pandas as pd
 from can_drive import SIGNALS, write_log
 
 from vehest.api import estimate, load_model
-from vehest.constants import FloatArray
-from vehest.data.recording import Recording
 from vehest.run.replay import replay_log
 
 JITTER, LOST = 0.001, 0.01
@@ -41,17 +38,17 @@ class Compared:
     missed: int
 
     @property
-    def ratios(self) -> tuple[float, float]:
+    def ratios(self):
         """Online over offline, of v and β."""
         return self.online[0] / self.offline[0], self.online[1] / self.offline[1]
 
 
-def told_for(channels: tuple[str, ...]) -> str:
+def told_for(channels):
     """--signals for a model's channels."""
     return ",".join(word for word in TOLD.split(",") if word.partition("=")[0] in channels)
 
 
-def compare(model: str, drive: Recording, folder: Path, output: Path | None = None) -> Compared:
+def compare(model, drive, folder, output=None):
     """Estimate a drive offline, and online from the frames of a bus with jitter and lost frames.
 
     Args:
@@ -71,7 +68,7 @@ def compare(model: str, drive: Recording, folder: Path, output: Path | None = No
     begin = SETTLED + max(online["time"].iloc[0] + written.origin, offline.time[known][0])
     end = min(online["time"].iloc[-1] + written.origin, offline.time[known][-1])
 
-    def errors(times: FloatArray, vy: FloatArray, sideslip: FloatArray) -> tuple[float, float]:
+    def errors(times, vy, sideslip):
         inside = (times >= begin) & (times <= end)
         v = vy[inside] - np.interp(times[inside], drive.time, drive["vy_ref"])
         beta = np.degrees(sideslip[inside] - np.interp(times[inside], drive.time, drive["sideslip_ref"]))

@@ -1,11 +1,8 @@
 """A log on a virtual bus with a model behind it: estimates as without a bus, what is lost is missing, what was written stays."""
 
-from __future__ import annotations
-
 import io
 import math
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -16,33 +13,32 @@ from conftest import planar_drive
 from vehest.bus.mapping import from_dataset, from_names
 from vehest.bus.view import Figures, View, rows_of
 from vehest.data.errors import ConfigurationError, DataError, MissingError, VehestError
-from vehest.data.recording import Recording
 from vehest.run.replay import replay_log
 from vehest.trust.contract import GuardedStepper
 
 can = pytest.importorskip("can", reason="python-can is not installed: pip install 'vehest[bus]'")
 cantools = pytest.importorskip("cantools", reason="cantools is not installed: pip install 'vehest[bus]'")
 
-from can_drive import DBC, SIGNALS, Written, ferrari, write_log  # noqa: E402
+from can_drive import DBC, SIGNALS, ferrari, write_log  # noqa: E402
 from replayed_drive import FERRARI, compare, told_for  # noqa: E402
 
 CHANNELS = ("yaw_rate", "vx", "ay", "ax")  # of the pre-trained model
 RATE = 100.0
 
 
-def drive(seconds: float = 20.0) -> Recording:
+def drive(seconds=20.0):
     return planar_drive(seconds, RATE, seed=3)
 
 
-def replayed(written: Written, **more: Any) -> dict[str, Any]:
+def replayed(written, **more):
     words = {"dbc": written.dbc, "signals": told_for(CHANNELS), "speed": "max", **more}
     return replay_log(written.log, **words)
 
 
-def by_cantools(written: Written) -> dict[str, list[float]]:
+def by_cantools(written):
     """Values of the frames in SI units and ISO 8855 signs, without vehest."""
     database = cantools.database.load_string(DBC, "dbc")
-    found: dict[str, list[float]] = {name: [] for name in CHANNELS}
+    found = {name: [] for name in CHANNELS}
     for frame in can.LogReader(written.log):
         values = database.decode_message(frame.arbitration_id, frame.data)
         if "VehSpd" in values:
@@ -54,7 +50,7 @@ def by_cantools(written: Written) -> dict[str, list[float]]:
     return found
 
 
-def test_estimates_are_those_of_the_model_stepped_on_the_decoded_values(tmp_path: Path) -> None:
+def test_estimates_are_those_of_the_model_stepped_on_the_decoded_values(tmp_path):
     written = write_log(drive(), tmp_path, jitter=0.001)
     figures = replayed(written, out=tmp_path / "out.csv")
     table = pd.read_csv(tmp_path / "out.csv")
@@ -71,7 +67,7 @@ def test_estimates_are_those_of_the_model_stepped_on_the_decoded_values(tmp_path
     np.testing.assert_allclose(table[["vy", "sideslip", "health"]], np.array(expected), rtol=1e-7, atol=1e-9)
 
 
-def test_estimates_hold_for_their_sample_less_the_delay_of_the_filter_and_plus_the_horizon(tmp_path: Path) -> None:
+def test_estimates_hold_for_their_sample_less_the_delay_of_the_filter_and_plus_the_horizon(tmp_path):
     written = write_log(drive(), tmp_path)
     replayed(written, out=tmp_path / "out.csv")
     table = pd.read_csv(tmp_path / "out.csv")
@@ -83,17 +79,14 @@ def test_estimates_hold_for_their_sample_less_the_delay_of_the_filter_and_plus_t
     assert np.abs(table["time"] - held).max() < 3e-4
 
 
-def test_lost_frames_are_missing_samples(tmp_path: Path) -> None:
+def test_lost_frames_are_missing_samples(tmp_path):
     written = write_log(drive(30.0), tmp_path, jitter=0.001, lost=0.02)
     figures = replayed(written)
-    assert figures["missing"] == {
-        "vx": len(written.lost["Speed"]),
-        **dict.fromkeys(("yaw_rate", "ay", "ax"), len(written.lost["IMU"])),
-    }
+    assert figures["missing"] == {"vx": len(written.lost["Speed"]), **dict.fromkeys(("yaw_rate", "ay", "ax"), len(written.lost["IMU"]))}
     assert figures["samples_lost"] == len(set(written.lost["IMU"]) | set(written.lost["Speed"]))
 
 
-def test_frames_of_estimates_say_what_the_table_says(tmp_path: Path) -> None:
+def test_frames_of_estimates_say_what_the_table_says(tmp_path):
     written = write_log(drive(), tmp_path, ".blf")
     replayed(written, out=tmp_path / "out.csv")
     figures = replayed(written, out=tmp_path / "sent.asc", identifier="0x321")
@@ -110,7 +103,7 @@ def test_frames_of_estimates_say_what_the_table_says(tmp_path: Path) -> None:
     np.testing.assert_allclose([said[k]["SideslipAngle"] for k in known], np.degrees(table["sideslip"].iloc[known]), atol=0.0003)
 
 
-def test_in_real_time_every_frame_is_sent_and_estimates_come_back(tmp_path: Path) -> None:
+def test_in_real_time_every_frame_is_sent_and_estimates_come_back(tmp_path):
     written = write_log(drive(3.0), tmp_path)
     figures = replayed(written, speed="4", out=tmp_path / "out.csv")
     assert figures["frames_sent"] == figures["frames_received"] == 600
@@ -119,7 +112,7 @@ def test_in_real_time_every_frame_is_sent_and_estimates_come_back(tmp_path: Path
 
 
 @pytest.mark.parametrize("speed", ["max", "1"])
-def test_what_was_written_before_a_stop_is_kept(tmp_path: Path, speed: str) -> None:
+def test_what_was_written_before_a_stop_is_kept(tmp_path, speed):
     written = write_log(drive(), tmp_path)
     calls = iter(range(10_000))
     words = {"dbc": written.dbc, "signals": told_for(CHANNELS), "out": tmp_path / "out.csv"}
@@ -129,7 +122,7 @@ def test_what_was_written_before_a_stop_is_kept(tmp_path: Path, speed: str) -> N
     assert len(pd.read_csv(tmp_path / "out.csv")) == figures["estimates"]
 
 
-def test_signals_called_like_channels_need_no_map(tmp_path: Path) -> None:
+def test_signals_called_like_channels_need_no_map(tmp_path):
     text = 'VERSION ""\n\nBO_ 5 A: 8 X\n SG_ vx : 0|16@1+ (0.01,0) [0|0] "m/s" X\n SG_ ay : 16|16@1- (0.01,0) [0|0] "g" X\n'
     (tmp_path / "own.dbc").write_text(text)
     found = from_names(tmp_path / "own.dbc", ["vx", "ay"])
@@ -139,7 +132,7 @@ def test_signals_called_like_channels_need_no_map(tmp_path: Path) -> None:
     assert set(from_names(tmp_path / "own.dbc", ["vx", "ay", "ax"], optional=["ax"]).wanted) == {"vx", "ay"}
 
 
-def test_a_data_set_says_the_same_as_words_do(tmp_path: Path) -> None:
+def test_a_data_set_says_the_same_as_words_do(tmp_path):
     written = write_log(drive(1.0), tmp_path)
     dataset = {"name": "mine", "source": "can", "dbc": str(written.dbc), "path": str(tmp_path), "rate_hz": 100, "channels": SIGNALS}
     declared = from_dataset(dataset, CHANNELS)
@@ -172,7 +165,7 @@ def test_a_data_set_says_the_same_as_words_do(tmp_path: Path) -> None:
         ({"model": "nothing"}, "there is no model 'nothing'"),
     ],
 )
-def test_words_that_make_no_sense_are_one_line(tmp_path: Path, words: dict[str, Any], said: str) -> None:
+def test_words_that_make_no_sense_are_one_line(tmp_path, words, said):
     written = write_log(drive(2.0), tmp_path)
     with pytest.raises(VehestError, match=said) as caught:
         replayed(written, **words)
@@ -180,7 +173,7 @@ def test_words_that_make_no_sense_are_one_line(tmp_path: Path, words: dict[str, 
     assert isinstance(caught.value, ConfigurationError | DataError | MissingError)
 
 
-def test_the_log_itself_is_never_written_over(tmp_path: Path) -> None:
+def test_the_log_itself_is_never_written_over(tmp_path):
     written = write_log(drive(2.0), tmp_path)
     before = written.log.read_bytes()
     with pytest.raises(ConfigurationError, match="is an input"):
@@ -188,7 +181,7 @@ def test_the_log_itself_is_never_written_over(tmp_path: Path) -> None:
     assert written.log.read_bytes() == before
 
 
-def test_a_damaged_log_ends_a_replay_in_one_line_in_real_time_too(tmp_path: Path) -> None:
+def test_a_damaged_log_ends_a_replay_in_one_line_in_real_time_too(tmp_path):
     written = write_log(drive(2.0), tmp_path)
     lines = written.log.read_text().splitlines()
     written.log.write_text("\n".join([*lines[:300], lines[300].replace("Rx   d 8", "Rx   d zz")]))
@@ -200,7 +193,7 @@ def test_a_damaged_log_ends_a_replay_in_one_line_in_real_time_too(tmp_path: Path
 FIGURES = Figures(frames_sent=30, frames_received=20, samples=10, samples_lost=1, estimates=2, latest_ms=1.2)
 
 
-def test_the_view_shows_estimate_band_health_and_reason_in_words() -> None:
+def test_the_view_shows_estimate_band_health_and_reason_in_words():
     values = {"vy": 0.5, "sideslip": math.radians(-1.25), "band_vy": 0.1, "band_sideslip": math.radians(0.5)}
     rows = dict(rows_of(FIGURES, {**values, "health": 2.0, "health_reason": 3e5}, 10.1, 20.0))
     assert rows["time"] == "10.1 s"
@@ -213,11 +206,11 @@ def test_the_view_shows_estimate_band_health_and_reason_in_words() -> None:
 
 
 class Terminal(io.StringIO):
-    def isatty(self) -> bool:
+    def isatty(self):
         return True
 
 
-def test_a_terminal_gets_a_table_and_any_other_stream_plain_lines() -> None:
+def test_a_terminal_gets_a_table_and_any_other_stream_plain_lines():
     values = {"vy": 0.5, "sideslip": 0.0, "health": 0.0, "health_reason": 0.0}
     plain, terminal = io.StringIO(), Terminal()
     for stream in (plain, terminal):
@@ -229,14 +222,14 @@ def test_a_terminal_gets_a_table_and_any_other_stream_plain_lines() -> None:
     assert "+0.500 m/s" in terminal.getvalue()
 
 
-def test_steppers_say_all_that_the_view_and_the_frames_need() -> None:
+def test_steppers_say_all_that_the_view_and_the_frames_need():
     stepper = GuardedStepper(vehest.load_model(), None, RATE)
     for k in range(300):
         said = stepper.step({"vx": 20.0, "yaw_rate": 0.1 * math.sin(0.05 * k), "ay": 2.0 * math.sin(0.05 * k), "ax": 0.0})
     assert {"vy", "sideslip", "health", "health_reason"} <= set(said)
 
 
-def test_a_replay_of_the_real_ferrari_errs_as_the_model_does_offline(data_root: Path, tmp_path: Path) -> None:
+def test_a_replay_of_the_real_ferrari_errs_as_the_model_does_offline(data_root, tmp_path):
     assert data_root.is_dir()
     found = compare("pretrained", ferrari(*FERRARI), tmp_path)
     assert found.lost > 200  # of 15,000 samples and two messages, 1 % each

@@ -1,7 +1,5 @@
 """`vehest replay` as people call it: figures, files, one line for what is wrong, and a clean end by Ctrl-C."""
 
-from __future__ import annotations
-
 import json
 import signal
 from pathlib import Path
@@ -11,8 +9,7 @@ import pytest
 import yaml
 
 from conftest import planar_drive
-from place import Place
-from vehest.bus.view import Figures, View
+from vehest.bus.view import View
 
 pytest.importorskip("can", reason="python-can is not installed: pip install 'vehest[bus]'")
 pytest.importorskip("cantools", reason="cantools is not installed: pip install 'vehest[bus]'")
@@ -24,7 +21,7 @@ TOLD = told_for(("vx", "yaw_rate", "ax", "ay"))
 
 
 @pytest.fixture
-def bus(place: Place) -> Place:
+def bus(place):
     """A log of ten seconds, its DBC, and a data set that describes both."""
     write_log(planar_drive(10.0, 100.0, seed=2), place.folder / "raw" / "bus", jitter=0.001, lost=0.01)
     channels = {name: SIGNALS[name] for name in ("vx", "yaw_rate", "ax", "ay")}
@@ -34,7 +31,7 @@ def bus(place: Place) -> Place:
     return place
 
 
-def test_figures_come_as_json_and_estimates_as_a_table(bus: Place) -> None:
+def test_figures_come_as_json_and_estimates_as_a_table(bus):
     words = ("--dbc", "raw/bus/car.dbc", "--signals", TOLD, "--speed", "max", "--json", "--quiet", "-o", "out.csv")
     code, out, err = bus("replay", "raw/bus/drive.asc", *words)
     assert (code, err) == (0, "")
@@ -44,7 +41,7 @@ def test_figures_come_as_json_and_estimates_as_a_table(bus: Place) -> None:
     assert figures["written"] == ["out.csv"]
 
 
-def test_a_data_set_serves_replays_and_estimates_alike(bus: Place) -> None:
+def test_a_data_set_serves_replays_and_estimates_alike(bus):
     code, _, err = bus("replay", "raw/bus/drive.asc", "--dataset", "bus", "--speed", "max", "--quiet", "-o", "online.csv")
     assert (code, err) == (0, "")
     code, _, _ = bus("estimate", "raw/bus/drive.asc", "dataset=bus", "-o", "offline.csv")
@@ -53,27 +50,27 @@ def test_a_data_set_serves_replays_and_estimates_alike(bus: Place) -> None:
     assert {"time", "vy", "sideslip", "health", "health_reason"} <= set(online) & set(offline)
 
 
-def test_the_dbc_of_estimates_is_written_alone(bus: Place) -> None:
+def test_the_dbc_of_estimates_is_written_alone(bus):
     words = ("--dbc", "raw/bus/car.dbc", "--signals", TOLD, "--speed", "max", "--quiet", "--write-dbc", "own.dbc", "--id", "0x100")
     assert bus("replay", "raw/bus/drive.asc", *words)[0] == 0
     assert "BO_ 256 VehestEstimate: 8" in Path("own.dbc").read_text()
 
 
-def test_progress_goes_to_standard_error_in_plain_lines(bus: Place) -> None:
+def test_progress_goes_to_standard_error_in_plain_lines(bus):
     code, _, err = bus("replay", "raw/bus/drive.asc", "--dbc", "raw/bus/car.dbc", "--signals", TOLD, "--speed", "max")
     assert code == 0
     assert err.startswith("time ")
     assert "\x1b" not in err
 
 
-def test_what_is_wrong_is_one_line_and_nothing_is_left_behind(bus: Place) -> None:
+def test_what_is_wrong_is_one_line_and_nothing_is_left_behind(bus):
     assert bus.refused("replay", "raw/bus/nothing.asc", "--dataset", "bus")[0] == 4
     assert bus.refused("replay", "raw/bus/drive.asc")[0] == 2
     assert bus.refused("replay", "raw/bus/car.dbc", "--dataset", "bus")[0] == 3
 
 
-def test_ctrl_c_ends_with_figures_and_keeps_what_was_written(bus: Place, monkeypatch: pytest.MonkeyPatch) -> None:
-    def interrupt(self: View, figures: Figures, values: object, seconds: float) -> None:
+def test_ctrl_c_ends_with_figures_and_keeps_what_was_written(bus, monkeypatch):
+    def interrupt(self, figures, values, seconds):
         if figures.samples == 400:
             signal.raise_signal(signal.SIGINT)
 

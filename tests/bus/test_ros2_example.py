@@ -1,12 +1,8 @@
 """The ROS 2 node of the documentation, without ROS: messages of a bag go through it and come back as they were."""
 
-from __future__ import annotations
-
 import importlib.util
 import math
 from pathlib import Path
-from types import ModuleType
-from typing import Any
 
 import numpy as np
 import pytest
@@ -25,7 +21,7 @@ START = 1_700_000_000  # s
 
 
 @pytest.fixture(scope="module")
-def node() -> ModuleType:
+def node():
     spec = importlib.util.spec_from_file_location("sideslip_node", EXAMPLE / "sideslip_node.py")
     assert spec is not None
     assert spec.loader is not None
@@ -35,27 +31,27 @@ def node() -> ModuleType:
 
 
 @pytest.fixture(scope="module")
-def types() -> Any:
+def types():
     found = get_typestore(Stores.ROS2_HUMBLE)
     found.register(get_types_from_msg((EXAMPLE / "msg" / "SideslipEstimate.msg").read_text(), KIND))
     return found
 
 
-def made(types: Any, kind: str, **fields: Any) -> Any:
+def made(types, kind, **fields):
     return types.types[kind](**fields)
 
 
-def header(types: Any, time: float) -> Any:
+def header(types, time):
     nanoseconds = START * 10**9 + round(1e9 * time)
     stamp = made(types, "builtin_interfaces/msg/Time", sec=nanoseconds // 10**9, nanosec=nanoseconds % 10**9)
     return made(types, "std_msgs/msg/Header", stamp=stamp, frame_id="base_link")
 
 
-def vector(types: Any, x: float = 0.0, y: float = 0.0, z: float = 0.0) -> Any:
+def vector(types, x=0.0, y=0.0, z=0.0):
     return made(types, "geometry_msgs/msg/Vector3", x=x, y=y, z=z)
 
 
-def imu(types: Any, time: float, yaw_rate: float, ax: float, ay: float) -> Any:
+def imu(types, time, yaw_rate, ax, ay):
     nothing = np.zeros(9)
     return made(
         types,
@@ -70,17 +66,17 @@ def imu(types: Any, time: float, yaw_rate: float, ax: float, ay: float) -> Any:
     )
 
 
-def speed(types: Any, time: float, vx: float) -> Any:
+def speed(types, time, vx):
     twist = made(types, "geometry_msgs/msg/Twist", linear=vector(types, vx), angular=vector(types))
     return made(types, "geometry_msgs/msg/TwistStamped", header=header(types, time), twist=twist)
 
 
-def through(types: Any, message: Any) -> Any:
+def through(types, message):
     """As it arrives on the other side of a wire."""
     return types.deserialize_cdr(types.serialize_cdr(message, message.__msgtype__), message.__msgtype__)
 
 
-def test_a_drive_goes_through_the_node_and_its_estimates_through_a_bag(tmp_path: Path, node: ModuleType, types: Any) -> None:
+def test_a_drive_goes_through_the_node_and_its_estimates_through_a_bag(tmp_path, node, types):
     drive = planar_drive(20.0, 100.0)
     stepper, bare = (vehest.online(vehest.load_model(), 100.0) for _ in range(2))
     samples, sent, expected, last = node.Samples(), [], [], stepper.last
@@ -107,7 +103,7 @@ def test_a_drive_goes_through_the_node_and_its_estimates_through_a_bag(tmp_path:
     assert held == pytest.approx(19.95 + 1 / 20 - stepper.delay, abs=1e-6)
 
 
-def test_a_speed_that_is_too_old_counts_as_not_measured(node: ModuleType, types: Any) -> None:
+def test_a_speed_that_is_too_old_counts_as_not_measured(node, types):
     samples = node.Samples()
     assert math.isnan(samples.imu(imu(types, 0.0, 0.1, 0.0, 1.0))[1]["vx"])
     samples.speed(speed(types, 0.0, 20.0))
@@ -115,7 +111,7 @@ def test_a_speed_that_is_too_old_counts_as_not_measured(node: ModuleType, types:
     assert math.isnan(samples.imu(imu(types, 0.2, 0.1, 0.0, 1.0))[1]["vx"])
 
 
-def test_what_there_is_not_is_nan_in_the_message(node: ModuleType) -> None:
+def test_what_there_is_not_is_nan_in_the_message(node):
     fields = node.fields_of({"vy": 0.5, "sideslip": 0.02, "health": 2.0, "health_reason": 300000.0})
     assert fields["reason"] == "there is no estimate"
     assert math.isnan(fields["yaw_rate"])

@@ -1,7 +1,5 @@
 """Frames become samples at even instants: what is lost or late is missing, and nothing else."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 
@@ -11,12 +9,12 @@ from vehest.data.errors import ConfigurationError
 CYCLE = 0.01
 
 
-def arrivals(n: int = 2000, phase: float = 0.003, jitter: float = 0.0, period: float = CYCLE, seed: int = 0) -> np.ndarray:
+def arrivals(n=2000, phase=0.003, jitter=0.0, period=CYCLE, seed=0):
     rng = np.random.default_rng(seed)
     return phase + period * np.arange(n) + rng.uniform(0.0, jitter, n) if jitter else phase + period * np.arange(n)
 
 
-def run(timing: Timing, frames: list[tuple[float, dict[str, float]]], until: float) -> list[tuple[float, dict[str, float], list[str]]]:
+def run(timing, frames, until):
     sampler, found = Sampler(timing), []
     for stamp, values in sorted(frames, key=lambda frame: frame[0]):
         while sampler.next_time < stamp:
@@ -29,7 +27,7 @@ def run(timing: Timing, frames: list[tuple[float, dict[str, float]]], until: flo
     return found
 
 
-def test_instants_lie_in_the_middle_of_the_longest_pause_of_a_cycle() -> None:
+def test_instants_lie_in_the_middle_of_the_longest_pause_of_a_cycle():
     timing = timing_of({"ay": arrivals(phase=0.001), "vx": arrivals(phase=0.003), "steer": arrivals(phase=0.002)})
     assert timing.rate_hz == 100.0
     assert timing.start % CYCLE == pytest.approx(0.007, abs=1e-6)  # the pause from 3 ms to 11 ms
@@ -37,7 +35,7 @@ def test_instants_lie_in_the_middle_of_the_longest_pause_of_a_cycle() -> None:
     assert timing.offset == pytest.approx((0.007 - clock) % CYCLE, abs=1e-6)
 
 
-def test_every_frame_is_in_one_sample_however_it_jitters() -> None:
+def test_every_frame_is_in_one_sample_however_it_jitters():
     stamps = arrivals(jitter=0.005, seed=4)
     timing = timing_of({"ay": stamps})
     found = run(timing, [(stamp, {"ay": float(k)}) for k, stamp in enumerate(stamps)], stamps[-1] + 0.002)
@@ -46,7 +44,7 @@ def test_every_frame_is_in_one_sample_however_it_jitters() -> None:
     assert np.diff(values).min() == np.diff(values).max() == 1.0
 
 
-def test_lost_frames_are_missing_samples_and_only_those() -> None:
+def test_lost_frames_are_missing_samples_and_only_those():
     stamps = arrivals(jitter=0.001)
     lost = {50, 51, 700, 1203}
     timing = timing_of({"ay": stamps, "vx": stamps})
@@ -56,7 +54,7 @@ def test_lost_frames_are_missing_samples_and_only_those() -> None:
     assert all("vx" not in values for _, values, missing in found if missing)
 
 
-def test_a_late_frame_is_missing_at_its_instant_and_superseded_at_the_next() -> None:
+def test_a_late_frame_is_missing_at_its_instant_and_superseded_at_the_next():
     stamps = arrivals()
     timing = timing_of({"ay": stamps})
     late = stamps.copy()
@@ -67,7 +65,7 @@ def test_a_late_frame_is_missing_at_its_instant_and_superseded_at_the_next() -> 
     assert numbers[at : at + 3] == [99.0, None, 101.0]
 
 
-def test_slower_messages_hold_for_their_own_period_and_no_longer() -> None:
+def test_slower_messages_hold_for_their_own_period_and_no_longer():
     fast, slow = arrivals(), arrivals(n=400, phase=0.0031, period=0.05)
     timing = timing_of({"ay": fast, "vx": slow})
     frames = [(stamp, {"ay": 1.0}) for stamp in fast] + [(stamp, {"vx": 2.0}) for k, stamp in enumerate(slow) if k != 200]
@@ -76,14 +74,14 @@ def test_slower_messages_hold_for_their_own_period_and_no_longer() -> None:
     assert missing[0] == pytest.approx(slow[200] + timing.offset, abs=CYCLE)
 
 
-def test_instants_follow_a_sender_whose_clock_is_wrong_by_100_ppm() -> None:
+def test_instants_follow_a_sender_whose_clock_is_wrong_by_100_ppm():
     stamps = arrivals(n=60_000, period=CYCLE * (1 + 1e-4))  # ten minutes, 60 ms of drift
     found = run(Timing(100.0, {"ay": CYCLE}, "ay", 0.005, 0.008), [(stamp, {"ay": 1.0}) for stamp in stamps], stamps[-1])
     assert not any(missing for _, _, missing in found)
     assert len(found) == pytest.approx(len(stamps), abs=1)
 
 
-def test_a_rate_that_is_none_is_refused() -> None:
+def test_a_rate_that_is_none_is_refused():
     with pytest.raises(ConfigurationError, match="must be a positive number"):
         timing_of({"ay": arrivals()}, -5.0)
     with pytest.raises(ConfigurationError, match="repeat their time stamps"):

@@ -3,8 +3,6 @@
 Jobs stand in a folder as files: ``ID_INDEX.json`` with state and process. `install` writes the commands, which call this file.
 """
 
-from __future__ import annotations
-
 import json
 import os
 import re
@@ -14,14 +12,13 @@ import sys
 import time
 from contextlib import suppress
 from pathlib import Path
-from typing import Any
 
 COMMANDS = ("sbatch", "srun", "sacct", "scancel", "scontrol")
 AT_A_TIME = 2
 MOMENT = 0.05
 
 
-def install(folder: Path) -> dict[str, str]:
+def install(folder):
     """Write the commands; returns the environment in which they are found."""
     commands = folder / "bin"
     commands.mkdir(parents=True)
@@ -32,11 +29,11 @@ def install(folder: Path) -> dict[str, str]:
     return {"PATH": f"{commands}{os.pathsep}{os.environ['PATH']}"}
 
 
-def _file(folder: Path, job: str) -> Path:
+def _file(folder, job):
     return folder / f"{job}.json"
 
 
-def _set(folder: Path, job: str, **values: Any) -> None:
+def _set(folder, job, **values):
     file = _file(folder, job)
     known = json.loads(file.read_text()) if file.is_file() else {}
     aside = file.with_suffix(f".{os.getpid()}")
@@ -44,12 +41,12 @@ def _set(folder: Path, job: str, **values: Any) -> None:
     aside.replace(file)
 
 
-def states(folder: Path) -> dict[str, str]:
+def states(folder):
     """Job -> state."""
     return {file.stem: json.loads(file.read_text())["state"] for file in folder.glob("*.json")}
 
 
-def sbatch(folder: Path, script: str) -> None:
+def sbatch(folder, script):
     """Queue the jobs of an array, each with a process that waits for its turn."""
     found = re.search(r"^#SBATCH --array=0-(\d+)", Path(script).read_text(), re.MULTILINE)
     job = str(1 + max((int(name.partition("_")[0]) for name in states(folder)), default=0))
@@ -60,7 +57,7 @@ def sbatch(folder: Path, script: str) -> None:
     print(f"Submitted batch job {job}")
 
 
-def turn(folder: Path, script: str, own: str) -> None:
+def turn(folder, script, own):
     """Run one job when there is room, and again whenever it is put back."""
     job, _, index = own.partition("_")
     variables = {"JOB_ID": own, "PROCID": "0", "LOCALID": "0", "NTASKS": "1", "NODEID": "0"}
@@ -81,7 +78,7 @@ def turn(folder: Path, script: str, own: str) -> None:
         _set(folder, own, state="COMPLETED" if code == 0 else "FAILED")
 
 
-def srun(folder: Path, *words: str) -> None:
+def srun(folder, *words):
     """Become the command behind the options."""
     command = list(words)
     while command[0].startswith("--"):
@@ -91,14 +88,14 @@ def srun(folder: Path, *words: str) -> None:
     os.execvp(command[0], command)
 
 
-def sacct(folder: Path, *_: str) -> None:
+def sacct(folder, *_):
     """List all jobs."""
     print("JobID|State|NodeList")
     for job, state in states(folder).items():
         print(f"{job}|{state}|here")
 
 
-def scancel(folder: Path, *words: str) -> None:
+def scancel(folder, *words):
     """End a job."""
     job = words[-1]
     _set(folder, job, state="CANCELLED")
@@ -106,7 +103,7 @@ def scancel(folder: Path, *words: str) -> None:
         os.killpg(json.loads(_file(folder, job).read_text())["process"], signal.SIGKILL)
 
 
-def scontrol(folder: Path, verb: str, job: str) -> None:
+def scontrol(folder, verb, job):
     """Put a job back into the queue."""
     assert verb == "requeue"
     _set(folder, job, state="REQUEUED")

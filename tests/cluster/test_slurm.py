@@ -1,12 +1,8 @@
 """SLURM jobs against the local launcher: by processes that submitit starts itself, and by a queue that answers to SLURM's commands."""
 
-from __future__ import annotations
-
 import importlib.util
 import os
 import signal
-from collections.abc import Iterator
-from pathlib import Path
 
 import pytest
 from pretended_slurm import install, scancel, states
@@ -20,14 +16,14 @@ pytestmark = [
 
 
 @pytest.fixture
-def queue(tmp_path: Path) -> Iterator[Path]:
+def queue(tmp_path):
     """A folder for a queue; the jobs in it end with the test."""
     yield tmp_path / "queue"
     for job in states(tmp_path / "queue"):
         scancel(tmp_path / "queue", job)
 
 
-def with_a_checkpoint(output: Path, but: dict | None = None) -> dict | None:
+def with_a_checkpoint(output, but=None):
     """A training under way, of another process than that of an entry."""
     return next((entry for entry in under_way(output) if but is None or entry["pid"] != but["pid"]), None)
 

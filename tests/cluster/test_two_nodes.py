@@ -1,13 +1,10 @@
 """Two Ray nodes against the local launcher: the same bits, whatever dies on the way; nothing that finished is made again."""
 
-from __future__ import annotations
-
 import importlib.util
 import os
 import random
 import signal
 from collections import Counter
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -27,13 +24,13 @@ LONGER = (*LONGER, "training.max_epochs=150", "training.checkpoint_seconds=0.01"
 
 
 @pytest.fixture(scope="session")
-def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def folder(tmp_path_factory):
     """A working folder with a data set of three short drives."""
     folder = tmp_path_factory.mktemp("cluster")
     former = os.environ.copy()
     os.environ["VEHEST_DATA"] = str(folder / "raw")
     os.environ.pop("MLFLOW_TRACKING_URI", None)
-    Place(folder, None)  # type: ignore[arg-type]
+    Place(folder, None)
     yield folder
     os.environ.clear()
     os.environ.update(former)
@@ -42,11 +39,11 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 class Alone(dict[str, Path]):
     """Output roots of the same sweeps by the local launcher, each made when it is first asked for."""
 
-    def __init__(self, folder: Path) -> None:
+    def __init__(self, folder):
         super().__init__()
         self._folder = folder
 
-    def __missing__(self, name: str) -> Path:
+    def __missing__(self, name):
         words = {"forty": FORTY, "longer": LONGER}[name]
         driver = Driver(self._folder, self._folder / f"alone-{name}", "sweep", *words, "--jobs", "2")
         assert driver.ended() == 0, driver.said
@@ -55,12 +52,12 @@ class Alone(dict[str, Path]):
 
 
 @pytest.fixture(scope="session")
-def alone(folder: Path) -> Alone:
+def alone(folder):
     return Alone(folder)
 
 
 @pytest.fixture(scope="session")
-def cluster(folder: Path) -> Iterator[TwoNodes]:
+def cluster(folder):
     """One that outlives a test, since nothing happens to its nodes."""
     nodes = TwoNodes()
     yield nodes
@@ -68,14 +65,14 @@ def cluster(folder: Path) -> Iterator[TwoNodes]:
 
 
 @pytest.fixture
-def mortal() -> Iterator[TwoNodes]:
+def mortal():
     """One of which a node will be lost."""
     nodes = TwoNodes()
     yield nodes
     nodes.shut_down()
 
 
-def swept(cluster: TwoNodes, folder: Path, output: Path, *words: str, alone: bool = False) -> Driver:
+def swept(cluster, folder, output, *words, alone=False):
     return Driver(folder, output, "sweep", *words, "--launcher", "ray", "--address", cluster.address, alone=alone)
 
 
@@ -168,7 +165,7 @@ def test_a_group_that_ends_every_worker_fails_alone_and_the_others_are_kept(clus
     one_seed = (*(word for word in LONGER if not word.startswith("seed=")), "seed=0")
     driver = swept(cluster, folder, output, *one_seed)
     poisoned = driver.sees(lambda: under_way(output))[0]["name"]
-    killed: set[int] = set()
+    killed = set()
     for _ in range(3):
         entry = driver.sees(lambda: next((e for e in under_way(output) if e["name"] == poisoned and e["pid"] not in killed), None))
         killed.add(entry["pid"])
@@ -204,8 +201,8 @@ def test_two_hundred_trainings_survive_twenty_kills_at_random_moments(cluster, f
     output = with_recordings(alone.output, tmp_path / "out")
     driver = swept(cluster, folder, output, *words)
     draw = random.Random(0)
-    killed: set[int] = set()
-    deaths: Counter[str] = Counter()
+    killed = set()
+    deaths = Counter()
     for moment in sorted(draw.randrange(200) for _ in range(20)):  # trainings that are finished by then
         entry = driver.sees(lambda moment=moment: victim(output, moment, killed, deaths, draw))
         killed.add(entry["pid"])
@@ -216,7 +213,7 @@ def test_two_hundred_trainings_survive_twenty_kills_at_random_moments(cluster, f
     assert weights(output) == weights(alone.output)
 
 
-def victim(output: Path, moment: int, killed: set[int], deaths: Counter[str], draw: random.Random) -> dict | None:
+def victim(output, moment, killed, deaths, draw):
     """A worker to kill, once so many trainings are finished; one group is not killed more than it may die."""
     if len(manifests(output)) < moment:
         return None

@@ -1,15 +1,11 @@
 """Two Ray nodes as two processes of this machine, the command line beside them, and what they leave behind."""
 
-from __future__ import annotations
-
 import os
 import shutil
 import signal
 import sys
-from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
-from typing import Any
 
 import pandas as pd
 
@@ -19,39 +15,39 @@ from processes import HANGS, start, wait_for
 class TwoNodes:
     """A cluster of a head and a further node, a core each, on loopback."""
 
-    def __init__(self) -> None:
+    def __init__(self):
         from ray.cluster_utils import Cluster
 
         self._cluster = Cluster()
         self.nodes = [self._add(include_dashboard=False), self._add()]
         self._cluster.wait_for_nodes()
 
-    def _add(self, **options: Any) -> Any:
+    def _add(self, **options):
         return self._cluster.add_node(num_cpus=1, env_vars={"RAY_USAGE_STATS_ENABLED": "0", "RAY_worker_niceness": "0"}, **options)
 
     @property
-    def address(self) -> str:
+    def address(self):
         return str(self._cluster.address)
 
-    def holds(self, node: Any, pid: int) -> bool:
+    def holds(self, node, pid):
         """Whether a worker is one of a node's."""
         return pid in _children(_raylet(node))
 
-    def lose(self, node: Any) -> None:
+    def lose(self, node):
         """End a node's daemons by SIGKILL, as a power cut does; its workers end when they notice."""
         for pid in _children(_raylet(node)):
             _kill(pid)
         self._cluster.remove_node(node, allow_graceful=False)
 
-    def shut_down(self) -> None:
+    def shut_down(self):
         self._cluster.shutdown()
 
 
-def _raylet(node: Any) -> int:
+def _raylet(node):
     return int(node.all_processes["raylet"][0].process.pid)
 
 
-def _children(pid: int) -> list[int]:
+def _children(pid):
     found = []
     for folder in Path("/proc").iterdir():
         if folder.name.isdigit():
@@ -64,7 +60,7 @@ def _children(pid: int) -> list[int]:
     return found
 
 
-def _kill(pid: int) -> None:
+def _kill(pid):
     with suppress(ProcessLookupError):
         os.kill(pid, signal.SIGKILL)
 
@@ -72,7 +68,7 @@ def _kill(pid: int) -> None:
 class Driver:
     """``vehest`` in a process of its own."""
 
-    def __init__(self, folder: Path, output: Path, *words: str, alone: bool = False, **environment: str) -> None:
+    def __init__(self, folder, output, *words, alone=False, **environment):
         """Start it; ``alone``: in an output root that no other process sees, and which is copied to ``output`` at the end."""
         self.output = output
         self._log = output.with_suffix(".log")
@@ -88,20 +84,20 @@ class Driver:
             own = {**os.environ, "VEHEST_OUTPUT": str(output), **environment}
             self.process = start(command, cwd=folder, stdout=log, stderr=log, env=own)
 
-    def ended(self) -> int:
+    def ended(self):
         """Exit code, once it has one."""
         return self.process.wait(HANGS)
 
-    def sees(self, event: Callable[[], Any]) -> Any:
+    def sees(self, event):
         """Wait for an event; a command that ends before it fails the test."""
         return wait_for(event, self.process, lambda: self.said)
 
     @property
-    def said(self) -> str:
+    def said(self):
         return self._log.read_text(encoding="utf-8")
 
 
-def under_way(output: Path) -> list[dict[str, Any]]:
+def under_way(output):
     """Trainings that a process holds the lock of, with its process and the epoch of their checkpoints."""
     found = []
     for file in sorted((output / "locks").glob("train-*.lock")):
@@ -113,28 +109,28 @@ def under_way(output: Path) -> list[dict[str, Any]]:
     return found
 
 
-def manifests(output: Path) -> dict[str, bytes]:
+def manifests(output):
     """Finished model -> its manifest, with the time at which it was made."""
     return {file.parent.name: file.read_bytes() for file in sorted((output / "train").glob("[!.]*/manifest.json"))}
 
 
-def metrics(output: Path) -> dict[str, str]:
+def metrics(output):
     """Evaluation -> its figures as they are written, to the last digit."""
     return {folder.name: (folder / "metrics.csv").read_text() for folder in sorted((output / "evaluate").iterdir()) if folder.is_dir()}
 
 
-def weights(output: Path) -> dict[str, bytes]:
+def weights(output):
     """Model -> its weights."""
     return {file.parent.name: file.read_bytes() for file in sorted((output / "train").glob("*/model.safetensors"))}
 
 
-def sweep_of(output: Path) -> pd.DataFrame:
+def sweep_of(output):
     """The table of the only sweep."""
     (folder,) = (output / "sweep").iterdir()
     return pd.read_csv(folder / "sweep.csv")
 
 
-def with_recordings(source: Path, output: Path) -> Path:
+def with_recordings(source, output):
     """An output root that has what another one has of recordings."""
     for stage in ("ingest", "downsample"):
         shutil.copytree(source / stage, output / stage)

@@ -1,11 +1,8 @@
 """The splits of Da Lio et al. 2023, on the official files and on simulated cars."""
 
-from __future__ import annotations
-
 import pytest
 
 from vehest.data.split_files import split_from_config
-from vehest.data.splits import Split
 from vehest.run.config import compose_config
 from vehest.sources.base import open_source
 
@@ -18,20 +15,20 @@ SETS = {  # Table I
 SCHEMES = {"cross_vehicle_1": ("C-1", "F-1"), "cross_vehicle_2": ("F-1", "C-1")}  # Table II: learn, stop
 
 
-def split(name: str) -> Split:
+def split(name):
     return split_from_config(compose_config("train", [f"split={name}"])["split"])
 
 
-def sets_of(spans: object) -> list[str]:
+def sets_of(spans):
     """Which of Table I's sets the recordings are, in alphabetical order of their names."""
-    names = sorted(span.recording for span in spans)  # type: ignore[attr-defined]
+    names = sorted(span.recording for span in spans)
     simulated = [f"{name[0].upper()}-{name[1]}" for name in names if name[2] == "_"]
     return simulated or [key for name in names for key, files in SETS.items() if name.rsplit("_", 1)[0] in files]
 
 
 @pytest.mark.parametrize("place", ["", "_sim"])
 @pytest.mark.parametrize("scheme", SCHEMES)
-def test_schemes_learn_on_one_car_stop_on_the_other_and_test_on_both(scheme: str, place: str) -> None:
+def test_schemes_learn_on_one_car_stop_on_the_other_and_test_on_both(scheme, place):
     found = split(scheme + place)
     learnt, stopped = SCHEMES[scheme]
     assert sets_of(found.train) == [learnt] * 3
@@ -41,7 +38,7 @@ def test_schemes_learn_on_one_car_stop_on_the_other_and_test_on_both(scheme: str
 
 
 @pytest.mark.parametrize("name", ["one_vehicle", "one_vehicle_sim"])
-def test_without_cross_vehicle_regularisation_two_files_teach_and_the_third_stops(name: str) -> None:
+def test_without_cross_vehicle_regularisation_two_files_teach_and_the_third_stops(name):
     found = split(name)
     assert (sets_of(found.train), sets_of(found.validation)) == (["F-1"] * 2, ["F-1"])
     third = {"j1": ["J-1"] * 2} if name.endswith("_sim") else {}
@@ -49,7 +46,7 @@ def test_without_cross_vehicle_regularisation_two_files_teach_and_the_third_stop
 
 
 @pytest.mark.parametrize("name", [*SCHEMES, "one_vehicle"])
-def test_every_recording_is_one_of_its_data_set(name: str, tmp_path) -> None:
+def test_every_recording_is_one_of_its_data_set(name, tmp_path):
     for place in ("", "_sim"):
         found = split(name + place)
         spans = [*found.train, *found.validation, *(span for spans in found.tests.values() for span in spans)]
@@ -59,7 +56,7 @@ def test_every_recording_is_one_of_its_data_set(name: str, tmp_path) -> None:
 
 
 @pytest.mark.parametrize("dataset", ["sim_two_cars", "sim_race_cars", "sim_race_cars_same_sensors"])
-def test_simulated_sets_last_as_long_as_the_papers(dataset: str) -> None:
+def test_simulated_sets_last_as_long_as_the_papers(dataset):
     drives = compose_config("ingest", [f"dataset={dataset}"])["dataset"]["drives"]
     minutes = {entry["id"]: entry["count"] * entry["manoeuvre"]["duration"] / 60.0 for entry in drives if entry["id"] != "j1"}
     assert minutes == pytest.approx({"c1": 19.0, "c2": 12.6, "f1": 25.7, "f2": 18.1}, abs=0.05)

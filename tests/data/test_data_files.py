@@ -1,12 +1,9 @@
 """Writing aside: a reader meets the old thing or the new one, never half of either."""
 
-from __future__ import annotations
-
 import hashlib
 import os
 import subprocess
 import sys
-from pathlib import Path
 
 import pytest
 
@@ -18,20 +15,20 @@ class InterruptedHereError(Exception):
     """Something that goes wrong half-way."""
 
 
-def write_half(path: Path) -> None:
+def write_half(path):
     with written_aside(path) as aside:
         aside.write_text("half of the ne")
         raise InterruptedHereError
 
 
-def write_half_a_folder(path: Path) -> None:
+def write_half_a_folder(path):
     with written_aside(path) as aside:
         aside.mkdir()
         (aside / "new").write_text("half")
         raise InterruptedHereError
 
 
-def test_nothing_stands_at_the_place_before_the_end(tmp_path: Path) -> None:
+def test_nothing_stands_at_the_place_before_the_end(tmp_path):
     path = tmp_path / "deep" / "er" / "file"
     with written_aside(path) as aside:
         aside.write_text("new")
@@ -40,20 +37,20 @@ def test_nothing_stands_at_the_place_before_the_end(tmp_path: Path) -> None:
     assert path.read_text() == "new"
 
 
-def test_a_failure_leaves_nothing(tmp_path: Path) -> None:
+def test_a_failure_leaves_nothing(tmp_path):
     with pytest.raises(InterruptedHereError):
         write_half(tmp_path / "file")
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_failure_keeps_the_old_file(tmp_path: Path) -> None:
+def test_a_failure_keeps_the_old_file(tmp_path):
     (tmp_path / "file").write_text("old")
     with pytest.raises(InterruptedHereError):
         write_half(tmp_path / "file")
     assert {path.name: path.read_text() for path in tmp_path.iterdir()} == {"file": "old"}
 
 
-def test_a_folder_is_replaced_as_a_whole_where_that_is_asked_for(tmp_path: Path) -> None:
+def test_a_folder_is_replaced_as_a_whole_where_that_is_asked_for(tmp_path):
     for content in ("one", "two"):
         with written_aside(tmp_path / "folder", replace_folder=True) as aside:
             aside.mkdir()
@@ -61,7 +58,7 @@ def test_a_folder_is_replaced_as_a_whole_where_that_is_asked_for(tmp_path: Path)
     assert [path.relative_to(tmp_path).as_posix() for path in sorted(tmp_path.rglob("*"))] == ["folder", "folder/two"]
 
 
-def test_a_folder_that_is_not_to_be_replaced_stays(tmp_path: Path) -> None:
+def test_a_folder_that_is_not_to_be_replaced_stays(tmp_path):
     (tmp_path / "folder").mkdir()
     (tmp_path / "folder" / "old").write_text("old")
     with pytest.raises(MissingError, match="cannot write"), written_aside(tmp_path / "folder") as aside:
@@ -69,7 +66,7 @@ def test_a_folder_that_is_not_to_be_replaced_stays(tmp_path: Path) -> None:
     assert [path.relative_to(tmp_path).as_posix() for path in sorted(tmp_path.rglob("*"))] == ["folder", "folder/old"]
 
 
-def test_a_failure_keeps_the_old_folder(tmp_path: Path) -> None:
+def test_a_failure_keeps_the_old_folder(tmp_path):
     (tmp_path / "folder").mkdir()
     (tmp_path / "folder" / "old").write_text("old")
     with pytest.raises(InterruptedHereError):
@@ -77,13 +74,13 @@ def test_a_failure_keeps_the_old_folder(tmp_path: Path) -> None:
     assert [path.relative_to(tmp_path).as_posix() for path in sorted(tmp_path.rglob("*"))] == ["folder", "folder/old"]
 
 
-def test_a_name_too_long_for_the_disk_is_refused_in_one_line(tmp_path: Path) -> None:
+def test_a_name_too_long_for_the_disk_is_refused_in_one_line(tmp_path):
     with pytest.raises(MissingError, match="cannot write") as error, written_aside(tmp_path / ("x" * 300)) as aside:
         aside.write_text("new")
     assert "\n" not in str(error.value)
 
 
-def test_what_a_dead_writer_left_is_swept_and_what_a_living_one_writes_stays(tmp_path: Path) -> None:
+def test_what_a_dead_writer_left_is_swept_and_what_a_living_one_writes_stays(tmp_path):
     dead = subprocess.Popen([sys.executable, "-c", ""])
     dead.wait()
     (tmp_path / f"{ASIDE_PREFIX}{dead.pid}-abc-file").write_text("half")
@@ -96,7 +93,7 @@ def test_what_a_dead_writer_left_is_swept_and_what_a_living_one_writes_stays(tmp
     assert remove_leftovers(tmp_path / "nowhere") == 0
 
 
-def test_a_killed_writer_leaves_only_what_is_swept(tmp_path: Path) -> None:
+def test_a_killed_writer_leaves_only_what_is_swept(tmp_path):
     script = "import os, sys, pathlib\nfrom vehest.data.files import written_aside\n"
     script += "with written_aside(pathlib.Path(sys.argv[1])) as aside:\n    aside.write_text('half')\n    os.kill(os.getpid(), 9)\n"
     (tmp_path / "file").write_text("old")
@@ -107,11 +104,11 @@ def test_a_killed_writer_leaves_only_what_is_swept(tmp_path: Path) -> None:
     assert [path.name for path in tmp_path.iterdir()] == ["file"]
 
 
-def test_the_digest_is_that_of_the_bytes(tmp_path: Path) -> None:
+def test_the_digest_is_that_of_the_bytes(tmp_path):
     (tmp_path / "file").write_bytes(b"abc")
     assert sha256_of(tmp_path / "file") == hashlib.sha256(b"abc").hexdigest()
 
 
-def test_a_file_that_cannot_be_read_has_no_digest(tmp_path: Path) -> None:
+def test_a_file_that_cannot_be_read_has_no_digest(tmp_path):
     with pytest.raises(DataError, match="cannot read"):
         sha256_of(tmp_path / "none")

@@ -1,11 +1,5 @@
 """Parquet files of others: numbers come out as they went in; files that are damaged or beyond the limits are refused in one line."""
 
-from __future__ import annotations
-
-from collections.abc import Callable
-from pathlib import Path
-from typing import Any
-
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
@@ -18,22 +12,22 @@ from vehest.data.parquet import parquet_file, read_numbers
 N = 1000
 
 
-def columns() -> dict[str, Any]:
+def columns():
     generator = np.random.default_rng(0)
     return {"time": np.arange(N) / 100.0, "vx": generator.normal(20.0, 1.0, N), "gear": generator.integers(1, 6, N)}
 
 
-def written(folder: Path, content: dict[str, Any], **options: Any) -> Path:
+def written(folder, content, **options):
     pq.write_table(pa.table(content), folder / "lap.parquet", **options)
     return folder / "lap.parquet"
 
 
-def read(file: Path, *names: str) -> dict[str, Any]:
+def read(file, *names):
     with parquet_file(file) as table:
         return read_numbers(file, table, names or table.schema_arrow.names)
 
 
-def refusal(file: Path) -> str:
+def refusal(file):
     with pytest.raises(DataError) as error:
         read(file)
     message = str(error.value)
@@ -44,21 +38,17 @@ def refusal(file: Path) -> str:
 
 @pytest.mark.parametrize(
     "options",
-    [
-        {},
-        {"row_group_size": 77, "compression": "none"},
-        {"data_page_size": 100, "compression": "zstd", "write_page_checksum": True},
-    ],
+    [{}, {"row_group_size": 77, "compression": "none"}, {"data_page_size": 100, "compression": "zstd", "write_page_checksum": True}],
     ids=str,
 )
-def test_numbers_come_out_as_they_went_in(tmp_path: Path, options: dict[str, Any]) -> None:
+def test_numbers_come_out_as_they_went_in(tmp_path, options):
     values = read(written(tmp_path, columns(), **options))
     for name, expected in columns().items():
         np.testing.assert_array_equal(values[name], expected)
         assert values[name].dtype == np.float64
 
 
-def test_what_is_missing_is_nan_and_whole_numbers_of_any_width_are_numbers(tmp_path: Path) -> None:
+def test_what_is_missing_is_nan_and_whole_numbers_of_any_width_are_numbers(tmp_path):
     content = {
         "a": pa.array([1, None, 3], pa.uint8()),
         "b": pa.array([1.5, 2.5, None], pa.float16()),
@@ -72,19 +62,14 @@ def test_what_is_missing_is_nan_and_whole_numbers_of_any_width_are_numbers(tmp_p
 
 @pytest.mark.parametrize(
     "odd",
-    [
-        pa.array([[1.0], [2.0]]),
-        pa.array(["1", "2"]),
-        pa.array([True, False]),
-        pa.array([1, 2], pa.timestamp("ns")),
-    ],
+    [pa.array([[1.0], [2.0]]), pa.array(["1", "2"]), pa.array([True, False]), pa.array([1, 2], pa.timestamp("ns"))],
     ids=lambda odd: str(odd.type),
 )
-def test_a_column_of_something_else_than_numbers_is_named_with_its_type(tmp_path: Path, odd: pa.Array) -> None:
+def test_a_column_of_something_else_than_numbers_is_named_with_its_type(tmp_path, odd):
     assert "column 'odd' is of type" in refusal(written(tmp_path, {"odd": odd}))
 
 
-def test_rows_and_memory_are_checked_before_anything_is_decoded(tmp_path: Path) -> None:
+def test_rows_and_memory_are_checked_before_anything_is_decoded(tmp_path):
     file = written(tmp_path, columns())
     with use_limits(Limits(samples=999)):
         assert "holds 1000 rows, more than the limit of 999; if that is meant, raise it: limits.samples=NUMBER" in refusal(file)
@@ -96,7 +81,7 @@ def test_rows_and_memory_are_checked_before_anything_is_decoded(tmp_path: Path) 
         assert set(read(zeros, "time", "vx")) == {"time", "vx"}
 
 
-def with_other_numbers_in_its_description(file: Path, before: int, after: int) -> None:
+def with_other_numbers_in_its_description(file, before, after):
     """Write one number of a Parquet file's description as another one, in as many bytes."""
     raw = file.read_bytes()
     start = len(raw) - 8 - int.from_bytes(raw[-8:-4], "little")
@@ -105,7 +90,7 @@ def with_other_numbers_in_its_description(file: Path, before: int, after: int) -
     file.write_bytes(raw[:start] + raw[start:].replace(varint(2 * before), varint(2 * after, length)))
 
 
-def varint(value: int, length: int = 0) -> bytes:
+def varint(value, length=0):
     parts = []
     while value or len(parts) < length or not parts:
         parts.append(value & 127)
@@ -114,7 +99,7 @@ def varint(value: int, length: int = 0) -> bytes:
 
 
 @pytest.mark.parametrize("claimed", [999, 1001, 10**6])
-def test_rows_that_are_not_there_are_missed(tmp_path: Path, claimed: int) -> None:
+def test_rows_that_are_not_there_are_missed(tmp_path, claimed):
     file = written(tmp_path, {"time": np.arange(N) / 100.0}, write_statistics=False, compression="none")
     with_other_numbers_in_its_description(file, N, claimed)
     if claimed < N:
@@ -123,7 +108,7 @@ def test_rows_that_are_not_there_are_missed(tmp_path: Path, claimed: int) -> Non
         assert "truncated or damaged" in refusal(file)
 
 
-def test_a_description_longer_than_the_limit_is_not_read(tmp_path: Path) -> None:
+def test_a_description_longer_than_the_limit_is_not_read(tmp_path):
     file = written(tmp_path, {f"c{k}": [1.0] for k in range(300)})
     with use_limits(Limits(text_bytes=10_000)):
         assert "holds a description of" in refusal(file)
@@ -132,7 +117,7 @@ def test_a_description_longer_than_the_limit_is_not_read(tmp_path: Path) -> None
 @pytest.mark.parametrize(
     "content", [lambda raw: b"", lambda raw: raw[:100], lambda raw: b"PAR1" + raw[-8:], lambda raw: raw[:-8] + b"\xff" * 4 + b"PAR1"]
 )
-def test_a_file_that_is_cut_off_is_refused(tmp_path: Path, content: Callable[[bytes], bytes]) -> None:
+def test_a_file_that_is_cut_off_is_refused(tmp_path, content):
     file = written(tmp_path, columns())
     file.write_bytes(content(file.read_bytes()))
     refusal(file)

@@ -1,7 +1,5 @@
 """Recordings, estimates, channels and units: what they refuse, and that cutting loses and doubles nothing."""
 
-from __future__ import annotations
-
 import math
 from itertools import pairwise
 
@@ -21,18 +19,18 @@ RATES = st.sampled_from([20.0, 100.0, 125.0, 1000.0 / 3.0, 400.0, 1000.0, 7.3, 9
 STARTS = st.sampled_from([0.0, 149.99, -3.7, 1e5, 1.7e9, 1_700_000_123.456])
 
 
-def counting(length: int, rate_hz: float = 100.0, start_time: float = 0.0, **changes: object) -> Recording:
+def counting(length, rate_hz=100.0, start_time=0.0, **changes):
     """A recording whose samples are their own index."""
     return Recording("lap", "car", rate_hz, start_time, {"ay": np.arange(float(length))}, **changes)
 
 
 @PROPERTY
 @given(st.integers(1, 400), RATES, STARTS, st.lists(st.floats(-0.2, 1.2), max_size=5))
-def test_consecutive_ranges_cover_every_sample_once(length: int, rate_hz: float, start_time: float, where: list[float]) -> None:
+def test_consecutive_ranges_cover_every_sample_once(length, rate_hz, start_time, where):
     recording = counting(length, rate_hz, start_time)
     inner = [start_time + share * recording.duration for share in where]
     bounds = [-math.inf, *sorted(inner), math.inf]
-    covered: list[float] = []
+    covered = []
     for start, stop in pairwise(bounds):
         first, end = recording.index_range(start, stop)
         if first < end:
@@ -42,9 +40,7 @@ def test_consecutive_ranges_cover_every_sample_once(length: int, rate_hz: float,
 
 @PROPERTY
 @given(st.integers(1, 400), RATES, STARTS, st.data())
-def test_a_cut_at_two_sample_times_holds_the_first_and_not_the_second(
-    length: int, rate_hz: float, start_time: float, data: st.DataObject
-) -> None:
+def test_a_cut_at_two_sample_times_holds_the_first_and_not_the_second(length, rate_hz, start_time, data):
     recording = counting(length, rate_hz, start_time)
     first = data.draw(st.integers(0, length - 1))
     end = data.draw(st.integers(first + 1, length))
@@ -55,26 +51,24 @@ def test_a_cut_at_two_sample_times_holds_the_first_and_not_the_second(
 
 @PROPERTY
 @given(st.integers(1, 200), RATES, STARTS, st.floats(-0.1, 1.1), st.floats(0.01, 0.99))
-def test_a_cut_between_samples_begins_with_the_next_one(
-    length: int, rate_hz: float, start_time: float, share: float, between: float
-) -> None:
+def test_a_cut_between_samples_begins_with_the_next_one(length, rate_hz, start_time, share, between):
     recording = counting(length, rate_hz, start_time)
     at = start_time + (np.floor(share * length) + between) / rate_hz
     first, end = recording.index_range(at, math.inf)
     assert (first, end) == (int((recording.time < at).sum()), length)
 
 
-def test_a_range_between_two_samples_is_refused_with_what_there_is() -> None:
+def test_a_range_between_two_samples_is_refused_with_what_there_is():
     with pytest.raises(DataError, match=r"'lap' spans 10 s to 11 s; it has no samples between 10.501 s and 10.502 s"):
         counting(100, 100.0, 10.0).cut(10.501, 10.502)
 
 
-def test_times_of_unix_clocks_are_printed_to_the_sample() -> None:
+def test_times_of_unix_clocks_are_printed_to_the_sample():
     with pytest.raises(DataError, match=r"spans 1700000000.5 s to 1700000001.5 s"):
         counting(100, 100.0, 1_700_000_000.5).cut(0.0, 1.0)
 
 
-def test_samples_are_copied_and_cannot_be_written_to() -> None:
+def test_samples_are_copied_and_cannot_be_written_to():
     samples = np.zeros(3)
     recording = Recording("r", "car", 10.0, 0.0, {"ay": samples})
     samples[0] = 1.0
@@ -98,41 +92,41 @@ def test_samples_are_copied_and_cannot_be_written_to() -> None:
         ({"kind": "reel"}, "real or simulated"),
     ],
 )
-def test_what_cannot_be_a_recording_is_refused(changes: dict[str, object], what: str) -> None:
-    arguments: dict[str, object] = {"id": "r", "vehicle": "car", "rate_hz": 10.0, "start_time": 0.0, "channels": {"ay": np.zeros(3)}}
+def test_what_cannot_be_a_recording_is_refused(changes, what):
+    arguments = {"id": "r", "vehicle": "car", "rate_hz": 10.0, "start_time": 0.0, "channels": {"ay": np.zeros(3)}}
     with pytest.raises(DataError) as error:
-        Recording(**(arguments | changes))  # type: ignore[arg-type]
+        Recording(**(arguments | changes))
     assert what in str(error.value)
     assert "\n" not in str(error.value)
 
 
-def test_only_gappy_channels_may_hold_nan() -> None:
+def test_only_gappy_channels_may_hold_nan():
     samples = {"ay": np.array([0.0, np.nan]), "ax": np.zeros(2)}
     assert Recording("r", "car", 10.0, 0.0, samples, gappy=frozenset({"ay"})).gappy == {"ay"}
     with pytest.raises(DataError, match="'ay'"):
         Recording("r", "car", 10.0, 0.0, samples, gappy=frozenset({"ax"}))
 
 
-def test_estimators_see_no_references() -> None:
+def test_estimators_see_no_references():
     recording = Recording("r", "car", 10.0, 0.0, {name: np.zeros(2) for name in ("vx", "vy_ref", "ay", "sideslip_ref")})
     assert list(recording.without_references().channels) == ["vx", "ay"]
     with pytest.raises(DataError, match="reference channels only"):
         recording.select(["vy_ref"]).without_references()
 
 
-def test_stacked_channels_are_columns_in_the_order_asked_for() -> None:
+def test_stacked_channels_are_columns_in_the_order_asked_for():
     recording = Recording("r", "car", 10.0, 0.0, {"vx": np.array([1.0, 2.0]), "ay": np.array([3.0, 4.0])})
     assert recording.stack(["ay", "vx"]).tolist() == [[3.0, 1.0], [4.0, 2.0]]
 
 
-def test_a_missing_channel_is_named_with_those_that_are_there() -> None:
+def test_a_missing_channel_is_named_with_those_that_are_there():
     with pytest.raises(DataError, match=r"'lap' has no channel 'vx' \(it has ay\)"):
         _ = counting(3)["vx"]
 
 
 @PROPERTY
 @given(st.integers(1, 60), RATES, STARTS, st.integers(1, 20))
-def test_held_estimates_are_the_latest_that_are_not_in_the_future(length: int, rate_hz: float, start_time: float, finer: int) -> None:
+def test_held_estimates_are_the_latest_that_are_not_in_the_future(length, rate_hz, start_time, finer):
     values = np.arange(float(length))
     estimate = Estimate("r", "ekf", rate_hz, start_time, {"vy": values, "sideslip": values})
     ticks = np.arange(-finer, (length + 1) * finer)  # sample k of the estimate is tick k·finer
@@ -142,13 +136,13 @@ def test_held_estimates_are_the_latest_that_are_not_in_the_future(length: int, r
 
 
 @pytest.mark.parametrize("shape", [(3, 2), (2, 2, 2), (3, 2, 1), (4, 2, 2)])
-def test_a_covariance_of_another_shape_is_refused(shape: tuple[int, ...]) -> None:
+def test_a_covariance_of_another_shape_is_refused(shape):
     with pytest.raises(DataError, match="covariance"):
         Estimate("r", "ekf", 20.0, 0.0, {"vy": np.zeros(3), "sideslip": np.zeros(3)}, covariance=np.zeros(shape))
 
 
 @pytest.mark.parametrize("names", [(), ("vy",), ("vy", "vy"), ("vy", "vz"), ("vy", "vx", "yaw_rate")])
-def test_rows_of_a_covariance_must_have_names(names: tuple[str, ...]) -> None:
+def test_rows_of_a_covariance_must_have_names(names):
     channels = {"vy": np.zeros(3), "sideslip": np.zeros(3)}
     with pytest.raises(DataError, match=r"covariance_of name n quantities, not \(3, 2, 2\) and \("):
         Estimate("r", "ekf", 20.0, 0.0, channels, covariance=np.zeros((3, 2, 2)), covariance_of=names)
@@ -156,7 +150,7 @@ def test_rows_of_a_covariance_must_have_names(names: tuple[str, ...]) -> None:
         Estimate("r", "ekf", 20.0, 0.0, channels, covariance_of=("vy",))
 
 
-def test_a_covariance_is_held_like_its_quantities_and_read_by_name() -> None:
+def test_a_covariance_is_held_like_its_quantities_and_read_by_name():
     covariance = np.arange(27.0).reshape(3, 3, 3)
     estimate = Estimate("r", "ukf", 10.0, 0.0, {"vy": np.zeros(3)}, covariance=covariance, covariance_of=("vx", "vy", "friction"))
     held = estimate.covariance_at(np.array([-0.05, 0.1, 0.19, 0.3]), ["friction", "vx"])
@@ -167,14 +161,14 @@ def test_a_covariance_is_held_like_its_quantities_and_read_by_name() -> None:
         estimate.covariance_at(np.zeros(1), ["yaw_rate"])
 
 
-def test_an_estimate_of_unknown_or_unequal_quantities_is_refused() -> None:
+def test_an_estimate_of_unknown_or_unequal_quantities_is_refused():
     with pytest.raises(DataError, match="unknown quantity 'vz'"):
         Estimate("r", "ekf", 20.0, 0.0, {"vz": np.zeros(3)})
     with pytest.raises(DataError, match="one common length"):
         Estimate("r", "ekf", 20.0, 0.0, {"vy": np.zeros(3), "sideslip": np.zeros(2)})
 
 
-def test_every_channel_has_a_range_and_a_unit_that_a_file_may_use() -> None:
+def test_every_channel_has_a_range_and_a_unit_that_a_file_may_use():
     for name, described in CHANNELS.items():
         assert name == described.name
         assert described.low < described.high
@@ -199,11 +193,11 @@ def test_every_channel_has_a_range_and_a_unit_that_a_file_may_use() -> None:
         ("ns", "s", 1e-9),
     ],
 )
-def test_units_convert_as_defined(unit: str, si_unit: str, one_is: float) -> None:
+def test_units_convert_as_defined(unit, si_unit, one_is):
     assert factor_to_si(unit, si_unit) == pytest.approx(one_is, rel=1e-15)
 
 
-def test_a_unit_of_something_else_is_refused() -> None:
+def test_a_unit_of_something_else_is_refused():
     with pytest.raises(DataError, match="'deg' cannot be converted to 'm/s'"):
         factor_to_si("deg", "m/s")
     with pytest.raises(DataError, match="'furlong' is not known"):

@@ -1,7 +1,5 @@
 """Resampling: nothing is shifted, bent or aliased, at any rational ratio."""
 
-from __future__ import annotations
-
 import math
 from fractions import Fraction
 
@@ -23,23 +21,23 @@ LENGTHS = st.integers(1, 120)
 every_ratio = pytest.mark.parametrize(("rate", "new_rate"), RATIOS)
 
 
-def recorded(samples: np.ndarray, rate_hz: float, start_time: float = 0.0) -> Recording:
+def recorded(samples, rate_hz, start_time=0.0):
     return Recording("lap", "car", rate_hz, start_time, {"ay": samples})
 
 
-def resampled(samples: np.ndarray, rate: float, new_rate: float) -> np.ndarray:
+def resampled(samples, rate, new_rate):
     return Resample(new_rate)(recorded(samples, rate))["ay"]
 
 
 @PROPERTY
 @given(st.sampled_from(RATIOS), LENGTHS, SMALL)
-def test_a_constant_stays_that_constant(ratio: tuple[float, float], length: int, value: float) -> None:
+def test_a_constant_stays_that_constant(ratio, length, value):
     np.testing.assert_allclose(resampled(np.full(length, value), *ratio), value, rtol=1e-12, atol=1e-12)
 
 
 @PROPERTY
 @given(st.sampled_from(RATIOS), st.integers(2, 120), SMALL, st.floats(-10, 10))
-def test_a_straight_line_stays_that_line(ratio: tuple[float, float], length: int, offset: float, slope: float) -> None:
+def test_a_straight_line_stays_that_line(ratio, length, offset, slope):
     rate, new_rate = ratio
     line = offset + slope * np.arange(length)
     out = Resample(new_rate)(recorded(line, rate))
@@ -48,7 +46,7 @@ def test_a_straight_line_stays_that_line(ratio: tuple[float, float], length: int
 
 @every_ratio
 @pytest.mark.parametrize("length", [1, 7, 40, 12_000])
-def test_filter_and_sums_are_those_of_scipy_to_the_bit(rate: float, new_rate: float, length: int) -> None:
+def test_filter_and_sums_are_those_of_scipy_to_the_bit(rate, new_rate, length):
     ratio = Fraction(new_rate / rate).limit_denominator(1000)
     up, down = ratio.numerator, ratio.denominator
     samples, half = np.cumsum(np.random.default_rng(length).normal(size=length)), 16 * max(up, down)
@@ -64,7 +62,7 @@ def test_filter_and_sums_are_those_of_scipy_to_the_bit(rate: float, new_rate: fl
 
 @every_ratio
 @pytest.mark.parametrize("share", [0.05, 0.3, 0.6])
-def test_a_slow_sine_keeps_amplitude_and_phase(rate: float, new_rate: float, share: float) -> None:
+def test_a_slow_sine_keeps_amplitude_and_phase(rate, new_rate, share):
     frequency = share * min(rate, new_rate) / 2
     seconds = 100 / min(rate, new_rate) * 2
     time = np.arange(round(seconds * rate)) / rate
@@ -76,7 +74,7 @@ def test_a_slow_sine_keeps_amplitude_and_phase(rate: float, new_rate: float, sha
 
 
 @pytest.mark.parametrize(("rate", "new_rate"), [ratio for ratio in RATIOS if ratio[1] < ratio[0]])
-def test_what_lies_above_the_new_nyquist_frequency_is_attenuated_by_60_db(rate: float, new_rate: float) -> None:
+def test_what_lies_above_the_new_nyquist_frequency_is_attenuated_by_60_db(rate, new_rate):
     seconds = 200 / new_rate
     time = np.arange(round(seconds * rate)) / rate
     for frequency in np.linspace(new_rate / 2, rate / 2, 23):
@@ -85,7 +83,7 @@ def test_what_lies_above_the_new_nyquist_frequency_is_attenuated_by_60_db(rate: 
         assert np.abs(out["ay"][inside]).max() < 1e-3, frequency
 
 
-def test_going_up_adds_no_images_of_the_signal() -> None:
+def test_going_up_adds_no_images_of_the_signal():
     time = np.arange(400) / 20
     out = resampled(np.sin(2 * np.pi * 6.0 * time), 20.0, 100.0)[200:-200]
     window = np.hanning(len(out))
@@ -97,7 +95,7 @@ def test_going_up_adds_no_images_of_the_signal() -> None:
 
 @every_ratio
 @pytest.mark.parametrize("length", [1, 2, 3, 50, 101])
-def test_the_first_sample_keeps_its_time_and_the_last_lies_in_the_recording(rate: float, new_rate: float, length: int) -> None:
+def test_the_first_sample_keeps_its_time_and_the_last_lies_in_the_recording(rate, new_rate, length):
     recording = recorded(np.zeros(length), rate, start_time=1_700_000_000.25)
     out = Resample(new_rate)(recording)
     assert out.start_time == recording.start_time
@@ -109,13 +107,13 @@ def test_the_first_sample_keeps_its_time_and_the_last_lies_in_the_recording(rate
 
 @PROPERTY
 @given(st.integers(1, 80), st.integers(1, 40))
-def test_plain_decimation_takes_every_nth_sample_as_it_is(length: int, step: int) -> None:
+def test_plain_decimation_takes_every_nth_sample_as_it_is(length, step):
     samples = np.random.default_rng(length).standard_normal(length)
     out = Resample(1000.0 / step, method="decimate")(recorded(samples, 1000.0))
     assert out["ay"].tolist() == samples.tolist()[::step]
 
 
-def test_the_same_rate_changes_nothing() -> None:
+def test_the_same_rate_changes_nothing():
     recording = recorded(np.random.default_rng(0).standard_normal(99), 100.0)
     for method in ("polyphase", "decimate"):
         assert Resample(100.0, method=method)(recording) is recording
@@ -123,7 +121,7 @@ def test_the_same_rate_changes_nothing() -> None:
 
 @PROPERTY
 @given(st.sampled_from(RATIOS), st.integers(1, 60), st.data(), st.floats(-5, 5))
-def test_resampling_is_linear(ratio: tuple[float, float], length: int, data: st.DataObject, factor: float) -> None:
+def test_resampling_is_linear(ratio, length, data, factor):
     one = data.draw(arrays(np.float64, length, elements=SMALL))
     other = data.draw(arrays(np.float64, length, elements=SMALL))
     together = resampled(one + factor * other, *ratio)
@@ -132,7 +130,7 @@ def test_resampling_is_linear(ratio: tuple[float, float], length: int, data: st.
 
 @PROPERTY
 @given(st.sampled_from([(100.0, 20.0), (125.0, 100.0), (1000.0, 20.0), (50.0, 30.0)]), st.integers(1, 12), st.data())
-def test_resampling_backwards_is_the_same_backwards(ratio: tuple[float, float], periods: int, data: st.DataObject) -> None:
+def test_resampling_backwards_is_the_same_backwards(ratio, periods, data):
     rate, new_rate = ratio
     step = (Fraction(rate) / Fraction(new_rate)).numerator
     length = periods * step + 1  # both ends lie on the new grid, so that it is the same grid from both sides
@@ -140,7 +138,7 @@ def test_resampling_backwards_is_the_same_backwards(ratio: tuple[float, float], 
     np.testing.assert_allclose(resampled(samples[::-1], *ratio), resampled(samples, *ratio)[::-1], rtol=1e-9, atol=1e-8)
 
 
-def test_there_and_back_keeps_a_slow_signal() -> None:
+def test_there_and_back_keeps_a_slow_signal():
     time = np.arange(600) / 20
     slow = np.sin(2 * np.pi * 0.7 * time) + 0.3 * np.cos(2 * np.pi * 2.9 * time)
     back = resampled(resampled(slow, 20.0, 125.0), 125.0, 20.0)
@@ -148,7 +146,7 @@ def test_there_and_back_keeps_a_slow_signal() -> None:
     np.testing.assert_allclose(back[40:-40], slow[40:-40], atol=1e-3)
 
 
-def test_channels_with_gaps_are_refused_by_the_filter_and_kept_by_decimation() -> None:
+def test_channels_with_gaps_are_refused_by_the_filter_and_kept_by_decimation():
     samples = np.where(np.arange(20) % 4 == 0, 1.0, np.nan)
     recording = Recording("lap", "car", 100.0, 0.0, {"ay": samples, "ax": np.zeros(20)}, gappy=frozenset({"ay"}))
     with pytest.raises(DataError, match="'ay' has gaps") as error:
@@ -157,7 +155,7 @@ def test_channels_with_gaps_are_refused_by_the_filter_and_kept_by_decimation() -
     np.testing.assert_array_equal(Resample(20.0, method="decimate")(recording)["ay"], samples[::5])
 
 
-def test_a_ratio_that_is_not_of_whole_numbers_is_refused() -> None:
+def test_a_ratio_that_is_not_of_whole_numbers_is_refused():
     with pytest.raises(DataError, match="not a ratio of whole numbers"):
         Resample(100.0 / math.pi)(recorded(np.zeros(10), 100.0))
     with pytest.raises(DataError, match="not a ratio of whole numbers"):
@@ -166,18 +164,18 @@ def test_a_ratio_that_is_not_of_whole_numbers_is_refused() -> None:
         Resample(1e-9)(recorded(np.zeros(10), 100.0))
 
 
-def test_plain_decimation_by_a_broken_ratio_points_at_the_filter() -> None:
+def test_plain_decimation_by_a_broken_ratio_points_at_the_filter():
     with pytest.raises(ConfigurationError, match="method=polyphase"):
         Resample(30.0, method="decimate")(recorded(np.zeros(10), 50.0))
 
 
 @pytest.mark.parametrize("rate_hz", [0.0, math.nan, -1.0])
-def test_a_rate_that_is_not_positive_is_refused(rate_hz: float) -> None:
+def test_a_rate_that_is_not_positive_is_refused(rate_hz):
     with pytest.raises(ConfigurationError, match="rate_hz must be a positive number"):
         Resample(rate_hz)
 
 
-def test_only_decimation_is_causal() -> None:
+def test_only_decimation_is_causal():
     recording = recorded(np.zeros(400), 100.0)
     changed = recorded(np.where(np.arange(400) < 200, 0.0, 1.0), 100.0)
     for method, same in (("polyphase", False), ("decimate", True)):

@@ -1,10 +1,7 @@
 """Splits and windows: no sample serves two purposes, no window crosses from one recording into another."""
 
-from __future__ import annotations
-
 import math
 import re
-from collections.abc import Callable, Iterable, Mapping, Sequence
 from itertools import combinations, pairwise
 from pathlib import Path
 
@@ -17,7 +14,7 @@ from hypothesis import strategies as st
 from vehest.data.errors import ConfigurationError, DataError
 from vehest.data.laps import laps_of
 from vehest.data.recording import Recording
-from vehest.data.split_files import Catalogue, dataset_names, split_from_config
+from vehest.data.split_files import dataset_names, split_from_config
 from vehest.data.splits import Span, Split
 from vehest.data.windows import window_starts, windows_of
 from vehest.run.config import compose_config
@@ -30,12 +27,12 @@ bounds = st.sampled_from([-math.inf, math.inf, 0.0, 1.0, 1.005, 1.01, 2.0, 3.5])
 
 
 @st.composite
-def spans(draw: st.DrawFn) -> Span:
+def spans(draw):
     start, stop = sorted(draw(st.lists(bounds, min_size=2, max_size=2, unique=True)))
     return Span("set", draw(st.sampled_from(["lap1", "lap2"])), start, stop)
 
 
-def samples_of(span: Span, rate_hz: float) -> set[tuple[str, int]]:
+def samples_of(span, rate_hz):
     """Which samples of a recording of four seconds a stretch takes."""
     recording = Recording(span.recording, "car", rate_hz, 0.0, {"ay": np.arange(4 * rate_hz)})
     first, end = recording.index_range(span.start, span.stop)
@@ -43,7 +40,7 @@ def samples_of(span: Span, rate_hz: float) -> set[tuple[str, int]]:
 
 
 @st.composite
-def roles(draw: st.DrawFn) -> list[tuple[Span, ...]]:
+def roles(draw):
     """Stretches for three purposes, of one recording: neighbours, or anything."""
     if draw(st.booleans()):
         times = sorted(draw(st.lists(bounds, min_size=4, max_size=7, unique=True)))
@@ -54,7 +51,7 @@ def roles(draw: st.DrawFn) -> list[tuple[Span, ...]]:
 
 @PROPERTY
 @given(roles(), st.sampled_from([20.0, 100.0, 125.0]))
-def test_train_validation_and_tests_never_share_samples(parts: list[tuple[Span, ...]], rate_hz: float) -> None:
+def test_train_validation_and_tests_never_share_samples(parts, rate_hz):
     train, validation, test = parts
     taken = [set().union(*(samples_of(span, rate_hz) for span in role)) for role in parts]
     shared = bool(taken[0] & taken[1] or taken[0] & taken[2] or taken[1] & taken[2])
@@ -69,13 +66,13 @@ def test_train_validation_and_tests_never_share_samples(parts: list[tuple[Span, 
 
 @PROPERTY
 @given(spans(), spans())
-def test_overlap_goes_both_ways_and_is_that_of_the_times(one: Span, other: Span) -> None:
+def test_overlap_goes_both_ways_and_is_that_of_the_times(one, other):
     assert one.overlaps(other) is other.overlaps(one)
     common = one.recording == other.recording and max(one.start, other.start) < min(one.stop, other.stop)
     assert one.overlaps(other) is common
 
 
-def test_neighbouring_ranges_share_nothing() -> None:
+def test_neighbouring_ranges_share_nothing():
     parts = Split("s", (Span("d", "r", 150, 450),), (Span("d", "r", 450, 550),), {"test": (Span("d", "r", 550, 700),)})
     assert len(parts.all_spans) == 3
     recording = Recording("r", "car", 100.0, 149.99, {"ay": np.zeros(55_001)})
@@ -83,27 +80,27 @@ def test_neighbouring_ranges_share_nothing() -> None:
     assert ranges == [(1, 30_001), (30_001, 40_001), (40_001, 55_001)]
 
 
-def test_equal_ranges_of_other_recordings_or_data_sets_share_nothing() -> None:
+def test_equal_ranges_of_other_recordings_or_data_sets_share_nothing():
     Split("s", (Span("d", "r1"),), (Span("d", "r2"),), {"test": (Span("e", "r1"),)})
 
 
-def test_two_test_sets_may_look_at_the_same_samples() -> None:
+def test_two_test_sets_may_look_at_the_same_samples():
     Split("s", (Span("d", "r", 0, 1),), (Span("d", "r", 1, 2),), {"all": (Span("d", "r", 2, 4),), "fast": (Span("d", "r", 3, 4),)})
 
 
-def test_a_shared_stretch_is_named_with_both_roles() -> None:
+def test_a_shared_stretch_is_named_with_both_roles():
     with pytest.raises(ConfigurationError) as error:
         Split("s", (Span("d", "lap3", 0, 10),), (Span("d", "lap3", 10, 20),), {"wet": (Span("d", "lap3", 5, 6),)})
     assert "train and test 'wet' share samples of recording 'lap3' (lap3 [0, 10) s and lap3 [5, 6) s)" in str(error.value)
 
 
 @pytest.mark.parametrize(("start", "stop"), [(2.0, 1.0), (1.0, 1.0), (math.nan, 1.0), (0.0, math.nan)])
-def test_a_stretch_must_run_forward(start: float, stop: float) -> None:
+def test_a_stretch_must_run_forward(start, stop):
     with pytest.raises(ConfigurationError, match="is not before stop"):
         Span("d", "r", start, stop)
 
 
-def test_plain_values_make_a_split() -> None:
+def test_plain_values_make_a_split():
     entry = {"recording": "lap", "start": 1, "stop": 2}
     config = {
         "name": "s",
@@ -119,7 +116,7 @@ def test_plain_values_make_a_split() -> None:
     assert split.datasets == ("d", "e")
 
 
-def test_a_split_may_have_tests_only_but_not_nothing() -> None:
+def test_a_split_may_have_tests_only_but_not_nothing():
     config = {"name": "s", "dataset": "d", "train": [], "validation": [], "tests": {"t": [{"recording": "x"}]}}
     split = split_from_config(config)
     assert (split.train, split.validation, split.datasets) == ((), (), ("d",))
@@ -141,7 +138,7 @@ def test_a_split_may_have_tests_only_but_not_nothing() -> None:
         ({"dataset": None}, "each range needs a dataset"),
     ],
 )
-def test_a_misspelt_split_is_refused_in_one_line(changes: dict[str, object], what: str) -> None:
+def test_a_misspelt_split_is_refused_in_one_line(changes, what):
     config = {"name": "s", "dataset": "d", "train": [{"recording": "a"}], "validation": [{"recording": "b"}], "tests": {}}
     with pytest.raises(ConfigurationError) as error:
         split_from_config(config | changes)
@@ -151,10 +148,10 @@ def test_a_misspelt_split_is_refused_in_one_line(changes: dict[str, object], wha
 
 
 @pytest.mark.parametrize("file", CONFIGURATIONS, ids=lambda file: file.stem)
-def test_every_split_that_is_shipped_is_one(file: Path) -> None:
+def test_every_split_that_is_shipped_is_one(file):
     """Patterns name recordings that the data sets have: those of simulated ones are known, any other has what the split names."""
 
-    def cruising(dataset: str) -> Mapping[str, Callable[[Iterable[str] | None], Recording]]:
+    def cruising(dataset):
         about = compose_config("ingest", [f"dataset={dataset}"])["dataset"]
         names = open_source(about).ids() if about["source"] == "simulated" else ["some", *re.findall(r"recording: ([^,}\s]+)", text)]
         speed, lap = np.full(20_000, 20.0), 2.0 * np.pi * np.arange(20_000) / 2000.0  # a lap of 100 s
@@ -166,7 +163,7 @@ def test_every_split_that_is_shipped_is_one(file: Path) -> None:
             "sideslip_ref": np.zeros(20_000),
         }
 
-        def reader(name: str) -> Callable[[Iterable[str] | None], Recording]:
+        def reader(name):
             drive = Recording(name, "car", 20.0, 0.0, long)
             return lambda channels: drive if channels is None else drive.select(channels)
 
@@ -182,10 +179,10 @@ def test_every_split_that_is_shipped_is_one(file: Path) -> None:
 # --- patterns and conditions
 
 
-def drives(ay: Mapping[str, Sequence[float]], vx: Sequence[float] | None = None, start_time: float = 0.0) -> Catalogue:
+def drives(ay, vx=None, start_time=0.0):
     """A catalogue of data set ``d``, or of any, with drives at 100 Hz of a given ay."""
 
-    def reader(name: str) -> Callable[[Iterable[str]], Recording]:
+    def reader(name):
         everything = {"ay": np.array(ay[name]), "vx": np.array(vx or [10.0] * len(ay[name]))}
         gappy = frozenset({"ay"})
         recording = Recording(name, "car", 100.0, start_time, everything, gappy=gappy)
@@ -194,22 +191,22 @@ def drives(ay: Mapping[str, Sequence[float]], vx: Sequence[float] | None = None,
     return lambda dataset: {name: reader(name) for name in ay}
 
 
-def kept_of(keep: object, catalogue: Catalogue, **entry: object) -> Split:
+def kept_of(keep, catalogue, **entry):
     """A split whose training is cut by a condition."""
     train = {"recordings": "train_*", **entry, "keep": keep}
     return split_from_config({"name": "s", "dataset": "d", "train": [train], "validation": [{"recording": "v"}]}, catalogue)
 
 
-def test_a_pattern_names_recordings_in_the_order_of_their_ids() -> None:
+def test_a_pattern_names_recordings_in_the_order_of_their_ids():
     catalogue = drives({name: [0.0] * 10 for name in ("train_b", "test_a", "train_a", "Train_c")})
     config = {"name": "s", "dataset": "d", "train": [{"recordings": "train_*", "start": 1}], "validation": [{"recording": "v"}]}
     assert split_from_config(config, catalogue).train == (Span("d", "train_a", 1.0), Span("d", "train_b", 1.0))
 
 
-def test_a_data_set_is_asked_for_once_and_only_where_a_pattern_or_condition_needs_it() -> None:
-    asked: list[str] = []
+def test_a_data_set_is_asked_for_once_and_only_where_a_pattern_or_condition_needs_it():
+    asked = []
 
-    def catalogue(dataset: str) -> Mapping[str, Callable[[Iterable[str] | None], Recording]]:
+    def catalogue(dataset):
         asked.append(dataset)
         return drives({"a1": [0.0] * 10, "b1": [0.0] * 10})(dataset)
 
@@ -220,7 +217,7 @@ def test_a_data_set_is_asked_for_once_and_only_where_a_pattern_or_condition_need
     assert asked == ["d"]
 
 
-def test_a_condition_keeps_whole_stretches_that_last() -> None:
+def test_a_condition_keeps_whole_stretches_that_last():
     # At 100 Hz: 1.99 s, too short; one sample above; 2 s, just long enough; one above; 3 s to the end. Limits belong to what is kept.
     ay = [-7.0] * 199 + [7.01] + [7.0] * 200 + [-7.01] + [0.0] * 300
     keep = {"magnitude": {"ay": {"at_most": 7.0}}, "at_least_seconds": 2.0}
@@ -234,10 +231,10 @@ def test_a_condition_keeps_whole_stretches_that_last() -> None:
 
 @PROPERTY
 @given(st.lists(st.tuples(st.sampled_from([0.0, 5.0, -9.0, math.nan]), st.integers(1, 40)), min_size=1, max_size=12), st.integers(0, 30))
-def test_what_a_condition_keeps_is_what_a_plain_loop_over_the_samples_keeps(pieces: list[tuple[float, int]], shortest: int) -> None:
+def test_what_a_condition_keeps_is_what_a_plain_loop_over_the_samples_keeps(pieces, shortest):
     ay = [value for value, length in pieces for _ in range(length)]
-    expected: set[int] = set()
-    run: list[int] = []
+    expected = set()
+    run = []
     for k, value in enumerate([*ay, math.inf]):
         if abs(value) <= 5.0:
             run.append(k)
@@ -256,20 +253,20 @@ def test_what_a_condition_keeps_is_what_a_plain_loop_over_the_samples_keeps(piec
     assert all(one[1] < other[0] for one, other in pairwise(ranges))
 
 
-def test_all_channels_of_a_condition_must_meet_it() -> None:
+def test_all_channels_of_a_condition_must_meet_it():
     ay, vx = [0.0] * 50 + [9.0] * 50 + [0.0] * 100, [10.0] * 150 + [4.0] * 50
     keep = {"magnitude": {"ay": {"at_most": 7.0}, "vx": {"at_least": 5.0}}}
     spans = kept_of(keep, drives({"train_1": ay}, vx=vx)).train
     assert [(span.start, span.stop) for span in spans] == [(-math.inf, 0.5), (1.0, 1.5)]
 
 
-def test_a_condition_looks_at_no_more_than_the_range() -> None:
+def test_a_condition_looks_at_no_more_than_the_range():
     keep = {"magnitude": {"ay": {"at_most": 7.0}}}
     spans = kept_of(keep, drives({"train_1": [0.0] * 100 + [9.0] * 100 + [0.0] * 100}), start=0.5, stop=2.5).train
     assert [(span.start, span.stop) for span in spans] == [(0.5, 1.0), (2.0, 2.5)]
 
 
-CONDITION: dict[str, object] = {"magnitude": {"ay": {"at_most": 7.0}}}
+CONDITION = {"magnitude": {"ay": {"at_most": 7.0}}}
 
 
 @pytest.mark.parametrize(
@@ -285,7 +282,7 @@ CONDITION: dict[str, object] = {"magnitude": {"ay": {"at_most": 7.0}}}
         ({"keep": {**CONDITION, "at_least_seconds": 3.0}}, "the condition of train keeps nothing (0 <= |ay| <= 7, 3 s or longer)"),
     ],
 )
-def test_a_pattern_or_condition_that_makes_no_sense_is_refused_in_one_line(entry: dict[str, object], what: str) -> None:
+def test_a_pattern_or_condition_that_makes_no_sense_is_refused_in_one_line(entry, what):
     named = {} if "recording" in entry else {"recordings": "train_*"}
     config = {"name": "s", "dataset": "d", "train": [{**named, **entry}], "validation": [{"recording": "v"}]}
     with pytest.raises(ConfigurationError) as error:
@@ -296,13 +293,13 @@ def test_a_pattern_or_condition_that_makes_no_sense_is_refused_in_one_line(entry
 
 
 @pytest.mark.parametrize("entry", [{"recordings": "train_*"}, {"recording": "train_1", "keep": CONDITION}])
-def test_patterns_and_conditions_without_recordings_say_what_they_need(entry: dict[str, object]) -> None:
+def test_patterns_and_conditions_without_recordings_say_what_they_need(entry):
     config = {"name": "s", "dataset": "d", "train": [entry], "validation": [{"recording": "v"}]}
     with pytest.raises(ConfigurationError, match="its patterns and the like need the recordings of data set 'd'"):
         split_from_config(config)
 
 
-def test_a_condition_on_a_channel_that_a_recording_lacks_names_both() -> None:
+def test_a_condition_on_a_channel_that_a_recording_lacks_names_both():
     with pytest.raises(DataError, match="recording 'train_1' has no channel 'yaw_rate'"):
         kept_of({"magnitude": {"yaw_rate": {"at_most": 1.0}}}, drives({"train_1": [0.0] * 10}))
 
@@ -310,14 +307,14 @@ def test_a_condition_on_a_channel_that_a_recording_lacks_names_both() -> None:
 # --- windows
 
 
-def recorded(name: str, length: int, offset: float) -> Recording:
+def recorded(name, length, offset):
     samples = offset + np.arange(float(length))
     return Recording(name, "car", 20.0, 0.0, {"vx": samples, "ay": -samples, "vy_ref": samples + 0.5})
 
 
 @PROPERTY
 @given(st.lists(st.integers(1, 25), min_size=1, max_size=4), st.integers(1, 12))
-def test_windows_are_those_of_a_plain_loop_over_each_recording(lengths: list[int], n_window: int) -> None:
+def test_windows_are_those_of_a_plain_loop_over_each_recording(lengths, n_window):
     recordings = [recorded(f"r{k}", length, 1000.0 * k) for k, length in enumerate(lengths)]
     expected = []
     for recording in recordings:
@@ -337,16 +334,16 @@ def test_windows_are_those_of_a_plain_loop_over_each_recording(lengths: list[int
 
 @PROPERTY
 @given(st.integers(0, 50), st.integers(1, 50))
-def test_window_starts_count_those_with_a_sample_after_them(n_samples: int, n_window: int) -> None:
+def test_window_starts_count_those_with_a_sample_after_them(n_samples, n_window):
     assert window_starts(n_samples, n_window).tolist() == [k for k in range(n_samples) if k + n_window < n_samples]
 
 
-def test_windows_share_memory_instead_of_being_copied() -> None:
+def test_windows_share_memory_instead_of_being_copied():
     windows = windows_of([recorded("r", 1000, 0.0)], ["vx", "ay"], "vy_ref", 30)
     assert windows.series.nbytes == 1000 * 2 * 8
 
 
-def test_windows_over_gaps_are_refused_by_name() -> None:
+def test_windows_over_gaps_are_refused_by_name():
     channels = {"vx": np.zeros(9), "ay": np.where(np.arange(9) == 4, np.nan, 0.0), "vy_ref": np.zeros(9)}
     recording = Recording("lap", "car", 20.0, 0.0, channels, gappy=frozenset({"ay"}))
     with pytest.raises(DataError, match="recording 'lap': channel 'ay' has gaps"):
@@ -357,7 +354,7 @@ def test_windows_over_gaps_are_refused_by_name() -> None:
 # --- percentages, laps and folds
 
 
-def circuit(name: str = "lap", laps: float = 4.3, start_time: float = 1.6e9, rate_hz: float = 20.0) -> tuple[Recording, float]:
+def circuit(name="lap", laps=4.3, start_time=1600000000.0, rate_hz=20.0):
     """A course of two straights and two unlike bends, driven at a speed of its own every lap; and the distance of a lap [m]."""
     straight, radii = 200.0, (60.0, 30.0)
     bends = [np.pi * radius for radius in radii]
@@ -375,14 +372,14 @@ def circuit(name: str = "lap", laps: float = 4.3, start_time: float = 1.6e9, rat
     ), length
 
 
-def catalogue_of(*recordings: Recording) -> Catalogue:
-    def reader(recording: Recording) -> Callable[[Iterable[str] | None], Recording]:
+def catalogue_of(*recordings):
+    def reader(recording):
         return lambda channels: recording if channels is None else recording.select(channels)
 
     return lambda dataset: {recording.id: reader(recording) for recording in recordings}
 
 
-def test_laps_last_as_long_as_the_course_is_driven_round_once() -> None:
+def test_laps_last_as_long_as_the_course_is_driven_round_once():
     recording, length = circuit()
     laps = laps_of(recording)
     assert len(laps) == 4
@@ -392,7 +389,7 @@ def test_laps_last_as_long_as_the_course_is_driven_round_once() -> None:
     assert all(one[1] == other[0] for one, other in pairwise(laps))
 
 
-def test_half_a_turn_of_an_oval_is_no_lap_and_a_circle_has_one_a_turn() -> None:
+def test_half_a_turn_of_an_oval_is_no_lap_and_a_circle_has_one_a_turn():
     time = np.arange(6000) / 50.0
     speed = np.full(6000, 10.0)
     bend = np.mod(10.0 * time, 100.0 + 10.0 * np.pi * 2.0) >= 100.0  # two equal halves: a straight, and half a turn of 20 m
@@ -403,14 +400,14 @@ def test_half_a_turn_of_an_oval_is_no_lap_and_a_circle_has_one_a_turn() -> None:
     np.testing.assert_allclose([stop - start for start, stop in laps_of(circle)], 2.0 * np.pi / 0.4, atol=0.03)
 
 
-def test_a_drive_that_never_repeats_has_no_laps() -> None:
+def test_a_drive_that_never_repeats_has_no_laps():
     generator = np.random.default_rng(1)
     yaw_rate = np.convolve(generator.standard_normal(6000), np.full(200, 0.01), mode="same")
     assert laps_of(Recording("road", "car", 50.0, 0.0, {"vx": np.full(6000, 20.0), "yaw_rate": yaw_rate})) == []
     assert laps_of(Recording("parked", "car", 50.0, 0.0, {"vx": np.zeros(600), "yaw_rate": np.zeros(600)})) == []
 
 
-def test_percentages_follow_one_another_over_every_recording() -> None:
+def test_percentages_follow_one_another_over_every_recording():
     one = Recording("a", "car", 10.0, 50.0, {"vx": np.ones(1000)})
     other = Recording("b", "car", 10.0, 0.0, {"vx": np.ones(200)})
     config = {"name": "s", "dataset": "d", "train": "60 %", "validation": "15%", "tests": {"wet": "20 %", "dry": "5 %"}}
@@ -421,7 +418,7 @@ def test_percentages_follow_one_another_over_every_recording() -> None:
     assert split.tests["dry"] == (Span("d", "a", 145.0, math.inf), Span("d", "b", 19.0, math.inf))
 
 
-def test_laps_are_named_from_either_end() -> None:
+def test_laps_are_named_from_either_end():
     recording, _ = circuit()
     laps = laps_of(recording)
     entry = {"recording": "lap"}
@@ -432,7 +429,7 @@ def test_laps_are_named_from_either_end() -> None:
     assert split.tests["end"] == (Span("d", "lap", *laps[3]),)
 
 
-def test_every_fold_is_tested_once_and_none_learns_from_its_test() -> None:
+def test_every_fold_is_tested_once_and_none_learns_from_its_test():
     recording, _ = circuit(laps=6.5)
     config = {"name": "s", "dataset": "d", "folds": {"number": 4, "of": "laps", "gap_seconds": 1.0}}
     splits = [split_from_config({**config, "fold": fold}, catalogue_of(recording)) for fold in range(4)]
@@ -449,7 +446,7 @@ def test_every_fold_is_tested_once_and_none_learns_from_its_test() -> None:
 
 
 @pytest.mark.parametrize("of", ["recordings", "seconds"])
-def test_folds_of_recordings_and_of_seconds_leave_nothing_out(of: str) -> None:
+def test_folds_of_recordings_and_of_seconds_leave_nothing_out(of):
     recordings = [Recording(name, "car", 10.0, 0.0, {"vx": np.ones(1000), "yaw_rate": np.zeros(1000)}) for name in "abcdef"]
     config = {"name": "s", "dataset": "d", "folds": {"number": 3, "of": of, "gap_seconds": 0.0}}
     for fold in range(3):
@@ -477,7 +474,7 @@ def test_folds_of_recordings_and_of_seconds_leave_nothing_out(of: str) -> None:
     ],
     ids=str,
 )
-def test_portions_that_make_no_sense_are_refused_in_one_line(changes: dict[str, object], what: str) -> None:
+def test_portions_that_make_no_sense_are_refused_in_one_line(changes, what):
     config = {"name": "s", "dataset": "d", "train": [{"recording": "lap"}], "validation": [{"recording": "b"}], "tests": {}}
     with pytest.raises(ConfigurationError) as error:
         split_from_config(config | changes, catalogue_of(circuit()[0]))
@@ -486,7 +483,7 @@ def test_portions_that_make_no_sense_are_refused_in_one_line(changes: dict[str, 
     assert "\n" not in str(error.value)
 
 
-def test_no_fold_is_a_scrap_and_gaps_are_kept_whole() -> None:
+def test_no_fold_is_a_scrap_and_gaps_are_kept_whole():
     """What is before the first lap and after the last belongs to them; a gap reaches over blocks that are shorter than it."""
     recording, _ = circuit(laps=6.5)
     for number in (3, 5):
@@ -500,7 +497,7 @@ def test_no_fold_is_a_scrap_and_gaps_are_kept_whole() -> None:
 
 
 @pytest.mark.parametrize("laps", [2.3, 2.5, 3.3, 3.97])
-def test_laps_end_where_the_course_begins_again_wherever_the_recording_stops(laps: float) -> None:
+def test_laps_end_where_the_course_begins_again_wherever_the_recording_stops(laps):
     time = np.arange(int(laps * 60.0 * 20.0)) / 20.0
     yaw_rate = 0.2 + 0.2 * np.sin(2.0 * np.pi * time / 60.0) + 0.3 * np.sin(6.0 * np.pi * time / 60.0 + 1.0) - (0.2 - 2.0 * np.pi / 60.0)
     found = laps_of(Recording("lap", "car", 20.0, 0.0, {"vx": np.full(len(time), 20.0), "yaw_rate": yaw_rate}))

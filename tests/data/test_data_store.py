@@ -1,7 +1,5 @@
 """The store: what is read back is what was written, bit for bit, and a failure leaves what was there before."""
 
-from __future__ import annotations
-
 import math
 import tempfile
 from pathlib import Path
@@ -33,7 +31,7 @@ json_values = st.recursive(
 
 
 @st.composite
-def recordings(draw: st.DrawFn) -> Recording:
+def recordings(draw):
     length = draw(st.integers(1, 50))
     names = draw(st.lists(st.sampled_from(sorted(CHANNELS)), min_size=1, max_size=4, unique=True))
     gappy = frozenset(name for name in names if draw(st.booleans()))
@@ -50,15 +48,15 @@ def recordings(draw: st.DrawFn) -> Recording:
     )
 
 
-def simple(samples: object = (1.0, 2.0, 3.0), **changes: object) -> Recording:
+def simple(samples=(1.0, 2.0, 3.0), **changes):
     return Recording("lap", "car", 100.0, 5.0, {"ay": np.asarray(samples, dtype=np.float64)}, **changes)
 
 
-def bits(values: np.ndarray) -> list[int]:
+def bits(values):
     return np.ascontiguousarray(values, dtype=np.float64).view(np.uint64).tolist()
 
 
-def assert_same_recording(read: Recording, written: Recording) -> None:
+def assert_same_recording(read, written):
     assert list(read.channels) == list(written.channels)
     for name, samples in written.channels.items():
         assert bits(read[name]) == bits(samples), name
@@ -67,7 +65,7 @@ def assert_same_recording(read: Recording, written: Recording) -> None:
     assert dict(read.provenance) == dict(written.provenance)
 
 
-def one_line(error: pytest.ExceptionInfo[BaseException]) -> str:
+def one_line(error):
     message = str(error.value)
     assert message
     assert "\n" not in message
@@ -76,7 +74,7 @@ def one_line(error: pytest.ExceptionInfo[BaseException]) -> str:
 
 @PROPERTY
 @given(recordings())
-def test_a_recording_comes_back_bit_for_bit_with_all_it_says_about_itself(recording: Recording) -> None:
+def test_a_recording_comes_back_bit_for_bit_with_all_it_says_about_itself(recording):
     with tempfile.TemporaryDirectory() as folder:
         file = Path(folder) / "recording.parquet"
         write_recording(recording, file)
@@ -84,7 +82,7 @@ def test_a_recording_comes_back_bit_for_bit_with_all_it_says_about_itself(record
         assert [path.name for path in Path(folder).iterdir()] == [file.name]
 
 
-def test_pandas_reads_the_same_numbers_from_the_file(tmp_path: Path) -> None:
+def test_pandas_reads_the_same_numbers_from_the_file(tmp_path):
     samples = np.random.default_rng(0).standard_normal(1000)
     write_recording(simple(samples), tmp_path / "r.parquet")
     table = pd.read_parquet(tmp_path / "r.parquet")
@@ -92,13 +90,13 @@ def test_pandas_reads_the_same_numbers_from_the_file(tmp_path: Path) -> None:
     assert bits(table["ay"].to_numpy()) == bits(samples)
 
 
-def test_writing_twice_gives_the_same_bytes(tmp_path: Path) -> None:
+def test_writing_twice_gives_the_same_bytes(tmp_path):
     for name in ("a", "b"):
         write_recording(simple(np.arange(500) / 7.0), tmp_path / name)
     assert (tmp_path / "a").read_bytes() == (tmp_path / "b").read_bytes()
 
 
-def test_chosen_channels_are_read_alone_and_in_the_order_asked_for(tmp_path: Path) -> None:
+def test_chosen_channels_are_read_alone_and_in_the_order_asked_for(tmp_path):
     channels = {name: np.full(3, float(k)) for k, name in enumerate(("vx", "ax", "ay"))}
     recording = Recording("r", "car", 10.0, 0.0, channels, gappy=frozenset({"ax"}))
     write_recording(recording, tmp_path / "r.parquet")
@@ -108,7 +106,7 @@ def test_chosen_channels_are_read_alone_and_in_the_order_asked_for(tmp_path: Pat
     assert read.gappy == frozenset()
 
 
-def test_a_channel_that_is_not_there_is_named_with_those_that_are(tmp_path: Path) -> None:
+def test_a_channel_that_is_not_there_is_named_with_those_that_are(tmp_path):
     write_recording(simple(), tmp_path / "r.parquet")
     with pytest.raises(DataError, match="no channel 'vx'") as error:
         read_recording(tmp_path / "r.parquet", ["vx"])
@@ -117,7 +115,7 @@ def test_a_channel_that_is_not_there_is_named_with_those_that_are(tmp_path: Path
 
 @PROPERTY
 @given(st.integers(1, 20), st.integers(1, 4), st.data())
-def test_an_estimate_comes_back_with_its_covariance(length: int, n_states: int, data: st.DataObject) -> None:
+def test_an_estimate_comes_back_with_its_covariance(length, n_states, data):
     values = arrays(np.float64, length, elements=finite | st.just(math.nan))
     covariance = data.draw(st.none() | arrays(np.float64, (length, n_states, n_states), elements=finite))
     names = tuple(data.draw(st.permutations(list(QUANTITIES)))[:n_states])
@@ -146,19 +144,19 @@ def test_an_estimate_comes_back_with_its_covariance(length: int, n_states: int, 
         assert bits(read.covariance.ravel()) == bits(estimate.covariance.ravel())
 
 
-def test_an_estimate_carries_its_time_column_for_other_tools(tmp_path: Path) -> None:
+def test_an_estimate_carries_its_time_column_for_other_tools(tmp_path):
     write_estimate(Estimate("r", "gru", 20.0, 450.0, {"vy": np.arange(3.0), "sideslip": np.zeros(3)}), tmp_path / "e.parquet")
     assert pd.read_parquet(tmp_path / "e.parquet")["time"].tolist() == pytest.approx([450.0, 450.05, 450.1], abs=1e-12)
 
 
-def test_a_missing_file_is_missing(tmp_path: Path) -> None:
+def test_a_missing_file_is_missing(tmp_path):
     with pytest.raises(MissingError, match="there is no file") as error:
         read_recording(tmp_path / "none.parquet")
     assert "none.parquet" in one_line(error)
 
 
 @pytest.mark.parametrize("kept", [1, 4, 200, -8, -1])
-def test_a_truncated_file_is_refused_in_one_line(tmp_path: Path, kept: int) -> None:
+def test_a_truncated_file_is_refused_in_one_line(tmp_path, kept):
     write_recording(simple(np.arange(300.0)), tmp_path / "r.parquet")
     (tmp_path / "r.parquet").write_bytes((tmp_path / "r.parquet").read_bytes()[:kept])
     with pytest.raises(DataError, match="truncated or damaged") as error:
@@ -167,7 +165,7 @@ def test_a_truncated_file_is_refused_in_one_line(tmp_path: Path, kept: int) -> N
     assert not is_stored_recording(tmp_path / "r.parquet")
 
 
-def test_no_flipped_bit_in_the_samples_goes_unnoticed(tmp_path: Path) -> None:
+def test_no_flipped_bit_in_the_samples_goes_unnoticed(tmp_path):
     write_recording(simple(np.random.default_rng(1).standard_normal(64)), tmp_path / "r.parquet")
     intact = (tmp_path / "r.parquet").read_bytes()
     samples_end = pq.ParquetFile(tmp_path / "r.parquet").metadata.row_group(0).column(0).total_compressed_size + 4
@@ -183,14 +181,14 @@ def test_no_flipped_bit_in_the_samples_goes_unnoticed(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     "metadata", [None, {b"vehest": b"[1, 2]"}, {b"vehest": b"not json"}, {b"vehest": b'{"content": "recording"}'}, {b"vehest": b"\xff"}]
 )
-def test_a_foreign_parquet_file_is_refused_in_one_line(tmp_path: Path, metadata: dict[bytes, bytes] | None) -> None:
+def test_a_foreign_parquet_file_is_refused_in_one_line(tmp_path, metadata):
     pq.write_table(pa.table({"ay": [1.0, 2.0]}).replace_schema_metadata(metadata), tmp_path / "foreign.parquet")
     with pytest.raises(DataError) as error:
         read_recording(tmp_path / "foreign.parquet")
     assert "foreign.parquet" in one_line(error)
 
 
-def test_a_recording_is_not_an_estimate_nor_the_other_way_round(tmp_path: Path) -> None:
+def test_a_recording_is_not_an_estimate_nor_the_other_way_round(tmp_path):
     write_recording(simple(), tmp_path / "r.parquet")
     write_estimate(Estimate("r", "gru", 20.0, 0.0, {"vy": np.zeros(3), "sideslip": np.zeros(3)}), tmp_path / "e.parquet")
     with pytest.raises(DataError, match="not an estimate"):
@@ -202,14 +200,14 @@ def test_a_recording_is_not_an_estimate_nor_the_other_way_round(tmp_path: Path) 
     assert not is_stored_recording(tmp_path / "none.parquet")
 
 
-def test_provenance_that_is_not_json_is_refused_and_leaves_nothing(tmp_path: Path) -> None:
+def test_provenance_that_is_not_json_is_refused_and_leaves_nothing(tmp_path):
     with pytest.raises(DataError, match="JSON") as error:
         write_recording(simple(provenance={"when": object()}), tmp_path / "r.parquet")
     one_line(error)
     assert list(tmp_path.iterdir()) == []
 
 
-def test_writing_below_a_file_is_refused_in_one_line(tmp_path: Path) -> None:
+def test_writing_below_a_file_is_refused_in_one_line(tmp_path):
     (tmp_path / "file").write_text("not a folder")
     with pytest.raises(MissingError, match="cannot write") as error:
         write_recording(simple(), tmp_path / "file" / "r.parquet")

@@ -1,9 +1,6 @@
 """Filters and corrections: what each says about time and truth, checked against closed forms."""
 
-from __future__ import annotations
-
 import math
-from collections.abc import Callable
 
 import numpy as np
 import pytest
@@ -12,53 +9,39 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from vehest.data import transforms
-from vehest.data.derived import (
-    AccelerationFromSpeed,
-    ScaleToWheelbase,
-    SideslipFromVelocity,
-    SpeedFromWheels,
-    VelocityFromSideslip,
-)
+from vehest.data.derived import AccelerationFromSpeed, ScaleToWheelbase, SideslipFromVelocity, SpeedFromWheels, VelocityFromSideslip
 from vehest.data.errors import ConfigurationError, DataError, VehestError
 from vehest.data.recording import Recording
-from vehest.data.transforms import (
-    TRANSFORMS,
-    LowPass,
-    MountingCorrection,
-    ReferenceLever,
-    RemoveOutliers,
-    Resample,
-    transform_from_config,
-)
+from vehest.data.transforms import TRANSFORMS, LowPass, MountingCorrection, ReferenceLever, RemoveOutliers, Resample, transform_from_config
 from vehest.data.windows import windows_of
 
 PROPERTY = settings(max_examples=50, deadline=None, derandomize=True, database=None)
 RATE = 100.0
 
 
-def recorded(**channels: np.ndarray) -> Recording:
+def recorded(**channels):
     return Recording("lap", "car", RATE, 3.0, channels)
 
 
-def filtered(samples: np.ndarray, direction: str, cutoff_hz: float = 5.0) -> np.ndarray:
-    return LowPass(cutoff_hz, direction=direction)(recorded(ay=samples))["ay"]  # type: ignore[arg-type]
+def filtered(samples, direction, cutoff_hz=5.0):
+    return LowPass(cutoff_hz, direction=direction)(recorded(ay=samples))["ay"]
 
 
-def fitted_sine(samples: np.ndarray, time: np.ndarray, frequency: float) -> tuple[float, float]:
+def fitted_sine(samples, time, frequency):
     """Amplitude and phase of the sine that fits best."""
     basis = np.stack([np.sin(2 * np.pi * frequency * time), np.cos(2 * np.pi * frequency * time)], axis=1)
     (sine, cosine), *_ = np.linalg.lstsq(basis, samples, rcond=None)
     return float(np.hypot(sine, cosine)), float(np.arctan2(cosine, sine))
 
 
-def bilinear(frequency: float, cutoff_hz: float) -> complex:
+def bilinear(frequency, cutoff_hz):
     """Response of a second-order Butterworth filter made digital by the bilinear transform with pre-warping."""
     warped = 1j * np.tan(np.pi * frequency / RATE) / np.tan(np.pi * cutoff_hz / RATE)
     return complex(1.0 / (warped**2 + math.sqrt(2.0) * warped + 1.0))
 
 
 @pytest.mark.parametrize("frequency", [0.5, 2.0, 5.0, 9.0, 20.0])
-def test_low_pass_has_the_gain_and_phase_of_a_butterworth_filter(frequency: float) -> None:
+def test_low_pass_has_the_gain_and_phase_of_a_butterworth_filter(frequency):
     time = np.arange(2000) / RATE
     inside = slice(500, 1500)
     response = bilinear(frequency, 5.0)
@@ -73,13 +56,13 @@ def test_low_pass_has_the_gain_and_phase_of_a_butterworth_filter(frequency: floa
 
 @PROPERTY
 @given(arrays(np.float64, 60, elements=st.floats(-100, 100)), st.integers(1, 59), st.floats(-1e3, 1e3))
-def test_causal_low_pass_does_not_see_the_future(samples: np.ndarray, now: int, shock: float) -> None:
+def test_causal_low_pass_does_not_see_the_future(samples, now, shock):
     changed = samples.copy()
     changed[now:] += shock
     np.testing.assert_array_equal(filtered(changed, "causal")[:now], filtered(samples, "causal")[:now])
 
 
-def test_zero_phase_low_pass_treats_both_directions_of_time_alike() -> None:
+def test_zero_phase_low_pass_treats_both_directions_of_time_alike():
     bump = np.exp(-((np.arange(401) - 200.0) ** 2) / 50.0)
     smooth = filtered(bump, "zero_phase")
     np.testing.assert_allclose(smooth, smooth[::-1], atol=1e-9)
@@ -89,18 +72,18 @@ def test_zero_phase_low_pass_treats_both_directions_of_time_alike() -> None:
 
 @PROPERTY
 @given(st.integers(1, 40), st.floats(-1e3, 1e3), st.sampled_from(["causal", "zero_phase"]))
-def test_low_pass_keeps_a_constant_however_short(length: int, value: float, direction: str) -> None:
+def test_low_pass_keeps_a_constant_however_short(length, value, direction):
     np.testing.assert_allclose(filtered(np.full(length, value), direction), value, rtol=1e-9, atol=1e-9)
 
 
 @pytest.mark.parametrize("cutoff_hz", [0.0, -1.0, 50.0, 80.0, math.nan])
-def test_low_pass_beyond_nyquist_is_refused(cutoff_hz: float) -> None:
+def test_low_pass_beyond_nyquist_is_refused(cutoff_hz):
     with pytest.raises(ConfigurationError, match="between 0 and 50 Hz"):
         LowPass(cutoff_hz)(recorded(ay=np.zeros(10)))
 
 
 @pytest.mark.parametrize("frequency", [0.5, 2.0, 5.0, 9.0, 20.0])
-def test_a_symmetric_low_pass_has_the_gain_of_its_taps_and_no_phase(frequency: float) -> None:
+def test_a_symmetric_low_pass_has_the_gain_of_its_taps_and_no_phase(frequency):
     time = np.arange(1000) / RATE
     samples = LowPass(5.0, design="fir")(recorded(ay=np.sin(2 * np.pi * frequency * time)))["ay"]
     lag = np.arange(-30, 31) / RATE
@@ -113,17 +96,17 @@ def test_a_symmetric_low_pass_has_the_gain_of_its_taps_and_no_phase(frequency: f
 
 
 @pytest.mark.parametrize("length", [1, 2, 7, 300])
-def test_a_symmetric_low_pass_keeps_a_line_to_its_ends(length: int) -> None:
+def test_a_symmetric_low_pass_keeps_a_line_to_its_ends(length):
     line = 3.0 - 0.2 * np.arange(length)
     np.testing.assert_allclose(LowPass(5.0, design="fir")(recorded(ay=line))["ay"], line, atol=1e-9)
 
 
-def test_what_cannot_be_causal_is_refused() -> None:
+def test_what_cannot_be_causal_is_refused():
     with pytest.raises(ConfigurationError, match="use design=butterworth for a causal one"):
         LowPass(5.0, direction="causal", design="fir")
 
 
-def test_reference_lever_brings_velocities_to_the_centre_of_gravity() -> None:
+def test_reference_lever_brings_velocities_to_the_centre_of_gravity():
     """A point 2 m ahead and 0.5 m to the left of the centre of gravity of a car that turns about a fixed point."""
     yaw_rate, vx, vy = np.array([0.0, 0.4, -0.3]), np.full(3, 15.0), np.array([0.0, -0.2, 0.4])
     at_sensor = {"vx_ref": vx - yaw_rate * 0.5, "vy_ref": vy + yaw_rate * 2.0, "yaw_rate": yaw_rate}
@@ -133,19 +116,19 @@ def test_reference_lever_brings_velocities_to_the_centre_of_gravity() -> None:
     np.testing.assert_allclose(moved["sideslip_ref"], np.arctan2(vy, vx))
 
 
-def test_only_the_named_channels_are_filtered() -> None:
+def test_only_the_named_channels_are_filtered():
     noise = np.random.default_rng(0).standard_normal(100)
     out = LowPass(5.0, channels=("ay",))(recorded(ay=noise, ax=noise))
     np.testing.assert_array_equal(out["ax"], noise)
     assert out["ay"].std() < 0.6 * noise.std()
 
 
-def drive_signal(length: int = 2000) -> np.ndarray:
+def drive_signal(length=2000):
     time = np.arange(length) / RATE
     return 4.0 * np.sin(2 * np.pi * 0.3 * time) + np.sin(2 * np.pi * 1.1 * time + 1.0)
 
 
-def test_outlier_removal_removes_planted_spikes_and_nothing_else() -> None:
+def test_outlier_removal_removes_planted_spikes_and_nothing_else():
     clean = drive_signal()
     spikes = np.random.default_rng(3).choice(np.arange(0, len(clean), 8), 60, replace=False)
     spoilt = clean.copy()
@@ -157,7 +140,7 @@ def test_outlier_removal_removes_planted_spikes_and_nothing_else() -> None:
 
 
 @pytest.mark.parametrize("noise", [0.0, 0.3])
-def test_outlier_removal_leaves_a_clean_signal_alone(noise: float) -> None:
+def test_outlier_removal_leaves_a_clean_signal_alone(noise):
     clean = drive_signal() + noise * np.random.default_rng(0).standard_normal(2000)
     out = RemoveOutliers()(recorded(ay=clean))["ay"]
     assert np.mean(out == clean) > 0.99  # six deviations of eleven normal samples: a few in a thousand
@@ -165,12 +148,12 @@ def test_outlier_removal_leaves_a_clean_signal_alone(noise: float) -> None:
         np.testing.assert_array_equal(out, clean)
 
 
-def test_outlier_removal_keeps_steps_ramps_and_quantised_ramps() -> None:
+def test_outlier_removal_keeps_steps_ramps_and_quantised_ramps():
     for samples in (np.repeat([0.0, 5.0], 50), np.arange(100.0), np.round(np.arange(100.0) / 7.0), np.full(100, 2.0)):
         np.testing.assert_array_equal(RemoveOutliers()(recorded(ay=samples))["ay"], samples)
 
 
-def test_outlier_removal_keeps_the_peak_of_a_slide_and_removes_a_glitch_on_it() -> None:
+def test_outlier_removal_keeps_the_peak_of_a_slide_and_removes_a_glitch_on_it():
     """A slide of 10 degrees within half a second, noise of an optical sensor."""
     time = np.arange(300) / RATE
     slide = np.radians(10.0) * np.exp(-np.square((time - 1.5) / 0.25)) + 1e-3 * np.random.default_rng(1).standard_normal(300)
@@ -182,7 +165,7 @@ def test_outlier_removal_keeps_the_peak_of_a_slide_and_removes_a_glitch_on_it() 
     assert (np.delete(cleaned == slide, 150)).mean() > 0.98
 
 
-def test_outlier_removal_removes_a_spike_from_a_channel_at_rest() -> None:
+def test_outlier_removal_removes_a_spike_from_a_channel_at_rest():
     samples = np.zeros(50)
     samples[20] = 9.0
     np.testing.assert_array_equal(RemoveOutliers()(recorded(ay=samples))["ay"], np.zeros(50))
@@ -190,7 +173,7 @@ def test_outlier_removal_removes_a_spike_from_a_channel_at_rest() -> None:
 
 @PROPERTY
 @given(st.integers(1, 14), st.integers(1, 8), st.data())
-def test_outlier_removal_of_short_recordings_stays_within_their_values(length: int, half_window: int, data: st.DataObject) -> None:
+def test_outlier_removal_of_short_recordings_stays_within_their_values(length, half_window, data):
     samples = data.draw(arrays(np.float64, length, elements=st.floats(-10, 10)))
     out = RemoveOutliers(half_window)(recorded(ay=samples))["ay"]
     assert len(out) == length
@@ -199,12 +182,12 @@ def test_outlier_removal_of_short_recordings_stays_within_their_values(length: i
 
 
 @pytest.mark.parametrize("arguments", [{"half_window": 0}, {"threshold": 0.0}, {"half_window": -3}])
-def test_outlier_removal_without_neighbours_or_threshold_is_refused(arguments: dict[str, float]) -> None:
+def test_outlier_removal_without_neighbours_or_threshold_is_refused(arguments):
     with pytest.raises(ConfigurationError, match="greater than 0"):
         transform_from_config({"name": "remove_outliers", **arguments})
 
 
-def rigid_body(lever_x: float, lever_y: float, yaw: float) -> tuple[Recording, np.ndarray, np.ndarray]:
+def rigid_body(lever_x, lever_y, yaw):
     """A car that circles and weaves, seen by a displaced and turned accelerometer, and what it does at its centre of gravity.
 
     The sensor's acceleration comes from differentiating its position in the plane twice, not from rigid-body formulae.
@@ -212,16 +195,16 @@ def rigid_body(lever_x: float, lever_y: float, yaw: float) -> tuple[Recording, n
     time, step = np.arange(800) / RATE, 2e-4
     lever, turn = complex(lever_x, lever_y), np.exp(1j * yaw)  # the plane as complex numbers
 
-    def heading(at: np.ndarray) -> np.ndarray:
+    def heading(at):
         return 0.4 * at + 0.5 * np.sin(1.5 * at)
 
-    def centre(at: np.ndarray) -> np.ndarray:
+    def centre(at):
         return 20.0 * at + 3.0 * np.sin(0.7 * at) + 5.0j * np.cos(0.5 * at)
 
-    def sensor(at: np.ndarray) -> np.ndarray:
+    def sensor(at):
         return centre(at) + lever * np.exp(1j * heading(at))
 
-    def acceleration(position: Callable[[np.ndarray], np.ndarray]) -> np.ndarray:
+    def acceleration(position):
         """In the vehicle's axes."""
         return (position(time + step) - 2 * position(time) + position(time - step)) / step**2 * np.exp(-1j * heading(time))
 
@@ -231,7 +214,7 @@ def rigid_body(lever_x: float, lever_y: float, yaw: float) -> tuple[Recording, n
 
 
 @pytest.mark.parametrize(("lever_x", "lever_y", "yaw"), [(0.0, 0.0, 0.2), (1.3, 0.0, 0.0), (0.0, -0.6, 0.0), (-0.8, 0.5, -0.15)])
-def test_mounting_correction_undoes_lever_arm_and_rotation(lever_x: float, lever_y: float, yaw: float) -> None:
+def test_mounting_correction_undoes_lever_arm_and_rotation(lever_x, lever_y, yaw):
     recording, true_ax, true_ay = rigid_body(lever_x, lever_y, yaw)
     corrected = MountingCorrection(lever_x, lever_y, yaw)(recording)
     inside = slice(1, -1)  # central differences of the yaw rate
@@ -241,14 +224,14 @@ def test_mounting_correction_undoes_lever_arm_and_rotation(lever_x: float, lever
     assert before > 0.1
 
 
-def test_mounting_correction_of_one_sample_knows_the_centripetal_part() -> None:
+def test_mounting_correction_of_one_sample_knows_the_centripetal_part():
     recording = recorded(ax=np.array([1.0]), ay=np.array([2.0]), yaw_rate=np.array([0.5]))
     corrected = MountingCorrection(lever_x=2.0, lever_y=-1.0)(recording)
     assert corrected["ax"].tolist() == [1.0 + 0.25 * 2.0]
     assert corrected["ay"].tolist() == [2.0 - 0.25 * 1.0]
 
 
-def test_filters_and_corrections_refuse_channels_with_gaps() -> None:
+def test_filters_and_corrections_refuse_channels_with_gaps():
     channels = {name: np.array([0.0, np.nan, 1.0, 2.0]) for name in ("ax", "ay", "yaw_rate")}
     recording = Recording("lap", "car", RATE, 0.0, channels, gappy=frozenset(channels))
     for transform in (LowPass(5.0), RemoveOutliers(), MountingCorrection(1.0)):
@@ -256,13 +239,13 @@ def test_filters_and_corrections_refuse_channels_with_gaps() -> None:
             transform(recording)
 
 
-def test_a_missing_channel_is_named() -> None:
+def test_a_missing_channel_is_named():
     for transform in (LowPass(5.0, channels=("vx",)), RemoveOutliers(channels=("vx",)), MountingCorrection(1.0)):
         with pytest.raises(DataError, match=r"no channel '(vx|ax)'"):
             transform(recorded(ay=np.zeros(20)))
 
 
-def test_transforms_leave_the_recording_they_are_given_alone() -> None:
+def test_transforms_leave_the_recording_they_are_given_alone():
     recording, *_ = rigid_body(1.0, 0.0, 0.0)
     before = {name: samples.copy() for name, samples in recording.channels.items()}
     for transform in (LowPass(5.0), RemoveOutliers(), MountingCorrection(1.0), Resample(20.0)):
@@ -272,7 +255,7 @@ def test_transforms_leave_the_recording_they_are_given_alone() -> None:
         np.testing.assert_array_equal(recording[name], samples)
 
 
-def test_transforms_are_built_from_plain_values() -> None:
+def test_transforms_are_built_from_plain_values():
     assert transform_from_config({"name": "low_pass", "cutoff_hz": 5, "channels": ["ax", "ay"]}) == LowPass(5, ("ax", "ay"))
     assert transform_from_config({"name": "remove_outliers", "channels": "ay"}) == RemoveOutliers(channels=("ay",))
     assert transform_from_config({"name": "resample", "rate_hz": 20.0}) == Resample(20.0)
@@ -285,13 +268,9 @@ def test_transforms_are_built_from_plain_values() -> None:
 
 
 @pytest.mark.parametrize(
-    ("config", "what"),
-    [
-        ({"name": "high_pass"}, "'high_pass' is not one of: resample"),
-        ({"name": "low_pass"}, "cutoff_hz"),
-    ],
+    ("config", "what"), [({"name": "high_pass"}, "'high_pass' is not one of: resample"), ({"name": "low_pass"}, "cutoff_hz")]
 )
-def test_a_misspelt_transform_is_refused_in_one_line(config: dict[str, object], what: str) -> None:
+def test_a_misspelt_transform_is_refused_in_one_line(config, what):
     with pytest.raises(ConfigurationError) as error:
         transform_from_config(config)
     assert what in str(error.value)
@@ -301,7 +280,7 @@ def test_a_misspelt_transform_is_refused_in_one_line(config: dict[str, object], 
 WHEELS = SpeedFromWheels(wheel_radius=0.48, track_front=2.1, track_rear=2.0)
 
 
-def rolling(**shown: np.ndarray) -> tuple[Recording, np.ndarray]:
+def rolling(**shown):
     """A car whose wheels roll, as Eqs. 61 to 64 have it, and its speed; ``shown`` replaces channels."""
     time = np.arange(2000) / RATE
     u = 8.0 + 3.0 * np.sin(0.7 * time)
@@ -315,7 +294,7 @@ def rolling(**shown: np.ndarray) -> tuple[Recording, np.ndarray]:
     return Recording("lap", "car", RATE, 3.0, channels, gappy=gappy), u
 
 
-def damaged(value: float, *wheels: str, start: int = 500, stop: int = 650) -> tuple[Recording, np.ndarray]:
+def damaged(value, *wheels, start=500, stop=650):
     """The same with some wheels that show another value for a while."""
     whole, _ = rolling()
     broken = {}
@@ -325,20 +304,20 @@ def damaged(value: float, *wheels: str, start: int = 500, stop: int = 650) -> tu
     return rolling(**broken)
 
 
-def test_speed_from_wheels_inverts_what_rolling_wheels_do() -> None:
+def test_speed_from_wheels_inverts_what_rolling_wheels_do():
     drive, u = rolling()
     np.testing.assert_allclose(WHEELS.corrected(drive), np.tile(u, (4, 1)), atol=1e-12)
     np.testing.assert_allclose(WHEELS(drive)["vx"], u, atol=1e-12)
 
 
 @pytest.mark.parametrize("value", [0.0, 60.0, math.nan])
-def test_a_wheel_that_drops_out_or_spins_does_not_count(value: float) -> None:
+def test_a_wheel_that_drops_out_or_spins_does_not_count(value):
     drive, u = damaged(value, "fl")
     np.testing.assert_allclose(WHEELS(drive)["vx"], u, atol=1e-12)
 
 
 @pytest.mark.parametrize("wheels", [("rl", "rr"), ("fl", "fr", "rl"), ("fl", "fr", "rl", "rr")])
-def test_without_two_wheels_the_acceleration_carries_the_speed_on(wheels: tuple[str, ...]) -> None:
+def test_without_two_wheels_the_acceleration_carries_the_speed_on(wheels):
     drive, u = damaged(math.nan if len(wheels) == 4 else 0.0, *wheels)
     vx = WHEELS(drive)["vx"]
     limited = np.abs(vx - u).max()
@@ -347,18 +326,18 @@ def test_without_two_wheels_the_acceleration_carries_the_speed_on(wheels: tuple[
     assert np.abs(np.diff(vx)).max() <= 12.0 / RATE + 1e-12
 
 
-def test_speed_from_wheels_knows_no_later_samples() -> None:
+def test_speed_from_wheels_knows_no_later_samples():
     drive, _ = damaged(0.0, "rl", "rr")
     np.testing.assert_array_equal(WHEELS(drive.cut(3.0, 9.0))["vx"], WHEELS(drive)["vx"][:600])
 
 
-def test_wheels_that_were_never_measured_are_refused() -> None:
+def test_wheels_that_were_never_measured_are_refused():
     missing = np.full(2000, math.nan)
     with pytest.raises(DataError, match="no wheel speed was measured"):
         WHEELS(rolling(yaw_rate=missing)[0])
 
 
-def test_rear_wheels_alone_give_the_speed_without_tracks() -> None:
+def test_rear_wheels_alone_give_the_speed_without_tracks():
     whole, u = rolling()
     rear = whole.select(["wheel_speed_rl", "wheel_speed_rr"])
     np.testing.assert_allclose(SpeedFromWheels(wheel_radius=0.48)(rear)["vx"], u, atol=1e-12)  # left and right make up for the track
@@ -368,14 +347,14 @@ def test_rear_wheels_alone_give_the_speed_without_tracks() -> None:
         SpeedFromWheels(wheel_radius=0.48)(whole.select(["yaw_rate"]))
 
 
-def test_acceleration_from_speed_is_its_derivative_late_by_the_filters_delay_or_not_at_all() -> None:
+def test_acceleration_from_speed_is_its_derivative_late_by_the_filters_delay_or_not_at_all():
     frequency, rate = 0.5, 100.0
     time = np.arange(3000) / rate
     drive = Recording("lap", "car", rate, 0.0, {"vx": 20.0 + 3.0 * np.sin(2 * np.pi * frequency * time)})
     amplitude = 3.0 * 2 * np.pi * frequency
     late = math.sqrt(2.0) / (2.0 * np.pi * 5.0) + 0.5 / rate
     for direction, delay in (("zero_phase", 0.0), ("causal", late)):
-        made = AccelerationFromSpeed(cutoff_hz=5.0, direction=direction)(drive)  # type: ignore[arg-type]
+        made = AccelerationFromSpeed(cutoff_hz=5.0, direction=direction)(drive)
         expected = amplitude * np.cos(2 * np.pi * frequency * (time - delay))
         np.testing.assert_allclose(made["ax"][300:-300], expected[300:-300], atol=0.005 * amplitude)
     causal = AccelerationFromSpeed()
@@ -384,7 +363,7 @@ def test_acceleration_from_speed_is_its_derivative_late_by_the_filters_delay_or_
         AccelerationFromSpeed(cutoff_hz=50.0)(drive)
 
 
-def test_velocity_and_sideslip_follow_from_each_other() -> None:
+def test_velocity_and_sideslip_follow_from_each_other():
     angle = np.deg2rad(np.array([-58.0, -3.0, 0.0, 12.0]))
     drive = recorded(vx=np.array([5.0, 20.0, 30.0, 10.0]), sideslip_ref=angle)
     there = VelocityFromSideslip()(drive)
@@ -395,7 +374,7 @@ def test_velocity_and_sideslip_follow_from_each_other() -> None:
         VelocityFromSideslip()(recorded(vx=np.ones(2), sideslip_ref=np.array([0.1, 1.6])))
 
 
-def test_an_angle_with_gaps_makes_a_velocity_with_gaps() -> None:
+def test_an_angle_with_gaps_makes_a_velocity_with_gaps():
     channels = {"vx": np.full(3, 20.0), "sideslip_ref": np.array([0.1, math.nan, 0.2])}
     drive = Recording("lap", "car", RATE, 0.0, channels, gappy=frozenset({"sideslip_ref"}))
     made = VelocityFromSideslip()(drive)
@@ -403,7 +382,7 @@ def test_an_angle_with_gaps_makes_a_velocity_with_gaps() -> None:
     np.testing.assert_array_equal(np.isnan(made["vy_ref"]), [False, True, False])
 
 
-def test_a_scaled_car_obeys_the_same_kinematics_with_the_same_accelerations() -> None:
+def test_a_scaled_car_obeys_the_same_kinematics_with_the_same_accelerations():
     """d(vy)/dt + vx·yaw_rate = ay holds in the units of the other car, by central differences of smooth signals."""
     time = np.arange(4000) / 100.0
     vx, vy, yaw_rate = 3.0 + 0.5 * np.sin(time), 0.4 * np.sin(1.3 * time), 2.0 * np.sin(0.8 * time)
@@ -419,7 +398,7 @@ def test_a_scaled_car_obeys_the_same_kinematics_with_the_same_accelerations() ->
     np.testing.assert_allclose(derived[1:-1], ay[1:-1], atol=1e-3)
 
 
-def lap(rate_hz: float = 100.0, n_samples: int = 400) -> Recording:
+def lap(rate_hz=100.0, n_samples=400):
     generator = np.random.default_rng(0)
     return Recording("lap", "car", rate_hz, 0.0, {name: generator.normal(0.0, 1.0, n_samples) for name in ("vx", "ay")})
 
@@ -436,7 +415,7 @@ def lap(rate_hz: float = 100.0, n_samples: int = 400) -> Recording:
     ],
     ids=str,
 )
-def test_what_asks_for_too_much_is_refused_by_the_name_of_the_limit(config: dict[str, object], limit: str) -> None:
+def test_what_asks_for_too_much_is_refused_by_the_name_of_the_limit(config, limit):
     long = config.get("channels") == "long"
     with pytest.raises(VehestError) as error:
         transform_from_config({key: value for key, value in config.items() if value != "long"})(lap(n_samples=600 if long else 400))
@@ -445,25 +424,25 @@ def test_what_asks_for_too_much_is_refused_by_the_name_of_the_limit(config: dict
     assert "\n" not in str(error.value)
 
 
-def test_a_rate_that_leaves_nothing_is_refused() -> None:
+def test_a_rate_that_leaves_nothing_is_refused():
     with pytest.raises(DataError, match="is not a ratio of whole numbers"):
         Resample(1e-9)(lap())
 
 
-def test_outlier_removal_in_pieces_is_that_of_the_whole(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_outlier_removal_in_pieces_is_that_of_the_whole(monkeypatch):
     whole = RemoveOutliers(half_window=7, threshold=2.0)(lap())["ay"]
     monkeypatch.setattr(transforms, "VALUES_AT_ONCE", 40)
     np.testing.assert_array_equal(RemoveOutliers(half_window=7, threshold=2.0)(lap())["ay"], whole)
 
 
-def test_a_long_symmetric_low_pass_is_that_of_its_direct_sum(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_long_symmetric_low_pass_is_that_of_its_direct_sum(monkeypatch):
     low_pass = LowPass(2.0, design="fir", reach=50.0)
     through_spectra = low_pass(lap(n_samples=12_000))["ay"]
     monkeypatch.setattr(transforms, "LONGEST_DIRECT", 20_000)
     np.testing.assert_allclose(through_spectra, low_pass(lap(n_samples=12_000))["ay"], atol=1e-12)
 
 
-def test_a_window_longer_than_the_limit_is_refused() -> None:
+def test_a_window_longer_than_the_limit_is_refused():
     with pytest.raises(
         DataError, match=r"a window of 2000000 samples is asked for, more than the limit of 1000000; .*limits\.filter_samples"
     ):

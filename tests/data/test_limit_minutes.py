@@ -1,7 +1,5 @@
 """Ranges cut down to minutes: as long as asked, in order, from any place, and only for what is learnt."""
 
-from __future__ import annotations
-
 import math
 
 import pytest
@@ -14,7 +12,7 @@ from vehest.data.splits import Span
 SPANS = (Span("d", "one", 10.0, 40.0), Span("d", "two", 100.0, 160.0))
 
 
-def total(spans) -> float:
+def total(spans):
     return sum(span.stop - span.start for span in spans)
 
 

@@ -1,7 +1,5 @@
 """Runs of samples, against a count sample by sample."""
 
-from __future__ import annotations
-
 from itertools import groupby
 
 import numpy as np
@@ -12,7 +10,7 @@ from vehest.data.runs import equal_runs, true_runs
 
 @pytest.mark.parametrize("length", [0, 1, 2, 50])
 @pytest.mark.parametrize("seed", range(3))
-def test_runs_are_those_of_a_count_sample_by_sample(length: int, seed: int) -> None:
+def test_runs_are_those_of_a_count_sample_by_sample(length, seed):
     samples = np.random.default_rng(seed).integers(0, 2, length)
     counted, place = [], 0
     for value, group in groupby(samples.tolist()):

@@ -1,7 +1,5 @@
 """Baselines: closed forms, one sample at a time, what they refuse."""
 
-from __future__ import annotations
-
 import itertools
 
 import numpy as np
@@ -18,18 +16,18 @@ from vehest.vehicle.parameters import SingleTrackParameters
 from vehest.vehicle.single_track import lateral_model
 
 
-def new(name: str, **settings: float):
+def new(name, **settings):
     given = {"rate_hz": 20.0, **({"wheelbase": 2.4} if name == "data_sheet" else {}), **settings}
     return estimator_class(name).from_config(given)
 
 
-def fitted(name: str, drive: Recording, **settings: float):
+def fitted(name, drive, **settings):
     estimator = new(name, **settings)
     record = estimator.fit(FitData([drive], [drive]), NoTraining())
     return estimator, record
 
 
-def steady_drive(car: SingleTrackParameters, seconds: float = 30.0) -> Recording:
+def steady_drive(car, seconds=30.0):
     """Steady cornering of the linear single track at several speeds and steering angles: v and r solve 0 = A x + B δ at each sample."""
     generator = np.random.default_rng(3)
     vx = generator.uniform(8.0, 35.0, round(20 * seconds))
@@ -67,7 +65,7 @@ def test_kinematic_integration_is_the_solution_of_its_equation():
     (estimate,) = estimator.estimate([drive.without_references()])
     rate = drive["ay"] - drive["vx"] * drive["yaw_rate"]
 
-    def derivative(t: float, v: np.ndarray) -> np.ndarray:
+    def derivative(t, v):
         return np.array([rate[min(int(np.floor(t * 20.0 + 1e-9)) + 1, len(rate) - 1)] - v[0] / 2.5])  # held from the sample before
 
     start = estimate["vy"][0]

@@ -1,7 +1,5 @@
 """Compilation that keeps a first training waiting is said beforehand, once, and what it compiles has the digits of every later run."""
 
-from __future__ import annotations
-
 import ast
 import os
 import subprocess
@@ -16,7 +14,7 @@ from vehest.estimators.kernels import planar_car
 from vehest.run.train import compiles_slowly
 
 
-def test_a_learned_filter_has_to_compile_until_its_code_is_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_learned_filter_has_to_compile_until_its_code_is_kept(tmp_path, monkeypatch):
     monkeypatch.setattr(planar_car, "_transition", SimpleNamespace(stats=SimpleNamespace(cache_path=str(tmp_path))))
     assert compiles_slowly("learned_ukf")
     assert not compiles_slowly("luenberger")
@@ -27,13 +25,13 @@ def test_a_learned_filter_has_to_compile_until_its_code_is_kept(tmp_path: Path, 
     assert not compiles_slowly("learned_ukf")
 
 
-def test_nothing_has_to_compile_where_compilation_is_off(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_nothing_has_to_compile_where_compilation_is_off(monkeypatch):
     monkeypatch.setattr(planar_car, "_transition", lambda: None)
     assert not compiles_slowly("learned_ukf")
 
 
 @pytest.mark.parametrize("kernels", ["networks", pytest.param("cars", marks=pytest.mark.slow)])
-def test_the_process_that_compiles_has_the_digits_of_those_that_read_the_cache(tmp_path: Path, kernels: str) -> None:
+def test_the_process_that_compiles_has_the_digits_of_those_that_read_the_cache(tmp_path, kernels):
     here = Path(__file__).parent
     environment = {**os.environ, "NUMBA_CACHE_DIR": str(tmp_path), "PYTHONPATH": os.pathsep.join([str(here), str(here.parent)])}
     command = [sys.executable, str(here / "digits.py"), kernels]
@@ -42,7 +40,7 @@ def test_the_process_that_compiles_has_the_digits_of_those_that_read_the_cache(t
     assert first == second
 
 
-def test_code_whose_sums_may_be_reordered_is_compiled_in_one_way_only() -> None:
+def test_code_whose_sums_may_be_reordered_is_compiled_in_one_way_only():
     """`fastmath` outside `kernels.compiling` would bring back a first run with digits of its own."""
     source = Path(vehest.__file__).parent
     decorated = [

@@ -1,7 +1,5 @@
 """The filter on Dugoff's tyres finds the tyres it was driven on, and follows the car with tyre forces and without."""
 
-from __future__ import annotations
-
 import sys
 from dataclasses import replace
 
@@ -10,7 +8,6 @@ import pytest
 
 from dugoff_drive import NOISE, TYRES, dugoff_drive
 from vehest.data.errors import ConfigurationError, DataError, MissingError
-from vehest.data.recording import Recording
 from vehest.estimators.base import FitData
 from vehest.estimators.cnn_ukf import CnnUkf, EndToEndSettings
 from vehest.estimators.dugoff_ukf import DugoffUkf
@@ -25,17 +22,17 @@ FORCES = {"force_factor": 1.5, "fy_front": 100.0, "fy_rear": 100.0}
 QUICK = IdentificationSettings(method="data", tyres_from="*", restarts=2, generations=40)
 
 
-def given(inputs: str = "full", **settings: object) -> DugoffUkf:
+def given(inputs="full", **settings):
     """A filter that knows the car it is on."""
     noise = LEVELS | (FORCES if inputs == "full" else {})
     return DugoffUkf.from_config({"inputs": inputs, "tyres": TYRES, "noise": noise, **settings})
 
 
-def changed(drive: Recording, channels: dict[str, np.ndarray], gappy: tuple[str, ...] = ()) -> Recording:
+def changed(drive, channels, gappy=()):
     return replace(drive, channels={**drive.channels, **channels}, gappy=frozenset(gappy))
 
 
-def error_of(estimator: DugoffUkf, drive: Recording) -> float:
+def error_of(estimator, drive):
     """Root mean square of the sideslip's error after a second [rad]."""
     estimate = estimator.estimate([drive.without_references()])[0]
     return float(np.sqrt(np.mean((estimate["sideslip"] - drive["sideslip_ref"])[100:] ** 2)))

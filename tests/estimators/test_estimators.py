@@ -1,7 +1,5 @@
 """Estimators: counts of the paper, one interface, online as in batch, files that execute nothing."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import fields
 from functools import cache

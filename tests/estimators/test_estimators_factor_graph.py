@@ -1,7 +1,5 @@
 """The factor graph against sparse least squares over its factors, and against a filter with the same noise."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np
@@ -11,35 +9,34 @@ from scipy.sparse.linalg import spsolve
 
 from single_track_drive import linear_drive, with_gaps
 from vehest.data.errors import ConfigurationError, DataError
-from vehest.data.recording import Recording
 from vehest.estimators.base import FitData
 from vehest.estimators.factor_graph import MEASURED, FactorGraph
 from vehest.estimators.registry import estimator_class
 from vehest.filters.gating import Gate
-from vehest.filters.gaussian import Filtered, Gaussian
+from vehest.filters.gaussian import Gaussian
 from vehest.filters.kalman_scan import kalman_scan
 from vehest.training.context import NoTraining
 
 GAPS = {"ay": slice(40, 60), "yaw_rate": slice(50, 70)}
 
 
-def factor_graph(**config) -> FactorGraph:
+def factor_graph(**config):
     estimator = estimator_class("factor_graph").from_config(config)
     assert isinstance(estimator, FactorGraph)
     return estimator
 
 
-def drive_with_gaps(seconds: float = 2.0) -> Recording:
+def drive_with_gaps(seconds=2.0):
     return with_gaps(linear_drive(seconds, seed=1)[0].without_references(), GAPS)
 
 
-def least_squares(estimator: FactorGraph, drive: Recording, first: int, last: int, start: np.ndarray, deviation: float) -> np.ndarray:
+def least_squares(estimator, drive, first, last, start, deviation):
     """States first … last by sparse least squares over the equations that factors stand for, (last - first + 1, 2)."""
     noise = estimator.settings.noise
     A, B, C, D = estimator.sampled_model(drive["vx"])
     entries, right = [], []
 
-    def equation(coefficients: dict[tuple[int, int], float], value: float, sigma: float) -> None:
+    def equation(coefficients, value, sigma):
         """Coefficients of state i of sample k."""
         entries.extend((len(right), 2 * (k - first) + i, weight / sigma) for (k, i), weight in coefficients.items())
         right.append(value / sigma)
@@ -60,12 +57,12 @@ def least_squares(estimator: FactorGraph, drive: Recording, first: int, last: in
     return spsolve(jacobian.T @ jacobian, jacobian.T @ np.array(right)).reshape(-1, 2)
 
 
-def filtered(estimator: FactorGraph, drive: Recording, gate: Gate | None = None) -> Filtered:
+def filtered(estimator, drive, gate=None):
     samples = drive.stack(estimator.channels)
     return kalman_scan(estimator.linear_model(samples), samples[:, MEASURED], Gaussian(np.zeros(2), 100.0**2 * np.eye(2)), gate)
 
 
-def states_of(estimate) -> np.ndarray:
+def states_of(estimate):
     return np.stack([estimate["sideslip"], estimate["yaw_rate"]], axis=1)
 
 

@@ -1,7 +1,5 @@
 """The Kalman filter over the single track: consistent on its own model, honest about where its noise levels come from."""
 
-from __future__ import annotations
-
 from dataclasses import asdict, replace
 
 import numpy as np
@@ -9,9 +7,7 @@ import pytest
 from scipy.stats import chi2
 
 from single_track_drive import NOISE, linear_drive, with_gaps
-from vehest.constants import FloatArray
 from vehest.data.errors import ConfigurationError, DataError
-from vehest.data.recording import Recording
 from vehest.estimators.base import FitData
 from vehest.estimators.kalman import KalmanFilter
 from vehest.estimators.registry import estimator_class
@@ -22,7 +18,7 @@ from vehest.vehicle.parameters import FERRARI_250LM
 GIVEN = {"noise": {**NOISE, "steer_factor": 1.0}}
 
 
-def kalman(**config) -> KalmanFilter:
+def kalman(**config):
     estimator = estimator_class("kalman").from_config(config)
     assert isinstance(estimator, KalmanFilter)
     return estimator
@@ -154,7 +150,7 @@ def test_settings_that_make_no_sense_are_refused(config, message):
         kalman(**config)
 
 
-def with_planted_offsets(seed: int, ay: float, steer: float) -> tuple[Recording, FloatArray]:
+def with_planted_offsets(seed, ay, steer):
     """A drive whose accelerometer and steering angle are off by constants that are drawn."""
     drive, states = linear_drive(4.0, seed=seed)
     generator = np.random.default_rng(1000 + seed)
@@ -162,7 +158,7 @@ def with_planted_offsets(seed: int, ay: float, steer: float) -> tuple[Recording,
     return replace(drive.without_references(), channels={**drive.without_references().channels, **shifted}), states
 
 
-def augmented(drive: Recording, ay: float, steer: float, seconds: float) -> tuple[FloatArray, FloatArray]:
+def augmented(drive, ay, steer, seconds):
     """β, r and two offsets filtered by the textbook's equations, all matrices written out: means (T, 4), covariances (T, 4, 4)."""
     A, B, C, D = kalman(**GIVEN).sampled_model(drive["vx"])
     kept = np.exp(-0.01 / seconds)

@@ -1,7 +1,5 @@
 """Filters whose tyres adapt: the compiled one against automatic differentiation, tyres found again, bad input survived."""
 
-from __future__ import annotations
-
 import importlib.util
 import time
 
@@ -16,7 +14,7 @@ from vehest.estimators.base import FitData
 from vehest.estimators.model_files import load_model, save_model
 from vehest.estimators.rational_ekf import BOXES, KINDS, LEVELS, RationalFilter
 from vehest.estimators.registry import estimator_class
-from vehest.filters.gaussian import Filtered, Gaussian
+from vehest.filters.gaussian import Gaussian
 from vehest.run.config import compose_config
 from vehest.training.context import FitContext
 from vehest.training.noise_tuning import NoiseTuningSettings
@@ -27,7 +25,7 @@ LEVEL = {"yaw_rate": 0.005, "ay": 0.15, "steer": 0.003, "tyres": 0.01}
 QUICK = NoiseTuningSettings(grid=1, max_evaluations=25)
 
 
-def rational(tyres: str = "rational_adaptive", **config) -> RationalFilter:
+def rational(tyres="rational_adaptive", **config):
     """A filter with everything given."""
     curves = {name: value for name, value in CURVES.items() if tyres != "linear" or name.startswith("c2")}
     estimator = estimator_class("rational_ekf").from_config({"tyres": tyres, "noise": LEVEL, "curves": curves, **config})
@@ -40,7 +38,7 @@ def drive():
     return rational_drive(40.0, seed=1)
 
 
-def readable(estimator: RationalFilter, samples: np.ndarray) -> Filtered[torch.Tensor]:
+def readable(estimator, samples):
     """The extended filter of the same model, with Jacobians from automatic differentiation, step by step."""
     first = Gaussian(*map(torch.as_tensor, estimator.first_gaussian(samples[0], {})))
     return extended_filter(rational_model(estimator), torch.as_tensor(samples[:, [0, 2]]), torch.as_tensor(samples[:, [1, 3]]), first)
@@ -52,7 +50,7 @@ def with_gaps(drive):
     return changed(drive, {"yaw_rate": yaw_rate, "ay": ay})
 
 
-def rmse(estimate, drive) -> float:
+def rmse(estimate, drive):
     return float(np.degrees(np.sqrt(np.mean((estimate["sideslip"] - drive["sideslip_ref"])[30:] ** 2))))
 
 

@@ -1,9 +1,5 @@
 """Recurrent networks over all samples so far: the loss, sequences, members, resuming, starting states, long drives."""
 
-from __future__ import annotations
-
-from pathlib import Path
-
 import numpy as np
 import pytest
 import torch
@@ -24,7 +20,7 @@ INPUTS = ["yaw_rate", "ax", "ay"]
 QUICK = SequenceSettings(PhaseSettings(max_epochs=3, learning_rate=1e-2), 60, 100, 20, batch_size=2)
 
 
-def _drive(seconds: float = 2.5, seed: int = 0, scale: float = 1.0) -> Recording:
+def _drive(seconds=2.5, seed=0, scale=1.0):
     """A planar drive at 100 Hz with a reference of the yaw rate."""
     drive = planar_drive(seconds, 100.0, seed, noise=0.02, name=f"drive {seed}")
     channels = {**drive.channels, "yaw_rate_ref": drive["yaw_rate"], "vy_ref": scale * drive["vy_ref"]}
@@ -34,13 +30,13 @@ def _drive(seconds: float = 2.5, seed: int = 0, scale: float = 1.0) -> Recording
 DATA = FitData([_drive(seed=1), _drive(0.5, seed=2)], [_drive(seed=3)])
 
 
-def _estimator(name: str, seed: int = 0, **config):
+def _estimator(name, seed=0, **config):
     estimator = estimator_class(name).from_config({"inputs": INPUTS, "n_states": 6} | config)
     estimator.seed(seed)
     return estimator
 
 
-def _weights(estimator) -> np.ndarray:
+def _weights(estimator):
     return np.concatenate([values.ravel() for values in estimator.weights().values()])
 
 
@@ -54,7 +50,7 @@ def _phase(estimator, training, train, validation):
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_validation_loss_is_the_weighted_squared_error_of_the_estimate_without_dropped_samples(name: str) -> None:
+def test_validation_loss_is_the_weighted_squared_error_of_the_estimate_without_dropped_samples(name):
     """Sequences of 100 samples from the start of the drive on, each estimated by itself through the public interface."""
     estimator = _estimator(name)
     record = estimator.fit(DATA, QUICK)
@@ -68,7 +64,7 @@ def test_validation_loss_is_the_weighted_squared_error_of_the_estimate_without_d
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_error_in_dropped_samples_teaches_nothing(name: str) -> None:
+def test_error_in_dropped_samples_teaches_nothing(name):
     """References that differ only where every possible sequence drops its samples lead to the same weights."""
     training = SequenceSettings(PhaseSettings(max_epochs=2), 250, 100, 20)
     whole = _drive(seed=1)
@@ -85,8 +81,8 @@ def test_error_in_dropped_samples_teaches_nothing(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_training_learns_a_lag_of_the_yaw_rate_that_holds_on_another_drive(name: str) -> None:
-    def lagging(seed: int) -> Recording:
+def test_training_learns_a_lag_of_the_yaw_rate_that_holds_on_another_drive(name):
+    def lagging(seed):
         noise = np.random.default_rng(seed).standard_normal((4, 600))
         measured = dict(zip(("vx", "yaw_rate", "ax", "ay"), noise, strict=True))
         return Recording("lag", "none", 100.0, 0.0, {**measured, "vy_ref": signal.lfilter([-0.5], [1.0, -0.8], noise[1])}, "simulated")
@@ -99,7 +95,7 @@ def test_training_learns_a_lag_of_the_yaw_rate_that_holds_on_another_drive(name:
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_members_train_as_if_alone_and_seeds_differ(name: str) -> None:
+def test_members_train_as_if_alone_and_seeds_differ(name):
     together = [_estimator(name, seed) for seed in (0, 1)]
     type(together[0]).fit_members(together, DATA, QUICK, FitContext())
     for seed, member in enumerate(together):
@@ -109,7 +105,7 @@ def test_members_train_as_if_alone_and_seeds_differ(name: str) -> None:
     assert not np.allclose(_weights(together[0]), _weights(together[1]))
 
 
-def test_training_that_is_stopped_goes_on_to_the_same_weights_dropout_included(tmp_path: Path) -> None:
+def test_training_that_is_stopped_goes_on_to_the_same_weights_dropout_included(tmp_path):
     whole = _estimator("velocity_gru", dropout=0.3)
     record = whole.fit(DATA, QUICK)
     questions = iter(range(100))
@@ -121,7 +117,7 @@ def test_training_that_is_stopped_goes_on_to_the_same_weights_dropout_included(t
     assert np.array_equal(_weights(whole), _weights(resumed))
 
 
-def test_sequences_start_elsewhere_each_epoch_and_stay_within_their_recordings() -> None:
+def test_sequences_start_elsewhere_each_epoch_and_stay_within_their_recordings():
     estimator = _estimator("velocity_gru")
     recordings = [_drive(1.7, 1), _drive(0.3, 2), _drive(0.9, 4)]
     phase = _phase(estimator, QUICK, recordings, recordings[:1])
@@ -139,7 +135,7 @@ def test_sequences_start_elsewhere_each_epoch_and_stay_within_their_recordings()
     assert firsts[0] != firsts[1] != firsts[2]
 
 
-def test_dropout_hides_its_share_of_the_hidden_state_and_keeps_the_mean() -> None:
+def test_dropout_hides_its_share_of_the_hidden_state_and_keeps_the_mean():
     estimator = _estimator("velocity_gru", dropout=0.25, n_states=64)
     phase = _phase(estimator, QUICK, DATA.train, DATA.train[:1])
     masks = torch.cat([batch.mask.reshape(-1) for batch in phase.batches(torch.Generator().manual_seed(0))])
@@ -147,7 +143,7 @@ def test_dropout_hides_its_share_of_the_hidden_state_and_keeps_the_mean() -> Non
     assert float(masks.mean()) == pytest.approx(1.0, abs=0.03)
 
 
-def test_truncated_training_takes_every_sample_of_every_drive_once_an_epoch() -> None:
+def test_truncated_training_takes_every_sample_of_every_drive_once_an_epoch():
     """Pieces of both drives, padded, their stretches in order: rows that count are the drives' rows, each once, in whatever order."""
     training = SequenceSettings(PhaseSettings(max_epochs=1), 60, 100, 0, validation_dropped_steps=20, truncate_steps=25, batch_size=3)
     estimator = _estimator("velocity_gru")
@@ -166,7 +162,7 @@ def test_truncated_training_takes_every_sample_of_every_drive_once_an_epoch() ->
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_truncated_training_carries_the_state_and_stops_gradients_there(name: str) -> None:
+def test_truncated_training_carries_the_state_and_stops_gradients_there(name):
     """Losses of stretches are those of the sequence as a whole; the second stretch's gradient is that of a start that is a constant."""
     training = SequenceSettings(PhaseSettings(max_epochs=1), 60, 100, 0, truncate_steps=30, batch_size=1)
     estimator = _estimator(name)
@@ -186,7 +182,7 @@ def test_truncated_training_carries_the_state_and_stops_gradients_there(name: st
         assert torch.allclose(one, other, rtol=1e-3, atol=1e-6)
 
 
-def test_mirrored_sequences_change_the_sign_of_what_a_mirror_turns() -> None:
+def test_mirrored_sequences_change_the_sign_of_what_a_mirror_turns():
     training = SequenceSettings(PhaseSettings(max_epochs=1), 60, 100, 20, mirrored=1.0)
     estimator = _estimator("velocity_lstm")
     drives = _drives(estimator, DATA.train[:1])
@@ -201,7 +197,7 @@ def test_mirrored_sequences_change_the_sign_of_what_a_mirror_turns() -> None:
     assert torch.equal(turned.targets[0, 0], expected)
 
 
-def test_lstm_starts_from_a_state_that_is_handed_over_and_the_gru_does_not() -> None:
+def test_lstm_starts_from_a_state_that_is_handed_over_and_the_gru_does_not():
     drive = _drive(seed=5).without_references()
     given = {"vx": 10.0, "vy": 3.0, "yaw_rate": 1.0}
     measured = {"vx": drive["vx"][0], "vy": 0.0, "yaw_rate": drive["yaw_rate"][0]}
@@ -215,7 +211,7 @@ def test_lstm_starts_from_a_state_that_is_handed_over_and_the_gru_does_not() -> 
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_long_drives_are_estimated_piece_by_piece_to_the_same_numbers(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_long_drives_are_estimated_piece_by_piece_to_the_same_numbers(name, monkeypatch):
     estimator = _estimator(name)
     estimator.fit(DATA, SequenceSettings(PhaseSettings(max_epochs=1), 60, 100, 20, dtype="float64"))
     drive = _drive(seed=5).without_references()
@@ -226,7 +222,7 @@ def test_long_drives_are_estimated_piece_by_piece_to_the_same_numbers(name: str,
         assert np.abs(whole[quantity] - pieces[quantity]).max() < 1e-12
 
 
-def test_lstm_follows_its_equations() -> None:
+def test_lstm_follows_its_equations():
     """h, c by the gates written out; then y⁺ = W₂ relu(W₁ [h⁺, y] + b₁) + b₂ on standardised quantities, in float64."""
     estimator = _estimator("velocity_lstm", n_dense=5)
     estimator.fit(DATA, SequenceSettings(PhaseSettings(max_epochs=1), 60, 100, 20, dtype="float64"))
@@ -247,12 +243,12 @@ def test_lstm_follows_its_equations() -> None:
     assert np.abs(np.stack([estimate[q] for q in ("vx", "vy", "yaw_rate")], axis=1) - np.array(expected)).max() < 1e-12
 
 
-def test_gru_of_the_paper_has_its_sizes() -> None:
+def test_gru_of_the_paper_has_its_sizes():
     assert estimator_class("velocity_gru").from_config({}).n_parameters == 3 * 64 * (6 + 64 + 2) + 3 * 65
     assert estimator_class("velocity_lstm").from_config({}).n_parameters == 4 * 64 * (6 + 64 + 2) + 64 * 68 + 3 * 65
 
 
-def test_inputs_stay_apart_from_what_is_read_for_the_sideslip_only() -> None:
+def test_inputs_stay_apart_from_what_is_read_for_the_sideslip_only():
     estimator = _estimator("velocity_gru")
     estimator.fit(DATA, QUICK)
     drive = _drive(seed=5).without_references()
@@ -273,12 +269,12 @@ def test_inputs_stay_apart_from_what_is_read_for_the_sideslip_only() -> None:
         ({"negative_slope": 0.0}, "negative_slope must lie between 0 and 1"),
     ],
 )
-def test_settings_that_make_no_sense_are_refused(config: dict[str, object], message: str) -> None:
+def test_settings_that_make_no_sense_are_refused(config, message):
     with pytest.raises(ConfigurationError, match=message):
         estimator_class("velocity_gru").from_config(config)
 
 
-def test_recordings_too_short_or_with_gaps_are_one_clear_error() -> None:
+def test_recordings_too_short_or_with_gaps_are_one_clear_error():
     with pytest.raises(
         DataError, match=r"sequence_steps is 300, but no training recording is as long: 'drive 1' 250, 'drive 2' 50; lower it"
     ):

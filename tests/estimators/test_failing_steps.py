@@ -1,9 +1,6 @@
 """A step that raises leaves its stepper as it was: whoever goes on gets what he would have got without it."""
 
-from __future__ import annotations
-
 import math
-from collections.abc import Callable
 from functools import cache
 from itertools import product
 
@@ -15,10 +12,9 @@ from every_estimator import fitted
 from single_track_drive import linear_drive
 from small_car_drive import small_car_drive
 from vehest.data.errors import DataError
-from vehest.estimators.base import Estimator
 from vehest.estimators.registry import estimator_class, estimator_names
 
-SETTINGS: dict[str, dict[str, object]] = {
+SETTINGS = {
     "data_sheet": {"wheelbase": 2.7},
     "ksnn": {"window": 5},
     "gru": {"window": 5},
@@ -35,7 +31,7 @@ OTHERS = [name for name in estimator_names() if name not in (*FILTERS, "ensemble
 known = cache(fitted)
 
 
-def ready(name: str) -> Estimator:
+def ready(name):
     """As it starts to learn, where that runs already."""
     if name in FITTED:
         return known(name)
@@ -44,25 +40,25 @@ def ready(name: str) -> Estimator:
     return made
 
 
-def rows(name: str) -> list[dict[str, float]]:
+def rows(name):
     recording = small_car_drive(2.0) if name.startswith("learned_ukf") else linear_drive(2.0)[0]
     return [{channel: float(recording[channel][k]) for channel in recording.channels} for k in range(60)]
 
 
-def missing(row: dict[str, float]) -> dict[str, float]:
+def missing(row):
     """Without what every method reads, or fails without."""
     return {name: value for name, value in row.items() if name not in ("ay", "vx", "steer")}
 
 
-def infinite(row: dict[str, float]) -> dict[str, float]:
+def infinite(row):
     return {**row, "ay": math.inf}
 
 
-def none(row: dict[str, float]) -> dict[str, float | None]:
+def none(row):
     return {**row, "yaw_rate": None, "vx": None}
 
 
-def motion(steps: list[dict[str, float]]) -> np.ndarray:
+def motion(steps):
     return np.array([step["vy"] for step in steps])
 
 
@@ -70,7 +66,7 @@ def motion(steps: list[dict[str, float]]) -> np.ndarray:
     ("name", "wrong"),
     [*product((*FILTERS, *OTHERS), (missing, none)), *product(FILTERS, (infinite,))],  # others take an infinite value
 )
-def test_who_goes_on_after_a_step_that_raised_gets_what_he_would_have_got(name: str, wrong: Callable[..., dict[str, float]]) -> None:
+def test_who_goes_on_after_a_step_that_raised_gets_what_he_would_have_got(name, wrong):
     made, samples = ready(name), rows(name)
     calm, disturbed = made.online(), made.online()
     expected = motion([calm.step(row) for row in samples])
@@ -78,6 +74,6 @@ def test_who_goes_on_after_a_step_that_raised_gets_what_he_would_have_got(name: 
     for k, row in enumerate(samples):
         if k in (0, 1, 20, 21, 40):
             with pytest.raises((DataError, TypeError)):
-                disturbed.step(wrong(row))  # type: ignore[arg-type]
+                disturbed.step(wrong(row))
         found.append(disturbed.step(row))
     assert np.array_equal(motion(found), expected, equal_nan=True)

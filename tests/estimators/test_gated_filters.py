@@ -1,8 +1,5 @@
 """Every filter with a gate: one spike does no harm, a jump of the truth is followed, online is batch, and nothing changes without it."""
 
-from __future__ import annotations
-
-from collections.abc import Callable
 from dataclasses import replace
 from functools import cache
 
@@ -15,18 +12,11 @@ from rational_drive import CURVES, rational_drive
 from single_track_drive import NOISE, linear_drive
 from small_car_drive import small_car_drive
 from vehest.data.errors import ConfigurationError
-from vehest.data.recording import Recording
-from vehest.estimators.base import Estimator
-from vehest.estimators.dugoff_ukf import PseudoMeasurement
 from vehest.estimators.registry import estimator_class
 
 SPIKE, JUMP = 6.0, 8.0  # s
-DUGOFF = {
-    "inputs": "imu",
-    "tyres": TYRES,
-    "noise": {"ay": 0.06, "yaw_rate": 0.002, "process_vy": 0.002, "process_yaw_rate": 0.002},
-}
-CONFIGS: dict[str, dict[str, object]] = {
+DUGOFF = {"inputs": "imu", "tyres": TYRES, "noise": {"ay": 0.06, "yaw_rate": 0.002, "process_vy": 0.002, "process_yaw_rate": 0.002}}
+CONFIGS = {
     "kalman": {"noise": {**NOISE, "steer_factor": 1.0}},
     "factor_graph": {"window": 0.2, "noise": {"measured_ay": 0.5}},
     "rational_ekf": {"tyres": "rational", "curves": CURVES, "noise": {"yaw_rate": 0.005, "ay": 0.15, "steer": 0.003}},
@@ -35,7 +25,7 @@ CONFIGS: dict[str, dict[str, object]] = {
     "learned_ukf": {"dynamics": "pacejka", "noise": "constant"},
     "learned_ukf_variant": {"dynamics": "pacejka", "noise": "constant", "correlated_noise": False},
 }
-DRIVES: dict[str, Callable[[int], Recording]] = {
+DRIVES = {
     "kalman": lambda seed: linear_drive(JUMP, seed=seed)[0],
     "factor_graph": lambda seed: linear_drive(JUMP, seed=seed)[0],
     "rational_ekf": lambda seed: rational_drive(JUMP, seed=seed),
@@ -47,28 +37,28 @@ DRIVES: dict[str, Callable[[int], Recording]] = {
 EVERY = pytest.mark.parametrize("name", CONFIGS)
 
 
-def estimator(name: str, gate: float | None = None) -> Estimator:
+def estimator(name, gate=None):
     """As it starts to learn, which is enough for filtering; weights are the same with a gate and without."""
     made = estimator_class(name).from_config({**CONFIGS[name], "gate": gate})
     made.seed(0)
     if name in ("ensemble_ukf", "cnn_ukf"):
-        network = made.network  # type: ignore[attr-defined]
+        network = made.network
         network.double().reset([torch.Generator().manual_seed(0)])
         with torch.no_grad():
             network.get_parameter("bias_3")[0, 1:] = torch.tensor([0.0, -6.0, -6.0])
     if name.startswith("learned_ukf"):
-        made.filter.reset(torch.Generator().manual_seed(0))  # type: ignore[attr-defined]
+        made.filter.reset(torch.Generator().manual_seed(0))
     return made
 
 
 @cache
-def drive(name: str) -> Recording:
+def drive(name):
     """Two drives one after the other, as if the car had jumped from the one motion into the other."""
     first, second = (DRIVES[name](seed).without_references() for seed in (1, 4))
     return replace(first, channels={channel: np.concatenate([values, second[channel]]) for channel, values in first.channels.items()})
 
 
-def spoilt(name: str, value: float) -> Recording:
+def spoilt(name, value):
     """The drive with one wild sample of ay."""
     own = drive(name)
     ay = own["ay"].copy()
@@ -76,13 +66,13 @@ def spoilt(name: str, value: float) -> Recording:
     return replace(own, channels={**own.channels, "ay": ay})
 
 
-def vy(made: Estimator, recording: Recording) -> np.ndarray:
+def vy(made, recording):
     return made.estimate([recording])[0]["vy"]
 
 
 @pytest.mark.parametrize("name", [name for name in CONFIGS if name != "cnn_ukf"])  # whose network sees the spike, too
 @pytest.mark.parametrize("size", [1e6, -1e3])
-def test_a_spike_is_as_good_as_a_sample_that_is_missing(name: str, size: float) -> None:
+def test_a_spike_is_as_good_as_a_sample_that_is_missing(name, size):
     gated, free = estimator(name, 6.0), estimator(name)
     at = round(SPIKE * drive(name).rate_hz)
     clean, spike = vy(gated, drive(name)), vy(gated, spoilt(name, size))
@@ -92,14 +82,14 @@ def test_a_spike_is_as_good_as_a_sample_that_is_missing(name: str, size: float) 
     assert not (believed <= 5.0 * harm).all(), "a free filter believes it"
 
 
-def test_a_wild_angle_of_a_network_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_wild_angle_of_a_network_is_refused(monkeypatch):
     made = estimator("cnn_ukf", 6.0)
-    own, at = made.pseudo_of, round(SPIKE * 100.0)  # type: ignore[attr-defined]
+    own, at = made.pseudo_of, round(SPIKE * 100.0)
     sure = lambda inputs: own(inputs)._replace(variance=np.full(len(inputs), 1e-4))  # noqa: E731
     monkeypatch.setattr(made, "pseudo_of", sure)
     clean = vy(made, drive("cnn_ukf"))
 
-    def wild(inputs: np.ndarray) -> PseudoMeasurement:
+    def wild(inputs):
         said = sure(inputs)
         angle = said.sideslip.copy()
         angle[at] += 1.0
@@ -112,7 +102,7 @@ def test_a_wild_angle_of_a_network_is_refused(monkeypatch: pytest.MonkeyPatch) -
 
 
 @EVERY
-def test_after_a_jump_of_the_truth_it_comes_back_to_what_it_would_say_without_a_gate(name: str) -> None:
+def test_after_a_jump_of_the_truth_it_comes_back_to_what_it_would_say_without_a_gate(name):
     gated, free = vy(estimator(name, 6.0), drive(name)), vy(estimator(name), drive(name))
     back = round((JUMP + 3.0) * drive(name).rate_hz)
     size = np.sqrt(np.mean(free[back:] ** 2))
@@ -120,12 +110,12 @@ def test_after_a_jump_of_the_truth_it_comes_back_to_what_it_would_say_without_a_
 
 
 @EVERY
-def test_a_gate_that_refuses_nothing_changes_no_bit(name: str) -> None:
+def test_a_gate_that_refuses_nothing_changes_no_bit(name):
     assert np.array_equal(vy(estimator(name), drive(name)), vy(estimator(name, 1e9), drive(name)))
 
 
 @EVERY
-def test_online_with_a_gate_is_batch_with_a_gate(name: str) -> None:
+def test_online_with_a_gate_is_batch_with_a_gate(name):
     recording, made = spoilt(name, 1e4), estimator(name, 4.0)
     batch, stepper = vy(made, recording), made.online()
     online = [stepper.step({channel: recording[channel][k] for channel in recording.channels})["vy"] for k in range(len(recording))]
@@ -136,21 +126,21 @@ def test_online_with_a_gate_is_batch_with_a_gate(name: str) -> None:
 
 
 @EVERY
-def test_a_variant_with_a_gate_is_called_another(name: str) -> None:
+def test_a_variant_with_a_gate_is_called_another(name):
     assert estimator(name, 5.0).variant.replace("_gate5", "") == estimator(name).variant != estimator(name, 5.0).variant
     assert "gated at 5 sigma" in estimator(name, 5.0).full_title
 
 
 @EVERY
-def test_a_gate_of_nothing_is_refused(name: str) -> None:
+def test_a_gate_of_nothing_is_refused(name):
     with pytest.raises(ConfigurationError, match=r"estimator\.gate must be positive"):
         estimator(name, 0.0)
 
 
-def test_a_gate_of_the_unscented_filter_on_rational_tyres_is_refused() -> None:
+def test_a_gate_of_the_unscented_filter_on_rational_tyres_is_refused():
     with pytest.raises(ConfigurationError, match=r"estimator\.gate is there for estimator\.filter=extended only"):
         estimator_class("rational_ekf").from_config({**CONFIGS["rational_ekf"], "filter": "unscented", "gate": 5.0})
 
 
-def test_a_learned_filter_is_trained_once_for_use_with_a_gate_and_without() -> None:
+def test_a_learned_filter_is_trained_once_for_use_with_a_gate_and_without():
     assert estimator("learned_ukf", 5.0).batch_key == estimator("learned_ukf").batch_key

@@ -1,7 +1,5 @@
 """The compiled recursions equal the plain PyTorch ones, and those equal something independent."""
 
-from __future__ import annotations
-
 import threading
 from types import SimpleNamespace
 
@@ -217,10 +215,10 @@ def test_observer_resets_below_the_threshold():
     assert (vx == 20.0).all()
 
 
-def test_a_group_of_jobs_keeps_matrix_products_on_one_thread(monkeypatch: pytest.MonkeyPatch) -> None:
-    seen: list[int] = []
+def test_a_group_of_jobs_keeps_matrix_products_on_one_thread(monkeypatch):
+    seen = []
 
-    def threads() -> list[int]:
+    def threads():
         return [pool["num_threads"] for pool in threadpool_info() if pool["user_api"] == "blas"]
 
     job = SimpleNamespace(plan=SimpleNamespace(key="", stage="train"))

@@ -1,7 +1,5 @@
 """The learned filter as an estimator: candidates, starts, dropouts, members, and what it refuses."""
 
-from __future__ import annotations
-
 from functools import cache
 
 import numpy as np
@@ -27,7 +25,7 @@ SENSORS = ("ax", "ay", "yaw_rate", "motor_speed", "steer", "motor_current")
 REFERENCES = {"vx": "vx_ref", "vy": "vy_ref", "yaw_rate": "yaw_rate_ref"}
 
 
-def quick(epochs: int = 1, one_step: int = 40, dtype: str = "float64", **changes) -> ThroughFilterSettings:
+def quick(epochs=1, one_step=40, dtype="float64", **changes):
     phases = {
         "one_step": PhaseSettings(learning_rate=1e-2, max_epochs=one_step, validate_every=one_step, schedule="cosine"),
         "through": PhaseSettings(learning_rate=1e-3, max_epochs=epochs),
@@ -37,18 +35,18 @@ def quick(epochs: int = 1, one_step: int = 40, dtype: str = "float64", **changes
     return ThroughFilterSettings(**phases, **sizes | changes)
 
 
-def data() -> FitData:
+def data():
     return FitData([small_car_drive(4.0, 0), small_car_drive(4.0, 1)], [small_car_drive(4.0, 2)])
 
 
-def estimator(seed: int = 0, **config) -> LearnedUkf:
+def estimator(seed=0, **config):
     made = LearnedUkf.from_config({"width": 16} | config)
     made.seed(seed)
     return made
 
 
 @cache
-def trained(dtype: str = "float64") -> LearnedUkf:
+def trained(dtype="float64"):
     """NNTF_UH, trained for a moment; tests leave it as it is."""
     made = estimator()
     drives = FitData([small_car_drive(8.0, seed) for seed in (10, 11, 12)], [small_car_drive(4.0, 2)])
@@ -56,11 +54,11 @@ def trained(dtype: str = "float64") -> LearnedUkf:
     return made
 
 
-def drive(seed: int = 3, seconds: float = 6.0) -> Recording:
+def drive(seed=3, seconds=6.0):
     return small_car_drive(seconds, seed).without_references()
 
 
-def with_gaps(recording: Recording, gaps: dict[str, slice]) -> Recording:
+def with_gaps(recording, gaps):
     channels = dict(recording.channels)
     for name, samples in gaps.items():
         channels[name] = channels[name].copy()
@@ -68,7 +66,7 @@ def with_gaps(recording: Recording, gaps: dict[str, slice]) -> Recording:
     return Recording(recording.id, recording.vehicle, recording.rate_hz, recording.start_time, channels, "simulated", frozenset(gaps))
 
 
-def online(made: LearnedUkf, recording: Recording) -> dict[str, np.ndarray]:
+def online(made, recording):
     stepper = made.online()
     names = (*SENSORS, "vx")
     rows = [stepper.step({name: float(recording[name][k]) for name in names}) for k in range(len(recording))]
@@ -78,7 +76,7 @@ def online(made: LearnedUkf, recording: Recording) -> dict[str, np.ndarray]:
 # Candidates
 
 
-def test_variants_are_called_as_in_the_paper() -> None:
+def test_variants_are_called_as_in_the_paper():
     cases = {
         "pc": {"dynamics": "pacejka", "noise": "constant", "through_filter": False},
         "pcr": {"dynamics": "residual", "noise": "constant", "through_filter": False},
@@ -93,7 +91,7 @@ def test_variants_are_called_as_in_the_paper() -> None:
 
 
 @pytest.mark.parametrize("dynamics", SHORT)
-def test_every_candidate_learns_and_estimates_with_a_covariance(dynamics: str) -> None:
+def test_every_candidate_learns_and_estimates_with_a_covariance(dynamics):
     made = estimator(
         dynamics=dynamics, noise="constant" if dynamics == "pacejka" else "state_dependent", through_filter=dynamics != "residual"
     )
@@ -110,7 +108,7 @@ def test_every_candidate_learns_and_estimates_with_a_covariance(dynamics: str) -
     assert all(np.isfinite(estimate[name]).all() for name in ("vx", "vy", "yaw_rate", "rim_speed", "friction", "sideslip", "nis"))
 
 
-def test_after_a_moment_of_training_it_estimates_a_drive_that_it_has_not_seen() -> None:
+def test_after_a_moment_of_training_it_estimates_a_drive_that_it_has_not_seen():
     """A sliding car's lateral velocity to less than half of its deviation, which a filter that calls it zero does not reach."""
     recording = small_car_drive(6.0, 3)
     start = {name: float(recording[reference][0]) for name, reference in REFERENCES.items()}
@@ -124,7 +122,7 @@ def test_after_a_moment_of_training_it_estimates_a_drive_that_it_has_not_seen() 
 
 
 @pytest.mark.parametrize(("dtype", "tolerance"), [("float64", 1e-9), ("float32", 1e-4)])
-def test_online_agrees_with_batch_also_where_sensors_fail(dtype: str, tolerance: float) -> None:
+def test_online_agrees_with_batch_also_where_sensors_fail(dtype, tolerance):
     recording = with_gaps(drive(seconds=2.0), {"ay": slice(40, 60), "steer": slice(50, 55), "motor_speed": slice(100, 120)})
     batch = trained(dtype).estimate([recording])[0]
     step_by_step = online(trained(dtype), recording)
@@ -132,7 +130,7 @@ def test_online_agrees_with_batch_also_where_sensors_fail(dtype: str, tolerance:
         assert np.abs(step_by_step[name] - batch[name]).max() <= tolerance, name
 
 
-def test_recordings_together_are_what_they_are_alone() -> None:
+def test_recordings_together_are_what_they_are_alone():
     drives = [drive(3, 2.0), drive(4, 1.0), drive(5, 2.0)]
     together = trained().estimate(drives)
     for one, own in zip(drives, together, strict=True):
@@ -143,7 +141,7 @@ def test_recordings_together_are_what_they_are_alone() -> None:
 # Starts
 
 
-def test_it_starts_from_a_state_that_is_handed_over_and_forgets_it() -> None:
+def test_it_starts_from_a_state_that_is_handed_over_and_forgets_it():
     recording = drive()
     free, given = (trained().estimate([recording], state)[0] for state in (None, {"vx": 2.5, "vy": 0.4, "yaw_rate": 0.5}))
     assert abs(given["vy"][0] - 0.4) < 0.1 < abs(free["vy"][0] - 0.4)
@@ -151,7 +149,7 @@ def test_it_starts_from_a_state_that_is_handed_over_and_forgets_it() -> None:
     assert abs(given["vy"][-1] - free["vy"][-1]) < 0.02
 
 
-def test_members_that_differ_in_the_start_of_friction_share_their_training() -> None:
+def test_members_that_differ_in_the_start_of_friction_share_their_training():
     one, other, third = estimator(), estimator(start_friction=0.4), estimator(repair=False)
     assert one.batch_key == other.batch_key == third.batch_key != estimator(noise="constant").batch_key
     told = []
@@ -167,7 +165,7 @@ def test_members_that_differ_in_the_start_of_friction_share_their_training() -> 
     assert (one.filter.repair, third.filter.repair) == (True, False)
 
 
-def test_seeds_differ_and_a_seed_gives_the_same_numbers_again() -> None:
+def test_seeds_differ_and_a_seed_gives_the_same_numbers_again():
     short = FitData([small_car_drive(1.2, 0)], [small_car_drive(1.2, 2)])
     made = [estimator(seed) for seed in (0, 0, 1)]
     for one in made:
@@ -181,7 +179,7 @@ def test_seeds_differ_and_a_seed_gives_the_same_numbers_again() -> None:
 
 
 @pytest.mark.parametrize("sensor", SENSORS)
-def test_half_a_second_without_a_sensor_stays_finite_and_is_forgotten(sensor: str) -> None:
+def test_half_a_second_without_a_sensor_stays_finite_and_is_forgotten(sensor):
     whole = drive()
     estimate, undisturbed = (trained().estimate([recording])[0] for recording in (with_gaps(whole, {sensor: slice(200, 250)}), whole))
     for name in ("vx", "vy", "yaw_rate", "rim_speed", "friction", "sideslip"):
@@ -193,7 +191,7 @@ def test_half_a_second_without_a_sensor_stays_finite_and_is_forgotten(sensor: st
         assert np.array_equal(estimate["nis_dof"][[199, 200, 249, 250]], [4, 3, 3, 4])
 
 
-def noise_drive(seconds: float, seed: int = 0) -> Recording:
+def noise_drive(seconds, seed=0):
     """Nothing but noise, with the deviations and worse of a wild drive."""
     generator = np.random.default_rng(seed)
     scales = {"ax": 6.0, "ay": 6.0, "yaw_rate": 3.0, "motor_speed": 60.0, "steer": 0.3, "motor_current": 15.0}
@@ -202,7 +200,7 @@ def noise_drive(seconds: float, seed: int = 0) -> Recording:
     return Recording("noise", "none", 100.0, 0.0, channels | {"vx": 0.05 * channels["motor_speed"]}, "simulated")
 
 
-def assert_finite_and_possible(estimate) -> None:
+def assert_finite_and_possible(estimate):
     for name in ("vx", "vy", "yaw_rate", "rim_speed", "friction"):
         assert np.isfinite(estimate[name]).all(), name
     assert np.isfinite(estimate.covariance).all()
@@ -211,20 +209,20 @@ def assert_finite_and_possible(estimate) -> None:
 
 
 @pytest.mark.parametrize("dtype", ["float64", "float32"])
-def test_pure_noise_stays_finite_and_within_what_is_possible(dtype: str) -> None:
+def test_pure_noise_stays_finite_and_within_what_is_possible(dtype):
     assert_finite_and_possible(trained(dtype).estimate([noise_drive(20.0)])[0])
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("dynamics", SHORT)
-def test_ten_minutes_of_pure_noise_stay_finite(dynamics: str) -> None:
+def test_ten_minutes_of_pure_noise_stay_finite(dynamics):
     made = estimator(dynamics=dynamics)
     made.fit(data(), quick(one_step=20, dtype="float32"))
     assert_finite_and_possible(made.estimate([noise_drive(600.0)])[0])
 
 
 @pytest.mark.slow
-def test_real_drives_with_dropouts_of_every_sensor_stay_finite(data_root) -> None:
+def test_real_drives_with_dropouts_of_every_sensor_stay_finite(data_root):
     """Half a second of each sensor in turn, and of all at once, in every recording of both tyres."""
     config = compose_config("ingest", ["dataset=f1tenth", f"root={data_root}", "output=unused"])
     recordings = {recording.id: recording for recording in open_source(config["dataset"]).recordings()}
@@ -241,12 +239,12 @@ def test_real_drives_with_dropouts_of_every_sensor_stay_finite(data_root) -> Non
 # What is refused
 
 
-def test_weights_of_another_width_are_refused() -> None:
+def test_weights_of_another_width_are_refused():
     with pytest.raises(DataError, match=r"do not fit its settings: 'dynamics\.network\.0\.bias'"):
         estimator(width=8).load_weights(trained().weights())
 
 
-def test_a_drive_without_what_it_learns_from_is_one_clear_error() -> None:
+def test_a_drive_without_what_it_learns_from_is_one_clear_error():
     missing = small_car_drive(1.2, 0).without_references()
     with pytest.raises(DataError, match="has no channel 'vx_ref', which estimator 'learned_ukf' learns from"):
         estimator().fit(FitData([missing], [missing]), quick())
@@ -263,12 +261,12 @@ def test_a_drive_without_what_it_learns_from_is_one_clear_error() -> None:
         ({"car": {"cg_to_rear_axle": 0.4}}, "less than the wheelbase"),
     ],
 )
-def test_settings_that_make_no_sense_are_refused(config: dict, message: str) -> None:
+def test_settings_that_make_no_sense_are_refused(config, message):
     with pytest.raises(ConfigurationError, match=message):
         LearnedUkf.from_config(config)
 
 
-def test_it_is_registered_and_counts_its_parameters() -> None:
+def test_it_is_registered_and_counts_its_parameters():
     """A network of 9, 64, 64, 4 for the tyres, nine numbers of the car, factors of the noise and of its dependence on the state."""
     made = estimator_class("learned_ukf").from_config({})
     assert made.settings == LearnedUkf.settings_type()
@@ -280,13 +278,13 @@ def test_it_is_registered_and_counts_its_parameters() -> None:
 # Diagonal noise and curvature
 
 
-def variant_of(seed: int = 0, **config) -> LearnedUkfVariant:
+def variant_of(seed=0, **config):
     made = LearnedUkfVariant.from_config({"width": 16} | config)
     made.seed(seed)
     return made
 
 
-def test_variant_without_its_options_is_the_learned_filter_to_the_bit() -> None:
+def test_variant_without_its_options_is_the_learned_filter_to_the_bit():
     one, other = estimator(), variant_of()
     for made in (one, other):
         made.fit(data(), quick(one_step=3))
@@ -298,7 +296,7 @@ def test_variant_without_its_options_is_the_learned_filter_to_the_bit() -> None:
 
 
 @pytest.mark.parametrize("noise", ["constant", "state_dependent"])
-def test_diagonal_noise_stays_diagonal_while_it_learns(noise: str) -> None:
+def test_diagonal_noise_stays_diagonal_while_it_learns(noise):
     full, made = estimator(noise=noise), variant_of(noise=noise, correlated_noise=False)
     for own in (full, made):
         own.fit(data(), quick(3, one_step=3))
@@ -320,7 +318,7 @@ def test_diagonal_noise_stays_diagonal_while_it_learns(noise: str) -> None:
     assert full.n_parameters - made.n_parameters == each * (10 + 6), "entries off the diagonals of 5 and 4 rows"
 
 
-def test_diagonal_noise_in_use_is_that_of_its_training() -> None:
+def test_diagonal_noise_in_use_is_that_of_its_training():
     """The compiled noise of filters at work against the module's own."""
     made = variant_of(correlated_noise=False)
     made.fit(data(), quick(2, one_step=3))
@@ -334,7 +332,7 @@ def test_diagonal_noise_in_use_is_that_of_its_training() -> None:
     np.testing.assert_allclose(process(states, np.zeros((4, 2))), of_process, rtol=1e-9, atol=0)
 
 
-def test_curvature_starts_at_pacejkas_curves_without_it_and_is_learnt() -> None:
+def test_curvature_starts_at_pacejkas_curves_without_it_and_is_learnt():
     plain = {"dynamics": "pacejka", "noise": "constant", "through_filter": False}
     one, other = estimator(**plain), variant_of(curvature=True, **plain)
     assert other.n_parameters == one.n_parameters + 3

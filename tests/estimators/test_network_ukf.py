@@ -1,9 +1,6 @@
 """Filters that take a network's word: how much it counts, online and in batch, gradients end to end, what is lost on the way."""
 
-from __future__ import annotations
-
 from dataclasses import fields, replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -50,7 +47,7 @@ TRAININGS = {
 BOTH = pytest.mark.parametrize("name", list(TRAININGS))
 
 
-def estimator_of(name: str, **config: object) -> NetworkUkf:
+def estimator_of(name, **config):
     own = {"members": 3} if name == "ensemble_ukf" else {}
     estimator = estimator_class(name).from_config({**GIVEN, **own, **config})
     estimator.seed(1)
@@ -58,7 +55,7 @@ def estimator_of(name: str, **config: object) -> NetworkUkf:
     return estimator
 
 
-def filter_alone(estimator: NetworkUkf) -> DugoffUkf:
+def filter_alone(estimator):
     """The same filter without its network."""
     own = {entry.name: getattr(estimator.settings, entry.name) for entry in fields(DugoffUkf.settings_type)}
     alone = DugoffUkf(DugoffUkf.settings_type(**own))
@@ -66,7 +63,7 @@ def filter_alone(estimator: NetworkUkf) -> DugoffUkf:
     return alone
 
 
-def end_to_end(batch_size: int = 4, dropout: float = 0.0) -> tuple[CnnUkf, EndToEnd]:
+def end_to_end(batch_size=4, dropout=0.0):
     """A network that is not trained yet, in double precision, and its training through the filter."""
     estimator = estimator_of("cnn_ukf", dropout=dropout)
     assert isinstance(estimator, CnnUkf)
@@ -79,14 +76,12 @@ def end_to_end(batch_size: int = 4, dropout: float = 0.0) -> tuple[CnnUkf, EndTo
     return estimator, EndToEnd(estimator, estimator.network.samples(*raw), DATA.train, training)
 
 
-def gradients_of(estimator: CnnUkf, loss: torch.Tensor) -> list[torch.Tensor]:
+def gradients_of(estimator, loss):
     return list(torch.autograd.grad(loss, list(estimator.network.parameters())))
 
 
 @pytest.mark.parametrize(("name", "inputs", "measured"), [("ensemble_ukf", "full", 5), ("cnn_ukf", "imu", 3)])
-def test_a_fitted_filter_with_a_network_runs_online_as_in_batch_and_from_its_file(
-    name: str, inputs: str, measured: int, tmp_path: Path
-) -> None:
+def test_a_fitted_filter_with_a_network_runs_online_as_in_batch_and_from_its_file(name, inputs, measured, tmp_path):
     estimator = estimator_of(name, inputs=inputs)
     record = estimator.fit(DATA, TRAININGS[name])
     assert np.isfinite(record.metrics["best_validation_loss"])
@@ -101,11 +96,11 @@ def test_a_fitted_filter_with_a_network_runs_online_as_in_batch_and_from_its_fil
     assert both[0]["nis_dof"][0] == measured
 
 
-def test_a_word_counts_as_much_as_its_variance_says() -> None:
+def test_a_word_counts_as_much_as_its_variance_says():
     estimator, drive = estimator_of("ensemble_ukf"), DATA.train[0]
     wrong = drive["sideslip_ref"] + 0.02
 
-    def filtered(variance: float) -> np.ndarray:
+    def filtered(variance):
         ((_, steps),) = estimator.filtered([drive], pseudo=[PseudoMeasurement(wrong, np.full(len(drive), variance))])
         return steps.filtered.mean[0, :, 0].numpy()
 
@@ -114,13 +109,13 @@ def test_a_word_counts_as_much_as_its_variance_says() -> None:
     np.testing.assert_allclose(filtered(1e6), alone, atol=1e-6)
 
 
-def test_the_ensembles_variance_is_scaled_by_the_papers_formula() -> None:
+def test_the_ensembles_variance_is_scaled_by_the_papers_formula():
     variance = np.array([1e-6, 4e-4])
     np.testing.assert_allclose(scaled_variance(variance, np.array([0.0, 1.0])), variance + LEAST_VARIANCE)
     np.testing.assert_allclose(scaled_variance(variance, np.array([-4.269, 0.7901])), 10**-4.269 * variance**0.7901 + LEAST_VARIANCE)
 
 
-def test_the_ensemble_says_the_mean_and_the_variance_of_its_networks() -> None:
+def test_the_ensemble_says_the_mean_and_the_variance_of_its_networks():
     inputs = DATA.validation[0].stack(estimator_of("ensemble_ukf").network_inputs)
     told = {}
     for kind in ("models", "mixture"):
@@ -136,7 +131,7 @@ def test_the_ensemble_says_the_mean_and_the_variance_of_its_networks() -> None:
     assert (told["mixture"].variance > told["models"].variance).all()
 
 
-def test_the_searched_scaling_makes_the_filter_better_than_the_variance_as_it_is() -> None:
+def test_the_searched_scaling_makes_the_filter_better_than_the_variance_as_it_is():
     """Eq. 11, on the validation recordings."""
     estimator = estimator_of("ensemble_ukf")
     search = IdentificationSettings(method="nelder_mead", grid=1, max_evaluations=10)
@@ -145,7 +140,7 @@ def test_the_searched_scaling_makes_the_filter_better_than_the_variance_as_it_is
     found = estimator.fit(DATA, training).metrics
     assert [found["scaling_p1"], found["scaling_p2"]] == estimator.scaling.tolist() != [0.0, 1.0]
 
-    def loss() -> float:
+    def loss():
         pseudo = estimator.pseudo_measurements(DATA.validation)
         return estimator.mean_squared_error(DATA.validation, search.skip_seconds, pseudo=pseudo)
 
@@ -154,7 +149,7 @@ def test_the_searched_scaling_makes_the_filter_better_than_the_variance_as_it_is
     assert found["best_validation_loss"] < loss()
 
 
-def test_the_loss_of_pre_training_is_that_of_the_formulas() -> None:
+def test_the_loss_of_pre_training_is_that_of_the_formulas():
     """Eqs. 5 and 6, with the distrust as a standard deviation."""
     estimator, _ = end_to_end()
     samples = estimator.network.samples(*learnt_samples(DATA.train, estimator.network_inputs, estimator.name))
@@ -169,7 +164,7 @@ def test_the_loss_of_pre_training_is_that_of_the_formulas() -> None:
     assert phase.loss(Draw(rows, torch.tensor([5]))).item() == pytest.approx(expected.item(), rel=1e-12)
 
 
-def test_the_loss_end_to_end_adds_the_mean_squared_errors_of_network_and_filter(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_loss_end_to_end_adds_the_mean_squared_errors_of_network_and_filter(monkeypatch):
     """Eq. 7, on a whole recording, with what the network says and with what the filter makes of it."""
     monkeypatch.setattr(cnn_ukf, "START", (KNOWN, KNOWN))  # as precise as a state that is handed over
     estimator, training = end_to_end()
@@ -185,7 +180,7 @@ def test_the_loss_end_to_end_adds_the_mean_squared_errors_of_network_and_filter(
     assert training.loss(batch).item() == pytest.approx(sum(errors), rel=1e-6)
 
 
-def test_gradients_end_to_end_are_those_of_automatic_differentiation() -> None:
+def test_gradients_end_to_end_are_those_of_automatic_differentiation():
     """Network, adaptive noises, filter and loss (Eq. 7), through a filter in readable torch."""
     estimator, training = end_to_end()
     batch = next(iter(training.batches(torch.Generator().manual_seed(2))))
@@ -203,7 +198,7 @@ def test_gradients_end_to_end_are_those_of_automatic_differentiation() -> None:
     assert found.item() > (batch.sideslip - said.sideslip).square().mean().item()  # the filter's error comes on top of the network's
 
 
-def test_a_sequence_that_is_lost_teaches_nothing_and_the_others_go_on() -> None:
+def test_a_sequence_that_is_lost_teaches_nothing_and_the_others_go_on():
     estimator, training = end_to_end()
     batch = next(iter(training.batches(torch.Generator().manual_seed(2))))
     rest = type(batch)(*(part[1:] if part.dim() and len(part) == 4 else part for part in batch))
@@ -216,7 +211,7 @@ def test_a_sequence_that_is_lost_teaches_nothing_and_the_others_go_on() -> None:
     assert training.lost == 1
 
 
-def test_a_gradient_that_is_not_finite_is_left_out_of_its_sequence_alone() -> None:
+def test_a_gradient_that_is_not_finite_is_left_out_of_its_sequence_alone():
     _, training = end_to_end()
     batch = next(iter(training.batches(torch.Generator().manual_seed(2))))
     gradient = torch.ones(4, 30, 4)
@@ -226,7 +221,7 @@ def test_a_gradient_that_is_not_finite_is_left_out_of_its_sequence_alone() -> No
     assert training.lost == 1
 
 
-def test_too_many_lost_sequences_stop_the_training_and_name_manoeuvre_and_step() -> None:
+def test_too_many_lost_sequences_stop_the_training_and_name_manoeuvre_and_step():
     _, training = end_to_end()
     firsts = torch.tensor([30, 830, 60, 100])
     batch = training.cut(firsts, torch.tensor([5]))
@@ -236,7 +231,7 @@ def test_too_many_lost_sequences_stop_the_training_and_name_manoeuvre_and_step()
     assert training.place(830) == "0.30 s of recording 'second'"
 
 
-def test_pre_training_starts_process_noise_where_the_filter_has_it() -> None:
+def test_pre_training_starts_process_noise_where_the_filter_has_it():
     estimator = estimator_of("cnn_ukf")
     stopping = iter([False])
     estimator.fit(DATA, TRAININGS["cnn_ukf"], FitContext(should_stop=lambda: next(stopping, True)))  # before its first step
@@ -248,7 +243,7 @@ def test_pre_training_starts_process_noise_where_the_filter_has_it() -> None:
 
 
 @BOTH
-def test_a_stopped_training_goes_on_to_the_same_weights(name: str, tmp_path: Path) -> None:
+def test_a_stopped_training_goes_on_to_the_same_weights(name, tmp_path):
     whole = estimator_of(name)
     whole.fit(DATA, TRAININGS[name])
     for answers in (iter([False] * 9), iter([False] * 10_000)):
@@ -259,7 +254,7 @@ def test_a_stopped_training_goes_on_to_the_same_weights(name: str, tmp_path: Pat
         assert np.array_equal(values, estimator.weights()[key]), key
 
 
-def test_what_makes_no_sense_is_said() -> None:
+def test_what_makes_no_sense_is_said():
     for name, config in (("ensemble_ukf", {"members": 1}), ("ensemble_ukf", {"variance": "all"}), ("cnn_ukf", {"hidden": [0, 3]})):
         with pytest.raises(ConfigurationError, match="estimator"):
             estimator_of(name, **config)
@@ -274,7 +269,7 @@ def test_what_makes_no_sense_is_said() -> None:
     ("away", "held"),
     [("pseudo_measurement", [cnn_ukf.DISTRUST]), ("adaptive_distrust", [cnn_ukf.DISTRUST]), ("adaptive_process", cnn_ukf.PROCESS)],
 )
-def test_what_is_taken_away_is_the_same_at_every_sample(away: str, held: list[int]) -> None:
+def test_what_is_taken_away_is_the_same_at_every_sample(away, held):
     estimator = estimator_of("cnn_ukf", **{away: False})
     assert isinstance(estimator, CnnUkf)
     estimator.fit(DATA, TRAININGS["cnn_ukf"])
@@ -301,7 +296,7 @@ def test_what_is_taken_away_is_the_same_at_every_sample(away: str, held: list[in
         )  # one value, but a learnt one
 
 
-def test_a_loss_in_degrees_is_the_same_in_another_unit() -> None:
+def test_a_loss_in_degrees_is_the_same_in_another_unit():
     _, own = end_to_end()
     batch = next(iter(own.batches(torch.Generator().manual_seed(0))))
     in_radians = float(own.loss(batch).detach())
@@ -309,7 +304,7 @@ def test_a_loss_in_degrees_is_the_same_in_another_unit() -> None:
     assert float(own.loss(batch).detach()) == pytest.approx(np.degrees(np.degrees(in_radians)), rel=1e-12)
 
 
-def test_one_recording_decides_less_where_recordings_count() -> None:
+def test_one_recording_decides_less_where_recordings_count():
     quiet, wild = (0.01 * 100, 100), (4.0 * 100, 100)
     assert error_over([quiet] * 9 + [wild], "samples") == pytest.approx(0.409)
     assert error_over([quiet] * 9 + [wild], "recordings") == pytest.approx(0.29**2)
@@ -334,6 +329,6 @@ def test_one_recording_decides_less_where_recordings_count() -> None:
         (IdentificationSettings, {"most_process_yaw_rate": 0.0}),
     ],
 )
-def test_settings_of_a_training_that_make_no_sense_are_refused(settings: type, wrong: dict[str, object]) -> None:
+def test_settings_of_a_training_that_make_no_sense_are_refused(settings, wrong):
     with pytest.raises(ConfigurationError, match=next(iter(wrong))):
         settings_from_config(settings, wrong, "training")

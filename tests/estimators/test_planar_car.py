@@ -1,17 +1,14 @@
 """Compiled planar cars are the readable ones, in values and in the gradients of everything that is learnt."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import torch
-from torch import Tensor
 
 from vehest.estimators.kernels.planar_car import CompiledPlanarCar, is_compilable
 from vehest.filters.gaussian import Gaussian
 from vehest.filters.sigma_points import symmetric_rule
 from vehest.filters.unscented_scan import TorchModel, moved, unscented_scan
-from vehest.vehicle.dynamics import Dynamics, NeuralCar, PacejkaCar, ResidualCar, TyreNetworkCar
+from vehest.vehicle.dynamics import NeuralCar, PacejkaCar, ResidualCar, TyreNetworkCar
 
 STEP = 0.01
 LOWER = [-1e9, -1e9, -1e9, -1e9, 0.05]
@@ -26,7 +23,7 @@ CARS = {
 }
 
 
-def scaled(car: TyreNetworkCar) -> TyreNetworkCar:
+def scaled(car):
     car.network.input_scale.copy_(torch.tensor(SIZES)[: len(car.network.input_scale)])
     car.network.output_scale.fill_(25.0)
     return car
@@ -35,27 +32,27 @@ def scaled(car: TyreNetworkCar) -> TyreNetworkCar:
 KINDS = pytest.mark.parametrize("kind", CARS)
 
 
-def a_car(kind: str = "NNTF", dtype: torch.dtype = torch.float64) -> Dynamics:
+def a_car(kind="NNTF", dtype=torch.float64):
     car = CARS[kind]()
     car.reset(torch.Generator().manual_seed(0))
     return car.to(dtype)
 
 
-def readable(car: Dynamics) -> TorchModel:
+def readable(car):
     return TorchModel(lambda x, u: car.transition(x, u, STEP), car.observation, list(car.parameters()), LOWER)
 
 
-def drawn(*shape: int, seed: int = 1) -> Tensor:
+def drawn(*shape, seed=1):
     return torch.randn(shape, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
 
 
-def driven(count: int) -> tuple[Tensor, Tensor]:
+def driven(count):
     """States from slow to fast and sliding, and inputs."""
     states = torch.tensor([2.5, 0.0, 0.0, 2.5, 0.6], dtype=torch.float64) + drawn(count, 5) * torch.tensor([0.6, 0.5, 1.5, 0.8, 0.1])
     return states, drawn(count, 2, seed=2) * torch.tensor([0.25, 6.0])
 
 
-def through_the_filter(car: Dynamics, compiled: bool, dtype: torch.dtype) -> tuple[Tensor, dict[str, Tensor]]:
+def through_the_filter(car, compiled, dtype):
     """Means of 25 sequences, more than a block of points holds, and the gradients of a random sum of them."""
     sequences, steps = 25, 12
     _, inputs = driven(sequences * steps)
@@ -73,7 +70,7 @@ def through_the_filter(car: Dynamics, compiled: bool, dtype: torch.dtype) -> tup
 
 
 @KINDS
-def test_compiled_points_move_and_are_observed_as_the_readable_ones(kind: str) -> None:
+def test_compiled_points_move_and_are_observed_as_the_readable_ones(kind):
     car = a_car(kind)
     points, inputs = driven(7 * 11)
     points, inputs = points.reshape(7, 11, 5).numpy(), inputs[:7].contiguous().numpy()
@@ -83,7 +80,7 @@ def test_compiled_points_move_and_are_observed_as_the_readable_ones(kind: str) -
 
 
 @KINDS
-def test_compiled_filter_has_the_values_and_all_gradients_of_the_readable_one(kind: str) -> None:
+def test_compiled_filter_has_the_values_and_all_gradients_of_the_readable_one(kind):
     car = a_car(kind)
     (known, gradients), (mean, own) = (through_the_filter(car, compiled, torch.float64) for compiled in (False, True))
     assert torch.allclose(mean, known, rtol=0, atol=1e-10)
@@ -93,7 +90,7 @@ def test_compiled_filter_has_the_values_and_all_gradients_of_the_readable_one(ki
         assert float(gradient.abs().max()) > 0, name
 
 
-def test_in_single_precision_it_agrees_to_a_ten_thousandth() -> None:
+def test_in_single_precision_it_agrees_to_a_ten_thousandth():
     car = a_car(dtype=torch.float32)
     mean, own = through_the_filter(car, True, torch.float32)
     known, gradients = through_the_filter(car.double(), False, torch.float64)
@@ -102,7 +99,7 @@ def test_in_single_precision_it_agrees_to_a_ten_thousandth() -> None:
         assert float((own[name].double() - gradient).norm() / gradient.norm()) < 1e-3, name
 
 
-def test_in_single_precision_gradients_survive_a_crawl_where_slips_are_immense() -> None:
+def test_in_single_precision_gradients_survive_a_crawl_where_slips_are_immense():
     """At 5 cm/s and sliding: squashed values have reached their ends, and what rounding leaves of their slopes must not count."""
     car = a_car("NNTF in SI units")
     states = torch.tensor([0.05, 1.5, -2.5, 3.0, 0.4], dtype=torch.float64) + drawn(200, 5) * torch.tensor([0.004, 1.0, 0.5, 0.3, 0.05])
@@ -116,13 +113,13 @@ def test_in_single_precision_gradients_survive_a_crawl_where_slips_are_immense()
     assert np.abs(slopes[1] - slopes[0]).max() < 1e-3 * np.abs(slopes[0]).max()
 
 
-def test_gradients_are_those_of_finite_differences_along_a_direction() -> None:
+def test_gradients_are_those_of_finite_differences_along_a_direction():
     """Of a step of the car alone, in all parameters at once."""
     car = a_car()
     states, inputs = driven(30)
     ways = [0.1 * drawn(*p.shape, seed=k) for k, p in enumerate(car.parameters())]
 
-    def value(shift: float) -> Tensor:
+    def value(shift):
         with torch.no_grad():
             for parameter, way in zip(car.parameters(), ways, strict=True):
                 parameter += shift * way
@@ -137,7 +134,7 @@ def test_gradients_are_those_of_finite_differences_along_a_direction() -> None:
     assert slope == pytest.approx(float((value(1e-5) - value(-1e-5)).detach()) / 2e-5, rel=1e-6)
 
 
-def test_a_car_with_nothing_to_learn_has_no_gradients_and_the_same_values() -> None:
+def test_a_car_with_nothing_to_learn_has_no_gradients_and_the_same_values():
     car = a_car()
     states, inputs = driven(5)
     learning = moved(CompiledPlanarCar(car, STEP, LOWER, torch.float64), states, inputs)
@@ -147,7 +144,7 @@ def test_a_car_with_nothing_to_learn_has_no_gradients_and_the_same_values() -> N
     assert torch.equal(moved(frozen, states, inputs), learning.detach())
 
 
-def test_other_cars_are_refused() -> None:
+def test_other_cars_are_refused():
     for car in (TyreNetworkCar(hidden=(4, 4, 4)), NeuralCar(hidden=(4,)), PacejkaCar(with_curvature=True)):
         assert not is_compilable(car)
         with pytest.raises(ValueError, match=f"no compiled code for this {type(car).__name__}"):

@@ -1,7 +1,5 @@
 """What has to come out on the real recording of the Ferrari 250 LM; skipped where it is not at hand."""
 
-from __future__ import annotations
-
 import json
 import sys
 

@@ -1,13 +1,8 @@
 """Networks over single samples: compiled layers, masks of dropout, members that do not touch each other, and the feed-forward network."""
 
-from __future__ import annotations
-
-from pathlib import Path
-
 import numpy as np
 import pytest
 import torch
-from torch import Tensor
 
 from dugoff_drive import dugoff_drive
 from vehest.data.errors import ConfigurationError, DataError
@@ -26,7 +21,7 @@ LONGER = SampleSettings(PhaseSettings(learning_rate=5e-3, max_epochs=25), batch_
 SEEDS = torch.tensor([7, 8, 9])
 
 
-def loaded_drive(seconds: float = 8.0, seed: int = 0, name: str = "drive") -> Recording:
+def loaded_drive(seconds=8.0, seed=0, name="drive"):
     """A drive on Dugoff's tyres with the forces that it lacks: shared out evenly, or at rest."""
     drive = dugoff_drive(seconds, seed, name=name)
     channels = dict(drive.channels)
@@ -38,7 +33,7 @@ def loaded_drive(seconds: float = 8.0, seed: int = 0, name: str = "drive") -> Re
 DATA = FitData([loaded_drive(seed=1), loaded_drive(4.0, seed=2)], [loaded_drive(4.0, seed=3)])
 
 
-def network(outputs: int, members: int = 3) -> SampleNetwork:
+def network(outputs, members=3):
     made = SampleNetwork(5, (11, 6), outputs, members).double()
     made.reset([torch.Generator().manual_seed(member) for member in range(members)])
     with torch.no_grad():
@@ -48,7 +43,7 @@ def network(outputs: int, members: int = 3) -> SampleNetwork:
     return made
 
 
-def readable(inputs: Tensor, parameters: list[Tensor], member: int, dropout: float) -> Tensor:
+def readable(inputs, parameters, member, dropout):
     """One member's outputs in torch, with the masks that its seed stands for."""
     hidden, scale = inputs, 256.0 / (256.0 - round(256 * dropout))
     for layer in (0, 1):
@@ -58,7 +53,7 @@ def readable(inputs: Tensor, parameters: list[Tensor], member: int, dropout: flo
     return hidden @ parameters[4][member] + parameters[5][member]
 
 
-def samples(count: int = 40) -> tuple[Tensor, Tensor, Tensor]:
+def samples(count=40):
     """Inputs, targets, and rows that three members see."""
     generator = torch.Generator().manual_seed(3)
     table, targets = (torch.randn(shape, generator=generator, dtype=torch.float64) for shape in ((count, 5), (count,)))
@@ -66,7 +61,7 @@ def samples(count: int = 40) -> tuple[Tensor, Tensor, Tensor]:
 
 
 @pytest.mark.parametrize("dropout", [0.0, 0.4])
-def test_compiled_layers_are_the_readable_ones_with_their_gradients(dropout: float) -> None:
+def test_compiled_layers_are_the_readable_ones_with_their_gradients(dropout):
     table, _, rows = samples()
     parameters = list(network(2).parameters())
     weights = torch.randn(3, 20, 2, generator=torch.Generator().manual_seed(5), dtype=torch.float64)
@@ -78,7 +73,7 @@ def test_compiled_layers_are_the_readable_ones_with_their_gradients(dropout: flo
         torch.testing.assert_close(own, other, rtol=1e-10, atol=1e-12)
 
 
-def test_losses_and_their_gradients_are_those_of_the_formulas() -> None:
+def test_losses_and_their_gradients_are_those_of_the_formulas():
     table, targets, rows = samples()
     for outputs, criterion in ((1, squared_error), (2, gaussian_likelihood)):
         parameters = list(network(outputs).parameters())
@@ -98,7 +93,7 @@ def test_losses_and_their_gradients_are_those_of_the_formulas() -> None:
             torch.testing.assert_close(own, other, rtol=1e-9, atol=1e-12)
 
 
-def test_a_member_learns_the_same_alone() -> None:
+def test_a_member_learns_the_same_alone():
     table, targets, rows = samples()
     together = list(network(1).parameters())
     alone = [parameter[1:2].detach().clone().requires_grad_() for parameter in together]
@@ -110,7 +105,7 @@ def test_a_member_learns_the_same_alone() -> None:
         assert torch.equal(both.grad[1:2], own.grad)
 
 
-def test_masks_hide_their_share_and_follow_from_the_seed() -> None:
+def test_masks_hide_their_share_and_follow_from_the_seed():
     mask = kept(1, 0, (400, 250), 0.2)
     assert abs(mask.mean() - 205 / 256) < 3 * np.sqrt(0.2 * 0.8 / mask.size)
     assert np.array_equal(mask, kept(1, 0, (400, 250), 0.2))
@@ -118,7 +113,7 @@ def test_masks_hide_their_share_and_follow_from_the_seed() -> None:
         assert (mask == other).mean() == pytest.approx(0.8**2 + 0.2**2, abs=0.01)
 
 
-def test_inputs_of_training_lie_between_zero_and_one_and_constant_ones_say_nothing() -> None:
+def test_inputs_of_training_lie_between_zero_and_one_and_constant_ones_say_nothing():
     made = SampleNetwork(2, (4, 3), 1).double()
     made.scale(np.array([[-2.0, 5.0], [6.0, 5.0]]), np.array([0.3, -0.4]))
     seen = made.scaled(torch.tensor([[-2.0, 5.0], [6.0, 5.0], [10.0, 7.0]], dtype=torch.float64))
@@ -126,14 +121,14 @@ def test_inputs_of_training_lie_between_zero_and_one_and_constant_ones_say_nothi
     assert float(made.unit) == pytest.approx(np.sqrt(0.125))
 
 
-def fitted(training: SampleSettings = QUICK, **config: object):  # type: ignore[no-untyped-def]
+def fitted(training=QUICK, **config):
     estimator = estimator_class("sideslip_ffnn").from_config({"hidden": [24, 12], "dropout": 0.05} | config)
     estimator.seed(1)
     return estimator, estimator.fit(DATA, training)
 
 
 @pytest.mark.parametrize("inputs", ["full", "imu"])
-def test_the_feed_forward_network_learns_and_runs_online_as_in_batch(inputs: str, tmp_path: Path) -> None:
+def test_the_feed_forward_network_learns_and_runs_online_as_in_batch(inputs, tmp_path):
     estimator, record = fitted(LONGER, inputs=inputs)
     assert estimator.channels == INPUTS[inputs]
     assert len(INPUTS["full"]) == 17
@@ -148,7 +143,7 @@ def test_the_feed_forward_network_learns_and_runs_online_as_in_batch(inputs: str
     np.testing.assert_allclose([step["vy"] for step in steps], estimate["vy"][:50], rtol=0, atol=1e-6)
 
 
-def test_a_stopped_training_goes_on_to_the_same_weights(tmp_path: Path) -> None:
+def test_a_stopped_training_goes_on_to_the_same_weights(tmp_path):
     whole, _ = fitted()
     halves = [iter([False] * 20), iter(())]
     for answers in halves:  # the first run is stopped within its third epoch
@@ -161,7 +156,7 @@ def test_a_stopped_training_goes_on_to_the_same_weights(tmp_path: Path) -> None:
         assert np.array_equal(values, estimator.weights()[name]), name
 
 
-def test_what_is_missing_or_makes_no_sense_is_said() -> None:
+def test_what_is_missing_or_makes_no_sense_is_said():
     drive = dugoff_drive(2.0)
     with pytest.raises(DataError, match=r"'fx_fl', which estimator 'sideslip_ffnn' learns from; set estimator.inputs=imu"):
         estimator_class("sideslip_ffnn").from_config({}).fit(FitData([drive], [drive]), QUICK)
@@ -170,7 +165,7 @@ def test_what_is_missing_or_makes_no_sense_is_said() -> None:
             estimator_class("sideslip_ffnn").from_config(config)
 
 
-def test_inputs_are_scaled_by_their_range_or_to_z_scores() -> None:
+def test_inputs_are_scaled_by_their_range_or_to_z_scores():
     inputs = np.column_stack([np.linspace(-3.0, 5.0, 50), np.full(50, 7.0)])
     network = SampleNetwork(2, (4, 3), 1).double()
     network.scale(inputs, np.ones(50))

@@ -1,7 +1,5 @@
 """The self-calibrating filter against a plain filter in NumPy, the network itself, and cars whose numbers are known."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Trainings that start from another model's weights."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 
@@ -19,7 +17,7 @@ def drives():
     return [planar_drive(30.0, 20.0, seed=seed) for seed in (1, 2)]
 
 
-def weights(model) -> np.ndarray:
+def weights(model):
     assert isinstance(model, WindowedEstimator)
     return np.concatenate([values.ravel() for values in model.weights().values()])
 

@@ -1,7 +1,5 @@
 """Fits of tyre curves against cars whose curves are known."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from functools import cache
 
@@ -18,7 +16,7 @@ CURVES = {"linear": np.array([[3.0e5], [4.0e5]]), "rational": np.array([[0.01286
 
 
 @cache
-def car(kind: str, seconds: float, rate_hz: float, size: float) -> dict[str, np.ndarray]:
+def car(kind, seconds, rate_hz, size):
     """What a single track with these curves does, integrated at 200 Hz."""
     every = round(200.0 / rate_hz)
     step = 1.0 / (every * rate_hz)
@@ -38,9 +36,7 @@ def car(kind: str, seconds: float, rate_hz: float, size: float) -> dict[str, np.
     return dict(zip(("yaw_rate", "ay", "steer", "sideslip_ref", "vx"), np.array(rows)[::every].T, strict=True))
 
 
-def drive(
-    kind: str = "rational", seed: int = 0, noise: float = 1.0, seconds: float = 100.0, rate_hz: float = 50.0, size: float = 1.0
-) -> Recording:
+def drive(kind="rational", seed=0, noise=1.0, seconds=100.0, rate_hz=50.0, size=1.0):
     """That car with noisy sensors."""
     generator = np.random.default_rng(seed)
     levels = {"yaw_rate": 0.002, "ay": 0.1, "steer": 0.001, "sideslip_ref": 0.001, "vx": 0.0}

@@ -1,7 +1,5 @@
 """Scores of bands against closed forms of a Gaussian, and coverage intervals against simulations."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np
@@ -25,7 +23,7 @@ UNIT = Quantity({"one": 1.0}, 0.01, tuple(GAUSSIAN.tolist()), (False,) * 4, 9.0)
 BANDS = Bands(("car",), ("mine",), (), ("two (all)",), "turn", 9, 100.0, ("vx",), 0, {}, UNIT, UNIT)
 
 
-def part_of(rng: np.random.Generator, seconds: float = 100.0, deviation: float = 0.1) -> Scored:
+def part_of(rng, seconds=100.0, deviation=0.1):
     """White Gaussian errors of v at 20 m/s, and true 90 % bands."""
     n = round(20.0 * seconds)
     vy, vx = rng.standard_normal(n), np.full(n, 20.0)

@@ -1,7 +1,5 @@
 """Covariances and innovations against the errors that they speak of."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np
@@ -16,7 +14,7 @@ from vehest.evaluation.metrics import Protocol, accuracy, score
 DRIVES = [linear_drive(60.0, seed=seed)[0] for seed in range(3)]
 
 
-def figures_of_kalman(factor: float) -> dict[str, float]:
+def figures_of_kalman(factor):
     """Metrics of a Kalman filter on drives of its own model, which believes noise to be ``factor`` times what it is."""
     noise = {name: factor * level for name, level in NOISE.items()} | {"steer_factor": 1.0}
     estimator = estimator_class("kalman").from_config({"noise": noise})

@@ -1,7 +1,5 @@
 """Floors of a drive against closed forms, the information form of the bound, filters at work, and planted noise."""
 
-from __future__ import annotations
-
 import math
 import os
 from pathlib import Path
@@ -36,7 +34,7 @@ PROTOCOL = Protocol(RATE, 2.0, 1.5)
 FERRARI = Path(os.environ.get("VEHEST_DATA", "")) / "revs" / "20140222_01_01_03_250lm"
 
 
-def noisy_reference(sigma: float, seconds: float = 400.0, ay_noise: float = 0.0, seed: int = 3) -> Recording:
+def noisy_reference(sigma, seconds=400.0, ay_noise=0.0, seed=3):
     """A drive that obeys planar kinematics, white noise on its reference and its accelerometer."""
     drive = planar_drive(seconds)
     generator = np.random.default_rng(seed)
@@ -46,7 +44,7 @@ def noisy_reference(sigma: float, seconds: float = 400.0, ay_noise: float = 0.0,
     return Recording("drive", "car", RATE, 0.0, channels, "simulated")
 
 
-def single_track_drive(seconds: float = 300.0, seed: int = 0) -> Recording:
+def single_track_drive(seconds=300.0, seed=0):
     """A car on its axles: v from yaw rate and the rear axle's slip, with slow errors; ax, ay with offset and noise; steering."""
     generator = np.random.default_rng(seed)
     n = round(seconds * RATE)
@@ -62,7 +60,7 @@ def single_track_drive(seconds: float = 300.0, seed: int = 0) -> Recording:
     return Recording("track", "car", RATE, 0.0, channels, "simulated")
 
 
-def markov(generator: np.random.Generator, n: int, deviation: float, time_constant: float) -> np.ndarray:
+def markov(generator, n, deviation, time_constant):
     decay = math.exp(-1.0 / (RATE * time_constant))
     values = np.empty(n)
     values[0] = deviation * generator.standard_normal()
@@ -130,7 +128,7 @@ def test_drive_of_few_samples_has_no_floor():
 # The bound: its recursion
 
 
-def random_model(steps: int, n: int = 4, m: int = 2, seed: int = 1) -> tuple[LinearModel, np.ndarray]:
+def random_model(steps, n=4, m=2, seed=1):
     generator = np.random.default_rng(seed)
     A = np.eye(n) * 0.95 + 0.1 * generator.standard_normal((steps, n, n))
     roots = [generator.standard_normal((size, size)) for size in (n, m, n)]

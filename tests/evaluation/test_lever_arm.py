@@ -1,7 +1,5 @@
 """The best lever arm against planted ones, and where it is asked for."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from scipy import optimize
@@ -15,7 +13,7 @@ RATE, N = 20.0, 400
 PROTOCOL = Protocol(rate_hz=RATE, skip_seconds=1.5)
 
 
-def drive(point: object = "unknown") -> Recording:
+def drive(point="unknown"):
     time = np.arange(N) / RATE
     yaw_rate = 0.8 * np.sin(0.9 * time) + 0.1
     channels = {"vx": 12.0 + np.sin(0.3 * time), "yaw_rate": yaw_rate, "vy_ref": 0.4 * np.cos(0.7 * time) - 0.3 * yaw_rate}
@@ -23,27 +21,27 @@ def drive(point: object = "unknown") -> Recording:
     return Recording("drive", "car", RATE, 0.0, channels, provenance=derived)
 
 
-def scored(recording: Recording, vy: np.ndarray) -> Scored:
+def scored(recording, vy):
     cut = recording.cut(PROTOCOL.skip_seconds, recording.end_time)
     vy = vy[-len(cut) :]
     sideslip, reference = np.arctan2(vy, cut["vx"]), np.arctan2(cut["vy_ref"], cut["vx"])
     return Scored(cut.time, vy, cut["vy_ref"], sideslip, reference, np.full(len(cut), np.nan))
 
 
-def figures(recording: Recording, vy: np.ndarray) -> dict[str, float]:
+def figures(recording, vy):
     span = Span("mine", "drive")
     return lever_arm_figures([scored(recording, vy)], [(recording, span)], PROTOCOL)
 
 
 @pytest.mark.parametrize("x", [-0.4, 0.0, 0.27])
-def test_a_planted_lever_arm_is_found_and_leaves_no_error(x: float) -> None:
+def test_a_planted_lever_arm_is_found_and_leaves_no_error(x):
     recording = drive()
     found = figures(recording, recording["vy_ref"] + x * recording["yaw_rate"])
     assert found["lever_arm"] == pytest.approx(x, abs=1e-12)
     assert [found[name] for name in ("rmse_vy", "rmse_sideslip", "fvu")] == pytest.approx([0.0, 0.0, 0.0], abs=1e-9)
 
 
-def test_no_other_lever_arm_leaves_less_of_a_noisy_estimate() -> None:
+def test_no_other_lever_arm_leaves_less_of_a_noisy_estimate():
     recording = drive()
     vy = recording["vy_ref"] + 0.2 * recording["yaw_rate"] + np.random.default_rng(0).normal(0.0, 0.1, N)
     part = scored(recording, vy)
@@ -57,7 +55,7 @@ def test_no_other_lever_arm_leaves_less_of_a_noisy_estimate() -> None:
     assert found["rmse_vy"] < accuracy([part])["rmse_vy"]
 
 
-def test_a_lever_arm_beyond_half_a_metre_is_cut_there() -> None:
+def test_a_lever_arm_beyond_half_a_metre_is_cut_there():
     recording = drive()
     found = figures(recording, recording["vy_ref"] - 1.3 * recording["yaw_rate"])
     assert found["lever_arm"] == -LONGEST
@@ -66,12 +64,12 @@ def test_a_lever_arm_beyond_half_a_metre_is_cut_there() -> None:
 
 
 @pytest.mark.parametrize("point", [None, {"x": 0.0, "y": 0.0}])
-def test_where_the_point_is_known_or_undeclared_nothing_is_given(point: object) -> None:
+def test_where_the_point_is_known_or_undeclared_nothing_is_given(point):
     recording = drive(point)
     assert figures(recording, recording["vy_ref"]) == {}
 
 
-def test_a_car_that_never_turns_has_no_lever_arm() -> None:
+def test_a_car_that_never_turns_has_no_lever_arm():
     recording = drive()
     part = scored(recording, recording["vy_ref"] + 0.1)
     best = best_lever_arm([part], [np.zeros(len(part.vy))], [np.ones(len(part.vy))])

@@ -1,7 +1,5 @@
 """Metrics against their definitions on series whose errors are known."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 

@@ -1,7 +1,5 @@
 """Local observability against closed forms."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import torch
@@ -11,7 +9,7 @@ from vehest_papers.kit.observability import observability_along, observability_m
 STEP = 0.1
 
 
-def moved(x: torch.Tensor, u: torch.Tensor) -> torch.Tensor:
+def moved(x, u):
     """Position and speed."""
     return torch.stack([x[0] + STEP * x[1], x[1] + u[0]])
 

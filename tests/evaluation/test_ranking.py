@@ -1,7 +1,5 @@
 """Blocks, intervals of single figures, and who may be called best, on errors whose outcome is known."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from arch.bootstrap import optimal_block_length
@@ -10,7 +8,6 @@ from scipy import signal
 from vehest.data.errors import DataError
 from vehest.evaluation.blocks import (
     COLUMNS,
-    Segments,
     _length,
     _pooled_covariances,
     _window,
@@ -29,7 +26,7 @@ from vehest.evaluation.significance import holm, root_interval, unexplained_inte
 RATE = 20.0
 
 
-def scored(error: np.ndarray, vy_ref: np.ndarray | None = None) -> Scored:
+def scored(error, vy_ref=None):
     """A range whose lateral velocity is off by ``error`` [m/s] at 20 m/s."""
     reference = np.zeros_like(error) if vy_ref is None else vy_ref
     time = np.arange(len(error)) / RATE
@@ -37,7 +34,7 @@ def scored(error: np.ndarray, vy_ref: np.ndarray | None = None) -> Scored:
     return Scored(time, reference + error, reference, beta, beta_ref, np.zeros_like(error))
 
 
-def coloured(generator: np.random.Generator, n: int, memory: float = 0.95) -> np.ndarray:
+def coloured(generator, n, memory=0.95):
     return signal.lfilter([np.sqrt(1.0 - memory**2)], [1.0, -memory], generator.standard_normal(n + 400))[400:]
 
 
@@ -111,7 +108,7 @@ def test_effective_blocks_count_what_carries_the_error():
     assert effective_blocks(np.array([1.0, *[0.0] * 19])) == pytest.approx(1.0)
 
 
-def candidates(generator: np.random.Generator, **levels: float) -> dict[tuple[str, str], list[Segments]]:
+def candidates(generator, **levels):
     """Three seeds each with errors of these sizes, partly common, over one drive of 300 s."""
     common = coloured(generator, 6000)
     return {

@@ -1,7 +1,5 @@
 """Regimes of a drive against one whose every sample is known, and their errors against those of all samples."""
 
-from __future__ import annotations
-
 import csv
 import json
 from pathlib import Path
@@ -21,7 +19,7 @@ RATE = 20.0
 ALL = Protocol(RATE, 0.0, 0.0)
 
 
-def stepped_drive() -> Recording:
+def stepped_drive():
     """Ten seconds straight ahead, ten in a circle at 3 m/s², ten at 7 m/s², with steep ramps of 1.2 s and 1.5 s between."""
     time = np.arange(600) / RATE
     ay = np.interp(time, [0, 10, 11.2, 20, 21.5, 30], [0, 0, 3, 3, 7, 7])
@@ -29,7 +27,7 @@ def stepped_drive() -> Recording:
     return Recording("steps", "car", RATE, 0.0, {"vx": np.full(600, 20.0), "yaw_rate": ay / 20.0, "ay": ay, "vy_ref": vy}, "simulated")
 
 
-def estimate_with(recording: Recording, error: np.ndarray) -> Estimate:
+def estimate_with(recording, error):
     vy = recording["vy_ref"] + error
     return Estimate(recording.id, "test", RATE, 0.0, {"vy": vy, "sideslip": np.arctan2(vy, recording["vx"])})
 

@@ -1,17 +1,12 @@
 """Ranges cut into sequences, each estimated anew, from the reference state where the protocol says so."""
 
-from __future__ import annotations
-
 import csv
-from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 import yaml
 
-from place import Place
 from vehest.data.errors import ConfigurationError, DataError
 from vehest.data.recording import Recording
 from vehest.data.splits import Span
@@ -23,7 +18,7 @@ PAPER = {"rate_hz": 100, "warm_up_seconds": 0, "skip_seconds": 2, "sequence_seco
 GIVEN = ["estimator=kalman", "estimator.noise.yaw_rate=0.01", "estimator.noise.ay=0.5", "estimator.noise.steer=0.01"]
 
 
-def recording(seconds: float, start_time: float = 100.0) -> Recording:
+def recording(seconds, start_time=100.0):
     time = np.arange(round(100.0 * seconds)) / 100.0
     channels = {name: np.sin(time + shift) for shift, name in enumerate(("vx_ref", "vy_ref", "yaw_rate_ref"))}
     return Recording("r", "car", 100.0, start_time, channels)
@@ -55,7 +50,7 @@ def test_reference_state_is_that_of_the_first_sample():
         ({"warm_up_seconds": 1}, "set evaluation.warm_up_seconds=0"),
     ],
 )
-def test_a_protocol_that_makes_no_sense_is_refused(changes: Mapping[str, Any], message: str):
+def test_a_protocol_that_makes_no_sense_is_refused(changes, message):
     assert protocol_from_config(PAPER) == Protocol(100.0, 0.0, 2.0, 10.0, True)
     with pytest.raises(ConfigurationError, match=message):
         protocol_from_config({**PAPER, **changes})
@@ -70,7 +65,7 @@ def test_reports_say_how_estimates_start():
 
 
 @pytest.fixture
-def steered(place: Place) -> Place:
+def steered(place):
     """A split with tests only: one range of 30 s and one of 13 s."""
     place.add_steered()
     ranges = [{"recording": "second"}, {"recording": "first", "start": 5, "stop": 18}]
@@ -79,7 +74,7 @@ def steered(place: Place) -> Place:
     return place
 
 
-def test_each_sequence_is_estimated_anew_from_its_true_state(steered: Place):
+def test_each_sequence_is_estimated_anew_from_its_true_state(steered):
     arguments = [*GIVEN, "split=whole", "tracking=none"]
     assert steered("train", *arguments)[0] == 0
     code, _, err = steered("eval", *arguments, *(f"evaluation.{key}={value}" for key, value in PAPER.items()))

@@ -1,14 +1,11 @@
 """Intervals and p-values of the paired block bootstrap, on losses whose differences are known."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from scipy import signal, stats
 
 from vehest.data.errors import DataError
 from vehest.evaluation.significance import (
-    Difference,
     _degrees_of_freedom,
     difference_of_blocks,
     differences_of_blocks,
@@ -22,19 +19,19 @@ N_SEQUENCES, LENGTH = 16, 100
 LABELS = sequence_labels([LENGTH] * N_SEQUENCES)
 
 
-def losses(generator: np.random.Generator, n_seeds: int, seed_level: float = 0.0, own_noise: bool = False) -> np.ndarray:
+def losses(generator, n_seeds, seed_level=0.0, own_noise=False):
     """Autocorrelated noise (0.95 from one sample to the next), common to the seeds or their own, and a level of each seed."""
     white = generator.standard_normal((n_seeds if own_noise else 1, N_SEQUENCES, LENGTH))
     noise = signal.lfilter([1.0], [1.0, -0.95], white, axis=2)
     return noise.reshape(len(noise), -1) + seed_level * generator.standard_normal((n_seeds, 1))
 
 
-def compared(first: np.ndarray, second: np.ndarray, block_seconds: float | None = None, n_resamples: int = 400) -> Difference:
+def compared(first, second, block_seconds=None, n_resamples=400):
     return paired_difference(first, second, LABELS, rate_hz=100.0, block_seconds=block_seconds, n_resamples=n_resamples)
 
 
 @pytest.mark.parametrize(("n_seeds", "seed_level"), [((1, 1), 0.0), ((3, 3), 0.5), ((3, 5), 1.5)])
-def test_intervals_of_equal_estimators_cover_zero_at_about_the_nominal_rate(n_seeds: tuple[int, int], seed_level: float) -> None:
+def test_intervals_of_equal_estimators_cover_zero_at_about_the_nominal_rate(n_seeds, seed_level):
     generator = np.random.default_rng(0)
     trials = [compared(*(losses(generator, n, seed_level) for n in n_seeds)) for _ in range(300)]
     mean = np.mean([trial.mean.low <= 0.0 <= trial.mean.high for trial in trials])
@@ -43,20 +40,20 @@ def test_intervals_of_equal_estimators_cover_zero_at_about_the_nominal_rate(n_se
     assert 0.91 <= median <= 0.99
 
 
-def test_noise_of_each_seed_alone_makes_intervals_wide_not_narrow() -> None:
+def test_noise_of_each_seed_alone_makes_intervals_wide_not_narrow():
     generator = np.random.default_rng(5)
     trials = [compared(*(losses(generator, 3, own_noise=True) for _ in range(2)), n_resamples=200) for _ in range(100)]
     assert np.mean([trial.mean.low <= 0.0 <= trial.mean.high for trial in trials]) >= 0.95
 
 
-def test_blocks_that_are_shorter_than_the_correlation_are_too_sure() -> None:
+def test_blocks_that_are_shorter_than_the_correlation_are_too_sure():
     generator = np.random.default_rng(1)
     pairs = [(losses(generator, 1), losses(generator, 1)) for _ in range(50)]
     covered = [result.mean.low <= 0.0 <= result.mean.high for result in (compared(*pair, 0.01, 100) for pair in pairs)]
     assert np.mean(covered) < 0.6
 
 
-def test_a_shift_is_found_although_sequences_differ_much_more() -> None:
+def test_a_shift_is_found_although_sequences_differ_much_more():
     generator = np.random.default_rng(2)
     hard = np.repeat(20.0 * generator.random(N_SEQUENCES), LENGTH)
     first, second = (hard + losses(generator, 3, 0.1) for _ in range(2))
@@ -66,7 +63,7 @@ def test_a_shift_is_found_although_sequences_differ_much_more() -> None:
     assert result.median.high < 0.0
 
 
-def test_one_seed_and_white_noise_are_a_paired_t_test() -> None:
+def test_one_seed_and_white_noise_are_a_paired_t_test():
     generator = np.random.default_rng(3)
     first, second = generator.standard_normal((2, 1, 60))
     first += 0.3
@@ -79,7 +76,7 @@ def test_one_seed_and_white_noise_are_a_paired_t_test() -> None:
     assert result.mean.p_value == pytest.approx(known.pvalue, rel=0.1)
 
 
-def test_one_lucky_training_of_three_proves_nothing() -> None:
+def test_one_lucky_training_of_three_proves_nothing():
     generator = np.random.default_rng(4)
     first, second = losses(generator, 3) * 0.01, losses(generator, 1) * 0.01
     first[0] -= 1.0
@@ -87,7 +84,7 @@ def test_one_lucky_training_of_three_proves_nothing() -> None:
     assert compared(first[:1], second).mean.p_value < 0.01, "but one training alone is as good as it is"
 
 
-def test_a_sequence_ends_a_block_and_equal_losses_do_not_differ() -> None:
+def test_a_sequence_ends_a_block_and_equal_losses_do_not_differ():
     same = np.arange(10.0)[None]
     result = paired_difference(same, same, sequence_labels([3, 7]), rate_hz=10.0, block_seconds=0.2)
     assert result.n_blocks == 2 + 4
@@ -103,12 +100,12 @@ def test_a_sequence_ends_a_block_and_equal_losses_do_not_differ() -> None:
         (np.zeros((1, 6)), [6], "1 blocks to resample"),
     ],
 )
-def test_losses_that_cannot_be_compared_are_refused(first: np.ndarray, labels: list[int], message: str) -> None:
+def test_losses_that_cannot_be_compared_are_refused(first, labels, message):
     with pytest.raises(DataError, match=message):
         paired_difference(first, np.zeros((1, 6)), sequence_labels(labels), rate_hz=10.0)
 
 
-def test_pairs_compared_together_see_the_draws_that_each_sees_alone(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_pairs_compared_together_see_the_draws_that_each_sees_alone(monkeypatch):
     monkeypatch.setattr("vehest.evaluation.significance.DRAWN_AT_ONCE", 1000)  # several turns
     generator = np.random.default_rng(2)
     sizes = generator.uniform(20.0, 40.0, 12)
@@ -118,7 +115,7 @@ def test_pairs_compared_together_see_the_draws_that_each_sees_alone(monkeypatch:
     assert root_intervals(sums, sizes) == [root_interval(own, sizes) for own in sums]
 
 
-def test_degrees_of_freedom_are_those_of_blocks_or_of_seeds_where_either_decides_alone() -> None:
+def test_degrees_of_freedom_are_those_of_blocks_or_of_seeds_where_either_decides_alone():
     """Welch-Satterthwaite of one part of the variance: its own degrees of freedom; of two equal ones: their sum."""
     sizes, even = np.ones(40), np.full((3, 40), 0.0)
     seeds = [np.array([-1.0, 0.0, 1.0]), np.array([-1.0, 0.0, 1.0])]

@@ -1,7 +1,5 @@
 """Periodograms against signals whose spectra are known, and the process noise against what was planted."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -6,11 +6,9 @@ import ctypes
 import shutil
 import subprocess
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 
-from vehest.estimators.base import Estimator
 from vehest.export.method import _common, method_source
 from vehest.export.rendering import render
 
@@ -53,7 +51,7 @@ class Library:
     library: ctypes.CDLL
     precision: str
 
-    def __call__(self, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def __call__(self, rows):
         """Outputs (T, 4) in the order of `OUTPUTS` and whether each step went well (T,); a lost method starts anew."""
         dtype = np.float64 if self.precision == "double" else np.float32
         rows = np.ascontiguousarray(rows, dtype)
@@ -65,7 +63,7 @@ class Library:
         return out.astype(np.float64), fine.astype(bool)
 
 
-def write(estimator: Estimator, precision: str, folder: Path) -> None:
+def write(estimator, precision, folder):
     folder.mkdir(parents=True, exist_ok=True)
     source = method_source(estimator, precision)
     (folder / "vehest_types.h").write_text(render("types.h.j2", precision, **_common(estimator)), encoding="ascii")
@@ -73,7 +71,7 @@ def write(estimator: Estimator, precision: str, folder: Path) -> None:
     (folder / "vehest_method.c").write_text(source.source, encoding="ascii")
 
 
-def built(estimator: Estimator, precision: str, folder: Path, compiler: str = "gcc") -> Library:
+def built(estimator, precision, folder, compiler="gcc"):
     """A library; a warning is an error."""
     write(estimator, precision, folder)
     (folder / "replay.c").write_text(REPLAY)

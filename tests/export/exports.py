@@ -15,8 +15,6 @@ from conftest import planar_drive
 from every_estimator import fitted
 from single_track_drive import linear_drive
 from small_car_drive import small_car_drive
-from vehest.data.recording import Recording
-from vehest.estimators.base import Estimator
 from vehest.export.method import exportable
 from vehest.export.program import program_files
 from vehest.export.vectors import COLUMNS, drive_for, replayed, table_text
@@ -34,7 +32,7 @@ LARGEST = {"vx": 20.0, "ax": 3.0, "ay": 5.0, "yaw_rate_vx": 5.0, "steer_vx": 1.0
 SECONDS = 120.0  # after which a program is taken to hang
 
 
-def tool(name: str) -> str:
+def tool(name):
     """A compiler or an emulator; the test is skipped without it."""
     found = shutil.which(name)
     if found is None:
@@ -47,11 +45,11 @@ WELL_CONDITIONED = {"learned_ukf": {"dynamics": "pacejka", "noise": "constant"}}
 
 
 @cache
-def model(name: str) -> Estimator:
+def model(name):
     return fitted(name, **WELL_CONDITIONED.get(name, {}))
 
 
-def drive(estimator: Estimator, seed: int, seconds: float = 40.0) -> Recording:
+def drive(estimator, seed, seconds=40.0):
     rate = estimator.settings.rate_hz
     if "motor_current" in estimator.channels:
         return small_car_drive(seconds, seed)
@@ -64,7 +62,7 @@ def drive(estimator: Estimator, seed: int, seconds: float = 40.0) -> Recording:
 
 
 @cache
-def trust(name: str) -> Trust:
+def trust(name):
     """Limits and health learnt on two drives, bands set by hand."""
     estimator = model(name)
     drives, rate = [drive(estimator, seed) for seed in (1, 2)], estimator.settings.rate_hz
@@ -87,7 +85,7 @@ def trust(name: str) -> Trust:
     return Trust(About(name), bands, learn_limits(drives, estimator.channels, rate), health)
 
 
-def faulted(estimator: Estimator, rate_hz: float, seconds: float = 30.0, seed: int = 0) -> dict[str, np.ndarray]:
+def faulted(estimator, rate_hz, seconds=30.0, seed=0):
     """A drive with a fault of any kind in any channel every few seconds, at a rate."""
     plain, generator = drive(estimator, seed + 3, seconds), np.random.default_rng(seed)
     times = np.arange(0.0, seconds - 0.1, 1.0 / rate_hz)
@@ -111,16 +109,16 @@ class Export:
     bus_rate_hz: float | None = None
     trusted: bool = True
 
-    def stepper(self) -> GuardedStepper:
+    def stepper(self):
         return GuardedStepper(model(self.name), trust(self.name) if self.trusted else None, self.bus_rate_hz)
 
-    def write(self) -> Export:
+    def write(self):
         self.folder.mkdir(parents=True, exist_ok=True)
-        for name, text in program_files(self.stepper(), self.precision, self.name).items():  # type: ignore[arg-type]
+        for name, text in program_files(self.stepper(), self.precision, self.name).items():
             (self.folder / name).write_text(text)
         return self
 
-    def vectors(self, *, faults: bool = False) -> None:
+    def vectors(self, *, faults=False):
         """Write in.csv and expected.csv: the vectors of every export, or a drive with faults."""
         stepper = self.stepper()
         if faults:
@@ -132,20 +130,20 @@ class Export:
         (self.folder / "expected.csv").write_text(table_text(COLUMNS, replayed(stepper, times, samples)))
 
     @property
-    def sources(self) -> list[str]:
+    def sources(self):
         return sorted(path.name for path in self.folder.glob("vehest_*.c"))
 
-    def build(self, compiler: str, *options: str, main: str = "main.c", out: str = "main") -> Path:
+    def build(self, compiler, *options, main="main.c", out="main"):
         flags = [*STRICT, *(["-Wdouble-promotion"] if self.precision == "float" else [])]
         command([tool(compiler), *flags, *options, main, *self.sources, "-lm", "-o", out], self.folder)
         return self.folder / out
 
-    def differences(self, program: list[str]) -> tuple[np.ndarray, int]:
+    def differences(self, program):
         """Run the vectors; see `compared`."""
         command([*program, "in.csv", "out.csv"], self.folder)
         return self.compared()
 
-    def compared(self) -> tuple[np.ndarray, int]:
+    def compared(self):
         """The largest difference of vy, sideslip and both bands, and how many rows have another health or, in double, reason."""
         own, wanted = (np.genfromtxt(self.folder / name, delimiter=",", skip_header=1) for name in ("out.csv", "expected.csv"))
         judged = slice(
@@ -156,7 +154,7 @@ class Export:
         return np.nanmax(np.abs(own - wanted)[same][:, :4], axis=0, initial=0.0), int((~same).sum())
 
 
-def command(words: list[str], folder: Path, seconds: float = SECONDS) -> str:
+def command(words, folder, seconds=SECONDS):
     """Run a program that has to succeed; what it said."""
     done = subprocess.run(words, cwd=folder, capture_output=True, text=True, timeout=seconds, check=False)
     assert done.returncode == 0, f"{' '.join(words)}\n{done.stdout}{done.stderr}"

@@ -1,10 +1,7 @@
 """Golden files: the C of models with weights set by hand. `python tests/export/golden.py` writes them anew after a wanted change."""
 
-from __future__ import annotations
-
 import re
 import sys
-from collections.abc import Iterable
 from pathlib import Path
 
 if __name__ == "__main__":
@@ -13,7 +10,6 @@ if __name__ == "__main__":
 import numpy as np
 from exports import LARGEST, WEIGHTS, model
 
-from vehest.estimators.base import Estimator
 from vehest.export.method import _common, method_source
 from vehest.export.program import program_files
 from vehest.export.rendering import render
@@ -28,7 +24,7 @@ FOLDER = Path(__file__).parent / "golden"
 NUMBER = re.compile(r"(?<![\w.])[-+]?(?:\d+\.\d*|\d+)(?:[eE][+-]?\d+)?f?(?![\w.])")
 
 
-def by_hand(name: str) -> Estimator:
+def by_hand(name):
     """Twentieths for weights, so that no training has a say."""
     shapes = model(name)
     twin = type(shapes)(shapes.settings)
@@ -41,7 +37,7 @@ def by_hand(name: str) -> Estimator:
     return twin
 
 
-def trust_by_hand() -> Trust:
+def trust_by_hand():
     """Limits, health and bands of three channels: one lag, one relation."""
     channels = ("vx", "yaw_rate", "ay")
     health = HealthModel(
@@ -69,7 +65,7 @@ def trust_by_hand() -> Trust:
     return Trust(About("kinematic"), bands, GuardLimits(own, 120.0, 1.0), health)
 
 
-def methods(families: Iterable[str]) -> dict[str, str]:
+def methods(families):
     """Name of a file -> the C of a family's method."""
     found = {}
     for name in families:
@@ -80,14 +76,14 @@ def methods(families: Iterable[str]) -> dict[str, str]:
     return found
 
 
-def contract() -> dict[str, str]:
+def contract():
     """Name of a file -> the C around a method."""
     stepper = GuardedStepper(by_hand("kinematic"), trust_by_hand(), 500.0)
     files = program_files(stepper, "float", "Kinematic integration, weights set by hand")
     return {f"contract/{name}": text for name, text in files.items() if "method" not in name}
 
 
-def sources() -> dict[str, str]:
+def sources():
     """Name of a golden file -> what it should hold today: a filter, a network and the contract.
 
     The comparison with Python holds the other families.
@@ -95,7 +91,7 @@ def sources() -> dict[str, str]:
     return methods(("dugoff_ukf", "ksnn")) | contract()
 
 
-def differences(text: str, golden: str) -> list[str]:
+def differences(text, golden):
     """Where a text is another than the golden one; numbers may differ in their last digits, as they do between machines."""
     ours, theirs = text.splitlines(), golden.splitlines()
     if len(ours) != len(theirs):
@@ -107,14 +103,14 @@ def differences(text: str, golden: str) -> list[str]:
     ]
 
 
-def _alike(own: str, other: str) -> bool:
+def _alike(own, other):
     if NUMBER.sub("#", own) != NUMBER.sub("#", other):
         return False
     numbers = [[float(number.rstrip("f")) for number in NUMBER.findall(line)] for line in (own, other)]
     return bool(np.allclose(*numbers, rtol=1e-9, atol=1e-12))
 
 
-def write(files: dict[str, str], folder: Path) -> None:
+def write(files, folder):
     for name, text in files.items():
         path = folder / name
         path.parent.mkdir(parents=True, exist_ok=True)

@@ -3,8 +3,6 @@
 `python tests/export/misra.py` prints the counts of docs/export.md.
 """
 
-from __future__ import annotations
-
 import re
 import subprocess
 import sys
@@ -25,14 +23,14 @@ VERSION = "Cppcheck 2.10"
 _ROW = re.compile(r"^\| (\d+\.\d+) \| (\d+) \|", re.MULTILINE)
 
 
-def version() -> str:
+def version():
     return subprocess.run(["cppcheck", "--version"], capture_output=True, text=True, check=True).stdout.strip()
 
 
-def found(home: Path) -> tuple[Counter[str], list[str]]:
+def found(home):
     """How often each rule is broken, and what cppcheck finds beside, a line each; the C is written into ``home``."""
     write(methods(FAMILIES) | contract(), home)
-    rules: Counter[str] = Counter()
+    rules = Counter()
     others = []
     for folder in sorted(home.iterdir()):
         words = [
@@ -43,11 +41,7 @@ def found(home: Path) -> tuple[Counter[str], list[str]]:
             "--quiet",
             "--template={id} {file}:{line} {message}",
         ]
-        words += [
-            "--suppress=missingIncludeSystem",
-            f"-I{home / 'kinematic'}",
-            *(str(path) for path in sorted(folder.glob("vehest_*.c"))),
-        ]
+        words += ["--suppress=missingIncludeSystem", f"-I{home / 'kinematic'}", *(str(path) for path in sorted(folder.glob("vehest_*.c")))]
         said = subprocess.run(words, capture_output=True, text=True, check=True, timeout=600.0).stderr
         for line in said.splitlines():
             kind, _, rest = line.partition(" ")
@@ -58,12 +52,12 @@ def found(home: Path) -> tuple[Counter[str], list[str]]:
     return rules, others
 
 
-def documented(text: str) -> dict[str, int]:
+def documented(text):
     """Counts in the table of docs/export.md."""
     return {rule: int(count) for rule, count in _ROW.findall(text)}
 
 
-def main() -> None:
+def main():
     """Print the counts, a row a rule."""
     with tempfile.TemporaryDirectory() as home:
         rules, others = found(Path(home))

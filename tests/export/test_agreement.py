@@ -1,7 +1,5 @@
 """What a model says in C is what Python's guarded stepper says, at whatever happens on a bus."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from exports import FAMILIES, Export, command

@@ -1,7 +1,5 @@
 """Exports on disk and from the command line."""
 
-from __future__ import annotations
-
 import os
 import subprocess
 import sys

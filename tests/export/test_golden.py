@@ -1,7 +1,5 @@
 """A changed generator shows as a changed golden file."""
 
-from __future__ import annotations
-
 import pytest
 
 from golden import FOLDER, differences, sources

@@ -5,12 +5,11 @@ from __future__ import annotations
 import copy
 from dataclasses import dataclass, replace
 from functools import cache
-from typing import Any
 
 import numpy as np
 import pytest
 import torch
-from c_build import COMPILERS, OUTPUTS, Library, built
+from c_build import COMPILERS, OUTPUTS, built
 
 from dugoff_drive import TYRES, dugoff_track
 from every_estimator import drive_for, fitted
@@ -33,7 +32,7 @@ WITH_FORCES = {**LEVELS, "force_factor": 3.0, "fy_front": 100.0, "fy_rear": 100.
 ON_DUGOFF = ("dugoff_ukf", "ensemble_ukf", "cnn_ukf")
 TRACK = {"inputs": "imu", "tyres": TYRES, "noise": LEVELS}
 FULL = {"inputs": "full", "tyres": TYRES, "noise": WITH_FORCES}
-VARIANTS: list[tuple[str, dict[str, Any]]] = [
+VARIANTS = [
     *((name, {}) for name in exportable() if name not in ON_DUGOFF),
     ("kalman", {"gate": 1.0}),
     ("kalman", {"gate": 3.0, "offsets": {"ay": 0.3, "steer": 0.01}}),
@@ -76,20 +75,20 @@ class Case:
     rows: np.ndarray
 
 
-def case_of(name: str, config: dict[str, Any]) -> Case:
+def case_of(name, config):
     """Networks are trained in float32, as usual; weights in float64 are the same numbers."""
     return _case(name, repr(config))
 
 
 @cache
-def _case(name: str, config: str) -> Case:
-    given: dict[str, Any] = next(own for family, own in VARIANTS if family == name and repr(own) == config)
+def _case(name, config):
+    given = next(own for family, own in VARIANTS if family == name and repr(own) == config)
     estimator = of_dugoff(name, given) if name in ON_DUGOFF else fitted(name, "float32", **given)
     rows = dugoff_rows(estimator) if name in ON_DUGOFF else drive_for(estimator).stack(estimator.channels)
     return Case(estimator, widened(estimator), disturbed(estimator, rows))
 
 
-def of_dugoff(name: str, config: dict[str, Any]) -> Estimator:
+def of_dugoff(name, config):
     """A filter with known tyres; a network with random weights, as sure of itself as a trained one."""
     estimator = estimator_class(name).from_config(config)
     if isinstance(estimator, NetworkUkf):
@@ -103,12 +102,12 @@ def of_dugoff(name: str, config: dict[str, Any]) -> Estimator:
             else:
                 network.get_parameter("bias_3")[..., 1] = -6.0
         if name == "ensemble_ukf":
-            estimator.scaling = np.array([-1.0, 0.8])  # type: ignore[attr-defined]
+            estimator.scaling = np.array([-1.0, 0.8])
     return estimator
 
 
 @cache
-def dugoff_channels() -> dict[str, np.ndarray]:
+def dugoff_channels():
     """A car on Dugoff's tyres that moves off, corners hard, nearly stops and moves off again, with all tyre forces."""
     generator, time = np.random.default_rng(1), np.arange(1200) / 100.0
     n, track = len(time), dugoff_track()
@@ -127,11 +126,11 @@ def dugoff_channels() -> dict[str, np.ndarray]:
     return channels
 
 
-def dugoff_rows(estimator: Estimator) -> np.ndarray:
+def dugoff_rows(estimator):
     return np.stack([dugoff_channels()[name] for name in estimator.channels], axis=1)
 
 
-def widened(estimator: Estimator) -> Estimator:
+def widened(estimator):
     """The same weights, computed in float64."""
     own = copy.deepcopy(estimator)
     if isinstance(own, Network):
@@ -139,7 +138,7 @@ def widened(estimator: Estimator) -> Estimator:
     return own
 
 
-def disturbed(estimator: Estimator, rows: np.ndarray) -> np.ndarray:
+def disturbed(estimator, rows):
     """One in twenty samples missing of what may be, and values on which a method without memory of them has to start anew."""
     rows, generator = rows.copy(), np.random.default_rng(0)
     for name in estimator.skippable:
@@ -156,7 +155,7 @@ def disturbed(estimator: Estimator, rows: np.ndarray) -> np.ndarray:
     return rows
 
 
-def stepped(estimator: Estimator, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def stepped(estimator, rows):
     """What Python's stepper says, (T, 4), and whether it did, (T,); after an error it starts anew."""
     out, fine, stepper = np.full((len(rows), len(OUTPUTS)), np.nan), np.ones(len(rows), bool), estimator.online()
     for k, row in enumerate(rows):
@@ -169,7 +168,7 @@ def stepped(estimator: Estimator, rows: np.ndarray) -> tuple[np.ndarray, np.ndar
     return out, fine
 
 
-def check(library: Library, estimator: Estimator, rows: np.ndarray, largest: float) -> None:
+def check(library, estimator, rows, largest):
     said, fine = library(rows)
     wanted, stepped_fine = stepped(estimator, rows)
     np.testing.assert_array_equal(fine, stepped_fine)
@@ -237,7 +236,7 @@ def test_every_file_of_a_ksnn_names_the_patent():
 
 def test_a_value_that_float_cannot_hold_is_refused():
     kalman = estimator_class("kalman").from_config({"noise": {"yaw_rate": 1e-3, "ay": 0.1, "steer": 0.01}})
-    kalman.values["steer"] = 1e36  # type: ignore[attr-defined]
+    kalman.values["steer"] = 1e36
     with pytest.raises(ConfigurationError, match=r"no float number; fit it anew, or export with precision double"):
         method_source(kalman, "float")
     assert "1e+39" in method_source(kalman, "double").source
@@ -259,15 +258,15 @@ def test_a_covariance_that_is_not_positive_definite_is_repaired_as_in_python(tmp
     A lift is a difference of eigenvalues that are nearly equal, so that rounding counts for more than elsewhere.
     """
     hard = copy.deepcopy(case_of("learned_ukf", {"dynamics": "pacejka", "noise": "constant", "gate": 3.0}).estimator)
-    hard.settings = replace(hard.settings, gate=None)  # type: ignore[type-var]
+    hard.settings = replace(hard.settings, gate=None)
     with torch.no_grad():
-        hard.filter.observation_noise.factor.mul_(0.002)  # type: ignore[attr-defined]
+        hard.filter.observation_noise.factor.mul_(0.002)
     rows = disturbed(hard, drive_for(hard).stack(hard.channels))[:200].copy()
     rows[:, 1:5] *= 3.0
     stepper, wanted, repaired, lifted = widened(hard).online(), [], 0, 0
     for row in rows:
         wanted.append(list(stepper.step(dict(zip(hard.channels, row.tolist(), strict=True))).values())[:3])
-        tape = stepper._filter._tape  # type: ignore[attr-defined]
+        tape = stepper._filter._tape
         repaired, lifted = repaired + bool(tape.repaired[0, 0]), lifted + bool(tape.repaired[0, 0] and tape.centre[0, 0] != 0)
     assert repaired > 20
     assert lifted > 0
@@ -275,7 +274,7 @@ def test_a_covariance_that_is_not_positive_definite_is_repaired_as_in_python(tmp
     np.testing.assert_allclose(said[:, [1, 0, 2]], wanted, rtol=0.0, atol=1e-6)
 
 
-def ferrari_rows(data_root, estimator: Estimator, first: float = 550.0, last: float = 700.0) -> np.ndarray:
+def ferrari_rows(data_root, estimator, first=550.0, last=700.0):
     recording = real_drive(data_root).cut(first, last)
     if estimator.settings.rate_hz != recording.rate_hz:
         recording = Resample(estimator.settings.rate_hz)(recording)
@@ -313,7 +312,7 @@ def test_the_observer_agrees_over_the_real_ferraris_test_range(precision, larges
 
 
 @cache
-def small_car(data_root, dynamics: str) -> Case:
+def small_car(data_root, dynamics):
     """Trained on real drives of the small car, for seconds, and another drive of it."""
     train, validation, test = (real_drive(data_root, name, "f1tenth") for name in DRIVES)
     estimator = estimator_class("learned_ukf").from_config({"dynamics": dynamics, "width": 8, "through_filter": False})

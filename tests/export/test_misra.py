@@ -1,7 +1,5 @@
 """What MISRA C:2012 has against exports, rule by rule, as docs/export.md explains it."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest
@@ -13,7 +11,7 @@ pytestmark = pytest.mark.export
 DOCUMENT = Path(__file__).parents[2] / "docs" / "export.md"
 
 
-def test_each_broken_rule_is_explained_with_its_count(tmp_path: Path):
+def test_each_broken_rule_is_explained_with_its_count(tmp_path):
     tool("cppcheck")
     if version() != VERSION:
         pytest.skip(f"{version()} counts otherwise than {VERSION}, whose counts are documented")

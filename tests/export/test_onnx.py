@@ -1,7 +1,5 @@
 """A network in ONNX says, step by step, what Python's stepper says."""
 
-from __future__ import annotations
-
 import json
 
 import numpy as np
@@ -31,7 +29,7 @@ VARIANTS = [
 class OnnxStepper:
     """A file in onnxruntime, with the states that it says that it begins with."""
 
-    def __init__(self, path) -> None:
+    def __init__(self, path):
         self.session = onnxruntime.InferenceSession(str(path), providers=["CPUExecutionProvider"])
         self.about = self.session.get_modelmeta().custom_metadata_map
         self.dtype = np.float64 if self.session.get_inputs()[0].type == "tensor(double)" else np.float32
@@ -39,7 +37,7 @@ class OnnxStepper:
         self.state = {f"state_{name}": np.array(values, self.dtype) for name, values in starts.items()}
         self.names = [output.name for output in self.session.get_outputs()]
 
-    def step(self, row: np.ndarray) -> dict[str, float]:
+    def step(self, row):
         said = dict(zip(self.names, self.session.run(None, {"sample": row.astype(self.dtype), **self.state}), strict=True))
         self.state = {name.replace("next_", "state_"): values for name, values in said.items() if name.startswith("next_")}
         return {name: float(values) for name, values in said.items() if not name.startswith("next_")}

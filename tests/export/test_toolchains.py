@@ -1,7 +1,5 @@
 """Exports under the compilers, analysers and emulators that a control unit's engineer would try them with."""
 
-from __future__ import annotations
-
 import re
 
 import pytest
@@ -46,7 +44,7 @@ def test_a_million_senseless_samples_break_neither_memory_nor_contract(tmp_path,
     _fuzz(Export(family, "double", tmp_path), place, 1_000_000, "-O2")
 
 
-def _fuzz(export: Export, place, steps: int, *options: str) -> None:
+def _fuzz(export, place, steps, *options):
     export.write()
     options = ("-g", "-fsanitize=address,undefined,float-cast-overflow", "-fno-sanitize-recover=all", "-I.", *options)
     program = export.build("gcc", *options, main=str(place / "fuzz.c"), out="fuzz")
@@ -99,7 +97,7 @@ def test_a_cortex_m4f_without_an_operating_system_finds_the_same(tmp_path, place
     assert int(re.search(r"instructions a step: (\d+)", said)[1]) > 100
 
 
-def run_on_board(export: Export, board) -> str:
+def run_on_board(export, board):
     """Build an export for the board that QEMU has, run in.csv to out.csv there, return what was said."""
     compiler, emulator = tool("arm-none-eabi-gcc"), tool(BOARD[0])
     options = [*STRICT, *ARM, "-I."]

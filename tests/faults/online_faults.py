@@ -22,7 +22,6 @@ import subprocess
 import sys
 import time
 import warnings
-from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
 from multiprocessing import get_context
@@ -33,12 +32,10 @@ import torch
 
 import vehest
 from vehest.data.files import written_aside
-from vehest.data.recording import Recording
 from vehest.data.store import read_recording
-from vehest.estimators.base import Estimator
 from vehest.run.downsample import transforms_of
 from vehest.trust.faults import KINDS, SEVERITIES, Fault, applies, inject
-from vehest.trust.guard import GuardLimits, learn_limits
+from vehest.trust.guard import learn_limits
 from vehest.trust.watch import STARTED
 
 SETTLE, LASTS, COMES_BACK, RECOVERS = 4.0, 4.0, 8.0, 3.0  # s
@@ -115,14 +112,12 @@ class Ground:
     overrides: tuple[str, ...] = ()
 
 
-def grounds(data_root: str | None) -> list[Ground]:
+def grounds(data_root):
     """A simulated drive always, the real ones where the recordings are."""
     bmw = {**FERRARI, "data_sheet": ("estimator.wheelbase=2.579", "estimator.cg_to_rear_axle=1.423")}
     own = "estimator.car={mass: 1093, yaw_inertia: 1791, cg_to_front_axle: 1.156, cg_to_rear_axle: 1.423, cg_height: 0.42}"
     bmw = {name: tuple(own if word == CAR else word for word in words) for name, words in bmw.items()}
-    found = [
-        Ground("sim_quickstart", "sim_quickstart", "simulated", ("drive_1", 0, 150), ("drive_2", 0, 90), ("drive_3", 40.0), bmw),
-    ]
+    found = [Ground("sim_quickstart", "sim_quickstart", "simulated", ("drive_1", 0, 150), ("drive_2", 0, 90), ("drive_3", 40.0), bmw)]
     if data_root:
         ferrari = "20140222_01_01_03_250lm"
         found.append(Ground("ferrari_250lm", "ferrari_250lm", "real", (ferrari, 0, 300), (ferrari, 300, 400), (ferrari, 450.0), FERRARI))
@@ -133,7 +128,7 @@ def grounds(data_root: str | None) -> list[Ground]:
     return found
 
 
-def recordings(ground: Ground, output: Path) -> dict[str, Recording]:
+def recordings(ground, output):
     """Id -> recording at its native rate, of those that the ground needs."""
     asked = [sys.executable, "-m", "vehest", "ingest", ground.dataset, f"output={output}", "--json", "--quiet"]
     folder = Path(json.loads(subprocess.run(asked, check=True, capture_output=True, text=True).stdout)["folder"])
@@ -141,23 +136,23 @@ def recordings(ground: Ground, output: Path) -> dict[str, Recording]:
     return {path.stem: read_recording(path) for path in sorted(folder.glob("*.parquet")) if path.stem in wanted}
 
 
-def stretch(recording: Recording, start: float, stop: float) -> Recording:
+def stretch(recording, start, stop):
     """From so many seconds after a recording's first sample to so many."""
     return recording.cut(recording.start_time + start, recording.start_time + stop)
 
 
-def at_rate(recording: Recording, estimator: Estimator) -> Recording:
+def at_rate(recording, estimator):
     """A recording as the estimator takes it."""
     for transform in transforms_of({"rate_hz": estimator.settings.rate_hz, **estimator.preparation}):
         recording = transform(recording)
     return recording
 
 
-def sideslip(vy: np.ndarray, vx: np.ndarray) -> np.ndarray:
+def sideslip(vy, vx):
     return np.degrees(np.arctan2(vy, vx))
 
 
-def walk(estimator: Estimator, limits: GuardLimits, samples: Mapping[str, np.ndarray]) -> tuple[np.ndarray, int, int, bool]:
+def walk(estimator, limits, samples):
     """v after each sample, held for the time that it is made for, with exceptions, starts, and whether the speed bounds it."""
     stepper = vehest.online(estimator)
     names, steps = list(samples), len(next(iter(samples.values())))
@@ -179,7 +174,7 @@ def walk(estimator: Estimator, limits: GuardLimits, samples: Mapping[str, np.nda
     return np.concatenate([np.full(shift, np.nan), said])[:steps], exceptions, starts, bounded
 
 
-def try_family(ground: Ground, name: str, output: Path) -> list[tuple[object, ...]]:
+def try_family(ground, name, output):
     """Fit a family and walk it through every case; a row each."""
     torch.set_num_threads(1)
     warnings.filterwarnings("ignore")
@@ -196,7 +191,7 @@ def try_family(ground: Ground, name: str, output: Path) -> list[tuple[object, ..
     warm = estimator.warm_up_steps + estimator.horizon_steps
     back = SETTLE + LASTS + max(RECOVERS, estimator.warm_up_steps / rate)
 
-    def error(vy: np.ndarray, chosen: np.ndarray) -> float:
+    def error(vy, chosen):
         return float(np.sqrt(np.mean(np.square(sideslip(vy[chosen], speed[chosen]) - reference[chosen]))))
 
     nominal = walk(estimator, limits, samples)[0]
@@ -221,14 +216,14 @@ def try_family(ground: Ground, name: str, output: Path) -> list[tuple[object, ..
     return rows
 
 
-def cases(data_root: str | None) -> Iterator[tuple[Ground, str]]:
+def cases(data_root):
     """What is tried, the slow families last."""
     slow = ("learned_ukf", "kalman", "dugoff_ukf", "factor_graph", "cnn_ukf", "ensemble_ukf")
     found = [(ground, name) for ground in grounds(data_root) for name in ground.families]
     return iter(sorted(found, key=lambda case: slow.index(case[1]) if case[1] in slow else -1))
 
 
-def write_table(path: Path, rows: Sequence[tuple[object, ...]]) -> None:
+def write_table(path, rows):
     """Write all rows at once, or nothing."""
     path.parent.mkdir(parents=True, exist_ok=True)
     with written_aside(path) as aside, open(aside, "w", newline="", encoding="utf-8") as stream:
@@ -237,7 +232,7 @@ def write_table(path: Path, rows: Sequence[tuple[object, ...]]) -> None:
         writer.writerows(rows)
 
 
-def main(words: Sequence[str] | None = None) -> int:
+def main(words=None):
     """Write the table; the last lines count what did not hold."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--out", type=Path, required=True)

@@ -5,20 +5,19 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
 from torch.func import jacfwd
 
-from vehest.estimators.rational_ekf import LOST, ROLLING, RationalFilter
-from vehest.filters.gating import Gate
+from vehest.estimators.rational_ekf import LOST, ROLLING
 from vehest.filters.gaussian import Filtered, Gaussian
 from vehest.filters.sigma_points import SigmaRule
 from vehest.filters.unscented_scan import MARGIN, Function, NonlinearFiltered
 
 
-def sigma_points(rule: SigmaRule, mean: Tensor, factor: Tensor) -> Tensor:
+def sigma_points(rule, mean, factor):
     """Points of N(mean, L Lᵀ).
 
     Args:
@@ -33,23 +32,23 @@ def sigma_points(rule: SigmaRule, mean: Tensor, factor: Tensor) -> Tensor:
     return torch.cat([centre, centre + offsets, centre - offsets], dim=-2)
 
 
-def mean_of(rule: SigmaRule, values: Tensor) -> Tensor:
+def mean_of(rule, values):
     """Weighted mean of values at the points, (..., 2n + 1, m) -> (..., m)."""
     return rule.centre_mean * values[..., 0, :] + rule.other * values[..., 1:, :].sum(-2)
 
 
-def covariance_of(rule: SigmaRule, deviations: Tensor, others: Tensor) -> Tensor:
+def covariance_of(rule, deviations, others):
     """Weighted Σ w d eᵀ of deviations from the mean, (..., 2n + 1, m) and (..., 2n + 1, k) -> (..., m, k)."""
     centre = deviations[..., 0, :].unsqueeze(-1) * others[..., 0, :].unsqueeze(-2)
     return rule.centre_covariance * centre + rule.other * (deviations[..., 1:, :].mT @ others[..., 1:, :])
 
 
-def stacked(states: list[Gaussian[Tensor]], axis: int) -> Gaussian[Tensor]:
+def stacked(states, axis):
     """States of successive samples as one, with the samples along an axis of the means."""
     return Gaussian(torch.stack([state.mean for state in states], axis), torch.stack([state.covariance for state in states], axis))
 
 
-def symmetric(matrix: Tensor) -> Tensor:
+def symmetric(matrix):
     """The symmetric part, which rounding has left a little (..., n, n)."""
     return 0.5 * (matrix + matrix.mT)
 
@@ -68,7 +67,7 @@ class Factor(NamedTuple):
     repaired: Tensor
 
 
-def factorised(covariance: Tensor) -> Factor:
+def factorised(covariance):
     """Cholesky factor of a covariance, lifted first where it is not positive definite.
 
     Lifting adds the same to every eigenvalue, as much as is needed for a margin of `MARGIN`; what is added counts as a constant in
@@ -118,7 +117,7 @@ class NonlinearModel:
     restart: Callable[[Gaussian[Tensor], Tensor], Gaussian[Tensor]] | None = None
     free: Function | None = None
 
-    def possible(self, state: Tensor) -> Tensor:
+    def possible(self, state):
         """States that `constrain` allows."""
         return state if self.constrain is None else self.constrain(state)
 
@@ -131,9 +130,7 @@ class _Updated(NamedTuple):
     lost: Tensor
 
 
-def unscented_filter(
-    model: NonlinearModel, measurements: Tensor, inputs: Tensor, initial: Gaussian[Tensor], rule: SigmaRule
-) -> NonlinearFiltered:
+def unscented_filter(model, measurements, inputs, initial, rule):
     """The unscented Kalman filter with additive noise; sigma points are drawn again before each update.
 
     Covariances that are not positive definite are repaired. Where a negative weight of the mean point is what takes the definiteness of an
@@ -174,7 +171,7 @@ def unscented_filter(
     return NonlinearFiltered(steps, torch.stack(lost, axis))
 
 
-def _predicted(model: NonlinearModel, state: Gaussian[Tensor], u: Tensor, rule: SigmaRule) -> tuple[Gaussian[Tensor], Tensor]:
+def _predicted(model, state, u, rule):
     """The state one sample later, and whether its covariance had to be repaired."""
     _, factor, repaired = factorised(state.covariance)
     drawn = model.possible(sigma_points(rule, state.mean, factor))
@@ -185,7 +182,7 @@ def _predicted(model: NonlinearModel, state: Gaussian[Tensor], u: Tensor, rule: 
     return Gaussian(model.possible(mean), covariance), repaired
 
 
-def _updated(model: NonlinearModel, state: Gaussian[Tensor], factor: Tensor, y: Tensor, u: Tensor, rule: SigmaRule) -> _Updated:
+def _updated(model, state, factor, y, u, rule):
     """The state given a measurement, of which NaN is skipped."""
     drawn = model.possible(sigma_points(rule, state.mean, factor))
     expected = model.observation(drawn, u.unsqueeze(-2))
@@ -198,7 +195,7 @@ def _updated(model: NonlinearModel, state: Gaussian[Tensor], factor: Tensor, y: 
     noise = torch.where(measured.unsqueeze(-1) & measured.unsqueeze(-2), model.observation_noise(state.mean, u), identity)
     innovation = torch.where(measured, torch.where(measured, y, zero) - mean, zero)
 
-    def conditioned(rule: SigmaRule) -> _Updated:
+    def conditioned(rule):
         covariance, factor, lost = factorised(symmetric(covariance_of(rule, spread, spread) + noise))
         cross = covariance_of(rule, deviations, spread)
         gain = torch.cholesky_solve(cross.mT, factor).mT
@@ -222,7 +219,7 @@ def _updated(model: NonlinearModel, state: Gaussian[Tensor], factor: Tensor, y: 
         return updated
     without = conditioned(replace(rule, centre_covariance=0.0))
 
-    def chosen(one: Tensor, other: Tensor) -> Tensor:
+    def chosen(one, other):
         return torch.where(lost.reshape(*lost.shape, *[1] * (one.dim() - lost.dim())), one, other)
 
     return _Updated(
@@ -234,7 +231,7 @@ def _updated(model: NonlinearModel, state: Gaussian[Tensor], factor: Tensor, y: 
     )
 
 
-def extended_filter(model: NonlinearModel, measurements: Tensor, inputs: Tensor, initial: Gaussian[Tensor]) -> Filtered[Tensor]:
+def extended_filter(model, measurements, inputs, initial):
     """The extended Kalman filter of one sequence, (T, m) and (T, p); Jacobians by automatic differentiation, NaN is skipped.
 
     Source: Jazwinski 1970, Chapter 8; the update holds for any gain, also that of a consider state (Schmidt).
@@ -264,20 +261,20 @@ def extended_filter(model: NonlinearModel, measurements: Tensor, inputs: Tensor,
     return Filtered(Gaussian(*parts[:2]), Gaussian(*parts[2:4]), *parts[4:])
 
 
-def rational_model(estimator: RationalFilter) -> NonlinearModel:
+def rational_model(estimator):
     """The model of a `RationalFilter`; inputs are speed and steering angle, and a lost sideslip angle is that of a car that rolls."""
     track, bound = estimator.track(), torch.as_tensor(estimator.bounds())
     car, n_tyres, levels = estimator.car, len(estimator.adapted), estimator.values
     noise = torch.tensor([levels["yaw_rate"], levels["ay"]], dtype=torch.float64).square().diag()
 
-    def adapts(yaw_rate: Tensor, inputs: Tensor) -> bool:
+    def adapts(yaw_rate, inputs):
         return bool((inputs[0] * yaw_rate).abs() >= estimator.adapt_above)
 
-    def process_noise(states: Tensor, inputs: Tensor) -> Tensor:
+    def process_noise(states, inputs):
         tyres = levels["tyres"] if adapts(states[1] + track.step * states[3], inputs) else 0.0
         return track.process_noise(states, inputs, levels["steer"], tyres)
 
-    def restart(state: Gaussian[Tensor], inputs: Tensor) -> Gaussian[Tensor]:
+    def restart(state, inputs):
         diverged = not bool(state.mean[0].abs() < estimator.largest_sideslip)
         if not diverged and bool(state.covariance[0, 0] < LOST**2):
             return state
@@ -298,7 +295,7 @@ def rational_model(estimator: RationalFilter) -> NonlinearModel:
     )
 
 
-def gated(run: Callable[[Tensor], Filtered[Any]], measurements: Tensor, gate: Gate) -> Filtered[Any]:
+def gated(run, measurements, gate):
     """What a filter without a gate, of one sequence (T, m), gives behind one: sample by sample, what is refused becomes NaN."""
     y, refused = measurements.clone(), [0] * measurements.shape[-1]
     steps = run(y)
@@ -319,7 +316,7 @@ def gated(run: Callable[[Tensor], Filtered[Any]], measurements: Tensor, gate: Ga
     return steps
 
 
-def scaled_rule(n: int, alpha: float, beta: float = 2.0, kappa: float = 0.0) -> SigmaRule:
+def scaled_rule(n, alpha, beta=2.0, kappa=0.0):
     """The scaled rule of van der Merwe 2004, whose weights of the mean point differ."""
     total = alpha**2 * (n + kappa)
     centre = 1.0 - n / total

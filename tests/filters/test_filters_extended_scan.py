@@ -1,7 +1,5 @@
 """The compiled extended filter against the readable one, the Kalman filter, and Jacobians by hand."""
 
-from __future__ import annotations
-
 import numba
 import numpy as np
 import pytest
@@ -32,13 +30,13 @@ def radar(x, u, parameters):
     return out
 
 
-def compiled_pendulum() -> CompiledModel:
+def compiled_pendulum():
     readable, none = pendulum_with_radar(), torch.zeros(3, dtype=torch.float64)
     noises = (readable.process_noise(none, none).numpy(), readable.observation_noise(none, none).numpy())
     return CompiledModel(with_jacobian(swing), with_jacobian(radar), np.array([9.81]), *noises)
 
 
-def as_arrays(state: Gaussian) -> Gaussian:
+def as_arrays(state):
     return Gaussian(state.mean.numpy(), state.covariance.numpy())
 
 

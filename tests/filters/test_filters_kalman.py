@@ -1,7 +1,5 @@
 """Kalman filter and smoother against the dense posterior, the Riccati equation and closed forms."""
 
-from __future__ import annotations
-
 import time
 
 import numpy as np
@@ -17,17 +15,17 @@ from vehest.filters.kalman_scan import kalman_scan
 N, M = 3, 2
 
 
-def spread(generator: torch.Generator, *shape: int) -> torch.Tensor:
+def spread(generator, *shape):
     """Random covariance matrices, well away from singular."""
     root = torch.randn(*shape, shape[-1], generator=generator, dtype=torch.float64)
     return root @ root.mT + 0.3 * torch.eye(shape[-1], dtype=torch.float64)
 
 
-def example(steps: int, seed: int = 0, missing: float = 0.0) -> tuple[LinearModel, np.ndarray, Gaussian]:
+def example(steps, seed=0, missing=0.0):
     """A time-varying model, measurements of which some are missing, and a first state."""
     generator = torch.Generator().manual_seed(seed)
 
-    def normal(*shape: int) -> torch.Tensor:
+    def normal(*shape):
         return torch.randn(*shape, generator=generator, dtype=torch.float64)
 
     model = LinearModel(
@@ -51,7 +49,7 @@ def tensors(parts):
     return type(parts)(*map(torch.from_numpy, parts))
 
 
-def dense_posterior(model: LinearModel, measurements: np.ndarray, initial: Gaussian, seen: int) -> tuple[np.ndarray, np.ndarray, float]:
+def dense_posterior(model, measurements, initial, seen):
     """Mean and covariance of all states at once, given the measurements of the first samples; and their log-density.
 
     Written down as one normal distribution of x[0], w[0], w[1], … and v[0], v[1], …: no recursion.

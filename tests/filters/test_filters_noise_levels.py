@@ -1,7 +1,5 @@
 """Noise levels read off signals: white noise, slow signals, gaps."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

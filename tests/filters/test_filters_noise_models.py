@@ -1,7 +1,5 @@
 """Covariances that can be learnt: definite, differentiable, with the entropy that is asked for."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 from scipy.stats import multivariate_normal
@@ -14,7 +12,7 @@ START = [1e-3, 1e-3, 1e-2, 1e-2, 1e-5]
 
 
 @pytest.fixture(params=["constant", "state dependent"])
-def noise(request) -> torch.nn.Module:
+def noise(request):
     return {
         "constant": lambda: ConstantNoise(START),
         "state dependent": lambda: StateDependentNoise(START, 5, generator=torch.Generator().manual_seed(1)),
@@ -72,7 +70,7 @@ def test_entropy_below_the_floor_is_raised_to_it_and_above_is_left():
 
 
 @pytest.mark.parametrize(("dtype", "tolerance"), [(torch.float64, 1e-14), (torch.float32, 1e-5)])
-def test_compiled_it_is_the_same_with_and_without_a_floor(dtype: torch.dtype, tolerance: float) -> None:
+def test_compiled_it_is_the_same_with_and_without_a_floor(dtype, tolerance):
     generator = torch.Generator().manual_seed(2)
     noise = StateDependentNoise(START, 3, deviation=1.0, generator=generator)
     noise.begin(torch.tensor([0.1, 0.2, 0.3, 0.1, 0.2]).diag(), 10.0, torch.tensor([2.0, 0.5, 1.0]))

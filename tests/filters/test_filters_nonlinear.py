@@ -1,23 +1,13 @@
 """Unscented and extended Kalman filters against the linear one, an independent library, closed forms and finite differences."""
 
-from __future__ import annotations
-
 import filterpy.kalman as filterpy
 import numpy as np
 import pytest
 import torch
-from readable_filters import (
-    NonlinearModel,
-    extended_filter,
-    factorised,
-    mean_of,
-    scaled_rule,
-    sigma_points,
-    unscented_filter,
-)
+from readable_filters import NonlinearModel, extended_filter, factorised, mean_of, scaled_rule, sigma_points, unscented_filter
 from test_filters_kalman import arrays, example, tensors
 
-from vehest.filters.gaussian import Filtered, Gaussian
+from vehest.filters.gaussian import Gaussian
 from vehest.filters.kalman_scan import kalman_scan
 from vehest.filters.sigma_points import cubature_rule, symmetric_rule
 from vehest.filters.unscented_scan import MARGIN
@@ -26,14 +16,14 @@ RULES = {"symmetric": symmetric_rule(3, 0.5), "scaled": scaled_rule(3, 0.5, 2.0,
 STEP = 0.1
 
 
-def constant(matrix: torch.Tensor):
+def constant(matrix):
     return lambda state, u: matrix.expand(*state.shape[:-1], *matrix.shape)
 
 
-def linear_as_nonlinear(model) -> NonlinearModel:
+def linear_as_nonlinear(model):
     """A linear model that varies in time, with the sample's number as the input."""
 
-    def at(part: torch.Tensor, u: torch.Tensor) -> torch.Tensor:
+    def at(part, u):
         return part[u[..., :1].long()].select(u.dim() - 1, 0)
 
     return NonlinearModel(
@@ -44,7 +34,7 @@ def linear_as_nonlinear(model) -> NonlinearModel:
     )
 
 
-def pendulum_with_radar() -> NonlinearModel:
+def pendulum_with_radar():
     """Angle, rate and an unknown damping; measured are the bob's height and its rate. Inputs push."""
 
     def transition(x, u):
@@ -60,7 +50,7 @@ def pendulum_with_radar() -> NonlinearModel:
     return NonlinearModel(transition, observation, constant(process), constant(noise))
 
 
-def measured_pendulum(steps: int = 40, sequences: int = 1, seed: int = 1) -> tuple[torch.Tensor, torch.Tensor, Gaussian]:
+def measured_pendulum(steps=40, sequences=1, seed=1):
     generator = torch.Generator().manual_seed(seed)
     model = pendulum_with_radar()
     x = torch.tensor([0.6, 0.0, 0.3], dtype=torch.float64).expand(sequences, 3)
@@ -112,7 +102,7 @@ def test_on_a_linear_model_every_filter_is_the_kalman_filter(name, missing):
         assert np.allclose(getattr(ours, part), getattr(known, part), atol=1e-9)
 
 
-def unrepaired(*arguments) -> Filtered:
+def unrepaired(*arguments):
     filtered = unscented_filter(*arguments)
     assert not filtered.repaired.any()
     return filtered.steps
@@ -197,7 +187,7 @@ def test_a_covariance_that_is_not_definite_is_lifted_just_enough():
     assert torch.allclose(repaired.factor @ repaired.factor.mT, repaired.covariance, atol=1e-12)
 
 
-def sharp() -> NonlinearModel:
+def sharp():
     """A model whose curvature makes a negative centre weight lose the covariance's definiteness."""
     return NonlinearModel(
         lambda x, u: torch.cat([x[..., :1] + 0.5 * x.square().sum(-1, keepdim=True), 0.9 * x[..., 1:]], -1).clamp(-5.0, 5.0),

@@ -8,13 +8,13 @@ from typing import NamedTuple
 
 import pytest
 import torch
-from readable_filters import NonlinearModel, unscented_filter
+from readable_filters import unscented_filter
 from test_filters_nonlinear import RULES, STEP, constant, measured_pendulum, pendulum_with_radar, sharp
 from torch import Tensor
 
 from vehest.filters.gaussian import Gaussian
-from vehest.filters.sigma_points import SigmaRule, symmetric_rule
-from vehest.filters.unscented_scan import NonlinearFiltered, TorchModel, UnscentedStepper, moved, unscented_scan
+from vehest.filters.sigma_points import symmetric_rule
+from vehest.filters.unscented_scan import TorchModel, UnscentedStepper, moved, unscented_scan
 
 FREE = [-1e9, -1e9, -1e9]
 ANY = {"measurements": torch.zeros(2, 5, 2), "inputs": torch.zeros(2, 5, 1)}
@@ -30,13 +30,13 @@ class Learnt(NamedTuple):
     gravity: Tensor
 
 
-def learnt(first: Gaussian[Tensor]) -> Learnt:
+def learnt(first):
     model, nothing = pendulum_with_radar(), torch.zeros(3, dtype=torch.float64)
     parts = (model.process_noise(nothing, nothing), model.observation_noise(nothing, nothing), *first)
     return Learnt(*(part.clone().requires_grad_() for part in (*parts, torch.tensor(9.81, dtype=torch.float64))))
 
 
-def both_ways(rule: SigmaRule, measurements: Tensor, inputs: Tensor, first: Gaussian[Tensor], lower=FREE, share=None):
+def both_ways(rule, measurements, inputs, first, lower=FREE, share=None):
     """The pendulum by the readable filter and by the scan: what they return, and gradients of a random sum of means and covariances.
 
     Those of the measurements come last.
@@ -55,7 +55,7 @@ def both_ways(rule: SigmaRule, measurements: Tensor, inputs: Tensor, first: Gaus
     return pairs
 
 
-def by_the_filter(p: Learnt, rule, measurements, inputs, least, _) -> NonlinearFiltered:
+def by_the_filter(p, rule, measurements, inputs, least, _):
     model = dataclasses.replace(
         pendulum_with_radar(),
         transition=partial(swung, p.gravity),
@@ -66,17 +66,17 @@ def by_the_filter(p: Learnt, rule, measurements, inputs, least, _) -> NonlinearF
     return unscented_filter(model, measurements, inputs, Gaussian(p.mean, p.covariance), rule)
 
 
-def by_the_scan(p: Learnt, rule, measurements, inputs, least, share) -> NonlinearFiltered:
+def by_the_scan(p, rule, measurements, inputs, least, share):
     model = TorchModel(partial(swung, p.gravity), pendulum_with_radar().observation, [p.gravity], least.tolist())
     return unscented_scan(model, measurements, inputs, Gaussian(p.mean, p.covariance), p.process, p.observation, rule, share=share)
 
 
-def swung(gravity: Tensor, x: Tensor, u: Tensor) -> Tensor:
+def swung(gravity, x, u):
     angle, rate, damping = x.unbind(-1)
     return torch.stack([angle + STEP * rate, rate + STEP * (u[..., 0] - gravity * torch.sin(angle) - damping * rate), damping], -1)
 
 
-def assert_equal(one: NonlinearFiltered, other: NonlinearFiltered) -> None:
+def assert_equal(one, other):
     for name in ("filtered", "predicted"):
         for a, b in zip(getattr(one.steps, name), getattr(other.steps, name), strict=True):
             assert torch.allclose(a, b, rtol=0, atol=1e-11, equal_nan=True), name
@@ -87,7 +87,7 @@ def assert_equal(one: NonlinearFiltered, other: NonlinearFiltered) -> None:
 
 
 @pytest.mark.parametrize("name", RULES)
-def test_scan_is_the_unscented_filter_in_values_and_gradients(name: str) -> None:
+def test_scan_is_the_unscented_filter_in_values_and_gradients(name):
     (filtered, gradients), (scanned, own) = both_ways(RULES[name], *measured_pendulum(30, 4))
     assert_equal(filtered, scanned)
     for field, a, b in zip((*Learnt._fields, "measurements"), gradients, own, strict=True):
@@ -95,7 +95,7 @@ def test_scan_is_the_unscented_filter_in_values_and_gradients(name: str) -> None
         assert a.abs().sum() > 0, field
 
 
-def test_missing_measurements_are_skipped_as_by_the_filter() -> None:
+def test_missing_measurements_are_skipped_as_by_the_filter():
     measurements, inputs, first = measured_pendulum(30, 3)
     measurements[0, 3, 0] = measurements[1, 5] = measurements[2, 10:20, 1] = torch.nan
     (filtered, gradients), (scanned, own) = both_ways(RULES["symmetric"], measurements, inputs, first)
@@ -105,7 +105,7 @@ def test_missing_measurements_are_skipped_as_by_the_filter() -> None:
         assert torch.allclose(a, b, rtol=0, atol=1e-10 * float(a.abs().max()))
 
 
-def test_states_stay_within_their_bounds_as_by_the_filter() -> None:
+def test_states_stay_within_their_bounds_as_by_the_filter():
     lower = [-1e9, -1e9, 0.25]
     (filtered, gradients), (scanned, own) = both_ways(RULES["scaled"], *measured_pendulum(30, 4), lower=lower)
     assert (scanned.steps.filtered.mean[..., 2] == 0.25).any(), "the bound is met"
@@ -115,14 +115,14 @@ def test_states_stay_within_their_bounds_as_by_the_filter() -> None:
         assert torch.allclose(a, b, rtol=0, atol=1e-10 * float(a.abs().max()))
 
 
-def test_gradients_are_those_of_finite_differences() -> None:
+def test_gradients_are_those_of_finite_differences():
     measurements, inputs, first = measured_pendulum(12, 2)
     weights = torch.randn(2, 12, 3, generator=torch.Generator().manual_seed(3), dtype=torch.float64)
     start = learnt(first)
     directions = [torch.randn(part.shape, generator=torch.Generator().manual_seed(k), dtype=torch.float64) for k, part in enumerate(start)]
     directions = [direction if direction.dim() < 2 else 1e-3 * (direction + direction.mT) for direction in directions]
 
-    def loss(shift: float) -> Tensor:
+    def loss(shift):
         moved_there = Learnt(*(part.detach() + shift * way for part, way in zip(start, directions, strict=True)))
         own = Learnt(*(part.requires_grad_() for part in moved_there))
         filtered = by_the_scan(own, RULES["symmetric"], measurements, inputs, torch.tensor(FREE), None)
@@ -134,13 +134,13 @@ def test_gradients_are_those_of_finite_differences() -> None:
     assert slope == pytest.approx(numeric, rel=1e-7)
 
 
-def spread(*sizes: float) -> Gaussian[Tensor]:
+def spread(*sizes):
     """Sequences of `sharp` that are more or less spread to begin with."""
     covariances = torch.tensor(sizes, dtype=torch.float64)[:, None, None] * torch.eye(5, dtype=torch.float64)
     return Gaussian(torch.zeros(len(sizes), 5, dtype=torch.float64), covariances)
 
 
-def sharply_scanned(initial: Gaussian[Tensor], repair: bool = True) -> NonlinearFiltered:
+def sharply_scanned(initial, repair=True):
     sequences = len(initial.mean)
     measurements = 0.1 * torch.randn(2, 20, 2, generator=torch.Generator().manual_seed(2), dtype=torch.float64)[:sequences]
     model, nothing = sharp(), torch.zeros(5, dtype=torch.float64)
@@ -150,7 +150,7 @@ def sharply_scanned(initial: Gaussian[Tensor], repair: bool = True) -> Nonlinear
     return unscented_scan(points, measurements, inputs, initial, *noises, symmetric_rule(5, -2.0), repair=repair)
 
 
-def test_lost_definiteness_is_repaired_and_counted_as_by_the_filter() -> None:
+def test_lost_definiteness_is_repaired_and_counted_as_by_the_filter():
     initial = spread(1.0, 1e-3)
     measurements = 0.1 * torch.randn(2, 20, 2, generator=torch.Generator().manual_seed(2), dtype=torch.float64)
     inputs = torch.zeros(2, 20, 1, dtype=torch.float64)
@@ -167,7 +167,7 @@ def test_lost_definiteness_is_repaired_and_counted_as_by_the_filter() -> None:
     assert torch.allclose(*slopes, rtol=0, atol=1e-6 * float(slopes[0].abs().max()))
 
 
-def test_without_repair_a_sequence_is_lost_and_leaves_the_others_alone() -> None:
+def test_without_repair_a_sequence_is_lost_and_leaves_the_others_alone():
     initial = spread(1.0, 1e-3)
     start = initial.mean.clone().requires_grad_()
     left = sharply_scanned(Gaussian(start, initial.covariance), repair=False)
@@ -181,10 +181,10 @@ def test_without_repair_a_sequence_is_lost_and_leaves_the_others_alone() -> None
     assert torch.isfinite(start.grad[1]).all()
 
 
-def test_sequences_shared_out_are_what_they_are_together() -> None:
+def test_sequences_shared_out_are_what_they_are_together():
     """Each in two pieces, one after the other."""
 
-    def halves(work, sequences: int) -> None:
+    def halves(work, sequences):
         for first, end in ((0, sequences // 2), (sequences // 2, sequences)):
             work(first, end)
 
@@ -197,7 +197,7 @@ def test_sequences_shared_out_are_what_they_are_together() -> None:
         assert torch.allclose(a, b, rtol=1e-13, atol=0)
 
 
-def test_noise_that_depends_on_the_estimate_is_that_of_the_filter_and_has_no_gradients() -> None:
+def test_noise_that_depends_on_the_estimate_is_that_of_the_filter_and_has_no_gradients():
     measurements, inputs, first = measured_pendulum(20, 2)
 
     def noise(base):
@@ -215,7 +215,7 @@ def test_noise_that_depends_on_the_estimate_is_that_of_the_filter_and_has_no_gra
         scanned.steps.filtered.mean.sum().backward()
 
 
-def test_one_sample_at_a_time_it_is_the_same_filter() -> None:
+def test_one_sample_at_a_time_it_is_the_same_filter():
     measurements, inputs, first = measured_pendulum(20, 1)
     measurements[0, 4, 0] = measurements[0, 9] = torch.nan
     model, p = pendulum_with_radar(), learnt(first)
@@ -229,7 +229,7 @@ def test_one_sample_at_a_time_it_is_the_same_filter() -> None:
         assert stepper.state.covariance == pytest.approx(state.covariance[0, k].numpy(), abs=1e-12), k
 
 
-def test_one_step_alone_is_the_model() -> None:
+def test_one_step_alone_is_the_model():
     gravity = torch.tensor(9.81, dtype=torch.float64, requires_grad=True)
     model = TorchModel(partial(swung, gravity), pendulum_with_radar().observation, [gravity])
     states, inputs = (torch.randn(6, n, generator=torch.Generator().manual_seed(n), dtype=torch.float64) for n in (3, 1))
@@ -248,8 +248,8 @@ def test_one_step_alone_is_the_model() -> None:
         ({"initial": Gaussian(torch.zeros(3, 3), torch.eye(3))}, "does not fit 2 sequences"),
     ],
 )
-def test_shapes_that_do_not_fit_are_refused(wrong: dict, message: str) -> None:
-    model: NonlinearModel = pendulum_with_radar()
+def test_shapes_that_do_not_fit_are_refused(wrong, message):
+    model = pendulum_with_radar()
     known = ANY | {"initial": Gaussian(torch.zeros(3), torch.eye(3))} | wrong
     points = TorchModel(model.transition, model.observation)
     with pytest.raises(ValueError, match=message):

@@ -1,7 +1,5 @@
 """Gates: outliers are refused as if they had not been measured, readable as compiled; what contradicts for long is believed again."""
 
-from __future__ import annotations
-
 import math
 from functools import partial
 
@@ -12,41 +10,39 @@ from readable_filters import extended_filter, gated, unscented_filter
 from scipy.stats import chi2, norm
 from test_filters_kalman import example, tensors
 from test_filters_nonlinear import RULES, linear_as_nonlinear, measured_pendulum, pendulum_with_radar
-from torch import Tensor
 
 from vehest.filters.gating import Gate
-from vehest.filters.gaussian import Filtered, Gaussian
+from vehest.filters.gaussian import Gaussian
 from vehest.filters.kalman import LinearModel
 from vehest.filters.kalman_scan import kalman_scan
-from vehest.filters.sigma_points import SigmaRule
 from vehest.filters.unscented_scan import TorchModel, UnscentedStepper, unscented_scan
 
 PATIENCE = 5
 NOTHING = torch.zeros(3, dtype=torch.float64)
 
 
-def walk(steps: int) -> tuple[LinearModel[np.ndarray], Gaussian[np.ndarray]]:
+def walk(steps):
     """A position that wanders by 0.1 a sample, measured to 1 by two sensors."""
     model = LinearModel(np.eye(1), np.zeros(1), 0.01 * np.eye(1), np.ones((2, 1)), np.zeros(2), np.eye(2))
     return LinearModel(*(np.broadcast_to(part, (steps, *part.shape)) for part in model)), Gaussian(np.zeros(1), np.eye(1))
 
 
-def pendulum(y: Tensor, u: Tensor, first: Gaussian[Tensor], gate: Gate | None):
+def pendulum(y, u, first, gate):
     model = pendulum_with_radar()
     noises = [noise(NOTHING, NOTHING) for noise in (model.process_noise, model.observation_noise)]
     return unscented_scan(TorchModel(model.transition, model.observation), y, u, first, *noises, RULES["symmetric"], gate=gate)
 
 
-def by_the_filter(u: Tensor, first: Gaussian[Tensor], rule: SigmaRule, y: Tensor) -> Filtered[Tensor]:
+def by_the_filter(u, first, rule, y):
     return unscented_filter(pendulum_with_radar(), y, u, first, rule).steps
 
 
-def test_the_limit_is_that_of_the_chi_square_distribution() -> None:
+def test_the_limit_is_that_of_the_chi_square_distribution():
     limit = Gate(3.0, PATIENCE).deviations ** 2
     assert chi2.sf(limit, 1) == pytest.approx(2.0 * norm.sf(3.0))
 
 
-def test_a_consistent_filter_refuses_as_often_as_the_normal_distribution_says() -> None:
+def test_a_consistent_filter_refuses_as_often_as_the_normal_distribution_says():
     steps, generator = 50_000, np.random.default_rng(0)
     model, first = walk(steps)
     truth = np.cumsum(0.1 * generator.standard_normal(steps))
@@ -56,7 +52,7 @@ def test_a_consistent_filter_refuses_as_often_as_the_normal_distribution_says() 
     assert 1.0 - taken.mean() == pytest.approx(share, abs=5.0 * math.sqrt(share / (2 * steps)) + 0.002)
 
 
-def test_an_outlier_is_as_good_as_missing_and_takes_no_other_sensor_with_it() -> None:
+def test_an_outlier_is_as_good_as_missing_and_takes_no_other_sensor_with_it():
     model, first = walk(40)
     y = np.random.default_rng(1).standard_normal((40, 2))
     missing = y.copy()
@@ -72,7 +68,7 @@ def test_an_outlier_is_as_good_as_missing_and_takes_no_other_sensor_with_it() ->
         assert np.array_equal(gated.log_likelihood, known.log_likelihood)
 
 
-def test_after_a_jump_of_the_truth_the_gate_opens_and_the_filter_comes_back() -> None:
+def test_after_a_jump_of_the_truth_the_gate_opens_and_the_filter_comes_back():
     model, first = walk(100)
     y = np.random.default_rng(2).standard_normal((100, 2))
     y[50:] += 1000.0
@@ -84,7 +80,7 @@ def test_after_a_jump_of_the_truth_the_gate_opens_and_the_filter_comes_back() ->
     assert gated.filtered.mean[-1] == pytest.approx(free.filtered.mean[-1], abs=1.0), "open, it goes where the free one goes"
 
 
-def test_a_gate_that_refuses_nothing_changes_no_bit() -> None:
+def test_a_gate_that_refuses_nothing_changes_no_bit():
     model, measurements, first = example(60, seed=3, missing=0.2)
     plain = kalman_scan(model, measurements, first)
     wide = kalman_scan(model, measurements, first, Gate(1e9, PATIENCE))
@@ -96,7 +92,7 @@ def test_a_gate_that_refuses_nothing_changes_no_bit() -> None:
     assert torch.equal(without.covariance, within.covariance)
 
 
-def outliers(steps: int, sequences: int) -> tuple[Tensor, Tensor, Gaussian[Tensor]]:
+def outliers(steps, sequences):
     y, u, first = measured_pendulum(steps, sequences)
     y[0, 5, 0], y[0, 9, 1], y[-1, 12] = 40.0, -40.0, 1e3
     y[0, 15:, 1] += 30.0  # longer than the gate is patient
@@ -104,7 +100,7 @@ def outliers(steps: int, sequences: int) -> tuple[Tensor, Tensor, Gaussian[Tenso
     return y, u, first
 
 
-def test_the_scan_refuses_what_the_readable_filter_refuses_whatever_the_rule() -> None:
+def test_the_scan_refuses_what_the_readable_filter_refuses_whatever_the_rule():
     y, u, first = outliers(30, 3)
     model, gate = pendulum_with_radar(), Gate(4.0, PATIENCE)
     noises = [noise(NOTHING, NOTHING) for noise in (model.process_noise, model.observation_noise)]
@@ -121,7 +117,7 @@ def test_the_scan_refuses_what_the_readable_filter_refuses_whatever_the_rule() -
         assert torch.allclose(readable.log_likelihood, scanned.log_likelihood, rtol=1e-10, atol=1e-10)
 
 
-def test_gradients_through_a_gate_are_those_of_missing_measurements() -> None:
+def test_gradients_through_a_gate_are_those_of_missing_measurements():
     y, u, first = outliers(30, 2)
     model = pendulum_with_radar()
     weights = torch.randn(2, 30, 3, generator=torch.Generator().manual_seed(4), dtype=torch.float64)
@@ -144,7 +140,7 @@ def test_gradients_through_a_gate_are_those_of_missing_measurements() -> None:
     assert torch.allclose(theirs, found[0][0], rtol=0, atol=1e-10 * float(theirs.abs().max()))
 
 
-def test_measurements_that_are_handed_over_are_left_as_they_are() -> None:
+def test_measurements_that_are_handed_over_are_left_as_they_are():
     y, u, first = outliers(30, 1)
     before = y.clone()
     pendulum(y, u, first, Gate(4.0, PATIENCE))
@@ -155,7 +151,7 @@ def test_measurements_that_are_handed_over_are_left_as_they_are() -> None:
     assert (measured == 1e3).all()
 
 
-def test_sample_by_sample_the_gate_is_that_of_the_whole_sequence() -> None:
+def test_sample_by_sample_the_gate_is_that_of_the_whole_sequence():
     y, u, first = outliers(30, 1)
     model, gate = pendulum_with_radar(), Gate(4.0, PATIENCE)
     whole = pendulum(y, u, first, gate).steps.filtered.mean[0].numpy()
@@ -166,7 +162,7 @@ def test_sample_by_sample_the_gate_is_that_of_the_whole_sequence() -> None:
         assert stepper.step(y[0, k].numpy(), u[0, k].numpy(), process, observation) == pytest.approx(whole[k], abs=1e-12), k
 
 
-def test_every_sequence_has_its_own_gate_however_they_are_shared_out() -> None:
+def test_every_sequence_has_its_own_gate_however_they_are_shared_out():
     y, u, first = outliers(30, 4)
     together = pendulum(y, u, first, Gate(4.0, PATIENCE)).steps
     for row in range(4):
@@ -185,7 +181,7 @@ def test_every_sequence_has_its_own_gate_however_they_are_shared_out() -> None:
     assert torch.equal(shared.filtered.mean, together.filtered.mean)
 
 
-def test_the_gate_of_the_kalman_filter_judges_by_its_innovations() -> None:
+def test_the_gate_of_the_kalman_filter_judges_by_its_innovations():
     model, measurements, first = example(60, seed=5, missing=0.1)
     measurements[20, 0], measurements[40:, 1] = 1e3, 1e3
     readable, number, gate = linear_as_nonlinear(tensors(model)), torch.arange(60.0).unsqueeze(-1), Gate(4.0, PATIENCE)
@@ -196,6 +192,6 @@ def test_the_gate_of_the_kalman_filter_judges_by_its_innovations() -> None:
     assert judged.filtered.mean.numpy() == pytest.approx(compiled.filtered.mean, abs=1e-9)
 
 
-def test_half_a_second_of_patience_is_counted_in_samples() -> None:
+def test_half_a_second_of_patience_is_counted_in_samples():
     assert Gate.of(None, 100.0) is None
     assert Gate.of(5.0, 100.0) == Gate(5.0, 50)

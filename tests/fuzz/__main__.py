@@ -1,7 +1,5 @@
 """``python -m fuzz``: try malformed inputs, write a row for each, and fail if any of them ends badly."""
 
-from __future__ import annotations
-
 import os
 
 os.environ |= {"OMP_NUM_THREADS": "1", "MKL_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "COLUMNS": "160", "MPLBACKEND": "agg"}
@@ -13,10 +11,10 @@ import time
 from pathlib import Path
 
 
-def main() -> int:
+def main():
     """Exit code 1 if any row is bad."""
     options = _options()
-    from fuzz.runner import Fuzzer, Row, described, summary, write_rows
+    from fuzz.runner import Fuzzer, described, summary, write_rows
 
     with tempfile.TemporaryDirectory(prefix="vehest-fuzz-", ignore_cleanup_errors=True) as made:
         started = time.monotonic()
@@ -26,9 +24,9 @@ def main() -> int:
         fuzzer.prepare()
         indices = options.only or range(options.inputs)
         print(f"{len(indices)} inputs, {len(set(fuzzer.turns))} generators, ready after {time.monotonic() - started:.0f} s", flush=True)
-        rows: list[Row] = []
+        rows = []
 
-        def report(row: Row) -> None:
+        def report(row):
             rows.append(row)
             if options.out and len(rows) % 50 == 0:
                 write_rows(rows, Path(options.out))
@@ -45,7 +43,7 @@ def main() -> int:
     return 1 if bad else 0
 
 
-def _options() -> argparse.Namespace:
+def _options():
     parser = argparse.ArgumentParser(prog="python -m fuzz", description=__doc__)
     parser.add_argument("--inputs", type=int, default=3000, help="how many")
     parser.add_argument("--seed", type=int, default=0, help="another seed makes other inputs")

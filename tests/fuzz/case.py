@@ -62,33 +62,33 @@ class Case:
     seconds: float = 20.0
 
     @property
-    def place(self) -> Path:
+    def place(self):
         """Working folder of the command."""
         return self.folder.joinpath(*_DEPTH)
 
     @property
-    def numbers(self) -> np.random.Generator:
+    def numbers(self):
         """Random numbers by the array."""
         return np.random.default_rng(self.rng.getrandbits(63))
 
-    def copy(self, template: str, to: str = ".") -> Path:
+    def copy(self, template, to="."):
         """Copy a template's folder into the place, and say where."""
         return Path(shutil.copytree(self.templates / template, self.place / to, symlinks=True, dirs_exist_ok=True))
 
-    def write(self, name: str | bytes, content: bytes | str) -> Path:
+    def write(self, name, content):
         """Write a file into the place."""
         path = self.place / os.fsdecode(name)
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_bytes(content if isinstance(content, bytes) else content.encode("utf-8", "surrogatepass"))
         return path
 
-    def spoil(self, file: Path, spoil: Callable[[bytes, random.Random], bytes]) -> bool:
+    def spoil(self, file, spoil):
         """Replace the content of a file by what ``spoil`` makes of it, unless the case is honest; returns whether that was done."""
         if not self.honest:
             file.write_bytes(spoil(file.read_bytes(), self.rng))
         return not self.honest
 
-    def idea(self, number: int) -> int:
+    def idea(self, number):
         """One of several ideas: all of them in turn, visit after visit; -1 in an honest case."""
         return -1 if self.honest else self.visit % number
 
@@ -115,27 +115,27 @@ class Generator:
     weight: int
 
 
-GENERATORS: list[Generator] = []
-TEMPLATES: dict[str, Callable[[Path], None]] = {}
+GENERATORS = []
+TEMPLATES = {}
 
 
-def generator(*needs: str, weight: int = 1) -> Callable[[Build], Build]:
+def generator(*needs, weight=1):
     """Register a generator with the templates that it copies from."""
 
-    def register(build: Build) -> Build:
+    def register(build):
         GENERATORS.append(Generator(build.__module__.rpartition(".")[2], build.__name__, build, needs, weight))
         return build
 
     return register
 
 
-def template(build: Callable[[Path], None]) -> Callable[[Path], None]:
+def template(build):
     """Register what fills a template's folder, under the function's name."""
     TEMPLATES[build.__name__] = build
     return build
 
 
-def load_families() -> None:
+def load_families():
     """Import every module of `fuzz.families`, which registers its generators."""
     from fuzz import families
 
@@ -143,11 +143,11 @@ def load_families() -> None:
         importlib.import_module(f"{families.__name__}.{module.name}")
 
 
-def schedule(chosen: list[Generator]) -> list[Generator]:
+def schedule(chosen):
     """The generators in the order in which they take turns; heavier ones come more than once a round."""
     return [one for turn in range(max(one.weight for one in chosen)) for one in chosen if one.weight > turn]
 
 
-def is_honest(one: Generator, position: int, visit: int) -> bool:
+def is_honest(one, position, visit):
     """Whether a visit makes the honest variant: the first visits of an eighth of the generators, then each in its turn."""
     return one.family != PLANTED and (visit + position) % 8 == 0

@@ -1,7 +1,5 @@
 """Imports made beforehand, and honest files made once by vehest's own commands; generators copy and spoil these."""
 
-from __future__ import annotations
-
 import encodings
 import importlib
 import os
@@ -9,27 +7,26 @@ import pkgutil
 import sys
 from contextlib import suppress
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pandas as pd
 import yaml
 
 from conftest import planar_drive
-from fuzz.case import Case, template
+from fuzz.case import template
 from place import DATASET, STEERED, write_csv
 from single_track_drive import linear_drive
 from vehest.cli import main
 
 SECONDS, RATE_HZ = 30.0, 50.0
-SPLIT: dict[str, Any] = {
+SPLIT = {
     "name": "mine",
     "dataset": "mine",
     "train": [{"recording": "one"}],
     "validation": [{"recording": "two"}],
     "tests": {"test": [{"recording": "three"}]},
 }
-PIPELINE: dict[str, Any] = {
+PIPELINE = {
     "study": "small",
     "title": "A small study",
     "report": "drive",
@@ -53,13 +50,13 @@ STEERED_SPLIT = SPLIT | {"name": "steered", "dataset": "steered"}
 KALMAN = ("estimator=kalman", "estimator.rate_hz=50", "split=steered", "tracking=none")
 
 
-def lap(seed: int = 9, seconds: float = SECONDS, rate_hz: float = RATE_HZ) -> pd.DataFrame:
+def lap(seed=9, seconds=SECONDS, rate_hz=RATE_HZ):
     """A drive whose columns are called like channels, in SI units."""
     drive = planar_drive(seconds, rate_hz, seed=seed, noise=0.02)
     return pd.DataFrame({"time": drive.time, **{name: drive[name] for name in ("vx", "yaw_rate", "ay", "ax", "vx_ref", "vy_ref")}})
 
 
-def run(*words: str) -> None:
+def run(*words):
     """A command of vehest, which must succeed, in the current folder."""
     former, code = (sys.argv, dict(os.environ)), 0
     os.environ |= {"VEHEST_DATA": str(Path.cwd() / "raw")}
@@ -78,14 +75,14 @@ def run(*words: str) -> None:
         raise RuntimeError(f"'vehest {' '.join(words)}' leaves with {code}")
 
 
-def write_yaml(path: Path, content: Any) -> None:
+def write_yaml(path, content):
     """An honest YAML file."""
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_text(yaml.safe_dump(content, allow_unicode=True, sort_keys=False), encoding="utf-8")
 
 
 @template
-def drives(folder: Path) -> None:
+def drives(folder):
     """Three tables of a car, with its data set, split and pipeline; a lap with columns called like channels."""
     (folder / "raw").mkdir()
     for seed, name in enumerate(("one", "two", "three"), start=1):
@@ -97,7 +94,7 @@ def drives(folder: Path) -> None:
 
 
 @template
-def steered(folder: Path) -> None:
+def steered(folder):
     """Three tables with a steering angle, for filters that know a car; and the Kalman filter of their split."""
     (folder / "raw" / "steered").mkdir(parents=True)
     for seed, name in enumerate(("one", "two", "three"), start=1):
@@ -111,13 +108,13 @@ def steered(folder: Path) -> None:
 
 
 @template
-def study(folder: Path) -> None:
+def study(folder):
     """The same with everything that its pipeline makes."""
     drives(folder)
     run("run", "small", "tracking=none", "--jobs", "1", "--quiet")
 
 
-def warm_up(folder: Path) -> None:
+def warm_up(folder):
     """Run what commands have in common once in this process: kernels are loaded, plugins of Hydra found, first imports done."""
     drives(folder)
     steered(folder)
@@ -133,7 +130,7 @@ def warm_up(folder: Path) -> None:
     run("data", "channels")
 
 
-def models_in(case: Case) -> list[Path]:
+def models_in(case):
     """Model folders of the copied study."""
     return sorted((case.place / "outputs" / "train").iterdir())
 
@@ -160,7 +157,7 @@ PIECES = (
 PACKAGES = ("typer", "rich")
 
 
-def import_everything() -> None:
+def import_everything():
     """Import all of vehest, the libraries that it loads when it needs them, and every text encoding."""
     import vehest
     import vehest_papers
@@ -184,7 +181,7 @@ def import_everything() -> None:
     load_kernels()
 
 
-def load_kernels() -> None:
+def load_kernels():
     """Load what every estimate runs from the compile cache, which is unpickled: later that means that an input asked for it."""
     import vehest
 

@@ -1,14 +1,9 @@
 """Hostile values, names and texts, and ways to spoil bytes and trees of plain values."""
 
-from __future__ import annotations
-
 import copy
 import json
 import math
-import random
-from collections.abc import Callable, Mapping
 from datetime import date
-from typing import Any
 
 import yaml
 
@@ -23,7 +18,7 @@ NAMES = (
 )  # fmt: skip
 """Names that no file system, terminal, shell or page should take as they are; the last two not even Python's own functions."""
 WRITABLE_NAMES = NAMES[:-2]
-SCALARS: tuple[Any, ...] = (
+SCALARS = (
     None, True, False, 0, 1, -1, 2**31, 2**63, 10**400, -(10**18), 0.5, -0.0, 1e-320, 1e300, math.inf, -math.inf, math.nan,
     "", "null", "1e400", "7", "x" * 100_000, "${nothing.there}", "${oc.env:HOME}", "${.}", "???", CALL, "os.system",
     [], {}, [[]], [None], {"": None}, {"a": {"b": {"c": [1, {"d": 2}]}}}, [1, "a", None, 2.5], {1: 2, None: 3, False: 4},
@@ -47,7 +42,7 @@ RAW = (
 JSON = ("[" * 100_000, '{"a": ' * 90 + "1" + "}" * 90, "1" * 5000, "NaN", "1e999", '"\\ud800"', "null", "3", "[]", '"a"')
 
 
-def spoil_bytes(content: bytes, rng: random.Random) -> bytes:
+def spoil_bytes(content, rng):
     """Flip, cut, repeat, overwrite or insert, once or a few times: anywhere, near the head or near the end."""
     data = bytearray(content)
     where = rng.choice(["anywhere", "anywhere", "head", "end"])
@@ -76,12 +71,12 @@ def spoil_bytes(content: bytes, rng: random.Random) -> bytes:
     return bytes(data)
 
 
-def hostile(rng: random.Random, yaml_text: bool = False) -> Any:
+def hostile(rng, yaml_text=False):
     """A value that belongs nowhere."""
     return Raw(rng.choice(RAW)) if yaml_text and rng.random() < 0.3 else copy.deepcopy(rng.choice(SCALARS))
 
 
-def spoil_tree(tree: Any, rng: random.Random, yaml_text: bool = False) -> Any:
+def spoil_tree(tree, rng, yaml_text=False):
     """Replace, remove, rename, wrap or repeat values anywhere in a tree of plain values, once or a few times."""
     tree = copy.deepcopy(tree)
     for _ in range(rng.choice([1, 1, 1, 2, 4])):
@@ -109,13 +104,13 @@ def spoil_tree(tree: Any, rng: random.Random, yaml_text: bool = False) -> Any:
     return tree
 
 
-def _holders(tree: Any) -> list[Any]:
+def _holders(tree):
     """Every mapping and list of a tree."""
     inner = tree.values() if isinstance(tree, dict) else tree if isinstance(tree, list) else ()
     return [tree, *(holder for value in inner for holder in _holders(value))] if isinstance(tree, dict | list) else []
 
 
-def spoil_items(tree: Mapping[str, Any], rng: random.Random) -> dict[Any, Any]:
+def spoil_items(tree, rng):
     """A tree spoilt besides its defaults, which stay; of one key alone, or of all."""
     items = {key: value for key, value in tree.items() if key != "defaults"}
     key = rng.choice([*items, ""])
@@ -123,11 +118,11 @@ def spoil_items(tree: Mapping[str, Any], rng: random.Random) -> dict[Any, Any]:
     return {**tree, **spoilt} if isinstance(spoilt, dict) else dict(tree)
 
 
-def yaml_of(tree: Any) -> str:
+def yaml_of(tree):
     """A tree as YAML; `Raw` values stand in it as they are."""
-    pieces: list[str] = []
+    pieces = []
 
-    def plain(value: Any) -> Any:
+    def plain(value):
         if isinstance(value, Raw):
             pieces.append(str(value))
             return f"RAW{len(pieces) - 1}RAW"
@@ -141,10 +136,10 @@ def yaml_of(tree: Any) -> str:
     return text
 
 
-def json_of(tree: Any) -> str:
+def json_of(tree):
     """A tree as JSON; what JSON cannot hold becomes text."""
 
-    def plain(value: Any) -> Any:
+    def plain(value):
         if isinstance(value, dict):
             return {str(key): plain(inner) for key, inner in value.items()}
         return [plain(inner) for inner in value] if isinstance(value, list | tuple) else value
@@ -152,10 +147,10 @@ def json_of(tree: Any) -> str:
     return json.dumps(plain(tree), default=str, indent=1)
 
 
-def spoil_text(text: str, rng: random.Random) -> bytes:
+def spoil_text(text, rng):
     """A text that is cut, spoilt in its bytes, encoded otherwise, or made large."""
     raw = text.encode("utf-8", "surrogatepass")
-    ways: list[Callable[[], bytes]] = [
+    ways = [
         lambda: text.encode("utf-16", "surrogatepass"),
         lambda: b"\xef\xbb\xbf" + raw,
         lambda: raw.replace(b"e", b"\xe4", 1),
@@ -169,7 +164,7 @@ def spoil_text(text: str, rng: random.Random) -> bytes:
     return rng.choice(ways)()
 
 
-def _bomb(rng: random.Random) -> str:
+def _bomb(rng):
     """A few hundred bytes of YAML whose aliases or merged mappings would unfold to 10¹² values, or some such number."""
     if rng.random() < 0.5:
         lines = ["m0: &m0 {a: 1, b: 2}"]
@@ -181,7 +176,7 @@ def _bomb(rng: random.Random) -> str:
     return "\n".join(lines) + "\n"
 
 
-def spoil_yaml(tree: Any, rng: random.Random, *, bombs: bool = True) -> bytes:
+def spoil_yaml(tree, rng, *, bombs=True):
     """A YAML file with a spoilt tree, spoilt text, or, if ``bombs``, something that explodes in it."""
     how = rng.random()
     if how < 0.6:
@@ -193,7 +188,7 @@ def spoil_yaml(tree: Any, rng: random.Random, *, bombs: bool = True) -> bytes:
     return spoil_text(yaml_of(tree), rng)
 
 
-def spoil_json(content: bytes, rng: random.Random) -> bytes:
+def spoil_json(content, rng):
     """A JSON file with a spoilt tree, spoilt text, or something too deep in it."""
     how, tree = rng.random(), json.loads(content)
     if how < 0.6:

@@ -18,12 +18,10 @@ import sys
 import time
 import traceback
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
 from dataclasses import astuple, dataclass, fields
 from pathlib import Path
-from typing import Any
 
-from fuzz.case import GENERATORS, PLANTED, TEMPLATES, Case, Command, Generator, is_honest, load_families, schedule
+from fuzz.case import GENERATORS, PLANTED, TEMPLATES, Case, is_honest, load_families, schedule
 from fuzz.verdicts import Outcome, differences, judge, last_line, refusal_lines, snapshot
 from fuzz.watched import READER, become
 from vehest.data.errors import printable
@@ -61,7 +59,7 @@ class Fuzzer:
         seconds: that a command may take.
     """
 
-    def __init__(self, folder: Path, seed: int, families: Sequence[str] = (), *, keep: bool = False, seconds: float = 20.0) -> None:
+    def __init__(self, folder, seed, families=(), *, keep=False, seconds=20.0):
         self.folder, self.seed, self.keep, self.seconds = folder.resolve(), seed, keep, seconds
         load_families()
         chosen = [one for one in GENERATORS if (one.family in families if families else one.family != PLANTED)]
@@ -69,7 +67,7 @@ class Fuzzer:
             raise SystemExit("no family has such a name")
         self.turns = schedule(chosen)
 
-    def prepare(self) -> None:
+    def prepare(self):
         """Import what commands import, and make the templates that generators copy from."""
         self.folder.chmod(0o711)  # for commands that run as a user without rights
         if all(one.family == PLANTED for one in self.turns):
@@ -87,14 +85,14 @@ class Fuzzer:
             with _quiet(folder):
                 TEMPLATES[name](folder)
 
-    def generator_of(self, index: int) -> tuple[Generator, int, bool]:
+    def generator_of(self, index):
         """Generator of an input, how often it has had its turn before, and whether the input is to be honest."""
         position, visit = index % len(self.turns), index // len(self.turns)
         one = self.turns[position]
         turns_before = self.turns[:position].count(one)
         return one, visit * one.weight + turns_before, is_honest(one, position, visit)
 
-    def run(self, indices: Sequence[int], jobs: int, report: Callable[[Row], None]) -> None:
+    def run(self, indices, jobs, report):
         """Try inputs in ``jobs`` workers, and report each as it ends."""
         gc.collect()
         gc.freeze()  # what is here stays; children need not copy it to look through it
@@ -109,7 +107,7 @@ class Fuzzer:
         for worker in workers:
             worker.join()
 
-    def _work(self, indices: Sequence[int], at: Any, rows: Any, parent: int) -> None:
+    def _work(self, indices, at, rows, parent):
         signal.signal(signal.SIGINT, signal.SIG_DFL)
         while os.getppid() == parent:
             with at.get_lock():
@@ -119,7 +117,7 @@ class Fuzzer:
                 return
             rows.put(self.try_one(indices[position]))
 
-    def try_one(self, index: int) -> Row:
+    def try_one(self, index):
         """Make one input, run its command in a forked child, and judge."""
         one, visit, honest = self.generator_of(index)
         case = self.case_of(index, visit, honest)
@@ -137,7 +135,7 @@ class Fuzzer:
         said = (printable(text.replace(str(case.folder), "…"))[:200] for text in (error, verdict, detail))
         return Row(index, one.family, one.name, honest, shown, *(round(number, 3) for number in took), *said)
 
-    def case_of(self, index: int, visit: int, honest: bool) -> Case:
+    def case_of(self, index, visit, honest):
         """An empty folder for an input; what is drawn depends on seed and index alone."""
         folder = self.folder / f"{index:06d}"
         _remove(folder)
@@ -147,7 +145,7 @@ class Fuzzer:
         return case
 
 
-def _watch(case: Case, command: Command) -> Outcome:
+def _watch(case, command):
     """Run a command in a forked child and see what it does."""
     if command.unprivileged and os.getuid() == 0:
         _hand_over(case.folder)
@@ -203,17 +201,17 @@ class _Readers:
         waited: seconds that reading processes waited for a core.
     """
 
-    def __init__(self, command: int) -> None:
+    def __init__(self, command):
         self._command = command
         self.command_kb = 0
         self.peaks_kb: dict[str, int] = {}
         self._waits: dict[str, float] = {}
 
     @property
-    def waited(self) -> float:
+    def waited(self):
         return sum(self._waits.values())
 
-    def look(self) -> None:
+    def look(self):
         """Note memory and waiting of those that run."""
         with contextlib.suppress(OSError, IndexError, StopIteration):
             self.command_kb = max(self.command_kb, _peak_kb(str(self._command)))
@@ -224,19 +222,19 @@ class _Readers:
                         self._waits[reader] = int(Path(f"/proc/{reader}/schedstat").read_text().split()[1]) / 1e9
 
 
-def _peak_kb(process: str) -> int:
+def _peak_kb(process):
     with open(f"/proc/{process}/status") as stream:
         return next(int(line.split()[1]) for line in stream if line.startswith("VmHWM:"))
 
 
-def _ends(process: int, seconds: float) -> bool:
+def _ends(process, seconds):
     """Whether a process ends within some seconds."""
     poll = select.poll()
     poll.register(process, select.POLLIN)
     return bool(poll.poll(seconds * 1000))
 
 
-def _seconds(child: int, started: float) -> float:
+def _seconds(child, started):
     """Wall clock since the start, less what the child has waited for a core on a machine that has others to serve."""
     try:
         waited = int(Path(f"/proc/{child}/schedstat").read_text().split()[1]) / 1e9
@@ -245,12 +243,12 @@ def _seconds(child: int, started: float) -> float:
     return time.monotonic() - started - waited
 
 
-def _hand_over(folder: Path) -> None:
+def _hand_over(folder):
     for path in (folder, *folder.rglob("*")):
         os.chown(path, 65534, 65534, follow_symlinks=False)
 
 
-def _remove(folder: Path) -> None:
+def _remove(folder):
     if folder.exists():
         for inside, _, _ in os.walk(folder):
             with contextlib.suppress(OSError):
@@ -258,7 +256,7 @@ def _remove(folder: Path) -> None:
         shutil.rmtree(folder, ignore_errors=True)
 
 
-def _text(path: Path) -> str:
+def _text(path):
     """A log as text, the first megabytes of it."""
     try:
         with open(path, "rb") as stream:
@@ -267,14 +265,14 @@ def _text(path: Path) -> str:
         return ""
 
 
-def _shown(command: Command, case: Case) -> str:
+def _shown(command, case):
     words = [os.fsdecode(word).replace(str(case.place), ".") for word in command.argv]
     cut = [word if len(word) <= 160 else f"{word[:150]}…({len(word)} characters)" for word in words]
     return printable(" ".join(shlex.quote(word) for word in cut))[:600]
 
 
 @contextlib.contextmanager
-def _quiet(folder: Path) -> Iterator[None]:
+def _quiet(folder):
     """Work in a folder, with what is printed kept back."""
     here, out, err = os.getcwd(), sys.stdout, sys.stderr
     sys.stdout, sys.stderr = io.StringIO(), io.StringIO()
@@ -289,7 +287,7 @@ def _quiet(folder: Path) -> Iterator[None]:
         sys.stdout, sys.stderr = out, err
 
 
-def write_rows(rows: Sequence[Row], path: Path) -> None:
+def write_rows(rows, path):
     """Rows as CSV, in the order of their index."""
     path.parent.mkdir(parents=True, exist_ok=True)
     with open(path, "w", newline="", encoding="utf-8") as stream:
@@ -298,7 +296,7 @@ def write_rows(rows: Sequence[Row], path: Path) -> None:
         writer.writerows(astuple(row) for row in sorted(rows, key=lambda one: one.index))
 
 
-def described(row: Row) -> str:
+def described(row):
     """A row for people, on two lines."""
     kind, took = " (honest)" if row.honest else "", f"{row.seconds:.1f} s ({row.cpu_seconds:.1f} s computing)"
     return (
@@ -307,7 +305,7 @@ def described(row: Row) -> str:
     )
 
 
-def summary(rows: Sequence[Row]) -> str:
+def summary(rows):
     """A line a family: how many inputs, how many honest ones, and how they ended."""
     lines = []
     for family in [*sorted({row.family for row in rows}), "all"]:

@@ -1,7 +1,5 @@
 """Two hundred malformed inputs end well, and a harness that would notice if they did not."""
 
-from __future__ import annotations
-
 import csv
 import os
 import random
@@ -21,7 +19,7 @@ pytestmark = pytest.mark.apart
 TESTS = Path(__file__).parents[1]
 
 
-def rows_of(folder: Path, *options: str) -> list[dict[str, str]]:
+def rows_of(folder, *options):
     """Rows of a run of the harness, in a process of its own."""
     out = folder / "fuzz.csv"
     paths = [str(TESTS), str(TESTS / "sources"), str(TESTS.parent / "src"), os.environ.get("PYTHONPATH", "")]
@@ -51,11 +49,11 @@ def test_each_misdeed_gets_its_verdict(tmp_path):
     assert {"refused"} == set(VERDICTS) - {verdict for verdict, _ in MISDEEDS.values()}
 
 
-def case_in(folder: Path, *, honest: bool) -> Case:
+def case_in(folder, *, honest):
     return Case(folder, folder / "templates", random.Random(0), honest, 0)
 
 
-def outcome(exit_code: int, stderr: str, changed: tuple[str, ...] = ()) -> Outcome:
+def outcome(exit_code, stderr, changed=()):
     return Outcome(exit_code, 0.1, 0.1, 1.0, "", stderr, (), changed, "")
 
 
@@ -90,7 +88,7 @@ def test_what_is_written_is_seen_in_the_folders(tmp_path):
 
 
 def test_the_same_seed_and_index_make_the_same_input(tmp_path):
-    def files(folder: Path, seed: int, index: int) -> tuple[Command, dict[str, bytes]]:
+    def files(folder, seed, index):
         fuzzer = Fuzzer(folder, seed, ["tables"])
         one, visit, honest = fuzzer.generator_of(index)
         case = fuzzer.case_of(index, visit, honest)

@@ -5,11 +5,10 @@ from __future__ import annotations
 import os
 import re
 import stat
-from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
-from fuzz.case import CANARY, Case, Command
+from fuzz.case import CANARY
 from vehest.data.files import ASIDE_PREFIX
 
 MEMORY_MB = 2048.0
@@ -62,14 +61,14 @@ class Outcome:
     stack: str
 
 
-def judge(case: Case, command: Command, outcome: Outcome) -> tuple[str, str]:
+def judge(case, command, outcome):
     """Verdict, and what it is about."""
     for verdict, detail in _findings(case, command, outcome):
         return verdict, detail
     return "ok", ""
 
 
-def _findings(case: Case, command: Command, outcome: Outcome) -> Iterator[tuple[str, str]]:
+def _findings(case, command, outcome):
     made = [path for path in outcome.changed if Path(path).name == CANARY]
     yield from (("executed", f"made {path}") for path in made)
     for verdict in ("executed", "outside"):
@@ -94,7 +93,7 @@ def _findings(case: Case, command: Command, outcome: Outcome) -> Iterator[tuple[
     yield from (("leftovers", path) for path in outcome.changed if ASIDE_PREFIX in path or path.startswith("tmp/"))
 
 
-def _about_lines(case: Case, command: Command, outcome: Outcome) -> Iterator[tuple[str, str]]:
+def _about_lines(case, command, outcome):
     if outcome.exit_code == 0:
         return
     if case.honest:
@@ -106,38 +105,38 @@ def _about_lines(case: Case, command: Command, outcome: Outcome) -> Iterator[tup
         yield "several lines", f"{len(lines)} lines, first {lines[0][:120]!r}"
 
 
-def refusal_lines(stderr: str) -> list[str]:
+def refusal_lines(stderr):
     """Lines on standard error that are no progress and no warning."""
     return [line for line in stderr.split("\n") if line.strip() and not line.startswith(PROGRESS)]
 
 
-def last_line(text: str) -> str:
+def last_line(text):
     """The last line that is not blank."""
     lines = [line for line in text.split("\n") if line.strip()]
     return lines[-1] if lines else ""
 
 
-def _prints_findings(command: Command) -> bool:
+def _prints_findings(command):
     """Whether a command says on standard output what is wrong, and leaves with a code by it."""
     words = [os.fsdecode(word) for word in command.argv[:2]]
     return words[:1] == ["doctor"] or words == ["data", "check"]
 
 
-def _is_allowed(path: str, case: Case, command: Command) -> bool:
+def _is_allowed(path, case, command):
     place = case.place.relative_to(case.folder).as_posix()
     roots = [f"{place}/{name}" for name in ("outputs", *command.targets)] + ["tmp"]
     return any(path == root or path.startswith(f"{root}/") for root in roots) or _is_aside_of(path, roots)
 
 
-def _is_aside_of(path: str, roots: list[str]) -> bool:
+def _is_aside_of(path, roots):
     """Whether a path is what a target is written to first."""
     folder, _, name = path.rpartition("/")
     return name.startswith(ASIDE_PREFIX) and any(root.rpartition("/")[0] == folder for root in roots)
 
 
-def snapshot(folder: Path) -> Snapshot:
+def snapshot(folder):
     """Everything below a folder, with what would change if it were written to; logs are left out, links not followed."""
-    found: Snapshot = {}
+    found = {}
     pending = [str(folder)]
     while pending:
         inside = pending.pop()
@@ -157,6 +156,6 @@ def snapshot(folder: Path) -> Snapshot:
     return found
 
 
-def differences(before: Snapshot, after: Snapshot) -> tuple[str, ...]:
+def differences(before, after):
     """Paths that are new, gone or different, sorted."""
     return tuple(sorted(path for path in before.keys() | after.keys() if before.get(path) != after.get(path)))

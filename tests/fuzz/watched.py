@@ -1,7 +1,5 @@
 """The forked child: limits, an audit hook, and the command line run as the terminal would run it; the reading processes that it starts."""
 
-from __future__ import annotations
-
 import faulthandler
 import json
 import os
@@ -10,12 +8,9 @@ import sys
 import tempfile
 import traceback
 import types
-from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any
 
 import vehest
-from fuzz.case import Case, Command
 
 ADDRESS_SPACE = 4 * 2**30
 FILE_SIZE = 2**30
@@ -74,16 +69,16 @@ class Watch:
         reads: whether this is a reading process, which imports what it needs and runs nothing but code of installed files.
     """
 
-    def __init__(self, inside: Path, report: int, *, reads: bool = False) -> None:
+    def __init__(self, inside, report, *, reads=False):
         self._inside, self._report, self._reads = os.path.realpath(inside), report, reads
         self._armed, self._noted = False, 0
 
-    def arm(self) -> None:
+    def arm(self):
         """Begin; there is no end but that of the process."""
         sys.addaudithook(self._hook)
         self._armed = True
 
-    def _hook(self, event: str, arguments: tuple[Any, ...]) -> None:
+    def _hook(self, event, arguments):
         if not self._armed:
             return
         if event == "open":
@@ -102,7 +97,7 @@ class Watch:
             if family is not None and int(family) != 1:
                 raise OSError(101, "the network is out of reach here")
 
-    def _code(self, event: str, arguments: tuple[Any, ...]) -> None:
+    def _code(self, event, arguments):
         try:
             caller = sys._getframe(2)
         except ValueError:  # the interpreter itself, at its start
@@ -126,11 +121,11 @@ class Watch:
             return
         self._note("executed", f"{event} of {str(code)[:80]!r} by {module}:{caller.f_lineno}")
 
-    def _imported(self, name: str) -> None:
+    def _imported(self, name):
         if name not in sys.modules and not name.startswith(HARMLESS_IMPORTS):
             self._note("executed", f"import of {name[:80]!r}")
 
-    def _program(self, event: str, arguments: tuple[Any, ...]) -> None:
+    def _program(self, event, arguments):
         if event == "os.fork" or _called_from(sys._getframe(2), ("multiprocessing.",)):
             return
         if event == "subprocess.Popen" and [*arguments[1]][:1] + [*arguments[1]][-2:] == [sys.executable, "-m", READER]:
@@ -138,12 +133,12 @@ class Watch:
         self._note("executed", f"{event} {str(arguments)[:120]}")
         raise PermissionError(1, "no program is started here")
 
-    def _opened(self, path: Any, mode: Any, flags: Any) -> None:
+    def _opened(self, path, mode, flags):
         writes = isinstance(flags, int) and flags & (os.O_WRONLY | os.O_RDWR | os.O_CREAT | os.O_TRUNC | os.O_APPEND)
         if writes or (isinstance(mode, str) and set(mode) & set("wax+")):
             self._written("open", path)
 
-    def _written(self, event: str, path: Any) -> None:
+    def _written(self, event, path):
         if not isinstance(path, str | bytes):
             return
         self._armed = False
@@ -159,7 +154,7 @@ class Watch:
             self._note("outside", f"{event} {real[:160]}")
             raise PermissionError(1, "this is outside of the sandbox", real)
 
-    def _note(self, verdict: str, what: str) -> None:
+    def _note(self, verdict, what):
         if self._noted < 20:
             self._noted += 1
             os.write(self._report, (json.dumps([verdict, what]) + "\n").encode())
@@ -169,7 +164,7 @@ HARMLESS_IMPORTS = ("pyspark",)
 """Starts of names of modules that honest commands look for anew each time, since they are not installed."""
 
 
-def _called_from(frame: Any, modules: tuple[str, ...]) -> bool:
+def _called_from(frame, modules):
     """Whether any caller, up to the command itself, belongs to these modules."""
     while frame is not None and frame.f_globals.get("__name__") != __name__:
         if str(frame.f_globals.get("__name__", "")).startswith(modules):
@@ -178,7 +173,7 @@ def _called_from(frame: Any, modules: tuple[str, ...]) -> bool:
     return False
 
 
-def become(case: Case, command: Command) -> None:
+def become(case, command):
     """Turn this forked process into the command; does not return."""
     code = 1
     try:
@@ -194,14 +189,14 @@ def become(case: Case, command: Command) -> None:
         os._exit(code)
 
 
-def watch_reader() -> None:
+def watch_reader():
     """Watch this reading process as its command is watched; events go through a pipe, since it may write to no file."""
     folder = Path(os.environ["FUZZ_CASE"])
     report = os.open(folder / "log" / "reader", os.O_WRONLY | os.O_NONBLOCK)
     Watch(folder, report, reads=True).arm()
 
 
-def _main_of(words: list[str]) -> Callable[[], None]:
+def _main_of(words):
     """The command line; or a planted misdeed, which shows that it is noticed."""
     if words and words[0].startswith("PLANTED:"):
         from fuzz.families.planted import MISDEEDS
@@ -212,7 +207,7 @@ def _main_of(words: list[str]) -> Callable[[], None]:
     return main
 
 
-def _run(main: Callable[[], None]) -> int:
+def _run(main):
     """Exit code of a main function, as the interpreter would make it."""
     code = 0
     try:
@@ -235,7 +230,7 @@ def _run(main: Callable[[], None]) -> int:
     return code & 0xFF
 
 
-def _prepare(case: Case, command: Command) -> int:
+def _prepare(case, command):
     """Streams, folders, environment, limits; returns the descriptor of the report."""
     logs = case.folder / "log"
     report = os.open(logs / "events", os.O_WRONLY | os.O_CREAT | os.O_APPEND, 0o666)
@@ -269,7 +264,7 @@ def _prepare(case: Case, command: Command) -> int:
     return report
 
 
-def _environment(case: Case, changes: Mapping[str, str | None]) -> None:
+def _environment(case, changes):
     for name in [name for name in os.environ if name.startswith(("VEHEST_", "MLFLOW_", "_VEHEST", "COMP_"))]:
         del os.environ[name]
     os.environ |= {"FUZZ_CASE": str(case.folder), "PYTHONDONTWRITEBYTECODE": "1"}
@@ -281,13 +276,13 @@ def _environment(case: Case, changes: Mapping[str, str | None]) -> None:
             os.environ[name] = value
 
 
-def _redirect(descriptor: int, path: Any, flags: int) -> None:
+def _redirect(descriptor, path, flags):
     opened = os.open(path, flags, 0o666)
     os.dup2(opened, descriptor)
     os.close(opened)
 
 
-def _status(field: str) -> int:
+def _status(field):
     """A figure of /proc/self/status [kB]."""
     with open("/proc/self/status") as stream:
         return next(int(line.split()[1]) for line in stream if line.startswith(f"{field}:"))

@@ -10,7 +10,7 @@ import platform
 import subprocess
 import sys
 import tempfile
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import cache, partial
 from importlib import metadata
@@ -24,7 +24,6 @@ import yaml
 from conftest import planar_drive
 from every_estimator import drive_for, fitted
 from place import DATASET, write_csv
-from vehest.data.recording import Recording
 from vehest.estimators.registry import estimator_class, estimator_names
 from vehest.run import calibrate, downsample, evaluate, evaluate_faults
 from vehest.sources.base import open_source, source_class
@@ -54,7 +53,7 @@ class Subject:
     tolerance: float
     numbers: Callable[[], Mapping[str, Arrays]]
 
-    def record(self) -> dict[str, Any]:
+    def record(self):
         """What digests.json holds of it."""
         parts = self.numbers()
         return {
@@ -64,7 +63,7 @@ class Subject:
         }
 
 
-def subjects() -> dict[str, Subject]:
+def subjects():
     """All of them, by name."""
     found = {name: _estimator(name) for name in estimator_names() if estimator_class(name).__module__.startswith("vehest.")}
     for name, make in SOURCES.items():
@@ -80,13 +79,13 @@ def subjects() -> dict[str, Subject]:
     return found
 
 
-def this_machine() -> dict[str, str]:
+def this_machine():
     """What digits depend on."""
     libraries = {name: metadata.version(name) for name in LIBRARIES}
     return {"cpu": str(llvmlite.binding.get_host_cpu_name()), "python": platform.python_version(), **libraries}
 
 
-def moved(name: str, recorded: Mapping[str, Any], now: Mapping[str, Any], tolerance: float | None) -> str:
+def moved(name, recorded, now, tolerance):
     """What to do about numbers that are not those recorded; empty where they are.
 
     Args:
@@ -108,7 +107,7 @@ def moved(name: str, recorded: Mapping[str, Any], now: Mapping[str, Any], tolera
     return f"{' and '.join(parts)} of {name} moved: raise {what} if that is meant, then run `make golden`"
 
 
-def digest_of(arrays: Arrays, digits: int = DIGITS) -> str:
+def digest_of(arrays, digits=DIGITS):
     """Digest of numbers, each rounded to so many digits of its array's largest."""
     digest = hashlib.sha256()
     for name, array in sorted(arrays.items()):
@@ -120,7 +119,7 @@ def digest_of(arrays: Arrays, digits: int = DIGITS) -> str:
     return digest.hexdigest()[:16]
 
 
-def _values(array: np.ndarray[Any, Any]) -> list[float | None]:
+def _values(array):
     """Largest value, and the first, middle and last; none where it is not finite."""
     flat = np.asarray(array, np.float64).ravel()
     if not flat.size:
@@ -129,7 +128,7 @@ def _values(array: np.ndarray[Any, Any]) -> list[float | None]:
     return [float(f"{value:.12g}") if np.isfinite(value) else None for value in picked]
 
 
-def _are_close(recorded: Mapping[str, list[float | None]], now: Mapping[str, list[float | None]], tolerance: float) -> bool:
+def _are_close(recorded, now, tolerance):
     if set(recorded) != set(now):
         return False
     for name, values in recorded.items():
@@ -139,13 +138,13 @@ def _are_close(recorded: Mapping[str, list[float | None]], now: Mapping[str, lis
     return True
 
 
-def _estimator(name: str) -> Subject:
+def _estimator(name):
     cls = estimator_class(name)
     versions = {f"{cls.__name__}.version": cls.version}
     if hasattr(cls.training_type, "version"):
         versions[f"{cls.training_type.__name__}.version"] = cls.training_type.version
 
-    def numbers() -> dict[str, Arrays]:
+    def numbers():
         estimator = fitted(name)
         estimate = estimator.estimate([drive_for(estimator)])[0]
         return {"weights": dict(estimator.weights()), "estimates": dict(estimate.channels)}
@@ -153,38 +152,38 @@ def _estimator(name: str) -> Subject:
     return Subject(versions, LEARNT if len(versions) > 1 else FIXED, numbers)
 
 
-def _in_folder(make: Callable[[Path], Arrays]) -> dict[str, Arrays]:
+def _in_folder(make):
     with tempfile.TemporaryDirectory() as folder:
         return {"numbers": make(Path(folder))}
 
 
-def _channels(recording: Recording) -> Arrays:
+def _channels(recording):
     return {"time": recording.time, **{name: recording[name] for name in recording.channels}}
 
 
 # Sources
 
 
-def _tabular(folder: Path) -> Arrays:
+def _tabular(folder):
     write_csv(folder / "lap.csv", 1, 5.0)
     return _channels(open_source(DATASET | {"path": str(folder)}).read("lap"))
 
 
-def _text_log(folder: Path) -> Arrays:
+def _text_log(folder):
     write_csv(folder / "lap.csv", 1, 5.0)
     lines = (folder / "lap.csv").read_text().splitlines()
     (folder / "lap.csv").write_text("\n".join([lines[0], "s,km/h,deg/s,,,", *lines[1:]]) + "\n")
     return _channels(open_source(DATASET | {"path": str(folder), "source": "text_log", "rows_below_names": 1}).read("lap"))
 
 
-def _vbo(folder: Path) -> Arrays:
+def _vbo(folder):
     from vbo_log import dataset, write_log
 
     write_log(folder / "lap.vbo")
     return _channels(open_source(dataset(folder)).read("lap"))
 
 
-def _can(folder: Path) -> Arrays:
+def _can(folder):
     from can_drive import SIGNALS, write_log
 
     write_log(planar_drive(5.0, 100.0, seed=3), folder, ".asc")
@@ -193,14 +192,14 @@ def _can(folder: Path) -> Arrays:
     return _channels(open_source({"name": "mine", "source": "can", "path": str(folder), **told}).read("drive"))
 
 
-def _rosbag(folder: Path) -> Arrays:
+def _rosbag(folder):
     from test_sources_rosbag import configuration, drive, write_bag
 
     write_bag(folder, drive(2.0))
     return _channels(open_source(configuration(folder)).read("lap"))
 
 
-def _mdf(folder: Path) -> Arrays:
+def _mdf(folder):
     from mdf_log import write_mdf
 
     from fuzz.families.mdf import DECLARED, signals
@@ -209,7 +208,7 @@ def _mdf(folder: Path) -> Arrays:
     return _channels(open_source(DECLARED | {"path": str(folder)}).read("lap"))
 
 
-def _revs(folder: Path) -> Arrays:
+def _revs(folder):
     from test_sources_revs import configuration
 
     time = np.arange(300) / 100.0
@@ -219,7 +218,7 @@ def _revs(folder: Path) -> Arrays:
     return _channels(open_source(configuration(folder)).read("lap"))
 
 
-def _simulated(folder: Path) -> Arrays:
+def _simulated(folder):
     drive = {"id": "a", "seed": 1, "manoeuvre": {"name": "laps", "course": "handling", "duration": 3.0}}
     vehicle = yaml.safe_load(VEHICLE.read_text(encoding="utf-8"))
     dataset = {"name": "sim", "source": "simulated", "vehicle": vehicle, "rate_hz": 50, "drives": [drive]}
@@ -241,38 +240,38 @@ SOURCES = {
 # Stages
 
 
-def _downsampled(folder: Path) -> Arrays:
+def _downsampled(folder):
     recording = planar_drive(10.0, 100.0, seed=1, noise=0.02)
     for transform in downsample.transforms_of({"rate_hz": 20.0, "method": "polyphase", "transforms": []}):
         recording = transform(recording)
     return _channels(recording)
 
 
-def _calibrated(folder: Path) -> Arrays:
+def _calibrated(folder):
     (trust,) = _outputs().glob("calibrate/*/trust.yaml")
     return dict(_leaves("", yaml.safe_load(trust.read_text(encoding="utf-8"))))
 
 
-def _evaluated(folder: Path) -> Arrays:
+def _evaluated(folder):
     return _metrics(lambda condition: not is_fault(condition))
 
 
-def _faulted(folder: Path) -> Arrays:
+def _faulted(folder):
     return _metrics(is_fault)
 
 
-def _metrics(chosen: Callable[[str], bool]) -> Arrays:
+def _metrics(chosen):
     (file,) = _outputs().glob("evaluate/*/metrics.csv")
     with file.open(newline="", encoding="utf-8") as stream:
         rows = [row for row in csv.DictReader(stream) if chosen(row["condition"])]
-    metrics: dict[str, list[float]] = {}
+    metrics = {}
     for row in rows:
         metrics.setdefault(row["metric"], []).extend(float(row[column] or "nan") for column in ("value", "low", "high"))
     return {metric: np.array(values) for metric, values in metrics.items()}
 
 
 @cache
-def _study() -> tempfile.TemporaryDirectory[str]:
+def _study():
     """A folder with a small study: one model, calibrated, evaluated without faults and under one."""
     made = tempfile.TemporaryDirectory()
     folder = Path(made.name)
@@ -290,11 +289,11 @@ def _study() -> tempfile.TemporaryDirectory[str]:
     return made
 
 
-def _outputs() -> Path:
+def _outputs():
     return Path(_study().name) / "outputs"
 
 
-def _leaves(path: str, content: Any) -> Iterator[tuple[str, np.ndarray[Any, Any]]]:
+def _leaves(path, content):
     """Numbers in plain values, by the keys that lead to them; texts are left out."""
     if isinstance(content, Mapping):
         for name, value in content.items():
@@ -303,7 +302,7 @@ def _leaves(path: str, content: Any) -> Iterator[tuple[str, np.ndarray[Any, Any]
         yield path, np.array(content)
 
 
-def main() -> None:
+def main():
     """Record the numbers of this machine."""
     former = json.loads(FILE.read_text(encoding="utf-8"))["subjects"] if FILE.is_file() else {}
     made = {}

@@ -1,12 +1,9 @@
 """What is recorded of every real recording as its source reads it; `make golden` records anew where VEHEST_DATA is set."""
 
-from __future__ import annotations
-
 import json
 import os
 import sys
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from golden_numbers import digest_of, this_machine
@@ -21,10 +18,10 @@ NAMES = (
     "ferrari_250lm_unlabelled roboracer saloon_standstill tum"
 )
 VBOX = ("vbo", "dataset.path=${root}/vbox", "dataset.clock=interpolate")
-READINGS: dict[str, tuple[str, ...]] = {name: (name,) for name in NAMES.split()} | {"vbox": VBOX}  # data set, and what else is set
+READINGS = {name: (name,) for name in NAMES.split()} | {"vbox": VBOX}  # data set, and what else is set
 
 
-def read(name: str, root: str) -> dict[str, Any]:
+def read(name, root):
     """Recording -> rate [Hz], start time [s], and for each channel a digest of its samples and their root mean square."""
     dataset, *otherwise = READINGS[name]
     config = compose_config("ingest", [f"dataset={dataset}", f"root={root}", *otherwise])["dataset"]
@@ -38,7 +35,7 @@ def read(name: str, root: str) -> dict[str, Any]:
     return found
 
 
-def main() -> None:
+def main():
     """Record the readings on this machine."""
     root = os.environ.get("VEHEST_DATA")
     if not root:

@@ -1,7 +1,5 @@
 """A kernel's constant that changes fails with the version to raise; code that is only moved and renamed trains nothing anew."""
 
-from __future__ import annotations
-
 import json
 import os
 import shutil
@@ -19,34 +17,32 @@ GOLDEN = "tests/golden/test_golden_numbers.py::test_numbers_are_those_recorded[l
 
 
 @pytest.fixture
-def checkout(tmp_path: Path) -> Path:
+def checkout(tmp_path):
     """Sources that a test may change."""
     shutil.copytree(ROOT / "src", tmp_path / "checkout" / "src", ignore=shutil.ignore_patterns("__pycache__"))
     (tmp_path / "checkout" / "conf").symlink_to(ROOT / "conf")
     return tmp_path / "checkout"
 
 
-def run(checkout: Path, folder: Path, *words: str) -> subprocess.CompletedProcess[str]:
+def run(checkout, folder, *words):
     environment = os.environ | {"PYTHONPATH": str(checkout / "src")}
     return subprocess.run([sys.executable, *words], cwd=folder, env=environment, capture_output=True, text=True, check=False)
 
 
-def change(file: Path, before: str, after: str) -> None:
+def change(file, before, after):
     text = file.read_text(encoding="utf-8")
     assert before in text
     file.write_text(text.replace(before, after), encoding="utf-8")
 
 
-def test_a_constant_changed_in_a_kernel_fails_with_the_version_to_raise(checkout: Path) -> None:
+def test_a_constant_changed_in_a_kernel_fails_with_the_version_to_raise(checkout):
     change(checkout / KERNEL, "damping = 1.0 + 2.0 * step", "damping = 1.0 + 2.02 * step")
     tested = run(checkout, ROOT, "-m", "pytest", "-p", "no:cacheprovider", GOLDEN)
     assert tested.returncode == 1
     assert "of luenberger moved: raise Luenberger.version" in tested.stdout
 
 
-def test_a_module_that_is_split_and_a_function_that_is_renamed_train_nothing_anew(
-    checkout: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_module_that_is_split_and_a_function_that_is_renamed_train_nothing_anew(checkout, tmp_path, capsys):
     place = Place(tmp_path, capsys)
     words = ("-m", "vehest", "train", "estimator=luenberger", "training.grid=1", "split=mine", "tracking=none", "--json")
     words = (*words, f"root={place.folder / 'raw'}", f"output={place.folder / 'outputs'}")

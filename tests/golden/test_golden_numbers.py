@@ -1,10 +1,7 @@
 """Numbers stay as recorded unless a version is raised; on another machine within the tolerance of golden_numbers.py."""
 
-from __future__ import annotations
-
 import json
 from functools import cache
-from typing import Any
 
 import pytest
 from golden_numbers import FILE, LEARNT, moved, subjects, this_machine
@@ -14,7 +11,7 @@ SUBJECTS = subjects()
 
 
 @cache
-def now(name: str) -> dict[str, Any]:
+def now(name):
     return SUBJECTS[name].record()
 
 
@@ -40,7 +37,7 @@ def test_numbers_that_move_name_the_version_to_raise(tolerance, monkeypatch):
 
     former = luenberger.Luenberger._estimate_one
 
-    def shifted(self: Any, recording: Any, state: Any) -> Any:
+    def shifted(self, recording, state):
         estimate = former(self, recording, state)
         estimate.channels["vy"][:] *= 1.01
         return estimate

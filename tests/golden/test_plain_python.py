@@ -1,7 +1,5 @@
 """Without compilation, as under a debugger, trainings, estimates and simulated drives have the numbers of compiled code."""
 
-from __future__ import annotations
-
 import json
 import os
 import subprocess
@@ -14,7 +12,7 @@ RECORD = "import json, sys; from golden_numbers import subjects; print(json.dump
 
 
 @pytest.mark.parametrize("name", ["ksnn", "source simulated"])
-def test_plain_python_gives_the_numbers_of_compiled_code(name: str) -> None:
+def test_plain_python_gives_the_numbers_of_compiled_code(name):
     environment = os.environ | {"NUMBA_DISABLE_JIT": "1", "PYTHONPATH": os.pathsep.join(sys.path)}
     ran = subprocess.run([sys.executable, "-c", RECORD, name], env=environment, capture_output=True, text=True, check=True)
     assert not moved(name, subjects()[name].record(), json.loads(ran.stdout), FIXED)

@@ -1,10 +1,6 @@
 """Real recordings are read as recorded: every sample to 12 digits, on another machine each channel's root mean square to 1e-9."""
 
-from __future__ import annotations
-
 import json
-from pathlib import Path
-from typing import Any
 
 import pytest
 from golden_numbers import FIXED, this_machine
@@ -13,12 +9,12 @@ from golden_readings import FILE, READINGS, read
 RECORDED = json.loads(FILE.read_text(encoding="utf-8"))
 
 
-def test_every_reading_is_recorded() -> None:
+def test_every_reading_is_recorded():
     assert set(RECORDED["readings"]) == set(READINGS), "run `make golden`"
 
 
 @pytest.mark.parametrize("name", READINGS)
-def test_real_recordings_are_read_as_recorded(data_root: Path, name: str) -> None:
+def test_real_recordings_are_read_as_recorded(data_root, name):
     recorded, now = RECORDED["readings"][name], read(name, str(data_root))
     assert list(now) == list(recorded)
     for recording, expected in recorded.items():
@@ -29,7 +25,7 @@ def test_real_recordings_are_read_as_recorded(data_root: Path, name: str) -> Non
         assert same, f"{recording} moved: raise the version of its source if that is meant, then run `make golden`"
 
 
-def _numbers(found: dict[str, Any]) -> dict[str, float]:
+def _numbers(found):
     """All but the digests."""
     sizes = {channel: size for channel, (_, size) in found["channels"].items()}
     return {"rate_hz": found["rate_hz"], "start_time": found["start_time"]} | sizes

@@ -29,7 +29,6 @@ import sys
 import tempfile
 import time
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -87,7 +86,7 @@ class Round:
 # --- runs -----------------------------------------------------------------------------------------------------------
 
 
-def started(output: Path, jobs: int, log: Path) -> int:
+def started(output, jobs, log):
     """Fork a run of the study into ``output``; returns its process, which leads a session of its own."""
     sys.stdout.flush()
     process = os.fork()
@@ -119,7 +118,7 @@ def started(output: Path, jobs: int, log: Path) -> int:
         os._exit(code)
 
 
-def ended(process: int, *, at_once: bool = False) -> int | None:
+def ended(process, *, at_once=False):
     """Exit code of a run, negative where a signal ended it; none if it goes on and is not waited for."""
     end = time.monotonic() + RUN_SECONDS
     while True:
@@ -134,7 +133,7 @@ def ended(process: int, *, at_once: bool = False) -> int | None:
         time.sleep(LOOK_SECONDS)
 
 
-def session(leader: int) -> list[int]:
+def session(leader):
     """Living processes that a run started, itself included."""
     alive = []
     for entry in os.scandir("/proc"):
@@ -148,7 +147,7 @@ def session(leader: int) -> list[int]:
     return alive
 
 
-def strays(leader: int, patience: float = 20.0) -> list[str]:
+def strays(leader, patience=20.0):
     """Processes of a run that outlive it for more than ``patience`` seconds; they are ended here."""
     end = time.monotonic() + patience
     while session(leader) and time.monotonic() < end:
@@ -162,7 +161,7 @@ def strays(leader: int, patience: float = 20.0) -> list[str]:
 # --- moments --------------------------------------------------------------------------------------------------------
 
 
-def names(folder: Path, wanted: Callable[[str], bool]) -> set[str]:
+def names(folder, wanted):
     """Names in a folder, none where it is not there."""
     try:
         return {entry.name for entry in os.scandir(folder) if wanted(entry.name)}
@@ -170,7 +169,7 @@ def names(folder: Path, wanted: Callable[[str], bool]) -> set[str]:
         return set()
 
 
-def seen(output: Path, stage: str, moment: str) -> set[str]:
+def seen(output, stage, moment):
     """What there is of a kind of event; one more of them is the event."""
     if moment == "begun":
         return names(output / stage, lambda name: name.startswith(".writing-"))
@@ -193,7 +192,7 @@ def seen(output: Path, stage: str, moment: str) -> set[str]:
     return names(output / "mlartifacts", lambda name: True)
 
 
-def killed(output: Path, stage: str, number: signal.Signals, jobs: int, draw: random.Random, log: Path) -> Kill | None:
+def killed(output, stage, number, jobs, draw, log):
     """Start a run, kill it at a moment of a stage; none if it ended before."""
     moment, count, delay = draw.choice(MOMENTS[stage]), draw.randint(1, COUNTS), draw.uniform(0.0, MAX_DELAY)
     count = 1 if (stage in {"ingest", "report"} and moment != "file") or moment == "store" else count
@@ -226,13 +225,13 @@ def killed(output: Path, stage: str, number: signal.Signals, jobs: int, draw: ra
 # --- checks ---------------------------------------------------------------------------------------------------------
 
 
-def artefacts(output: Path) -> Iterator[Path]:
+def artefacts(output):
     """Folders of all stages."""
     for stage in STAGES:
         yield from (output / stage / name for name in sorted(names(output / stage, lambda name: not name.startswith("."))))
 
 
-def broken(output: Path) -> list[str]:
+def broken(output):
     """Folders that are not whole."""
     from vehest.data.errors import VehestError
     from vehest.run.artefacts import read_artefact
@@ -246,7 +245,7 @@ def broken(output: Path) -> list[str]:
     return found
 
 
-def locks_held(output: Path) -> list[str]:
+def locks_held(output):
     """Locks that somebody holds."""
     held = []
     for name in names(output / "locks", lambda name: name.endswith(".lock")):
@@ -258,7 +257,7 @@ def locks_held(output: Path) -> list[str]:
     return held
 
 
-def content(output: Path) -> dict[str, str]:
+def content(output):
     """Artefact -> what it holds, times aside: the digest of its files, of a report the metrics that it publishes."""
     from vehest.run.artefacts import read_artefact
     from vehest.run.evaluate import TIMES
@@ -275,16 +274,16 @@ def content(output: Path) -> dict[str, str]:
     return found
 
 
-def differences(found: Mapping[str, str], wanted: Mapping[str, str]) -> list[str]:
+def differences(found, wanted):
     """What one has and the other has not, or has otherwise."""
     return [name for name in sorted({*found, *wanted}) if found.get(name) != wanted.get(name)]
 
 
-def tracked(output: Path) -> dict[str, str]:
+def tracked(output):
     """Finished run -> its artefact and what was logged of it, times aside; runs that are neither finished nor killed by that name."""
     with sqlite3.connect(f"file:{output / 'mlflow.db'}?mode=ro", uri=True) as store:
         runs = store.execute("select run_uuid, name, status from runs where lifecycle_stage = 'active'").fetchall()
-        found: dict[str, str] = {}
+        found = {}
         for run, name, status in runs:
             if status == "KILLED":  # of an interrupted training, by which it is told from the finished one
                 continue
@@ -298,7 +297,7 @@ def tracked(output: Path) -> dict[str, str]:
     return found
 
 
-def leftovers(output: Path) -> list[str]:
+def leftovers(output):
     """What killed runs left and nobody needs: half-written things, parts, checkpoints, locks."""
     found = [str(path.relative_to(output)) for path in output.rglob(".*") if path.name.startswith((".writing-", ".parts-"))]
     found += [f"checkpoints/{name}" for name in names(output / "checkpoints", lambda name: True)]
@@ -308,7 +307,7 @@ def leftovers(output: Path) -> list[str]:
 # --- rounds ---------------------------------------------------------------------------------------------------------
 
 
-def one_round(position: int, wanted: Sequence[tuple[str, signal.Signals]], output: Path, reference: Path, draw: random.Random) -> Round:
+def one_round(position, wanted, output, reference, draw):
     """Kill runs in one output root, let the last one end, and look at what there is."""
     own, jobs = Round(position), 2 if position % 4 == 3 else 1
     log = output.with_suffix(".log")
@@ -328,7 +327,7 @@ def one_round(position: int, wanted: Sequence[tuple[str, signal.Signals]], outpu
     return own
 
 
-def rows_of(own: Round, first: int) -> Iterator[list[object]]:
+def rows_of(own, first):
     """A row a kill."""
     for position, kill in enumerate(own.kills):
         faults = [*own.failed, *own.metrics, *own.tracking, *own.leftovers, *kill.at_once]
@@ -340,7 +339,7 @@ def rows_of(own: Round, first: int) -> Iterator[list[object]]:
         yield [*head, equal, complete, left, outcome]
 
 
-def still_wanted(missing: Counter[tuple[str, signal.Signals]]) -> list[tuple[str, signal.Signals]]:
+def still_wanted(missing):
     """For the next round: of each stage a kill that is missing most."""
     chosen = []
     for stage in STAGES:
@@ -350,7 +349,7 @@ def still_wanted(missing: Counter[tuple[str, signal.Signals]]) -> list[tuple[str
     return chosen
 
 
-def main() -> None:
+def main():
     """Run rounds until every kill was made; exit code 1 if any row is bad."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--kills", type=int, default=100, help="how many, spread evenly over five stages and three signals")
@@ -372,7 +371,7 @@ def main() -> None:
     sys.exit(1 if bad else 0)
 
 
-def _rounds(missing: Counter[tuple[str, signal.Signals]], draw: random.Random, scratch: Path, out: Path) -> int:
+def _rounds(missing, draw, scratch, out):
     os.chdir(scratch)  # runs find the configuration that came with the package
     begun = time.monotonic()
     reference = scratch / "reference"

@@ -1,10 +1,6 @@
 """Parts of the study of the KS-NN whose errors are planted, without a network or a drive."""
 
-from __future__ import annotations
-
 import math
-from collections.abc import Mapping
-from pathlib import Path
 
 import numpy as np
 from study_parts import metric_rows, part_of
@@ -12,7 +8,7 @@ from study_parts import metric_rows, part_of
 from vehest.data.splits import Span, Split
 from vehest.evaluation.blocks import Segments, write_segments
 from vehest.evaluation.metrics import Protocol
-from vehest.studies.artefacts import EvaluatedModel, PartArtefacts
+from vehest.studies.artefacts import EvaluatedModel
 from vehest_papers.ksnn import paper
 
 SEGMENTS, SAMPLES = 600, 20
@@ -33,7 +29,7 @@ NAMES = {
 N_PARAMETERS = {name: row.n_parameters for name, row in paper.TABLE_IV.items()} | {paper.ZERO: 0, paper.STATIC_MAP: 2}
 
 
-def planted_segments(fvu: float, test: str, seed: int) -> Segments:
+def planted_segments(fvu, test, seed):
     """Segments of a drive in which so much of v is left, errors large where those of every other candidate are."""
     common = np.random.default_rng(len(test) + ord(test[0]))
     hard = common.lognormal(0.0, 0.4, SEGMENTS)
@@ -54,15 +50,7 @@ def planted_segments(fvu: float, test: str, seed: int) -> Segments:
     )
 
 
-def planted_part(
-    folder: Path,
-    fvus: Mapping[str, Mapping[str, float]],
-    *,
-    train: str,
-    seeds: int = 3,
-    spread: float = 0.02,
-    tests: tuple[str, ...] = ("c2", "f2"),
-) -> PartArtefacts:
+def planted_part(folder, fvus, *, train, seeds=3, spread=0.02, tests=("c2", "f2")):
     """A comparison whose candidates leave this FVU.
 
     Args:
@@ -96,7 +84,7 @@ def planted_part(
     return part_of(split, Protocol(), models, rows, kinds={"cars": "simulated"}, data_titles={"cars": "Cars"})
 
 
-def of_the_paper(table: Mapping[str, paper.Published], static_map: float = 0.6) -> dict[str, dict[str, float]]:
+def of_the_paper(table, static_map=0.6):
     """Every category with the FVU that the paper prints, and the baselines."""
     printed = {name: {"c2": row.c2_fvu, "f2": row.f2_fvu} for name, row in table.items()}
     return {paper.ZERO: {"c2": 1.0, "f2": 1.0}, paper.STATIC_MAP: {"c2": static_map, "f2": static_map}, **printed}

@@ -1,7 +1,5 @@
 """What a paper claims against errors whose outcome is known: reproduced, not reproduced, undecided, not testable."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

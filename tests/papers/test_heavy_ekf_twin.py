@@ -1,7 +1,5 @@
 """The twin of the heavy vehicle: plant, tyres, driver, the filter with a state of crossfall, oracle tyres, and how cells are compared."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 
@@ -10,7 +8,6 @@ import pytest
 import torch
 from readable_filters import NonlinearModel, extended_filter, rational_model
 from scipy import integrate
-from torch import Tensor
 
 from vehest.constants import GRAVITY
 from vehest.filters.gaussian import Gaussian
@@ -30,14 +27,14 @@ from vehest_papers.heavy_ekf.candidates import (
     states_of,
     tuning_drives,
 )
-from vehest_papers.heavy_ekf.twin import CURVES, FINER, RATE, TRUCK, Conditions, Drive, Plant, course, drive, driven
+from vehest_papers.heavy_ekf.twin import CURVES, FINER, RATE, TRUCK, Conditions, Plant, course, drive, driven
 
 LEVELS = Levels(ay=0.1, steer=0.005, tyres=0.003)
 SECONDS = 30.0
 
 
 @pytest.fixture(scope="module")
-def dry() -> list[Drive]:
+def dry():
     return [drive(Conditions(5.0), seed, SECONDS) for seed in range(6)]
 
 
@@ -45,14 +42,14 @@ def dry() -> list[Drive]:
 
 
 @pytest.mark.parametrize("conditions", [Conditions(3.0), Conditions(8.0, payload=True, wet_patches=True, crossfall=True)], ids=str)
-def test_the_plant_is_what_another_integrator_makes_of_equations_1_to_6(conditions: Conditions) -> None:
+def test_the_plant_is_what_another_integrator_makes_of_equations_1_to_6(conditions):
     """Steered as it was: SciPy's Dormand and Prince at 1e-10, with slips and forces written out here."""
     plant, own = Plant.of(payload=conditions.payload), course(conditions, np.random.default_rng(3), 12.0)
     states, steer, lateral = driven(plant, own)
     car, step = plant.car, 1.0 / (RATE * FINER)
     front_load, rear_load = plant.load_front, plant.load_rear
 
-    def slope(time: float, state: np.ndarray, k: int) -> list[float]:
+    def slope(time, state, k):
         beta, r = state
         u, mu = own.speed[k], own.friction[k]
         slips = steer[k] - beta - car.cg_to_front_axle * r / u, -beta + car.cg_to_rear_axle * r / u
@@ -73,7 +70,7 @@ def test_the_plant_is_what_another_integrator_makes_of_equations_1_to_6(conditio
         state = found.y[:, -1]
 
 
-def test_axles_make_no_more_than_the_paper_s_largest_forces() -> None:
+def test_axles_make_no_more_than_the_paper_s_largest_forces():
     """F_max = c₂ √(2c₁)/2: 39.0 kN front and 38.6 kN rear, the weight of about 8 t."""
     slip = np.linspace(0.0, 0.5, 50001)
     largest = [rational_axle(slip, c1, c2, 1.0).force.max() for c1, c2 in CURVES.reshape(2, 2)]
@@ -82,7 +79,7 @@ def test_axles_make_no_more_than_the_paper_s_largest_forces() -> None:
 
 
 @pytest.mark.parametrize("payload", [False, True])
-def test_the_truck_slides_before_it_rolls_over(payload: bool) -> None:
+def test_the_truck_slides_before_it_rolls_over(payload):
     plant = Plant.of(payload=payload)
     assert plant.slides_at < plant.roll_over
     own = drive(Conditions(8.0, payload=payload), 0, SECONDS)
@@ -90,14 +87,14 @@ def test_the_truck_slides_before_it_rolls_over(payload: bool) -> None:
 
 
 @pytest.mark.parametrize("slip", factorial.SLIPS)
-def test_the_driver_reaches_the_slip_and_does_not_spin(slip: float) -> None:
+def test_the_driver_reaches_the_slip_and_does_not_spin(slip):
     for seed in range(3):
         own = drive(Conditions(slip), seed)
         assert np.degrees(np.abs(own.rear_slip)).max() == pytest.approx(slip, rel=0.05)
         assert np.degrees(np.abs(own.sideslip)).max() < 15.0
 
 
-def test_payload_keeps_the_sum_of_loads_and_moments() -> None:
+def test_payload_keeps_the_sum_of_loads_and_moments():
     plant = Plant.of(payload=True)
     empty = np.array([TRUCK.cg_to_rear_axle, TRUCK.cg_to_front_axle]) / 3.5 * TRUCK.mass
     loads = np.array([plant.load_front, plant.load_rear]) * empty
@@ -105,13 +102,13 @@ def test_payload_keeps_the_sum_of_loads_and_moments() -> None:
     assert loads[0] * plant.car.cg_to_front_axle == pytest.approx(loads[1] * plant.car.cg_to_rear_axle)
 
 
-def test_curves_under_friction_are_those_that_a_filter_at_friction_1_would_need() -> None:
+def test_curves_under_friction_are_those_that_a_filter_at_friction_1_would_need():
     plant, slip = Plant.of(payload=False), np.linspace(-0.2, 0.2, 41)
     c1, c2 = plant.curves(0.6)[:2]
     np.testing.assert_allclose(rational_axle(slip, c1, c2, 1.0).force, rational_axle(slip, CURVES[0], CURVES[1], 0.6).force, rtol=1e-12)
 
 
-def test_the_seed_decides_course_and_sensors_whatever_the_plant() -> None:
+def test_the_seed_decides_course_and_sensors_whatever_the_plant():
     one, other = drive(Conditions(4.0), 5, SECONDS), drive(Conditions(4.0, crossfall=True), 5, SECONDS)
     np.testing.assert_array_equal(one.samples[:, 1], other.samples[:, 1])
     noise = [own.samples[:, 0] - own.yaw_rate for own in (one, other)]
@@ -122,7 +119,7 @@ def test_the_seed_decides_course_and_sensors_whatever_the_plant() -> None:
 
 
 @pytest.mark.parametrize("name", [paper.LINT, paper.RATT, paper.RATTE])
-def test_a_crossfall_that_is_known_to_be_nothing_leaves_the_paper_s_filter(name: str, dry: list[Drive]) -> None:
+def test_a_crossfall_that_is_known_to_be_nothing_leaves_the_paper_s_filter(name, dry):
     """Also where it restarts: a limit of 1.5° on a drive that goes beyond."""
     estimator = estimator_of(name, LEVELS, mistaken(-0.2))
     for limit in (estimator.largest_sideslip, math.radians(1.5)):
@@ -134,11 +131,11 @@ def test_a_crossfall_that_is_known_to_be_nothing_leaves_the_paper_s_filter(name:
 
 
 @pytest.mark.parametrize("name", [paper.LINT, paper.RATT, paper.RATTE])
-def test_filter_with_a_crossfall_state_is_the_readable_one_with_automatic_jacobians(name: str) -> None:
+def test_filter_with_a_crossfall_state_is_the_readable_one_with_automatic_jacobians(name):
     estimator, samples = estimator_of(name, LEVELS, mistaken(-0.2)), drive(Conditions(5.0, crossfall=True), 1, 6.0).samples
     plain, extra, step = rational_model(estimator), torch.zeros(1).double(), 1.0 / RATE
 
-    def transition(states: Tensor, inputs: Tensor) -> Tensor:
+    def transition(states, inputs):
         pull = torch.nn.functional.pad(states[..., -1:] / inputs[..., :1], (2, states.shape[-1] - 3))
         return torch.cat([plain.transition(states[..., :-1], inputs), states[..., -1:]], -1) + pull
 
@@ -157,7 +154,7 @@ def test_filter_with_a_crossfall_state_is_the_readable_one_with_automatic_jacobi
     np.testing.assert_allclose(crossfall_filter.filtered(estimator, samples), theirs, atol=1e-9)
 
 
-def test_the_crossfall_is_found_and_its_filter_is_the_better_one_for_it() -> None:
+def test_the_crossfall_is_found_and_its_filter_is_the_better_one_for_it():
     own = drive(Conditions(5.0, crossfall=True), 1, 60.0)
     without = states_of(paper.RATT, LEVELS, own, CURVES)
     state = states_of(f"{paper.RATT}, crossfall state", LEVELS, own, CURVES)
@@ -165,17 +162,17 @@ def test_the_crossfall_is_found_and_its_filter_is_the_better_one_for_it() -> Non
     assert rmse(state[:, 0], own) < rmse(without[:, 0], own)
 
 
-def test_oracle_tyres_are_not_worse_than_mistaken_ones_on_average(dry: list[Drive]) -> None:
+def test_oracle_tyres_are_not_worse_than_mistaken_ones_on_average(dry):
     told = np.mean([rmse(oracle(LEVELS, own), own) for own in dry])
     for mismatch in (-0.3, -0.1, 0.1, 0.2):
         assert told <= np.mean([rmse(states_of(paper.RATT, LEVELS, own, mistaken(mismatch))[:, 0], own) for own in dry])
 
 
-def test_an_oracle_on_a_dry_road_is_the_filter_with_the_right_curves(dry: list[Drive]) -> None:
+def test_an_oracle_on_a_dry_road_is_the_filter_with_the_right_curves(dry):
     np.testing.assert_allclose(oracle(LEVELS, dry[0]), states_of(ORACLE, LEVELS, dry[0], CURVES)[:, 0], atol=1e-12)
 
 
-def test_an_oracle_goes_on_where_the_friction_steps() -> None:
+def test_an_oracle_goes_on_where_the_friction_steps():
     """Steps between frictions that are nearly the same change nothing that is seen."""
     own = drive(Conditions(4.0, wet_patches=True), 2, 60.0)
     assert len(set(own.friction.tolist())) == 2
@@ -186,7 +183,7 @@ def test_an_oracle_goes_on_where_the_friction_steps() -> None:
 # The experiment
 
 
-def test_levels_are_tuned_in_cells_and_on_seeds_that_are_not_scored() -> None:
+def test_levels_are_tuned_in_cells_and_on_seeds_that_are_not_scored():
     assert not set(TUNED_SLIPS) & set(factorial.SLIPS)
     assert not set(TUNED_MISMATCHES) & set(factorial.MISMATCHES)
     assert factorial.SEEDS <= FIRST_TUNING_SEED
@@ -195,11 +192,11 @@ def test_levels_are_tuned_in_cells_and_on_seeds_that_are_not_scored() -> None:
     assert all(high - low >= 8.0 for low, high in BOX.values())
 
 
-def cell(name: str, squared: dict[str, np.ndarray]) -> factorial.Cell:
+def cell(name, squared):
     return factorial.Cell(name, Conditions(4.0), 0.0, squared, {}, (0.0, 0.0, 0.0))
 
 
-def test_a_change_is_paired_over_seeds() -> None:
+def test_a_change_is_paired_over_seeds():
     """Seeds that differ a hundredfold, one filter 20 % below the other on each: told apart, and 20 %."""
     generator = np.random.default_rng(0)
     hard = 10.0 ** generator.uniform(-2.0, 0.0, factorial.SEEDS)
@@ -211,7 +208,7 @@ def test_a_change_is_paired_over_seeds() -> None:
     assert not found[1, ("A", "B")].told_apart
 
 
-def test_holm_asks_more_of_a_table_with_more_cells() -> None:
+def test_holm_asks_more_of_a_table_with_more_cells():
     generator = np.random.default_rng(1)
     one = {
         "A": np.exp(0.5 * generator.standard_normal(factorial.SEEDS)),
@@ -225,7 +222,7 @@ def test_holm_asks_more_of_a_table_with_more_cells() -> None:
 # The vehicle
 
 
-def test_eigenvalues_have_the_paper_s_ratios() -> None:
+def test_eigenvalues_have_the_paper_s_ratios():
     """1 above 6 m/s and at most about 1.3 below, with Table 1's stiffnesses."""
     stiff = replace(TRUCK, cornering_stiffness_front=CURVES[1], cornering_stiffness_rear=CURVES[3])
     fast, slow = vehicle.ratios(stiff, np.array([6.5, 10.0, 30.0])), vehicle.ratios(stiff, np.array([0.5, 2.0, 4.0]))
@@ -233,7 +230,7 @@ def test_eigenvalues_have_the_paper_s_ratios() -> None:
     assert 1.0 < slow.max() < 1.35
 
 
-def test_tracks_are_found_from_wheels_that_roll() -> None:
+def test_tracks_are_found_from_wheels_that_roll():
     from vehest.data.recording import Recording
 
     time = np.arange(2000) / 20.0

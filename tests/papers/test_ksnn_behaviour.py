@@ -1,10 +1,7 @@
 """How estimators behave: biases taken off, the start of a window, low yaw rates and spectra, on drives whose truth is known."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -12,7 +9,6 @@ from study_parts import metric_rows, part_of, stored
 from trained_ksnn import ksnn_with_weights
 
 from conftest import planar_drive
-from vehest.data.recording import Recording
 from vehest.data.splits import Span, Split
 from vehest.data.store import write_estimate
 from vehest.estimators.model_files import save_model
@@ -27,11 +23,11 @@ OFFSET = 0.2
 SECONDS = 240.0
 
 
-def without_ay(recording: Recording, offset: float) -> Recording:
+def without_ay(recording, offset):
     return replace(recording, channels={**recording.channels, "ay": recording["ay"] - offset})
 
 
-def scheme(folder: Path, *, bias: bool = False) -> Scheme:
+def scheme(folder, *, bias=False):
     """A linear KS-NN and v = 0 on a car measured as it is, and on another whose a_y shows too little."""
     drives = {name: planar_drive(SECONDS, seed=seed, name=name) for seed, name in enumerate(("c1", "c2"))}
     drives |= {name: without_ay(planar_drive(SECONDS, seed=seed, name=name), OFFSET) for seed, name in ((5, "f1"), (6, "f2"))}

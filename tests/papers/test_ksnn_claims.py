@@ -1,7 +1,5 @@
 """Verdicts on the paper's statements: where our errors are the paper's own figures they come out, and where they are turned they do not."""
 
-from __future__ import annotations
-
 import math
 from pathlib import Path
 
@@ -22,7 +20,7 @@ from vehest_papers.ksnn.schemes import Scheme
 PUBLISHED = {"scheme_1": (paper.TABLE_IV, "c", "c2", "f2"), "scheme_2": (paper.TABLE_V, "f", "f2", "c2")}
 
 
-def schemes(folder: Path, fvus=None, **options) -> list[Scheme]:
+def schemes(folder, fvus=None, **options):
     """Both schemes, with the paper's figures if no others are given."""
     made = []
     for name, (table, train, own, other) in PUBLISHED.items():
@@ -201,7 +199,7 @@ def test_masked_segments_without_a_mask_are_the_evaluations_own():
     assert half.squared_error_vy.sum() == pytest.approx(np.sum((vy - reference)[:40] ** 2))
 
 
-def change(ratio: float, error: float) -> Change:
+def change(ratio, error):
     return Change(math.log(ratio), error, 30.0)
 
 

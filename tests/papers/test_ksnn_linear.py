@@ -1,7 +1,5 @@
 """A KS-NN's linear forms and sub-models against the network itself and against Eqs. 11 and 12 filtered literally."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import torch

@@ -1,7 +1,5 @@
 """Closed-form noise sensitivities against impulse responses of the estimators, their state-space forms, and injected noise."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -1,7 +1,5 @@
 """What is said of real recordings: statistics against closed forms, and the report on recordings made here."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 
@@ -16,7 +14,7 @@ from vehest_papers.real_cars.document import documents
 from vehest_papers.real_cars.statistics import statistics_of
 
 
-def drive(seconds: float = 120.0, size: float = 1.0, noise: float = 0.0, name: str = "lap") -> Recording:
+def drive(seconds=120.0, size=1.0, noise=0.0, name="lap"):
     """At 20 m/s in a sinusoidal course; v = size·(static part + a part that no static map has) and white noise on its reference."""
     time = np.arange(round(100.0 * seconds)) / 100.0
     yaw_rate = 0.3 * np.sin(0.4 * time)
@@ -28,7 +26,7 @@ def drive(seconds: float = 120.0, size: float = 1.0, noise: float = 0.0, name: s
     return Recording(name, "car", 100.0, 0.0, channels, provenance={"derived": {"reference_point": "unknown"}})
 
 
-def test_statistics_are_those_of_the_closed_form() -> None:
+def test_statistics_are_those_of_the_closed_form():
     """At constant speed a static map is one factor of the yaw rate, and the cosine that it leaves has 1/√2 of its amplitude."""
     found = statistics_of([drive()])
     level = math.degrees(0.2 / math.sqrt(2.0) / 20.0)
@@ -50,11 +48,11 @@ def test_statistics_are_those_of_the_closed_form() -> None:
     ],
     ids=["short", "silent", "noisy", "unlabelled"],
 )
-def test_a_recording_that_cannot_rank_says_why(recording: Recording, what: str) -> None:
+def test_a_recording_that_cannot_rank_says_why(recording, what):
     assert any(what in reason for reason in statistics_of([recording]).reasons)
 
 
-def test_a_standing_car_counts_for_nothing() -> None:
+def test_a_standing_car_counts_for_nothing():
     moving = drive()
     speed = np.concatenate([np.zeros(3000), moving["vx"][3000:]])
     assert statistics_of([replace(moving, channels={**moving.channels, "vx": speed})]).driven == pytest.approx(90.0, abs=1.5)
@@ -62,7 +60,7 @@ def test_a_standing_car_counts_for_nothing() -> None:
     assert statistics_of([parked]).driven == 0.0
 
 
-def test_the_report_tells_what_can_rank_and_why_the_rest_cannot(tmp_path) -> None:
+def test_the_report_tells_what_can_rank_and_why_the_rest_cannot(tmp_path):
     datasets = []
     for name, recording in (("long", drive()), ("short", drive(seconds=40.0))):
         write_recording(recording, tmp_path / f"{name}.parquet")

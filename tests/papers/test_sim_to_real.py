@@ -1,14 +1,9 @@
 """From simulated cars to a real one: what is learnt on, what is chosen by, and what the report says of it."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import replace
-from pathlib import Path
-from typing import Any
 
 import numpy as np
-import pandas as pd
 import pytest
 from study_parts import metric_rows, part_of
 
@@ -20,13 +15,13 @@ from vehest.data.store import write_estimate, write_recording
 from vehest.estimators.model_files import save_model
 from vehest.estimators.registry import estimator_class
 from vehest.evaluation.metrics import Protocol, accuracy, score
-from vehest.report.document import Document, Table, write_document
+from vehest.report.document import Table, write_document
 from vehest.run.config import compose_config
 from vehest.run.config_files import choices
 from vehest.simulation.fleet import variations_from_config, varied
 from vehest.simulation.plant.parameters import compiled_parameters, vehicle_from_configuration
 from vehest.sources.base import kind_of, open_source
-from vehest.studies.artefacts import EvaluatedModel, PartArtefacts, StudyArtefacts
+from vehest.studies.artefacts import EvaluatedModel, StudyArtefacts
 from vehest_papers.sim_to_real import documents
 
 PROTOCOL = Protocol(rate_hz=20.0)
@@ -35,12 +30,12 @@ LEARNT = ("sim_fleet_wide", "sim_fleet_fast", "sim_fleet_rough", "sim_fleet_more
 HELD_OUT = "sim_fleet_held_out"
 
 
-def dataset(name: str) -> Mapping[str, Any]:
+def dataset(name):
     return compose_config("ingest", [f"dataset={name}"])["dataset"]
 
 
-def courses(name: str) -> set[str]:
-    return {drive.manoeuvre["course"] for drive in open_source(dataset(name)).drives.values() if "course" in drive.manoeuvre}  # type: ignore[attr-defined]
+def courses(name):
+    return {drive.manoeuvre["course"] for drive in open_source(dataset(name)).drives.values() if "course" in drive.manoeuvre}
 
 
 # What is learnt on, and what is chosen by
@@ -61,7 +56,7 @@ def test_nothing_is_learnt_or_stopped_on_that_is_not_simulated(name):
 @pytest.mark.parametrize("name", LEARNT)
 def test_validation_cars_are_other_cars_on_other_courses(name):
     assert not courses(name) & courses(HELD_OUT)
-    fleets: list[Any] = [open_source(dataset(of)) for of in (name, HELD_OUT)]
+    fleets = [open_source(dataset(of)) for of in (name, HELD_OUT)]
     seeds = [{fleet.seed_of(drive_id) for drive_id in fleet.drives} for fleet in fleets]
     assert not seeds[0] & seeds[1]
 
@@ -96,7 +91,7 @@ ERRORS = {  # part -> (on validation, on race cars, on another simulation's car,
 }
 
 
-def part(folder: Path, name: str) -> PartArtefacts:
+def part(folder, name):
     """A part whose seeds err by given sizes on a drive of 60 s, which stands for validation and tests."""
     recording = planar_drive(60.0, 20.0, seed=3)
     file = folder / "lap.parquet"
@@ -130,13 +125,13 @@ def part(folder: Path, name: str) -> PartArtefacts:
 
 
 @pytest.fixture(scope="module")
-def artefacts(tmp_path_factory: pytest.TempPathFactory) -> StudyArtefacts:
+def artefacts(tmp_path_factory):
     folder = tmp_path_factory.mktemp("toy")
     parts = {name: part(folder, name) for name in ERRORS}
     return StudyArtefacts("toy", "Toy", "About.", "vehest run toy", {name: name.title() for name in ERRORS}, parts, [])
 
 
-def overview(document: Document) -> pd.DataFrame:
+def overview(document):
     (table,) = (block.frame for block in document.blocks if isinstance(block, Table))
     return table.set_index("part")
 

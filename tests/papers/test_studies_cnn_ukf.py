@@ -1,9 +1,6 @@
 """The study of the UKF-informed network, from small models and drives made by the test."""
 
-from __future__ import annotations
-
 import re
-from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -18,19 +15,18 @@ from test_sample_network import loaded_drive
 
 from dugoff_drive import TYRES
 from vehest.data.errors import DataError
-from vehest.data.recording import Recording
 from vehest.data.splits import Span, Split
 from vehest.data.store import write_estimate, write_recording
 from vehest.data.transforms import transform_from_config
-from vehest.estimators.base import Estimator, FitData
+from vehest.estimators.base import FitData
 from vehest.estimators.dugoff_ukf import DugoffUkf, PseudoMeasurement
 from vehest.estimators.model_files import load_model, save_model
 from vehest.estimators.networks.sample_network import INPUTS
 from vehest.estimators.networks.velocity_recurrent import SequenceSettings
 from vehest.estimators.registry import estimator_class
 from vehest.evaluation.metrics import Protocol, Scored, accuracy, score_all
-from vehest.report.document import Document, Figure, Table
-from vehest.studies.artefacts import EvaluatedModel, PartArtefacts, StudyArtefacts
+from vehest.report.document import Figure, Table
+from vehest.studies.artefacts import EvaluatedModel, StudyArtefacts
 from vehest.training.samples import SampleSettings
 from vehest.training.sequences import PhaseSettings
 from vehest_papers.cnn_ukf import claims, document, documents, networks, observability, paper, perturbed, search, tables, traces
@@ -48,10 +44,10 @@ POINT = "point"
 SAMPLES = SampleSettings(PhaseSettings(learning_rate=1e-3, max_epochs=1))
 
 
-def fitted_models(data: FitData) -> dict[str, tuple[Estimator, list[int]]]:
+def fitted_models(data):
     """Candidate -> a small model and its seeds."""
     given = {"tyres": TYRES, "noise": LEVELS}
-    made: dict[str, tuple[Estimator, list[int]]] = {
+    made = {
         paper.MODEL: (estimator_class("dugoff_ukf").from_config(given), [0]),
         paper.SMOOTH: (estimator_class("dugoff_ukf").from_config({**given, "curve": "smooth"}), [0]),
     }
@@ -68,7 +64,7 @@ def fitted_models(data: FitData) -> dict[str, tuple[Estimator, list[int]]]:
     return made
 
 
-def further_networks(data: FitData) -> dict[str, tuple[Estimator, list[int]]]:
+def further_networks(data):
     """A recurrent network with all 17 inputs, and a point of the search."""
     recurrent = estimator_class("velocity_gru").from_config({"inputs": list(INPUTS["full"]), "outputs": ["vy"], "n_states": 4})
     phase = PhaseSettings(learning_rate=1e-3, max_epochs=1)
@@ -80,7 +76,7 @@ def further_networks(data: FitData) -> dict[str, tuple[Estimator, list[int]]]:
 
 
 @pytest.fixture(scope="module")
-def everything(tmp_path_factory: pytest.TempPathFactory) -> PartArtefacts:
+def everything(tmp_path_factory):
     """The four methods, the smooth filter, baselines and further networks on four test manoeuvres of six seconds."""
     folder = tmp_path_factory.mktemp("study")
     recordings = {name: loaded_drive(6.0, seed=number, name=name) for number, name in enumerate(NAMES)}
@@ -108,22 +104,22 @@ def everything(tmp_path_factory: pytest.TempPathFactory) -> PartArtefacts:
 
 
 @pytest.fixture(scope="module")
-def part(everything: PartArtefacts) -> PartArtefacts:
+def part(everything):
     """What Table II needs."""
     return replace(everything, models=[own for own in everything.models if not is_further(own)])
 
 
-def is_further(own: EvaluatedModel) -> bool:
+def is_further(own):
     return own.estimator == "velocity_gru" or own.model_folder.name.startswith(POINT)
 
 
 @pytest.fixture(scope="module")
-def runs(part: PartArtefacts) -> dict[str, list[Run]]:
+def runs(part):
     return runs_of(part, Prepared(part))
 
 
 @pytest.fixture(scope="module")
-def report(part: PartArtefacts, everything: PartArtefacts) -> Document:
+def report(part, everything):
     """Of a study whose parts are all made from the same small models."""
     names = ("full", "before", "free", "ablation", "standard", "limited", "recurrent", "search_5_6")
     models = {
@@ -139,7 +135,7 @@ def report(part: PartArtefacts, everything: PartArtefacts) -> Document:
     return documents(StudyArtefacts("cnn_ukf", "t", "a", "c", {name: f"Part {name}" for name in names}, parts, []))["report"]
 
 
-def test_report_has_every_table_and_figure_of_the_paper_and_says_what_its_data_are(report: Document) -> None:
+def test_report_has_every_table_and_figure_of_the_paper_and_says_what_its_data_are(report):
     text = "\n".join(block if isinstance(block, str) else block.caption for block in report.blocks)
     shown = {block.name for block in report.blocks if isinstance(block, Figure)}
     assert {f"figure_{number}" for number in range(4, 15)} == shown
@@ -164,7 +160,7 @@ def test_report_has_every_table_and_figure_of_the_paper_and_says_what_its_data_a
     assert not re.search(r"\bnan\b", text)
 
 
-def test_every_claim_has_a_verdict_and_an_interval_or_says_why_not(report: Document) -> None:
+def test_every_claim_has_a_verdict_and_an_interval_or_says_why_not(report):
     frame = next(block.frame for block in report.blocks if isinstance(block, Table) and block.name == "claims")
     assert len(frame) > 25
     tested = frame[(frame["verdict"] != "not testable on this data") & (frame["data"] == "simulated")]
@@ -174,12 +170,12 @@ def test_every_claim_has_a_verdict_and_an_interval_or_says_why_not(report: Docum
     assert (frame.loc[frame["verdict"] == "not testable on this data", "ours"] == "–").all()
 
 
-def test_the_published_page_for_a_busy_engineer_is_short() -> None:
+def test_the_published_page_for_a_busy_engineer_is_short():
     text = (ROOT / "results" / "cnn_ukf" / "report.md").read_text(encoding="utf-8")
     assert len(text[: text.index("## Appendix")].split()) <= 2500
 
 
-def test_candidates_have_the_papers_names(part: PartArtefacts) -> None:
+def test_candidates_have_the_papers_names(part):
     assert set(map(candidate_of, part.models)) == {*paper.OF_FOUR, paper.SMOOTH, paper.ZERO}
     away = replace(part.models[-2], estimator="cnn_ukf", variant="full_no_adaptive_process")
     assert candidate_of(away) == "process noise constant"
@@ -188,14 +184,14 @@ def test_candidates_have_the_papers_names(part: PartArtefacts) -> None:
         runs_of(twice, Prepared(twice))
 
 
-def test_a_hybrid_that_is_its_own_filter_is_drawn_as_the_hybrid() -> None:
+def test_a_hybrid_that_is_its_own_filter_is_drawn_as_the_hybrid():
     assert line_of(paper.CNN + OWN) == line_of(paper.CNN)
 
 
-def made_run(candidate: str, errors: Sequence[np.ndarray], seed: int = 0, validation: np.ndarray | None = None, ay: float = 5.0) -> Run:
+def made_run(candidate, errors, seed=0, validation=None, ay=5.0):
     """A run whose manoeuvres, a slalom and J-turns, have these errors [deg]."""
 
-    def scored(error: np.ndarray) -> Scored:
+    def scored(error):
         zero = np.zeros(len(error))
         return Scored(np.arange(len(error)) / 100.0, zero, zero, np.radians(error), zero, zero + ay)
 
@@ -208,11 +204,11 @@ def made_run(candidate: str, errors: Sequence[np.ndarray], seed: int = 0, valida
 WAVE = np.tile([1.0, -1.0], 50)
 
 
-def noisy(level: float, generator: np.random.Generator, count: int = 12) -> list[np.ndarray]:
+def noisy(level, generator, count=12):
     return [level * own * WAVE for own in generator.uniform(0.8, 1.2, count)]
 
 
-def test_indicators_are_those_of_the_paper(runs: dict[str, list[Run]]) -> None:
+def test_indicators_are_those_of_the_paper(runs):
     own = ManoeuvreErrors(runs, "t")
     for candidate, seeds in runs.items():
         for indicator in ("mse", "mse_nonlinear", "max_error", "max_error_nonlinear"):
@@ -220,7 +216,7 @@ def test_indicators_are_those_of_the_paper(runs: dict[str, list[Run]]) -> None:
             assert own.get(candidate, indicator).value == pytest.approx(expected)
 
 
-def test_a_real_difference_is_told_and_none_is_not() -> None:
+def test_a_real_difference_is_told_and_none_is_not():
     generator = np.random.default_rng(0)
     levels = {"a": 1.0, "b": 1.5, "c": 1.0}
     made = {name: [made_run(name, noisy(level, generator), seed) for seed in range(3)] for name, level in levels.items()}
@@ -231,7 +227,7 @@ def test_a_real_difference_is_told_and_none_is_not() -> None:
     assert claims.level("level", "", "d", own.change("a", "b", MSE)).verdict == "not reproduced"
 
 
-def test_a_filter_that_does_not_listen_is_called_its_own() -> None:
+def test_a_filter_that_does_not_listen_is_called_its_own():
     errors = noisy(1.0, np.random.default_rng(0), 40)
     same, other = [made_run(paper.SMOOTH, errors)], [made_run(paper.CNN, [0.5 * own for own in errors])]
     assert claims.is_own_filter(ManoeuvreErrors({paper.SMOOTH: same, paper.CNN: same}, "t"), paper.CNN, 0.9)
@@ -239,16 +235,16 @@ def test_a_filter_that_does_not_listen_is_called_its_own() -> None:
     assert claims.is_own_filter(ManoeuvreErrors({paper.SMOOTH: same, paper.CNN: other}, "t"), paper.CNN, 0.01)
 
 
-def test_groups_in_which_a_candidate_is_best_are_counted() -> None:
+def test_groups_in_which_a_candidate_is_best_are_counted():
     generator = np.random.default_rng(0)
     levels = {paper.MODEL: 3.0, paper.DATA: 2.0, paper.DEEP: 2.0, paper.CNN: 1.0}
     own = ManoeuvreErrors({name: [made_run(name, noisy(level, generator))] for name, level in levels.items()}, "t")
     (found,) = [entry for entry in claims.on_accuracy(own, "d") if getattr(entry, "claim", "").startswith("Fig. 6")]
-    assert found.ours.startswith("2 [")  # type: ignore[union-attr]
-    assert found.verdict == "not reproduced"  # type: ignore[union-attr]  # of two groups there are not five
+    assert found.ours.startswith("2 [")
+    assert found.verdict == "not reproduced"  # of two groups there are not five
 
 
-def test_validation_chooses_the_seed_and_no_single_manoeuvre_does() -> None:
+def test_validation_chooses_the_seed_and_no_single_manoeuvre_does():
     one = made_run(paper.MODEL, [np.full(10, 1.0)], 0, validation=np.full(10, 2.0))
     other = made_run(paper.MODEL, [np.full(10, 2.0)], 1, validation=np.full(10, 1.0))
     assert chosen([one, other]).model.seed == 1
@@ -257,19 +253,17 @@ def test_validation_chooses_the_seed_and_no_single_manoeuvre_does() -> None:
     assert chosen([quiet, wild]).model.seed == 0
 
 
-def test_a_drive_is_scored_until_it_slides_beyond_twelve_degrees() -> None:
+def test_a_drive_is_scored_until_it_slides_beyond_twelve_degrees():
     angle = np.array([0.1, 0.2, 0.22, 0.1])
     part = Scored(np.arange(4.0), angle, angle, angle, angle, angle)
     assert len(until(part, 0.21).time) == 2
     assert len(until(part, 0.3).time) == 4
 
 
-def test_what_networks_say_is_held_against_the_reference_of_the_same_time(
-    part: PartArtefacts, runs: dict[str, list[Run]], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_what_networks_say_is_held_against_the_reference_of_the_same_time(part, runs, monkeypatch):
     prepared = Prepared(part)
 
-    def knowing(run: Run, drives: Sequence[Recording]) -> list[PseudoMeasurement]:
+    def knowing(run, drives):
         whole = [prepared.recording("car", drive.id).cut(drive.start_time, drive.end_time + 0.005) for drive in drives]
         true = [np.arctan2(own["vy_ref"], own["vx"]) for own in whole]
         return [PseudoMeasurement(angle, np.full(len(angle), np.radians(2.0) ** 2)) for angle in true]
@@ -281,7 +275,7 @@ def test_what_networks_say_is_held_against_the_reference_of_the_same_time(
         np.testing.assert_allclose(own.distrust, 2.0)
 
 
-def test_a_filter_moves_by_no_more_than_its_network_and_less_where_it_distrusts(part: PartArtefacts, runs: dict[str, list[Run]]) -> None:
+def test_a_filter_moves_by_no_more_than_its_network_and_less_where_it_distrusts(part, runs):
     heard = networks.shift_of(runs[paper.CNN][0], Prepared(part))
     assert 0.0 < heard < 1.0
     perfect = networks.with_perfect_distrust(runs[paper.CNN][0], Prepared(part), "oracle")
@@ -289,7 +283,7 @@ def test_a_filter_moves_by_no_more_than_its_network_and_less_where_it_distrusts(
     assert perfect.kpis.mse < max(runs[paper.CNN][0].kpis.mse, 1e-3)
 
 
-def test_filters_that_are_not_those_that_were_found_are_named(runs: dict[str, list[Run]], tmp_path: Path) -> None:
+def test_filters_that_are_not_those_that_were_found_are_named(runs, tmp_path):
     assert "are those that the filters found" in tables.given_as_found(runs)
     other = estimator_class("dugoff_ukf").from_config({"tyres": {**TYRES, "friction_rear": 1.2 * TYRES["friction_rear"]}, "noise": LEVELS})
     save_model(other, tmp_path)
@@ -299,11 +293,11 @@ def test_filters_that_are_not_those_that_were_found_are_named(runs: dict[str, li
     assert "friction_rear of DE-UKF" in words
 
 
-def test_tyres_and_body_are_changed_in_a_copy() -> None:
+def test_tyres_and_body_are_changed_in_a_copy():
     for name in ("dugoff_ukf", "cnn_ukf"):
         fitted = estimator_class(name).from_config({"tyres": TYRES, "noise": LEVELS})
         changed, heavy = perturbed.with_stiffness(fitted, 0.1, -0.1), perturbed.with_body(fitted, 1.1, 0.9)
-        before, after, other = ((own if isinstance(own, DugoffUkf) else own.model) for own in (fitted, changed, heavy))  # type: ignore[attr-defined]
+        before, after, other = ((own if isinstance(own, DugoffUkf) else own.model) for own in (fitted, changed, heavy))
         np.testing.assert_allclose(after.axle_tyres / before.axle_tyres, [1.1, 1.0, 1.0, 0.9, 1.0, 1.0])
         assert other.track().car.mass == pytest.approx(1.1 * before.track().car.mass)
         assert other.track().car.yaw_inertia == pytest.approx(0.9 * before.track().car.yaw_inertia)
@@ -312,12 +306,12 @@ def test_tyres_and_body_are_changed_in_a_copy() -> None:
             change(estimator_class("sideslip_ffnn").from_config({}), 0.1, 0.1)
 
 
-def test_wrong_tyres_cost_the_model_more_than_nothing(part: PartArtefacts, runs: dict[str, list[Run]]) -> None:
+def test_wrong_tyres_cost_the_model_more_than_nothing(part, runs):
     table = perturbed.values(perturbed.perturbed({paper.MODEL: runs[paper.MODEL]}, Prepared(part)))
     assert table["mse"].to_numpy().argmin() == perturbed.NOMINAL
 
 
-def test_the_model_is_observable_straight_ahead_as_well() -> None:
+def test_the_model_is_observable_straight_ahead_as_well():
     estimator = estimator_class("dugoff_ukf").from_config({"tyres": TYRES, "noise": LEVELS, "curve": "smooth"})
     assert isinstance(estimator, DugoffUkf)
     found = observability.local(estimator)
@@ -327,22 +321,20 @@ def test_the_model_is_observable_straight_ahead_as_well() -> None:
     assert (first.verdict, second.verdict) == ("reproduced", "not reproduced")
 
 
-def test_claims_of_added_candidates_are_tested_where_they_were_trained(report: Document) -> None:
+def test_claims_of_added_candidates_are_tested_where_they_were_trained(report):
     frame = next(block.frame for block in report.blocks if isinstance(block, Table) and block.name == "claims")
     added = frame[frame["claim"].str.contains("limited set|z-scores|recurrent")]
     assert len(added) == 7
     assert (added["verdict"] != "not testable on this data").all()
 
 
-def test_scaling_of_the_full_set_changes_the_filter_and_nothing_else(
-    part: PartArtefacts, runs: dict[str, list[Run]], tmp_path: Path
-) -> None:
+def test_scaling_of_the_full_set_changes_the_filter_and_nothing_else(part, runs, tmp_path):
     prepared = Prepared(part)
     learnt = {name: runs[name] for name in (paper.DATA, *paper.HYBRIDS)}
     same = limited(runs, learnt, prepared).scaling
     assert same.get(AS_TUNED, MSE).value == pytest.approx(same.get(OF_THE_FULL_SET, MSE).value, rel=2e-3)  # estimated on raw drives
     other = load_model(runs[paper.DEEP][0].model.model_folder)
-    other.scaling = other.scaling + np.array([4.0, 0.0])  # type: ignore[attr-defined]  # DE-UKF
+    other.scaling = other.scaling + np.array([4.0, 0.0])  # DE-UKF
     save_model(other, tmp_path)
     of_full = [replace(run, model=replace(run.model, model_folder=tmp_path)) for run in runs[paper.DEEP]]
     changed = limited({**runs, paper.DEEP: of_full}, learnt, prepared)
@@ -353,7 +345,7 @@ def test_scaling_of_the_full_set_changes_the_filter_and_nothing_else(
         limited(runs, {name: learnt[name] for name in (paper.DATA, paper.DEEP)}, prepared)
 
 
-def test_the_search_compares_validation_with_the_papers_widths(everything: PartArtefacts, runs: dict[str, list[Run]]) -> None:
+def test_the_search_compares_validation_with_the_papers_widths(everything, runs):
     point = replace(everything, models=[own for own in everything.models if own.model_folder.name.startswith(POINT)])
     parts = {"search_5_6": runs_of(point, Prepared(point)), "standard": {paper.DATA: runs[paper.DATA]}}
     assert list(search.points_of(parts, runs)) == [(5, 6), (10, 6)]
@@ -364,29 +356,29 @@ def test_the_search_compares_validation_with_the_papers_widths(everything: PartA
     assert search.search_table(parts, {**runs, paper.DATA: [wild]}, "D").frame["validation"].tolist() == table.frame["validation"].tolist()
 
 
-def test_a_report_without_its_main_part_is_refused(part: PartArtefacts) -> None:
+def test_a_report_without_its_main_part_is_refused(part):
     with pytest.raises(DataError, match="needs part 'full'"):
         documents(StudyArtefacts("cnn_ukf", "t", "a", "c", {"limited": "l"}, {"limited": part}, []))
 
 
-def test_the_study_prepares_references_as_the_pipeline_prepares_recordings() -> None:
+def test_the_study_prepares_references_as_the_pipeline_prepares_recordings():
     content = yaml.safe_load((ROOT / "pipelines" / "cnn_ukf.yaml").read_text())
     offline = {override for part in content["parts"].values() for sweep in part["sweeps"] for override in sweep}
     (told,) = {override for override in offline if override.startswith("downsample.transforms=")}
     assert tuple(transform_from_config(entry) for entry in yaml.safe_load(told.partition("=")[2])) == OFFLINE
 
 
-def test_references_and_accelerations_are_low_passed_before_they_are_scored(part: PartArtefacts) -> None:
+def test_references_and_accelerations_are_low_passed_before_they_are_scored(part):
     prepared = Prepared(part)
     noisy = part.references["car", "test_lap_1"]
     assert np.std(np.diff(prepared.recording("car", "test_lap_1")["ay"], 2)) < 0.1 * np.std(np.diff(loaded_ay(noisy), 2))
 
 
-def loaded_ay(path: Path) -> np.ndarray:
+def loaded_ay(path):
     return pd.read_parquet(path)["ay"].to_numpy()
 
 
-def test_the_manoeuvre_drawn_is_the_one_with_the_largest_angle_whose_car_did_not_spin(part: PartArtefacts, tmp_path: Path) -> None:
+def test_the_manoeuvre_drawn_is_the_one_with_the_largest_angle_whose_car_did_not_spin(part, tmp_path):
     calm = Prepared(part).recording("car", "test_j_turn_1")
     references, spans = dict(part.references), list(SPLIT.tests["test"])
     for name, factor, spun in (("test_j_turn_2", 1.5, False), ("test_j_turn_3", 2.0, True)):
@@ -402,20 +394,20 @@ def test_the_manoeuvre_drawn_is_the_one_with_the_largest_angle_whose_car_did_not
         traces.manoeuvre_of(part, Prepared(part), "skidpad")
 
 
-def test_manoeuvres_in_two_ranges_are_refused(part: PartArtefacts) -> None:
+def test_manoeuvres_in_two_ranges_are_refused(part):
     spans = (*SPLIT.tests["test"], Span("car", "test_lap_1", 4.0))
     twice = replace(part, split=Split("made", SPLIT.train, SPLIT.validation, {"test": spans}))
     with pytest.raises(DataError, match="has several ranges, but a manoeuvre is one"):
         runs_of(twice, Prepared(twice))
 
 
-def test_a_method_that_the_paper_does_not_have_is_refused() -> None:
+def test_a_method_that_the_paper_does_not_have_is_refused():
     with pytest.raises(DataError, match="'GRU' is none of the paper's methods"):
         candidate_of(EvaluatedModel("gru", "states_5", "GRU", 0, Path(), Path()))
 
 
-def test_the_report_counts_the_drives_that_are_cut_and_tells_how_far_they_slide() -> None:
-    def driven(*largest: float) -> SimpleNamespace:
+def test_the_report_counts_the_drives_that_are_cut_and_tells_how_far_they_slide():
+    def driven(*largest):
         test = {f"drive {k}": [SimpleNamespace(sideslip_ref=np.radians([0.0, -angle]))] for k, angle in enumerate(largest)}
         return SimpleNamespace(runs={"any": [SimpleNamespace(test=test)]})
 

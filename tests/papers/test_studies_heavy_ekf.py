@@ -1,7 +1,5 @@
 """Pieces of the study of heavy-vehicle laps, on a short drive of a filter whose curves and levels are given."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 from typing import cast
@@ -23,7 +21,7 @@ RATE = 20.0
 TRUCK = SingleTrackParameters(7912.0, 24230.0, 1.7401, 1.7599, 1.0, 1.0)
 
 
-def short_drive(seconds: float = 60.0) -> Recording:
+def short_drive(seconds=60.0):
     """A truck that weaves, by steady-state gains, with wheels that roll."""
     time = np.arange(round(seconds * RATE)) / RATE
     generator = np.random.default_rng(0)
@@ -39,21 +37,21 @@ def short_drive(seconds: float = 60.0) -> Recording:
 
 
 @pytest.fixture(scope="module")
-def ratte() -> RationalFilter:
+def ratte():
     curves = AxleCurves(0.013, 487e3, 0.0077, 622e3)
     return RationalFilter(
         RationalFilter.settings_type(car=TRUCK, minimum_speed=2.0, curves=curves, noise=TrackNoise(0.003, 0.1, 0.002, 0.003))
     )
 
 
-def test_every_fault_leaves_the_filter_finite(ratte: RationalFilter) -> None:
+def test_every_fault_leaves_the_filter_finite(ratte):
     drive = short_drive()
     for name, apply in watching.faults(WHEELS).items():
         estimate = ratte.estimate([apply(drive).without_references()])[0]
         assert all(np.isfinite(values).all() for values in estimate.channels.values()), name
 
 
-def test_the_monitor_sees_a_yaw_rate_of_the_other_sign(ratte: RationalFilter) -> None:
+def test_the_monitor_sees_a_yaw_rate_of_the_other_sign(ratte):
     drive = short_drive()
     wrong = watching.faults(WHEELS)["yaw rate of the other sign"](drive)
     sound, flipped = (ratte.estimate([own.without_references()])[0] for own in (drive, wrong))
@@ -61,7 +59,7 @@ def test_the_monitor_sees_a_yaw_rate_of_the_other_sign(ratte: RationalFilter) ->
     assert np.max(watching.monitor(flipped["nis"], flipped["nis_dof"], RATE)) > 3.0 * limit
 
 
-def test_table_of_bad_input_names_the_drive_backwards(ratte: RationalFilter) -> None:
+def test_table_of_bad_input_names_the_drive_backwards(ratte):
     drive = short_drive()
     filters = {"RATTE": Filter("RATTE", cast("EvaluatedModel", None), ratte)}
     table, *words = watching.bad_input_table(filters, drive, [drive], WHEELS, 2.0, "SIMULATED")
@@ -72,26 +70,26 @@ def test_table_of_bad_input_names_the_drive_backwards(ratte: RationalFilter) -> 
     assert not any("the drive backwards" in str(block) for block in words)
 
 
-def test_monitor_is_the_mean_over_measured_numbers_in_windows() -> None:
+def test_monitor_is_the_mean_over_measured_numbers_in_windows():
     nis, dof = np.repeat([2.0, 6.0, 0.0], 200), np.repeat([2.0, 1.0, 0.0], 200)
     np.testing.assert_array_equal(watching.monitor(nis, dof, RATE), [1.0, 6.0, math.nan])
 
 
-def test_parameters_show_where_the_truck_turns(ratte: RationalFilter) -> None:
+def test_parameters_show_where_the_truck_turns(ratte):
     seen = watching.observability_of(ratte, short_drive(), 2.0).smallest
     turning = np.abs(np.sin(0.4 * (np.arange(len(seen)) + 10) / RATE))
     assert np.median(seen[turning > 0.9]) > np.median(seen[turning < 0.1])
     assert np.isfinite(seen).all()
 
 
-def test_convergence_counts_from_the_last_time_outside() -> None:
+def test_convergence_counts_from_the_last_time_outside():
     time = np.arange(6.0) + 100.0
     assert tyres.convergence_time(time, np.array([2.0, 1.0, 1.5, 1.05, 1.0, 0.95]), 1.0) == 3.0
     assert tyres.convergence_time(time, np.full(6, 1.05), 1.0) == 0.0
     assert tyres.convergence_time(time, np.array([1.0, 1.0, 1.0, 1.0, 1.0, 1.2]), 1.0) == math.inf
 
 
-def test_gains_are_those_of_the_figures() -> None:
+def test_gains_are_those_of_the_figures():
     rmse = {
         (name, f"{kind}_{drive}"): value
         for name, value in (("LINT", 1.0), ("RATT", 0.5), ("RATTE", 0.25))
@@ -103,12 +101,12 @@ def test_gains_are_those_of_the_figures() -> None:
     assert frame["paper"].tolist() == ["37 %", "44 %", "65 %"]
 
 
-def estimated(drive: Recording, gain: float, noise: float = 0.0) -> Estimate:
+def estimated(drive, gain, noise=0.0):
     sideslip = gain * drive["sideslip_ref"] + noise * np.random.default_rng(1).standard_normal(len(drive))
     return Estimate(drive.id, "scaled", drive.rate_hz, drive.start_time, {"vy": drive["vx"] * np.tan(sideslip), "sideslip": sideslip})
 
 
-def test_an_estimate_that_is_a_fifth_too_small_has_a_gain_of_0_8_and_reproduces_the_claim() -> None:
+def test_an_estimate_that_is_a_fifth_too_small_has_a_gain_of_0_8_and_reproduces_the_claim():
     drive = short_drive(120.0)
     drive = replace(drive, channels={**drive.channels, "ay": 2.0 * drive["ay"]})
     estimates = {"nominal_laps": {"LINT": estimated(drive, 0.8, 1e-5), "RATT": estimated(drive, 1.0, 1e-5)}}
@@ -118,21 +116,21 @@ def test_an_estimate_that_is_a_fifth_too_small_has_a_gain_of_0_8_and_reproduces_
     assert [claim.verdict for claim in accuracy.underestimation_claims(gains)] == ["reproduced", "undecided"] * 2
 
 
-def test_laps_are_thirds_of_the_way() -> None:
+def test_laps_are_thirds_of_the_way():
     drive = short_drive(90.0)
     laps = accuracy.laps_of(drive)
     assert [int(lap.sum()) for lap in laps] == [600, 600, 600]
     assert not (laps[0] & laps[1]).any()
 
 
-def test_the_stop_is_the_last_time_that_the_truck_moved() -> None:
+def test_the_stop_is_the_last_time_that_the_truck_moved():
     drive = short_drive(60.0)
     speed = np.where(drive.time < 40.0, 10.0, 0.0)
     stopped = Recording("stops", "truck", RATE, 0.0, {**drive.channels, "vx_ref": speed}, "simulated")
     assert accuracy.stop_of(stopped) == pytest.approx(40.0, abs=0.06)
 
 
-def test_tracks_of_the_truck_are_found_from_its_wheels() -> None:
+def test_tracks_of_the_truck_are_found_from_its_wheels():
     """The truck's tracks, from wheels with the rolling radius of the AV-21."""
     drive = short_drive(60.0)
     wheels = {
@@ -143,12 +141,12 @@ def test_tracks_of_the_truck_are_found_from_its_wheels() -> None:
     assert (front, rear) == pytest.approx((2.08, 2.08), rel=0.02)
 
 
-def test_an_axle_whose_wheels_turn_alike_is_named_and_not_corrected() -> None:
+def test_an_axle_whose_wheels_turn_alike_is_named_and_not_corrected():
     assert "rear (Eqs. 63, 64)" in vehicle._locked_in_words(np.array([1.6, 0.0]))
     assert vehicle._locked_in_words(np.array([1.6, 1.5])) == ""
 
 
-def test_an_order_that_every_draw_has_is_told_apart_and_one_that_draws_decide_is_not() -> None:
+def test_an_order_that_every_draw_has_is_told_apart_and_one_that_draws_decide_is_not():
     samples = np.full(5, 1000.0)
     level = np.array([1.0, 1.1, 0.9, 1.05, 0.95]) * 0.04 * 1000.0
     jumps = np.array([1.5, 0.6, 1.4, 0.5, 1.0])

@@ -1,7 +1,5 @@
 """Table I and Figures 4 and 5 from drives whose figures are known."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Section IV in figures and words: both follow from the weights that were planted."""
 
-from __future__ import annotations
-
 import re
 
 import numpy as np
@@ -12,14 +10,7 @@ from trained_ksnn import ksnn_with_weights
 from conftest import planar_drive
 from vehest.data.errors import ConfigurationError, DataError
 from vehest.report.document import Document, Figure, Table, write_document
-from vehest_papers.ksnn.interpretation import (
-    feedback_functions,
-    gain_curves,
-    gains_in_words,
-    interpretation,
-    steady_third,
-    sub_models,
-)
+from vehest_papers.ksnn.interpretation import feedback_functions, gain_curves, gains_in_words, interpretation, steady_third, sub_models
 from vehest_papers.ksnn.linear_system import LocalModels
 from vehest_papers.ksnn.subjects import Trained
 

@@ -1,7 +1,5 @@
 """Figures 3 and 8: levels and words against errors whose spectra were planted."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Figure 7: what it draws and says follows the models, and injected noise agrees with the closed form."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

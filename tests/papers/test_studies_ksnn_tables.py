@@ -1,7 +1,5 @@
 """Tables and the scatter of the KS-NN study, from metrics made by the test."""
 
-from __future__ import annotations
-
 import math
 from pathlib import Path
 
@@ -12,7 +10,7 @@ from study_parts import metric_rows, part_of
 from vehest.data.errors import DataError
 from vehest.data.splits import Span, Split
 from vehest.evaluation.metrics import Protocol
-from vehest.studies.artefacts import EvaluatedModel, PartArtefacts
+from vehest.studies.artefacts import EvaluatedModel
 from vehest_papers.ksnn import paper, scatter, tables
 from vehest_papers.ksnn.candidates import category_of, chosen, chosen_by_category, runs_of, structure_of
 from vehest_papers.ksnn.schemes import Scheme
@@ -37,7 +35,7 @@ FIGURES = {
 }
 
 
-def part(figures=FIGURES, drop: str = "") -> PartArtefacts:
+def part(figures=FIGURES, drop=""):
     rows, models = [], []
     for (estimator, variant, seed), (validation, *fvus) in figures.items():
         values = {("validation", "rmse_vy"): validation, ("validation", "fvu"): validation**2}

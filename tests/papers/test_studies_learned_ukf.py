@@ -1,7 +1,5 @@
 """The study of the learned UKF, from small models and recordings made by the test."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 from pathlib import Path
@@ -22,7 +20,7 @@ from vehest.estimators.model_files import save_model
 from vehest.evaluation.metrics import Protocol, accuracy, reference_state, score_all, sequences
 from vehest.evaluation.significance import Interval
 from vehest.report.document import Figure, Table, write_document
-from vehest.studies.artefacts import EvaluatedModel, PartArtefacts, StudyArtefacts
+from vehest.studies.artefacts import EvaluatedModel, StudyArtefacts
 from vehest.training.through_filter import Drive
 from vehest_papers.learned_ukf import claims, documents, friction, paper, tables
 from vehest_papers.learned_ukf.additions import (
@@ -70,7 +68,7 @@ CANDIDATES = {
 }
 
 
-def recording(name: str, seconds: float = 3.2, seed: int = 0) -> Recording:
+def recording(name, seconds=3.2, seed=0):
     """A drive of smooth motion that no model explains."""
     time = np.arange(round(100 * seconds)) / 100.0
     vx, vy, yaw_rate = 2.5 + 0.4 * np.sin(1.3 * time + seed), 0.3 * np.sin(2.0 * time + seed), 1.2 * np.cos(1.1 * time + seed)
@@ -80,7 +78,7 @@ def recording(name: str, seconds: float = 3.2, seed: int = 0) -> Recording:
     return Recording(name, "car", 100.0, 0.0, {**measured, "vx_ref": vx, "vy_ref": vy, "yaw_rate_ref": yaw_rate}, "simulated")
 
 
-def filter_of(seed: int = 0, **settings: object) -> LearnedUkf:
+def filter_of(seed=0, **settings):
     """A filter with networks of random weights, not trained."""
     estimator = LearnedUkf(LearnedUkf.settings_type(**{"width": 4, "scaled": False, **settings}))
     estimator.filter.reset(torch.Generator().manual_seed(seed))
@@ -88,7 +86,7 @@ def filter_of(seed: int = 0, **settings: object) -> LearnedUkf:
 
 
 @pytest.fixture(scope="module")
-def part(tmp_path_factory: pytest.TempPathFactory) -> PartArtefacts:
+def part(tmp_path_factory):
     """Five filters and a network, two seeds each, on two sets of three sequences."""
     folder = tmp_path_factory.mktemp("study")
     recordings = {name: recording(name, seed=number) for number, name in enumerate(SPANS)}
@@ -120,13 +118,13 @@ def part(tmp_path_factory: pytest.TempPathFactory) -> PartArtefacts:
     return part_of(SPLIT, PROTOCOL, models, rows, kinds=kinds, data_titles=titles, references=references, facts=facts)
 
 
-def constant(own: Recording) -> Estimate:
+def constant(own):
     """An estimate without covariance that stays at the start."""
     channels = {name: np.full(len(own), own[f"{name}_ref"][0]) for name in ("vx", "vy", "yaw_rate")}
     return Estimate(own.id, "velocity_gru", 100.0, own.start_time, {**channels, "sideslip": channels["vy"] / channels["vx"]})
 
 
-def model(part: PartArtefacts, candidate: str, seed: int = 0) -> EvaluatedModel:
+def model(part, candidate, seed=0):
     return models_by_candidate(part)[candidate][seed]
 
 
@@ -186,13 +184,13 @@ def test_report_shows_every_table_and_figure_of_the_paper_and_says_what_its_data
     assert "Recordings are made" in text
 
 
-def only(part: PartArtefacts, candidate: str, training: dict[str, object] | None = None) -> PartArtefacts:
+def only(part, candidate, training=None):
     """The part with one candidate, trained in another way."""
     own = [replace(one, training={**one.training, **(training or {})}) for one in models_by_candidate(part)[candidate]]
     return replace(part, models=own)
 
 
-def of_length(part: PartArtefacts, steps: int) -> PartArtefacts:
+def of_length(part, steps):
     return only(part, "NNTF_U", {"steps": steps, "batch_size": 2})
 
 
@@ -272,7 +270,7 @@ def test_a_metric_that_is_missing_is_said(part):
         runs_of(replace(part, metrics=metrics))
 
 
-def errors_of(**levels: float) -> Losses:
+def errors_of(**levels):
     """Twelve sequences of 50 samples, three seeds; losses around a level, in sequences of different difficulty."""
     generator = np.random.default_rng(0)
     hard = np.repeat(generator.uniform(1.0, 3.0, 12), 50)
@@ -330,7 +328,7 @@ def test_same_weights_are_compared_seed_by_seed():
     assert paired.error < 0.2 * free.error
 
 
-def interval(low: float, high: float) -> Interval:
+def interval(low, high):
     return Interval(0.5 * (low + high), low, high, 0.5)
 
 
@@ -408,7 +406,7 @@ def test_baselines_take_their_other_velocities_from_what_is_measured(part, tmp_p
 
 
 def test_trials_show_what_validation_chose_and_what_the_tables_use_instead(part):
-    def trial(size: float, validation: float) -> PartArtefacts:
+    def trial(size, validation):
         own = replace(model(part, "NNTF_UH"), training={"through": {"learning_rate": size}})
         metrics = part.metrics.copy()
         metrics.loc[(metrics["test_set"] == "validation") & (metrics["metric"] == "mse_weighted"), "value"] = validation
@@ -492,7 +490,7 @@ def test_lengths_are_those_of_trainings_through_the_filter(part):
 # Comparisons that were added
 
 
-def subject_of(squared: dict[str, np.ndarray], title: str = "own", validation: tuple[float, ...] = ()) -> Subject:
+def subject_of(squared, title="own", validation=()):
     """A candidate with planted losses, three seeds."""
     models = [EvaluatedModel("learned_ukf", "nntf_uh", title, seed, Path(), Path()) for seed in (0, 1, 2)]
     values = zip(models, validation, strict=False)
@@ -503,7 +501,7 @@ def subject_of(squared: dict[str, np.ndarray], title: str = "own", validation: t
     return Subject(title, part, models, errors, title)
 
 
-def planted(**levels: float) -> Subject:
+def planted(**levels):
     """Losses of a level in each test, in sequences of different difficulty, of seeds that differ much."""
     generator = np.random.default_rng(0)
     hard = np.repeat(generator.uniform(1.0, 3.0, 12), 50)

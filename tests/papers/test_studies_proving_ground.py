@@ -1,7 +1,5 @@
 """The study of the simulated cars: its statistics against plain ones, its pages, and pipelines of data sets alone."""
 
-from __future__ import annotations
-
 import json
 import os
 import re
@@ -18,9 +16,8 @@ from test_cli import _statuses
 from conftest import planar_drive
 from place import DATASET
 from vehest.data.files import ASIDE_PREFIX
-from vehest.data.recording import Recording
 from vehest.data.store import write_recording
-from vehest.report.document import Document, write_document
+from vehest.report.document import write_document
 from vehest.simulation.plant.parameters import Vehicle
 from vehest.studies.artefacts import AbsentDataset, StoredDataset, StudyArtefacts
 from vehest_papers.proving_ground import documents, gates
@@ -36,14 +33,14 @@ CALM = {"spun": False, "left_road": False, "stood": False, "completed": True, "g
 REAL = AbsentDataset("ferrari_250lm", "The real car", "somebody's licence", "somebody's paper")
 
 
-def _drive(name: str = "f1_001", seed: int = 0, seconds: float = 60.0, rate_hz: float = 20.0, *, steered: float = 0.0) -> Recording:
+def _drive(name="f1_001", seed=0, seconds=60.0, rate_hz=20.0, *, steered=0.0):
     """A drive with a steering angle: that of the curvature, and ``steered`` rad more in left turns, less in right ones."""
     plain = planar_drive(seconds, rate_hz, seed=seed, name=name)
     steer = np.arctan(2.4 * plain["yaw_rate"] / plain["vx"]) + steered * np.sign(plain["yaw_rate"])
     return replace(plain, vehicle="ferrari_250_lm", channels={**plain.channels, "steer": steer})
 
 
-def _simulated(recording: Recording, manoeuvre: str = "laps", **flags: object) -> Recording:
+def _simulated(recording, manoeuvre="laps", **flags):
     """The same as if vehest's plant had made it."""
     about = {
         "parameter_set": FERRARI["parameter_set"],
@@ -56,7 +53,7 @@ def _simulated(recording: Recording, manoeuvre: str = "laps", **flags: object) -
     return replace(recording, kind="simulated", provenance=about)
 
 
-def _stored(folder: Path, name: str, kind: str, recordings: list[Recording]) -> StoredDataset:
+def _stored(folder, name, kind, recordings):
     files = {}
     for recording in recordings:
         files[recording.id] = folder / f"{name}-{recording.id}.parquet"
@@ -65,7 +62,7 @@ def _stored(folder: Path, name: str, kind: str, recordings: list[Recording]) -> 
 
 
 @pytest.fixture(scope="module")
-def study(tmp_path_factory) -> StudyArtefacts:
+def study(tmp_path_factory):
     """Three simulated drives, of which one spun, and a real one."""
     folder = tmp_path_factory.mktemp("store")
     spin = {"spun": True, "gave_up_at": 12.5, "largest_sideslip": 2.0, "stood": True}
@@ -80,7 +77,7 @@ def study(tmp_path_factory) -> StudyArtefacts:
 
 
 @pytest.fixture(scope="module")
-def made(study) -> dict[str, Document]:
+def made(study):
     return documents(study)
 
 
@@ -368,11 +365,11 @@ def test_samples_beyond_the_drawn_range_are_counted():
 # Gates
 
 
-def _set(name: str, seed: int, seconds: float = 60.0) -> Recording:
+def _set(name, seed, seconds=60.0):
     return replace(_simulated(_drive(f"{name}_001", seed, seconds)), vehicle=f"car {name[0]}")
 
 
-def test_a_static_map_explains_all_of_a_car_that_is_one() -> None:
+def test_a_static_map_explains_all_of_a_car_that_is_one():
     own = _set("f1", 1)
     exact = own["yaw_rate"] * (1.07 - 0.005 * own["vx"] ** 2)
     mapped = replace(own, channels={**own.channels, "vy_ref": exact})
@@ -383,7 +380,7 @@ def test_a_static_map_explains_all_of_a_car_that_is_one() -> None:
     assert gates.left_by(gates.static_map_of([noisy]), [noisy]) == pytest.approx(0.09 / 1.09, rel=0.1)
 
 
-def test_a_gate_is_met_within_its_range_and_named_where_it_is_not(tmp_path) -> None:
+def test_a_gate_is_met_within_its_range_and_named_where_it_is_not(tmp_path):
     drives = {gates.AFTER: {"c1": [_set("c1", 1)], "f1": [_set("f1", 2)]}}
     found = gates.gates(drives, [])
     assert {gate.of for gate in found} == {"C-1", "C-2", "F-1", "F-2", "Corvette", "Ferrari"} | {"Jaguar"}
@@ -396,7 +393,7 @@ def test_a_gate_is_met_within_its_range_and_named_where_it_is_not(tmp_path) -> N
     assert any("needs the real recording" in text for text in said)
 
 
-def test_the_gate_on_the_spectrum_is_zero_against_itself_and_in_decibels() -> None:
+def test_the_gate_on_the_spectrum_is_zero_against_itself_and_in_decibels():
     own = _set("f1", 3, 120.0)
     rate = np.gradient(own["vy_ref"]) * own.rate_hz
     twice = replace(
@@ -409,13 +406,10 @@ def test_the_gate_on_the_spectrum_is_zero_against_itself_and_in_decibels() -> No
     np.testing.assert_allclose([gate.values[gates.AFTER] for gate in doubled], 20.0 * np.log10(2.0), atol=0.1)
 
 
-def test_the_first_cars_stand_in_the_gates_only(tmp_path) -> None:
+def test_the_first_cars_stand_in_the_gates_only(tmp_path):
     stored = [
         _stored(tmp_path, name, "simulated", [replace(_set(letter, seed), vehicle=vehicle)])
-        for name, letter, seed, vehicle in (
-            (gates.AFTER, "f1", 4, "ferrari_250_lm"),
-            (gates.BEFORE, "c1", 5, "corvette_grand_sport"),
-        )
+        for name, letter, seed, vehicle in ((gates.AFTER, "f1", 4, "ferrari_250_lm"), (gates.BEFORE, "c1", 5, "corvette_grand_sport"))
     ]
     made = documents(StudyArtefacts("proving_ground", "Proving ground", "About it.", "vehest run x.yaml", datasets=stored))
     assert "corvette_grand_sport" not in made

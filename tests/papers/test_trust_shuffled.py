@@ -1,7 +1,5 @@
 """How often 0.90 lies in the interval of a band's coverage where calibration and test are alike."""
 
-from __future__ import annotations
-
 import numpy as np
 import pandas as pd
 import pytest
@@ -9,7 +7,7 @@ import pytest
 from vehest_papers.trust.shuffled import LEARNT, Scores, in_words, over_parts, share_if_shuffled, shuffled_in_words, together
 
 
-def scores(manoeuvres: int, alike: float, seed: int, samples: int = 40) -> Scores:
+def scores(manoeuvres, alike, seed, samples=40):
     """Sizes of Gaussian errors, of which a share of the variance is one number a manoeuvre."""
     generator = np.random.default_rng(seed)
     labels = np.repeat(np.arange(manoeuvres), samples)

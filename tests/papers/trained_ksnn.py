@@ -1,14 +1,12 @@
 """KS-NNs as training leaves them, without the training: weights drawn around typical ones, so that tests know them."""
 
-from __future__ import annotations
-
 import torch
 
 from vehest.estimators.ksnn import Ksnn
 from vehest.estimators.networks.ksnn import KinematicsStructuredNetwork
 
 
-def ksnn_with_weights(n_local=3, n_hidden=0, bias=False, seed=0, window=30, yaw_rate_max=0.6) -> Ksnn:
+def ksnn_with_weights(n_local=3, n_hidden=0, bias=False, seed=0, window=30, yaw_rate_max=0.6):
     """A KS-NN in float64 with γ about 0.95, β about 0.8 and feedback that matters."""
     settings = Ksnn.settings_type(n_local=n_local, n_hidden=n_hidden, bias=bias, window=window)
     network = KinematicsStructuredNetwork(settings, yaw_rate_max).double()

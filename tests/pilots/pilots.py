@@ -3,8 +3,6 @@
 pipelines/STUDY.yaml -> reduced pipeline -> `vehest run` -> report's metrics.csv and tables/*.csv -> rounded, in OUT/STUDY/ -> `compare`
 """
 
-from __future__ import annotations
-
 import argparse
 import json
 import os
@@ -13,10 +11,9 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping
 from functools import cache, partial
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -32,14 +29,14 @@ DIGITS, SHOWN = 6, 5
 _texts = partial(pd.read_csv, dtype=str, keep_default_na=False)
 
 
-def reduced(pipeline: Mapping[str, Any]) -> dict[str, Any]:
+def reduced(pipeline):
     """A pipeline with all parts and candidates, but one seed and at most the `BUDGETS` for each training."""
     parts = {name: {**part, "sweeps": _reduced_sweeps(part["sweeps"])} for name, part in pipeline.get("parts", {}).items()}
     changed = {"parts": parts} if parts else {"sweeps": _reduced_sweeps(pipeline["sweeps"])} if "sweeps" in pipeline else {}
     return {**pipeline, **changed, "publish": False}
 
 
-def _reduced_sweeps(sweeps: Sequence[Sequence[str]]) -> list[list[str]]:
+def _reduced_sweeps(sweeps):
     """Every candidate as a sweep of its own, with the first seed of its sweep."""
     candidates = []
     for sweep in sweeps:
@@ -51,14 +48,14 @@ def _reduced_sweeps(sweeps: Sequence[Sequence[str]]) -> list[list[str]]:
 
 
 @cache
-def _budgets_of(overrides: Sequence[str]) -> list[str]:
+def _budgets_of(overrides):
     """Overrides for what is above its budget in a training's configuration, or in a phase of it."""
     training = compose_config("train", overrides)["training"]
     phases = {"training": training} | {f"training.{name}": value for name, value in training.items() if isinstance(value, Mapping)}
     return [f"{phase}.{name}={most}" for phase, values in phases.items() for name, most in BUDGETS.items() if values.get(name, most) > most]
 
 
-def write_data_sets(folder: Path) -> None:
+def write_data_sets(folder):
     """Configurations of simulated data sets with fewer and shorter drives."""
     folder.mkdir(parents=True, exist_ok=True)
     for file in (ROOT / "conf" / "dataset").glob("*.yaml"):
@@ -72,7 +69,7 @@ def write_data_sets(folder: Path) -> None:
             (folder / file.name).write_text(yaml.safe_dump(dataset, allow_unicode=True), encoding="utf-8")
 
 
-def run(study: str, out: Path, output: Path, jobs: int) -> bool:
+def run(study, out, output, jobs):
     """Run the pilot of a study and keep its tables; returns whether all of it succeeded."""
     begun, computed = time.monotonic(), sum(os.times()[2:4])  # the latter of processes that ended
     pipeline = yaml.safe_load((ROOT / "pipelines" / f"{study}.yaml").read_text(encoding="utf-8"))
@@ -86,7 +83,7 @@ def run(study: str, out: Path, output: Path, jobs: int) -> bool:
     return ran.returncode == 0
 
 
-def collect(report: Path, folder: Path) -> None:
+def collect(report, folder):
     """Copy a report's tables, numbers rounded."""
     shutil.rmtree(folder, ignore_errors=True)
     for file in [*report.glob("metrics.csv"), *(report / "tables").glob("*.csv")]:
@@ -95,14 +92,14 @@ def collect(report: Path, folder: Path) -> None:
         _texts(file).map(_rounded).to_csv(target, index=False)
 
 
-def _rounded(cell: str) -> str:
+def _rounded(cell):
     try:
         return f"{float(cell):.{DIGITS}g}"
     except ValueError:
         return cell
 
 
-def differences(first: Path, second: Path) -> Iterator[str]:
+def differences(first, second):
     """Files that two folders do not share, tables of another shape, and cells with other values."""
     for name in sorted({file.relative_to(side).as_posix() for side in (first, second) for file in side.rglob("*.csv")}):
         absent = [side for side in (first, second) if not (side / name).is_file()]
@@ -117,7 +114,7 @@ def differences(first: Path, second: Path) -> Iterator[str]:
             yield f"{name}, row {row + 1}, {table.columns[column]}: {table.iat[row, column]} | {other.iat[row, column]}"
 
 
-def compare(first: Path, second: Path) -> int:
+def compare(first, second):
     """Print of every study whether its tables are equal, else the first differences and their number; returns how many studies differ."""
     differing = 0
     for study in sorted({folder.name for side in (first, second) for folder in side.iterdir() if folder.is_dir()}):
@@ -128,7 +125,7 @@ def compare(first: Path, second: Path) -> int:
     return differing
 
 
-def main() -> None:
+def main():
     """Run or compare; the exit code is 1 where a pilot failed, or folders differ."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("studies", nargs="*", help="names of pipelines; all by default")

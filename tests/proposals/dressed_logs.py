@@ -5,12 +5,7 @@ What the recordings do not have is computed: the angle of a steering wheel (16 t
 slip (0.32 m, tracks of 1.35 m), heading by integration, gear, temperatures.
 """
 
-from __future__ import annotations
-
-from collections.abc import Callable, Mapping
 from functools import cache
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -24,7 +19,7 @@ Columns = dict[str, np.ndarray]
 
 
 @cache
-def ferrari(data: Path, step: int = 1) -> Columns:
+def ferrari(data, step=1):
     """150 to 450 s of the drive in SI units and ISO 8855 axes, every ``step``-th sample, (T,) each."""
     names = {"t": "t", "vx": "vx", "vy": "vy", "r": "yawRate", "ax": "axCG", "ay": "ayCG", "delta": "delta", "beta": "beta_true"}
     read = {name: np.loadtxt(data / DRIVE / f"{file}.txt") for name, file in names.items()}
@@ -34,7 +29,7 @@ def ferrari(data: Path, step: int = 1) -> Columns:
 
 
 @cache
-def f1tenth(data: Path, run: int, rate_hz: float = 100.0) -> Columns:
+def f1tenth(data, run, rate_hz=100.0):
     """One run in SI units and ISO 8855 axes, by straight lines where another rate is wanted, (T,) each."""
     table = pd.read_csv(data / RUNS)
     table = table[table["run_id"] == run]
@@ -44,12 +39,12 @@ def f1tenth(data: Path, run: int, rate_hz: float = 100.0) -> Columns:
     return {"t": t} | {name: np.interp(t, own, table[column].to_numpy()) for name, column in {**names, "Iq": "Iq"}.items()}
 
 
-def later(t: np.ndarray, samples: np.ndarray, delay: float) -> np.ndarray:
+def later(t, samples, delay):
     """What a sensor shows that is late [s]."""
     return np.interp(t - delay, t, samples)
 
 
-def nuisances(t: np.ndarray, seed: int) -> Columns:
+def nuisances(t, seed):
     """What a logger writes besides: a temperature that rises, a gear, a voltage, a level that stays."""
     random = np.random.default_rng(seed)
     return {
@@ -60,13 +55,13 @@ def nuisances(t: np.ndarray, seed: int) -> Columns:
     }
 
 
-def write(file: Path, columns: Mapping[str, np.ndarray], digits: int = 4, **options: Any) -> None:
+def write(file, columns, digits=4, **options):
     """A table of text."""
     table = pd.DataFrame({name: np.round(samples, digits) for name, samples in columns.items()})
     table.to_csv(file, index=False, **options)
 
 
-def units(data: Path, folder: Path) -> None:
+def units(data, folder):
     """km/h, deg/s and g, hardly any of it in the header."""
     d, more = ferrari(data), nuisances(ferrari(data)["t"], 1)
     columns = {
@@ -83,7 +78,7 @@ def units(data: Path, folder: Path) -> None:
     write(folder / "units.csv", columns)
 
 
-def german(data: Path, folder: Path) -> None:
+def german(data, folder):
     """Decimal commas, semicolons, Latin-1, German names, milliseconds, lateral acceleration to the right."""
     d = ferrari(data)
     columns = {
@@ -99,7 +94,7 @@ def german(data: Path, folder: Path) -> None:
     write(folder / "german.csv", columns, sep=";", decimal=",", encoding="latin-1")
 
 
-def numbered(data: Path, folder: Path) -> None:
+def numbered(data, folder):
     """Columns without names or units, tabulators between them, 50 Hz."""
     d = ferrari(data, 2)
     more = nuisances(d["t"], 3)
@@ -107,7 +102,7 @@ def numbered(data: Path, folder: Path) -> None:
     write(folder / "numbered.txt", {f"Ch{number}": samples for number, samples in enumerate(columns, start=1)}, 5, sep="\t")
 
 
-def unix(data: Path, folder: Path) -> None:
+def unix(data, folder):
     """Unix time in milliseconds, a gyro that points down, a model car."""
     d = f1tenth(data, 2)
     columns = {
@@ -124,7 +119,7 @@ def unix(data: Path, folder: Path) -> None:
     write(folder / "unix.csv", columns, 5)
 
 
-def flipped(data: Path, folder: Path) -> None:
+def flipped(data, folder):
     """g, deg/s, degrees, two channels that count to the right, and two speeds whose names tell nothing."""
     d = f1tenth(data, 5)
     columns = {
@@ -140,7 +135,7 @@ def flipped(data: Path, folder: Path) -> None:
     write(folder / "flipped.csv", columns, 5)
 
 
-def wheels(data: Path, folder: Path) -> None:
+def wheels(data, folder):
     """Wheels in rpm for a speed, a gyro that counts to the right."""
     d = ferrari(data)
     side = 0.5 * TRACK * d["r"]
@@ -159,7 +154,7 @@ def wheels(data: Path, folder: Path) -> None:
     write(folder / "wheels.csv", columns)
 
 
-def sideslip(data: Path, folder: Path) -> None:
+def sideslip(data, folder):
     """A sideslip angle alone for a reference, no longitudinal acceleration, unix time, 50 Hz, a gyro that is 100 ms late."""
     d = ferrari(data, 2)
     columns = {
@@ -173,14 +168,14 @@ def sideslip(data: Path, folder: Path) -> None:
     write(folder / "sideslip.csv", columns)
 
 
-def mdf(data: Path, folder: Path) -> None:
+def mdf(data, folder):
     """MDF 4 in groups of two rasters, units for some of the signals, a yaw rate that counts to the right."""
     import asammdf
 
     fast, slow = ferrari(data), ferrari(data, 2)
     more = nuisances(slow["t"], 8)
 
-    def signal(d: Columns, name: str, samples: np.ndarray, unit: str = "") -> Any:
+    def signal(d, name, samples, unit=""):
         return asammdf.Signal(np.round(samples, 5), d["t"], name=name, unit=unit)
 
     groups = [
@@ -204,7 +199,7 @@ def mdf(data: Path, folder: Path) -> None:
         measurement.save(folder / "drive.mf4", overwrite=True)
 
 
-def bag(data: Path, folder: Path) -> None:
+def bag(data, folder):
     """A ROS 2 bag: an inertial unit turned round, a servo's command from 0 to 1, velocities of motion capture."""
     from rosbags.rosbag2 import StoragePlugin, Writer
     from rosbags.typesys import Stores, get_typestore
@@ -214,20 +209,20 @@ def bag(data: Path, folder: Path) -> None:
     made = types.types
     start = round(UNIX * 1e9)
 
-    def header(k: int) -> Any:
+    def header(k):
         stamp = start + round(d["t"][k] * 1e9)
         return made["std_msgs/msg/Header"](made["builtin_interfaces/msg/Time"](sec=stamp // 10**9, nanosec=stamp % 10**9), "base")
 
-    def vector(x: float, y: float, z: float) -> Any:
+    def vector(x, y, z):
         return made["geometry_msgs/msg/Vector3"](x=float(x), y=float(y), z=float(z))
 
-    def twist(x: float, y: float, r: float) -> Any:
+    def twist(x, y, r):
         return made["geometry_msgs/msg/Twist"](linear=vector(x, y, 0.0), angular=vector(0.0, 0.0, r))
 
     still = made["geometry_msgs/msg/Quaternion"](0.0, 0.0, 0.0, 1.0)
     origin = made["geometry_msgs/msg/Pose"](made["geometry_msgs/msg/Point"](0.0, 0.0, 0.0), still)
     none, flat = np.zeros(9), np.zeros(36)
-    messages: dict[str, tuple[str, Callable[[int], Any]]] = {
+    messages = {
         "/imu/data": (
             "sensor_msgs/msg/Imu",
             lambda k: made["sensor_msgs/msg/Imu"](
@@ -256,7 +251,7 @@ def bag(data: Path, folder: Path) -> None:
                 writer.write(connections[topic], start + round(t * 1e9), bytes(types.serialize_cdr(message(k), kind)))
 
 
-def vbo(data: Path, folder: Path) -> None:
+def vbo(data, folder):
     """A VBOX's log: z down, the heading of a compass, lateral acceleration to the right."""
     d = ferrari(data)
     heading = np.degrees(-np.cumsum(d["r"]) / 100.0) % 360.0
@@ -270,7 +265,7 @@ def vbo(data: Path, folder: Path) -> None:
     (folder / "lap.vbo").write_bytes("\r\n".join([*head, names, "", "[data]", *rows, ""]).encode("latin-1"))
 
 
-def two_runs(data: Path, folder: Path) -> None:
+def two_runs(data, folder):
     """Two files of 200 Hz, a lateral acceleration that is 80 ms late."""
     for number, run in ((1, 2), (2, 5)):
         d = f1tenth(data, run, 200.0)
@@ -288,7 +283,7 @@ def two_runs(data: Path, folder: Path) -> None:
         write(folder / f"run_{number}.csv", columns, 5)
 
 
-def no_reference(data: Path, folder: Path) -> None:
+def no_reference(data, folder):
     """Neither reference nor time, German shorthand, 50 Hz."""
     d = ferrari(data, 2)
     columns = {
@@ -302,7 +297,7 @@ def no_reference(data: Path, folder: Path) -> None:
     write(folder / "no_reference.csv", columns, 5)
 
 
-LOGS: dict[str, tuple[Callable[[Path, Path], None], str]] = {
+LOGS = {
     "units": (units, "units.csv"),
     "german": (german, "german.csv"),
     "numbered": (numbered, "numbered.txt"),
@@ -319,7 +314,7 @@ LOGS: dict[str, tuple[Callable[[Path, Path], None], str]] = {
 """Log -> what writes it, and its files."""
 
 
-def write_log(name: str, data: Path, folder: Path) -> list[Path]:
+def write_log(name, data, folder):
     """Write one log into a folder of its own.
 
     Args:

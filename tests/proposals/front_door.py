@@ -1,16 +1,12 @@
 """`vehest new --yes`, then `vehest run --minutes 5`, on the ten logs of front_door_logs.py, held against front_door.yaml, a line each."""
 
-from __future__ import annotations
-
 import argparse
 import json
 import os
 import subprocess
 import sys
 import tempfile
-from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
 
 import yaml
 from front_door_logs import LOGS, write_log
@@ -18,7 +14,7 @@ from front_door_logs import LOGS, write_log
 EXPECTED = Path(__file__).parent / "front_door.yaml"
 
 
-def vehest(folder: Path, *words: str) -> tuple[int, str, str]:
+def vehest(folder, *words):
     """Exit code, standard output and error of a command in a folder."""
     ran = subprocess.run(
         [sys.executable, "-m", "vehest", *words], cwd=folder, capture_output=True, text=True, check=False, env=dict(os.environ)
@@ -26,7 +22,7 @@ def vehest(folder: Path, *words: str) -> tuple[int, str, str]:
     return ran.returncode, ran.stdout, ran.stderr
 
 
-def differences(told: Mapping[str, Any], code: int, plain: Mapping[str, Any], words: str) -> list[str]:
+def differences(told, code, plain, words):
     """What `vehest new` did otherwise than expected."""
     if code:
         return [] if told["end"] == "stop" else [f"exit {code}: {words.strip().splitlines()[-1]}"]
@@ -42,7 +38,7 @@ def differences(told: Mapping[str, Any], code: int, plain: Mapping[str, Any], wo
     return wrong + ([f"'{told['note']}' is not said"] if told.get("note", "") not in said else [])
 
 
-def tried(name: str, data: Path, folder: Path, minutes: float) -> tuple[list[str], str]:
+def tried(name, data, folder, minutes):
     """Differences from what is expected, and how the way ended."""
     told = yaml.safe_load(EXPECTED.read_text(encoding="utf-8"))[name]
     files = [str(file) for file in write_log(name, data, folder)]
@@ -60,7 +56,7 @@ def tried(name: str, data: Path, folder: Path, minutes: float) -> tuple[list[str
     return wrong + ([f"exit {code}"] if (code != 0) == (told["end"] == "verdict") else []), end
 
 
-def main(words: Sequence[str] | None = None) -> int:
+def main(words=None):
     """Try the logs that are named, or all; 1 where one came out otherwise than expected."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("names", nargs="*", default=list(LOGS))

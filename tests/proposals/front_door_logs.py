@@ -3,19 +3,14 @@
 Each goes from ``vehest new NAME FILES --yes`` to ``vehest run NAME --minutes 5``: to a verdict, or to a sentence that says what to record.
 """
 
-from __future__ import annotations
-
-from collections.abc import Callable
-from pathlib import Path
-
 import numpy as np
-from dressed_logs import RATIO, Columns, G, ferrari, later, write
+from dressed_logs import RATIO, G, ferrari, later, write
 
 RADIUS = 0.33  # m
 MPS = 3.6  # km/h
 
 
-def usual(d: Columns) -> Columns:
+def usual(d):
     """The columns that most logs have."""
     return {
         "Time [s]": d["t"],
@@ -28,19 +23,19 @@ def usual(d: Columns) -> Columns:
     }
 
 
-def part(d: Columns, start: float, seconds: float) -> Columns:
+def part(d, start, seconds):
     """A part of a drive, its time from 0."""
     rows = (d["t"] >= start) & (d["t"] < start + seconds)
     return {name: own[rows] - (start if name == "t" else 0.0) for name, own in d.items()}
 
 
-def six_seconds(data: Path, folder: Path) -> None:
+def six_seconds(data, folder):
     """Fifteen manoeuvres of six seconds, a file each."""
     for number in range(15):
         write(folder / f"turn_{number:02d}.csv", usual(part(ferrari(data), 10.0 + 18.0 * number, 6.0)))
 
 
-def standstill_first(data: Path, folder: Path) -> None:
+def standstill_first(data, folder):
     """A minute at standstill before the drive."""
     d, waits = ferrari(data), 6000
     random = np.random.default_rng(2)
@@ -50,7 +45,7 @@ def standstill_first(data: Path, folder: Path) -> None:
     write(folder / "cold_start.csv", usual(joined))
 
 
-def two_speeds(data: Path, folder: Path) -> None:
+def two_speeds(data, folder):
     """The speed of antennas and that of the car's bus; the antenna's comes first and is the smoother one."""
     d, random = ferrari(data), np.random.default_rng(3)
     own = np.round(MPS * later(d["t"], d["vx"], 0.03) * 1.01 / 0.05) * 0.05 + 0.02 * random.standard_normal(len(d["t"]))
@@ -59,7 +54,7 @@ def two_speeds(data: Path, folder: Path) -> None:
     write(folder / "antenna.csv", columns)
 
 
-def misnamed_lateral(data: Path, folder: Path) -> None:
+def misnamed_lateral(data, folder):
     """A lateral velocity called like an acceleration, before the acceleration itself, neither with a unit."""
     d = ferrari(data)
     columns = {
@@ -74,7 +69,7 @@ def misnamed_lateral(data: Path, folder: Path) -> None:
     write(folder / "misnamed.csv", columns, 5)
 
 
-def two_yaw_rates(data: Path, folder: Path) -> None:
+def two_yaw_rates(data, folder):
     """The yaw rate of the car's ESP, 40 ms late and rough, and that of the reference."""
     d, random = ferrari(data), np.random.default_rng(5)
     rough = np.round(np.degrees(later(d["t"], d["r"], 0.04)) / 0.1) * 0.1 + 0.05 * random.standard_normal(len(d["t"]))
@@ -83,7 +78,7 @@ def two_yaw_rates(data: Path, folder: Path) -> None:
     write(folder / "two_yaw_rates.csv", columns)
 
 
-def fast_speedometer(data: Path, folder: Path) -> None:
+def fast_speedometer(data, folder):
     """A speedometer 6 % high, wheels that are right, in rad/s by their header."""
     d = ferrari(data)
     columns = usual(d) | {"VehSpd [km/h]": 1.06 * MPS * d["vx"]}
@@ -91,7 +86,7 @@ def fast_speedometer(data: Path, folder: Path) -> None:
     write(folder / "speedometer.csv", columns)
 
 
-def wheels_in_kmh(data: Path, folder: Path) -> None:
+def wheels_in_kmh(data, folder):
     """Wheel speeds in km/h without a unit, beside a speedometer 5 % high."""
     d = ferrari(data)
     columns = usual(d) | {"VehSpd [km/h]": 1.05 * MPS * d["vx"]}
@@ -99,18 +94,18 @@ def wheels_in_kmh(data: Path, folder: Path) -> None:
     write(folder / "wheels_kmh.csv", columns)
 
 
-def vbox(data: Path, folder: Path) -> None:
+def vbox(data, folder):
     """Three drives of a Volvo S90 as its VBOX wrote them: offsets of the Slip_* points changed places."""
     for number in ("038", "040", "041"):
         (folder / f"S90__{number}.VBO").write_bytes((data / "vbox" / f"S90__{number}.VBO").read_bytes())
 
 
-def twenty_seconds(data: Path, folder: Path) -> None:
+def twenty_seconds(data, folder):
     """One file of 20 s."""
     write(folder / "short.csv", usual(part(ferrari(data), 60.0, 20.0)))
 
 
-def no_reference(data: Path, folder: Path) -> None:
+def no_reference(data, folder):
     """No lateral velocity, sideslip angle or position; accelerations in g."""
     d = ferrari(data)
     columns = usual(d) | {"AccY [g]": d["ay"] / G, "AccX [g]": d["ax"] / G}
@@ -119,7 +114,7 @@ def no_reference(data: Path, folder: Path) -> None:
     write(folder / "no_reference.csv", columns)
 
 
-LOGS: dict[str, Callable[[Path, Path], None]] = {
+LOGS = {
     "six_seconds": six_seconds,
     "standstill_first": standstill_first,
     "two_speeds": two_speeds,
@@ -133,7 +128,7 @@ LOGS: dict[str, Callable[[Path, Path], None]] = {
 }
 
 
-def write_log(name: str, data: Path, folder: Path) -> list[Path]:
+def write_log(name, data, folder):
     """Write one log into a folder of its own; returns its files."""
     own = folder / name
     own.mkdir(parents=True)

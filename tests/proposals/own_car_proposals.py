@@ -4,8 +4,6 @@
 logs at hand, and revised after their outcome was seen. How it does on logs that it was not developed with, they do not tell.
 """
 
-from __future__ import annotations
-
 import argparse
 import csv
 import json
@@ -13,9 +11,7 @@ import os
 import subprocess
 import sys
 import tempfile
-from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
 
 import yaml
 from dressed_logs import LOGS, write_log
@@ -33,7 +29,7 @@ LONGEST_UNPLANTED = 60.0  # ms that a channel may be late by itself
 Row = dict[str, str]
 
 
-def proposed_for(files: list[Path], folder: Path) -> dict[str, Any]:
+def proposed_for(files, folder):
     """What `vehest new --json` says of files, run in an empty folder."""
     command = [sys.executable, "-m", "vehest", "new", "my_car", *(str(file) for file in files), "--json", "--dry-run"]
     ran = subprocess.run(command, cwd=folder, capture_output=True, text=True, check=False, env=dict(os.environ))
@@ -42,7 +38,7 @@ def proposed_for(files: list[Path], folder: Path) -> dict[str, Any]:
     return dict(json.loads(ran.stdout))
 
 
-def rows_of(log: str, answers: Mapping[str, Any], proposed: Mapping[str, Any]) -> list[Row]:
+def rows_of(log, answers, proposed):
     """A row a column, and one for each question about the log as a whole."""
     columns = {one["column"]: one for one in proposed["channels"]}
     asked = {question["key"]: question for question in proposed["open"]}
@@ -66,15 +62,13 @@ def rows_of(log: str, answers: Mapping[str, Any], proposed: Mapping[str, Any]) -
     return rows
 
 
-def _mirror(answers: Mapping[str, Any], columns: Mapping[str, Any]) -> int:
+def _mirror(answers, columns):
     """1, or -1 where all signs are reversed, by the yaw rate's column."""
     name, told = next((name, told) for name, told in answers["columns"].items() if told["channel"] == "yaw_rate")
     return int(told["sign"] * columns[name]["sign"]) if name in columns else 1
 
 
-def _row(
-    log: str, name: str, told: Mapping[str, Any], one: Mapping[str, Any] | None, asked: Mapping[str, Any], mirror: int, undecidable: bool
-) -> Row:
+def _row(log, name, told, one, asked, mirror, undecidable):
     right = f"{told['channel']}, {told['unit']}, sign {told['sign']:+d}" + (f", {told['delay']} ms late" if "delay" in told else "")
     if one is None:
         return _line(log, name, right, "no channel", [], False, False)
@@ -91,7 +85,7 @@ def _row(
     return _line(log, name, right, shown, one["evidence"], name in asked, agrees and (name in asked) == undecidable)
 
 
-def _clock(log: str, told: Mapping[str, Any] | None, proposed: Mapping[str, Any]) -> Row:
+def _clock(log, told, proposed):
     """The column of times and the rate that it makes."""
     clock = proposed["time"]
     shown = "none" if clock is None else f"{clock['column']}, {clock['unit']}, {proposed['rate_hz']:g} Hz"
@@ -100,12 +94,12 @@ def _clock(log: str, told: Mapping[str, Any] | None, proposed: Mapping[str, Any]
     return _line(log, "(time)", right, shown, [] if clock is None else [clock["evidence"]], asked, shown == right and not asked)
 
 
-def _line(log: str, column: str, right: str, shown: str, evidence: list[str], asked: bool, correct: bool) -> Row:
+def _line(log, column, right, shown, evidence, asked, correct):
     cells = (log, column, right, shown, "; ".join(filter(None, evidence)), "asked" if asked else "decided", "yes" if correct else "no")
     return dict(zip(COLUMNS, cells, strict=True))
 
 
-def main() -> None:
+def main():
     """Write the logs into a temporary folder, and the table."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--out", type=Path, default=Path("results/own_car/proposals.csv"))
@@ -114,7 +108,7 @@ def main() -> None:
     if not data:
         raise SystemExit("VEHEST_DATA is not set: the logs are made of the real recordings")
     answers = yaml.safe_load(ANSWERS.read_text(encoding="utf-8"))
-    rows: list[Row] = []
+    rows = []
     with tempfile.TemporaryDirectory(prefix="vehest-") as folder:
         for log in LOGS:
             files = write_log(log, Path(data), Path(folder))

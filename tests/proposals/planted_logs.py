@@ -1,9 +1,5 @@
 """A car that is known, as a logger might have written it; for tests."""
 
-from __future__ import annotations
-
-from pathlib import Path
-
 import numpy as np
 import pandas as pd
 
@@ -11,7 +7,7 @@ G = 9.80665
 WHEELBASE, RATIO, RADIUS, TRACK = 2.7, 15.0, 0.31, 1.5
 
 
-def drive(seconds: float = 120.0, rate_hz: float = 50.0, seed: int = 0) -> dict[str, np.ndarray]:
+def drive(seconds=120.0, rate_hz=50.0, seed=0):
     """A linear single track on a winding road: SI units, ISO 8855, (T,) each, the wheels' and the steering wheel's angles with them."""
     generator = np.random.default_rng(seed)
     t = np.arange(round(seconds * rate_hz)) / rate_hz
@@ -23,7 +19,7 @@ def drive(seconds: float = 120.0, rate_hz: float = 50.0, seed: int = 0) -> dict[
     steer = WHEELBASE * r / vx + 0.002 * ay_wanted
     ax, ay = np.gradient(vx, t) - vy * r, np.gradient(vy, t) + vx * r
 
-    def noisy(samples: np.ndarray, level: float) -> np.ndarray:
+    def noisy(samples, level):
         return samples + level * generator.standard_normal(len(t))
 
     side = 0.5 * TRACK * r
@@ -42,7 +38,7 @@ def drive(seconds: float = 120.0, rate_hz: float = 50.0, seed: int = 0) -> dict[
     }
 
 
-def usual(d: dict[str, np.ndarray]) -> pd.DataFrame:
+def usual(d):
     """km/h, deg/s and g under names that an engineer would give."""
     return pd.DataFrame(
         {
@@ -57,7 +53,7 @@ def usual(d: dict[str, np.ndarray]) -> pd.DataFrame:
     )
 
 
-def write(file: Path, table: pd.DataFrame, **options: object) -> Path:
+def write(file, table, **options):
     """A table of text."""
-    table.round(5).to_csv(file, index=False, **options)  # type: ignore[call-overload]
+    table.round(5).to_csv(file, index=False, **options)
     return file

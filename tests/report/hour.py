@@ -1,7 +1,5 @@
 """An hour of made-up driving at 20 Hz with eight estimators, for what a page of it weighs and does."""
 
-from __future__ import annotations
-
 import numpy as np
 import pandas as pd
 from matplotlib.figure import Figure as MatplotlibFigure
@@ -14,12 +12,12 @@ RATE, SECONDS = 20.0, 3600.0
 COLOURS = ("#4aa5e0", "#0b4f9c", "#f59a23", "#b8480b", "#8e24aa", "#00876c", "#d6336c", "#767676")
 
 
-def hour_of_driving() -> Document:
+def hour_of_driving():
     """Laps of 90 s, every signal with sensor noise; band and health with each estimator; sixteen channels."""
     rng = np.random.default_rng(0)
     time = np.arange(int(RATE * SECONDS)) / RATE
 
-    def noisy(values: np.ndarray, size: float) -> np.ndarray:
+    def noisy(values, size):
         return values + size * rng.standard_normal(len(time))
 
     lap = 2 * np.pi * time / 90.0
@@ -42,10 +40,6 @@ def hour_of_driving() -> Document:
     errors = [float(np.sqrt(np.mean((own.vy - vy) ** 2))) for own in candidates]
     frame = pd.DataFrame({"title": [own.label for own in candidates], "error": errors})
     frame = frame.assign(low=0.8 * frame["error"], high=1.3 * frame["error"], interval="as drawn")
-    columns = {
-        "title": Column("estimator"),
-        "error": Column("RMSE(v) [m/s]"),
-        "interval": Column("interval", bar=("error", "low", "high")),
-    }
+    columns = {"title": Column("estimator"), "error": Column("RMSE(v) [m/s]"), "interval": Column("interval", bar=("error", "low", "high"))}
     links = [ModelLink(f"../../train/model-{i}/", f"vehest estimate model-{i} lap.csv -o out.parquet") for i in range(len(candidates))]
     return Document("An hour", [Table("board", "Board.", frame, columns, links), Figure("traces", "Traces.", static, explorer)])

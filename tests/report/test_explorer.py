@@ -1,7 +1,4 @@
-from __future__ import annotations
-
 import json
-from pathlib import Path
 
 import numpy as np
 import pandas as pd
@@ -12,7 +9,7 @@ from vehest.report.document import Column, Document, Table, bars_of, write_docum
 from vehest.report.explorer import Explorer, packed, reckoned_course, unpacked
 
 
-def there_and_back(**columns: np.ndarray) -> dict[str, np.ndarray]:
+def there_and_back(**columns):
     described, data = packed(columns)
     return unpacked({"length": len(next(iter(columns.values()))), "columns": described, "data": data})
 
@@ -58,7 +55,7 @@ def test_bars_share_an_axis_from_zero_and_one_far_beyond_is_cut():
     assert (one["cut"], far["cut"], far["at"]) == (False, True, 100.0)
 
 
-def test_bars_go_with_their_rows_into_the_page_and_into_no_other_file(tmp_path: Path):
+def test_bars_go_with_their_rows_into_the_page_and_into_no_other_file(tmp_path):
     frame = pd.DataFrame({"name": ["a", "b"], "error": [1.0, 2.0], "low": [0.5, 1.5], "high": [1.5, 2.5], "interval": ["x", "y"]})
     columns = {"name": Column("name"), "interval": Column("interval", bar=("error", "low", "high"))}
     write_document(Document("Bars", [Table("bars", "Bars.", frame, columns)]), tmp_path)
@@ -68,7 +65,7 @@ def test_bars_go_with_their_rows_into_the_page_and_into_no_other_file(tmp_path: 
     assert "svg" not in (tmp_path / "report.md").read_text(encoding="utf-8")
 
 
-def test_page_of_an_hour_at_20_hz_takes_less_than_10_mb(tmp_path: Path):
+def test_page_of_an_hour_at_20_hz_takes_less_than_10_mb(tmp_path):
     write_document(hour_of_driving(), tmp_path)
     assert (tmp_path / "report.html").stat().st_size < 10e6
 

@@ -1,7 +1,5 @@
 """The verdict on a car of one's own: a winner only where there is one, and what more recordings would bring."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np
@@ -10,20 +8,20 @@ import pytest
 from test_report import drive, study
 
 from vehest.data.store import read_recording, write_recording
-from vehest.studies.artefacts import PartArtefacts, StudyArtefacts
+from vehest.studies.artefacts import StudyArtefacts
 from vehest.studies.own_car import documents, not_compared, verdict, verdict_of
 
 
 @pytest.fixture(scope="module")
-def part(tmp_path_factory: pytest.TempPathFactory) -> PartArtefacts:
+def part(tmp_path_factory):
     return study(tmp_path_factory.mktemp("study"))
 
 
-def without(part: PartArtefacts, *names: str) -> PartArtefacts:
+def without(part, *names):
     return replace(part, models=[model for model in part.models if model.estimator not in names])
 
 
-def said(part: PartArtefacts) -> str:
+def said(part):
     return " ".join(verdict_of(part, "test").sentences)
 
 

@@ -1,14 +1,10 @@
 """The page of a report in headless Chromium: what it draws, what its filter says, how it reads with dark and light, wide and narrow."""
 
-from __future__ import annotations
-
 import json
 import math
 import shutil
 import subprocess
-from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -17,7 +13,7 @@ from test_report import FAMILIES, drive, study
 
 from chromium import WIDTHS, axe_violations, browser, complaints, opened
 from vehest.data.splits import Span
-from vehest.report.document import Document, write_document
+from vehest.report.document import write_document
 from vehest.report.explorer import unpacked
 from vehest.studies.artefacts import StudyArtefacts
 from vehest.studies.drive import comparison, leaderboard
@@ -29,13 +25,13 @@ SCHEMES = ("light", "dark")
 
 
 @pytest.fixture(scope="module")
-def chromium(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Any]:
+def chromium(tmp_path_factory):
     with browser(tmp_path_factory.mktemp("profile")) as driver:
         yield driver
 
 
 @pytest.fixture(scope="module")
-def toy(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Any, Document]:
+def toy(tmp_path_factory):
     """A comparison whose numbers are known, as a page."""
     folder = tmp_path_factory.mktemp("toy")
     artefacts = study(tmp_path_factory.mktemp("study"))
@@ -45,37 +41,37 @@ def toy(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Any, Document]:
 
 
 @pytest.fixture(scope="module")
-def hour(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def hour(tmp_path_factory):
     folder = tmp_path_factory.mktemp("hour")
     write_document(hour_of_driving(), folder)
     return folder / "report.html"
 
 
-def board(driver: Any) -> dict[str, tuple[float, float]]:
+def board(driver):
     """What the filter's table says: estimator -> RMSE(β) [deg], RMSE(v) [m/s]."""
     script = "return [...document.querySelectorAll('.explorer tbody tr')].map(row => [...row.cells].map(cell => cell.textContent))"
     return {cells[1]: (float(cells[2]), float(cells[4])) for cells in driver.execute_script(script)}
 
 
-def fill(driver: Any, label: str, value: str) -> None:
+def fill(driver, label, value):
     field = driver.find_element("css selector", f'.explorer input[aria-label="{label}"]')
     field.clear()
     field.send_keys(value)
 
 
-def views(driver: Any) -> list[list[float]]:
+def views(driver):
     """First and last time that each trace shows [s]."""
     return driver.execute_script(
         "return document.querySelector('figure.live').explorer.plots.map(plot => [plot.scales.x.min, plot.scales.x.max])"
     )
 
 
-def press(driver: Any, text: str) -> None:
+def press(driver, text):
     (button,) = [own for own in driver.find_elements("css selector", ".views button, .filters button") if own.text == text]
     button.click()
 
 
-def test_errors_over_all_rows_are_those_of_the_leaderboard(chromium: Any, toy: tuple[Path, Any, Document]) -> None:
+def test_errors_over_all_rows_are_those_of_the_leaderboard(chromium, toy):
     path, ranked, _ = toy
     opened(chromium, path)
     shown = board(chromium)
@@ -84,7 +80,7 @@ def test_errors_over_all_rows_are_those_of_the_leaderboard(chromium: Any, toy: t
         assert shown[row["title"]] == pytest.approx((row["rmse_sideslip"], row["rmse_vy"]), abs=1e-3)
 
 
-def test_errors_over_filtered_rows_are_those_computed_from_the_signals(chromium: Any, toy: tuple[Path, Any, Document]) -> None:
+def test_errors_over_filtered_rows_are_those_computed_from_the_signals(chromium, toy):
     path, ranked, _ = toy
     opened(chromium, path)
     fill(chromium, "speed from [m/s]", "30")
@@ -102,7 +98,7 @@ def test_errors_over_filtered_rows_are_those_computed_from_the_signals(chromium:
     assert board(chromium)["KS-NN linear + bias, P = 2"][0] == pytest.approx(ranked.iloc[0]["rmse_sideslip"], abs=1e-3)
 
 
-def test_browser_unpacks_what_was_packed(chromium: Any, toy: tuple[Path, Any, Document]) -> None:
+def test_browser_unpacks_what_was_packed(chromium, toy):
     path, _, document = toy
     opened(chromium, path)
     (explorer,) = [block.interactive for block in document.blocks if getattr(block, "interactive", None) is not None]
@@ -112,7 +108,7 @@ def test_browser_unpacks_what_was_packed(chromium: Any, toy: tuple[Path, Any, Do
         assert np.array(read, dtype=float) == pytest.approx(known[name], abs=1e-12, nan_ok=True)
 
 
-def test_all_traces_zoom_together_and_back(chromium: Any, hour: Path) -> None:
+def test_all_traces_zoom_together_and_back(chromium, hour):
     opened(chromium, hour)
     assert len(views(chromium)) == 3 + 1 + 3  # v, β and its error; health; three channels
     for text, view in {"": (0.0, 3599.95), "busiest 20 s": (100.0, 120.0), "whole range": (0.0, 3599.95)}.items():
@@ -121,7 +117,7 @@ def test_all_traces_zoom_together_and_back(chromium: Any, hour: Path) -> None:
         assert all(shown == pytest.approx(view) for shown in views(chromium))
 
 
-def test_dragging_over_one_trace_zooms_all(chromium: Any, hour: Path) -> None:
+def test_dragging_over_one_trace_zooms_all(chromium, hour):
     from selenium.webdriver import ActionChains
 
     opened(chromium, hour)
@@ -135,14 +131,14 @@ def test_dragging_over_one_trace_zooms_all(chromium: Any, hour: Path) -> None:
         assert stop == pytest.approx(1800.0, abs=30.0)
 
 
-def test_errors_can_be_taken_over_the_stretch_in_view(chromium: Any, hour: Path) -> None:
+def test_errors_can_be_taken_over_the_stretch_in_view(chromium, hour):
     opened(chromium, hour)
     press(chromium, "busiest 20 s")
     chromium.find_element("css selector", '.filters input[type="checkbox"]').click()
     assert chromium.find_element("css selector", ".said").text.startswith("401 of 72000 samples, 20.1 s")
 
 
-def test_leaderboard_sorts_by_what_its_bars_show_and_says_the_command(chromium: Any, toy: tuple[Path, Any, Document]) -> None:
+def test_leaderboard_sorts_by_what_its_bars_show_and_says_the_command(chromium, toy):
     path, ranked, _ = toy
     opened(chromium, path)
     header = chromium.find_element("xpath", "//figure[@id='table-leaderboard_test']//th/button[contains(., 'interval')]")
@@ -158,10 +154,10 @@ def test_leaderboard_sorts_by_what_its_bars_show_and_says_the_command(chromium: 
 
 
 @pytest.mark.parametrize("scheme", SCHEMES)
-def test_button_turns_the_page_to_the_other_scheme_with_its_figures(chromium: Any, toy: tuple[Path, Any, Document], scheme: str) -> None:
+def test_button_turns_the_page_to_the_other_scheme_with_its_figures(chromium, toy, scheme):
     opened(chromium, toy[0], scheme=scheme)
 
-    def paper() -> str:
+    def paper():
         return chromium.execute_script("return getComputedStyle(document.body).backgroundColor")
 
     grounds = {"light": "rgb(255, 255, 255)", "dark": "rgb(26, 26, 26)"}
@@ -176,7 +172,7 @@ def test_button_turns_the_page_to_the_other_scheme_with_its_figures(chromium: An
 
 @pytest.mark.parametrize("width", WIDTHS)
 @pytest.mark.parametrize("scheme", SCHEMES)
-def test_page_is_accessible_fits_its_width_and_complains_of_nothing(chromium: Any, hour: Path, toy: Any, width: int, scheme: str) -> None:
+def test_page_is_accessible_fits_its_width_and_complains_of_nothing(chromium, hour, toy, width, scheme):
     for path in (hour, toy[0]):
         opened(chromium, path, width=width, scheme=scheme)
         assert axe_violations(chromium) == []
@@ -189,7 +185,7 @@ CUT = """return [...document.querySelectorAll("main *")].filter(
 ).map((own) => own.ariaLabel ?? own.tagName)"""
 
 
-def test_page_of_an_own_car_opens_with_verdict_bars_and_traces_the_rest_folded(chromium: Any, tmp_path: Path) -> None:
+def test_page_of_an_own_car_opens_with_verdict_bars_and_traces_the_rest_folded(chromium, tmp_path):
     """Two test ranges: nothing is cut at 1280 px, folded or not, the page does not scroll sideways at 390, traces break between ranges."""
     tests = {"test": (Span("toy", "lap", 60.0, 72.0), Span("toy", "lap", 74.0, 85.0))}
     document = documents(
@@ -213,7 +209,7 @@ def test_page_of_an_own_car_opens_with_verdict_bars_and_traces_the_rest_folded(c
     assert chromium.execute_script(CUT) == []
 
 
-def test_page_shows_the_figure_where_scripts_may_not_run(chromium: Any, toy: tuple[Path, Any, Document]) -> None:
+def test_page_shows_the_figure_where_scripts_may_not_run(chromium, toy):
     chromium.execute_cdp_cmd("Emulation.setScriptExecutionDisabled", {"value": True})
     try:
         chromium.get(toy[0].as_uri())
@@ -222,7 +218,7 @@ def test_page_shows_the_figure_where_scripts_may_not_run(chromium: Any, toy: tup
         chromium.execute_cdp_cmd("Emulation.setScriptExecutionDisabled", {"value": False})
 
 
-def test_every_script_is_read_by_node_without_complaint(tmp_path: Path) -> None:
+def test_every_script_is_read_by_node_without_complaint(tmp_path):
     node = shutil.which("node")
     if node is None:
         pytest.skip("no node to check the scripts with")

@@ -1,7 +1,5 @@
 """The reliability diagram: what it draws, and labels that do not cover each other."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -6,7 +6,6 @@ import os
 import re
 import subprocess
 import sys
-from collections.abc import Sequence
 from dataclasses import replace
 from html.parser import HTMLParser
 from pathlib import Path
@@ -45,7 +44,7 @@ FAMILIES = {
 LEARNT_IN_EPOCHS = ("ksnn", "gru")
 
 
-def drive(seconds: float = 90.0) -> Recording:
+def drive(seconds=90.0):
     time = np.arange(int(seconds * RATE)) / RATE
     yaw_rate = 0.4 * np.sin(0.5 * time)
     vx = 30.0 + 4.0 * np.sin(0.1 * time)
@@ -54,13 +53,13 @@ def drive(seconds: float = 90.0) -> Recording:
     return Recording("lap", "car", RATE, 0.0, channels, kind="simulated")
 
 
-def estimate_of(recording: Recording, span: Span, size: float, phase: float) -> Estimate:
+def estimate_of(recording, span, size, phase):
     part = recording.cut(span.start - PROTOCOL.warm_up_seconds, span.stop)
     vy = part["vy_ref"] + size * np.sin(3.0 * part.time + phase)
     return Estimate("lap", "any", RATE, part.start_time, {"vy": vy, "sideslip": np.arctan2(vy, part["vx"])})
 
 
-def study(folder: Path, tests: dict[str, tuple[Span, ...]] | None = None) -> PartArtefacts:
+def study(folder, tests=None):
     recording = drive()
     write_recording(recording, folder / "lap.parquet")
     tests = tests or {"test": (Span("toy", "lap", 60.0, 85.0),)}
@@ -102,19 +101,19 @@ def study(folder: Path, tests: dict[str, tuple[Span, ...]] | None = None) -> Par
     )
 
 
-def metric_rows(model: EvaluatedModel, test_set: str, metrics: dict[str, float]) -> list[tuple[object, ...]]:
+def metric_rows(model, test_set, metrics):
     head = ("toy", model.estimator, model.variant, "toy", "toy", "simulated", test_set, "all", "nominal", RATE, "causal", model.seed)
     return [(*head, name, value, UNITS.get(name, "1"), math.nan, math.nan) for name, value in metrics.items()]
 
 
-def history(epochs: int) -> pd.DataFrame:
+def history(epochs):
     if not epochs:
         return pd.DataFrame({"start_gain": [0.5], "start_threshold": [0.1], "train_loss": [0.2]})
     epoch = np.arange(1, epochs + 1)
     return pd.DataFrame({"epoch": epoch, "train_loss": 1.0 / epoch, "validation_loss": 1.5 / epoch})
 
 
-def with_value(artefacts: PartArtefacts, value: float, **where: object) -> PartArtefacts:
+def with_value(artefacts, value, **where):
     metrics = artefacts.metrics.copy()
     hit = np.logical_and.reduce([(metrics[name] == wanted).to_numpy() for name, wanted in where.items()])
     assert hit.any()
@@ -122,19 +121,19 @@ def with_value(artefacts: PartArtefacts, value: float, **where: object) -> PartA
     return replace(artefacts, metrics=metrics)
 
 
-def row_of(board: pd.DataFrame, estimator: str, test_set: str = "test") -> pd.Series:
+def row_of(board, estimator, test_set="test"):
     rows = board[(board["estimator"] == estimator) & (board["test_set"] == test_set)]
     assert len(rows) == 1
     return rows.iloc[0]
 
 
 @pytest.fixture(scope="module")
-def artefacts(tmp_path_factory: pytest.TempPathFactory) -> PartArtefacts:
+def artefacts(tmp_path_factory):
     return study(tmp_path_factory.mktemp("study"))
 
 
 @pytest.fixture(scope="module")
-def written(artefacts: PartArtefacts, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def written(artefacts, tmp_path_factory):
     folder = tmp_path_factory.mktemp("report")
     write_document(comparison(artefacts), folder)
     return folder
@@ -143,20 +142,20 @@ def written(artefacts: PartArtefacts, tmp_path_factory: pytest.TempPathFactory) 
 # The leaderboard
 
 
-def test_seed_is_chosen_on_validation_even_where_another_is_better_on_test(artefacts: PartArtefacts) -> None:
+def test_seed_is_chosen_on_validation_even_where_another_is_better_on_test(artefacts):
     row = row_of(leaderboard(artefacts), "ksnn")
     assert row["seed"] == 1  # lowest on validation, highest on test
     assert row["rmse_sideslip"] == row["rmse_sideslip_max"] > row["rmse_sideslip_min"]
 
 
-def test_lower_seed_wins_a_tie_on_validation(artefacts: PartArtefacts) -> None:
+def test_lower_seed_wins_a_tie_on_validation(artefacts):
     tied = with_value(artefacts, 0.05, estimator="ksnn", test_set="validation", metric="rmse_vy")
     assert row_of(leaderboard(tied), "ksnn")["seed"] == 0
     backwards = replace(tied, models=list(reversed(tied.models)))
     assert row_of(leaderboard(backwards), "ksnn")["seed"] == 0
 
 
-def test_leaderboard_equals_errors_computed_from_the_stored_signals(artefacts: PartArtefacts) -> None:
+def test_leaderboard_equals_errors_computed_from_the_stored_signals(artefacts):
     recording = drive()
     time = recording.time
     scored = (time >= 61.5 - 1e-9) & (time < 85.0 - 1e-9)
@@ -181,7 +180,7 @@ def test_leaderboard_equals_errors_computed_from_the_stored_signals(artefacts: P
     assert (row["n_seeds"], row["n_parameters"], row["epochs"]) == (3, 20, 11)
 
 
-def test_leaderboard_is_sorted_by_the_chosen_seeds_sideslip_error_within_each_test_set(tmp_path: Path) -> None:
+def test_leaderboard_is_sorted_by_the_chosen_seeds_sideslip_error_within_each_test_set(tmp_path):
     spans = {"late": (Span("toy", "lap", 60.0, 85.0),), "early": (Span("toy", "lap", 60.0, 66.0), Span("toy", "lap", 70.0, 80.0))}
     artefacts = study(tmp_path, spans)
     board = leaderboard(artefacts)
@@ -193,26 +192,26 @@ def test_leaderboard_is_sorted_by_the_chosen_seeds_sideslip_error_within_each_te
     assert {"leaderboard_late", "leaderboard_early", "traces_late", "traces_early", "zoom_early"} <= set(names)
 
 
-def test_method_without_epochs_and_seeds_has_neither_in_the_leaderboard(artefacts: PartArtefacts) -> None:
+def test_method_without_epochs_and_seeds_has_neither_in_the_leaderboard(artefacts):
     row = row_of(leaderboard(artefacts), "luenberger")
     assert math.isnan(row["epochs"])
     assert math.isnan(row["rmse_sideslip_std"])
     assert row["n_seeds"] == 1
 
 
-def test_narrower_subsets_and_other_conditions_do_not_enter(artefacts: PartArtefacts) -> None:
+def test_narrower_subsets_and_other_conditions_do_not_enter(artefacts):
     other = artefacts.metrics.assign(value=99.0)
     metrics = pd.concat([artefacts.metrics, other.assign(subset="nonlinear"), other.assign(condition="noisy")])
     pd.testing.assert_frame_equal(leaderboard(replace(artefacts, metrics=metrics)), leaderboard(artefacts))
 
 
-def test_metrics_read_back_from_csv_give_the_same_leaderboard(artefacts: PartArtefacts, tmp_path: Path) -> None:
+def test_metrics_read_back_from_csv_give_the_same_leaderboard(artefacts, tmp_path):
     artefacts.metrics.to_csv(tmp_path / "metrics.csv", index=False)
     again = replace(artefacts, metrics=pd.read_csv(tmp_path / "metrics.csv"))
     pd.testing.assert_frame_equal(leaderboard(again), leaderboard(artefacts))
 
 
-def test_diverged_estimator_comes_last_and_shows_dashes(artefacts: PartArtefacts) -> None:
+def test_diverged_estimator_comes_last_and_shows_dashes(artefacts):
     for metric in ("rmse_sideslip", "rmse_vy", "fvu", "p99_sideslip", "max_error_sideslip"):
         artefacts = with_value(artefacts, math.nan, estimator="gru", metric=metric)
     board = leaderboard(artefacts)
@@ -226,13 +225,13 @@ def test_diverged_estimator_comes_last_and_shows_dashes(artefacts: PartArtefacts
     assert any("No finite error" in block and "GRU" in block for block in document.blocks if isinstance(block, str))
 
 
-def test_two_values_for_one_run_are_refused(artefacts: PartArtefacts) -> None:
+def test_two_values_for_one_run_are_refused(artefacts):
     twin = with_value(artefacts, 7.0, estimator="gru", seed=1, test_set="test", metric="rmse_vy").metrics
     with pytest.raises(DataError, match=r"rmse_vy of gru/states_5, seed 1, on 'test' is both"):
         leaderboard(replace(artefacts, metrics=pd.concat([artefacts.metrics, twin])))
 
 
-def test_several_seeds_without_validation_metrics_are_refused(artefacts: PartArtefacts) -> None:
+def test_several_seeds_without_validation_metrics_are_refused(artefacts):
     metrics = artefacts.metrics[artefacts.metrics["test_set"] != "validation"]
     with pytest.raises(DataError, match="no metrics on the validation range"):
         leaderboard(replace(artefacts, metrics=metrics))
@@ -241,18 +240,18 @@ def test_several_seeds_without_validation_metrics_are_refused(artefacts: PartArt
 # What the drive can show
 
 
-def with_rows(artefacts: PartArtefacts, metrics: dict[str, float], subset: str = "all") -> PartArtefacts:
+def with_rows(artefacts, metrics, subset="all"):
     rows = [row for model in artefacts.models for row in metric_rows(model, "test", metrics)]
     added = pd.DataFrame(rows, columns=list(METRIC_COLUMNS)).assign(subset=subset)
     return replace(artefacts, metrics=pd.concat([artefacts.metrics, added], ignore_index=True))
 
 
-def table_of(artefacts: PartArtefacts, name: str) -> Table | None:
+def table_of(artefacts, name):
     return next((block for block in comparison(artefacts).blocks if isinstance(block, Table) and block.name == name), None)
 
 
-def test_bound_stands_beside_the_errors_where_there_is_one(artefacts: PartArtefacts) -> None:
-    def bounds(of: PartArtefacts) -> list[str]:
+def test_bound_stands_beside_the_errors_where_there_is_one(artefacts):
+    def bounds(of):
         headers, rows, _ = formatted(table_of(of, "leaderboard_test"))
         return [row[headers.index("bound [deg]")] for row in rows] if "bound [deg]" in headers else []
 
@@ -260,7 +259,7 @@ def test_bound_stands_beside_the_errors_where_there_is_one(artefacts: PartArtefa
     assert bounds(with_rows(artefacts, {"floor_cramer_rao": 0.125})) == ["0.125"] * 5
 
 
-def test_floors_of_the_drive_are_tabled_from_the_spread_down(artefacts: PartArtefacts) -> None:
+def test_floors_of_the_drive_are_tabled_from_the_spread_down(artefacts):
     frame = table_of(artefacts, "floors_test").frame
     assert frame["what"].tolist()[:2] == ["v = 0: the reference itself", "noise of the reference, at least"]
     scored = drive().cut(61.5, 85.0)
@@ -270,7 +269,7 @@ def test_floors_of_the_drive_are_tabled_from_the_spread_down(artefacts: PartArte
     assert not any("δ" in inputs for inputs in frame["inputs"]), "there is no steering angle in this drive"
 
 
-def test_errors_by_regime_are_those_of_the_chosen_seeds(artefacts: PartArtefacts) -> None:
+def test_errors_by_regime_are_those_of_the_chosen_seeds(artefacts):
     assert table_of(artefacts, "regimes_test") is None
     known = with_rows(artefacts, {"rmse_sideslip": 0.25, "share": 0.375}, "turning")
     known = with_value(known, 0.5, estimator="ksnn", seed=1, subset="turning", metric="rmse_sideslip")
@@ -281,8 +280,8 @@ def test_errors_by_regime_are_those_of_the_chosen_seeds(artefacts: PartArtefacts
     pd.testing.assert_frame_equal(leaderboard(known), leaderboard(artefacts))
 
 
-def test_silent_drive_and_noisy_reference_are_warned_of(artefacts: PartArtefacts) -> None:
-    def warned(**floors: float) -> str:
+def test_silent_drive_and_noisy_reference_are_warned_of(artefacts):
+    def warned(**floors):
         return " ".join(warnings_of(with_rows(artefacts, floors)))
 
     assert "silent" not in warned(floor_cramer_rao=0.1, floor_reference=0.01)
@@ -291,7 +290,7 @@ def test_silent_drive_and_noisy_reference_are_warned_of(artefacts: PartArtefacts
     assert "is close to the noise of the reference, at least 0.05°" in warned(floor_reference=0.05)
 
 
-def test_part_without_lateral_acceleration_is_warned_of_by_speed_and_sideslip_alone(artefacts: PartArtefacts, tmp_path: Path) -> None:
+def test_part_without_lateral_acceleration_is_warned_of_by_speed_and_sideslip_alone(artefacts, tmp_path):
     whole = drive()
     write_recording(whole.select([name for name in whole.channels if name != "ay"]), tmp_path / "lap.parquet")
     without = replace(artefacts, references={("toy", "lap"): tmp_path / "lap.parquet"})
@@ -304,11 +303,11 @@ def test_part_without_lateral_acceleration_is_warned_of_by_speed_and_sideslip_al
 # The words
 
 
-def words_of(artefacts: PartArtefacts) -> str:
+def words_of(artefacts):
     return "\n\n".join(block for block in comparison(artefacts).blocks if isinstance(block, str))
 
 
-def test_headline_names_a_winner_only_where_it_is_told_apart(artefacts: PartArtefacts) -> None:
+def test_headline_names_a_winner_only_where_it_is_told_apart(artefacts):
     """Luenberger is the only one with a single seed here: its figure is taken away, then KS-NN is compared with a twin of itself."""
     text = words_of(artefacts)
     best = leaderboard(artefacts).iloc[0]
@@ -324,14 +323,14 @@ def test_headline_names_a_winner_only_where_it_is_told_apart(artefacts: PartArte
     assert "which is not told apart from Twin" in text
 
 
-def test_no_winner_without_the_baselines(artefacts: PartArtefacts) -> None:
+def test_no_winner_without_the_baselines(artefacts):
     models = [model for model in artefacts.models if model.estimator not in ("zero", "static_map")]
     text = words_of(replace(artefacts, models=models))
     assert "**no estimator can be called best**" in text
     assert "was not compared with v = 0 and which was not compared with the static map" in text
 
 
-def test_leaderboard_says_who_beats_the_baselines_and_how_far_each_is_from_the_first(artefacts: PartArtefacts) -> None:
+def test_leaderboard_says_who_beats_the_baselines_and_how_far_each_is_from_the_first(artefacts):
     board = leaderboard(artefacts)
     assert row_of(board, "ksnn")["against_best"] == "lowest"
     assert row_of(board, "gru")["beats_zero"] == row_of(board, "gru")["beats_static_map"] == "yes"
@@ -342,11 +341,11 @@ def test_leaderboard_says_who_beats_the_baselines_and_how_far_each_is_from_the_f
 
 
 @pytest.mark.parametrize(("kind", "words"), [("simulated", "**Simulated data:**"), ("real", "**Real data:**")])
-def test_report_says_on_its_first_page_whether_data_are_real(artefacts: PartArtefacts, kind: str, words: str) -> None:
+def test_report_says_on_its_first_page_whether_data_are_real(artefacts, kind, words):
     assert any(str(block).startswith(words) for block in comparison(replace(artefacts, kinds={"toy": kind})).blocks[:2])
 
 
-def test_report_warns_of_tests_without_sideslip_and_of_trainings_cut_short(artefacts: PartArtefacts) -> None:
+def test_report_warns_of_tests_without_sideslip_and_of_trainings_cut_short(artefacts):
     assert "hardly excites sideslip" not in words_of(artefacts)
     assert "limit of" not in words_of(artefacts)
     short = [replace(model, training={"max_epochs": 11}) for model in artefacts.models]
@@ -356,15 +355,15 @@ def test_report_warns_of_tests_without_sideslip_and_of_trainings_cut_short(artef
     )
 
 
-def test_patent_is_mentioned_exactly_where_a_ksnn_takes_part(artefacts: PartArtefacts) -> None:
-    def text(models: Sequence[EvaluatedModel]) -> str:
+def test_patent_is_mentioned_exactly_where_a_ksnn_takes_part(artefacts):
+    def text(models):
         return "".join(block for block in comparison(replace(artefacts, models=models)).blocks if isinstance(block, str))
 
     assert "PCT/IT2023/050058" in text(artefacts.models)
     assert "PCT/IT2023/050058" not in text([model for model in artefacts.models if model.estimator != "ksnn"])
 
 
-def test_report_says_how_it_was_made(written: Path) -> None:
+def test_report_says_how_it_was_made(written):
     text = (written / "report.md").read_text(encoding="utf-8")
     for words in ("`vehest run pipelines/toy.yaml`", "at 20 Hz", "up to 2 s before", "the first 1.5 s", "Training: by hand.", "60 to 85 s"):
         assert words in text
@@ -373,7 +372,7 @@ def test_report_says_how_it_was_made(written: Path) -> None:
 # What is written
 
 
-def test_links_of_the_markdown_report_resolve(written: Path) -> None:
+def test_links_of_the_markdown_report_resolve(written):
     text = (written / "report.md").read_text(encoding="utf-8")
     targets = re.findall(r"\]\(([^)]+)\)", text)
     assert len(targets) == 4 + 2 * 6
@@ -382,14 +381,14 @@ def test_links_of_the_markdown_report_resolve(written: Path) -> None:
     assert {path.relative_to(written).as_posix() for path in written.rglob("*.*")} == {*targets, "report.md", "report.html"}
 
 
-def test_rows_of_markdown_tables_have_as_many_cells_as_their_header(written: Path) -> None:
+def test_rows_of_markdown_tables_have_as_many_cells_as_their_header(written):
     lines = (written / "report.md").read_text(encoding="utf-8").splitlines()
     tables = [len(re.findall(r"(?<!\\)\|", line)) for line in lines if line.startswith("| ")]
     assert set(tables) == {6, 7, 11, 12}  # one bar more than columns, in a cell "\|" stands for a bar
     assert any(r"GRU \| 5 &lt;states>" in line for line in lines)
 
 
-def test_csv_tables_read_back_with_every_digit(artefacts: PartArtefacts, written: Path) -> None:
+def test_csv_tables_read_back_with_every_digit(artefacts, written):
     board = leaderboard(artefacts)
     table = pd.read_csv(written / "tables" / "leaderboard_test.csv", float_precision="round_trip")
     assert table.columns.tolist() == [*board.columns, "interval"]
@@ -412,9 +411,7 @@ write_document(comparison(study(made)), report)
 """
 
 
-def test_two_processes_draw_the_same_bytes_whatever_the_order_of_their_sets(
-    artefacts: PartArtefacts, written: Path, tmp_path: Path
-) -> None:
+def test_two_processes_draw_the_same_bytes_whatever_the_order_of_their_sets(artefacts, written, tmp_path):
     places = [str(Path(__file__).parent), str(Path(__file__).parents[1])]
     environment = {**os.environ, "PYTHONHASHSEED": "1"}  # that of this process is drawn
     made, report = tmp_path / artefacts.references["toy", "lap"].parent.name, tmp_path / written.name
@@ -426,13 +423,13 @@ def test_two_processes_draw_the_same_bytes_whatever_the_order_of_their_sets(
         assert (report / file).read_bytes() == (written / file).read_bytes(), file
 
 
-def test_figures_name_no_date_and_no_version(written: Path) -> None:
+def test_figures_name_no_date_and_no_version(written):
     for path in (written / "figures").iterdir():
         content = path.read_bytes()
         assert not any(word in content for word in (b"Software", b"Matplotlib v", b"dc:date", b"tIME", b"tEXt", b"dc:creator")), path
 
 
-def test_what_is_for_the_page_alone_is_in_no_other_file(tmp_path: Path) -> None:
+def test_what_is_for_the_page_alone_is_in_no_other_file(tmp_path):
     frame = pd.DataFrame({"train_seconds": [1.5]})
     document = Document("Words", ["Only words.", Table("first", "First.", pd.DataFrame({"a": [1]}))])
     write_document(document, tmp_path, on_page=["## Times", Table("timings", "What it took.", frame)])
@@ -445,7 +442,7 @@ def test_what_is_for_the_page_alone_is_in_no_other_file(tmp_path: Path) -> None:
         write_document(document, tmp_path, on_page=[Table("first", "", frame)])
 
 
-def test_times_are_medians_over_seeds_by_part_and_estimator() -> None:
+def test_times_are_medians_over_seeds_by_part_and_estimator():
     rows = [
         (part, "gru", "states_5", seed, test, metric, value)
         for part, slower in (("there", 1.0), ("back", 2.0))
@@ -466,7 +463,7 @@ def test_times_are_medians_over_seeds_by_part_and_estimator() -> None:
     assert timings_of_study([("", table[:0], titles)]) == []
 
 
-def test_page_is_left_out_on_request(tmp_path: Path) -> None:
+def test_page_is_left_out_on_request(tmp_path):
     write_document(Document("Words", ["Only words."]), tmp_path, page=False)
     assert [path.name for path in tmp_path.iterdir()] == ["report.md"]
     assert (tmp_path / "report.md").read_text(encoding="utf-8") == "# Words\n\nOnly words.\n"
@@ -475,7 +472,7 @@ def test_page_is_left_out_on_request(tmp_path: Path) -> None:
 class Page(HTMLParser):
     """Everything in a page that a browser would load, and the text of its scripts and tables."""
 
-    def __init__(self, text: str) -> None:
+    def __init__(self, text):
         super().__init__()
         self.loads: list[tuple[str, str]] = []
         self.tags: list[str] = []
@@ -484,7 +481,7 @@ class Page(HTMLParser):
         self._cell = False
         self.feed(text)
 
-    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+    def handle_starttag(self, tag, attrs):
         values = {name: value or "" for name, value in attrs}
         self.tags.append(tag)
         self.loads += [(tag, values[name]) for name in ("src", "href", "srcset", "data", "poster", "action") if name in values]
@@ -496,15 +493,15 @@ class Page(HTMLParser):
         if tag in {"td", "th"}:
             self.rows[-1].append("")
 
-    def handle_endtag(self, tag: str) -> None:
+    def handle_endtag(self, tag):
         self._cell = self._cell and tag not in {"td", "th"}
 
-    def handle_data(self, data: str) -> None:
+    def handle_data(self, data):
         if self._cell:
             self.rows[-1][-1] += data
 
 
-def test_page_loads_nothing_from_anywhere(written: Path) -> None:
+def test_page_loads_nothing_from_anywhere(written):
     text = (written / "report.html").read_text(encoding="utf-8")
     page = Page(text)
     assert page.loads, "figures are embedded"
@@ -522,7 +519,7 @@ def test_page_loads_nothing_from_anywhere(written: Path) -> None:
     assert "prefers-color-scheme: dark" in style[1]
 
 
-def test_page_shows_the_numbers_of_the_leaderboard_and_the_static_figures(artefacts: PartArtefacts, written: Path) -> None:
+def test_page_shows_the_numbers_of_the_leaderboard_and_the_static_figures(artefacts, written):
     page = Page((written / "report.html").read_text(encoding="utf-8"))
     best = leaderboard(artefacts).iloc[0]
     rows = [row for row in page.rows if row[0].splitlines()[0] == best["title"]]
@@ -534,7 +531,7 @@ def test_page_shows_the_numbers_of_the_leaderboard_and_the_static_figures(artefa
     assert all(b"<svg" in image and b"prefers-color-scheme" in image for image in images)
 
 
-def test_paths_of_figures_are_given_to_a_hundredth_of_a_point(tmp_path: Path) -> None:
+def test_paths_of_figures_are_given_to_a_hundredth_of_a_point(tmp_path):
     static = MatplotlibFigure()
     static.add_subplot().plot(np.sin(np.arange(200.0)))
     write_document(Document("One", [Figure("line", "A line.", static)]), tmp_path, page=False)
@@ -543,14 +540,14 @@ def test_paths_of_figures_are_given_to_a_hundredth_of_a_point(tmp_path: Path) ->
     assert not any(re.search(r"\.\d{3}", path) for path in paths)
 
 
-def test_page_without_interactive_figures_leaves_the_library_out(tmp_path: Path) -> None:
+def test_page_without_interactive_figures_leaves_the_library_out(tmp_path):
     static = MatplotlibFigure()
     static.add_subplot().plot([0, 1], [1, 0])
     write_document(Document("One", [Figure("line", "A line.", static)]), tmp_path)
     assert (tmp_path / "report.html").stat().st_size < 60_000
 
 
-def test_text_cannot_bring_markup_into_the_page(tmp_path: Path) -> None:
+def test_text_cannot_bring_markup_into_the_page(tmp_path):
     frame = pd.DataFrame({"name": ["<script>alert(1)</script>"]})
     write_document(Document("<b>", ["<script>alert(2)</script> ![x](https://example.org/x.png)", Table("t", "<i>c</i>", frame)]), tmp_path)
     text = (tmp_path / "report.html").read_text(encoding="utf-8")
@@ -560,7 +557,7 @@ def test_text_cannot_bring_markup_into_the_page(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("names", [["a", "a"], ["a/b"], [".."], ["A"]])
-def test_document_refuses_names_that_cannot_name_its_files(names: list[str]) -> None:
+def test_document_refuses_names_that_cannot_name_its_files(names):
     with pytest.raises(ValueError, match=r"cannot name a file|2 tables called 'a'"):
         Document("Names", [Table(name, "", pd.DataFrame()) for name in names])
 
@@ -568,20 +565,20 @@ def test_document_refuses_names_that_cannot_name_its_files(names: list[str]) -> 
 # Style
 
 
-def test_table_columns_line_up_and_show_missing_values_as_dashes() -> None:
+def test_table_columns_line_up_and_show_missing_values_as_dashes():
     frame = pd.DataFrame({"error": [0.31234, 0.78, math.nan], "count": [12, 345678, 9], "name": ["a", None, "c"]})
     _, rows, numeric = formatted(Table("t", "", frame, {name: Column(name) for name in frame}))
     assert numeric == [True, True, False]
     assert rows == [["0.312", "12", "a"], ["0.780", "345\N{NARROW NO-BREAK SPACE}678", MISSING], [MISSING, "9", "c"]]
 
 
-def test_numbers_are_written_with_the_digits_asked_for() -> None:
+def test_numbers_are_written_with_the_digits_asked_for():
     assert [significant(value) for value in (0.43512, 12.3456, 0.0, math.nan, -0.0261)] == ["0.435", "12.3", "0", MISSING, "−0.0261"]
     assert decimals_for([0.31, 0.44, 12.0]) == 3
     assert decimals_for([math.nan]) == 0
 
 
-def test_each_family_has_one_hue_and_each_estimator_a_line_of_its_own() -> None:
+def test_each_family_has_one_hue_and_each_estimator_a_line_of_its_own():
     assert colour_of("ksnn", "linear_no_bias_p2") != colour_of("ksnn", "linear_bias_p2")
     assert colour_of("ksnn", "linear_bias_p2") == colour_of("ksnn", "linear_bias_p3")
     names = [("ksnn", f"nonlinear_bias_p{p}_q{q}") for p in range(2, 5) for q in range(1, 5)] + [("luenberger", ""), ("new", "x")]
@@ -589,13 +586,13 @@ def test_each_family_has_one_hue_and_each_estimator_a_line_of_its_own() -> None:
     assert len(set(lines.values())) == len(names)
 
 
-def test_colours_stand_out_on_dark_and_light_pages() -> None:
-    def luminance(colour: str) -> float:
+def test_colours_stand_out_on_dark_and_light_pages():
+    def luminance(colour):
         parts = [int(colour[start : start + 2], 16) / 255 for start in (1, 3, 5)]
         linear = [part / 12.92 if part <= 0.04045 else ((part + 0.055) / 1.055) ** 2.4 for part in parts]
         return 0.2126 * linear[0] + 0.7152 * linear[1] + 0.0722 * linear[2]
 
-    def contrast(one: str, other: str) -> float:
+    def contrast(one, other):
         high, low = sorted((luminance(one), luminance(other)), reverse=True)
         return (high + 0.05) / (low + 0.05)
 
@@ -606,7 +603,7 @@ def test_colours_stand_out_on_dark_and_light_pages() -> None:
     assert contrast(on_dark("#000000"), on_dark("#ffffff")) > 10.0
 
 
-def test_decimation_keeps_peaks_ends_and_gaps() -> None:
+def test_decimation_keeps_peaks_ends_and_gaps():
     time = np.arange(10_000) / 100.0
     values = np.sin(time)
     values[4321], values[8000:8200] = 7.0, np.nan
@@ -618,7 +615,7 @@ def test_decimation_keeps_peaks_ends_and_gaps() -> None:
     assert (np.diff(at) > 0).all()
 
 
-def test_importing_the_report_package_loads_no_drawing_library() -> None:
+def test_importing_the_report_package_loads_no_drawing_library():
     code = "import sys, vehest.report.document, vehest.report.figures; print({'matplotlib', 'pandas', 'jinja2'} & set(sys.modules))"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "set()"

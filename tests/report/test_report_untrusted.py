@@ -31,7 +31,7 @@ HOSTILE = (
 class _Seen(HTMLParser):
     """Elements, attributes and text of a page."""
 
-    def __init__(self, page: str) -> None:
+    def __init__(self, page):
         super().__init__()
         self.elements: list[str] = []
         self.attributes: list[tuple[str, str | None]] = []
@@ -46,15 +46,15 @@ class _Seen(HTMLParser):
         self.text += data
 
 
-def _document(name: str) -> Document:
+def _document(name):
     table = Table("names", f"Of {name}.", pd.DataFrame({"n": [name], "x": [1.0]}), {"n": Column(name), "x": Column("x")})
     return Document(name, [f"The data are {name}.", f"Recording {as_text(name)}, {as_code(name)}.", table])
 
 
-def _rendered(folder) -> tuple[str, str]:
+def _rendered(folder):
     """The Markdown file as a lenient viewer shows it, and the page."""
     lenient = MarkdownIt("commonmark", {"html": True}).enable("table")
-    lenient.validateLink = lambda url: True  # type: ignore[method-assign]
+    lenient.validateLink = lambda url: True
     return lenient.render((folder / "report.md").read_text(encoding="utf-8")), (folder / "report.html").read_text(encoding="utf-8")
 
 

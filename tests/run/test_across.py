@@ -1,17 +1,14 @@
 """Studies across folds and across vehicles, run from the command line on a small data set."""
 
-from __future__ import annotations
-
 import json
 import math
-from pathlib import Path
 
 import numpy as np
 import pandas as pd
 import pytest
 import yaml
 
-from place import Place, write_csv
+from place import write_csv
 from vehest.data.store import read_estimate, read_recording
 from vehest.run.study import read_study
 
@@ -21,7 +18,7 @@ LACKING = ["estimator=kalman"]  # there is no steering angle
 
 
 @pytest.fixture
-def across(place) -> Place:
+def across(place):
     """A place with a split in three folds, two vehicles, and a pipeline of either kind."""
     for seed, name in enumerate(("one", "two", "three"), 1):
         write_csv(place.folder / "raw" / f"{name}.csv", seed, 60.0)
@@ -38,7 +35,7 @@ def across(place) -> Place:
     return place
 
 
-def rmse_by_hand(output: Path, models: str, protocol_skip: float = 1.5) -> float:
+def rmse_by_hand(output, models, protocol_skip=1.5):
     """RMSE(β) over the tested recordings of all folds from the stored estimates and recordings [deg], with NumPy alone."""
     errors = []
     folders = sorted((output / "evaluate").glob(f"{models}-on-folded_fold_*"))
@@ -54,7 +51,7 @@ def rmse_by_hand(output: Path, models: str, protocol_skip: float = 1.5) -> float
     return float(np.sqrt(np.mean(np.square(np.concatenate(errors)))))
 
 
-def test_errors_of_all_folds_count_together(across) -> None:
+def test_errors_of_all_folds_count_together(across):
     code, out, err = across("run", "folds_of_mine", "tracking=none", "output=out", "--json")
     assert code == 0, err
     rows = {row["title"]: row for row in json.loads(out)["overview"]}
@@ -75,7 +72,7 @@ def test_errors_of_all_folds_count_together(across) -> None:
     assert before == {file: file.read_bytes() for file in (across.folder / "results").rglob("*") if file.is_file()}
 
 
-def test_vehicles_stand_side_by_side_and_what_failed_hides_nobody(across) -> None:
+def test_vehicles_stand_side_by_side_and_what_failed_hides_nobody(across):
     code, out, err = across("run", "vehicles", "tracking=none", "output=out", "--json")
     assert code == 5, err
     assert "steer" in err
@@ -92,7 +89,7 @@ def test_vehicles_stand_side_by_side_and_what_failed_hides_nobody(across) -> Non
     assert math.isclose(board.loc[board["estimator"] == "zero", "rmse_sideslip"].item(), board["rmse_sideslip"].max(), rel_tol=0.2)
 
 
-def test_bands_and_faults_are_told_apart_by_car(across) -> None:
+def test_bands_and_faults_are_told_apart_by_car(across):
     other = yaml.safe_load((across.folder / "conf" / "dataset" / "mine.yaml").read_text(encoding="utf-8"))
     other = {**other, "name": "other", "vehicle": "another car"}
     (across.folder / "conf" / "dataset" / "other.yaml").write_text(yaml.safe_dump(other, allow_unicode=True), encoding="utf-8")
@@ -121,7 +118,7 @@ def test_bands_and_faults_are_told_apart_by_car(across) -> None:
     assert severe["flagged"].mean() > 0.7
 
 
-def test_missing_files_are_said_before_anything_is_made(across) -> None:
+def test_missing_files_are_said_before_anything_is_made(across):
     dataset = yaml.safe_load((across.folder / "conf" / "dataset" / "mine.yaml").read_text(encoding="utf-8"))
     elsewhere = {**dataset, "name": "elsewhere", "path": "${root}/elsewhere"}
     (across.folder / "conf" / "dataset" / "elsewhere.yaml").write_text(yaml.safe_dump(elsewhere, allow_unicode=True), encoding="utf-8")
@@ -134,7 +131,7 @@ def test_missing_files_are_said_before_anything_is_made(across) -> None:
     assert not (across.folder / "out" / "ingest").exists()
 
 
-def test_a_pipeline_of_folds_has_a_part_a_fold(across) -> None:
+def test_a_pipeline_of_folds_has_a_part_a_fold(across):
     parts = read_study("folds_of_mine").parts
     assert [(name, part.overrides) for name, part in parts.items()] == [(f"fold_{k + 1}", (f"++split.fold={k}",)) for k in range(3)]
 
@@ -148,7 +145,7 @@ def test_a_pipeline_of_folds_has_a_part_a_fold(across) -> None:
     ],
     ids=str,
 )
-def test_a_report_that_does_not_suit_is_refused_in_one_line(across, content: dict[str, object], what: str) -> None:
+def test_a_report_that_does_not_suit_is_refused_in_one_line(across, content, what):
     (across.folder / "pipelines" / "odd.yaml").write_text(yaml.safe_dump({"study": "odd", **content}))
     code, out, err = across("run", "odd")
     assert (code, out) == (2, "")

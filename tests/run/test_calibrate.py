@@ -1,7 +1,5 @@
 """Calibration as a stage: between training and evaluation, found by its model, and left out where there is nothing to calibrate by."""
 
-from __future__ import annotations
-
 import csv
 import json
 import math
@@ -14,7 +12,6 @@ import pytest
 import yaml
 
 from conftest import planar_drive
-from place import Place
 from vehest.data.store import read_estimate
 from vehest.run.artefacts import read_artefact
 from vehest.run.calibrate import STAGE, calibration_of, trust_of
@@ -24,19 +21,19 @@ from vehest.trust.record import About, Trust, write_trust
 TRAIN = ("estimator=luenberger", "split=mine", "training.grid=1", "training.max_evaluations=5", "tracking=none")
 
 
-def metrics_of(folder: Path) -> dict[tuple[str, str, str], dict[str, str]]:
+def metrics_of(folder):
     """(test set, subset, metric) -> row."""
     with open(folder / "metrics.csv", encoding="utf-8") as stream:
         return {(row["test_set"], row["subset"], row["metric"]): row for row in csv.DictReader(stream) if row["condition"] == "nominal"}
 
 
-def without_validation(place: Place) -> None:
+def without_validation(place):
     split = {"name": "blind", "dataset": "mine", "train": [], "validation": [], "tests": {"test": [{"recording": "three"}]}}
     (place.folder / "conf" / "split" / "blind.yaml").write_text(yaml.safe_dump(split))
 
 
 @pytest.fixture
-def evaluated(place) -> tuple[Place, Path, Path]:
+def evaluated(place):
     """A place, a model and its evaluation."""
     _, out, err = place.once("train", *TRAIN, "--json")
     assert "calibrate  luenberger-luenberger-seed0-trust bands by" in err

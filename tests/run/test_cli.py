@@ -1,7 +1,5 @@
 """The command line from end to end, on a small data set of its own: what runs, what is skipped, what is refused."""
 
-from __future__ import annotations
-
 import importlib.util
 import json
 import shutil
@@ -9,7 +7,6 @@ import signal
 import subprocess
 import sys
 from pathlib import Path
-from types import ModuleType
 
 import numpy as np
 import pandas as pd
@@ -20,7 +17,7 @@ import yaml
 import processes
 import vehest
 from conftest import planar_drive
-from place import DATASET, PIPELINE, Place, write_csv
+from place import DATASET, PIPELINE, write_csv
 from processes import HANGS, Striking, is_alive, start, wait_for
 from vehest.data.files import ASIDE_PREFIX
 from vehest.data.store import read_recording
@@ -31,8 +28,8 @@ from vehest.training import supervised
 from vehest.trust.health import reason_in_words
 
 
-def _statuses(err: str) -> list[tuple[str, str]]:
-    return [tuple(line.split()[:2]) for line in err.splitlines() if line.split()[:1] and line.split()[0] in ("done", "skipped", "would")]  # type: ignore[misc]
+def _statuses(err):
+    return [tuple(line.split()[:2]) for line in err.splitlines() if line.split()[:1] and line.split()[0] in ("done", "skipped", "would")]
 
 
 def test_pipeline_runs_then_skips_then_reruns_only_what_a_change_touches(place):
@@ -216,7 +213,7 @@ def test_help_shows_choices_and_answers_quickly(place):
 # --- input that cannot be used -------------------------------------------------------------------------------------
 
 
-def _rewrite(place: Place, change) -> None:
+def _rewrite(place, change):
     path = place.folder / "raw" / "one.csv"
     table = pd.read_csv(path)
     change(table).to_csv(path, index=False)
@@ -327,7 +324,7 @@ def test_what_did_not_fit_into_the_minutes_is_named_and_the_same_command_goes_on
     class OneEvaluation(TimeLimit):
         """A time that is up once one evaluation is there."""
 
-        def requested(self) -> bool:
+        def requested(self):
             return any((outputs / "evaluate").glob("*/manifest.json"))
 
     with monkeypatch.context() as patched:
@@ -460,7 +457,7 @@ BUDGET = ("split=mine", "training.max_epochs=8", "training.patience=8", "trainin
 SAVES = (supervised, "save_checkpoint")  # once an epoch
 
 
-def _killed(place: Place, module: ModuleType, name: str, call: int, *arguments: str) -> None:
+def _killed(place, module, name, call, *arguments):
     """Run a command in a process that is killed once a function of a module is through for the n-th time."""
     program = f"import sys; sys.path.insert(0, {str(Path(processes.__file__).parent)!r}); sys.argv = {['vehest', *arguments]!r}\n"
     program += f"import {module.__name__} as module; from processes import Striking; from vehest.cli import main\n"
@@ -468,7 +465,7 @@ def _killed(place: Place, module: ModuleType, name: str, call: int, *arguments: 
     assert start([sys.executable, "-c", program], cwd=place.folder).wait(HANGS) == -signal.SIGKILL
 
 
-def _epochs(place: Place, monkeypatch: pytest.MonkeyPatch, *arguments: str) -> tuple[list[int], dict]:
+def _epochs(place, monkeypatch, *arguments):
     """Run a training: epochs of its checkpoints, and what it says."""
     with monkeypatch.context() as patch:
         save = Striking(supervised.save_checkpoint)

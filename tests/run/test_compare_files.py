@@ -1,7 +1,5 @@
 """Estimates made elsewhere stand beside each other, v = 0 and a static map on one recording."""
 
-from __future__ import annotations
-
 import json
 import math
 
@@ -16,11 +14,11 @@ from vehest.run.compare_files import compare_estimates, read_estimate_table
 
 
 @pytest.fixture(scope="module")
-def drive() -> Recording:
+def drive():
     return planar_drive(120.0, 50.0, seed=3)
 
 
-def written(folder, name: str, drive: Recording, error: float, **columns: np.ndarray):
+def written(folder, name, drive, error, **columns):
     rng = np.random.default_rng(1)
     table = {"time": drive.time, "vy": drive["vy_ref"] + error * np.sin(2.0 * drive.time + rng.uniform(0, 6.0))}
     file = folder / f"{name}.csv"
@@ -69,7 +67,7 @@ def test_the_static_map_knows_no_sample_that_it_is_judged_by(drive):
     assert rows["static_map"] > rows["zero"] > rows["true"]
 
 
-def read_back(drive: Recording):
+def read_back(drive):
     from vehest.data.estimate import Estimate
 
     return Estimate(drive.id, "true", drive.rate_hz, drive.start_time, {"vy": drive["vy_ref"], "sideslip": np.zeros(len(drive))})

@@ -1,7 +1,5 @@
 """Configuration: overrides, choices, sweeps, local files first, errors of one line, completion."""
 
-from __future__ import annotations
-
 import os
 import shutil
 import subprocess
@@ -19,7 +17,7 @@ from vehest.run.study import jobs_of, read_study
 
 
 @pytest.fixture
-def elsewhere(tmp_path, monkeypatch) -> Path:
+def elsewhere(tmp_path, monkeypatch):
     """An empty working folder."""
     monkeypatch.chdir(tmp_path)
     return tmp_path
@@ -91,7 +89,7 @@ def test_shipped_pipeline_of_the_ferrari_has_35_jobs(elsewhere):
 SHIPPED = {file.stem for file in (Path(__file__).parents[2] / "pipelines").glob("*.yaml")}
 
 
-COMPOSED: set[frozenset[str]] = set()
+COMPOSED = set()
 
 
 @pytest.mark.parametrize("name", sorted(SHIPPED - {"ksnn", "ksnn_revs"}))  # these two: test_parts

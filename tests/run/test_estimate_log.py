@@ -1,7 +1,5 @@
 """`vehest estimate` gives a log back with the estimate as channels of its own."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np
@@ -11,8 +9,6 @@ from mdf_log import write_mdf
 from scipy.io import loadmat
 
 from conftest import planar_drive
-from place import Place
-from vehest.data.recording import Recording
 
 asammdf = pytest.importorskip("asammdf", reason="the measurements of these tests are written by asammdf")
 COLUMNS = ("vx", "yaw_rate", "ay", "ax")
@@ -20,7 +16,7 @@ DESCRIBED = "dataset=mine"
 
 
 @pytest.fixture
-def described(place: Place) -> tuple[Place, Recording]:
+def described(place):
     """A measurement of 30 s, its times from 5 s on, and a data set that describes it."""
     drive = planar_drive(30.0, 100.0, seed=4, noise=0.02)
     stamps = 5.0 + np.arange(len(drive)) / 100.0
@@ -35,7 +31,7 @@ def described(place: Place) -> tuple[Place, Recording]:
     return place, drive
 
 
-def test_a_measurement_comes_back_with_the_table_s_numbers_in_a_group_of_their_own(described: tuple[Place, Recording]):
+def test_a_measurement_comes_back_with_the_table_s_numbers_in_a_group_of_their_own(described):
     place, drive = described
     assert place("estimate", "my drive.mf4", DESCRIBED, "-o", "beta.mf4")[0] == 0
     assert place("estimate", "my drive.mf4", DESCRIBED, "-o", "beta.csv")[0] == 0
@@ -51,7 +47,7 @@ def test_a_measurement_comes_back_with_the_table_s_numbers_in_a_group_of_their_o
         assert [text.decode().removeprefix("-") for text in words.samples] == table["health_reason"].fillna("").tolist()
 
 
-def test_a_mat_file_holds_the_log_and_the_estimate_on_one_clock(described: tuple[Place, Recording]):
+def test_a_mat_file_holds_the_log_and_the_estimate_on_one_clock(described):
     place, drive = described
     assert place("estimate", "my drive.mf4", DESCRIBED, "-o", "beta.mat")[0] == 0
     assert place("estimate", "my drive.mf4", DESCRIBED, "-o", "beta.csv")[0] == 0
@@ -62,12 +58,12 @@ def test_a_mat_file_holds_the_log_and_the_estimate_on_one_clock(described: tuple
     assert len(found["vehest_band_sideslip"]) == len(found["time"]) == len(drive)
 
 
-def test_a_table_does_not_become_a_measurement(place: Place):
+def test_a_table_does_not_become_a_measurement(place):
     code, line = place.refused("estimate", "lap.csv", "-o", "beta.mf4")
     assert (code, "'lap.csv' with further channels, which is no .mf4" in line) == (2, True)
 
 
-def test_an_older_measurement_is_refused_before_anything_is_written(described: tuple[Place, Recording]):
+def test_an_older_measurement_is_refused_before_anything_is_written(described):
     place, drive = described
     write_mdf(Path("old.mf4"), {"bus": [asammdf.Signal(drive[name], drive.time, name=f"Veh_{name}") for name in COLUMNS]}, "3.30")
     code, line = place.refused("estimate", "old.mf4", DESCRIBED, "-o", "beta.mf4")

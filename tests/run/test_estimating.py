@@ -1,7 +1,5 @@
 """`vehest estimate` and the Python interface on drives with something wrong, and what goes with a model: bands, health, trust.yaml."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 
@@ -12,34 +10,32 @@ import yaml
 
 import vehest
 from conftest import planar_drive
-from place import Place
 from vehest.constants import GRAVITY
 from vehest.data.recording import Recording
-from vehest.estimators.base import Estimator
 from vehest.trust.record import TRUST, read_trust
 
 QUICK = ("training.grid=1", "training.max_evaluations=5")
 
 
-def drive_of(seed: int, seconds: float = 30.0) -> Recording:
+def drive_of(seed, seconds=30.0):
     """A drive at the 100 Hz that the observer works at."""
     return planar_drive(seconds, 100.0, seed=seed, noise=0.02)
 
 
 @pytest.fixture(scope="module")
-def model() -> Estimator:
+def model():
     """An observer with what was learnt of how far it can be trusted."""
     return vehest.train("luenberger", [drive_of(1)], [drive_of(2)], QUICK)
 
 
 @pytest.fixture
-def saved(place: Place, model: Estimator) -> Place:
+def saved(place, model):
     """A place with the model in the folder ``own``."""
     vehest.save_model(model, place.folder / "own")
     return place
 
 
-def lap(changes: dict[str, np.ndarray] | None = None) -> None:
+def lap(changes=None):
     """Write lap.csv: a drive with some of its channels replaced."""
     drive = drive_of(4).without_references()
     pd.DataFrame({"time": drive.time, **drive.channels, **(changes or {})}).to_csv("lap.csv", index=False)
@@ -48,7 +44,7 @@ def lap(changes: dict[str, np.ndarray] | None = None) -> None:
 # What the checks find
 
 
-def test_a_drive_without_faults_has_no_findings_and_strict_takes_it(saved: Place):
+def test_a_drive_without_faults_has_no_findings_and_strict_takes_it(saved):
     lap()
     code, out, err = saved("estimate", "own", "lap.csv", "--strict", "--json")
     assert (code, err) == (0, "")
@@ -57,7 +53,7 @@ def test_a_drive_without_faults_has_no_findings_and_strict_takes_it(saved: Place
     assert "of the drive" in said["verdict"]
 
 
-def test_a_speed_that_stands_at_0_is_a_warning_and_health_accuses_it(saved: Place):
+def test_a_speed_that_stands_at_0_is_a_warning_and_health_accuses_it(saved):
     lap({"vx": np.zeros(3000)})
     code, out, err = saved("estimate", "own", "lap.csv", "-o", "out.csv", "--json")
     assert code == 0
@@ -68,7 +64,7 @@ def test_a_speed_that_stands_at_0_is_a_warning_and_health_accuses_it(saved: Plac
     assert np.isfinite(table["vy"]).any()
 
 
-def test_strict_refuses_a_speed_that_stands_at_0_and_writes_nothing(saved: Place):
+def test_strict_refuses_a_speed_that_stands_at_0_and_writes_nothing(saved):
     lap({"vx": np.zeros(3000)})
     assert saved.refused("estimate", "own", "lap.csv", "-o", "out.csv", "--strict") == (
         3,
@@ -81,7 +77,7 @@ def test_strict_refuses_a_speed_that_stands_at_0_and_writes_nothing(saved: Place
     ("factor", "check", "message"),
     [(-1.0, "sign", "ay and vx·yaw_rate disagree in sign"), (1.0 / GRAVITY, "unit", "ay is in g; set its unit")],
 )
-def test_accelerations_that_contradict_turning_are_refused_unless_they_are_accepted(saved: Place, factor: float, check: str, message: str):
+def test_accelerations_that_contradict_turning_are_refused_unless_they_are_accepted(saved, factor, check, message):
     lap({"ay": factor * drive_of(4)["ay"]})
     code, line = saved.refused("estimate", "own", "lap.csv", "-o", "out.csv")
     assert code == 3
@@ -95,7 +91,7 @@ def test_accelerations_that_contradict_turning_are_refused_unless_they_are_accep
     assert warning.startswith("warning: ay")
 
 
-def test_channels_that_the_model_does_not_read_contradict_nobody(saved: Place):
+def test_channels_that_the_model_does_not_read_contradict_nobody(saved):
     lap({"vx_ref": np.zeros(3000)})
     code, _, err = saved("estimate", "own", "lap.csv", "--strict")
     assert (code, err) == (0, "")
@@ -104,7 +100,7 @@ def test_channels_that_the_model_does_not_read_contradict_nobody(saved: Place):
 # What goes with a model
 
 
-def test_online_says_what_estimate_says_of_the_whole_drive(model: Estimator):
+def test_online_says_what_estimate_says_of_the_whole_drive(model):
     drive = drive_of(4)
     channels = {name: drive[name].copy() for name in model.channels}
     channels["ay"][1000:1100] = channels["ay"][1000]  # a second that stands still
@@ -119,7 +115,7 @@ def test_online_says_what_estimate_says_of_the_whole_drive(model: Estimator):
         np.testing.assert_allclose([step.get(name, np.nan) for step in said], values, rtol=0.0, atol=1e-9, err_msg=name)
 
 
-def test_a_saved_model_keeps_its_band_and_its_health(model: Estimator, tmp_path: Path):
+def test_a_saved_model_keeps_its_band_and_its_health(model, tmp_path):
     vehest.save_model(model, tmp_path / "own")
     assert read_trust(tmp_path / "own").bands is not None
     drive = drive_of(4)
@@ -129,7 +125,7 @@ def test_a_saved_model_keeps_its_band_and_its_health(model: Estimator, tmp_path:
         np.testing.assert_array_equal(after[name], values, err_msg=name)
 
 
-def test_a_model_that_saw_no_recording_estimates_without_band_and_the_file_says_why(saved: Place):
+def test_a_model_that_saw_no_recording_estimates_without_band_and_the_file_says_why(saved):
     zero = vehest.train("zero", [], [], ["estimator.rate_hz=100"])
     assert set(vehest.estimate(zero, drive_of(4)).channels) == {"vy", "sideslip", "health", "health_reason"}
     vehest.save_model(zero, saved.folder / "zero")
@@ -155,7 +151,7 @@ def test_without_a_validation_recording_there_is_no_band():
         (lambda text: yaml.safe_dump({**yaml.safe_load(text), "bands": {"vy": "wide"}}), "bands"),
     ],
 )
-def test_a_damaged_trust_file_is_one_clear_line(saved: Place, damage, message: str):
+def test_a_damaged_trust_file_is_one_clear_line(saved, damage, message):
     lap()
     file = saved.folder / "own" / TRUST
     file.write_text(damage(file.read_text(encoding="utf-8")), encoding="utf-8")

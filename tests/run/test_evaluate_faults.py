@@ -1,19 +1,15 @@
 """Faults as conditions of an evaluation: their rows, their keys, one training for all of them, and errors in one line."""
 
-from __future__ import annotations
-
 import csv
 import json
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pandas as pd
 import pytest
 import yaml
 
-from place import Place
 from vehest.data.errors import ConfigurationError
 from vehest.data.splits import Span, Split
 from vehest.data.store import read_recording
@@ -31,7 +27,7 @@ FROZEN = ("fault=frozen", "fault.channel=yaw_rate", "fault.severity=severe", "fa
 CONDITION = "frozen:yaw_rate:severe"
 
 
-def evaluated(place: Place, *overrides: str) -> tuple[Path, dict[str, Any]]:
+def evaluated(place, *overrides):
     """Folder and figures of an evaluation."""
     code, out, err = place("eval", *TRAINED, *overrides, "--json")
     assert code == 0, err
@@ -40,7 +36,7 @@ def evaluated(place: Place, *overrides: str) -> tuple[Path, dict[str, Any]]:
 
 
 @pytest.fixture
-def trained(place: Place) -> Place:
+def trained(place):
     """A place with a model."""
     code, _, err = place.once("train", *TRAINED)
     assert code == 0, err
@@ -221,7 +217,7 @@ def test_a_fault_that_suits_no_channel_is_named_and_the_others_go_on(place):
     assert [row["n_seeds"] for row in json.loads(out)["summary"]] == [0, 1, 1, 1]
 
 
-def pipeline_with(place: Place, sweeps: list[list[str]], **keys: Any) -> str:
+def pipeline_with(place, sweeps, **keys):
     pipeline = {"study": "faulted", "report": "drive", "split": "mine", "sweeps": sweeps, **keys}
     (place.folder / "pipelines" / "faulted.yaml").write_text(yaml.safe_dump(pipeline))
     return "faulted"

@@ -1,7 +1,5 @@
 """The page docs/from_a_log.md taken at its word, on 20 s of the real Ferrari made to look like another car's log."""
 
-from __future__ import annotations
-
 import re
 from pathlib import Path
 
@@ -9,16 +7,14 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from place import Place
-
 PAGE = Path(__file__).parents[2] / "docs" / "from_a_log.md"
 DRIVE = "revs/20140222_01_01_03_250lm"
 
 
-def log_of(data_root: Path) -> pd.DataFrame:
+def log_of(data_root):
     """300 to 320 s of the drive at 50 Hz: unix time, km/h, deg/s, lateral acceleration reversed, angles in degrees."""
 
-    def column(name: str) -> np.ndarray:
+    def column(name):
         return np.loadtxt(data_root / DRIVE / f"{name}.txt")
 
     time = column("t")
@@ -36,7 +32,7 @@ def log_of(data_root: Path) -> pd.DataFrame:
 
 
 @pytest.fixture
-def logged(place, data_root) -> Place:
+def logged(place, data_root):
     """A place with the log, and the files that the page tells to write."""
     folder = place.folder / "raw" / "my_log"
     folder.mkdir()
@@ -47,7 +43,7 @@ def logged(place, data_root) -> Place:
     return place
 
 
-def test_a_log_of_twenty_seconds_gets_a_leaderboard_and_no_winner(logged) -> None:
+def test_a_log_of_twenty_seconds_gets_a_leaderboard_and_no_winner(logged):
     page = PAGE.read_text(encoding="utf-8")
     code, out, err = logged("data", "check", "my_log")
     assert (code, err) == (0, "")

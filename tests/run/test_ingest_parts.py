@@ -1,23 +1,20 @@
 """Recordings that take long to make are kept as soon as they are done; an ingest that was interrupted goes on with the rest."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 
 import pytest
 
-from place import Place
 from vehest.data.errors import DataError
 from vehest.sources.tabular import TabularSource
 
 
 @pytest.fixture
-def slow(monkeypatch: pytest.MonkeyPatch) -> list[str]:
+def slow(monkeypatch):
     """Tables that count as slow; the names that were read."""
     read, names = TabularSource.read, []
 
-    def counted(self: TabularSource, recording_id: str):
+    def counted(self, recording_id):
         names.append(recording_id)
         return read(self, recording_id)
 
@@ -26,10 +23,10 @@ def slow(monkeypatch: pytest.MonkeyPatch) -> list[str]:
     return names
 
 
-def failing(monkeypatch: pytest.MonkeyPatch, name: str, error: BaseException) -> None:
+def failing(monkeypatch, name, error):
     read = TabularSource.read
 
-    def fails(self: TabularSource, recording_id: str):
+    def fails(self, recording_id):
         if recording_id == name:
             raise error
         return read(self, recording_id)
@@ -37,13 +34,13 @@ def failing(monkeypatch: pytest.MonkeyPatch, name: str, error: BaseException) ->
     monkeypatch.setattr(TabularSource, "read", fails)
 
 
-def ingested(place: Place) -> Path:
+def ingested(place):
     code, out, err = place("ingest", "mine", "--json")
     assert code == 0, err
     return Path(json.loads(out)["folder"])
 
 
-def test_what_was_finished_before_a_failure_is_not_made_again(place: Place, slow: list[str], monkeypatch: pytest.MonkeyPatch) -> None:
+def test_what_was_finished_before_a_failure_is_not_made_again(place, slow, monkeypatch):
     with monkeypatch.context() as broken:
         failing(broken, "three", DataError("'three.csv' is unwell"))
         code, _, err = place("ingest", "mine")
@@ -57,7 +54,7 @@ def test_what_was_finished_before_a_failure_is_not_made_again(place: Place, slow
     assert [item.name for item in (place.folder / "outputs" / "ingest").iterdir()] == [folder.name], "nothing is left beside it"
 
 
-def test_an_interruption_keeps_what_is_done(place: Place, slow: list[str], monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_interruption_keeps_what_is_done(place, slow, monkeypatch):
     with monkeypatch.context() as broken:
         failing(broken, "three", KeyboardInterrupt())
         assert place("ingest", "mine")[0] == 130
@@ -65,7 +62,7 @@ def test_an_interruption_keeps_what_is_done(place: Place, slow: list[str], monke
     assert slow == ["one", "three", "two"], "each is read once"
 
 
-def test_a_part_of_other_settings_is_not_used(place: Place, slow: list[str], monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_part_of_other_settings_is_not_used(place, slow, monkeypatch):
     with monkeypatch.context() as broken:
         failing(broken, "three", DataError("unwell"))
         assert place("ingest", "mine")[0] == 3

@@ -1,7 +1,5 @@
 """A few kills of the quickstart; `make kills` makes a hundred."""
 
-from __future__ import annotations
-
 import csv
 import subprocess
 import sys
@@ -15,7 +13,7 @@ SCRIPT = Path(__file__).parents[1] / "kills" / "kills.py"
 
 
 @pytest.mark.slow
-def test_a_study_that_is_killed_ends_in_the_same_numbers_and_leaves_nothing_behind(tmp_path: Path):
+def test_a_study_that_is_killed_ends_in_the_same_numbers_and_leaves_nothing_behind(tmp_path):
     table = tmp_path / "kills.csv"
     done = subprocess.run([sys.executable, SCRIPT, "--kills", "3", "--out", table], capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stdout + done.stderr

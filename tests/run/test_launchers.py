@@ -1,13 +1,10 @@
 """What launchers share: progress, artefacts that travel, options."""
 
-from __future__ import annotations
-
 import importlib.util
 import json
 import os
 import time
 from dataclasses import replace
-from pathlib import Path
 
 import pytest
 
@@ -16,7 +13,7 @@ from vehest.data.errors import ConfigurationError, DataError, MissingError
 from vehest.data.files import ASIDE_PREFIX, aside_of, remove_leftovers
 from vehest.data.splits import Span, Split
 from vehest.run import console
-from vehest.run.artefacts import MANIFEST, Artefact, StagePlan, find, make, read_artefact
+from vehest.run.artefacts import MANIFEST, StagePlan, find, make, read_artefact
 from vehest.run.console import Messages
 from vehest.run.failures import Failure
 from vehest.run.group import Group
@@ -30,7 +27,7 @@ FINE = Messages(silent=True)
 SPLIT = Split("any", (), (), {"test": (Span("any", "one", 0.0, 1.0),)})
 
 
-def job(output: Path, seed: int = 0, *, variant: str = "small", epochs: int = 10, **training: object) -> TrainJob:
+def job(output, seed=0, *, variant="small", epochs=10, **training):
     config = {
         "estimator": {"name": "net", "kind": variant},
         "training": {"max_epochs": epochs},
@@ -42,8 +39,8 @@ def job(output: Path, seed: int = 0, *, variant: str = "small", epochs: int = 10
     return TrainJob(plan, config["estimator"], {**config["training"], **training}, SPLIT, seed, {})
 
 
-def trained(own: TrainJob, seconds: float, text: str = "weights") -> Artefact:
-    def write(folder: Path) -> None:
+def trained(own, seconds, text="weights"):
+    def write(folder):
         (folder / "model.safetensors").write_text(text)
         (folder / "fit.csv").write_text("metric,value\nepochs,3\n")
         (folder / "timings.csv").write_text(f"metric,value\ntrain_seconds,{seconds}\n")

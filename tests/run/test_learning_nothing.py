@@ -1,7 +1,5 @@
 """Estimators that learn nothing: no training range is needed, recorded, or held against a test."""
 
-from __future__ import annotations
-
 import csv
 import json
 import math
@@ -10,13 +8,11 @@ from pathlib import Path
 import pytest
 import yaml
 
-from place import Place
-
 OWN_NOISE = ("estimator=kalman", "estimator.noise.read_from=recording", "tracking=none")
 
 
 @pytest.fixture
-def steered(place) -> Place:
+def steered(place):
     """Two drives with a steering angle, a split with a test only, and one that trains on the other drive."""
     place.add_steered()
     whole = {"name": "whole", "dataset": "steered", "train": [], "validation": [], "tests": {"test": [{"recording": "second"}]}}
@@ -31,7 +27,7 @@ def steered(place) -> Place:
     return place
 
 
-def figures_of(out: str) -> dict:
+def figures_of(out):
     return {name: value for name, value in json.loads(out).items() if name.endswith(".test")}
 
 

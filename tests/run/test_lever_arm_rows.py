@@ -1,20 +1,17 @@
 """Rows of errors with the best lever arm in a study's metrics: where the reference's point is unknown, and nowhere else."""
 
-from __future__ import annotations
-
 import json
-from typing import Any
 
 import numpy as np
 import pandas as pd
 import pytest
 import yaml
 
-from place import DATASET, Place
+from place import DATASET
 from vehest.data.store import read_recording
 
 
-def run(place: Place, point: object) -> tuple[pd.DataFrame, dict[str, Any]]:
+def run(place, point):
     declared = DATASET if point is None else {**DATASET, "reference_point": point}
     (place.folder / "conf" / "dataset" / "mine.yaml").write_text(yaml.safe_dump(declared))
     pipeline = {"study": "levers", "report": "drive", "split": "mine", "sweeps": [["estimator=zero"]]}
@@ -25,7 +22,7 @@ def run(place: Place, point: object) -> tuple[pd.DataFrame, dict[str, Any]]:
     return pd.read_csv(metrics), json.loads(out)
 
 
-def test_where_the_point_is_unknown_errors_are_given_with_the_best_lever_arm_too(place: Place) -> None:
+def test_where_the_point_is_unknown_errors_are_given_with_the_best_lever_arm_too(place):
     table, shown = run(place, "unknown")
     tests = table[(table["test_set"] == "test") & (table["subset"] == "all")]
     levers, nominal = (tests[tests["condition"] == name].set_index("metric")["value"] for name in ("best_lever_arm", "nominal"))
@@ -39,6 +36,6 @@ def test_where_the_point_is_unknown_errors_are_given_with_the_best_lever_arm_too
 
 
 @pytest.mark.parametrize("point", [None, {"x": 0.0, "y": 0.0}])
-def test_where_the_point_is_known_or_undeclared_there_are_none(place: Place, point: object) -> None:
+def test_where_the_point_is_known_or_undeclared_there_are_none(place, point):
     table, _ = run(place, point)
     assert set(table["condition"]) == {"nominal"}

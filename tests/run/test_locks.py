@@ -1,23 +1,18 @@
 """Two runs in one output root: each artefact and each MLflow run once, the same numbers as alone, nobody waits for ever."""
 
-from __future__ import annotations
-
 import json
 import os
 import signal
 import subprocess
 import sys
-from collections.abc import Iterator
 from contextlib import contextmanager
-from pathlib import Path
 
 import pytest
 
-from place import Place
 from processes import start
 from vehest.run.artefacts import StagePlan, read_artefact
 from vehest.run.group import _held
-from vehest.run.locks import Lock, Waiting, held
+from vehest.run.locks import Lock, held
 from vehest.run.train import TrainJob
 
 pytestmark = pytest.mark.apart
@@ -33,7 +28,7 @@ sys.stdin.read()
 
 
 @contextmanager
-def held_elsewhere(output: Path, stage: str, name: str) -> Iterator[subprocess.Popen[str]]:
+def held_elsewhere(output, stage, name):
     """A process of its own that holds a lock until it is ended."""
     own = [sys.executable, "-c", HOLDER, str(output), stage, name]
     process = start(own, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
@@ -46,7 +41,7 @@ def held_elsewhere(output: Path, stage: str, name: str) -> Iterator[subprocess.P
         process.communicate()
 
 
-def test_a_lock_ends_with_the_process_that_holds_it(tmp_path: Path):
+def test_a_lock_ends_with_the_process_that_holds_it(tmp_path):
     lock = Lock(tmp_path, "train", "a model")
     with held_elsewhere(tmp_path, "train", "a model") as holder:
         assert not lock.take()
@@ -57,8 +52,8 @@ def test_a_lock_ends_with_the_process_that_holds_it(tmp_path: Path):
     lock.release()
 
 
-def test_waiting_says_once_for_whom_and_ends_when_asked(tmp_path: Path):
-    said: list[Waiting] = []
+def test_waiting_says_once_for_whom_and_ends_when_asked(tmp_path):
+    said = []
     asked = iter([False, False, True])
     with held_elsewhere(tmp_path, "train", "a model") as holder:
         with held(Lock(tmp_path, "train", "a model"), lambda: next(asked), said.append) as mine:
@@ -67,7 +62,7 @@ def test_waiting_says_once_for_whom_and_ends_when_asked(tmp_path: Path):
         assert str(holder.pid) in said[0].holder
 
 
-def test_names_that_suit_no_file_are_locks_of_their_own(tmp_path: Path):
+def test_names_that_suit_no_file_are_locks_of_their_own(tmp_path):
     first, second = Lock(tmp_path, "train", "../a/b"), Lock(tmp_path, "train", ".._a_b")
     assert first.take()
     assert second.take()
@@ -77,7 +72,7 @@ def test_names_that_suit_no_file_are_locks_of_their_own(tmp_path: Path):
     second.release()
 
 
-def test_a_group_begins_with_what_nobody_trains_and_waits_for_the_rest_with_empty_hands(tmp_path: Path):
+def test_a_group_begins_with_what_nobody_trains_and_waits_for_the_rest_with_empty_hands(tmp_path):
     jobs = [_job(tmp_path, seed) for seed in range(3)]
     first, second = jobs[0].plan.lock, jobs[1].plan.lock
     assert first.take()
@@ -86,9 +81,9 @@ def test_a_group_begins_with_what_nobody_trains_and_waits_for_the_rest_with_empt
         assert not second.take()
     assert second.take(), "a group that is done with its members holds none"
 
-    said: list[Waiting] = []
+    said = []
 
-    def others_end(waiting: Waiting) -> None:
+    def others_end(waiting):
         said.append(waiting)
         first.release()
 
@@ -100,15 +95,15 @@ def test_a_group_begins_with_what_nobody_trains_and_waits_for_the_rest_with_empt
     second.release()
 
 
-def _job(output: Path, seed: int) -> TrainJob:
+def _job(output, seed):
     plan = StagePlan("train", f"model-seed{seed}", {"seed": seed}, {}, "code", output)
-    return TrainJob(plan, {}, {}, None, seed, {})  # type: ignore[arg-type]
+    return TrainJob(plan, {}, {}, None, seed, {})
 
 
 COMMAND = [sys.executable, "-m", "vehest"]
 
 
-def test_a_run_waits_for_what_another_makes_says_so_and_goes_on(place: Place):
+def test_a_run_waits_for_what_another_makes_says_so_and_goes_on(place):
     assert place("ingest", "mine")[0] == 0
     [folder] = (place.folder / "outputs" / "ingest").iterdir()
     with held_elsewhere(place.folder / "outputs", "ingest", folder.name) as holder:
@@ -124,7 +119,7 @@ def test_a_run_waits_for_what_another_makes_says_so_and_goes_on(place: Place):
 
 @pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
 @pytest.mark.parametrize("stage", ["ingest", "train"])
-def test_a_run_that_waits_stops_at_once_and_leaves_nothing(place: Place, stage: str, number: signal.Signals, code: int):
+def test_a_run_that_waits_stops_at_once_and_leaves_nothing(place, stage, number, code):
     command = ["ingest", "mine"] if stage == "ingest" else ["train", "split=mine", "training.max_epochs=1", "tracking=none"]
     assert place(*command)[0] == 0
     before = place.files()
@@ -174,7 +169,7 @@ print(at_once(1, "alone"), at_once(3, "together"))
 """
 
 
-def test_three_runs_at_once_make_each_artefact_and_each_mlflow_run_once_with_the_numbers_of_one_alone(place: Place):
+def test_three_runs_at_once_make_each_artefact_and_each_mlflow_run_once_with_the_numbers_of_one_alone(place):
     from mlflow import MlflowClient
 
     done = subprocess.run([sys.executable, "-c", SIDE_BY_SIDE], capture_output=True, text=True, check=False)
@@ -196,7 +191,7 @@ def test_three_runs_at_once_make_each_artefact_and_each_mlflow_run_once_with_the
     assert not list((together / "checkpoints").rglob("*"))
 
 
-def test_a_training_made_again_leaves_its_evaluation_up_to_date(place: Place):
+def test_a_training_made_again_leaves_its_evaluation_up_to_date(place):
     arguments = ("split=mine", "training.max_epochs=1", "tracking=none", "--json")
     assert place("train", *arguments)[0] == 0
     assert json.loads(place("eval", *arguments)[1])["skipped"] is False
@@ -207,7 +202,7 @@ def test_a_training_made_again_leaves_its_evaluation_up_to_date(place: Place):
     assert evaluated["step_seconds.test"] > 0
 
 
-def _folders(output: Path) -> list[Path]:
+def _folders(output):
     return [
         folder
         for stage in ("ingest", "downsample", "train", "calibrate", "evaluate", "report")
@@ -215,5 +210,5 @@ def _folders(output: Path) -> list[Path]:
     ]
 
 
-def _contents(output: Path) -> dict[str, str]:
+def _contents(output):
     return {folder.name: read_artefact(folder).digest for folder in _folders(output) if folder.parent.name != "report"}

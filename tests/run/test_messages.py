@@ -1,7 +1,5 @@
 """Messages to users: usage errors, hostile names, full disks, broken streams; one line each, without control of the terminal."""
 
-from __future__ import annotations
-
 import errno
 import io
 import json
@@ -11,7 +9,6 @@ import shutil
 import sqlite3
 import subprocess
 import sys
-from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -21,7 +18,7 @@ import yaml
 from safetensors import SafetensorError
 
 from conftest import planar_drive
-from place import DATASET, Place
+from place import DATASET
 from vehest.data.errors import ConfigurationError, MissingError, is_printable, printable
 from vehest.data.files import no_room, written_aside
 from vehest.data.limits import Limits, use_limits
@@ -33,7 +30,7 @@ from vehest.run.printing import TerminalTable, emit
 HOSTILE = "a\x1b]0;owned\x07\x9b31m\u202e[bold]b[/] :car:"
 
 
-def _shows_only_text(text: str) -> bool:
+def _shows_only_text(text):
     return all(character == "\n" or is_printable(character) for character in text)
 
 
@@ -248,7 +245,7 @@ def test_long_honest_overrides_are_read():
 
 
 @contextmanager
-def _small_disk(size: int) -> Iterator[None]:
+def _small_disk(size):
     """Files of this process may not grow beyond a size [bytes]: every larger write fails as on a full disk."""
     former = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (size, former[1]))
@@ -292,7 +289,7 @@ def test_a_full_disk_names_its_target_in_every_stage_and_leaves_nothing(place):
         assert place(*command)[0] == 0
 
 
-def _break_off(target: Path, error: Exception) -> None:
+def _break_off(target, error):
     with written_aside(target) as aside:
         aside.write_text("half")
         raise error
@@ -336,7 +333,7 @@ def test_what_is_no_full_disk_is_none(tmp_path):
     ],
 )
 def test_what_goes_wrong_inside_is_one_line(place, monkeypatch, error, code, words):
-    def fail() -> None:
+    def fail():
         raise error
 
     monkeypatch.setattr("vehest.run.doctor.examine", fail)
@@ -347,7 +344,7 @@ def test_what_goes_wrong_inside_is_one_line(place, monkeypatch, error, code, wor
     assert len(line) < 5_000
 
 
-def _shell(place: Place, script: str, **environment: str) -> subprocess.CompletedProcess[str]:
+def _shell(place, script, **environment):
     command = f"vehest() {{ '{sys.executable}' -m vehest \"$@\"; }}\n{script}"
     kept = {name: value for name, value in os.environ.items() if name not in ("HOME", "LANG", "LC_ALL", "TERM", "PYTHONIOENCODING")}
     return subprocess.run(

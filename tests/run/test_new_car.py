@@ -1,7 +1,5 @@
 """`vehest new` on the command line: what is asked, answered, written and refused, and that `vehest run` takes it."""
 
-from __future__ import annotations
-
 import io
 import json
 from pathlib import Path
@@ -20,7 +18,7 @@ FILES = ("conf/dataset/my_car.yaml", "conf/split/my_car.yaml", "pipelines/my_car
 
 
 @pytest.fixture
-def log(tmp_path, monkeypatch) -> Path:
+def log(tmp_path, monkeypatch):
     """A working folder with nothing but a log in it."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("VEHEST_OUTPUT", str(tmp_path / "outputs"))
@@ -28,7 +26,7 @@ def log(tmp_path, monkeypatch) -> Path:
     return write(tmp_path / "lap.csv", usual(drive()))
 
 
-def test_enter_takes_what_is_proposed_and_what_is_known_of_the_car_is_used(log) -> None:
+def test_enter_takes_what_is_proposed_and_what_is_known_of_the_car_is_used(log):
     result = CliRunner().invoke(app, ["new", "my_car", "lap.csv"], input="\n2.7\n1500\n\n")
     assert result.exit_code == 0, result.output
     assert "yaw_rate: column Gyro, deg/s: ay and vx·yaw_rate agree" in result.output
@@ -44,7 +42,7 @@ def test_enter_takes_what_is_proposed_and_what_is_known_of_the_car_is_used(log) 
     assert any("estimator=kalman" in sweep and "estimator.car.mass=1500" in sweep for sweep in sweeps)
 
 
-def test_an_answer_that_is_none_is_asked_again(log) -> None:
+def test_an_answer_that_is_none_is_asked_again(log):
     result = CliRunner().invoke(app, ["new", "my_car", "lap.csv"], input="perhaps\nno\n-3\n\n\n\n")
     assert result.exit_code == 0, result.output
     assert "'perhaps' is neither yes nor no" in result.output
@@ -60,7 +58,7 @@ def test_an_answer_that_is_none_is_asked_again(log) -> None:
     }
 
 
-def test_a_column_can_be_declared_otherwise_or_left_out(tmp_path, log) -> None:
+def test_a_column_can_be_declared_otherwise_or_left_out(tmp_path, log):
     d = drive()
     write(tmp_path / "two.csv", usual(d).assign(Speed2=3.6 * d["vx"] + 0.01))
     result = CliRunner().invoke(app, ["new", "my_car", "two.csv"], input="vx_ref km/h\n\n\n\n\n\n")
@@ -72,7 +70,7 @@ def test_a_column_can_be_declared_otherwise_or_left_out(tmp_path, log) -> None:
     assert len(yaml.safe_load(Path(FILES[0]).read_text(encoding="utf-8"))["channels"]) == len(first) - 1
 
 
-def test_yes_asks_nothing_and_lists_what_it_left_open(capsys, log) -> None:
+def test_yes_asks_nothing_and_lists_what_it_left_open(capsys, log):
     code, out, err = run_vehest(capsys, "new", "my_car", "lap.csv", "--yes")
     assert (code, err) == (0, "")
     assert "open, taken as proposed:\n  left_right: yes (in a left turn" in out
@@ -80,7 +78,7 @@ def test_yes_asks_nothing_and_lists_what_it_left_open(capsys, log) -> None:
     assert "Open, not decided by the log: in a left turn" in Path(FILES[0]).read_text(encoding="utf-8")
 
 
-def test_json_says_all_of_it_to_a_script(capsys, log) -> None:
+def test_json_says_all_of_it_to_a_script(capsys, log):
     code, out, err = run_vehest(capsys, "new", "my_car", "lap.csv", "--json", "--dry-run")
     assert (code, err) == (0, "")
     said = json.loads(out)
@@ -95,7 +93,7 @@ def test_json_says_all_of_it_to_a_script(capsys, log) -> None:
     assert all(Path(file).exists() for file in FILES)
 
 
-def test_run_takes_what_was_written(capsys, log) -> None:
+def test_run_takes_what_was_written(capsys, log):
     assert run_vehest(capsys, "new", "my_car", "lap.csv", "--yes", "--wheelbase", "2.7", "--mass", "1500")[0] == 0
     code, _, err = run_vehest(capsys, "run", "my_car", "--dry-run", "tracking=none")
     assert code == 0, err
@@ -115,7 +113,7 @@ def test_run_takes_what_was_written(capsys, log) -> None:
     assert code == 0, out
 
 
-def test_nothing_is_overwritten_without_force(capsys, log) -> None:
+def test_nothing_is_overwritten_without_force(capsys, log):
     Path("conf/split").mkdir(parents=True)
     Path(FILES[1]).write_text("mine")
     code, out, err = run_vehest(capsys, "new", "my_car", "lap.csv", "--yes")
@@ -127,7 +125,7 @@ def test_nothing_is_overwritten_without_force(capsys, log) -> None:
     assert "dataset: my_car" in Path(FILES[1]).read_text()
 
 
-def test_nothing_half_written_stays(capsys, log) -> None:
+def test_nothing_half_written_stays(capsys, log):
     Path("pipelines").write_text("a file where a folder is wanted")
     code, _, err = run_vehest(capsys, "new", "my_car", "lap.csv", "--yes")
     assert code in (2, 4)
@@ -147,7 +145,7 @@ def test_nothing_half_written_stays(capsys, log) -> None:
         (("new", "my_car", "lap.csv"), 2, "no terminal for questions; add --yes"),
     ],
 )
-def test_what_cannot_be_done_is_one_line(capsys, log, monkeypatch, words: tuple[str, ...], code: int, said: str) -> None:
+def test_what_cannot_be_done_is_one_line(capsys, log, monkeypatch, words, code, said):
     monkeypatch.setattr("sys.stdin", io.StringIO(""))
     found, _, err = run_vehest(capsys, *words)
     assert found == code
@@ -155,7 +153,7 @@ def test_what_cannot_be_done_is_one_line(capsys, log, monkeypatch, words: tuple[
     assert err.count("error:") == 1
 
 
-def test_files_beside_those_that_are_named_stay_out_of_the_data_set(tmp_path, capsys, log) -> None:
+def test_files_beside_those_that_are_named_stay_out_of_the_data_set(tmp_path, capsys, log):
     for number in (1, 2):
         write(tmp_path / f"run_{number}.csv", usual(drive(seed=number)))
     write(tmp_path / "run_other.csv", usual(drive(seed=3)))
@@ -165,7 +163,7 @@ def test_files_beside_those_that_are_named_stay_out_of_the_data_set(tmp_path, ca
     assert [one["id"] for one in json.loads(out)["recordings"]] == ["run_1", "run_2"]
 
 
-def test_without_a_speed_no_pipeline_is_written_that_could_not_run(tmp_path, capsys, log) -> None:
+def test_without_a_speed_no_pipeline_is_written_that_could_not_run(tmp_path, capsys, log):
     write(tmp_path / "slow.csv", usual(drive()).drop(columns="Speed"))
     code, out, _ = run_vehest(capsys, "new", "my_car", "slow.csv", "--yes")
     assert code == 0
@@ -175,14 +173,14 @@ def test_without_a_speed_no_pipeline_is_written_that_could_not_run(tmp_path, cap
     assert run_vehest(capsys, "data", "check", "my_car")[0] == 0
 
 
-def test_without_speed_and_accelerations_the_yaw_rate_alone_is_written(tmp_path, capsys, log) -> None:
+def test_without_speed_and_accelerations_the_yaw_rate_alone_is_written(tmp_path, capsys, log):
     write(tmp_path / "gyro.csv", usual(drive())[["Time [s]", "Gyro"]].assign(Voltage=12.0))
     code, out, err = run_vehest(capsys, "new", "my_car", "gyro.csv", "--yes")
     assert (code, err) == (0, "")
     assert "it lacks vx, ax, ay" in out
 
 
-def test_short_recordings_stay_whole_and_too_little_stops_with_what_to_record(tmp_path, capsys, log) -> None:
+def test_short_recordings_stay_whole_and_too_little_stops_with_what_to_record(tmp_path, capsys, log):
     for number in range(10):
         part = usual(drive(seed=number)).iloc[:400]
         write(tmp_path / f"turn_{number}.csv", part)
@@ -200,14 +198,14 @@ def test_short_recordings_stay_whole_and_too_little_stops_with_what_to_record(tm
     assert "vehest run" not in out
 
 
-def test_force_takes_away_split_and_pipeline_that_the_new_logs_do_not_allow(tmp_path, capsys, log) -> None:
+def test_force_takes_away_split_and_pipeline_that_the_new_logs_do_not_allow(tmp_path, capsys, log):
     assert run_vehest(capsys, "new", "my_car", "lap.csv", "--yes")[0] == 0
     write(tmp_path / "bare.csv", usual(drive()).drop(columns="Beta"))
     assert run_vehest(capsys, "new", "my_car", "bare.csv", "--yes", "--force")[0] == 0
     assert [Path(file).exists() for file in FILES] == [True, False, False]
 
 
-def test_a_stop_gives_in_json_what_was_found_and_a_dry_run_needs_no_force(capsys, log) -> None:
+def test_a_stop_gives_in_json_what_was_found_and_a_dry_run_needs_no_force(capsys, log):
     assert run_vehest(capsys, "new", "my_car", "lap.csv", "--yes")[0] == 0
     before = [Path(file).read_text() for file in FILES]
     code, out, err = run_vehest(capsys, "new", "my_car", "lap.csv", "--json", "--dry-run", "--answer", "gear=3")
@@ -219,7 +217,7 @@ def test_a_stop_gives_in_json_what_was_found_and_a_dry_run_needs_no_force(capsys
     assert [Path(file).read_text() for file in FILES] == before
 
 
-def test_an_estimator_of_ones_own_is_compared_too(tmp_path, capsys, log, monkeypatch) -> None:
+def test_an_estimator_of_ones_own_is_compared_too(tmp_path, capsys, log, monkeypatch):
     code, _, err = run_vehest(capsys, "new", "my_car", "lap.csv", "--yes", "--with", "sliding_mode:SlidingMode")
     assert code == 2
     assert '[project.entry-points."vehest.estimators"], NAME = "sliding_mode:SlidingMode"; then install it with pip' in err

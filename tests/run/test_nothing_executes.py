@@ -45,10 +45,10 @@ class Case:
     refused: frozenset[str] = field(default_factory=frozenset)
 
 
-def by_source(**dataset: Any) -> Callable[[Path], Any]:
+def by_source(**dataset):
     """Read a file or folder as the one recording of a data set."""
 
-    def read(file: Path) -> Any:
+    def read(file):
         from vehest.sources.base import open_source
 
         (recording,) = open_source({"name": "mine", "path": str(file.parent), "files": file.name, "vehicle": "car", **dataset}).recordings()
@@ -60,10 +60,10 @@ def by_source(**dataset: Any) -> Callable[[Path], Any]:
 # --- formats -----------------------------------------------------------------------------------------------------------------------
 
 
-def mdf(honest: Path, hostile: Path) -> Callable[[Path], Any]:
+def mdf(honest, hostile):
     import asammdf
 
-    def write(file: Path, version: str, conversion: Any, **attached: Any) -> None:
+    def write(file, version, conversion, **attached):
         with asammdf.MDF(version=version) as measurement:
             raw = np.arange(len(FAST)) % 40
             measurement.append([asammdf.Signal(raw, FAST, name="v", unit="m/s", conversion=conversion)], comment="Only")
@@ -84,7 +84,7 @@ def mdf(honest: Path, hostile: Path) -> Callable[[Path], Any]:
     return by_source(source="mdf", rate_hz=100, channels={"vx": {"column": "v", "unit": "m/s"}})
 
 
-def mat(honest: Path, hostile: Path) -> Callable[[Path], Any]:
+def mat(honest, hostile):
     from scipy.io import savemat
 
     values = {"value": np.sin(FAST)[:, None], "time": FAST[:, None]}
@@ -103,7 +103,7 @@ def mat(honest: Path, hostile: Path) -> Callable[[Path], Any]:
     return lambda file: read(file.with_suffix(""))
 
 
-def rosbag(honest: Path, hostile: Path) -> Callable[[Path], Any]:
+def rosbag(honest, hostile):
     import shutil
     import sqlite3
 
@@ -121,7 +121,7 @@ def rosbag(honest: Path, hostile: Path) -> Callable[[Path], Any]:
                 )
     good = honest / "SQLITE3"
 
-    def changed(name: str, *statements: str) -> None:
+    def changed(name, *statements):
         shutil.copytree(good, hostile / name)
         database = sqlite3.connect(hostile / name / "SQLITE3.db3")
         for statement in statements:
@@ -152,8 +152,8 @@ def rosbag(honest: Path, hostile: Path) -> Callable[[Path], Any]:
     )
 
 
-def table(honest: Path, hostile: Path) -> Callable[[Path], Any]:
-    def write(file: Path, header: list[str], first: str) -> None:
+def table(honest, hostile):
+    def write(file, header, first):
         with open(file, "w", newline="", encoding="utf-8") as stream:
             writer = csv.writer(stream)
             writer.writerow(header)
@@ -167,7 +167,7 @@ def table(honest: Path, hostile: Path) -> Callable[[Path], Any]:
     return by_source(source="tabular", time={"column": "time", "unit": "s"}, channels={"vx": {"column": "v", "unit": "m/s"}})
 
 
-def vbo(honest: Path, hostile: Path) -> Callable[[Path], Any]:
+def vbo(honest, hostile):
     from vbo_log import dataset, write_log
 
     write_log(honest / "a.vbo")
@@ -181,7 +181,7 @@ def vbo(honest: Path, hostile: Path) -> Callable[[Path], Any]:
     return by_source(**{key: value for key, value in dataset(honest).items() if key not in ("name", "path")})
 
 
-def model_folder(honest: Path, hostile: Path) -> Callable[[Path], Any]:
+def model_folder(honest, hostile):
     import shutil
 
     import vehest.pretrained
@@ -201,7 +201,7 @@ def model_folder(honest: Path, hostile: Path) -> Callable[[Path], Any]:
     shutil.copytree(good, hostile / "pickle")
     (hostile / "pickle" / "model.safetensors").write_bytes(b"cos\nsystem\n(S'touch MARK'\ntR.")
 
-    def read(folder: Path) -> Any:
+    def read(folder):
         from vehest.estimators.model_files import load_model
 
         return load_model(folder)
@@ -223,7 +223,7 @@ CASES = {
 
 
 @pytest.mark.parametrize("name", CASES)
-def test_hostile_files_execute_nothing(tmp_path: Path, name: str) -> None:
+def test_hostile_files_execute_nothing(tmp_path, name):
     case = CASES[name]
     if case.needs:
         pytest.importorskip(case.needs, reason="the files of this test cannot be written")
@@ -244,7 +244,7 @@ def test_hostile_files_execute_nothing(tmp_path: Path, name: str) -> None:
     assert list(tmp_path.rglob(f"*{MARK}*")) == []
 
 
-def watch(name: str, folder: Path) -> dict[str, Any]:
+def watch(name, folder):
     """Read honest files of a format, then watch while hostile ones are read: file -> how it ended, and what was seen."""
     from vehest.data.errors import VehestError
 
@@ -257,12 +257,12 @@ def watch(name: str, folder: Path) -> dict[str, Any]:
     for file in sorted(hostile.iterdir())[:1]:  # what the way to an error imports
         with contextlib.suppress(VehestError):
             read(folder / "nowhere" / file.name)
-    outcome: dict[str, Any] = {}
-    seen: list[str] = []
+    outcome = {}
+    seen = []
     armed = [False]
     temporary = tempfile.gettempdir()
 
-    def hook(event: str, arguments: tuple[Any, ...]) -> None:
+    def hook(event, arguments):
         if not armed[0]:
             return
         if (event == "subprocess.Popen" and "vehest.sources.limited" in arguments[1]) or (event == "open" and arguments[0] == os.devnull):
@@ -288,7 +288,7 @@ def watch(name: str, folder: Path) -> dict[str, Any]:
     return outcome
 
 
-def _writes(arguments: tuple[Any, ...]) -> bool:
+def _writes(arguments):
     path, mode, flags = arguments
     if isinstance(path, int):
         return False

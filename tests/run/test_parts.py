@@ -1,7 +1,5 @@
 """A study of several comparisons, each on a split of its own, run from the command line on a small data set."""
 
-from __future__ import annotations
-
 import dataclasses
 import json
 import re
@@ -11,7 +9,7 @@ import pandas as pd
 import pytest
 import yaml
 
-from place import Place, write_csv
+from place import write_csv
 from vehest.report.document import Document
 from vehest.run.study import jobs_of, read_study
 from vehest.run.train import new_estimator
@@ -27,7 +25,7 @@ CANDIDATES = [
 
 
 @pytest.fixture
-def parts_place(place) -> Place:
+def parts_place(place):
     """A place whose data set serves two schemes, and a part whose raw files are elsewhere."""
     for seed, name in enumerate(("one", "two", "three"), 1):
         write_csv(place.folder / "raw" / f"{name}.csv", seed, 80.0)
@@ -170,11 +168,7 @@ def test_the_study_of_the_paper_differs_from_that_on_its_own_recordings_in_split
     simulated, official = read_study("ksnn"), read_study("ksnn_revs")
     shared = [part for name, part in simulated.parts.items() if not name.startswith("same_")]
     changed = {part.split: other.split for part, other in zip(shared, official.parts.values(), strict=True) if part != other}
-    assert changed == {
-        "cross_vehicle_1_sim": "cross_vehicle_1",
-        "cross_vehicle_2_sim": "cross_vehicle_2",
-        "one_vehicle_sim": "one_vehicle",
-    }
+    assert changed == {"cross_vehicle_1_sim": "cross_vehicle_1", "cross_vehicle_2_sim": "cross_vehicle_2", "one_vehicle_sim": "one_vehicle"}
     assert all(
         dataclasses.replace(part, split="") == dataclasses.replace(other, split="")
         for part, other in zip(official.parts.values(), shared, strict=True)

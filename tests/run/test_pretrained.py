@@ -1,7 +1,5 @@
 """The model for cars that nobody has trained on, which comes with vehest."""
 
-from __future__ import annotations
-
 import importlib.util
 import json
 import re
@@ -15,7 +13,7 @@ import yaml
 
 import vehest
 from conftest import planar_drive
-from place import Place, write_csv
+from place import write_csv
 from vehest.cli import _complete_model_or_file
 from vehest.estimators.model_files import load_model, save_model
 from vehest.estimators.registry import estimator_class
@@ -27,7 +25,7 @@ from vehest.trust.record import read_trust
 ROOT = Path(__file__).parents[2]
 
 
-def test_estimate_without_a_model_takes_the_one_that_comes_with_vehest_and_says_so(place: Place):
+def test_estimate_without_a_model_takes_the_one_that_comes_with_vehest_and_says_so(place):
     table = write_csv(place.folder / "lap.csv", 9).drop(columns="Vy")
     table.to_csv(place.folder / "lap.csv", index=False)
     code, out, err = place("estimate", "lap.csv", "dataset=mine", "-o", "default.csv", "--json")
@@ -43,7 +41,7 @@ def test_estimate_without_a_model_takes_the_one_that_comes_with_vehest_and_says_
     assert (bands > 0.0).all()
 
 
-def test_an_estimate_of_the_shipped_model_loads_no_torch_no_pandas_and_no_scipy_signal(place: Place):
+def test_an_estimate_of_the_shipped_model_loads_no_torch_no_pandas_and_no_scipy_signal(place):
     write_csv(place.folder / "lap.csv", 9)
     program = "import sys\nfrom vehest.cli import main\ntry: main()\nfinally: print(*sys.modules, file=sys.stderr)\n"
     for out in ("lap.parquet", "estimate.csv"):
@@ -53,7 +51,7 @@ def test_an_estimate_of_the_shipped_model_loads_no_torch_no_pandas_and_no_scipy_
         assert not {"torch", "pandas", "scipy.signal", "scipy.stats", "matplotlib"} & set(result.stderr.split())
 
 
-def test_completion_of_the_first_word_offers_models_and_recordings(place: Place):
+def test_completion_of_the_first_word_offers_models_and_recordings(place):
     (place.folder / "outputs" / "train" / "ksnn-a").mkdir(parents=True)
     for name in ("lap.csv", "lap.parquet", "notes.txt"):
         (place.folder / name).touch()
@@ -63,7 +61,7 @@ def test_completion_of_the_first_word_offers_models_and_recordings(place: Place)
     assert _complete_model_or_file("./la") == ["./lap.csv", "./lap.parquet"]
 
 
-def test_a_named_model_is_used_and_a_folder_is_no_recording(place: Place):
+def test_a_named_model_is_used_and_a_folder_is_no_recording(place):
     write_csv(place.folder / "lap.csv", 9)
     observer = estimator_class("luenberger").from_config({"rate_hz": 20})
     observer.load_weights({"gain": np.array([5.0]), "threshold": np.array([0.05])})
@@ -76,7 +74,7 @@ def test_a_named_model_is_used_and_a_folder_is_no_recording(place: Place):
     assert "comes after the model" in place.refused("estimate", "own")[1]
 
 
-def test_a_recording_whose_name_holds_an_equals_sign_is_no_override(place: Place):
+def test_a_recording_whose_name_holds_an_equals_sign_is_no_override(place):
     write_csv(place.folder / "speed=30.csv", 9)
     code, out, err = place("estimate", "pretrained", "speed=30.csv", "dataset=mine", "--json")
     assert code == 0, err
@@ -108,7 +106,7 @@ def test_what_is_known_of_the_pretrained_model_was_learnt_on_other_cars_than_the
     assert "ferrari_250_lm" not in trust.bands.vehicles
 
 
-def bands_on(name: str, data_root: Path) -> tuple[float, float, float]:
+def bands_on(name, data_root):
     """Of a data set's first recording: sideslip errors inside the pre-trained model's band, its median [°], share that is valid."""
     source = open_source(compose_config("ingest", [f"dataset={name}", f"root={data_root}"])["dataset"])
     recording = next(iter(source.recordings()))
@@ -120,7 +118,7 @@ def bands_on(name: str, data_root: Path) -> tuple[float, float, float]:
     return float(inside), float(np.degrees(np.median(band[judged]))), float(valid)
 
 
-def test_the_documentation_tells_what_the_pretrained_bands_are_worth_on_real_cars(data_root: Path):
+def test_the_documentation_tells_what_the_pretrained_bands_are_worth_on_real_cars(data_root):
     text = " ".join((ROOT / "docs" / "trust.md").read_text(encoding="utf-8").split())
     told = re.search(r"they hold (\d+) % where 90 % are asked, half width ([\d.]+)° in the median, and (\d+) % of the drive is valid", text)
     assert told is not None

@@ -1,26 +1,23 @@
 """Pruning lists artefacts that no current configuration can reuse, and nothing else."""
 
-from __future__ import annotations
-
 import json
 import os
 import subprocess
 import sys
-from pathlib import Path
 
 import pytest
 
 from place import run_vehest
 from vehest.data.files import ASIDE_PREFIX
 from vehest.run import calibrate, downsample, evaluate, ingest, report, train
-from vehest.run.artefacts import Artefact, StagePlan, make
+from vehest.run.artefacts import StagePlan, make
 from vehest.run.prune import DAMAGED, LEFT_OVER, ORPHANED, OUTDATED, SUPERFLUOUS, unused_artefacts
 
 
 class Root:
     """An output root with artefacts that hold next to nothing."""
 
-    def __init__(self, output: Path) -> None:
+    def __init__(self, output):
         self.output = output
         dataset = {"source": "tabular"}
         self.ingested = self.add("ingest", "drives", dataset, {"lap.csv": "raw"}, ingest.code_of_ingest(dataset))
@@ -32,12 +29,12 @@ class Root:
         of_both = of_model | {"calibration": self.trusted.digest}
         self.scored = self.add("evaluate", "one-on-mine", {}, of_both, evaluate.code_of_evaluation(name))
 
-    def add(self, stage: str, label: str, config: dict, inputs: dict[str, str], code: str) -> Artefact:
+    def add(self, stage, label, config, inputs, code):
         """Make an artefact with one file, whose content is its label."""
         plan = StagePlan(stage, label, config, inputs, code, self.output)
         return make(plan, lambda folder: (folder / "content").write_text(label) and None)
 
-    def found(self) -> dict[str, str]:
+    def found(self):
         """Path in the root."""
         return {found.path.relative_to(self.output).as_posix(): found.reason for found in unused_artefacts(self.output)}
 
@@ -47,11 +44,11 @@ def root(tmp_path):
     return Root(tmp_path / "outputs")
 
 
-def name_of(artefact: Artefact) -> str:
+def name_of(artefact):
     return f"{artefact.stage}/{artefact.folder.name}"
 
 
-def a_dead_process() -> int:
+def a_dead_process():
     ended = subprocess.Popen([sys.executable, "-c", ""])
     ended.wait()
     return ended.pid

@@ -1,11 +1,8 @@
 """Published results: a rerun leaves them as they are, and a check says whether they are those of today."""
 
-from __future__ import annotations
-
 import json
 import shutil
 import subprocess
-from pathlib import Path
 
 import numpy as np
 import pandas as pd
@@ -30,7 +27,7 @@ TIME_NAMES = ("seconds", "minutes", "[ms]", "## Times")
 
 
 @pytest.fixture(scope="module")
-def published(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def published(tmp_path_factory):
     """A folder with a small study that was run and published."""
     folder = tmp_path_factory.mktemp("published")
     with pytest.MonkeyPatch.context() as patch:
@@ -47,12 +44,12 @@ def published(tmp_path_factory: pytest.TempPathFactory) -> Path:
 class _Silent:
     """Stands for pytest's capsys, which serves single tests only."""
 
-    def readouterr(self) -> tuple[str, str]:
+    def readouterr(self):
         return "", ""
 
 
 @pytest.fixture
-def checked(published: Path, place: Place) -> Place:
+def checked(published, place):
     """The same study in a folder of its own, without the output root: what is checked needs no models."""
     for name in ("conf", "pipelines", "raw", "results"):
         shutil.rmtree(place.folder / name, ignore_errors=True)
@@ -60,11 +57,11 @@ def checked(published: Path, place: Place) -> Place:
     return place
 
 
-def contents(folder: Path) -> dict[str, bytes]:
+def contents(folder):
     return {file.relative_to(folder).as_posix(): file.read_bytes() for file in sorted(folder.rglob("*")) if file.is_file()}
 
 
-def verdict(place: Place, *words: str) -> tuple[int, str]:
+def verdict(place, *words):
     """Exit code and outcome of a check of one study; it needs no output root and makes none."""
     code, out, err = place(*CHECK, *words)
     assert not (place.folder / "outputs").exists()
@@ -72,14 +69,14 @@ def verdict(place: Place, *words: str) -> tuple[int, str]:
     return code, out.strip()
 
 
-def changed(file: Path, **values: object) -> None:
+def changed(file, **values):
     file.write_text(yaml.safe_dump({**yaml.safe_load(file.read_text()), **values}, allow_unicode=True))
 
 
 # What is published
 
 
-def test_numbers_are_published_with_six_digits_and_everything_else_as_it_is(tmp_path: Path) -> None:
+def test_numbers_are_published_with_six_digits_and_everything_else_as_it_is(tmp_path):
     file = tmp_path / "table.csv"
     cells = ["0.7459900813211685", "-1.2345678e-07", "1234567.0", "7", "0.10", "", '"0.0123456789, 2"', "nan", "1e-05"]
     file.write_text("a,b,c,d,e,f,g,h,i\n" + ",".join(cells) + "\n", encoding="utf-8")
@@ -87,14 +84,14 @@ def test_numbers_are_published_with_six_digits_and_everything_else_as_it_is(tmp_
     assert published_content(file).decode() == "a,b,c,d,e,f,g,h,i\n" + ",".join(expected) + "\n"
 
 
-def test_published_metrics_are_those_of_the_report_to_six_digits(published: Path) -> None:
+def test_published_metrics_are_those_of_the_report_to_six_digits(published):
     (report,) = (published / "outputs" / "report").iterdir()
     own, there = (pd.read_csv(folder / "metrics.csv")["value"] for folder in (report, published / "results" / "small"))
     np.testing.assert_allclose(there, own, rtol=5e-6)
     assert (there != own).any()
 
 
-def test_times_are_in_no_published_file_but_beside_the_page_and_on_it(published: Path) -> None:
+def test_times_are_in_no_published_file_but_beside_the_page_and_on_it(published):
     (report,) = (published / "outputs" / "report").iterdir()
     timings = pd.read_csv(report / TIMINGS)
     metrics = pd.read_csv(published / "results" / "small" / "metrics.csv")
@@ -116,7 +113,7 @@ def test_times_are_in_no_published_file_but_beside_the_page_and_on_it(published:
         assert not words or (name, words) == ("tables/ranges.csv", ["seconds"]), name  # how long the ranges of the drive are
 
 
-def test_a_rerun_leaves_the_work_tree_clean(published: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_rerun_leaves_the_work_tree_clean(published, monkeypatch, capsys):
     undrawn(monkeypatch)
     monkeypatch.chdir(published)
     monkeypatch.setenv("VEHEST_DATA", str(published / "raw"))
@@ -136,9 +133,7 @@ def test_a_rerun_leaves_the_work_tree_clean(published: Path, monkeypatch: pytest
     assert run_vehest(capsys, *CHECK)[:2] == (0, "small: up to date\n")
 
 
-def test_results_that_other_code_gives_alike_are_recorded_as_its_own(
-    published: Path, place: Place, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_results_that_other_code_gives_alike_are_recorded_as_its_own(published, place, monkeypatch):
     shutil.rmtree(place.folder)
     shutil.copytree(published, place.folder)
     shutil.rmtree(place.folder / "outputs" / "finished")
@@ -155,12 +150,12 @@ def test_results_that_other_code_gives_alike_are_recorded_as_its_own(
 # What is checked
 
 
-def test_published_results_are_up_to_date_by_study_and_by_file(checked: Place) -> None:
+def test_published_results_are_up_to_date_by_study_and_by_file(checked):
     for words in ([], ["small"], ["pipelines/small.yaml"], ["small", f"root={checked.folder / 'raw'}"]):
         assert verdict(checked, *words) == (0, "small: up to date")
 
 
-def test_a_changed_setting_of_one_estimator_makes_the_study_stale_and_is_named(checked: Place) -> None:
+def test_a_changed_setting_of_one_estimator_makes_the_study_stale_and_is_named(checked):
     changed(checked.folder / "pipelines" / "small.yaml", sweeps=[QUICK["sweeps"][0], [*QUICK["sweeps"][1], "training.learning_rate=0.002"]])
     assert verdict(checked) == (3, "small: stale: configuration (train gru, report)")
     code, out = verdict(checked, "--json")
@@ -168,14 +163,14 @@ def test_a_changed_setting_of_one_estimator_makes_the_study_stale_and_is_named(c
     assert (code, json.loads(out)) == (3, [{"study": "small", "state": "stale", "changes": changes, "note": ""}])
 
 
-def test_what_trains_nothing_new_leaves_a_study_up_to_date(checked: Place) -> None:
+def test_what_trains_nothing_new_leaves_a_study_up_to_date(checked):
     sweeps = [[*sweep, "training.checkpoint_seconds=1"] if "estimator=gru" in sweep else sweep for sweep in QUICK["sweeps"]]
     changed(checked.folder / "pipelines" / "small.yaml", sweeps=sweeps)
     changed(checked.folder / "conf" / "dataset" / "mine.yaml", citation="somebody else")
     assert verdict(checked) == (0, "small: up to date")
 
 
-def test_estimators_that_come_and_go_are_named(checked: Place) -> None:
+def test_estimators_that_come_and_go_are_named(checked):
     changed(checked.folder / "pipelines" / "small.yaml", sweeps=[QUICK["sweeps"][1], ["estimator=zero"]])
     code, line = verdict(checked)
     assert code == 3
@@ -186,14 +181,14 @@ def test_estimators_that_come_and_go_are_named(checked: Place) -> None:
     assert {f"{stage} {name}" for stage in stages for name in ("zero added", "luenberger removed")} <= named
 
 
-def test_changed_split_and_title_are_named(checked: Place) -> None:
+def test_changed_split_and_title_are_named(checked):
     changed(checked.folder / "conf" / "split" / "mine.yaml", tests={"test": [{"recording": "three", "stop": 20}]})
     assert verdict(checked) == (3, "small: stale: configuration (split)")
     changed(checked.folder / "conf" / "dataset" / "mine.yaml", title="Another title")
     assert verdict(checked) == (3, "small: stale: configuration (split, report)")
 
 
-def test_changed_code_and_data_are_told_apart(checked: Place, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_changed_code_and_data_are_told_apart(checked, monkeypatch):
     with open(checked.folder / "raw" / "two.csv", "a") as stream:
         stream.write("\n")
     assert verdict(checked) == (3, "small: stale: data (ingest mine)")
@@ -201,14 +196,14 @@ def test_changed_code_and_data_are_told_apart(checked: Place, monkeypatch: pytes
     assert verdict(checked) == (3, "small: stale: code (report), data (ingest mine)")
 
 
-def test_raw_files_that_are_elsewhere_are_not_compared_and_this_is_said(checked: Place) -> None:
+def test_raw_files_that_are_elsewhere_are_not_compared_and_this_is_said(checked):
     shutil.rmtree(checked.folder / "raw")
     assert verdict(checked) == (0, "small: up to date: raw files not here, not compared: mine")
     changed(checked.folder / "conf" / "dataset" / "mine.yaml", vehicle="another car")
     assert verdict(checked) == (3, "small: stale: configuration (ingest mine); raw files not here, not compared: mine")
 
 
-def test_nothing_is_known_without_keys_without_a_pipeline_and_without_results(checked: Place) -> None:
+def test_nothing_is_known_without_keys_without_a_pipeline_and_without_results(checked):
     file = checked.folder / "results" / "small" / PROVENANCE
     about = json.loads(file.read_text())
     file.write_text(json.dumps({name: value for name, value in about.items() if name != "keys"}))
@@ -222,7 +217,7 @@ def test_nothing_is_known_without_keys_without_a_pipeline_and_without_results(ch
     assert verdict(checked, "quickstart")[1] == "quickstart: not known: there is nothing in 'results/quickstart' that vehest published"
 
 
-def test_a_pipeline_that_cannot_be_run_any_more_is_stale(checked: Place) -> None:
+def test_a_pipeline_that_cannot_be_run_any_more_is_stale(checked):
     changed(checked.folder / "pipelines" / "small.yaml", sweeps=[["estimator=luenberger", "training.nothing=1"]])
     code, line = verdict(checked)
     assert code == 3
@@ -237,12 +232,12 @@ def test_a_pipeline_that_cannot_be_run_any_more_is_stale(checked: Place) -> None
         ((*CHECK, "small", "seed=7"), 2, "'seed=7' changes the results"),
     ],
 )
-def test_what_cannot_be_checked_is_one_line(checked: Place, words: tuple[str, ...], code: int, message: str) -> None:
+def test_what_cannot_be_checked_is_one_line(checked, words, code, message):
     ended, line = checked.refused(*words)
     assert (ended, message in line) == (code, True), line
 
 
-def test_where_nothing_is_published_there_is_nothing_to_check(place: Place) -> None:
+def test_where_nothing_is_published_there_is_nothing_to_check(place):
     code, line = place.refused(*CHECK)
     assert code == 4
     assert "no study is published in 'results'" in line
@@ -251,13 +246,13 @@ def test_where_nothing_is_published_there_is_nothing_to_check(place: Place) -> N
 # Published weights
 
 
-def models(folder: Path) -> dict[str, dict[str, bytes]]:
+def models(folder):
     """Files of every model in an output root, but those with times."""
     found = {model.name: contents(model) for model in (folder / "outputs" / "train").iterdir() if not model.name.startswith(".")}
     return {name: {file: own for file, own in files.items() if file not in (TIMINGS, "manifest.json")} for name, files in found.items()}
 
 
-def test_a_run_elsewhere_takes_the_published_weights_and_comes_to_the_same_results(published: Path, checked: Place) -> None:
+def test_a_run_elsewhere_takes_the_published_weights_and_comes_to_the_same_results(published, checked):
     before = contents(checked.folder / "results")
     code, _, said = checked(*RUN)
     assert code == 0
@@ -266,7 +261,7 @@ def test_a_run_elsewhere_takes_the_published_weights_and_comes_to_the_same_resul
     assert contents(checked.folder / "results") == before
 
 
-def test_weights_of_another_key_are_not_taken(checked: Place) -> None:
+def test_weights_of_another_key_are_not_taken(checked):
     changed(checked.folder / "pipelines" / "small.yaml", sweeps=[QUICK["sweeps"][0], [*QUICK["sweeps"][1][:-1], "training.max_epochs=1"]])
     code, _, said = checked(*RUN)
     assert code == 0
@@ -274,14 +269,14 @@ def test_weights_of_another_key_are_not_taken(checked: Place) -> None:
     assert said.count("1 epochs") == 2
 
 
-def test_trainings_are_repeated_on_demand(checked: Place) -> None:
+def test_trainings_are_repeated_on_demand(checked):
     code, _, said = checked(*RUN, "--retrain")
     assert code == 0
     assert "taken from" not in said
     assert said.count("2 epochs") == 2
 
 
-def test_damaged_weights_are_refused_in_one_line(checked: Place) -> None:
+def test_damaged_weights_are_refused_in_one_line(checked):
     file = checked.folder / "results" / "small" / "weights.safetensors"
     file.write_bytes(file.read_bytes()[:100])
     code, _, err = checked(*RUN)

@@ -1,12 +1,9 @@
 """A finished study is recognised by what it was made from, and prints what a run in full would print."""
 
-from __future__ import annotations
-
 import json
 import os
 import subprocess
 import sys
-from pathlib import Path
 
 import pytest
 import yaml
@@ -29,11 +26,11 @@ def study(place):
     return place
 
 
-def cached() -> bool:
+def cached():
     return RunCache("run", WORDS[0], WORDS[1:]).load() is not None
 
 
-def forget(place) -> None:
+def forget(place):
     for record in (place.folder / "outputs" / "finished").iterdir():
         record.unlink()
 
@@ -89,7 +86,7 @@ def test_a_published_copy_that_is_gone_is_published_again(study):
 
 
 def test_whatever_differs_is_looked_at_anew(study, monkeypatch):
-    def changed(file: Path, content: bytes) -> None:
+    def changed(file, content):
         former, about = file.read_bytes(), file.stat()
         file.write_bytes(content)
         os.utime(file, ns=(about.st_atime_ns, about.st_mtime_ns))

@@ -1,13 +1,9 @@
 """What describes something, and is damaged, hostile or of another version, is one line; and no name in it leads out of the output root."""
 
-from __future__ import annotations
-
 import json
 import sys
 import tempfile
-from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pyarrow.parquet as pq
@@ -45,7 +41,7 @@ from vehest.training.checkpoints import Checkpoint, load_checkpoint, resume_epoc
 HOSTILE = ["../../../evil", "/tmp/evil", "..", "a/b", "a\\b", "a\0b", "", ".hidden", "x" * 300, "ä" * 200, "a\nb"]
 
 
-def changed(content: Any, /, **changes: Any) -> Any:
+def changed(content, /, **changes):
     return {key: value for key, value in {**content, **changes}.items() if value is not ...}
 
 
@@ -53,7 +49,7 @@ def changed(content: Any, /, **changes: Any) -> Any:
 
 
 @pytest.fixture
-def model(tmp_path: Path) -> Path:
+def model(tmp_path):
     folder = tmp_path / "model"
     folder.mkdir()
     estimator = estimator_class("ksnn").from_config({})
@@ -62,12 +58,12 @@ def model(tmp_path: Path) -> Path:
     return folder
 
 
-def rewrite(model: Path, **changes: Any) -> None:
+def rewrite(model, **changes):
     path = model / "model.yaml"
     path.write_text(yaml.safe_dump(changed(yaml.safe_load(path.read_text()), **changes)))
 
 
-def test_the_description_of_a_model_is_read_with_its_types(model: Path) -> None:
+def test_the_description_of_a_model_is_read_with_its_types(model):
     described = read_description(model)
     assert isinstance(described, Description)
     assert (described.estimator, described.about.seed, described.about.datasets) == ("ksnn", 3, ("d",))
@@ -91,7 +87,7 @@ def test_the_description_of_a_model_is_read_with_its_types(model: Path) -> None:
         ({"evil": 1}, "unknown key 'evil'"),
     ],
 )
-def test_a_description_that_does_not_fit_is_one_line_that_names_file_and_key(model: Path, changes: dict[str, Any], message: str) -> None:
+def test_a_description_that_does_not_fit_is_one_line_that_names_file_and_key(model, changes, message):
     rewrite(model, **changes)
     with pytest.raises(VehestError) as caught:
         load_model(model)
@@ -101,13 +97,13 @@ def test_a_description_that_does_not_fit_is_one_line_that_names_file_and_key(mod
 
 
 @pytest.mark.parametrize("text", ["[]", "3", "null", "2026-01-01", "a: &a [*a]", "{" * 100, b"\xff", "a: !!python/object:os {}"])
-def test_a_description_that_is_none_is_one_line(model: Path, text: str | bytes) -> None:
+def test_a_description_that_is_none_is_one_line(model, text):
     (model / "model.yaml").write_bytes(text if isinstance(text, bytes) else text.encode())
     with pytest.raises(DataError, match=r"model\.yaml"):
         load_model(model)
 
 
-def test_weights_that_are_not_finite_are_counted_by_tensor(model: Path) -> None:
+def test_weights_that_are_not_finite_are_counted_by_tensor(model):
     weights = load_file(model / "model.safetensors")
     name = max(weights, key=lambda own: weights[own].size)
     weights[name] = weights[name].copy()
@@ -117,7 +113,7 @@ def test_weights_that_are_not_finite_are_counted_by_tensor(model: Path) -> None:
         load_model(model)
 
 
-def test_levels_that_each_recording_tells_may_be_open_and_not_infinite(tmp_path: Path) -> None:
+def test_levels_that_each_recording_tells_may_be_open_and_not_infinite(tmp_path):
     estimator = estimator_class("kalman").from_config({})
     save_model(estimator, tmp_path)
     load_model(tmp_path)
@@ -127,14 +123,14 @@ def test_levels_that_each_recording_tells_may_be_open_and_not_infinite(tmp_path:
 
 
 @pytest.mark.parametrize("dtype", [np.float16, np.int64, np.uint8, np.bool_])
-def test_weights_of_another_type_are_refused(model: Path, dtype: Any) -> None:
+def test_weights_of_another_type_are_refused(model, dtype):
     weights = load_file(model / "model.safetensors")
     save_file({name: values.astype(dtype) for name, values in weights.items()}, model / "model.safetensors")
     with pytest.raises(DataError, match=r"tensor '\w+.*' is of type \w+, not one of: F32, F64"):
         load_model(model)
 
 
-def test_weights_of_a_type_that_numpy_does_not_know_are_refused(model: Path) -> None:
+def test_weights_of_a_type_that_numpy_does_not_know_are_refused(model):
     save_tensors({"a": torch.zeros(4, dtype=torch.bfloat16)}, model / "model.safetensors")
     with pytest.raises(DataError, match="is of type BF16"):
         load_model(model)
@@ -149,7 +145,7 @@ def test_weights_of_a_type_that_numpy_does_not_know_are_refused(model: Path) -> 
         (None, {"a": {"dtype": "F64", "shape": [2], "data_offsets": [-16, 0]}}),
     ],
 )
-def test_a_header_that_lies_is_one_line(model: Path, length: int | None, header: Any) -> None:
+def test_a_header_that_lies_is_one_line(model, length, header):
     text = json.dumps(header).encode()
     (model / "model.safetensors").write_bytes((length or len(text)).to_bytes(8, "little") + text + bytes(16))
     with pytest.raises(DataError, match=r"model\.safetensors"):
@@ -159,15 +155,15 @@ def test_a_header_that_lies_is_one_line(model: Path, length: int | None, header:
 # ------------------------------------------------------------------------------------------------------------- manifests
 
 
-def plan(output: Path, label: str = "mine") -> StagePlan:
+def plan(output, label="mine"):
     return StagePlan("stage", label, {"a": 1.0}, {"raw": "0"}, "code", output)
 
 
-def made(output: Path, label: str = "mine") -> Artefact:
+def made(output, label="mine"):
     return make(plan(output, label), lambda folder: (folder / "a.txt").write_text("a") and None)
 
 
-def test_a_manifest_states_its_format_and_one_without_is_read_too(tmp_path: Path) -> None:
+def test_a_manifest_states_its_format_and_one_without_is_read_too(tmp_path):
     artefact = made(tmp_path)
     path = artefact.folder / "manifest.json"
     content = json.loads(path.read_text())
@@ -190,9 +186,7 @@ def test_a_manifest_states_its_format_and_one_without_is_read_too(tmp_path: Path
         *[({"outputs": {name: {"sha256": "0" * 64, "bytes": 1}}}, "") for name in HOSTILE],
     ],
 )
-def test_a_manifest_that_does_not_fit_is_one_line_and_its_artefact_is_not_there(
-    tmp_path: Path, changes: dict[str, Any], message: str
-) -> None:
+def test_a_manifest_that_does_not_fit_is_one_line_and_its_artefact_is_not_there(tmp_path, changes, message):
     artefact = made(tmp_path)
     path = artefact.folder / "manifest.json"
     path.write_text(json.dumps(changed(json.loads(path.read_text()), **changes)))
@@ -203,14 +197,14 @@ def test_a_manifest_that_does_not_fit_is_one_line_and_its_artefact_is_not_there(
 
 
 @pytest.mark.parametrize("text", ["", "[]", "[" * 100_000, '{"format": 1', "NaN"])
-def test_a_manifest_that_is_none_is_one_line(tmp_path: Path, text: str) -> None:
+def test_a_manifest_that_is_none_is_one_line(tmp_path, text):
     artefact = made(tmp_path)
     (artefact.folder / "manifest.json").write_text(text)
     with pytest.raises(DataError):
         read_artefact(artefact.folder)
 
 
-def test_a_file_of_an_artefact_is_no_link(tmp_path: Path) -> None:
+def test_a_file_of_an_artefact_is_no_link(tmp_path):
     artefact = made(tmp_path / "out")
     (tmp_path / "elsewhere").write_text("a")
     (artefact.folder / "a.txt").unlink()
@@ -219,7 +213,7 @@ def test_a_file_of_an_artefact_is_no_link(tmp_path: Path) -> None:
         read_artefact(artefact.folder)
 
 
-def test_a_model_whose_manifest_names_no_ranges_is_one_line(tmp_path: Path) -> None:
+def test_a_model_whose_manifest_names_no_ranges_is_one_line(tmp_path):
     artefact = made(tmp_path)
     with pytest.raises(DataError, match=r"manifest\.json': config describes no training \('train'\)"):
         learnt_spans(artefact)
@@ -231,7 +225,7 @@ def test_a_model_whose_manifest_names_no_ranges_is_one_line(tmp_path: Path) -> N
         learnt_spans(told)
 
 
-def test_labels_that_are_fine_name_the_folder_as_before(tmp_path: Path) -> None:
+def test_labels_that_are_fine_name_the_folder_as_before(tmp_path):
     own = plan(tmp_path, "ksnn-linear_bias_p2-seed0-on-ferrari_drive")
     assert own.folder == tmp_path / "stage" / f"{own.label}-{own.key[:12]}"
     assert own.checkpoint_folder == tmp_path / "checkpoints" / f"{own.label}-{own.key[:12]}"
@@ -240,12 +234,12 @@ def test_labels_that_are_fine_name_the_folder_as_before(tmp_path: Path) -> None:
 # --------------------------------------------------------------------------------------------------------------- Parquet
 
 
-def recording(name: str = "lap", n: int = 20) -> Recording:
+def recording(name="lap", n=20):
     provenance = {"mass": 1000.0}
     return Recording(name, "car", 10.0, 0.0, {"vx": np.ones(n), "vy_ref": np.zeros(n)}, provenance=provenance)
 
 
-def redescribed(path: Path, change: Callable[[dict[str, Any]], Any]) -> None:
+def redescribed(path, change):
     table = pq.read_table(path)
     content = change(json.loads(table.schema.metadata[b"vehest"]))
     described = content if isinstance(content, bytes) else json.dumps(content).encode()
@@ -265,7 +259,7 @@ def redescribed(path: Path, change: Callable[[dict[str, Any]], Any]) -> None:
         ({"content": "estimate"}, "not a recording that vehest wrote"),
     ],
 )
-def test_what_a_recording_says_about_itself_is_checked(tmp_path: Path, changes: dict[str, Any], message: str) -> None:
+def test_what_a_recording_says_about_itself_is_checked(tmp_path, changes, message):
     path = tmp_path / "lap.parquet"
     write_recording(recording(), path)
     redescribed(path, lambda content: changed(content, **changes))
@@ -276,7 +270,7 @@ def test_what_a_recording_says_about_itself_is_checked(tmp_path: Path, changes: 
 
 
 @pytest.mark.parametrize("text", [b"\xff", b"{", b"[" * 100_000])
-def test_a_recording_whose_description_is_damaged_is_not_taken_for_a_table(tmp_path: Path, text: bytes) -> None:
+def test_a_recording_whose_description_is_damaged_is_not_taken_for_a_table(tmp_path, text):
     path = tmp_path / "lap.parquet"
     write_recording(recording(), path)
     redescribed(path, lambda _: text)
@@ -296,7 +290,7 @@ def test_a_recording_whose_description_is_damaged_is_not_taken_for_a_table(tmp_p
         ({"mode": "psychic"}, "mode 'psychic' is not one of"),
     ],
 )
-def test_sizes_of_an_estimate_are_held_against_its_columns(tmp_path: Path, changes: dict[str, Any], message: str) -> None:
+def test_sizes_of_an_estimate_are_held_against_its_columns(tmp_path, changes, message):
     path = tmp_path / "estimate.parquet"
     covariance = np.tile(np.eye(2), (5, 1, 1))
     channels = {"vy": np.zeros(5), "sideslip": np.zeros(5)}
@@ -308,7 +302,7 @@ def test_sizes_of_an_estimate_are_held_against_its_columns(tmp_path: Path, chang
     assert message in str(caught.value)
 
 
-def test_columns_of_another_type_are_refused(tmp_path: Path) -> None:
+def test_columns_of_another_type_are_refused(tmp_path):
     path = tmp_path / "lap.parquet"
     write_recording(recording(), path)
     table = pq.read_table(path)
@@ -321,13 +315,9 @@ def test_columns_of_another_type_are_refused(tmp_path: Path) -> None:
 # ------------------------------------------------------------------------------------------- what stages read back
 
 
-def test_tables_that_are_damaged_are_one_line(tmp_path: Path) -> None:
+def test_tables_that_are_damaged_are_one_line(tmp_path):
     path = tmp_path / "fit.csv"
-    for text in (
-        "metric\n1\n",
-        "metric,value\nepochs,many\n",
-        'metric,value\n"open,1\n',
-    ):
+    for text in ("metric\n1\n", "metric,value\nepochs,many\n", 'metric,value\n"open,1\n'):
         path.write_text(text)
         with pytest.raises(DataError, match=r"fit\.csv"):
             read_fit_metrics(tmp_path)
@@ -342,7 +332,7 @@ def test_tables_that_are_damaged_are_one_line(tmp_path: Path) -> None:
     assert read_rows(path)[0] == {"metric": "epochs", "value": "7"}
 
 
-def test_frames_have_the_columns_and_numbers_that_are_asked_for(tmp_path: Path) -> None:
+def test_frames_have_the_columns_and_numbers_that_are_asked_for(tmp_path):
     path = tmp_path / "metrics.csv"
     for text, message in (("", "cannot be read as CSV"), ("a\n1\n", "no column 'value'"), ("value\nmany\n", "holds text")):
         path.write_text(text)
@@ -350,7 +340,7 @@ def test_frames_have_the_columns_and_numbers_that_are_asked_for(tmp_path: Path) 
             read_frame(path, ("value",), numbers=("value",))
 
 
-def test_a_checkpoint_that_says_nonsense_counts_as_none(tmp_path: Path) -> None:
+def test_a_checkpoint_that_says_nonsense_counts_as_none(tmp_path):
     for values in ({"epoch": "three"}, {}, {"epoch": 3, "finished": "no"}):
         save_checkpoint(tmp_path, Checkpoint({"a": torch.zeros(2)}, values))
         assert load_checkpoint(tmp_path) is None
@@ -359,7 +349,7 @@ def test_a_checkpoint_that_says_nonsense_counts_as_none(tmp_path: Path) -> None:
     assert resume_epoch(tmp_path) == 3
 
 
-def test_a_published_study_that_is_damaged_shows_nothing(tmp_path: Path) -> None:
+def test_a_published_study_that_is_damaged_shows_nothing(tmp_path):
     for text in ("[]", "{", '{"kinds": [1]}', "[" * 100_000):
         (tmp_path / PROVENANCE).write_text(text)
         assert published_in(tmp_path) is None
@@ -368,7 +358,7 @@ def test_a_published_study_that_is_damaged_shows_nothing(tmp_path: Path) -> None
 
 
 @pytest.mark.parametrize("link", ["results", "results/study"])
-def test_nothing_is_published_through_a_link(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, link: str) -> None:
+def test_nothing_is_published_through_a_link(tmp_path, monkeypatch, link):
     monkeypatch.chdir(tmp_path)
     report = made(tmp_path / "out")
     (tmp_path / "elsewhere").mkdir()
@@ -402,7 +392,7 @@ PIPELINE = {"study": "mine", "report": "drive", "split": "quickstart", "sweeps":
         ({"report": ...}, "it needs study, report and one of: split and sweeps"),
     ],
 )
-def test_a_pipeline_that_does_not_fit_is_one_line(tmp_path: Path, changes: dict[str, Any], message: str) -> None:
+def test_a_pipeline_that_does_not_fit_is_one_line(tmp_path, changes, message):
     path = tmp_path / "mine.yaml"
     path.write_text(yaml.safe_dump(changed(PIPELINE, **changes)))
     with pytest.raises(ConfigurationError) as caught:
@@ -415,7 +405,7 @@ BOMB = "\n".join(["a0: &a0 [x, x, x, x, x, x, x, x, x]", *(f"a{n}: &a{n} [{', '.
 
 
 @pytest.mark.parametrize("text", [BOMB, "[" * 200, "[1, 2", b"\xff", "3", "- a", "a: &a {b: *a}"])
-def test_a_pipeline_that_is_none_is_one_line(tmp_path: Path, text: str | bytes) -> None:
+def test_a_pipeline_that_is_none_is_one_line(tmp_path, text):
     path = tmp_path / "mine.yaml"
     path.write_bytes(text if isinstance(text, bytes) else text.encode())
     with pytest.raises(ConfigurationError, match=r"mine\.yaml"):
@@ -423,14 +413,14 @@ def test_a_pipeline_that_is_none_is_one_line(tmp_path: Path, text: str | bytes) 
 
 
 @pytest.fixture
-def conf(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+def conf(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "conf" / "dataset").mkdir(parents=True)
     return tmp_path / "conf"
 
 
 @pytest.mark.parametrize("text", ["hydra:\n  searchpath: [pkg://antigravity]", "a: &a {hydra: {searchpath: [pkg://antigravity]}}\n<<: *a"])
-def test_no_root_file_in_conf_reaches_hydras_search_path(conf: Path, text: str) -> None:
+def test_no_root_file_in_conf_reaches_hydras_search_path(conf, text):
     (conf / "ingest.yaml").write_text(f"{text}\ndefaults: [dataset: tabular, common, _self_]")
     assert compose_config("ingest", ["dataset=sim_small"])["dataset"]["name"] == "sim_small"
     assert "antigravity" not in sys.modules
@@ -448,7 +438,7 @@ def test_no_root_file_in_conf_reaches_hydras_search_path(conf: Path, text: str) 
         ("defaults:\n  - ../../elsewhere", "Could not load 'dataset/../../elsewhere'"),
     ],
 )
-def test_a_file_in_conf_that_is_none_is_one_line(conf: Path, text: str | bytes, message: str) -> None:
+def test_a_file_in_conf_that_is_none_is_one_line(conf, text, message):
     (conf / "dataset" / "mine.yaml").write_bytes(text if isinstance(text, bytes) else text.encode())
     with pytest.raises(ConfigurationError) as caught:
         compose_config("ingest", ["dataset=mine"])
@@ -456,7 +446,7 @@ def test_a_file_in_conf_that_is_none_is_one_line(conf: Path, text: str | bytes, 
     assert "\n" not in str(caught.value)
 
 
-def test_shapes_of_shared_groups_are_checked() -> None:
+def test_shapes_of_shared_groups_are_checked():
     good = {"output": "o", "limits": {}, "downsample": {"method": "decimate"}, "tracking": {"name": "none"}, "seed": 0}
     validated(Root, good, "", error=ConfigurationError)
     for changes, message in (
@@ -474,13 +464,13 @@ def test_shapes_of_shared_groups_are_checked() -> None:
 @pytest.mark.parametrize(
     "override", ["hydra.searchpath=[pkg://antigravity]", "++hydra.searchpath=[pkg://antigravity]", "+hydra/launcher=evil"]
 )
-def test_no_override_reaches_hydra_itself(override: str) -> None:
+def test_no_override_reaches_hydra_itself(override):
     with pytest.raises(ConfigurationError, match="is an option of Hydra itself"):
         compose_config("train", [override])
     assert "antigravity" not in sys.modules
 
 
-def test_the_protocol_is_read_with_its_types() -> None:
+def test_the_protocol_is_read_with_its_types():
     assert protocol_from_config({"rate_hz": 20, "initial_state": False, "sequence_seconds": None}).rate_hz == 20.0
     for wrong in (
         {"rate_hz": "20"},
@@ -494,7 +484,7 @@ def test_the_protocol_is_read_with_its_types() -> None:
             protocol_from_config(wrong)
 
 
-def test_transforms_are_read_with_their_types() -> None:
+def test_transforms_are_read_with_their_types():
     assert transform_from_config({"name": "low_pass", "cutoff_hz": 5, "channels": "ay"}) is not None
     for wrong in ({"cutoff_hz": "5"}, {"cutoff_hz": True}, {"cutoff_hz": 5, "direction": "sideways"}, {"cutoff_hz": 5, "zero": 1}, {}):
         with pytest.raises(ConfigurationError, match=r"transform 'low_pass': "):
@@ -519,7 +509,7 @@ TABULAR = {"name": "mine", "source": "tabular", "rate_hz": 100}
         ({"name": "../evil"}, "must be made of letters"),
     ],
 )
-def test_a_data_set_that_does_not_fit_names_data_set_and_key(changes: dict[str, Any], message: str) -> None:
+def test_a_data_set_that_does_not_fit_names_data_set_and_key(changes, message):
     with pytest.raises(ConfigurationError) as caught:
         open_source(changed(TABULAR, **changes))
     assert message in str(caught.value)
@@ -529,7 +519,7 @@ def test_a_data_set_that_does_not_fit_names_data_set_and_key(changes: dict[str, 
 # ----------------------------------------------------------------------------------------------------------------- names
 
 
-def tree(folder: Path) -> set[str]:
+def tree(folder):
     return {path.relative_to(folder).as_posix() for path in folder.rglob("*")}
 
 
@@ -538,13 +528,13 @@ names = st.one_of(st.sampled_from(HOSTILE), st.text(max_size=40), st.text(alphab
 
 @settings(max_examples=25, deadline=None)
 @given(label=names, stage=names, output=names, recording_id=names)
-def test_no_name_inside_a_file_leads_out_of_the_output_root(label: str, stage: str, output: str, recording_id: str) -> None:
+def test_no_name_inside_a_file_leads_out_of_the_output_root(label, stage, output, recording_id):
     with tempfile.TemporaryDirectory() as made_here:
         root = Path(made_here)
         inside = root / "a" / "b" / "out"
         inside.mkdir(parents=True)
         before = tree(root)
-        attempts: list[Callable[[], object]] = [
+        attempts = [
             lambda: make(StagePlan(stage, label, {}, {}, "", inside), lambda folder: None),
             lambda: save_checkpoint(plan(inside, label).checkpoint_folder, Checkpoint({}, {"epoch": 1})),
             lambda: write_recording(recording(recording_id), inside / recording_file(recording_id)),
@@ -558,7 +548,7 @@ def test_no_name_inside_a_file_leads_out_of_the_output_root(label: str, stage: s
         assert all(name.startswith("a/b/out/") for name in tree(root) - before)
 
 
-def _downsampled_from(inside: Path, output: str) -> None:
+def _downsampled_from(inside, output):
     """Downsample what a manifest names that somebody else has written."""
     ingested = make(plan(inside, "ingested"), lambda folder: write_recording(recording(), folder / "lap.parquet"))
     path = ingested.folder / "manifest.json"
@@ -569,14 +559,14 @@ def _downsampled_from(inside: Path, output: str) -> None:
     write_downsample(read_artefact(ingested.folder), {"rate_hz": 10.0, "method": "decimate", "transforms": []}, target)
 
 
-def test_formats_are_whole_numbers_between_the_oldest_and_the_newest() -> None:
+def test_formats_are_whole_numbers_between_the_oldest_and_the_newest():
     assert check_format(1, 2, "'f'") == 1
     for wrong in (0, 3, True, 1.5, None, "1"):
         with pytest.raises(DataError, match="'f'"):
             check_format(wrong, 2, "'f'")
 
 
-def test_whole_numbers_with_a_point_stay_as_they_are_where_anything_may_stand() -> None:
+def test_whole_numbers_with_a_point_stay_as_they_are_where_anything_may_stand():
     described = validated(Description, {"format": 1.0, "estimator": "a", "settings": {"x": 5.0, "y": [2.0]}}, "'f'")
     assert described.format == 1
     assert isinstance(described.format, int)

@@ -1,16 +1,12 @@
 """`vehest simulate`: seeds, interruption, drives that go wrong, and what it refuses."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 import yaml
 
-from place import Place
 from vehest.data.store import read_recording
 from vehest.run.config_files import complete_override
 from vehest.simulation.plant import compiled
@@ -20,7 +16,7 @@ LAP = {"name": "laps", "course": "handling", "duration": 3.0}
 MANY_TURNS = {"name": "j_turn", "speed": 30.0, "severity": 1.4, "steer_time": 0.15, "turn_time": 5.0}
 
 
-def simulated(place: Place, drives: list[dict[str, Any]], **more: object) -> None:
+def simulated(place, drives, **more):
     """Write conf/dataset/sim.yaml."""
     content = {
         "defaults": [{"/vehicle@vehicle": "bmw_320i_low"}, "_self_"],
@@ -38,17 +34,17 @@ def simulated(place: Place, drives: list[dict[str, Any]], **more: object) -> Non
     (place.folder / "conf" / "dataset" / "sim.yaml").write_text(yaml.safe_dump(content))
 
 
-def made(place: Place, *arguments: str) -> dict[str, Any]:
+def made(place, *arguments):
     code, out, err = place("simulate", "sim", *arguments, "--json")
     assert code == 0, err
     return json.loads(out)
 
 
-def samples(folder: str) -> dict[str, np.ndarray]:
+def samples(folder):
     return {file.stem: read_recording(file)["ay"] for file in sorted(Path(folder).glob("*.parquet"))}
 
 
-def test_a_seed_gives_the_same_samples_however_many_processes_make_them(place: Place) -> None:
+def test_a_seed_gives_the_same_samples_however_many_processes_make_them(place):
     simulated(place, [{"id": "lap", "count": 3, "manoeuvre": LAP}])
     alone = samples(made(place, "seed=1")["folder"])
     together = samples(made(place, "seed=1", "--jobs", "2", "--force")["folder"])
@@ -59,7 +55,7 @@ def test_a_seed_gives_the_same_samples_however_many_processes_make_them(place: P
     assert not any(np.array_equal(values, other[name]) for name, values in alone.items())
 
 
-def test_seed_is_short_for_the_data_sets_seed(place: Place) -> None:
+def test_seed_is_short_for_the_data_sets_seed(place):
     simulated(place, [{"id": "lap", "manoeuvre": LAP}])
     folder = made(place, "seed=1")["folder"]
     again = made(place, "dataset.seed=1")
@@ -69,7 +65,7 @@ def test_seed_is_short_for_the_data_sets_seed(place: Place) -> None:
     assert (code, json.loads(out)["folder"]) == (0, folder), "the ordinary ingest"
 
 
-def test_everything_it_makes_says_that_it_is_simulated(place: Place) -> None:
+def test_everything_it_makes_says_that_it_is_simulated(place):
     simulated(place, [{"id": "lap", "manoeuvre": LAP}])
     (file,) = Path(made(place)["folder"]).glob("*.parquet")
     recording = read_recording(file)
@@ -79,11 +75,11 @@ def test_everything_it_makes_says_that_it_is_simulated(place: Place) -> None:
     assert out.startswith("lap: simulated, bmw_320i_low, 50 Hz")
 
 
-def test_drives_that_were_done_before_a_kill_are_not_made_again(place: Place, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_drives_that_were_done_before_a_kill_are_not_made_again(place, monkeypatch):
     simulated(place, [{"id": "lap", "count": 3, "manoeuvre": LAP}])
     read, begun = SimulatedSource.read, []
 
-    def interrupted(self: SimulatedSource, recording_id: str):
+    def interrupted(self, recording_id):
         begun.append(recording_id)
         if begun == ["lap_001", "lap_002"]:
             raise KeyboardInterrupt
@@ -95,7 +91,7 @@ def test_drives_that_were_done_before_a_kill_are_not_made_again(place: Place, mo
     assert begun == ["lap_001", "lap_002", "lap_002", "lap_003"]
 
 
-def test_a_drive_that_spins_is_kept_flagged_and_counted(place: Place) -> None:
+def test_a_drive_that_spins_is_kept_flagged_and_counted(place):
     tail_happy = {"tire": {"p_dy1": 1.0}, "tire_rear": {"p_dy1": 0.6}}
     simulated(
         place,
@@ -115,7 +111,7 @@ def test_a_drive_that_spins_is_kept_flagged_and_counted(place: Place) -> None:
     assert "spun: 1 (wild)" in out
 
 
-def test_a_spin_at_high_speed_is_no_impossible_recording(place: Place) -> None:
+def test_a_spin_at_high_speed_is_no_impossible_recording(place):
     wild = {"name": "random_steer", "speed": [45.0, 60.0], "severity": [1.4, 1.8], "duration": 8.0}
     simulated(place, [{"id": "fast", "count": 4, "manoeuvre": wild}], defaults=[{"/vehicle@vehicle": "bmw_545i"}, "_self_"])
     outcome = made(place)
@@ -128,7 +124,7 @@ def test_a_spin_at_high_speed_is_no_impossible_recording(place: Place) -> None:
     assert "the simulated car spun here" in out
 
 
-def test_a_report_of_simulated_drives_never_says_real(place: Place) -> None:
+def test_a_report_of_simulated_drives_never_says_real(place):
     simulated(place, [{"id": name, "manoeuvre": {**LAP, "duration": 12.0}} for name in "abc"], rate_hz=100)
     file = place.folder / "conf" / "dataset" / "sim.yaml"
     content = yaml.safe_load(file.read_text())
@@ -148,7 +144,7 @@ def test_a_report_of_simulated_drives_never_says_real(place: Place) -> None:
     assert "| real |" not in report
 
 
-def test_looking_at_a_simulated_data_set_reads_what_is_in_the_store(place: Place, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_looking_at_a_simulated_data_set_reads_what_is_in_the_store(place, monkeypatch):
     simulated(place, [{"id": "lap", "manoeuvre": LAP}])
     made(place)
     monkeypatch.setattr(compiled, "advance", None)  # nothing can be simulated any more
@@ -157,13 +153,13 @@ def test_looking_at_a_simulated_data_set_reads_what_is_in_the_store(place: Place
     assert "error" not in out
 
 
-def test_only_simulated_data_sets_are_simulated(place: Place) -> None:
+def test_only_simulated_data_sets_are_simulated(place):
     code, line = place.refused("simulate", "mine")
     assert code == 2
     assert line == "error: data set 'mine' is not simulated but read from files; run 'vehest ingest mine'"
 
 
-def test_a_bad_seed_is_one_line(place: Place) -> None:
+def test_a_bad_seed_is_one_line(place):
     simulated(place, [{"id": "lap", "manoeuvre": LAP}])
     assert place.refused("simulate", "sim", "seed=one") == (
         2,
@@ -171,13 +167,13 @@ def test_a_bad_seed_is_one_line(place: Place) -> None:
     )
 
 
-def test_a_manoeuvre_that_is_misspelt_is_one_line(place: Place) -> None:
+def test_a_manoeuvre_that_is_misspelt_is_one_line(place):
     simulated(place, [{"id": "lap", "manoeuvre": {"name": "slalon"}}])
     code, line = place.refused("simulate", "sim")
     assert code == 2
     assert "there is no manoeuvre 'slalon'; there are braking_in_turn, double_lane_change" in line
 
 
-def test_options_of_the_data_set_are_offered(place: Place) -> None:
+def test_options_of_the_data_set_are_offered(place):
     offered = [text for text, _ in complete_override("ingest", ["dataset=sim_small"], "dataset.")]
     assert {"dataset.seed=0", "dataset.rate_hz=100"} <= set(offered)

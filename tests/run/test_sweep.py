@@ -1,7 +1,5 @@
 """A sweep: all combinations over their seeds, intervals, a choice on validation alone, heat maps; and what is skipped or fails."""
 
-from __future__ import annotations
-
 import json
 import math
 import xml.etree.ElementTree as ElementTree
@@ -27,7 +25,7 @@ QUICK = ("split=mine", "estimator=ksnn", "training.max_epochs=1", "training.batc
 GRID = (*QUICK, "estimator.n_local=2,3", "estimator.n_hidden=0,1", "seed=range(2)")
 
 
-def jobs_of(scores: dict[tuple[object, ...], dict[str, list[float]]], keys: tuple[str, ...]) -> pd.DataFrame:
+def jobs_of(scores, keys):
     """A table of jobs from settings -> set -> RMSE(β) of each seed."""
     rows = []
     for number, (values, sets) in enumerate(scores.items()):
@@ -38,7 +36,7 @@ def jobs_of(scores: dict[tuple[object, ...], dict[str, list[float]]], keys: tupl
     return pd.DataFrame(rows).assign(error="", n_parameters=12, epochs=5.0)
 
 
-def artefacts_of(jobs: pd.DataFrame, keys: tuple[str, ...], kind: str = "simulated") -> SweepArtefacts:
+def artefacts_of(jobs, keys, kind="simulated"):
     spans = {name: Span("mine", name, -math.inf, math.inf) for name in ("one", "two", "three")}
     split = Split("mine", (spans["one"],), (spans["two"],), {"test": (spans["three"],)})
     return SweepArtefacts("s", "vehest sweep", keys, jobs, split, Protocol(20.0, 10.0, 1.5), {"mine": kind}, {"mine": "My car"}, ["facts"])
@@ -104,7 +102,7 @@ def test_a_combination_with_a_failed_seed_is_shown_and_never_chosen():
 
 
 def test_heat_maps_need_two_numeric_keys_and_have_a_panel_a_boolean():
-    def score(value: float) -> dict[str, list[float]]:
+    def score(value):
         return {"validation": [value, value + 0.1], "test": [2 * value, 2 * value]}
 
     keys = ("estimator.n_local", "estimator.n_hidden", "estimator.bias")

@@ -1,7 +1,5 @@
 """Runs in MLflow: in the local store, on a server of its own, and what happens when that server is away."""
 
-from __future__ import annotations
-
 import os
 import signal
 import socket
@@ -12,11 +10,9 @@ import threading
 import urllib.request
 from contextlib import suppress
 from dataclasses import replace
-from pathlib import Path
 
 import pytest
 
-from place import Place
 from processes import start, wait_for
 from vehest.run.artefacts import MANIFEST, Artefact, read_artefact
 from vehest.run.tracking import Tracker
@@ -57,7 +53,7 @@ def test_training_goes_on_when_the_tracking_server_is_away(place):
 TRAIN = ("train", "split=mine", "training.max_epochs=2")
 
 
-def _local(place: Place, stage: str = "") -> list:
+def _local(place, stage=""):
     """Runs in the local store, of one stage or of all."""
     from mlflow import MlflowClient
 
@@ -67,7 +63,7 @@ def _local(place: Place, stage: str = "") -> list:
     return [run for run in runs if run.data.tags["vehest.stage"] == stage or (not stage and run.data.tags["vehest.stage"] != "study")]
 
 
-def test_what_a_server_that_was_away_missed_is_logged_by_the_next_run(place: Place, monkeypatch: pytest.MonkeyPatch):
+def test_what_a_server_that_was_away_missed_is_logged_by_the_next_run(place, monkeypatch):
     with monkeypatch.context() as away:
         away.setattr(Tracker, "_log", _raising(ConnectionError("no answer")))
         code, _, err = place("run", "small")
@@ -81,7 +77,7 @@ def test_what_a_server_that_was_away_missed_is_logged_by_the_next_run(place: Pla
 
 
 @pytest.mark.parametrize("step", ["log_batch", "log_artifact", "log_figure", "set_terminated"])
-def test_a_run_that_was_half_logged_is_completed(place: Place, monkeypatch: pytest.MonkeyPatch, step: str):
+def test_a_run_that_was_half_logged_is_completed(place, monkeypatch, step):
     from mlflow import MlflowClient
 
     with monkeypatch.context() as killed:
@@ -96,7 +92,7 @@ def test_a_run_that_was_half_logged_is_completed(place: Place, monkeypatch: pyte
     assert {"model.safetensors", "manifest.json", "figures"} <= {entry.path for entry in client.list_artifacts(run.info.run_id)}
 
 
-def test_an_unfinished_run_of_another_output_root_is_left_alone(place: Place, monkeypatch: pytest.MonkeyPatch):
+def test_an_unfinished_run_of_another_output_root_is_left_alone(place, monkeypatch):
     from mlflow import MlflowClient
 
     shared = f"tracking.uri=sqlite:///{place.folder / 'outputs' / 'mlflow.db'}"
@@ -108,7 +104,7 @@ def test_an_unfinished_run_of_another_output_root_is_left_alone(place: Place, mo
     assert sorted(run.info.status for run in _local(place, "train")) == ["FINISHED", "RUNNING"]
 
 
-def test_the_same_training_made_again_is_the_same_run_and_another_outcome_is_another(place: Place):
+def test_the_same_training_made_again_is_the_same_run_and_another_outcome_is_another(place):
     assert place(*TRAIN)[0] == 0
     assert place(*TRAIN, "--force")[0] == 0
     [run] = _local(place, "train")
@@ -121,14 +117,14 @@ def test_the_same_training_made_again_is_the_same_run_and_another_outcome_is_ano
     assert [run.info.status for run in _local(place, "train")] == ["FINISHED"] * 2
 
 
-def test_a_store_that_is_gone_is_filled_again(place: Place):
+def test_a_store_that_is_gone_is_filled_again(place):
     assert place(*TRAIN)[0] == 0
     (place.folder / "outputs" / "mlflow.db").unlink()
     assert place(*TRAIN)[0] == 0
     assert len(_local(place, "train")) == 1
 
 
-def test_a_finished_and_tracked_study_is_recognised_without_mlflow(place: Place):
+def test_a_finished_and_tracked_study_is_recognised_without_mlflow(place):
     assert place("run", "small")[0] == 0
     done = _in_process(
         "import vehest.cli, atexit; atexit.register(lambda: print('mlflow' in sys.modules)); vehest.cli.main()", "run", "small"
@@ -140,7 +136,7 @@ def test_a_finished_and_tracked_study_is_recognised_without_mlflow(place: Place)
 FULL = "import resource, vehest.cli; resource.setrlimit(resource.RLIMIT_FSIZE, (200_000, 200_000)); vehest.cli.main()"
 
 
-def test_what_a_full_disk_kept_from_tracking_is_logged_by_the_next_run(place: Place):
+def test_what_a_full_disk_kept_from_tracking_is_logged_by_the_next_run(place):
     assert place(*TRAIN, "tracking=none")[0] == 0
     full = _in_process(FULL, *TRAIN)
     assert full.returncode == 0, full.stderr
@@ -151,7 +147,7 @@ def test_what_a_full_disk_kept_from_tracking_is_logged_by_the_next_run(place: Pl
     assert [run.info.status for run in _local(place, "train")] == ["FINISHED"]
 
 
-def test_a_disk_that_fills_up_while_runs_are_logged_loses_none(place: Place):
+def test_a_disk_that_fills_up_while_runs_are_logged_loses_none(place):
     assert place(*TRAIN)[0] == 0
     store = place.folder / "outputs" / "mlflow.db"
     with sqlite3.connect(store) as padded:  # larger than any other file, so that it alone reaches the limit
@@ -166,20 +162,20 @@ def test_a_disk_that_fills_up_while_runs_are_logged_loses_none(place: Place):
     assert [run.info.status for run in _local(place)] == ["FINISHED"] * 14
 
 
-def _raising(error: BaseException):
+def _raising(error):
     def raises(*arguments, **options):
         raise error
 
     return raises
 
 
-def _in_process(code: str, *arguments: str) -> subprocess.CompletedProcess[str]:
+def _in_process(code, *arguments):
     """A command in a process of its own, run by ``code``."""
     own = [sys.executable, "-c", f"import sys; sys.argv = ['vehest', *sys.argv[1:]]; {code}", *arguments]
     return subprocess.run(own, capture_output=True, text=True, check=False)
 
 
-def mlflow_server(folder: Path) -> tuple[str, subprocess.Popen[bytes]]:
+def mlflow_server(folder):
     """A real MLflow server on loopback, ready to answer: its address and its process."""
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
@@ -190,7 +186,7 @@ def mlflow_server(folder: Path) -> tuple[str, subprocess.Popen[bytes]]:
     with open(folder / "log", "wb") as log:
         process = start(command, stdout=log, stderr=log, cwd=folder)
 
-    def answers() -> bool:
+    def answers():
         with suppress(OSError), urllib.request.urlopen(f"{address}/health", timeout=5):
             return True
         return False
@@ -199,12 +195,12 @@ def mlflow_server(folder: Path) -> tuple[str, subprocess.Popen[bytes]]:
     return address, process
 
 
-def _runs(client, name: str = "vehest") -> dict:
+def _runs(client, name="vehest"):
     experiment = client.get_experiment_by_name(name)
     return {run.info.run_name: run for run in client.search_runs([experiment.experiment_id])} if experiment else {}
 
 
-def test_a_server_receives_every_run_of_a_study_and_its_loss_half_way_stops_nothing(place: Place):
+def test_a_server_receives_every_run_of_a_study_and_its_loss_half_way_stops_nothing(place):
     from mlflow import MlflowClient
 
     address, process = mlflow_server(place.folder / "server")
@@ -221,7 +217,7 @@ def test_a_server_receives_every_run_of_a_study_and_its_loss_half_way_stops_noth
     assert {"model.safetensors", "model.yaml", "manifest.json", "figures"} <= kept
     assert not (place.folder / "outputs" / "mlflow.db").exists()
 
-    def fell_over() -> None:
+    def fell_over():
         wait_for(lambda: _runs(client, "second"), process)
         os.killpg(process.pid, signal.SIGKILL)
         process.wait()
@@ -238,7 +234,7 @@ def test_a_server_receives_every_run_of_a_study_and_its_loss_half_way_stops_noth
     assert len(list((place.folder / "again" / "train").iterdir())) == 4
 
 
-def test_a_server_that_hears_and_never_answers_is_given_up(place: Place, monkeypatch):
+def test_a_server_that_hears_and_never_answers_is_given_up(place, monkeypatch):
     monkeypatch.setenv("MLFLOW_HTTP_REQUEST_TIMEOUT", "1")
     with socket.socket() as deaf:
         deaf.bind(("127.0.0.1", 0))
@@ -249,13 +245,13 @@ def test_a_server_that_hears_and_never_answers_is_given_up(place: Place, monkeyp
     assert err.count("logging to MLflow") == 1
 
 
-def test_every_parameter_is_tracked_however_many_there_are(tmp_path: Path):
+def test_every_parameter_is_tracked_however_many_there_are(tmp_path):
     from mlflow import MlflowClient
 
     config = {"group": {f"value_{position}": position for position in range(250)}}
     (tmp_path / MANIFEST).write_text("{}")
     artefact = Artefact(tmp_path, "train", "model", "abc", "complete", {}, config, {})
-    said: list[str] = []
+    said = []
     Tracker({"name": "mlflow"}, tmp_path / "outputs", said.append).log(artefact, dict, {})
     assert not said
     [run] = _runs(MlflowClient(f"sqlite:///{tmp_path / 'outputs' / 'mlflow.db'}")).values()

@@ -1,9 +1,6 @@
 """What estimators lack is said before anything is trained, what is promised to supply it does, and rates fit the recordings."""
 
-from __future__ import annotations
-
 import json
-from collections.abc import Iterator
 from copy import deepcopy
 from dataclasses import replace
 from functools import cache
@@ -15,7 +12,7 @@ import pytest
 import yaml
 
 from conftest import planar_drive
-from place import DATASET, Place
+from place import DATASET
 from vehest.data.derivable_channels import MAKES, derivation_of
 from vehest.data.derived import WHEELS
 from vehest.data.errors import DataError
@@ -43,7 +40,7 @@ UNITS = {"vx": "m/s", "yaw_rate": "rad/s", "ay": "m/s²", "ax": "m/s²", "steer"
 UNITS |= {"vx_ref": "m/s", "vy_ref": "m/s", "sideslip_ref": "rad"} | {f"wheel_speed_{wheel}": "rad/s" for wheel in WHEELS}
 
 
-def log(channels: set[str], rate_hz: float = 50.0, seed: int = 1, seconds: float = 30.0, name: str = "lap") -> Recording:
+def log(channels, rate_hz=50.0, seed=1, seconds=30.0, name="lap"):
     """A drive of which only these channels were logged."""
     drive = planar_drive(seconds, rate_hz, seed=seed, noise=0.02, name=name)
     steer = 2.5 * drive["yaw_rate"] / drive["vx"]
@@ -53,7 +50,7 @@ def log(channels: set[str], rate_hz: float = 50.0, seed: int = 1, seconds: float
 
 
 @pytest.fixture(autouse=True, scope="module")
-def _composed_once() -> Iterator[None]:
+def _composed_once():
     """The configuration of each estimator is composed once for all tables."""
     composed = cache(lambda command, *overrides: compose_config(command, list(overrides)))
     with pytest.MonkeyPatch.context() as patch:
@@ -61,15 +58,15 @@ def _composed_once() -> Iterator[None]:
         yield
 
 
-def rows(recording: Recording) -> dict[str, dict]:
+def rows(recording):
     return {row.estimator: row.as_plain() for row in all_usabilities([summary_of(recording)])}
 
 
-def with_values(entries: list[dict]) -> list[dict]:
+def with_values(entries):
     return [{key: VALUES[key] if value is None else value for key, value in entry.items()} for entry in entries]
 
 
-def add_logged(place: Place, channels: set[str], rate_hz: float = 50.0, **options: object) -> None:
+def add_logged(place, channels, rate_hz=50.0, **options):
     """A data set ``logged`` of three laps with these channels, and a split ``logged`` on it."""
     folder = place.folder / "raw" / "logged"
     folder.mkdir()
@@ -86,12 +83,12 @@ def add_logged(place: Place, channels: set[str], rate_hz: float = 50.0, **option
         (place.folder / "conf" / group / "logged.yaml").write_text(yaml.safe_dump(content, allow_unicode=True))
 
 
-def add_study(place: Place, *sweeps: list[str], **options: object) -> None:
+def add_study(place, *sweeps, **options):
     pipeline = {"study": "logged", "report": "drive", "split": "logged", "sweeps": list(sweeps), **options}
     (place.folder / "pipelines" / "logged.yaml").write_text(yaml.safe_dump(pipeline))
 
 
-def models(place: Place) -> set[str]:
+def models(place):
     return {folder.name.split("-")[0] for folder in (place.folder / "outputs" / "train").glob("[!.]*")}
 
 
@@ -140,7 +137,7 @@ def test_fit_fails_for_each_channel_that_it_is_said_to_need(name):
 
 
 def test_channels_of_a_settings_choice_and_references_of_outputs_count():
-    def needed(*overrides: str) -> set[str]:
+    def needed(*overrides):
         config = compose_config("train", list(overrides))
         estimator = new_estimator(config["estimator"])
         return set(lacking_to_train(estimator, settings_from_config(estimator.training_type, config["training"], "training"), ()))

@@ -1,7 +1,5 @@
 """Keys hold versions: readable texts that say nothing of where code stands."""
 
-from __future__ import annotations
-
 import re
 
 import pytest
@@ -23,7 +21,7 @@ from vehest.training.supervised import SupervisedSettings
 PLAIN = re.compile(r"\w+=[\w.]+( \w+=[\w.]+)*")
 
 
-def trainings() -> dict[str, str]:
+def trainings():
     """Estimator -> version of its training."""
     return {name: code_of_training(name) for name in estimator_names()}
 

@@ -1,10 +1,7 @@
 """From a log to an estimator that runs, by the commands of docs/own_car.md and those that the verdict names."""
 
-from __future__ import annotations
-
 import json
 import re
-from pathlib import Path
 
 import numpy as np
 import pandas as pd
@@ -16,7 +13,7 @@ from place import run_vehest
 
 
 @pytest.fixture
-def log(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+def log(tmp_path, monkeypatch):
     """Four minutes of a simulated car in a logger's dress, in an empty folder."""
     monkeypatch.chdir(tmp_path)
     for name in ("VEHEST_DATA", "VEHEST_OUTPUT", "MLFLOW_TRACKING_URI"):

@@ -1,7 +1,5 @@
 """From a log to C where no module of POSIX can be imported and nothing can fork, as on Windows, in a folder with spaces in its name."""
 
-from __future__ import annotations
-
 import os
 import subprocess
 import sys
@@ -32,7 +30,7 @@ print(sorted(name for name in ("fcntl", "resource") if sys.modules[name] is not 
 """
 
 
-def commands(*words: tuple[str, ...]) -> subprocess.CompletedProcess[str]:
+def commands(*words):
     """Run commands, one after another, in a child that has none of it."""
     environment = {key: value for key, value in os.environ.items() if key not in ("VEHEST_DATA", "VEHEST_OUTPUT")}
     code = CHILD.replace("WORDS", repr(words))

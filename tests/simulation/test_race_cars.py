@@ -1,7 +1,5 @@
 """What makes simulated cars differ as real ones do: tyres that lag and wear, payloads, installations, drivers who correct, traffic."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 
@@ -31,11 +29,11 @@ from vehest.sources.base import open_source
 LENGTHS = (0.4, 0.9)  # m, front and rear
 
 
-def _lagging(lengths: tuple[float, float] = LENGTHS) -> MultiBodyPlant:
+def _lagging(lengths=LENGTHS):
     return MultiBodyPlant(replace(plant_of("ferrari_250_lm").vehicle, relaxation=lengths))
 
 
-def _swerve(plant: MultiBodyPlant, seconds: float = 1.5) -> list:
+def _swerve(plant, seconds=1.5):
     """States after every millisecond of a swerve at 25 m/s."""
     states = [plant.initial_state(0.0, 0.0, 0.0, 25.0)]
     for k in range(round(1000 * seconds)):
@@ -47,7 +45,7 @@ def _swerve(plant: MultiBodyPlant, seconds: float = 1.5) -> list:
 # --- tyres that lag
 
 
-def test_lateral_forces_follow_the_slip_over_the_relaxation_length() -> None:
+def test_lateral_forces_follow_the_slip_over_the_relaxation_length():
     """Against scipy's integration of dq/dt = u/length (asked - q), the force over load, with what a plant without lag asks for there."""
     plant, plain = _lagging(), _lagging((0.0, 0.0))
     states = _swerve(plant)
@@ -63,7 +61,7 @@ def test_lateral_forces_follow_the_slip_over_the_relaxation_length() -> None:
     for wheel in (0, 3):
         length = LENGTHS[wheel // 2]
 
-        def rate(t: float, q: np.ndarray, wheel: int = wheel, length: float = length) -> np.ndarray:
+        def rate(t, q, wheel=wheel, length=length):
             return np.interp(t, times, speed) / length * (np.interp(t, times, asked[:, wheel]) - q)
 
         held = solve_ivp(rate, (0.0, times[-1]), [0.0], t_eval=times, max_step=2e-3, rtol=1e-8, atol=1e-10).y[0]
@@ -72,8 +70,8 @@ def test_lateral_forces_follow_the_slip_over_the_relaxation_length() -> None:
         np.testing.assert_allclose(ours, held, atol=0.01 * np.abs(held).max())
 
 
-def test_a_short_relaxation_length_is_none_but_for_the_step() -> None:
-    def off(step: float) -> float:
+def test_a_short_relaxation_length_is_none_but_for_the_step():
+    def off(step):
         ends = []
         for length in (1e-4, 0.0):
             plant = MultiBodyPlant(replace(plant_of("ferrari_250_lm").vehicle, relaxation=(length, length)), step)
@@ -88,15 +86,15 @@ def test_a_short_relaxation_length_is_none_but_for_the_step() -> None:
     assert off(2.5e-4) < 0.4 * off(1e-3)  # first order in the step
 
 
-def test_a_long_relaxation_length_delays_the_yaw_rate() -> None:
-    def first_peak(lengths: tuple[float, float]) -> int:
+def test_a_long_relaxation_length_delays_the_yaw_rate():
+    def first_peak(lengths):
         yaw_rate = np.array([state.yaw_rate for state in _swerve(_lagging(lengths))])
         return int(np.argmax(yaw_rate[:600]))  # ms; the steering turns back after a third of a second
 
     assert first_peak((0.9, 0.9)) > first_peak((0.0, 0.0)) + 5
 
 
-def test_relaxation_is_refused_where_it_makes_no_sense() -> None:
+def test_relaxation_is_refused_where_it_makes_no_sense():
     with pytest.raises(ConfigurationError, match=r"relaxation rear must be zero or positive, not -0\.1 m"):
         _lagging((0.1, -0.1))
 
@@ -104,7 +102,7 @@ def test_relaxation_is_refused_where_it_makes_no_sense() -> None:
 # --- payload, wear
 
 
-def test_a_payload_moves_the_static_loads_as_levers_say() -> None:
+def test_a_payload_moves_the_static_loads_as_levers_say():
     empty = plant_of("corvette_grand_sport")
     full = MultiBodyPlant(loaded(empty.vehicle, 80.0, forward=-0.6, up=0.1))
     loads = []
@@ -118,12 +116,12 @@ def test_a_payload_moves_the_static_loads_as_levers_say() -> None:
     assert full.parameters.I_z - empty.parameters.I_z == pytest.approx(80.0 * 0.6**2 * empty.parameters.m / full.parameters.m)
 
 
-def test_a_payload_off_the_axles_is_refused() -> None:
+def test_a_payload_off_the_axles_is_refused():
     with pytest.raises(ConfigurationError, match="puts the centre of gravity off the axles"):
         loaded(plant_of("corvette_grand_sport").vehicle, 5000.0, forward=-3.0, up=0.0)
 
 
-def test_tyres_warm_up_and_wear() -> None:
+def test_tyres_warm_up_and_wear():
     stint = Stint(cold=0.1, warm_time=100.0, wear=0.04, wear_time=1000.0)
     assert stint.friction_at(-2.0) == stint.friction_at(0.0) == pytest.approx(0.9)
     assert stint.friction_at(100.0) == pytest.approx((1.0 - 0.1 / math.e) * (1.0 - 0.004))
@@ -134,7 +132,7 @@ def test_tyres_warm_up_and_wear() -> None:
         stint_from_config({"hot": 0.1})
 
 
-def test_the_plant_feels_the_tyres_lose_grip_and_the_driver_does_not_know() -> None:
+def test_the_plant_feels_the_tyres_lose_grip_and_the_driver_does_not_know():
     laps = Laps(course="palm_beach_like", duration=5.0, severity=0.8)
     plant = plant_of("ferrari_250_lm")
     plain, cold = drive(plant, laps, 3), drive(plant, laps, 3, stint=Stint(cold=0.1))
@@ -145,7 +143,7 @@ def test_the_plant_feels_the_tyres_lose_grip_and_the_driver_does_not_know() -> N
 # --- drivers
 
 
-def test_corrections_have_their_size_and_their_band() -> None:
+def test_corrections_have_their_size_and_their_band():
     hands = Hands(0.8, np.random.default_rng(0))
     times = np.arange(0.0, 400.0, 0.01)
     asked = np.array([hands.at(time, 1.0) for time in times])
@@ -156,10 +154,10 @@ def test_corrections_have_their_size_and_their_band() -> None:
     assert hands.at(1.0, 0.0) == pytest.approx(hands.at(1.0, 1.0) / 3.0)
 
 
-def test_corrections_put_energy_into_the_lateral_velocity_at_1_hz() -> None:
+def test_corrections_put_energy_into_the_lateral_velocity_at_1_hz():
     plant = plant_of("ferrari_250_lm")
 
-    def at_1_hz(corrections: float) -> float:
+    def at_1_hz(corrections):
         vy = drive(plant, Laps(course="palm_beach_like", duration=60.0, severity=0.7, corrections=corrections), 5).motion.vy
         frequency, density = welch(np.gradient(vy) * 100.0, 100.0, nperseg=1024)
         return float(density[(frequency > 0.7) & (frequency < 1.5)].mean())
@@ -167,18 +165,18 @@ def test_corrections_put_energy_into_the_lateral_velocity_at_1_hz() -> None:
     assert at_1_hz(1.0) > 3.0 * at_1_hz(0.0)
 
 
-def test_traffic_slows_the_car_down_where_it_is_met() -> None:
+def test_traffic_slows_the_car_down_where_it_is_met():
     car = car_of(plant_of("ferrari_250_lm"))
     free = Laps(course="palm_beach_like", duration=200.0, severity=0.8)
     held = replace(free, traffic=2.0, traffic_speed=(7.0, 12.0))
-    plans = [laps.controller(car, SURFACES["dry"], 7).plan for laps in (free, held)]  # type: ignore[attr-defined]
+    plans = [laps.controller(car, SURFACES["dry"], 7).plan for laps in (free, held)]
     alone, behind = (plan.speed[: min(len(plan.speed) for plan in plans)] for plan in plans)
     assert (behind <= alone + 1e-9).all()
     assert 6.9 < behind.min() < 12.1
     assert behind.min() < 0.8 * alone.min()
 
 
-def test_what_a_drive_does_without_is_not_spoken_of() -> None:
+def test_what_a_drive_does_without_is_not_spoken_of():
     plain = Laps(course="palm_beach_like", duration=5.0).description()
     assert not {"corrections", "traffic", "traffic_speed"} & set(plain)
     assert Laps(course="palm_beach_like", duration=5.0, traffic=1.0).description()["traffic"] == 1.0
@@ -187,7 +185,7 @@ def test_what_a_drive_does_without_is_not_spoken_of() -> None:
 # --- installations
 
 
-def test_gain_and_bias_are_the_same_in_every_drive() -> None:
+def test_gain_and_bias_are_the_same_in_every_drive():
     motion = motion_of(50, ay=3.0)
     levels = only(ay=SensorLevel(gain=0.02, bias=-0.1))
     for seed in (1, 2):
@@ -195,13 +193,13 @@ def test_gain_and_bias_are_the_same_in_every_drive() -> None:
 
 
 @pytest.mark.parametrize("share", [1.0, 0.4, -0.5])
-def test_roll_leaks_by_its_share_and_sign(share: float) -> None:
+def test_roll_leaks_by_its_share_and_sign(share):
     motion = motion_of(10, roll=0.03)
     shown = measure(motion, only(tilt=Tilt(roll_share=share)), 0)["ay"]
     np.testing.assert_allclose(shown, GRAVITY * math.sin(0.03 * share), rtol=1e-9)
 
 
-def test_a_speed_of_wheels_is_right_on_the_straight_and_errs_with_slip() -> None:
+def test_a_speed_of_wheels_is_right_on_the_straight_and_errs_with_slip():
     steer = np.concatenate([np.zeros(80), np.full(20, 0.1)])
     wheels = np.full((100, 4), 30.0 / 0.32)
     wheels[90:] *= 0.8  # locking
@@ -210,7 +208,7 @@ def test_a_speed_of_wheels_is_right_on_the_straight_and_errs_with_slip() -> None
     np.testing.assert_allclose(shown[90:], 24.0)
 
 
-def test_idle_values_are_not_spoken_of_and_others_are() -> None:
+def test_idle_values_are_not_spoken_of_and_others_are():
     laps = Laps(course="palm_beach_like", duration=1.0)
     about = simulate_drive(id="d", vehicle=plant_of("ferrari_250_lm").vehicle, manoeuvre=laps, seed=1).provenance
     assert not {"gain", "bias"} & set(about["sensors"]["ay"])
@@ -226,12 +224,12 @@ def test_idle_values_are_not_spoken_of_and_others_are() -> None:
 # --- data sets
 
 
-def test_each_race_car_has_an_installation_of_its_own() -> None:
+def test_each_race_car_has_an_installation_of_its_own():
     source = open_source(compose_config("ingest", ["dataset=sim_race_cars"])["dataset"])
-    installed = {name: str(source.drives[f"{name}_001"].sensors) for name in ("c1", "f1", "j1")}  # type: ignore[attr-defined]
+    installed = {name: str(source.drives[f"{name}_001"].sensors) for name in ("c1", "f1", "j1")}
     assert len(set(installed.values())) == 3
     same = open_source(compose_config("ingest", ["dataset=sim_race_cars_same_sensors"])["dataset"])
-    assert str(same.drives["c1_001"].sensors) == str(same.drives["f1_001"].sensors)  # type: ignore[attr-defined]
+    assert str(same.drives["c1_001"].sensors) == str(same.drives["f1_001"].sensors)
 
 
 @pytest.mark.parametrize(
@@ -242,14 +240,14 @@ def test_each_race_car_has_an_installation_of_its_own() -> None:
         ({"sensors": "racing"}, "sensors 'racing' is not one of"),
     ],
 )
-def test_what_a_drive_says_of_its_own_is_checked_before_anything_is_simulated(change: dict, message: str) -> None:
+def test_what_a_drive_says_of_its_own_is_checked_before_anything_is_simulated(change, message):
     dataset = compose_config("ingest", ["dataset=sim_race_cars"])["dataset"]
     dataset["drives"] = [{**dict(dataset["drives"][0]), **change}]
     with pytest.raises(ConfigurationError, match=message):
         open_source(dataset)
 
 
-def test_a_scale_over_the_logarithm_is_as_often_below_one_as_above() -> None:
+def test_a_scale_over_the_logarithm_is_as_often_below_one_as_above():
     variation = variations_from_config([{"parameters": ["m"], "factor": [0.5, 2.0], "log": True}])[0]
     drawn = [variation.drawn(np.random.default_rng(seed)) for seed in range(2000)]
     assert np.mean(np.array(drawn) < 1.0) == pytest.approx(0.5, abs=0.04)
@@ -257,7 +255,7 @@ def test_a_scale_over_the_logarithm_is_as_often_below_one_as_above() -> None:
     assert 1.95 < max(drawn) <= 2.0
 
 
-def test_a_fleet_draws_the_share_of_roll_of_either_sign() -> None:
+def test_a_fleet_draws_the_share_of_roll_of_either_sign():
     variation = SensorVariation.from_config({"roll_share": [-0.5, 1.5]})
     shares = [variation.applied(SensorLevels(), seed).tilt.roll_share for seed in range(200)]
     assert min(shares) < -0.3

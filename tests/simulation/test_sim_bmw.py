@@ -1,13 +1,9 @@
 """The data set sim_bmw stands in for the recordings of Bertipaglia et al. 2024: mix, length, splits, and the car."""
 
-from __future__ import annotations
-
 import math
 from collections import Counter
-from collections.abc import Callable, Iterable, Mapping
 from functools import cache, partial
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -15,11 +11,9 @@ import yaml
 
 from vehest.data.recording import Recording
 from vehest.data.split_files import split_from_config
-from vehest.data.splits import Split
 from vehest.simulation.drive import simulate_drive
 from vehest.simulation.driving.car import car_of
 from vehest.simulation.driving.driver import Follower
-from vehest.simulation.driving.manoeuvre import Manoeuvre
 from vehest.simulation.driving.manoeuvres import manoeuvre_from_config
 from vehest.simulation.plant.handling import ramp_steer
 from vehest.simulation.plant.multi_body import MultiBodyPlant
@@ -45,34 +39,34 @@ TEST_MANOEUVRES = {
 }
 
 
-def configuration(group: str, name: str) -> dict[str, Any]:
-    values: dict[str, Any] = yaml.safe_load((CONFIGURATIONS / group / f"{name}.yaml").read_text(encoding="utf-8"))
+def configuration(group, name):
+    values = yaml.safe_load((CONFIGURATIONS / group / f"{name}.yaml").read_text(encoding="utf-8"))
     values.pop("defaults", None)
     return values
 
 
 @cache
-def source(dataset: str = "sim_bmw") -> SimulatedSource:
+def source(dataset="sim_bmw"):
     return SimulatedSource({**configuration("dataset", dataset), "vehicle": configuration("vehicle", "bmw_545i")})
 
 
 @cache
-def plant() -> MultiBodyPlant:
+def plant():
     return MultiBodyPlant(vehicle_from_configuration(configuration("vehicle", "bmw_545i")))
 
 
-def role_of(drive_id: str) -> str:
+def role_of(drive_id):
     return drive_id.split("_")[0]
 
 
-def mix(role: str, dataset: str = "sim_bmw") -> Counter[str]:
+def mix(role, dataset="sim_bmw"):
     return Counter(drive.manoeuvre["name"] for name, drive in source(dataset).drives.items() if role_of(name) == role)
 
 
 # --- the mix
 
 
-def test_there_are_216_manoeuvres_in_shares_of_75_15_and_10_percent() -> None:
+def test_there_are_216_manoeuvres_in_shares_of_75_15_and_10_percent():
     roles = Counter(role_of(name) for name in source().drives)
     assert sum(roles.values()) == 216
     assert set(roles) == {"train", "validation", "test"}
@@ -80,7 +74,7 @@ def test_there_are_216_manoeuvres_in_shares_of_75_15_and_10_percent() -> None:
         assert abs(roles[role] - 216 * share) <= 2, role  # 23 test manoeuvres are 10.6 % in the paper itself
 
 
-def test_the_test_drives_are_the_papers_and_the_others_share_their_mix() -> None:
+def test_the_test_drives_are_the_papers_and_the_others_share_their_mix():
     assert mix("test") == TEST_MANOEUVRES
     for role in ("train", "validation"):
         drives = mix(role)
@@ -88,15 +82,15 @@ def test_the_test_drives_are_the_papers_and_the_others_share_their_mix() -> None
             assert abs(drives[name] - count / 23 * drives.total()) < 1.0, (role, name)
 
 
-def test_each_manoeuvre_is_driven_with_and_without_stability_control_and_on_the_dry_road() -> None:
+def test_each_manoeuvre_is_driven_with_and_without_stability_control_and_on_the_dry_road():
     for name in TEST_MANOEUVRES:
         switched = [drive.stability_control for drive in source().drives.values() if drive.manoeuvre["name"] == name]
         assert 0.3 < np.mean(switched) < 0.6, name
     assert {drive.surface or source().options.surface for drive in source().drives.values()} == {"dry"}
 
 
-def test_train_validation_and_test_drives_come_from_the_same_ranges() -> None:
-    def ranges(role: str) -> set[str]:
+def test_train_validation_and_test_drives_come_from_the_same_ranges():
+    def ranges(role):
         drives = [drive.manoeuvre for name, drive in source().drives.items() if role_of(name) == role]
         return {str({key: value for key, value in drive.items() if key != "laps"}) for drive in drives}
 
@@ -104,7 +98,7 @@ def test_train_validation_and_test_drives_come_from_the_same_ranges() -> None:
     assert len({source().seed_of(name) for name in source().drives}) == 216
 
 
-def test_the_new_test_is_twice_the_papers_from_the_ranges_of_training_and_shares_no_seed() -> None:
+def test_the_new_test_is_twice_the_papers_from_the_ranges_of_training_and_shares_no_seed():
     assert mix("unseen", "sim_bmw_unseen") == {name: 2 * count for name, count in TEST_MANOEUVRES.items()}
     new, old = source("sim_bmw_unseen").drives, source().drives
     seeds = {source("sim_bmw_unseen").seed_of(name) for name in new}
@@ -117,7 +111,7 @@ def test_the_new_test_is_twice_the_papers_from_the_ranges_of_training_and_shares
     assert tested == known
 
 
-def nominal_seconds(manoeuvre: Manoeuvre) -> float:
+def nominal_seconds(manoeuvre):
     """How long a manoeuvre takes if every range gives its middle, and the car does as planned."""
     car, middle = car_of(plant()), {key: np.mean(value) for key, value in vars(manoeuvre).items() if isinstance(value, float | int | tuple)}
     controller = manoeuvre.controller(car, SURFACES["dry"], 0)
@@ -136,14 +130,14 @@ def nominal_seconds(manoeuvre: Manoeuvre) -> float:
         return float(line_begins + middle["turn_time"] + (speed - middle["until_speed"]) / middle["deceleration"])
     if manoeuvre.name == "laps":
         assert isinstance(controller, Follower)
-        course = course_by_name(manoeuvre.course)  # type: ignore[attr-defined]
+        course = course_by_name(manoeuvre.course)
         slow = float(np.mean(1.0 / controller.plan.speed))  # seconds a metre
         return float(middle["laps"] * course.length * slow)
-    gates = manoeuvre.gates(car.width)  # type: ignore[attr-defined]
+    gates = manoeuvre.gates(car.width)
     return float((gates[-1].end - gates[0].begin + 80.0) / controller.drawn["speed"])
 
 
-def test_it_is_about_two_hours_as_planned() -> None:
+def test_it_is_about_two_hours_as_planned():
     counts = Counter(yaml.safe_dump(dict(drive.manoeuvre)) for drive in source().drives.values())
     seconds = sum(count * nominal_seconds(manoeuvre_from_config(yaml.safe_load(text))) for text, count in counts.items())
     assert seconds / 3600.0 == pytest.approx(2.0, abs=0.1)
@@ -152,7 +146,7 @@ def test_it_is_about_two_hours_as_planned() -> None:
 # --- the splits
 
 
-def five_seconds(name: str, channels: Iterable[str]) -> Recording:
+def five_seconds(name, channels):
     """A recording beyond 7 m/s² from 2.5 s on, and slower than 5 m/s from 4.5 s on."""
     sample = np.arange(500)
     made = {"ay": np.where(sample < 250, -6.0, -8.0), "vx": np.where(sample < 450, 15.0, 4.0)}
@@ -160,16 +154,16 @@ def five_seconds(name: str, channels: Iterable[str]) -> Recording:
     return Recording(name, "bmw_545i", 100.0, 0.0, made).select(channels)
 
 
-def catalogue(dataset: str) -> Mapping[str, Callable[[Iterable[str]], Recording]]:
+def catalogue(dataset):
     return {name: partial(five_seconds, name) for name in source(dataset).ids()}
 
 
 @cache
-def split(name: str) -> Split:
+def split(name):
     return split_from_config(configuration("split", name), catalogue)
 
 
-def test_splits_take_the_drives_by_their_names() -> None:
+def test_splits_take_the_drives_by_their_names():
     for name in ("sim_bmw", "sim_bmw_limited"):
         parts = {"train": split(name).train, "validation": split(name).validation, "test": split(name).tests["test"]}
         for role, spans in parts.items():
@@ -177,7 +171,7 @@ def test_splits_take_the_drives_by_their_names() -> None:
             assert {span.dataset for span in spans} == {"sim_bmw"}
 
 
-def test_the_limited_split_learns_below_7_and_is_tested_on_everything() -> None:
+def test_the_limited_split_learns_below_7_and_is_tested_on_everything():
     full, limited = split("sim_bmw"), split("sim_bmw_limited")
     assert {span.stop for span in full.train + full.validation} == {4.0}  # a spin after that
     assert {span.stop for span in full.tests["test"]} == {4.5}  # below 5 m/s after that
@@ -186,7 +180,7 @@ def test_the_limited_split_learns_below_7_and_is_tested_on_everything() -> None:
     assert limited.kept["train"].seconds == pytest.approx(161 * 2.5)
 
 
-def test_the_new_splits_learn_on_the_same_drives_and_test_on_none_that_chose() -> None:
+def test_the_new_splits_learn_on_the_same_drives_and_test_on_none_that_chose():
     full, limited = split("sim_bmw_unseen"), split("sim_bmw_unseen_limited")
     assert full.train == split("sim_bmw").train
     assert limited.train == split("sim_bmw_limited").train
@@ -200,13 +194,13 @@ def test_the_new_splits_learn_on_the_same_drives_and_test_on_none_that_chose() -
 # --- the car
 
 
-def test_the_cars_mass_inertia_and_axle_distances_are_the_papers() -> None:
+def test_the_cars_mass_inertia_and_axle_distances_are_the_papers():
     p = plant().parameters
     assert (p.m, p.I_z, p.a, p.b) == (1970.0, 3498.0, 1.47, 1.41)
 
 
 @pytest.mark.parametrize("speed", [15.0, 25.0, 40.0])
-def test_the_car_is_a_mildly_understeering_road_car_with_a_limit_of_nearly_one_g(speed: float) -> None:
+def test_the_car_is_a_mildly_understeering_road_car_with_a_limit_of_nearly_one_g(speed):
     ramp = ramp_steer(plant(), speed)
     limit, linear = int(np.argmax(ramp.ay)), (ramp.ay > 1.0) & (ramp.ay < 3.0)
     assert 9.3 < ramp.ay[limit] < 9.8
@@ -221,7 +215,7 @@ def test_the_car_is_a_mildly_understeering_road_car_with_a_limit_of_nearly_one_g
     assert gradient * 9.81 == pytest.approx(np.degrees(1.0 / 18.0), rel=0.08)  # camber takes 5 %
 
 
-def test_a_j_turn_over_the_limit_shows_about_10_and_slides() -> None:
+def test_a_j_turn_over_the_limit_shows_about_10_and_slides():
     # The accelerometer leans with the body and shows up to half a metre per second squared more than the tyres give.
     manoeuvre = manoeuvre_from_config({"name": "j_turn", "speed": 25.0, "severity": 1.2, "turn_time": 8.0})
     largest = {}

@@ -1,7 +1,5 @@
 """The proving ground: what its courses, surfaces, lines, driver and drives claim."""
 
-from __future__ import annotations
-
 import json
 import math
 from concurrent.futures import ProcessPoolExecutor
@@ -16,9 +14,8 @@ from scipy.optimize import lsq_linear
 from scipy.spatial import cKDTree
 
 from vehest.data.errors import ConfigurationError
-from vehest.data.recording import Recording
-from vehest.simulation.drive import Trip, simulate_drive
 from vehest.simulation.drive import drive as drive_plant
+from vehest.simulation.drive import simulate_drive
 from vehest.simulation.driving.car import car_of
 from vehest.simulation.driving.driver import Driver, draw_style, speed_profile
 from vehest.simulation.driving.manoeuvres import manoeuvre_from_config
@@ -26,7 +23,7 @@ from vehest.simulation.errors import SimulationError
 from vehest.simulation.plant import compiled
 from vehest.simulation.plant.multi_body import MultiBodyPlant
 from vehest.simulation.plant.parameters import Vehicle, vehicle_from_configuration
-from vehest.simulation.road.course import Compound, Corner, Course, Layout, Straight, build_course, course_by_name
+from vehest.simulation.road.course import Compound, Corner, Layout, Straight, build_course, course_by_name
 from vehest.simulation.road.lines import least_within
 from vehest.simulation.road.surface import surface_from_config
 from vehest.simulation.road.tracks import LAYOUTS
@@ -38,24 +35,24 @@ HANDLING = course_by_name("handling")
 LAP_SEEDS = (0, 2)  # the fastest styles among seeds 0 to 4
 
 
-def drive(seed: int, duration: float = 12.0, **options: object) -> Recording:
+def drive(seed, duration=12.0, **options):
     manoeuvre = manoeuvre_from_config({"name": "laps", "course": "handling", "duration": duration})
     return simulate_drive(id=f"drive{seed}", vehicle=LOWERED, manoeuvre=manoeuvre, seed=seed, **options)
 
 
-def drive_counted(seed: int) -> tuple[Recording, int]:
+def drive_counted(seed):
     """A drive, and how many functions had to be compiled for it."""
     recording = drive(seed)
     misses = [function.dispatcher.stats.cache_misses for function in (compiled.advance, compiled.evaluate)]
     return recording, sum(sum(miss.values()) for miss in misses)
 
 
-def trip(seed: int, course: str = "handling", surface: str = "dry", step: float = 1e-3, rate_hz: float = 100.0, **options: object) -> Trip:
+def trip(seed, course="handling", surface="dry", step=0.001, rate_hz=100.0, **options):
     manoeuvre = manoeuvre_from_config({"name": "laps", "course": course, **options})
     return drive_plant(MultiBodyPlant(LOWERED, step), manoeuvre, seed, surface=surface_from_config(surface), rate_hz=rate_hz)
 
 
-def places_on(course: Course, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def places_on(course, x, y):
     """Nearest arc lengths, and distances from the centre line [m]."""
     fine = np.linspace(0.0, course.length, 40_000)
     centre = np.stack([np.interp(fine, course.arc_length, values) for values in (course.x, course.y)], axis=1)
@@ -64,17 +61,17 @@ def places_on(course: Course, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray,
 
 
 @pytest.fixture(scope="module")
-def laps() -> list[Trip]:
+def laps():
     return [trip(seed, laps=1) for seed in LAP_SEEDS]
 
 
 @pytest.fixture(scope="module")
-def circuit() -> Trip:
+def circuit():
     return trip(1, course="palm_beach_like", duration=80.0)  # 2 km of 3.3 km, until the banked corner's end
 
 
 @pytest.fixture(scope="module")
-def recording() -> Recording:
+def recording():
     return drive(seed=1)
 
 
@@ -91,7 +88,7 @@ def recording() -> Recording:
         ("hill_circuit", 3660, 3700),
     ],
 )
-def test_courses_are_closed_and_as_long_as_stated(name: str, shortest: float, longest: float) -> None:
+def test_courses_are_closed_and_as_long_as_stated(name, shortest, longest):
     course = course_by_name(name)
     assert course.gap < 1e-6
     assert abs(course.turning) == pytest.approx(2.0 * math.pi, abs=1e-9)
@@ -102,7 +99,7 @@ def test_courses_are_closed_and_as_long_as_stated(name: str, shortest: float, lo
 
 
 @pytest.mark.parametrize("name", sorted(LAYOUTS))
-def test_courses_do_not_come_near_themselves(name: str) -> None:
+def test_courses_do_not_come_near_themselves(name):
     course = course_by_name(name)
     places = np.stack([course.x, course.y], axis=1)[:-1]
     pairs = cKDTree(places).query_pairs(14.0, output_type="ndarray")
@@ -111,14 +108,14 @@ def test_courses_do_not_come_near_themselves(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", sorted(LAYOUTS))
-def test_courses_turn_both_ways_at_several_radii(name: str) -> None:
+def test_courses_turn_both_ways_at_several_radii(name):
     for side in (1.0, -1.0):
         curvature = side * course_by_name(name).curvature
         tops = curvature[1:-1][(curvature[1:-1] > 1e-6) & (curvature[1:-1] >= curvature[:-2]) & (curvature[1:-1] >= curvature[2:])]
         assert len(np.unique(np.round(1.0 / tops))) >= 3
 
 
-def test_palm_beach_like_has_eleven_corners_and_a_straight_of_six_tenths_of_a_mile() -> None:
+def test_palm_beach_like_has_eleven_corners_and_a_straight_of_six_tenths_of_a_mile():
     course = course_by_name("palm_beach_like")
     # A turn is a stretch to one side; the two compound corners count as two turns, the opening kink after a corner as none.
     straight = np.abs(course.curvature) < 1e-9
@@ -132,7 +129,7 @@ def test_palm_beach_like_has_eleven_corners_and_a_straight_of_six_tenths_of_a_mi
 
 
 @pytest.mark.parametrize("name", sorted(LAYOUTS))
-def test_course_positions_follow_from_their_curvature(name: str) -> None:
+def test_course_positions_follow_from_their_curvature(name):
     course = course_by_name(name)
     chord = np.hypot(np.diff(course.x), np.diff(course.y))
     np.testing.assert_allclose(chord, course.arc_length[1], rtol=1e-3)
@@ -142,14 +139,14 @@ def test_course_positions_follow_from_their_curvature(name: str) -> None:
     np.testing.assert_allclose(np.diff(course.heading), slope * course.arc_length[1], atol=5e-4)
 
 
-def test_circle_of_four_corners_has_the_length_of_its_parts() -> None:
+def test_circle_of_four_corners_has_the_length_of_its_parts():
     corner = Corner(radius=50.0, angle=math.pi / 2.0, transition=10.0)
     square = build_course("square", [Straight(101.0), corner, Straight(100.0), corner] * 2)
     assert square.gap < 1e-9
     assert square.length == pytest.approx(402.0 + 4.0 * (50.0 * math.pi / 2.0 + 10.0))
 
 
-def test_compound_corner_turns_by_the_sum_of_its_parts() -> None:
+def test_compound_corner_turns_by_the_sum_of_its_parts():
     corner = Compound((Corner(40.0, math.pi / 3.0, 12.0), Corner(80.0, math.pi / 6.0, 12.0)))
     square = build_course("square", [Straight(100.0), corner] * 4)
     assert square.turning == pytest.approx(2.0 * math.pi)
@@ -158,7 +155,7 @@ def test_compound_corner_turns_by_the_sum_of_its_parts() -> None:
         Compound((Corner(40.0, 1.0, 12.0), Corner(80.0, -1.0, 12.0)))
 
 
-def test_banked_corners_lean_inwards_and_heights_become_grades() -> None:
+def test_banked_corners_lean_inwards_and_heights_become_grades():
     banked = Corner(radius=50.0, angle=math.pi / 2.0, transition=10.0, banking=0.05)
     layout = Layout((Straight(100.0), banked) * 4, crossfall=0.01, heights=((0.0, 0.0), (0.5, 4.0)), friction=((0.25, 0.5, 0.6),))
     course = build_course("banked", layout)
@@ -170,7 +167,7 @@ def test_banked_corners_lean_inwards_and_heights_become_grades() -> None:
     assert (course.friction == 0.6).mean() == pytest.approx(0.25, abs=0.01)
 
 
-def test_course_that_does_not_close_is_an_error() -> None:
+def test_course_that_does_not_close_is_an_error():
     with pytest.raises(ConfigurationError, match="90°"):
         build_course("open", [Straight(100.0), Corner(50.0, math.pi / 2.0, 10.0)])
     with pytest.raises(ConfigurationError, match="handling"):
@@ -180,7 +177,7 @@ def test_course_that_does_not_close_is_an_error() -> None:
 # --- surfaces
 
 
-def test_patches_are_drawn_by_the_seed_and_come_again_every_lap() -> None:
+def test_patches_are_drawn_by_the_seed_and_come_again_every_lap():
     patchy, places = surface_from_config("patchy"), np.arange(0.0, 5000.0)
     scale = patchy.along(places, 3, 2500.0)
     np.testing.assert_array_equal(scale[:2500], scale[2500:])
@@ -192,7 +189,7 @@ def test_patches_are_drawn_by_the_seed_and_come_again_every_lap() -> None:
     assert np.diff(edges)[np.diff(edges) > 3].min() >= 15  # patches of 20 m, less their two edges
 
 
-def test_surfaces_seed_keeps_patches_from_drive_to_drive() -> None:
+def test_surfaces_seed_keeps_patches_from_drive_to_drive():
     own, places = surface_from_config({"friction": 0.9, "patches": 0.3, "seed": 7}), np.arange(1000.0)
     np.testing.assert_array_equal(own.along(places, 1), own.along(places, 2))
 
@@ -202,15 +199,15 @@ def test_surfaces_seed_keeps_patches_from_drive_to_drive() -> None:
     [("icy", "icy"), ({"friction": 0.0}, "0.05"), ({"mu": 0.5}, "mu"), ({"patches": 0.9, "friction": 0.5}, "patches"),
      ({"patches": 0.5, "patch_length": [1.0, 2.0]}, "5 m")],
 )  # fmt: skip
-def test_surface_that_makes_no_sense_is_refused(configuration: object, complaint: str) -> None:
+def test_surface_that_makes_no_sense_is_refused(configuration, complaint):
     with pytest.raises(ConfigurationError, match=complaint):
-        surface_from_config(configuration)  # type: ignore[arg-type]
+        surface_from_config(configuration)
 
 
 # --- lines
 
 
-def test_smoothest_line_agrees_with_a_general_solver() -> None:
+def test_smoothest_line_agrees_with_a_general_solver():
     generator = np.random.default_rng(0)
     rows = np.diff(np.eye(46)[:, 3:-3], 3, axis=0)
     lower, upper = np.full(40, -np.inf), np.full(40, np.inf)
@@ -225,21 +222,21 @@ def test_smoothest_line_agrees_with_a_general_solver() -> None:
 # --- driver
 
 
-def test_driver_stays_within_a_metre_and_a_half_of_the_centre_line(laps: list[Trip]) -> None:
+def test_driver_stays_within_a_metre_and_a_half_of_the_centre_line(laps):
     for lap in laps:
         place, distance = places_on(HANDLING, lap.motion.x, lap.motion.y)
         assert distance.max() < 1.5
         assert len(np.unique(place // 6.0)) >= math.floor(HANDLING.length / 6.0)  # it really goes all the way around
 
 
-def test_lap_begins_and_ends_on_the_line(laps: list[Trip]) -> None:
+def test_lap_begins_and_ends_on_the_line(laps):
     for lap in laps:
         assert lap.motion.x[0] == pytest.approx(0.0, abs=1.0)
         assert lap.motion.x[-1] == pytest.approx(0.0, abs=1.0)
         assert lap.motion.vx[0] == pytest.approx(lap.motion.vx[-1], abs=3.0)  # a flying start
 
 
-def test_laps_are_fast_and_without_spin(laps: list[Trip]) -> None:
+def test_laps_are_fast_and_without_spin(laps):
     car = car_of(MultiBodyPlant(LOWERED))
     for lap in laps:
         motion = lap.motion
@@ -254,13 +251,13 @@ def test_laps_are_fast_and_without_spin(laps: list[Trip]) -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("seed", [1, 3, 4, 5, 6])
-def test_no_seed_spins_or_leaves_its_line(seed: int) -> None:
+def test_no_seed_spins_or_leaves_its_line(seed):
     lap = trip(seed, duration=130.0)  # a lap and a half
     assert lap.flags.largest_lateral_error < 1.0
     assert not lap.flags.spun
 
 
-def test_speed_profile_stays_within_friction_circle_and_power() -> None:
+def test_speed_profile_stays_within_friction_circle_and_power():
     driver, car, used = Driver(), car_of(MultiBodyPlant(LOWERED)), np.full_like(HANDLING.curvature, 8.0)
     speed = speed_profile(HANDLING.curvature, used, HANDLING.arc_length[1], car, driver)
     lateral = speed**2 * HANDLING.curvature
@@ -274,7 +271,7 @@ def test_speed_profile_stays_within_friction_circle_and_power() -> None:
     assert np.isclose(np.abs(lateral), 8.0).sum() > 5  # and uses all of it in the corners
 
 
-def test_speed_profile_uses_a_banked_corner_and_respects_a_slippery_one() -> None:
+def test_speed_profile_uses_a_banked_corner_and_respects_a_slippery_one():
     driver, car = Driver(), car_of(MultiBodyPlant(LOWERED))
     curvature, used = np.full(200, 0.02), np.full(200, 8.0)
     speed = speed_profile(curvature, used, 1.0, car, driver)[100]
@@ -286,12 +283,12 @@ def test_speed_profile_uses_a_banked_corner_and_respects_a_slippery_one() -> Non
     assert slippery**2 * 0.02 == pytest.approx(4.0, rel=3e-3)
 
 
-def test_style_beyond_the_grip_is_an_error() -> None:
+def test_style_beyond_the_grip_is_an_error():
     with pytest.raises(ConfigurationError, match="grip fraction"):
         draw_style(0, (1.1, 1.1), 0.05, 0.5)
 
 
-def test_vehicles_own_driver_values_count() -> None:
+def test_vehicles_own_driver_values_count():
     own = replace(LOWERED, driver={"grip": 7.0, "top_speed": 30.0, "power_per_mass": 20.0})
     car = car_of(MultiBodyPlant(own))
     assert (car.grip, car.top_speed, car.power_per_mass) == (7.0, 30.0, 20.0)
@@ -303,7 +300,7 @@ def test_vehicles_own_driver_values_count() -> None:
 # --- roads that are not level
 
 
-def test_circuit_lap_keeps_the_bank_and_grade_of_its_place(circuit: Trip) -> None:
+def test_circuit_lap_keeps_the_bank_and_grade_of_its_place(circuit):
     course, motion = course_by_name("palm_beach_like"), circuit.motion
     place, _ = places_on(course, motion.x, motion.y)
     # The car is turned against the road by its sideslip and by the line's angle, a few degrees.
@@ -313,7 +310,7 @@ def test_circuit_lap_keeps_the_bank_and_grade_of_its_place(circuit: Trip) -> Non
     assert motion.bank.max() > 0.03  # right turns lean the other way
 
 
-def test_tyre_forces_gravity_and_air_make_the_acceleration(circuit: Trip) -> None:
+def test_tyre_forces_gravity_and_air_make_the_acceleration(circuit):
     motion, plant = circuit.motion, MultiBodyPlant(LOWERED)
     mass, drag = plant.parameters.m, car_of(plant).drag
     speed = np.hypot(motion.vx, motion.vy)
@@ -327,13 +324,13 @@ def test_tyre_forces_gravity_and_air_make_the_acceleration(circuit: Trip) -> Non
     assert np.abs(across + 9.81 * np.sin(motion.bank) - motion.ay)[banked].mean() > 0.25  # and does not without gravity
 
 
-def test_flat_leaves_bank_and_grade_out() -> None:
+def test_flat_leaves_bank_and_grade_out():
     motion = trip(1, course="palm_beach_like", duration=2.0, flat=True).motion
     assert not motion.bank.any()
     assert not motion.grade.any()
 
 
-def test_wet_road_lowers_what_is_reached_and_patches_are_in_the_motion() -> None:
+def test_wet_road_lowers_what_is_reached_and_patches_are_in_the_motion():
     dry, wet, patchy = (trip(3, surface=name, duration=40.0) for name in ("dry", "wet", "patchy"))
     assert np.abs(wet.motion.ay).max() < 0.8 * np.abs(dry.motion.ay).max()
     assert wet.motion.friction.min() == wet.motion.friction.max() == 0.7
@@ -348,7 +345,7 @@ def test_wet_road_lowers_what_is_reached_and_patches_are_in_the_motion() -> None
 # --- drives
 
 
-def test_same_seed_gives_the_same_samples_here_and_in_two_processes_at_once(recording: Recording) -> None:
+def test_same_seed_gives_the_same_samples_here_and_in_two_processes_at_once(recording):
     with ProcessPoolExecutor(max_workers=2, mp_context=get_context("spawn")) as pool:
         others = list(pool.map(drive_counted, [1, 1]))
     for other in (drive(seed=1), *(other for other, _ in others)):
@@ -357,19 +354,19 @@ def test_same_seed_gives_the_same_samples_here_and_in_two_processes_at_once(reco
     assert [compilations for _, compilations in others] == [0, 0]  # machine code is kept on disk
 
 
-def test_other_seeds_give_other_drives(recording: Recording) -> None:
+def test_other_seeds_give_other_drives(recording):
     other = drive(seed=2)
     assert np.abs(recording["vx"] - other["vx"]).max() > 0.5
     assert np.abs(draw_style(1, (0.65, 0.9), 0.05, 0.5).grip_fraction - draw_style(2, (0.65, 0.9), 0.05, 0.5).grip_fraction) > 0.01
 
 
-def test_sampling_rate_does_not_change_the_drive() -> None:
+def test_sampling_rate_does_not_change_the_drive():
     coarse, fine = (drive(seed=0, duration=8.0, rate_hz=rate, sensors=ideal_sensors()) for rate in (20.0, 100.0))
     for name in coarse.channels:
         np.testing.assert_array_equal(coarse[name], fine[name][::5])
 
 
-def test_ideal_sensors_are_kinematically_consistent() -> None:
+def test_ideal_sensors_are_kinematically_consistent():
     # dvy/dt = ay - vx r and dvx/dt = ax + vy r over two samples, by Simpson's rule; the circuit has bank and grade.
     slalom = manoeuvre_from_config({"name": "slalom", "severity": 0.9, "spacing": 30.0})
     circuit = manoeuvre_from_config({"name": "laps", "course": "palm_beach_like", "severity": 0.9, "duration": 35.0})
@@ -388,7 +385,7 @@ def test_ideal_sensors_are_kinematically_consistent() -> None:
         assert np.abs(vy[2:] - vy[:-2]).max() > 5e-4
 
 
-def test_recording_says_where_it_comes_from(recording: Recording) -> None:
+def test_recording_says_where_it_comes_from(recording):
     assert recording.kind == "simulated"
     assert recording.vehicle == "bmw_320i_low"
     assert (len(recording), recording.rate_hz) == (1200, 100.0)
@@ -407,7 +404,7 @@ def test_recording_says_where_it_comes_from(recording: Recording) -> None:
     assert 0.0 < flags["largest_sideslip"] < 0.2
 
 
-def test_rollover_says_which_drive_and_when() -> None:
+def test_rollover_says_which_drive_and_when():
     tall = Vehicle("tall", 2, {**LOWERED.overrides, "h_s": 1.4}, driver={"grip": 9.0})
     manoeuvre = manoeuvre_from_config({"name": "j_turn", "speed": 30.0, "severity": 1.5})
     with pytest.raises(
@@ -418,11 +415,11 @@ def test_rollover_says_which_drive_and_when() -> None:
 
 
 @pytest.mark.parametrize("options", [{"rate_hz": 30.0}, {"rate_hz": 0.0}, {"duration": 0.0}, {"seed": -1}])
-def test_drive_that_makes_no_sense_is_refused(options: dict[str, float]) -> None:
+def test_drive_that_makes_no_sense_is_refused(options):
     with pytest.raises(ConfigurationError):
         drive(**{"seed": 0, "duration": 1.0, **options})
 
 
-def test_step_that_does_not_fit_the_rate_is_refused() -> None:
+def test_step_that_does_not_fit_the_rate_is_refused():
     with pytest.raises(ConfigurationError, match=r"step of 0\.003 s"):
         trip(0, step=3e-3, duration=1.0)

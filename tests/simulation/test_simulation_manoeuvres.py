@@ -1,19 +1,16 @@
 """Manoeuvres of the proving ground, with every shipped car: what each is for, how it ends, and what the seed decides."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import fields, replace
 from functools import cache
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 import yaml
 
 from vehest.data.errors import ConfigurationError
-from vehest.simulation.drive import Trip, drive, simulate_drive
+from vehest.simulation.drive import drive, simulate_drive
 from vehest.simulation.driving.car import car_of
 from vehest.simulation.driving.cones import DoubleLaneChange, Slalom
 from vehest.simulation.driving.laps import Laps
@@ -28,7 +25,7 @@ VEHICLES = Path(__file__).parents[2] / "conf" / "vehicle"
 CARS = sorted(
     path.stem for path in VEHICLES.glob("*.yaml") if "plant" not in yaml.safe_load(path.read_text(encoding="utf-8"))
 )  # multi-body
-MODERATE: dict[str, dict[str, Any]] = {
+MODERATE = {
     "lane change": {"name": "double_lane_change", "severity": 0.55},
     "obstacle": {"name": "double_lane_change", "layout": "iso_3888_2", "severity": 0.5},
     "slalom 18 m": {"name": "slalom", "severity": 0.5},
@@ -41,7 +38,7 @@ MODERATE: dict[str, dict[str, Any]] = {
     "handling lap": {"name": "laps", "course": "vairano_like", "severity": 0.75, "duration": 20.0},
     "circuit": {"name": "laps", "course": "palm_beach_like", "severity": 0.75, "duration": 26.0},
 }
-MODERATE_LAPS: dict[str, dict[str, Any]] = {  # whole laps, seconds each
+MODERATE_LAPS = {  # whole laps, seconds each
     "speed lap": {"name": "speed_laps", "speeds": [25.0], "severity": 0.6},
     "fast lap": {"name": "fast_lap", "mean_speed": 21.5, "top_speed": 32.0},
 }
@@ -49,41 +46,41 @@ PUBLISHED = {name: Vehicle(name, number) for number, name in PUBLISHED_SETS.item
 
 
 @cache
-def vehicle(name: str) -> Vehicle:
+def vehicle(name):
     if name in PUBLISHED:
         return PUBLISHED[name]
     return vehicle_from_configuration(yaml.safe_load((VEHICLES / f"{name}.yaml").read_text(encoding="utf-8")))
 
 
 @cache
-def moderate(car: str, which: str) -> Trip:
+def moderate(car, which):
     return drive(MultiBodyPlant(vehicle(car)), manoeuvre_from_config((MODERATE | MODERATE_LAPS)[which]), seed=1)
 
 
-def go(car: str | Vehicle, seed: int = 1, surface: str = "dry", stability_control: bool = False, **configuration: Any) -> Trip:
+def go(car, seed=1, surface="dry", stability_control=False, **configuration):
     plant = MultiBodyPlant(vehicle(car) if isinstance(car, str) else car)
     manoeuvre = manoeuvre_from_config(configuration)
     return drive(plant, manoeuvre, seed, surface=surface_from_config(surface), stability_control=stability_control)
 
 
-def side_of(trip: Trip) -> float:
+def side_of(trip):
     return {"left": 1.0, "right": -1.0}[trip.drawn["side"]]
 
 
-def times(trip: Trip) -> np.ndarray:
+def times(trip):
     return np.arange(len(trip.motion)) / trip.motion.rate_hz
 
 
 # --- all of them
 
 
-def test_every_manoeuvre_is_among_the_moderate_ones() -> None:
+def test_every_manoeuvre_is_among_the_moderate_ones():
     assert {configuration["name"] for configuration in (MODERATE | MODERATE_LAPS).values()} == set(MANOEUVRES)
 
 
 @pytest.mark.parametrize("car", [*CARS, *(pytest.param(name, marks=pytest.mark.slow) for name in PUBLISHED)])
 @pytest.mark.parametrize("which", [*MODERATE, *(pytest.param(name, marks=pytest.mark.slow) for name in MODERATE_LAPS)])
-def test_moderate_severity_is_completed_by_every_car(car: str, which: str) -> None:
+def test_moderate_severity_is_completed_by_every_car(car, which):
     trip = moderate(car, which)
     flags, motion = trip.flags, trip.motion
     assert flags.completed
@@ -102,8 +99,8 @@ def test_moderate_severity_is_completed_by_every_car(car: str, which: str) -> No
 
 
 @pytest.mark.parametrize("name", ["double_lane_change", "slalom", "skidpad", "braking_in_turn", "j_turn", "spiral", "random_steer"])
-def test_seed_decides_every_sample_and_nothing_else_does(name: str) -> None:
-    def one(seed: int) -> Trip:
+def test_seed_decides_every_sample_and_nothing_else_does(name):
+    def one(seed):
         return go("bmw_545i", seed, name=name, severity=(0.4, 0.6), **{"duration": 3.0} if name == "random_steer" else {})
 
     first, again, other = one(1), one(1), one(2)
@@ -114,7 +111,7 @@ def test_seed_decides_every_sample_and_nothing_else_does(name: str) -> None:
     assert np.abs(first.motion.yaw_rate[:n_common] - other.motion.yaw_rate[:n_common]).max() > 0.02
 
 
-def test_seeds_take_both_sides() -> None:
+def test_seeds_take_both_sides():
     car, surface = car_of(MultiBodyPlant(vehicle("bmw_545i"))), surface_from_config("dry")
     sides = {manoeuvre_from_config({"name": "slalom"}).controller(car, surface, seed).drawn["side"] for seed in range(12)}
     assert sides == {"left", "right"}
@@ -125,7 +122,7 @@ def test_seeds_take_both_sides() -> None:
 
 @pytest.mark.parametrize("car", CARS)
 @pytest.mark.parametrize("which", ["lane change", "obstacle"])
-def test_lane_change_keeps_the_car_between_the_cones(car: str, which: str) -> None:
+def test_lane_change_keeps_the_car_between_the_cones(car, which):
     trip, manoeuvre = moderate(car, which), manoeuvre_from_config(MODERATE[which])
     assert isinstance(manoeuvre, DoubleLaneChange)
     width = car_of(MultiBodyPlant(vehicle(car))).width
@@ -139,7 +136,7 @@ def test_lane_change_keeps_the_car_between_the_cones(car: str, which: str) -> No
     assert x[-1] > manoeuvre.gates(width)[-1].end + 30.0
 
 
-def test_gates_are_those_of_the_standards() -> None:
+def test_gates_are_those_of_the_standards():
     first = DoubleLaneChange(layout="iso_3888_1").gates(1.8)
     assert [gate.begin for gate in first] == [0.0, 45.0, 95.0]
     assert first[-1].end == 125.0
@@ -154,7 +151,7 @@ def test_gates_are_those_of_the_standards() -> None:
 
 @pytest.mark.parametrize("car", CARS)
 @pytest.mark.parametrize("which", ["slalom 18 m", "slalom 30 m"])
-def test_slalom_passes_the_cones_on_alternating_sides(car: str, which: str) -> None:
+def test_slalom_passes_the_cones_on_alternating_sides(car, which):
     trip, manoeuvre = moderate(car, which), manoeuvre_from_config(MODERATE[which])
     assert isinstance(manoeuvre, Slalom)
     width = car_of(MultiBodyPlant(vehicle(car))).width
@@ -170,7 +167,7 @@ def test_slalom_passes_the_cones_on_alternating_sides(car: str, which: str) -> N
 
 
 @pytest.mark.parametrize("car", CARS)
-def test_skidpad_keeps_its_radius_while_the_lateral_acceleration_rises(car: str) -> None:
+def test_skidpad_keeps_its_radius_while_the_lateral_acceleration_rises(car):
     trip = moderate(car, "skidpad")
     motion, side = trip.motion, side_of(trip)
     turned = side * (motion.yaw - motion.yaw[0]) > math.pi / 3.0
@@ -190,7 +187,7 @@ def test_skidpad_keeps_its_radius_while_the_lateral_acceleration_rises(car: str)
 
 
 @pytest.mark.parametrize("car", CARS)
-def test_braking_in_turn_brakes_while_it_turns_and_ends_a_second_after_the_stand(car: str) -> None:
+def test_braking_in_turn_brakes_while_it_turns_and_ends_a_second_after_the_stand(car):
     trip = moderate(car, "braking in turn")
     motion, side = trip.motion, side_of(trip)
     braking = (times(trip) > trip.drawn["brakes_at"] + 0.5) & (motion.vx > 5.0)
@@ -203,7 +200,7 @@ def test_braking_in_turn_brakes_while_it_turns_and_ends_a_second_after_the_stand
     assert (len(motion) - 1 - standing) / 100.0 == pytest.approx(1.0, abs=0.05)
 
 
-def test_braking_in_turn_can_end_at_a_speed_and_keep_to_the_circle() -> None:
+def test_braking_in_turn_can_end_at_a_speed_and_keep_to_the_circle():
     trip = go("bmw_545i", name="braking_in_turn", severity=0.5, deceleration=3.0, until_speed=5.0, steering="path")
     assert trip.flags.completed
     assert not trip.flags.stood
@@ -215,7 +212,7 @@ def test_braking_in_turn_can_end_at_a_speed_and_keep_to_the_circle() -> None:
 
 
 @pytest.mark.parametrize("car", CARS)
-def test_j_turn_reaches_the_steady_turn_that_was_asked_for(car: str) -> None:
+def test_j_turn_reaches_the_steady_turn_that_was_asked_for(car):
     trip = moderate(car, "j-turn")
     motion, drawn = trip.motion, trip.drawn
     last = slice(-100, None)
@@ -228,7 +225,7 @@ def test_j_turn_reaches_the_steady_turn_that_was_asked_for(car: str) -> None:
     assert reached - drawn["begin"] < drawn["steer_time"] + 0.3
 
 
-def test_spiral_tightens_slowly_first_to_one_side_then_to_the_other() -> None:
+def test_spiral_tightens_slowly_first_to_one_side_then_to_the_other():
     trip = moderate("bmw_545i", "spiral")
     motion, side, drawn = trip.motion, side_of(trip), trip.drawn
     ramp = (times(trip) > drawn["begin"] + 0.5) & (times(trip) < drawn["begin"] + drawn["ramp_time"])
@@ -241,7 +238,7 @@ def test_spiral_tightens_slowly_first_to_one_side_then_to_the_other() -> None:
     assert (side_of(once) * once.motion.ay).min() > -1.5
 
 
-def test_random_steer_stays_in_its_band_at_roughly_constant_speed() -> None:
+def test_random_steer_stays_in_its_band_at_roughly_constant_speed():
     trip = go("bmw_545i", name="random_steer", severity=0.6, speed=20.0, band=[0.2, 1.0], duration=60.0)
     steer = trip.motion.steer[200:]
     spectrum = np.abs(np.fft.rfft(steer * np.hanning(len(steer)))) ** 2
@@ -256,7 +253,7 @@ def test_random_steer_stays_in_its_band_at_roughly_constant_speed() -> None:
 
 
 @pytest.mark.parametrize(("car", "reached"), [("corvette_grand_sport", 11.6), ("ferrari_250_lm", 10.8)])
-def test_race_cars_lap_the_circuit_at_nearly_all_of_their_grip_without_a_spin(car: str, reached: float) -> None:
+def test_race_cars_lap_the_circuit_at_nearly_all_of_their_grip_without_a_spin(car, reached):
     # Table I of Da Lio et al. 2023: 99 % of |ay| lie below 11.3 to 11.6 m/s² for the Corvette, 10.6 to 10.8 m/s² for the Ferrari.
     trip = go(car, seed=100, name="laps", course="palm_beach_like", severity=0.95, laps=1)
     assert (trip.flags.spun, trip.flags.left_road, trip.flags.completed) == (False, False, True)
@@ -265,7 +262,7 @@ def test_race_cars_lap_the_circuit_at_nearly_all_of_their_grip_without_a_spin(ca
     assert np.quantile(np.abs(trip.motion.ay), 0.99) > reached
 
 
-def lap_times(trip: Trip, n_laps: int) -> np.ndarray:
+def lap_times(trip, n_laps):
     """Times [s] at which the line is crossed, from the first sample on: the road there leads along the x axis."""
     x, y = trip.motion.x, trip.motion.y
     crossing = np.flatnonzero((x[:-1] < 0.0) & (x[1:] >= 0.0) & (np.abs(y[1:]) < 10.0))
@@ -274,7 +271,7 @@ def lap_times(trip: Trip, n_laps: int) -> np.ndarray:
     return crossings
 
 
-def test_speed_laps_keep_their_speed_and_stop_in_five_seconds() -> None:
+def test_speed_laps_keep_their_speed_and_stop_in_five_seconds():
     trip = go("heavy_truck", name="speed_laps", speeds=[45.0 / 3.6])
     motion = trip.motion
     end = lap_times(trip, 2)[1]
@@ -289,14 +286,14 @@ def test_speed_laps_keep_their_speed_and_stop_in_five_seconds() -> None:
 
 
 @pytest.mark.slow
-def test_three_speed_laps_take_as_long_as_in_the_paper() -> None:
+def test_three_speed_laps_take_as_long_as_in_the_paper():
     # Di Biase et al. 2020, text to Fig. 6: laps of 0-299 s, 299-526 s and 526-721 s at around 30, 40 and 45 km/h.
     trip = go("heavy_truck", name="speed_laps")
     laps = np.diff(lap_times(trip, 4))
     np.testing.assert_allclose(laps, [299.0, 227.0, 195.0], rtol=0.04)
 
 
-def test_fast_lap_has_the_papers_mean_and_top_speed() -> None:
+def test_fast_lap_has_the_papers_mean_and_top_speed():
     # Di Biase et al. 2020: mean 76 km/h, top 115 km/h. The driver lags a little behind the plan that has them exactly.
     trip = go("heavy_truck", name="fast_lap")
     duration = len(trip.motion) / 100.0
@@ -305,7 +302,7 @@ def test_fast_lap_has_the_papers_mean_and_top_speed() -> None:
     assert not trip.flags.left_road
 
 
-def test_fast_lap_beyond_the_cars_reach_says_what_is_reached() -> None:
+def test_fast_lap_beyond_the_cars_reach_says_what_is_reached():
     with pytest.raises(ConfigurationError, match=r"heavy_truck.* m/s at most"):
         go("heavy_truck", name="fast_lap", mean_speed=32.0, top_speed=33.0)
 
@@ -316,14 +313,14 @@ def test_fast_lap_beyond_the_cars_reach_says_what_is_reached() -> None:
 SPINNING = {"name": "j_turn", "severity": 1.3, "speed": 30.0, "turn_time": 8.0}
 
 
-def oversteering() -> Vehicle:
+def oversteering():
     """A Ferrari whose rear tyres have three quarters of the front tyres' friction."""
     base = vehicle("ferrari_250_lm")
     rear = base.overrides["tire_rear"] | {"p_ky1": -18.0, "p_dy1": 0.75 * base.overrides["tire"]["p_dy1"]}
     return replace(base, name="oversteering", overrides={**base.overrides, "tire_rear": rear})
 
 
-def test_spin_is_kept_and_flagged_until_a_second_after_the_stand() -> None:
+def test_spin_is_kept_and_flagged_until_a_second_after_the_stand():
     trip = go(oversteering(), **SPINNING)
     flags, motion = trip.flags, trip.motion
     assert (flags.spun, flags.completed, flags.stood) == (True, False, True)
@@ -339,7 +336,7 @@ def test_spin_is_kept_and_flagged_until_a_second_after_the_stand() -> None:
 
 
 @pytest.mark.parametrize("seed", [1, 2])  # to the right and to the left
-def test_stability_control_prevents_that_spin(seed: int) -> None:
+def test_stability_control_prevents_that_spin(seed):
     held = go(oversteering(), seed, stability_control=True, **SPINNING)
     assert (held.flags.spun, held.flags.completed) == (False, True)
     # The car alone turns right around; as far as 10 degrees a driver would still be at ease.
@@ -348,15 +345,15 @@ def test_stability_control_prevents_that_spin(seed: int) -> None:
     assert held.motion.vx[-1] > 10.0  # it was not simply stopped
 
 
-def test_stability_control_leaves_a_calm_drive_alone() -> None:
+def test_stability_control_leaves_a_calm_drive_alone():
     calm = go("bmw_545i", name="slalom", severity=0.3, stability_control=True)
     assert calm.flags.stability_share == 0.0
 
 
-def test_drive_that_is_cut_off_is_not_completed() -> None:
+def test_drive_that_is_cut_off_is_not_completed():
     class Impatient(Laps):
         @property
-        def longest(self) -> float:
+        def longest(self):
             return 3.0
 
     for manoeuvre, completed in ((Impatient(laps=1), False), (Laps(duration=3.0), True)):
@@ -365,7 +362,7 @@ def test_drive_that_is_cut_off_is_not_completed() -> None:
         assert (trip.flags.completed, trip.flags.gave_up_at) == (completed, None)
 
 
-def test_car_that_leaves_the_road_is_kept_and_flagged() -> None:
+def test_car_that_leaves_the_road_is_kept_and_flagged():
     manoeuvre = manoeuvre_from_config({"name": "double_lane_change", "layout": "iso_3888_2", "speed": 45.0})
     recording = simulate_drive(id="out", vehicle=vehicle("bmw_545i"), manoeuvre=manoeuvre, seed=0)
     flags = recording.provenance["flags"]
@@ -380,7 +377,7 @@ def test_car_that_leaves_the_road_is_kept_and_flagged() -> None:
 
 
 @pytest.mark.parametrize("name", sorted(MANOEUVRES))
-def test_description_makes_the_manoeuvre_again(name: str) -> None:
+def test_description_makes_the_manoeuvre_again(name):
     manoeuvre = manoeuvre_from_config({"name": name, **({"laps": 2} if name == "laps" else {})})
     assert isinstance(manoeuvre, Manoeuvre)
     as_lists = {key: list(value) if isinstance(value, tuple) else value for key, value in manoeuvre.description().items()}
@@ -399,6 +396,6 @@ def test_description_makes_the_manoeuvre_again(name: str) -> None:
         ({"name": "fast_lap", "mean_speed": 40.0, "top_speed": 30.0}, "top_speed"),
     ],
 )
-def test_configuration_that_makes_no_sense_names_the_value(configuration: dict[str, Any], complaint: str) -> None:
+def test_configuration_that_makes_no_sense_names_the_value(configuration, complaint):
     with pytest.raises(ConfigurationError, match=complaint):
         manoeuvre_from_config(configuration)

@@ -1,13 +1,10 @@
 """The planar plant, its car and its driver: closed forms, energy, standstill and spins, and what the simulated tyre sets hold."""
 
-from __future__ import annotations
-
 import math
 import re
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -21,44 +18,33 @@ from vehest.simulation.driving.freestyle import Freestyle
 from vehest.simulation.driving.manoeuvres import one_of
 from vehest.simulation.errors import SimulationError
 from vehest.simulation.planar_drive import CHANNELS, PLANAR_MANOEUVRES, drive_freely, simulate_planar_drive
-from vehest.simulation.plant.motion import Motion
-from vehest.simulation.plant.planar import (
-    FIRST_WHEEL,
-    LOAD_AX,
-    LOAD_AY,
-    STEER,
-    VX,
-    VY,
-    YAW_RATE,
-    Inputs,
-    PlanarPlant,
-)
-from vehest.simulation.plant.planar_car import PARAMETERS, PlanarCar, planar_car_from_configuration
+from vehest.simulation.plant.planar import FIRST_WHEEL, LOAD_AX, LOAD_AY, STEER, VX, VY, YAW_RATE, Inputs, PlanarPlant
+from vehest.simulation.plant.planar_car import PARAMETERS, planar_car_from_configuration
 from vehest.simulation.road.surface import SURFACES
 from vehest.simulation.sensors.levels import PRESETS
 from vehest.sources.base import open_source
 
 CONF = Path(__file__).parents[2] / "conf"
-CONFIGURATION: dict[str, Any] = yaml.safe_load((CONF / "vehicle" / "f1tenth.yaml").read_text(encoding="utf-8"))
+CONFIGURATION = yaml.safe_load((CONF / "vehicle" / "f1tenth.yaml").read_text(encoding="utf-8"))
 CAR = planar_car_from_configuration(CONFIGURATION)
 EVEN = replace(CAR, stiffness_factor_rear=CAR.stiffness_factor_front, load_sensitivity=0.0)  # all tyres alike
 
 
-def held(car: PlanarCar, seconds: float, speed: float = 0.0, **inputs: float) -> np.ndarray:
+def held(car, seconds, speed=0.0, **inputs):
     """The state after some time with constant inputs."""
     plant = PlanarPlant(car)
     return plant.advance(plant.initial_state(speed), Inputs(**inputs), round(1000 * seconds))
 
 
 @cache
-def freestyle(seed: int = 1, rate_hz: float = 1000.0) -> Motion:
+def freestyle(seed=1, rate_hz=1000.0):
     return drive_freely(PlanarPlant(CAR), Freestyle(duration=15.0), seed, rate_hz=rate_hz).motion
 
 
 # --- closed forms
 
 
-def test_steady_speed_is_where_the_motors_torque_meets_its_friction_and_the_air() -> None:
+def test_steady_speed_is_where_the_motors_torque_meets_its_friction_and_the_air():
     car, current = replace(CAR, air_drag=1.0), 1.15 * CAR.coulomb_torque / CAR.torque_constant
     state = held(car, 30.0, speed=1.0, current=current)
     speed, wheels = state[VX], state[FIRST_WHEEL : FIRST_WHEEL + 4].mean()
@@ -67,7 +53,7 @@ def test_steady_speed_is_where_the_motors_torque_meets_its_friction_and_the_air(
     assert 0.5 < speed < 2.0
 
 
-def test_locked_wheels_slide_with_the_tyres_force_at_full_slip() -> None:
+def test_locked_wheels_slide_with_the_tyres_force_at_full_slip():
     plant = PlanarPlant(EVEN)
     state = plant.advance(plant.initial_state(4.0), Inputs(current=-70.0), 200)
     state[FIRST_WHEEL : FIRST_WHEEL + 4] = 0.0
@@ -81,7 +67,7 @@ def test_locked_wheels_slide_with_the_tyres_force_at_full_slip() -> None:
 
 
 @pytest.mark.parametrize("steer", [0.05, -0.3])
-def test_slow_circle_is_that_of_the_axles_geometry(steer: float) -> None:
+def test_slow_circle_is_that_of_the_axles_geometry(steer):
     rolls_freely = replace(CAR, coulomb_torque=0.0, viscous_torque=0.0, axle_lock=0.0, centre_lock=0.0)
     state = held(rolls_freely, 1.0, speed=0.6, steer=steer)
     assert 0.4 < state[VX] < 0.6
@@ -89,7 +75,7 @@ def test_slow_circle_is_that_of_the_axles_geometry(steer: float) -> None:
     assert state[YAW_RATE] == pytest.approx(expected, rel=0.05)  # tyres scrub: both wheels steer by one angle
 
 
-def test_small_slips_have_the_stiffness_of_the_linear_single_track() -> None:
+def test_small_slips_have_the_stiffness_of_the_linear_single_track():
     plant, car = PlanarPlant(EVEN), EVEN
     state = plant.initial_state(3.0)
     state[VY], state[STEER] = 0.003, 0.001
@@ -108,7 +94,7 @@ def test_small_slips_have_the_stiffness_of_the_linear_single_track() -> None:
 # --- balances
 
 
-def test_tyre_forces_and_air_make_all_accelerations_of_a_drive() -> None:
+def test_tyre_forces_and_air_make_all_accelerations_of_a_drive():
     motion = freestyle()
     drag = CAR.air_drag * np.hypot(motion.vx, motion.vy)
     np.testing.assert_allclose(CAR.mass * motion.ax, motion.tyre_fx.sum(axis=1) - drag * motion.vx, atol=1e-9)
@@ -120,7 +106,7 @@ def test_tyre_forces_and_air_make_all_accelerations_of_a_drive() -> None:
     assert np.quantile(np.abs(CAR.yaw_inertia * turning - moment)[1:-1], 0.99) < 0.02 * np.abs(moment).max()
 
 
-def test_a_drive_is_kinematically_consistent() -> None:
+def test_a_drive_is_kinematically_consistent():
     motion, rate = freestyle(), 1000.0
     inner = slice(1, -1)
     for shown, expected in (
@@ -133,7 +119,7 @@ def test_a_drive_is_kinematically_consistent() -> None:
         assert np.quantile(np.abs(shown - expected)[inner], 0.999) < 0.02 * np.abs(expected).max()
 
 
-def test_wheel_loads_carry_the_weight_and_balance_the_moments_of_inertia() -> None:
+def test_wheel_loads_carry_the_weight_and_balance_the_moments_of_inertia():
     plant = PlanarPlant(CAR)
     state = plant.initial_state(2.0)
     state[LOAD_AX], state[LOAD_AY] = 2.0, -3.0
@@ -144,7 +130,7 @@ def test_wheel_loads_carry_the_weight_and_balance_the_moments_of_inertia() -> No
     assert -axles == pytest.approx(CAR.mass * CAR.cg_height * 2.0)
 
 
-def test_no_force_is_larger_than_friction_times_load() -> None:
+def test_no_force_is_larger_than_friction_times_load():
     motion = freestyle()
     force = np.hypot(motion.tyre_fx, motion.tyre_fy)
     relative = motion.tyre_fz / (0.25 * CAR.mass * GRAVITY) - 1.0
@@ -153,7 +139,7 @@ def test_no_force_is_larger_than_friction_times_load() -> None:
 
 
 @pytest.mark.parametrize("yaw_rate", [0.0, 6.0, -12.0])
-def test_a_car_that_coasts_loses_energy_until_it_stands(yaw_rate: float) -> None:
+def test_a_car_that_coasts_loses_energy_until_it_stands(yaw_rate):
     plant = PlanarPlant(CAR)
     state = plant.initial_state(4.0)
     state[VY], state[YAW_RATE] = 1.5, yaw_rate
@@ -170,18 +156,18 @@ def test_a_car_that_coasts_loses_energy_until_it_stands(yaw_rate: float) -> None
 # --- standstill and spins
 
 
-def test_a_car_at_rest_stays_at_rest_whatever_the_steering_does() -> None:
+def test_a_car_at_rest_stays_at_rest_whatever_the_steering_does():
     state = held(CAR, 2.0, steer=0.4)
     assert state[STEER] == pytest.approx(0.4)
     np.testing.assert_array_equal(state[:STEER], 0.0)
 
 
-def test_motor_friction_holds_the_car_against_a_small_current_but_for_a_creep() -> None:
+def test_motor_friction_holds_the_car_against_a_small_current_but_for_a_creep():
     assert held(CAR, 2.0, current=0.5 * CAR.coulomb_torque / CAR.torque_constant)[VX] < 0.06
     assert held(CAR, 2.0, current=30.0)[VX] > 2.0
 
 
-def test_nothing_becomes_infinite_under_wild_inputs_from_standstill_through_spins_and_backwards() -> None:
+def test_nothing_becomes_infinite_under_wild_inputs_from_standstill_through_spins_and_backwards():
     plant, generator = PlanarPlant(CAR), np.random.default_rng(5)
     state, fastest, backwards, turned = plant.initial_state(), 0.0, 0.0, 0.0
     for _ in range(80):
@@ -197,7 +183,7 @@ def test_nothing_becomes_infinite_under_wild_inputs_from_standstill_through_spin
     assert 3.0 < turned < 40.0
 
 
-def test_right_is_the_mirror_image_of_left() -> None:
+def test_right_is_the_mirror_image_of_left():
     left, right = (held(CAR, 1.5, speed=3.0, steer=side * 0.5, current=40.0) for side in (1.0, -1.0))
     np.testing.assert_allclose(right[[VX, LOAD_AX]], left[[VX, LOAD_AX]], rtol=1e-9)
     np.testing.assert_allclose(right[[VY, YAW_RATE, LOAD_AY, STEER]], -left[[VY, YAW_RATE, LOAD_AY, STEER]], rtol=1e-9)
@@ -205,14 +191,14 @@ def test_right_is_the_mirror_image_of_left() -> None:
     assert left[YAW_RATE] > 1.0  # a left turn is positive
 
 
-def test_fixed_step_agrees_with_solve_ivp() -> None:
+def test_fixed_step_agrees_with_solve_ivp():
     plant, inputs = PlanarPlant(CAR), Inputs(steer=0.45, current=45.0)
     start = plant.initial_state(2.0)
     reference = solve_ivp(lambda _, state: plant.derivative(state, inputs)[0], (0.0, 0.5), start, rtol=1e-9, atol=1e-10, max_step=0.005)
     np.testing.assert_allclose(plant.advance(start, inputs, 500), reference.y[:, -1], rtol=1e-3, atol=2e-4)
 
 
-def test_state_that_is_not_finite_is_an_error() -> None:
+def test_state_that_is_not_finite_is_an_error():
     plant = PlanarPlant(CAR, step=0.1)
     with pytest.raises(SimulationError, match=r"smaller step than 0\.1 s"):
         plant.advance(plant.initial_state(3.0), Inputs(0.4, 60.0), 10_000)
@@ -221,8 +207,8 @@ def test_state_that_is_not_finite_is_an_error() -> None:
 # --- drives
 
 
-def test_seed_decides_every_sample_and_nothing_else_does() -> None:
-    def record(seed: int) -> dict[str, np.ndarray]:
+def test_seed_decides_every_sample_and_nothing_else_does():
+    def record(seed):
         recording = simulate_planar_drive(id="a", car=CAR, manoeuvre=Freestyle(duration=3.0), seed=seed)
         return {name: recording[name] for name in CHANNELS}
 
@@ -231,12 +217,12 @@ def test_seed_decides_every_sample_and_nothing_else_does() -> None:
     assert not any(np.array_equal(first[name], other[name]) for name in CHANNELS)
 
 
-def test_sampling_rate_does_not_change_the_drive() -> None:
+def test_sampling_rate_does_not_change_the_drive():
     fine, coarse = freestyle(), freestyle(rate_hz=100.0)
     np.testing.assert_array_equal(fine.vy[::10], coarse.vy)
 
 
-def test_vx_is_the_motors_speed_at_the_rim_and_errs_where_wheels_slip() -> None:
+def test_vx_is_the_motors_speed_at_the_rim_and_errs_where_wheels_slip():
     recording = simulate_planar_drive(id="a", car=CAR, manoeuvre=Freestyle(duration=15.0), seed=1, sensors=PRESETS["ideal"])
     motion = freestyle(rate_hz=100.0)
     assert set(recording.channels) == set(CHANNELS)
@@ -248,13 +234,13 @@ def test_vx_is_the_motors_speed_at_the_rim_and_errs_where_wheels_slip() -> None:
     assert recording.provenance["parameters"]["friction"] == CAR.friction
 
 
-def test_slippery_floor_lowers_what_is_reached_by_its_scale() -> None:
+def test_slippery_floor_lowers_what_is_reached_by_its_scale():
     floors = {name: drive_freely(PlanarPlant(CAR), Freestyle(duration=15.0), 1, surface=SURFACES[name]).motion for name in ("dry", "wet")}
     reached = {name: np.quantile(np.hypot(motion.ax, motion.ay), 0.95) for name, motion in floors.items()}
     assert reached["wet"] / reached["dry"] == pytest.approx(0.7, rel=0.05)
 
 
-def test_driver_who_saves_late_slides_further() -> None:
+def test_driver_who_saves_late_slides_further():
     late, early = (
         drive_freely(PlanarPlant(CAR), Freestyle(duration=20.0, sideslip=(limit, limit)), 2).flags.largest_sideslip for limit in (1.0, 0.1)
     )
@@ -265,22 +251,22 @@ def test_driver_who_saves_late_slides_further() -> None:
 
 
 @cache
-def tyre_sets() -> dict[str, dict[str, np.ndarray]]:
+def tyre_sets():
     source = open_source(compose_config("ingest", ["dataset=sim_tyre_sets"])["dataset"])
     return {name: dict(source.read(name).channels) for name in source.ids()}
 
 
-def of(pattern: str, channel: str) -> np.ndarray:
+def of(pattern, channel):
     return np.concatenate([drive[channel] for name, drive in tyre_sets().items() if name.startswith(pattern)])
 
 
-def test_tyre_sets_are_as_long_as_stated_and_finite() -> None:
+def test_tyre_sets_are_as_long_as_stated_and_finite():
     assert all(np.isfinite(samples).all() for drive in tyre_sets().values() for samples in drive.values())
     for pattern, minutes in (("learn_a", 3.0), ("test_a", 1.5), ("test_d", 3.0)):
         assert len(of(pattern, "vx")) / 6000.0 == pytest.approx(minutes, rel=0.1)
 
 
-def test_tyre_sets_slide_and_spin_their_wheels_as_the_recordings_do() -> None:
+def test_tyre_sets_slide_and_spin_their_wheels_as_the_recordings_do():
     # iros_hoons_1: 99 % of |β| below 23°, of the slip ratio below 0.95, half of the yaw rates above 2.3 rad/s, speeds of 0.8 to 3.9 m/s.
     for pattern in ("learn_a", "test_a", "test_d"):
         vx, vy = of(pattern, "vx_ref"), of(pattern, "vy_ref")
@@ -293,7 +279,7 @@ def test_tyre_sets_slide_and_spin_their_wheels_as_the_recordings_do() -> None:
         assert 1.4 < np.median(np.abs(of(pattern, "yaw_rate_ref"))) < 2.5
 
 
-def test_tyre_d_has_less_grip_than_tyre_a() -> None:
+def test_tyre_d_has_less_grip_than_tyre_a():
     grip = {}
     for tyre in ("test_a", "test_d"):
         vx, yaw_rate = of(tyre, "vx_ref"), of(tyre, "yaw_rate_ref")
@@ -304,7 +290,7 @@ def test_tyre_d_has_less_grip_than_tyre_a() -> None:
 # --- configuration
 
 
-def test_every_value_says_where_it_comes_from_or_that_it_is_assumed() -> None:
+def test_every_value_says_where_it_comes_from_or_that_it_is_assumed():
     lines = (CONF / "vehicle" / "f1tenth.yaml").read_text(encoding="utf-8").partition("parameters:\n")[2].splitlines()
     assert len(lines) == len(PARAMETERS)
     for line in lines:
@@ -318,7 +304,7 @@ def test_every_value_says_where_it_comes_from_or_that_it_is_assumed() -> None:
         ({"parameters": {**CONFIGURATION["parameters"], "mass": -1.0}}, "mass: .* greater than 0, not -1"),
     ],
 )
-def test_vehicle_that_makes_no_sense_names_the_value(changes: dict[str, Any], complaint: str) -> None:
+def test_vehicle_that_makes_no_sense_names_the_value(changes, complaint):
     with pytest.raises(ConfigurationError, match=complaint):
         planar_car_from_configuration({**CONFIGURATION, **changes})
 
@@ -331,12 +317,12 @@ def test_vehicle_that_makes_no_sense_names_the_value(changes: dict[str, Any], co
         ({"name": "freestyle", "brakes": 0.6, "kicks": 0.6}, "shares of one"),
     ],
 )
-def test_freestyle_that_makes_no_sense_is_refused(configuration: dict[str, Any], complaint: str) -> None:
+def test_freestyle_that_makes_no_sense_is_refused(configuration, complaint):
     with pytest.raises(ConfigurationError, match=complaint):
         one_of(configuration, PLANAR_MANOEUVRES)
 
 
-def data_set(**changes: Any) -> dict[str, Any]:
+def data_set(**changes):
     drive = {"id": "a", "manoeuvre": {"name": "freestyle", "duration": 1.0}}
     return {"name": "mine", "source": "simulated", "vehicle": CONFIGURATION, "drives": [drive], **changes}
 
@@ -350,12 +336,12 @@ def data_set(**changes: Any) -> dict[str, Any]:
         ({"vehicle": {"name": "a", "parameter_set": 2}}, "there is no manoeuvre 'freestyle'"),
     ],
 )
-def test_data_set_that_the_plant_cannot_make_is_refused(changes: dict[str, Any], complaint: str) -> None:
+def test_data_set_that_the_plant_cannot_make_is_refused(changes, complaint):
     with pytest.raises(ConfigurationError, match=complaint):
         open_source(data_set(**changes))
 
 
-def test_cars_of_a_data_set_vary_from_drive_to_drive() -> None:
+def test_cars_of_a_data_set_vary_from_drive_to_drive():
     drives = [{"id": "a", "count": 2, "manoeuvre": {"name": "freestyle", "duration": 1.0}}]
     source = open_source(data_set(drives=drives, vary=[{"parameters": ["friction", "mass"], "factor": [0.5, 0.9]}]))
     assert source.inputs() == {}  # the planar plant is vehest's own

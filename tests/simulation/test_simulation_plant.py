@@ -1,7 +1,5 @@
 """The plant: library's equations, what was added to them, and that it holds from standstill to a spin."""
 
-from __future__ import annotations
-
 import fcntl
 import math
 from dataclasses import fields
@@ -9,7 +7,6 @@ from functools import cache
 from pathlib import Path
 from threading import Event, Thread
 from types import FunctionType
-from typing import Any
 
 import numpy as np
 import pytest
@@ -40,7 +37,7 @@ from vehest.simulation.plant.regimes import FIRST_WHEEL, ROLL, VX, VY, YAW_RATE,
 CONFIGURATIONS = Path(__file__).parents[2] / "conf" / "vehicle"
 
 
-def shipped(name: str) -> Vehicle:
+def shipped(name):
     return vehicle_from_configuration(yaml.safe_load((CONFIGURATIONS / f"{name}.yaml").read_text(encoding="utf-8")))
 
 
@@ -69,18 +66,18 @@ PUBLISHED_DERIVATIVES = [
 class TwoTyres:
     """Parameters of the library whose ``tire`` is the front one for two calls, then the rear one for two, and so on."""
 
-    def __init__(self, vehicle: Vehicle) -> None:
+    def __init__(self, vehicle):
         self.values, self.asked = library_parameters(vehicle), 0
         self.tyres = (self.values.tire, rear_tyre(vehicle))
 
-    def __getattr__(self, name: str) -> Any:
+    def __getattr__(self, name):
         if name == "tire":
             self.asked += 1
             return self.tyres[(self.asked - 1) % 4 // 2]
         return getattr(self.values, name)
 
 
-def in_python(function: Dispatcher) -> FunctionType:
+def in_python(function):
     """A compiled function as plain Python, with all it calls: Python's sines are those of the library."""
     plain = function.py_func
     used = {name: plain.__globals__[name] for name in plain.__code__.co_names if name in plain.__globals__}
@@ -90,28 +87,26 @@ def in_python(function: Dispatcher) -> FunctionType:
 
 
 @cache
-def equations_in_python() -> Any:
+def equations_in_python():
     return in_python(multi_body)
 
 
-def derivatives_of(x: list[float], inputs: list[float], vehicle: Vehicle) -> list[float]:
+def derivatives_of(x, inputs, vehicle):
     derivatives, contact = [math.nan] * 29, (int(Regime.ROLLING), np.zeros(5), 1.0, 1.0, False, np.zeros(8))
     equations_in_python()(list(x), *inputs, contact, compiled_parameters(vehicle), derivatives)
     return derivatives
 
 
-def disturbed(plant: MultiBodyPlant, generator: np.random.Generator, speed: float = 25.0) -> np.ndarray:
+def disturbed(plant, generator, speed=25.0):
     values = plant.initial_state(1.0, 2.0, 0.3, speed).values
     return values + 0.02 * generator.standard_normal(29) * np.maximum(np.abs(values), 0.1)
 
 
-def inputs_of(steering: float = 0.0, acceleration: float = 0.0, moment: float = 0.0, along: float = 0.0, across: float = 0.0) -> np.ndarray:
+def inputs_of(steering=0.0, acceleration=0.0, moment=0.0, along=0.0, across=0.0):
     return np.array([steering, acceleration, moment, along, across])
 
 
-def drive(
-    plant: MultiBodyPlant, state: PlantState, command: Any, seconds: float, rate_hz: float = 100.0, friction: float = 1.0
-) -> tuple[Motion, list[PlantState]]:
+def drive(plant, state, command, seconds, rate_hz=100.0, friction=1.0):
     """What follows from inputs command(time, state), held between samples."""
     states, inputs, n_steps = [], [], round(1.0 / (rate_hz * plant.step))
     for k in range(round(seconds * rate_hz)):
@@ -122,12 +117,12 @@ def drive(
     return plant.motion(states, np.array(inputs), rate_hz, friction=friction), states
 
 
-def lane_change(time: float, state: PlantState) -> np.ndarray:
+def lane_change(time, state):
     target = 0.06 * math.sin(2.0 * math.pi * 0.5 * time) if time < 2.0 else 0.0
     return inputs_of(20.0 * (target - state.steer), 1.0 if time < 2.0 else -6.0)
 
 
-def spins(time: float, state: PlantState) -> np.ndarray:
+def spins(time, state):
     """A sine with dwell in the steering, too large for the speed, then the brakes."""
     phase = min(time, max(time - 0.5, 0.75 / 0.7)) * 0.7
     target = 0.2 * math.sin(2.0 * math.pi * phase) if phase < 1.0 else 0.0
@@ -135,7 +130,7 @@ def spins(time: float, state: PlantState) -> np.ndarray:
 
 
 @pytest.fixture(scope="module")
-def spin() -> tuple[Motion, list[PlantState]]:
+def spin():
     plant = MultiBodyPlant(CORVETTE)
     return drive(plant, plant.initial_state(0.0, 0.0, 0.0, 40.0), spins, 12.0)
 
@@ -143,7 +138,7 @@ def spin() -> tuple[Motion, list[PlantState]]:
 # --- the library's equations
 
 
-def test_published_derivatives_are_reproduced() -> None:
+def test_published_derivatives_are_reproduced():
     computed = derivatives_of(PUBLISHED_STATE, list(PUBLISHED_INPUTS), AS_PUBLISHED)
     np.testing.assert_allclose(computed, PUBLISHED_DERIVATIVES, rtol=0.0, atol=5e-8)  # as the library's own test: seven places
     inputs = inputs_of(*PUBLISHED_INPUTS)
@@ -154,7 +149,7 @@ def test_published_derivatives_are_reproduced() -> None:
 
 
 @pytest.mark.parametrize("vehicle", [LOWERED, FERRARI, TRUCK], ids=lambda vehicle: vehicle.name)
-def test_equations_are_the_librarys_bit_by_bit(vehicle: Vehicle) -> None:
+def test_equations_are_the_librarys_bit_by_bit(vehicle):
     plant, generator, parameters = MultiBodyPlant(vehicle), np.random.default_rng(0), TwoTyres(vehicle)
     assert plant.initial_state(0.0, 0.0, 0.0, 0.0).values[[16, 21]].tolist() == np.array(init_mb([0.0] * 7, parameters))[[16, 21]].tolist()
     for _ in range(200):
@@ -165,7 +160,7 @@ def test_equations_are_the_librarys_bit_by_bit(vehicle: Vehicle) -> None:
 
 
 @pytest.mark.parametrize("vehicle", [LOWERED, FERRARI, TRUCK], ids=lambda vehicle: vehicle.name)
-def test_compiled_derivatives_are_the_librarys_to_1e_12(vehicle: Vehicle) -> None:
+def test_compiled_derivatives_are_the_librarys_to_1e_12(vehicle):
     plant, generator, parameters = MultiBodyPlant(vehicle), np.random.default_rng(1), TwoTyres(vehicle)
     for _ in range(20):
         state, inputs = disturbed(plant, generator), generator.uniform([-0.3, -8.0], [0.3, 0.5])
@@ -174,7 +169,7 @@ def test_compiled_derivatives_are_the_librarys_to_1e_12(vehicle: Vehicle) -> Non
         np.testing.assert_allclose(derivatives[0], expected, rtol=1e-12, atol=1e-12 * np.abs(expected).max())
 
 
-def test_slip_is_the_librarys_down_to_the_smallest_wheel_velocity_and_finite_below() -> None:
+def test_slip_is_the_librarys_down_to_the_smallest_wheel_velocity_and_finite_below():
     plant = MultiBodyPlant(LOWERED)
     for speed in (1.02 * SMALLEST_WHEEL_VELOCITY, 2.0 * SMALLEST_WHEEL_VELOCITY):
         state = plant.initial_state(0.0, 0.0, 0.0, speed).values
@@ -191,11 +186,11 @@ def test_slip_is_the_librarys_down_to_the_smallest_wheel_velocity_and_finite_bel
     assert np.isfinite(derivatives_of(creeping.tolist(), [0.0, 0.0], LOWERED)).all()
 
 
-def test_fixed_step_agrees_with_solve_ivp() -> None:
+def test_fixed_step_agrees_with_solve_ivp():
     plant, inputs = MultiBodyPlant(LOWERED), inputs_of(0.04, -2.0)
     parameters, start = library_parameters(LOWERED), plant.initial_state(0.0, 0.0, 0.0, 30.0)
 
-    def right_hand_side(_: float, state: np.ndarray) -> list[float]:
+    def right_hand_side(_, state):
         return vehicle_dynamics_mb(state.tolist(), inputs[:2].tolist(), parameters)
 
     reference = solve_ivp(right_hand_side, (0.0, 1.0), start.values, method="DOP853", rtol=1e-8, atol=1e-9).y[:, -1]
@@ -204,7 +199,7 @@ def test_fixed_step_agrees_with_solve_ivp() -> None:
     assert abs(state.yaw_rate * state.vx) > 6.0  # the manoeuvre is not a harmless one
 
 
-def test_halving_the_step_changes_nothing_that_matters() -> None:
+def test_halving_the_step_changes_nothing_that_matters():
     # A lane change at 8 m/s², braking at 6 m/s² to standstill: all of a drive but the spin.
     whole, half = (
         drive(plant, plant.initial_state(0.0, 0.0, 0.0, 30.0), lane_change, 8.0)[0]
@@ -223,22 +218,22 @@ def test_halving_the_step_changes_nothing_that_matters() -> None:
 # --- signs and references
 
 
-def turn_left(speed: float, steer: float, seconds: float, vehicle: Vehicle = LOWERED) -> Motion:
+def turn_left(speed, steer, seconds, vehicle=LOWERED):
     plant = MultiBodyPlant(vehicle)
 
-    def hold(time: float, state: PlantState) -> np.ndarray:
+    def hold(time, state):
         return inputs_of(np.clip(10.0 * (steer - state.steer), -0.02, 0.02), 3.0 * (speed - state.vx) + 0.8)
 
     return drive(plant, plant.initial_state(0.0, 0.0, 0.0, speed), hold, seconds)[0]
 
 
-def test_steady_cornering_at_45_m_per_s_reaches_the_known_figure() -> None:
+def test_steady_cornering_at_45_m_per_s_reaches_the_known_figure():
     turn = turn_left(speed=45.0, steer=0.0275, seconds=15.0)
     assert turn.ay[-1] == pytest.approx(9.3, abs=0.1)
     assert math.degrees(turn.sideslip[-1]) == pytest.approx(-3.4, abs=0.15)
 
 
-def test_left_turn_has_the_signs_of_iso_8855() -> None:
+def test_left_turn_has_the_signs_of_iso_8855():
     turn = turn_left(speed=20.0, steer=0.04, seconds=5.0)
     for name in ("steer", "yaw_rate", "ay", "yaw", "y"):
         assert getattr(turn, name)[-1] > 0, name
@@ -250,7 +245,7 @@ def test_left_turn_has_the_signs_of_iso_8855() -> None:
     assert (turn.tyre_fy[-1] > 0).all()
 
 
-def test_braking_lowers_the_nose() -> None:
+def test_braking_lowers_the_nose():
     plant = MultiBodyPlant(LOWERED)
     motion, _ = drive(plant, plant.initial_state(0.0, 0.0, 0.0, 30.0), lambda time, state: inputs_of(acceleration=-5.0), 1.0)
     assert motion.pitch[-1] > 0.005
@@ -260,7 +255,7 @@ def test_braking_lowers_the_nose() -> None:
     np.testing.assert_allclose(np.gradient(motion.pitch, 0.01)[5:-1], motion.pitch_rate[5:-1], atol=2e-3)
 
 
-def test_right_is_the_mirror_image_of_left() -> None:
+def test_right_is_the_mirror_image_of_left():
     plant = MultiBodyPlant(FERRARI)
     start = plant.initial_state(0.0, 0.0, 0.0, 30.0)
     left, _ = drive(plant, start, lambda time, state: inputs_of(0.05 if time < 1.0 else -0.05, -2.0), 2.0)
@@ -276,7 +271,7 @@ def test_right_is_the_mirror_image_of_left() -> None:
 # --- balances
 
 
-def test_accelerations_are_consistent_with_velocities_in_every_regime(spin: tuple[Motion, list[PlantState]]) -> None:
+def test_accelerations_are_consistent_with_velocities_in_every_regime(spin):
     plant = MultiBodyPlant(FERRARI)
     motion, states = drive(plant, plant.initial_state(0.0, 0.0, 0.0, 14.0), lane_change, 5.5, rate_hz=1000.0)
     assert {state.regime for state in states} == {Regime.ROLLING, Regime.SLOW}
@@ -296,12 +291,12 @@ def test_accelerations_are_consistent_with_velocities_in_every_regime(spin: tupl
 
 
 @pytest.mark.parametrize("moment", [0.0, 900.0, -900.0])
-def test_tyre_forces_account_for_all_accelerations(moment: float) -> None:
+def test_tyre_forces_account_for_all_accelerations(moment):
     # Masses times accelerations by differences of velocities of the body and of both axles, against the sum of forces.
     plant, slope = MultiBodyPlant(FERRARI), road_gravity(bank=0.05, grade=0.03)
     p, rate_hz = plant.parameters, 1000.0
 
-    def command(time: float, state: PlantState) -> np.ndarray:
+    def command(time, state):
         return inputs_of(20.0 * (0.05 * math.sin(3.0 * time) - state.steer), -1.0, moment, *slope)
 
     motion, states = drive(plant, plant.initial_state(0.0, 0.0, 0.0, 30.0), command, 2.0, rate_hz)
@@ -320,7 +315,7 @@ def test_tyre_forces_account_for_all_accelerations(moment: float) -> None:
     assert np.abs(motion.ay).max() > 8.0
 
 
-def test_yaw_moment_turns_left_and_brakes_within_what_one_side_can() -> None:
+def test_yaw_moment_turns_left_and_brakes_within_what_one_side_can():
     plant = MultiBodyPlant(FERRARI)
     p, state = plant.parameters, plant.initial_state(0.0, 0.0, 0.0, 30.0)
     inputs = np.array([inputs_of(moment=moment) for moment in (0.0, 900.0, 1e6)])
@@ -332,7 +327,7 @@ def test_yaw_moment_turns_left_and_brakes_within_what_one_side_can() -> None:
     assert after.yaw_rate == pytest.approx(900.0 / p.I_z * 0.01, rel=0.05)  # the tyres already resist
 
 
-def test_gravity_on_a_bank_pulls_body_and_axles_alike() -> None:
+def test_gravity_on_a_bank_pulls_body_and_axles_alike():
     # Hardly any friction: the car slips sideways as a whole, and its joints are not strained.
     plant, across = MultiBodyPlant(FERRARI), road_gravity(bank=0.1, grade=0.0)[1]
     assert across == pytest.approx(-GRAVITY * math.sin(0.1))  # the left side is higher
@@ -341,7 +336,7 @@ def test_gravity_on_a_bank_pulls_body_and_axles_alike() -> None:
     assert np.abs([state.values[27:29] for state in states]).max() < 1e-4  # 1e-2 with the body pulled alone
 
 
-def test_friction_halved_halves_the_reachable_lateral_acceleration() -> None:
+def test_friction_halved_halves_the_reachable_lateral_acceleration():
     plant = MultiBodyPlant(CORVETTE)
     dry, wet = (ramp_steer(plant, 25.0, friction=friction).ay.max() for friction in (1.0, 0.5))
     assert wet / dry == pytest.approx(0.5, rel=0.08)  # above: smaller slip angles cost less drag
@@ -350,7 +345,7 @@ def test_friction_halved_halves_the_reachable_lateral_acceleration() -> None:
 # --- standstill, spin, rollover
 
 
-def test_car_in_equilibrium_stays_there() -> None:
+def test_car_in_equilibrium_stays_there():
     for vehicle in (FERRARI, TRUCK, LOWERED):
         plant = MultiBodyPlant(vehicle)
         for speed in (0.0, 0.5, 30.0):
@@ -362,7 +357,7 @@ def test_car_in_equilibrium_stays_there() -> None:
                 assert np.abs(moved[1:]).max() < 1e-9
 
 
-def test_truck_stops_from_45_km_per_h_in_five_seconds_stands_and_drives_off() -> None:
+def test_truck_stops_from_45_km_per_h_in_five_seconds_stands_and_drives_off():
     plant = MultiBodyPlant(TRUCK)
     motion, states = drive(
         plant, plant.initial_state(0.0, 0.0, 0.0, 12.5), lambda time, state: inputs_of(acceleration=-2.54 if time < 7.0 else 1.5), 12.0
@@ -377,10 +372,10 @@ def test_truck_stops_from_45_km_per_h_in_five_seconds_stands_and_drives_off() ->
     assert not states[-1].spun
 
 
-def test_regimes_join_without_jumps_that_matter() -> None:
+def test_regimes_join_without_jumps_that_matter():
     plant = MultiBodyPlant(CORVETTE)
 
-    def stop_and_go(time: float, state: PlantState) -> np.ndarray:
+    def stop_and_go(time, state):
         return inputs_of(10.0 * (0.15 * math.sin(time) - state.steer), -2.5 if time < 3.0 else 2.0)
 
     motion, states = drive(plant, plant.initial_state(0.0, 0.0, 0.0, 5.0), stop_and_go, 6.0, rate_hz=1000.0)
@@ -398,7 +393,7 @@ def test_regimes_join_without_jumps_that_matter() -> None:
     assert np.abs(path).max() < 0.01  # follows its front wheels
 
 
-def test_brakes_hold_the_car_on_a_slope() -> None:
+def test_brakes_hold_the_car_on_a_slope():
     plant = MultiBodyPlant(FERRARI)
     along = road_gravity(bank=0.0, grade=0.1)[0]
     assert along > 0.0  # downhill
@@ -412,7 +407,7 @@ def test_brakes_hold_the_car_on_a_slope() -> None:
     assert motion.grade[0] == 0.1
 
 
-def test_spin_is_survived_and_ends_at_standstill(spin: tuple[Motion, list[PlantState]]) -> None:
+def test_spin_is_survived_and_ends_at_standstill(spin):
     motion, states = spin
     assert states[-1].spun
     assert not states[0].spun
@@ -434,13 +429,13 @@ def test_spin_is_survived_and_ends_at_standstill(spin: tuple[Motion, list[PlantS
     assert away.spun  # it has been in a spin, whatever it does now
 
 
-def test_published_bmw_rolls_over_where_the_lowered_one_corners() -> None:
+def test_published_bmw_rolls_over_where_the_lowered_one_corners():
     with pytest.raises(SimulationError, match="rolled over") as raised:
         turn_left(speed=45.0, steer=0.0275, seconds=15.0, vehicle=AS_PUBLISHED)
     assert raised.value.exit_code == 3
 
 
-def test_lifted_wheel_carries_nothing_and_does_not_outrun_the_engine() -> None:
+def test_lifted_wheel_carries_nothing_and_does_not_outrun_the_engine():
     plant = MultiBodyPlant(CORVETTE)
     p = plant.parameters
     motion, _ = drive(plant, plant.initial_state(0.0, 0.0, 0.0, 20.0), lambda t, s: inputs_of(0.3 if t < 0.3 else 0.0, 7.0), 3.0)
@@ -457,7 +452,7 @@ ALL_VEHICLES = [*(shipped(name) for name in MULTI_BODY), *(Vehicle(f"set {n}", n
 
 
 @pytest.mark.parametrize("vehicle", ALL_VEHICLES, ids=lambda vehicle: vehicle.name)
-def test_no_state_becomes_infinite_between_standstill_and_70_m_per_s(vehicle: Vehicle) -> None:
+def test_no_state_becomes_infinite_between_standstill_and_70_m_per_s(vehicle):
     plant = MultiBodyPlant(vehicle)
     for speed in (0.0, 0.05, 0.9, 1.0, 1.1, 1.3, 2.0, 5.0, 15.0, 40.0, 70.0):
         for acceleration in (-20.0, 0.0, 5.0):
@@ -468,7 +463,7 @@ def test_no_state_becomes_infinite_between_standstill_and_70_m_per_s(vehicle: Ve
                 assert abs(state.values[ROLL]) < (0.3 if vehicle.name.startswith("set") else 0.2)  # the published springs are soft
 
 
-def test_state_that_is_not_finite_is_an_error() -> None:
+def test_state_that_is_not_finite_is_an_error():
     plant = MultiBodyPlant(LOWERED)
     state = plant.initial_state(0.0, 0.0, 0.0, 20.0)
     state.values[VY] = np.nan
@@ -476,7 +471,7 @@ def test_state_that_is_not_finite_is_an_error() -> None:
         plant.advance(state, inputs_of(), 1)
 
 
-def test_start_that_makes_no_sense_is_refused() -> None:
+def test_start_that_makes_no_sense_is_refused():
     with pytest.raises(ConfigurationError, match="step"):
         MultiBodyPlant(LOWERED, step=0.0)
     with pytest.raises(ConfigurationError, match="-1"):
@@ -486,7 +481,7 @@ def test_start_that_makes_no_sense_is_refused() -> None:
 # --- repeatability
 
 
-def test_first_call_waits_for_another_process_that_compiles(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_first_call_waits_for_another_process_that_compiles(monkeypatch):
     function, called = compiled._Kept(compiled._advance), Event()
     assert function.lock is not None
     monkeypatch.setattr(function, "dispatcher", called.set)
@@ -502,7 +497,7 @@ def test_first_call_waits_for_another_process_that_compiles(monkeypatch: pytest.
         function()  # later calls do not
 
 
-def test_no_kind_of_array_is_compiled_for_twice() -> None:
+def test_no_kind_of_array_is_compiled_for_twice():
     plant, state = MultiBodyPlant(FERRARI), MultiBodyPlant(FERRARI).initial_state(0.0, 0.0, 0.0, 20.0)
     read_only, columns = np.broadcast_to(inputs_of(), (3, 5)), np.zeros((3, 10), order="F")[:, ::2]
     for inputs in (read_only, columns, columns.tolist()):

@@ -1,11 +1,7 @@
 """Simulated sensors: each error against theory, each alone, and the levels against the real recording."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import asdict, fields, replace
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -28,7 +24,7 @@ KINDS = ("noise", "offset", "drift", "quantisation", "delay", "scale")
 LOUD = SensorLevel(noise=0.1, offset=0.2, drift=0.3, drift_time=5.0, quantisation=1e-4, delay=0.013, scale=0.05)
 
 
-def motion_of(n_samples: int, rate_hz: float = 100.0, **values: Any) -> Motion:
+def motion_of(n_samples, rate_hz=100.0, **values):
     """A motion with the given values, numbers or arrays; all else is zero."""
     wide = ("wheel_speed", "tyre_fx", "tyre_fy", "tyre_fz")
     arrays = {
@@ -41,7 +37,7 @@ def motion_of(n_samples: int, rate_hz: float = 100.0, **values: Any) -> Motion:
     return Motion(rate_hz, **arrays)
 
 
-def weaving(seconds: float = 20.0, rate_hz: float = 100.0) -> Motion:
+def weaving(seconds=20.0, rate_hz=100.0):
     """A car that weaves, rolls and pitches on a banked grade; every quantity moves, and each in its own way."""
     t = np.arange(round(seconds * rate_hz)) / rate_hz
     wheels = np.stack([80.0 + i + np.sin((1.0 + i) * t) for i in range(4)], axis=1)
@@ -70,11 +66,11 @@ def weaving(seconds: float = 20.0, rate_hz: float = 100.0) -> Motion:
     )
 
 
-def swerving(seconds: float) -> Motion:
+def swerving(seconds):
     """A hard drive that obeys planar kinematics, whose body rolls with ay and pitches with ax as the Ferrari's does."""
     t = np.arange(round(seconds * 100.0)) / 100.0
 
-    def sines(*parts: tuple[float, float, float]) -> tuple[np.ndarray, np.ndarray]:
+    def sines(*parts):
         angles = [2.0 * np.pi * frequency * t + phase for _, frequency, phase in parts]
         value = sum(part[0] * np.sin(angle) for part, angle in zip(parts, angles, strict=True))
         slope = sum(part[0] * 2.0 * np.pi * part[1] * np.cos(angle) for part, angle in zip(parts, angles, strict=True))
@@ -88,12 +84,12 @@ def swerving(seconds: float) -> Motion:
     return motion_of(len(t), vx=vx, vy=vy, yaw_rate=yaw_rate, ax=ax, ay=ay, roll=0.0021 * ay, pitch=-0.0042 * ax, steer=0.1 * yaw_rate)
 
 
-def only(**levels: Any) -> SensorLevels:
+def only(**levels):
     """Ideal sensors but for the given ones."""
     return replace(ideal_sensors(), **levels)
 
 
-def different(one: dict[str, np.ndarray], other: dict[str, np.ndarray]) -> set[str]:
+def different(one, other):
     assert one.keys() == other.keys()
     return {name for name in one if not np.array_equal(one[name], other[name])}
 
@@ -101,7 +97,7 @@ def different(one: dict[str, np.ndarray], other: dict[str, np.ndarray]) -> set[s
 # --- what is shown
 
 
-def test_ideal_sensors_show_the_motion_itself() -> None:
+def test_ideal_sensors_show_the_motion_itself():
     motion = weaving()
     shown = measure(motion, ideal_sensors(), seed=3)
     for name in ("vx", "yaw_rate", "roll_rate", "pitch_rate", "ax", "ay", "steer"):
@@ -115,14 +111,14 @@ def test_ideal_sensors_show_the_motion_itself() -> None:
     np.testing.assert_array_equal(shown["sideslip_ref"], motion.sideslip)
 
 
-def test_channels_are_those_of_the_table_without_angles_of_the_body() -> None:
+def test_channels_are_those_of_the_table_without_angles_of_the_body():
     shown = measure(weaving(1.0), SensorLevels(), seed=0)
     assert set(shown) <= set(CHANNELS)
     assert {"roll", "pitch", "handwheel"}.isdisjoint(shown)
     assert len(shown) == 2 + 5 + 4 + 12 + 2 + 4
 
 
-def test_a_car_without_an_electric_motor_shows_none_and_its_recording_speaks_of_none() -> None:
+def test_a_car_without_an_electric_motor_shows_none_and_its_recording_speaks_of_none():
     electric = weaving(1.0)
     motion = replace(electric, motor_speed=None, motor_current=None)
     with_motor, without = measure(electric, SensorLevels(), 0), measure(motion, SensorLevels(), 0)
@@ -133,7 +129,7 @@ def test_a_car_without_an_electric_motor_shows_none_and_its_recording_speaks_of_
     assert "vibration" in described(PRESETS["small_car"], electric)
 
 
-def test_vibration_grows_with_the_wheels_speed_and_moves_nothing_else() -> None:
+def test_vibration_grows_with_the_wheels_speed_and_moves_nothing_else():
     motion = motion_of(20_000, wheel_speed=np.repeat(np.linspace(0.0, 100.0, 20_000)[:, None], 4, axis=1))
     shaken = measure(motion, only(vibration=Vibration(yaw_rate=0.01, ax=0.1, ay=0.2)), seed=3)
     assert different(shaken, measure(motion, ideal_sensors(), seed=3)) == {"yaw_rate", "ax", "ay"}
@@ -145,7 +141,7 @@ def test_vibration_grows_with_the_wheels_speed_and_moves_nothing_else() -> None:
     np.testing.assert_array_equal(louder["ax"], shaken["ax"])
 
 
-def test_a_single_sample_is_measured_too() -> None:
+def test_a_single_sample_is_measured_too():
     levels = replace(SensorLevels(), imu=Mounting(lever_x=0.5), reference=PRESETS["race"].reference)
     assert all(np.isfinite(samples).all() and samples.shape == (1,) for samples in measure(motion_of(1, vx=20.0), levels, 0).values())
 
@@ -154,7 +150,7 @@ def test_a_single_sample_is_measured_too() -> None:
 
 
 @pytest.mark.parametrize("rate_hz", [20.0, 100.0, 1000.0])
-def test_noise_is_white_and_has_its_density_at_every_rate(rate_hz: float) -> None:
+def test_noise_is_white_and_has_its_density_at_every_rate(rate_hz):
     # 20,000 samples: the standard deviation is known to 0.5 %, a correlation to 0.007; four of either are allowed.
     shown = measure(motion_of(20_000, rate_hz, vx=20.0), only(ay=SensorLevel(noise=0.01)), seed=5)
     assert np.std(shown["ay"]) == pytest.approx(0.01 * math.sqrt(rate_hz / 2.0), rel=0.02)
@@ -166,7 +162,7 @@ def test_noise_is_white_and_has_its_density_at_every_rate(rate_hz: float) -> Non
     assert stats.kstest(shown["ay"] / np.std(shown["ay"]), "norm").pvalue > 1e-3
 
 
-def test_offset_and_scale_are_drawn_for_each_drive_and_for_each_wheel() -> None:
+def test_offset_and_scale_are_drawn_for_each_drive_and_for_each_wheel():
     # 400 draws: a standard deviation is known to 3.5 %, a mean to 5 % of it, a correlation to 0.05; four of each are allowed.
     levels = only(ay=SensorLevel(offset=0.03), wheel_speed=SensorLevel(scale=0.01))
     drives = [measure(motion_of(2, wheel_speed=50.0), levels, seed) for seed in range(400)]
@@ -179,7 +175,7 @@ def test_offset_and_scale_are_drawn_for_each_drive_and_for_each_wheel() -> None:
     assert np.abs(np.corrcoef(scales.T) - np.eye(4)).max() < 0.2
 
 
-def test_drift_is_a_stationary_gauss_markov_process() -> None:
+def test_drift_is_a_stationary_gauss_markov_process():
     # 2000 s with a correlation time of 2 s are about 1000 independent values: 2.5 % of the deviation, 0.03 of a correlation.
     drift = measure(motion_of(40_000, 20.0), only(yaw_rate=SensorLevel(drift=0.01, drift_time=2.0)), seed=2)["yaw_rate"]
     assert np.std(drift) == pytest.approx(0.01, rel=0.1)
@@ -192,7 +188,7 @@ def test_drift_is_a_stationary_gauss_markov_process() -> None:
     assert np.ptp(starts, axis=1).max() < 1e-5
 
 
-def test_quantisation_error_is_uniform_within_half_a_step() -> None:
+def test_quantisation_error_is_uniform_within_half_a_step():
     ramp = np.linspace(0.0, 1.0, 50_001) ** 2
     shown = measure(motion_of(len(ramp), steer=ramp), only(steer=SensorLevel(quantisation=0.001)), seed=0)["steer"]
     steps = shown / 0.001
@@ -204,7 +200,7 @@ def test_quantisation_error_is_uniform_within_half_a_step() -> None:
 
 
 @pytest.mark.parametrize("delay", [0.004, 0.01, 0.0137, 0.25])
-def test_delay_of_a_sine_is_its_phase(delay: float) -> None:
+def test_delay_of_a_sine_is_its_phase(delay):
     # At 5 Hz and 100 Hz sampling the cubic between samples loses up to 3/128 (2π·0.05)⁴ = 0.02 % of the amplitude.
     t = np.arange(1000) / 100.0
     shown = measure(motion_of(1000, yaw_rate=np.sin(2.0 * np.pi * 5.0 * t)), only(yaw_rate=SensorLevel(delay=delay)), seed=0)["yaw_rate"]
@@ -212,7 +208,7 @@ def test_delay_of_a_sine_is_its_phase(delay: float) -> None:
     np.testing.assert_allclose(shown[late:-1], np.sin(2.0 * np.pi * 5.0 * (t[late:-1] - delay)), atol=3e-4)
 
 
-def test_delay_holds_the_start_and_takes_whole_samples_as_they_are() -> None:
+def test_delay_holds_the_start_and_takes_whole_samples_as_they_are():
     ramp = 5.0 + np.arange(50.0)
     whole = measure(motion_of(50, vx=ramp), only(vx=SensorLevel(delay=0.03)), seed=0)["vx"]
     np.testing.assert_array_equal(whole, np.concatenate([[5.0, 5.0, 5.0], ramp[:-3]]))
@@ -227,13 +223,13 @@ def test_delay_holds_the_start_and_takes_whole_samples_as_they_are() -> None:
 
 
 @pytest.mark.parametrize(("angle", "ax", "ay"), [("roll", 0, 1), ("bank", 0, 1), ("pitch", -1, 0), ("grade", -1, 0)])
-def test_gravity_leaks_in_at_rest_with_the_left_side_up_or_the_nose_down(angle: str, ax: int, ay: int) -> None:
+def test_gravity_leaks_in_at_rest_with_the_left_side_up_or_the_nose_down(angle, ax, ay):
     shown = measure(motion_of(3, **{angle: 0.05}), only(tilt=Tilt()), seed=0)
     np.testing.assert_allclose(shown["ax"], ax * G * math.sin(0.05), rtol=1e-12, atol=1e-12)
     np.testing.assert_allclose(shown["ay"], ay * G * math.sin(0.05), rtol=1e-12, atol=1e-12)
 
 
-def test_specific_force_is_the_acceleration_less_gravity_in_turned_axes() -> None:
+def test_specific_force_is_the_acceleration_less_gravity_in_turned_axes():
     motion = weaving()
     force = specific_force(motion)
     for k in (0, 333, 1999):
@@ -242,7 +238,7 @@ def test_specific_force_is_the_acceleration_less_gravity_in_turned_axes() -> Non
         np.testing.assert_allclose(force[:, k], (road @ body).T @ level, atol=1e-12)
 
 
-def test_each_angle_is_switched_off_alone() -> None:
+def test_each_angle_is_switched_off_alone():
     motion = weaving()
     for angle in ("roll", "pitch", "bank", "grade"):
         without = replace(motion, **{angle: np.zeros(len(motion))})
@@ -251,7 +247,7 @@ def test_each_angle_is_switched_off_alone() -> None:
         assert np.abs(expected - specific_force(motion)).max() > 0.1
 
 
-def test_gyros_of_a_rolled_body_feel_the_yaw_rate() -> None:
+def test_gyros_of_a_rolled_body_feel_the_yaw_rate():
     # A turntable: the body's axes in the road's are R(t) = Rz(ψ)Ry(θ)Rx(φ), its angular velocity the skew matrix RᵀdR/dt.
     motion = weaving()
     shown = body_rates(motion)
@@ -264,7 +260,7 @@ def test_gyros_of_a_rolled_body_feel_the_yaw_rate() -> None:
     assert measure(motion_of(1, roll=0.05, yaw_rate=0.6), only(tilt=Tilt()), 0)["pitch_rate"][0] == pytest.approx(0.6 * math.sin(0.05))
 
 
-def test_accelerometer_away_from_the_axis_of_a_turntable() -> None:
+def test_accelerometer_away_from_the_axis_of_a_turntable():
     # Yaw rate 0.5 t about the centre: tangential 0.5 l, centripetal (0.5 t)² l; central differences of a line are exact.
     t = np.arange(200) / 100.0
     shown = measure(motion_of(200, yaw_rate=0.5 * t), only(imu=Mounting(lever_x=1.2, lever_y=-0.4)), seed=0)
@@ -272,7 +268,7 @@ def test_accelerometer_away_from_the_axis_of_a_turntable() -> None:
     np.testing.assert_allclose(shown["ay"], 0.5 * 1.2 + (0.5 * t) ** 2 * 0.4, atol=1e-12)
 
 
-def test_accelerometer_on_a_swinging_arm_feels_the_second_derivative_of_its_place() -> None:
+def test_accelerometer_on_a_swinging_arm_feels_the_second_derivative_of_its_place():
     # Place R(t) l by differentiation, with all three rates at work; differences over 10 ms are good to 1e-3 of the amplitude.
     motion = weaving()
     lever = np.array([1.0, -0.6, 0.8])
@@ -287,7 +283,7 @@ def test_accelerometer_on_a_swinging_arm_feels_the_second_derivative_of_its_plac
         np.testing.assert_allclose([shown["ax"][k] - bare["ax"][k], shown["ay"][k] - bare["ay"][k]], expected[:2], atol=1e-3)
 
 
-def test_mounting_correction_undoes_the_mounting() -> None:
+def test_mounting_correction_undoes_the_mounting():
     motion = weaving()
     mounting = Mounting(lever_x=0.8, lever_y=-0.3, yaw=0.1)
     turned = measure(motion, only(imu=mounting), seed=0)
@@ -299,7 +295,7 @@ def test_mounting_correction_undoes_the_mounting() -> None:
         assert np.abs(turned[name] - getattr(motion, name)).max() > 0.1
 
 
-def test_turned_unit_shows_the_same_vectors_along_other_axes() -> None:
+def test_turned_unit_shows_the_same_vectors_along_other_axes():
     motion = weaving()
     straight = measure(motion, only(tilt=Tilt()), seed=0)
     turned = measure(motion, only(tilt=Tilt(), imu=Mounting(roll=0.1, pitch=-0.05, yaw=0.2)), seed=0)
@@ -309,7 +305,7 @@ def test_turned_unit_shows_the_same_vectors_along_other_axes() -> None:
         np.testing.assert_allclose(np.stack([turned[name] for name in names]), (axes.T @ vector)[: len(names)], atol=1e-12)
 
 
-def test_misalignment_lets_gravity_in_by_its_level() -> None:
+def test_misalignment_lets_gravity_in_by_its_level():
     shown = [measure(motion_of(1), only(imu=Mounting(misalignment=0.01)), seed) for seed in range(400)]
     for name in ("ax", "ay"):
         assert np.std([drive[name][0] for drive in shown]) == pytest.approx(G * 0.01, rel=0.14)  # 400 draws
@@ -318,26 +314,26 @@ def test_misalignment_lets_gravity_in_by_its_level() -> None:
 # --- the reference
 
 
-def test_reference_in_the_bumper_is_moved_to_the_centre_of_gravity() -> None:
+def test_reference_in_the_bumper_is_moved_to_the_centre_of_gravity():
     motion = replace(weaving(), roll_rate=np.zeros(2000), pitch_rate=np.zeros(2000))
     shown = measure(motion, only(reference=Reference("optical", lever_x=2.0, lever_y=0.4, lever_z=-0.2)), seed=0)
     np.testing.assert_allclose(shown["vx_ref"], motion.vx, atol=1e-12)
     np.testing.assert_allclose(shown["vy_ref"], motion.vy, atol=1e-12)
 
 
-def test_lever_error_of_the_reference_goes_with_the_yaw_rate() -> None:
+def test_lever_error_of_the_reference_goes_with_the_yaw_rate():
     motion = motion_of(10, vx=20.0, yaw_rate=0.5)
     errors = [measure(motion, only(reference=Reference("gnss", lever_error=0.02)), seed)["vy_ref"][0] for seed in range(400)]
     assert np.std(errors) == pytest.approx(0.5 * 0.02, rel=0.14)
 
 
-def test_roll_moves_a_reference_below_the_centre_of_gravity() -> None:
+def test_roll_moves_a_reference_below_the_centre_of_gravity():
     shown = measure(motion_of(5, vx=20.0, roll_rate=0.2, pitch_rate=0.1), only(reference=Reference("optical", lever_z=-0.3)), seed=0)
     np.testing.assert_allclose(shown["vy_ref"], 0.2 * 0.3)  # left side going up: what is below goes left
     np.testing.assert_allclose(shown["vx_ref"], 20.0 - 0.1 * 0.3)  # nose going down: what is below goes back
 
 
-def test_heading_error_of_the_reference_is_an_error_of_the_sideslip_angle() -> None:
+def test_heading_error_of_the_reference_is_an_error_of_the_sideslip_angle():
     motion, levels = weaving(1.0), only(reference=Reference("gnss", heading=SensorLevel(offset=0.01)))
     drives = [measure(motion, levels, seed) for seed in range(400)]
     errors = np.array([drive["sideslip_ref"] - motion.sideslip for drive in drives])
@@ -346,7 +342,7 @@ def test_heading_error_of_the_reference_is_an_error_of_the_sideslip_angle() -> N
     np.testing.assert_allclose(np.hypot(drives[0]["vx_ref"], drives[0]["vy_ref"]), np.hypot(motion.vx, motion.vy))
 
 
-def test_reference_and_car_err_apart() -> None:
+def test_reference_and_car_err_apart():
     shown = measure(motion_of(20_000, vx=20.0), only(vx=LOUD, yaw_rate=LOUD, reference=Reference("gnss", vx=LOUD, yaw_rate=LOUD)), seed=1)
     for name in ("vx", "yaw_rate"):
         errors = np.diff(shown[name]), np.diff(shown[f"{name}_ref"])
@@ -359,12 +355,12 @@ def test_reference_and_car_err_apart() -> None:
 # --- one by one
 
 
-def channels_of(sensor: str) -> set[str]:
+def channels_of(sensor):
     return {f"{sensor}_{wheel}" for wheel in WHEELS} if sensor in ("wheel_speed", "fx", "fy", "fz") else {sensor}
 
 
 @pytest.mark.parametrize("sensor", SENSORS)
-def test_switching_off_an_error_leaves_all_else_bit_by_bit(sensor: str) -> None:
+def test_switching_off_an_error_leaves_all_else_bit_by_bit(sensor):
     motion = weaving(2.0)
     levels = replace(SensorLevels(), **dict.fromkeys(SENSORS, LOUD))
     all_on = measure(motion, levels, seed=7)
@@ -375,7 +371,7 @@ def test_switching_off_an_error_leaves_all_else_bit_by_bit(sensor: str) -> None:
     assert different(all_on, measure(motion, silent, seed=7)) == channels_of(sensor)
 
 
-def test_errors_of_one_sensor_do_not_disturb_each_other() -> None:
+def test_errors_of_one_sensor_do_not_disturb_each_other():
     motion = motion_of(500, ay=3.0)
     ay = {kind: measure(motion, only(ay=level), seed=7)["ay"] - 3.0 for kind, level in _alone(LOUD).items()}
     together = measure(motion, only(ay=replace(LOUD, quantisation=0.0)), seed=7)["ay"] - 3.0
@@ -383,7 +379,7 @@ def test_errors_of_one_sensor_do_not_disturb_each_other() -> None:
     assert ay["scale"][0] / (LOUD.scale * 3.0) != pytest.approx(ay["offset"][0] / LOUD.offset)
 
 
-def test_streams_of_all_errors_differ() -> None:
+def test_streams_of_all_errors_differ():
     levels = {name: SensorLevel(offset=1.0, drift=1.0, noise=1.0, scale=1.0) for name in SENSORS}
     first = []
     for kind in ("offset", "drift", "noise"):
@@ -394,7 +390,7 @@ def test_streams_of_all_errors_differ() -> None:
     assert len({round(value, 9) for value in first}) == len(first) == 3 * 28
 
 
-def test_switching_off_takes_parts_wholes_and_kinds() -> None:
+def test_switching_off_takes_parts_wholes_and_kinds():
     levels = replace(PRESETS["race"], imu=Mounting(lever_x=0.3, yaw=0.1, misalignment=0.01))
     off = switched_off(levels, "ay.noise", "tilt.bank", "imu.lever_x", "reference.heading.drift", "*.offset")
     assert off.ay == replace(levels.ay, noise=0.0, offset=0.0)
@@ -406,27 +402,27 @@ def test_switching_off_takes_parts_wholes_and_kinds() -> None:
     assert switched_off(levels) == levels
 
 
-def test_everything_switched_off_shows_the_motion() -> None:
+def test_everything_switched_off_shows_the_motion():
     motion = weaving()
     nothing = switched_off(PRESETS["race"], "tilt", "imu", "reference", *SENSORS)
     assert different(measure(motion, nothing, 0), measure(motion, ideal_sensors(), 1)) == set()
 
 
 @pytest.mark.parametrize("name", ["az", "ay.slope", "ay.noise.much", "ay.drift_time", "reference.kind", "*.lever_x", ""])
-def test_switching_off_what_there_is_not_names_what_there_is(name: str) -> None:
+def test_switching_off_what_there_is_not_names_what_there_is(name):
     with pytest.raises(ConfigurationError, match="cannot switch off") as error:
         switched_off(SensorLevels(), name)
     assert "\n" not in str(error.value)
 
 
-def test_same_seed_same_samples_and_another_seed_others() -> None:
+def test_same_seed_same_samples_and_another_seed_others():
     motion = weaving()
     one, again, other = (measure(motion, PRESETS["race"], seed) for seed in (5, 5, 6))
     assert different(one, again) == set()
     assert different(one, other) == set(one)
 
 
-def test_a_longer_drive_begins_with_the_same_errors() -> None:
+def test_a_longer_drive_begins_with_the_same_errors():
     short, long = (measure(motion_of(n, vx=20.0), SensorLevels(), seed=3) for n in (500, 900))
     for name in short:
         np.testing.assert_array_equal(short[name], long[name][:500], err_msg=name)
@@ -454,11 +450,11 @@ def test_a_longer_drive_begins_with_the_same_errors() -> None:
         ("{switched_off: [ay.noise, '*.drift']}", switched_off(SensorLevels(), "ay.noise", "*.drift")),
     ],
 )
-def test_configurations_mean_what_they_say(spelt: str, meant: SensorLevels) -> None:
+def test_configurations_mean_what_they_say(spelt, meant):
     assert sensor_levels_from_config(yaml.safe_load(spelt)) == meant
 
 
-def test_reference_kinds_are_different() -> None:
+def test_reference_kinds_are_different():
     kinds = {kind: sensor_levels_from_config({"reference": kind}).reference for kind in ("optical", "gnss", "ideal")}
     assert {reference.kind for reference in kinds.values()} == set(kinds)
     assert kinds["optical"].lever_x > 1.0 > kinds["gnss"].lever_x
@@ -479,7 +475,7 @@ def test_reference_kinds_are_different() -> None:
         ("{switched_off: [ay.slope]}", "sensors: cannot switch off 'ay.slope': 'slope' is not one of: noise, offset"),
     ],
 )
-def test_configuration_that_makes_no_sense_is_refused_in_one_line(spelt: str, said: str) -> None:
+def test_configuration_that_makes_no_sense_is_refused_in_one_line(spelt, said):
     with pytest.raises(ConfigurationError) as error:
         sensor_levels_from_config(yaml.safe_load(spelt))
     assert said in str(error.value)
@@ -489,7 +485,7 @@ def test_configuration_that_makes_no_sense_is_refused_in_one_line(spelt: str, sa
 # --- levels from the real recording
 
 
-def test_density_is_found_beside_a_resonance_and_jolts() -> None:
+def test_density_is_found_beside_a_resonance_and_jolts():
     noise = measure(motion_of(60_000), only(ay=SensorLevel(noise=0.02)), seed=0)["ay"]
     assert noise_density(noise, 100.0) == pytest.approx(0.02, rel=0.05)
     shaken = noise + 0.3 * np.sin(2.0 * np.pi * 21.0 * np.arange(60_000) / 100.0)
@@ -498,7 +494,7 @@ def test_density_is_found_beside_a_resonance_and_jolts() -> None:
 
 
 @pytest.mark.parametrize("seed", [0, 1])
-def test_reading_a_simulated_race_car_gives_its_levels_back(seed: int) -> None:
+def test_reading_a_simulated_race_car_gives_its_levels_back(seed):
     # 25 minutes are 250 correlation times of ay's drift: 5 % of its deviation. Its time, where the correlation falls to 1/e, is less
     # well known, and the reference's own slow errors blur all that is slow.
     race = PRESETS["race"]
@@ -514,7 +510,7 @@ def test_reading_a_simulated_race_car_gives_its_levels_back(seed: int) -> None:
     assert found["pitch_gradient"] == pytest.approx(0.0042, rel=0.3)
 
 
-def test_race_levels_are_those_of_the_ferrari_recording(data_root: Path) -> None:
+def test_race_levels_are_those_of_the_ferrari_recording(data_root):
     folder = data_root / "revs" / "20140222_01_01_03_250lm"
     files = {"vx": "vx", "yaw_rate": "yawRate", "ax": "axCG", "ay": "ayCG", "steer": "delta", "vx_ref": "vx", "vy_ref": "vy"}
     found = read_off({name: np.loadtxt(folder / f"{file}.txt") for name, file in files.items()}, 100.0)
@@ -531,17 +527,17 @@ def test_race_levels_are_those_of_the_ferrari_recording(data_root: Path) -> None
 # --- helpers
 
 
-def _turn_z(angle: float) -> np.ndarray:
+def _turn_z(angle):
     return np.array([[math.cos(angle), -math.sin(angle), 0.0], [math.sin(angle), math.cos(angle), 0.0], [0.0, 0.0, 1.0]])
 
 
-def _rotation(roll: float, pitch: float) -> np.ndarray:
+def _rotation(roll, pitch):
     """Ry(pitch) Rx(roll): the axes of what is pitched, then rolled, as columns."""
     about_y = np.array([[math.cos(pitch), 0.0, math.sin(pitch)], [0.0, 1.0, 0.0], [-math.sin(pitch), 0.0, math.cos(pitch)]])
     about_x = np.array([[1.0, 0.0, 0.0], [0.0, math.cos(roll), -math.sin(roll)], [0.0, math.sin(roll), math.cos(roll)]])
     return about_y @ about_x
 
 
-def _alone(level: SensorLevel) -> dict[str, SensorLevel]:
+def _alone(level):
     """One level for each kind of error, with that kind only."""
     return {kind: replace(SensorLevel(drift_time=level.drift_time), **{kind: getattr(level, kind)}) for kind in KINDS}

@@ -1,7 +1,5 @@
 """Stability control: when it acts, how much, and that it helps."""
 
-from __future__ import annotations
-
 import math
 from pathlib import Path
 
@@ -18,12 +16,12 @@ OURS = ("corvette_grand_sport", "ferrari_250_lm", "bmw_545i", "heavy_truck")
 CONTROL = StabilityControl(wheelbase=2.5, understeer_gradient=0.002, yaw_inertia=2000.0, grip=9.0, largest_moment=3000.0)
 
 
-def plant_of(name: str) -> MultiBodyPlant:
+def plant_of(name):
     configuration = yaml.safe_load((CONFIGURATIONS / f"{name}.yaml").read_text(encoding="utf-8"))
     return MultiBodyPlant(vehicle_from_configuration(configuration))
 
 
-def sine_with_dwell(plant: MultiBodyPlant, amplitude: float, control: StabilityControl | None, friction: float) -> tuple[float, np.ndarray]:
+def sine_with_dwell(plant, amplitude, control, friction):
     """Largest sideslip [rad] of the manoeuvre of FMVSS 126 at 80 km/h, and the moments [N m] that the control asked for."""
     state, doing = plant.initial_state(0.0, 0.0, 0.0, 80.0 / 3.6), StabilityState()
     largest, moments = 0.0, []
@@ -41,7 +39,7 @@ def sine_with_dwell(plant: MultiBodyPlant, amplitude: float, control: StabilityC
 
 @pytest.mark.parametrize("name", OURS)
 @pytest.mark.parametrize("friction", [1.0, 0.5])
-def test_sideslip_stays_lower_with_control_than_without(name: str, friction: float) -> None:
+def test_sideslip_stays_lower_with_control_than_without(name, friction):
     plant = plant_of(name)
     control, amplitude = stability_control(plant), 0.16 if friction == 1.0 else 0.09
     without, _ = sine_with_dwell(plant, amplitude, None, friction)
@@ -51,7 +49,7 @@ def test_sideslip_stays_lower_with_control_than_without(name: str, friction: flo
 
 
 @pytest.mark.parametrize("name", OURS)
-def test_largest_moment_is_within_what_the_plant_can_brake_on_either_side(name: str) -> None:
+def test_largest_moment_is_within_what_the_plant_can_brake_on_either_side(name):
     plant = plant_of(name)
     rolling = plant.initial_state(0.0, 0.0, 0.0, 20.0)
     forces = plant.motion([rolling] * 2, np.array([[0.0, 0.0, moment, 0.0, 0.0] for moment in (1e9, -1e9)]), 100.0).tyre_fx
@@ -61,13 +59,13 @@ def test_largest_moment_is_within_what_the_plant_can_brake_on_either_side(name: 
 
 
 @pytest.mark.parametrize("name", OURS)
-def test_control_leaves_calm_driving_alone(name: str) -> None:
+def test_control_leaves_calm_driving_alone(name):
     plant = plant_of(name)
     _, moments = sine_with_dwell(plant, 0.03, stability_control(plant), 1.0)
     assert not moments.any()
 
 
-def test_moment_turns_the_car_towards_the_reference() -> None:
+def test_moment_turns_the_car_towards_the_reference():
     turns_too_much = CONTROL.step(StabilityState(reference=0.2), 0.01, steer=0.025, vx=20.0, yaw_rate=0.5)
     turns_too_little = CONTROL.step(StabilityState(reference=0.2), 0.01, steer=0.025, vx=20.0, yaw_rate=0.0)
     assert turns_too_much.moment < 0.0 < turns_too_little.moment
@@ -75,7 +73,7 @@ def test_moment_turns_the_car_towards_the_reference() -> None:
     assert mirrored.moment == -turns_too_much.moment
 
 
-def test_reference_is_the_linear_single_track_within_friction() -> None:
+def test_reference_is_the_linear_single_track_within_friction():
     state = StabilityState()
     for _ in range(200):
         state = CONTROL.step(state, 0.01, steer=0.02, vx=20.0, yaw_rate=0.0)
@@ -86,7 +84,7 @@ def test_reference_is_the_linear_single_track_within_friction() -> None:
         assert state.reference == pytest.approx(friction * 9.0 / 20.0)
 
 
-def test_control_has_hysteresis_and_a_largest_moment() -> None:
+def test_control_has_hysteresis_and_a_largest_moment():
     between = StabilityState(reference=0.05, active=False)
     assert not CONTROL.step(between, 1e-6, steer=0.0, vx=20.0, yaw_rate=0.0).active
     assert CONTROL.step(StabilityState(reference=0.05, active=True), 1e-6, steer=0.0, vx=20.0, yaw_rate=0.0).active

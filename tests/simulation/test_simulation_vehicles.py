@@ -1,7 +1,5 @@
 """The shipped vehicles: steady handling, load transfer, springs, and that they are the cars their sources describe."""
 
-from __future__ import annotations
-
 import math
 import re
 from functools import cache
@@ -14,7 +12,6 @@ import yaml
 from vehest.constants import GRAVITY
 from vehest.data.errors import ConfigurationError
 from vehest.simulation.plant.handling import ramp_steer
-from vehest.simulation.plant.motion import Motion
 from vehest.simulation.plant.multi_body import MultiBodyPlant, PlantState
 from vehest.simulation.plant.parameters import Vehicle, library_parameters, rear_tyre, vehicle_from_configuration
 from vehest.simulation.plant.regimes import HEAVE, PITCH, ROLL, ROLL_RATE, Regime
@@ -29,17 +26,17 @@ each_of_ours = pytest.mark.parametrize("name", OURS)
 
 
 @cache
-def plant_of(name: str) -> MultiBodyPlant:
+def plant_of(name):
     configuration = yaml.safe_load((CONFIGURATIONS / f"{name}.yaml").read_text(encoding="utf-8"))
     return MultiBodyPlant(vehicle_from_configuration(configuration))
 
 
 @cache
-def ramp_of(name: str) -> Motion:
+def ramp_of(name):
     return ramp_steer(plant_of(name), 20.0 if name == "heavy_truck" else 25.0)
 
 
-def steady_turn(plant: MultiBodyPlant, speed: float, steer: float, seconds: float = 8.0) -> Motion:
+def steady_turn(plant, speed, steer, seconds=8.0):
     """The last moment of a turn at constant speed and steering angle, as a motion of one sample."""
     state, integral = plant.initial_state(0.0, 0.0, 0.0, speed), 0.0
     for _ in range(round(100 * seconds)):
@@ -50,7 +47,7 @@ def steady_turn(plant: MultiBodyPlant, speed: float, steer: float, seconds: floa
     return plant.motion([state], inputs[None], 100.0)
 
 
-def cornering_stiffnesses(plant: MultiBodyPlant) -> tuple[float, float]:
+def cornering_stiffnesses(plant):
     """Of the axles [N/rad], from the tyres' stiffness per load and the static loads."""
     p = plant.parameters
     weight = p.m * GRAVITY / (p.a + p.b)
@@ -62,7 +59,7 @@ def cornering_stiffnesses(plant: MultiBodyPlant) -> tuple[float, float]:
 
 @each_vehicle
 @pytest.mark.parametrize("speed", [10.0, 30.0])
-def test_steady_cornering_at_low_lateral_acceleration_is_the_linear_single_tracks(name: str, speed: float) -> None:
+def test_steady_cornering_at_low_lateral_acceleration_is_the_linear_single_tracks(name, speed):
     plant = plant_of(name)
     p, (front, rear) = plant.parameters, cornering_stiffnesses(plant_of(name))
     length, ay = p.a + p.b, 0.7
@@ -76,7 +73,7 @@ def test_steady_cornering_at_low_lateral_acceleration_is_the_linear_single_track
 
 
 @each_vehicle
-def test_understeer_rises_with_lateral_acceleration_up_to_the_limit(name: str) -> None:
+def test_understeer_rises_with_lateral_acceleration_up_to_the_limit(name):
     ramp, plant = ramp_of(name), plant_of(name)
     angle, limit = understeer_angle(ramp, plant.wheelbase), int(np.argmax(ramp.ay))
     share = 0.95 if name == "jaguar_e_type" else 0.99  # its rear bends as early as its front: at the limit it turns neutral
@@ -88,13 +85,13 @@ def test_understeer_rises_with_lateral_acceleration_up_to_the_limit(name: str) -
 
 
 @each_vehicle
-def test_grip_is_what_the_car_reaches_in_steady_state(name: str) -> None:
+def test_grip_is_what_the_car_reaches_in_steady_state(name):
     plant = plant_of(name)
     assert ramp_of(name).ay.max() == pytest.approx(plant.grip, rel=0.055)
     assert ramp_steer(plant, 15.0).ay.max() == pytest.approx(plant.grip, rel=0.055)
 
 
-def test_cars_reach_the_lateral_accelerations_of_the_papers() -> None:
+def test_cars_reach_the_lateral_accelerations_of_the_papers():
     # Table I of Da Lio et al. 2023: 99 % quantiles of the laps; Fig. 4 of Bertipaglia et al. 2024: spread over ±10 m/s²,
     # in transients too, which reach a little more than a steady turn.
     for name, shown, at_most in (("corvette_grand_sport", 11.6, 12.5), ("ferrari_250_lm", 10.78, 11.7), ("bmw_545i", 9.4, 10.5)):
@@ -106,7 +103,7 @@ def test_cars_reach_the_lateral_accelerations_of_the_papers() -> None:
 
 
 @each_of_ours
-def test_steering_to_and_fro_at_the_limit_ends_without_rollover(name: str) -> None:
+def test_steering_to_and_fro_at_the_limit_ends_without_rollover(name):
     plant, state = plant_of(name), plant_of(name).initial_state(0.0, 0.0, 0.0, 22.0)
     for k in range(400):
         target = 0.12 * math.sin(2.0 * math.pi * 0.7 * 0.01 * k) if k < 285 else 0.0
@@ -117,7 +114,7 @@ def test_steering_to_and_fro_at_the_limit_ends_without_rollover(name: str) -> No
 
 
 @each_of_ours
-def test_understeer_and_roll_gradients_are_a_cars_usual_ones(name: str) -> None:
+def test_understeer_and_roll_gradients_are_a_cars_usual_ones(name):
     ramp, plant = ramp_of(name), plant_of(name)
     low = (ramp.ay > 1.0) & (ramp.ay < 3.0)
     for angle, smallest, largest in ((understeer_angle(ramp, plant.wheelbase), 0.5, 1.5), (ramp.roll, 1.5, 4.5)):
@@ -125,7 +122,7 @@ def test_understeer_and_roll_gradients_are_a_cars_usual_ones(name: str) -> None:
         assert smallest < math.degrees(gradient) * GRAVITY < largest  # degrees at 1 g
 
 
-def test_the_third_race_car_hardly_understeers_and_has_a_race_cars_springs() -> None:
+def test_the_third_race_car_hardly_understeers_and_has_a_race_cars_springs():
     ramp, plant = ramp_of("jaguar_e_type"), plant_of("jaguar_e_type")
     low = (ramp.ay > 1.0) & (ramp.ay < 3.0)
     gradient = np.polyfit(ramp.ay[low], understeer_angle(ramp, plant.wheelbase)[low], 1)[0]
@@ -146,7 +143,7 @@ def test_the_third_race_car_hardly_understeers_and_has_a_race_cars_springs() -> 
 
 
 @each_vehicle
-def test_lateral_load_transfer_balances_the_moments_of_inertia_and_lean(name: str) -> None:
+def test_lateral_load_transfer_balances_the_moments_of_inertia_and_lean(name):
     # Moments about the ground below the middle of the track, from forces and angles that sensors could see: mass times
     # acceleration times height, the weight of the leaning body and of axles on tyres of unlike deflection, and the tyres'
     # sideways give. Heights are less than the drawing's by the tyres' deflection.
@@ -169,7 +166,7 @@ def test_lateral_load_transfer_balances_the_moments_of_inertia_and_lean(name: st
 
 
 @each_vehicle
-def test_longitudinal_load_transfer_is_mass_times_acceleration_times_height_over_wheelbase(name: str) -> None:
+def test_longitudinal_load_transfer_is_mass_times_acceleration_times_height_over_wheelbase(name):
     plant = plant_of(name)
     p, state, inputs = plant.parameters, plant.initial_state(0.0, 0.0, 0.0, 30.0), np.array([0.0, -3.0, 0.0, 0.0, 0.0])
     states = [state, plant.advance(state, inputs, 2500)]  # the body's nod is over
@@ -182,7 +179,7 @@ def test_longitudinal_load_transfer_is_mass_times_acceleration_times_height_over
 
 
 @each_vehicle
-def test_car_at_rest_has_its_weight_on_its_axles_and_settles_there(name: str) -> None:
+def test_car_at_rest_has_its_weight_on_its_axles_and_settles_there(name):
     plant = plant_of(name)
     p, rest = plant.parameters, plant.initial_state(0.0, 0.0, 0.0, 0.0)
     assert p.m_s + p.m_uf + p.m_ur == pytest.approx(p.m, rel=1e-4)
@@ -200,7 +197,7 @@ def test_car_at_rest_has_its_weight_on_its_axles_and_settles_there(name: str) ->
 
 
 @each_vehicle
-def test_body_bounces_at_a_plausible_frequency_and_damping(name: str) -> None:
+def test_body_bounces_at_a_plausible_frequency_and_damping(name):
     plant = plant_of(name)
     low, high = (2.0, 4.0) if name in ("corvette_grand_sport", "ferrari_250_lm", "jaguar_e_type") else (1.0, 2.0)
     bounce = [mode for mode in suspension_modes(plant) if abs(mode) < 2.0 * math.pi * 5.0 and mode.imag > 0.0][:2]
@@ -210,7 +207,7 @@ def test_body_bounces_at_a_plausible_frequency_and_damping(name: str) -> None:
         assert 0.2 < -mode.real / abs(mode) < 0.6
 
 
-def suspension_modes(plant: MultiBodyPlant) -> list[complex]:
+def suspension_modes(plant):
     """Eigenvalues of heave, pitch and the axles' heave at rest, by central differences, slowest first."""
     places = [8, 9, 11, 12, 16, 17, 21, 22]
     rest, columns = plant.initial_state(0.0, 0.0, 0.0, 0.0).values, []
@@ -226,7 +223,7 @@ def suspension_modes(plant: MultiBodyPlant) -> list[complex]:
 @pytest.mark.parametrize(
     ("name", "top"), [("corvette_grand_sport", 64.0), ("ferrari_250_lm", 65.4), ("bmw_545i", 60.0), ("heavy_truck", 32.0)]
 )
-def test_top_speed_of_the_recordings_is_reached_and_straight(name: str, top: float) -> None:
+def test_top_speed_of_the_recordings_is_reached_and_straight(name, top):
     plant = plant_of(name)
     state = plant.initial_state(0.0, 0.0, 0.0, top - 1.0)
     kick = state.values.copy()
@@ -245,7 +242,7 @@ def test_top_speed_of_the_recordings_is_reached_and_straight(name: str, top: flo
 # --- sources
 
 
-def test_ferrari_has_the_published_axle_stiffnesses_and_yaw_inertia() -> None:
+def test_ferrari_has_the_published_axle_stiffnesses_and_yaw_inertia():
     plant = plant_of("ferrari_250_lm")
     p, (front, rear) = plant.parameters, cornering_stiffnesses(plant)
     assert (p.m, p.a, p.b) == (982.0, 1.33, 1.07)
@@ -254,7 +251,7 @@ def test_ferrari_has_the_published_axle_stiffnesses_and_yaw_inertia() -> None:
     assert rear == pytest.approx(1.2e5, rel=0.01)
 
 
-def test_truck_has_the_axle_forces_that_were_fitted_and_the_eigenvalues_that_were_reported() -> None:
+def test_truck_has_the_axle_forces_that_were_fitted_and_the_eigenvalues_that_were_reported():
     # Di Biase et al. 2020, Table 1 and the remark below Eq. 27, with the rational tyre at friction 1.
     plant = plant_of("heavy_truck")
     p = plant.parameters
@@ -281,7 +278,7 @@ SOURCE = re.compile(
 
 
 @each_vehicle
-def test_every_value_says_where_it_comes_from_or_that_it_is_assumed(name: str) -> None:
+def test_every_value_says_where_it_comes_from_or_that_it_is_assumed(name):
     overrides = (CONFIGURATIONS / f"{name}.yaml").read_text(encoding="utf-8").partition("overrides:\n")[2]
     block = ""  # comment above a group of values that have none of their own
     for line in overrides.splitlines():
@@ -295,7 +292,7 @@ def test_every_value_says_where_it_comes_from_or_that_it_is_assumed(name: str) -
     assert "parameter_set: 2  # BMW 320i (Althoff and Würsching" in (CONFIGURATIONS / f"{name}.yaml").read_text(encoding="utf-8")
 
 
-def test_cars_without_stated_shifts_pull_to_neither_side() -> None:
+def test_cars_without_stated_shifts_pull_to_neither_side():
     for name in OURS:
         plant = plant_of(name)
         after = plant.advance(plant.initial_state(0.0, 0.0, 0.0, 30.0), np.array([0.0, -3.0, 0.0, 0.0, 0.0]), 2000)
@@ -315,12 +312,12 @@ def test_cars_without_stated_shifts_pull_to_neither_side() -> None:
         ({"name": "a", "parameter_set": 2, "overrides": {"tire_rear": {"grip": 1.0}}}, r"'tire_rear\.grip'"),
     ],
 )
-def test_vehicle_that_makes_no_sense_names_the_value(configuration: dict[str, object], complaint: str) -> None:
+def test_vehicle_that_makes_no_sense_names_the_value(configuration, complaint):
     with pytest.raises(ConfigurationError, match=complaint):
         vehicle_from_configuration(configuration)
 
 
-def test_overrides_reach_the_plant() -> None:
+def test_overrides_reach_the_plant():
     slippery = Vehicle("slippery", 2, {"h_s": 0.45, "tire": {"p_dy1": 0.5}, "tire_rear": {"p_dx1": 0.6}})
     assert library_parameters(slippery).tire.p_dy1 == 0.5
     assert library_parameters(slippery).h_s == 0.45

@@ -8,8 +8,6 @@ from typing import Any
 
 import numpy as np
 
-from vehest.data.recording import Recording
-
 DBC = """VERSION ""
 
 NS_ :
@@ -37,7 +35,7 @@ BO_ 1024 Untouched: 8 Gateway
 CM_ SG_ 288 AccLat "positive to the right,
 BO_ 1 nothing: 8 nobody";
 """
-SIGNALS: dict[str, Any] = {
+SIGNALS = {
     "vx": {"column": "Speed.VehSpd", "unit": "km/h"},
     "yaw_rate": {"column": "YawRate", "unit": "deg/s"},
     "ax": {"column": "IMU.AccLong", "unit": "m/s²"},
@@ -64,9 +62,7 @@ class Written:
     origin: float
 
 
-def write_log(
-    recording: Recording, folder: Path, suffix: str = ".asc", *, jitter: float = 0.0, lost: float = 0.0, seed: int = 0, repeats: int = 1
-) -> Written:
+def write_log(recording, folder, suffix=".asc", *, jitter=0.0, lost=0.0, seed=0, repeats=1):
     """Write a recording as the frames of a bus.
 
     Args:
@@ -102,17 +98,13 @@ def write_log(
     return Written(dbc, log, {name: np.flatnonzero(flags) for name, flags in gone.items()}, recording.start_time - first)
 
 
-def _messages(recording: Recording) -> dict[str, tuple[int, bool, list[bytes]]]:
+def _messages(recording):
     """Message -> its identifier, whether that is extended, and a frame a sample."""
     import cantools
 
     database = cantools.database.load_string(DBC, "dbc")
     values = {
-        "IMU": {
-            "YawRate": np.degrees(recording["yaw_rate"]),
-            "AccLat": -recording["ay"],
-            "AccLong": recording["ax"],
-        },
+        "IMU": {"YawRate": np.degrees(recording["yaw_rate"]), "AccLat": -recording["ay"], "AccLong": recording["ax"]},
         "Speed": {"VehSpd": 3.6 * recording["vx"]},
     }
     if "steer" in recording:
@@ -129,7 +121,7 @@ def _messages(recording: Recording) -> dict[str, tuple[int, bool, list[bytes]]]:
     return found
 
 
-def ferrari(start: float, stop: float) -> Recording:
+def ferrari(start, stop):
     """A stretch of the real Ferrari's drive, as its data set declares it."""
     from vehest.run.config import compose_config
     from vehest.sources.base import open_source

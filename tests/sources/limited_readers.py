@@ -1,9 +1,6 @@
 """Functions that a limited process calls as readers: one that answers, and one for each way of ending otherwise."""
 
-from __future__ import annotations
-
 import os
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -15,33 +12,33 @@ from vehest.sources.limited import Arrays
 Answer = tuple[Arrays, dict[str, Any]]
 
 
-def answers(file: Path, factor: float) -> Answer:
+def answers(file, factor):
     """Numbers of the file, times a factor."""
     print("what a library prints is no answer")
     return {"vx": factor * np.fromfile(file), "n": np.arange(3)}, {"limit": current_limits().samples}
 
 
-def hangs(file: Path) -> Answer:
+def hangs(file):
     while True:
         pass
 
 
-def takes_memory(file: Path) -> Answer:
+def takes_memory(file):
     return {"vx": np.ones(250_000_000)}, {}
 
 
-def crashes(file: Path) -> Answer:
+def crashes(file):
     os.abort()
 
 
-def writes(file: Path) -> Answer:
+def writes(file):
     file.with_name("written").write_text("x")
     return {}, {}
 
 
-def misses(file: Path) -> Answer:
+def misses(file):
     raise MissingError(f"'{file}' needs another one")
 
 
-def fails(file: Path) -> Answer:
+def fails(file):
     raise KeyError("vx\x1b[2J\nsecond line")

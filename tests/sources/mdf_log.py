@@ -1,18 +1,13 @@
 """Measurements by asammdf's own writer; for tests."""
 
-from __future__ import annotations
-
-from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
 
-from vehest.data.recording import Recording
 from vehest.sources.base import open_source
 
 ONE = {"vx": {"column": "v", "unit": "m/s"}}
 
 
-def write_mdf(file: Path, groups: Mapping[str, list[Any]], version: str = "4.10", clock: Any = None, **options: Any) -> Path:
+def write_mdf(file, groups, version="4.10", clock=None, **options):
     """Write groups of signals, each on its own clock; ``clock`` is the conversion of the first group's times."""
     import asammdf
 
@@ -25,7 +20,7 @@ def write_mdf(file: Path, groups: Mapping[str, list[Any]], version: str = "4.10"
     return saved.rename(file)  # the writer chooses the suffix
 
 
-def read_mdf(file: Path, **options: Any) -> Recording:
+def read_mdf(file, **options):
     """Read a measurement as a data set of 100 Hz declares it, by default its signal v."""
     declared = {"name": "mine", "source": "mdf", "path": str(file.parent), "files": file.name, "rate_hz": 100, "channels": ONE}
     return open_source(declared | options).read(file.stem)

@@ -1,15 +1,11 @@
 """How what cannot be used is refused; for tests."""
 
-from __future__ import annotations
-
-from collections.abc import Callable
-
 import pytest
 
 from vehest.data.errors import DataError, VehestError
 
 
-def refusal(act: Callable[[], object], kind: type[VehestError] = DataError) -> str:
+def refusal(act, kind=DataError):
     """The one printable line of the error in which ``act`` ends."""
     with pytest.raises(VehestError) as error:
         act()

@@ -1,7 +1,5 @@
 """Reading in a process of its own: what comes back, and one line naming the file however it ends."""
 
-from __future__ import annotations
-
 import sys
 from pathlib import Path
 
@@ -16,13 +14,13 @@ VALUES = np.array([0.1, np.nan, -np.inf, 1e-310])
 
 
 @pytest.fixture
-def file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+def file(tmp_path, monkeypatch):
     monkeypatch.syspath_prepend(str(Path(__file__).parent))
     VALUES.tofile(tmp_path / "lap.bin")
     return tmp_path / "lap.bin"
 
 
-def test_arrays_and_summary_come_back_and_limits_go_along(file: Path) -> None:
+def test_arrays_and_summary_come_back_and_limits_go_along(file):
     with use_limits(Limits(samples=77)):
         reading = read_limited("limited_readers:answers", file, factor=2.0)
     np.testing.assert_array_equal(reading.arrays["vx"], 2.0 * VALUES)
@@ -42,9 +40,7 @@ def test_arrays_and_summary_come_back_and_limits_go_along(file: Path) -> None:
         ("fails", DataError, "make it again"),
     ],
 )
-def test_however_reading_ends_it_is_one_line_and_nothing_is_written(
-    file: Path, monkeypatch: pytest.MonkeyPatch, function: str, kind: type[VehestError], said: str
-) -> None:
+def test_however_reading_ends_it_is_one_line_and_nothing_is_written(file, monkeypatch, function, kind, said):
     monkeypatch.setattr("vehest.sources.limited.SECONDS", 2.0)
     with use_limits(Limits(memory=1_000_000_000)), pytest.raises(VehestError) as error:
         read_limited(f"limited_readers:{function}", file)

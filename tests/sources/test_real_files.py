@@ -1,9 +1,5 @@
 """What the publishers' files say of their own sensors; their readings are recorded in tests/golden."""
 
-from __future__ import annotations
-
-from pathlib import Path
-
 import numpy as np
 import pandas as pd
 import pytest
@@ -13,7 +9,7 @@ from vehest.alignment.checks import checks_of_recording
 
 
 @pytest.mark.parametrize("dataset", ["ferrari_250lm_unlabelled", "av21"])
-def test_drives_without_a_reference_or_without_lateral_acceleration_are_read(data_root: Path, dataset: str) -> None:
+def test_drives_without_a_reference_or_without_lateral_acceleration_are_read(data_root, dataset):
     recordings = list(source_of(data_root, dataset).recordings())
     assert not [f for recording in recordings for f in checks_of_recording(recording) if f.level == "error"]
     for recording in recordings:
@@ -25,7 +21,7 @@ def test_drives_without_a_reference_or_without_lateral_acceleration_are_read(dat
             assert np.median((recording["vx"] / recording["vx_ref"])[moving]) == pytest.approx(1.0, abs=0.006)
 
 
-def test_roboracer_runs_restart_and_are_scored_by_their_poses(data_root: Path) -> None:
+def test_roboracer_runs_restart_and_are_scored_by_their_poses(data_root):
     recordings = {recording.id: recording for recording in source_of(data_root, "roboracer").recordings()}
     table = pd.read_csv(data_root / "roboracer" / "ftg_stanley_total_training.csv").iloc[1639:2082]
     run = recordings["ftg_stanley_total_training_run_2"]
@@ -40,7 +36,7 @@ def test_roboracer_runs_restart_and_are_scored_by_their_poses(data_root: Path) -
     assert not [f for recording in recordings.values() for f in checks_of_recording(recording) if f.level == "error"]
 
 
-def test_dart_sensors_agree_with_its_poses_once_held_values_and_latency_are_taken_off(data_root: Path) -> None:
+def test_dart_sensors_agree_with_its_poses_once_held_values_and_latency_are_taken_off(data_root):
     source = source_of(data_root, "dart")
     recording = source.read("car_1_Datarecording_09_16_2024_10_02_28")
     assert recording.provenance["held"]["rate_hz"] == pytest.approx(10.0, abs=0.05)

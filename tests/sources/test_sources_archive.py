@@ -1,12 +1,8 @@
 """Archives from strangers: what is harmless comes out as it went in, all else is refused in one line and leaves nothing behind."""
 
-from __future__ import annotations
-
 import stat
 import tempfile
 import zipfile
-from collections.abc import Iterator
-from pathlib import Path
 
 import pytest
 from refusals import refusal
@@ -18,7 +14,7 @@ CONTENT = {"bag/metadata.yaml": b"a: 1\n", "bag/data.db3": bytes(range(256)) * 4
 
 
 @pytest.fixture(autouse=True)
-def temporary(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
+def temporary(tmp_path, monkeypatch):
     """A temporary folder of our own, which every test must leave empty."""
     folder = tmp_path / "temporary"
     folder.mkdir()
@@ -27,7 +23,7 @@ def temporary(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]
     assert list(folder.iterdir()) == []
 
 
-def packed(folder: Path, content: dict[str, bytes], name: str = "bag.zip") -> Path:
+def packed(folder, content, name="bag.zip"):
     file = folder / name
     with zipfile.ZipFile(file, "w", zipfile.ZIP_DEFLATED) as archive:
         for path, data in content.items():
@@ -35,7 +31,7 @@ def packed(folder: Path, content: dict[str, bytes], name: str = "bag.zip") -> Pa
     return file
 
 
-def refused(file: Path, **limits: int) -> str:
+def refused(file, **limits):
     before = sorted(file.parent.rglob("*"))
     message = refusal(unpacked(file, **limits).__enter__)
     assert str(file) in message
@@ -43,7 +39,7 @@ def refused(file: Path, **limits: int) -> str:
     return message
 
 
-def test_what_was_packed_comes_out_and_is_gone_afterwards(tmp_path: Path) -> None:
+def test_what_was_packed_comes_out_and_is_gone_afterwards(tmp_path):
     file = packed(tmp_path, CONTENT)
     with unpacked(file) as folder:
         found = {path.relative_to(folder).as_posix(): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
@@ -52,14 +48,14 @@ def test_what_was_packed_comes_out_and_is_gone_afterwards(tmp_path: Path) -> Non
 
 
 @pytest.mark.parametrize("name", ["../evil", "/etc/evil", "C:\\evil", "a/\x1b[2J"])
-def test_a_name_that_leaves_the_folder_is_refused(tmp_path: Path, name: str) -> None:
+def test_a_name_that_leaves_the_folder_is_refused(tmp_path, name):
     message = refused(packed(tmp_path, {"bag/metadata.yaml": b"", name: b"evil"}))
     assert "is no file inside the folder" in message
     assert not (tmp_path.parent / "evil").exists()
 
 
 @pytest.mark.parametrize("kind", [stat.S_IFLNK, stat.S_IFIFO])
-def test_links_and_special_files_are_refused(tmp_path: Path, kind: int) -> None:
+def test_links_and_special_files_are_refused(tmp_path, kind):
     file = tmp_path / "bag.zip"
     with zipfile.ZipFile(file, "w") as archive:
         entry = zipfile.ZipInfo("bag/data.db3")
@@ -68,7 +64,7 @@ def test_links_and_special_files_are_refused(tmp_path: Path, kind: int) -> None:
     assert "is no file inside the folder" in refused(file)
 
 
-def test_more_bytes_or_entries_than_the_limit_are_refused(tmp_path: Path) -> None:
+def test_more_bytes_or_entries_than_the_limit_are_refused(tmp_path):
     file = packed(tmp_path, {"zeros": bytes(10**6), "more": bytes(10**6)})
     assert file.stat().st_size < 10**4
     assert "0.002 GB unpacked, more than the limit of 10000 entries and 0.0015 GB" in refused(file, most_bytes=1_500_000)
@@ -76,7 +72,7 @@ def test_more_bytes_or_entries_than_the_limit_are_refused(tmp_path: Path) -> Non
         assert (folder / "more").stat().st_size == 10**6
 
 
-def test_an_archive_that_understates_its_size_is_refused(tmp_path: Path) -> None:
+def test_an_archive_that_understates_its_size_is_refused(tmp_path):
     file = packed(tmp_path, {"data.db3": bytes(10**6)})
     raw = bytearray(file.read_bytes())
     for at in (raw.index(b"PK\x03\x04") + 22, raw.index(b"PK\x01\x02") + 24):
@@ -85,12 +81,12 @@ def test_an_archive_that_understates_its_size_is_refused(tmp_path: Path) -> None
     assert "not a sound zip archive" in refused(file)
 
 
-def test_what_an_archive_says_of_its_sizes_is_held_against_its_own_size(tmp_path: Path) -> None:
+def test_what_an_archive_says_of_its_sizes_is_held_against_its_own_size(tmp_path):
     file = packed(tmp_path, {"zeros": bytes(80 * 2**20)})
     assert "0.0839 GB unpacked, more than the limit of 10000 entries and 0.0671 GB" in refused(file)
 
 
-def test_a_list_of_entries_longer_than_the_limit_is_not_read(tmp_path: Path) -> None:
+def test_a_list_of_entries_longer_than_the_limit_is_not_read(tmp_path):
     file = packed(tmp_path, {f"{k:0100d}": b"" for k in range(200)})
     with use_limits(Limits(text_bytes=10_000)):
         assert "holds a list of entries of" in refused(file)

@@ -1,12 +1,8 @@
 """Logs of python-can's own writers: a drive comes back as it was, and one clear line for what cannot be used."""
 
-from __future__ import annotations
-
 import re
 import struct
 import zlib
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -25,25 +21,25 @@ FOUR = {name: SIGNALS[name] for name in ("vx", "yaw_rate", "ax", "ay")}
 STEPS = {"vx": 0.01 / 3.6, "yaw_rate": np.radians(0.005), "ax": 0.001, "ay": 0.001}
 
 
-def source(folder: Path, **options: Any) -> Any:
+def source(folder, **options):
     told = {"files": "drive.*", "dbc": str(folder / "car.dbc"), "rate_hz": 100, "channels": FOUR, **options}
     return open_source({"name": "mine", "source": "can", "path": str(folder), **told})
 
 
-def read(folder: Path, **options: Any) -> Recording:
+def read(folder, **options):
     found = source(folder, **options).read("drive")
     assert isinstance(found, Recording)
     return found
 
 
-def drive(seconds: float = 10.0) -> Recording:
+def drive(seconds=10.0):
     return planar_drive(seconds, 100.0, seed=3)
 
 
 SPEED = {"vx": {"column": "Speed", "unit": "m/s"}}
 
 
-def log(folder: Path, dbc: str, frames: list[tuple[float, int, bytes]]) -> None:
+def log(folder, dbc, frames):
     """Frames of message 291: their times, buses and bytes."""
     (folder / "car.dbc").write_text(dbc)
     with can.Logger(folder / "drive.asc") as writer:
@@ -51,12 +47,12 @@ def log(folder: Path, dbc: str, frames: list[tuple[float, int, bytes]]) -> None:
             writer(can.Message(stamp, 291, False, data=data, channel=bus))
 
 
-def one(signal: str, length: int = 8) -> str:
+def one(signal, length=8):
     return f'VERSION ""\n\nBO_ 291 Speed: {length} Car\n SG_ Speed : {signal}\n'
 
 
 @pytest.mark.parametrize("suffix", [".asc", ".blf", ".log"])
-def test_a_drive_comes_back_within_the_resolution_of_its_signals(tmp_path: Path, suffix: str) -> None:
+def test_a_drive_comes_back_within_the_resolution_of_its_signals(tmp_path, suffix):
     sent = drive()
     write_log(sent, tmp_path, suffix)
     got = read(tmp_path)
@@ -68,7 +64,7 @@ def test_a_drive_comes_back_within_the_resolution_of_its_signals(tmp_path: Path,
         np.testing.assert_allclose(got[name], sent[name][k], atol=0.5 * step + slack + 1e-9)
 
 
-def test_raw_values_that_mean_nothing_are_gaps_of_a_gappy_channel(tmp_path: Path) -> None:
+def test_raw_values_that_mean_nothing_are_gaps_of_a_gappy_channel(tmp_path):
     frames = [(k / 100, 0, struct.pack("<H6x", 65535 if 20 <= k < 30 else 1000 + k)) for k in range(100)]
     log(tmp_path, one('0|16@1+ (0.01,0) [0|0] "m/s" Car'), frames)
     entry = {"vx": {**SPEED["vx"], "invalid": [65535]}}
@@ -76,7 +72,7 @@ def test_raw_values_that_mean_nothing_are_gaps_of_a_gappy_channel(tmp_path: Path
     assert np.flatnonzero(np.isnan(got["vx"])).tolist() == list(range(20, 30))
 
 
-def test_one_bus_of_several_is_taken(tmp_path: Path) -> None:
+def test_one_bus_of_several_is_taken(tmp_path):
     frames = [((k // 2) / 100, k % 2, bytes([10 + k % 2] * 8)) for k in range(200)]
     log(tmp_path, one('0|8@1+ (1,0) [0|0] "m/s" Car'), frames)
     assert "say which by bus" in refusal(lambda: read(tmp_path, channels=SPEED))
@@ -94,7 +90,7 @@ def test_one_bus_of_several_is_taken(tmp_path: Path) -> None:
         ({"rate_hz": 50}, "faster than the raster"),
     ],
 )
-def test_what_is_declared_wrongly_is_said_in_a_line(tmp_path: Path, options: dict[str, Any], said: str) -> None:
+def test_what_is_declared_wrongly_is_said_in_a_line(tmp_path, options, said):
     write_log(drive(), tmp_path)
     assert said in refusal(lambda: read(tmp_path, **options))
 
@@ -108,12 +104,12 @@ def test_what_is_declared_wrongly_is_said_in_a_line(tmp_path: Path, options: dic
         (one("soon"), "cannot be read as a DBC"),
     ],
 )
-def test_a_dbc_that_makes_no_sense_is_one_line(tmp_path: Path, dbc: str, said: str) -> None:
+def test_a_dbc_that_makes_no_sense_is_one_line(tmp_path, dbc, said):
     log(tmp_path, dbc, [(k / 100, 0, bytes(8)) for k in range(50)])
     assert said in refusal(lambda: read(tmp_path, channels=SPEED))
 
 
-def blf_with(content: bytes, method: int = 0) -> bytes:
+def blf_with(content, method=0):
     """A BLF file with one container of whatever is given."""
     head = b"LOGG" + struct.pack("<L", 144) + bytes(136)
     body = content if method == 0 else zlib.compress(content)
@@ -130,13 +126,13 @@ def blf_with(content: bytes, method: int = 0) -> bytes:
         (".asc", lambda content: content.replace(b" 120 ", b" zzz "), "is damaged .*zzz"),
     ],
 )
-def test_a_damaged_log_is_one_line(tmp_path: Path, suffix: str, change: Any, said: str) -> None:
+def test_a_damaged_log_is_one_line(tmp_path, suffix, change, said):
     written = write_log(drive(3.0), tmp_path, suffix)
     written.log.write_bytes(change(written.log.read_bytes()))
     assert re.search(said, refusal(lambda: read(tmp_path)))
 
 
-def test_more_frames_than_the_limits_are_refused(tmp_path: Path) -> None:
+def test_more_frames_than_the_limits_are_refused(tmp_path):
     write_log(drive(3.0), tmp_path, ".blf")
     with use_limits(Limits(samples=100)):
         assert "holds 101 frames or more" in refusal(lambda: read(tmp_path))

@@ -1,9 +1,5 @@
 """From time stamps to a uniform clock, and from a file's columns to channels."""
 
-from __future__ import annotations
-
-from pathlib import Path
-
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -25,14 +21,14 @@ PROPERTY = settings(max_examples=120, deadline=None, derandomize=True, database=
 
 @PROPERTY
 @given(st.sampled_from(RATES), st.integers(2, 2000), st.sampled_from([0.0, 149.99, -12.5, 1_700_000_123.456]))
-def test_the_rate_that_was_meant_comes_back_at_any_start(rate: float, length: int, start: float) -> None:
+def test_the_rate_that_was_meant_comes_back_at_any_start(rate, length, start):
     clock = uniform_clock(start + np.arange(length) / rate, "'file'")
     assert clock.rate_hz == pytest.approx(rate, rel=1e-12)
     assert (clock.start_time, clock.n_samples, clock.stamps) == (start, length, None)
 
 
 @pytest.mark.parametrize("rate", [125.0, 1000.0 / 3.0])
-def test_time_stamps_rounded_to_milliseconds_can_be_resampled_to_20_hz(rate: float) -> None:
+def test_time_stamps_rounded_to_milliseconds_can_be_resampled_to_20_hz(rate):
     stamps = np.round(1_700_000_000.0 + np.arange(500) / rate, 3)
     clock = uniform_clock(stamps, "'file'", "interpolate")
     recording = Recording("lap", "car", clock.rate_hz, clock.start_time, {"ay": np.zeros(clock.n_samples)})
@@ -42,7 +38,7 @@ def test_time_stamps_rounded_to_milliseconds_can_be_resampled_to_20_hz(rate: flo
 
 @pytest.mark.parametrize("share", [0.1, 0.2, 0.24])  # from a quarter on, a long step cannot be told from a lost sample
 @pytest.mark.parametrize("rate", [20.0, 100.0, 125.0])
-def test_the_rate_survives_strong_jitter_and_gaps(rate: float, share: float) -> None:
+def test_the_rate_survives_strong_jitter_and_gaps(rate, share):
     generator = np.random.default_rng(5)
     stamps = (np.arange(1000) + share * generator.uniform(-1, 1, 1000)) / rate
     kept = np.delete(stamps, [*range(300, 350), 500, 777])
@@ -51,7 +47,7 @@ def test_the_rate_survives_strong_jitter_and_gaps(rate: float, share: float) -> 
     assert clock.n_samples == pytest.approx(1000, abs=1)
 
 
-def test_jitter_beyond_a_hundredth_of_an_interval_needs_interpolation() -> None:
+def test_jitter_beyond_a_hundredth_of_an_interval_needs_interpolation():
     even, noise = np.arange(1000) / 100.0, np.random.default_rng(0).uniform(-1, 1, 1000)
     assert uniform_clock(even + 4e-5 * noise, "'file'").rate_hz == 100.0
     with pytest.raises(DataError, match="set clock: interpolate"):
@@ -59,7 +55,7 @@ def test_jitter_beyond_a_hundredth_of_an_interval_needs_interpolation() -> None:
     assert uniform_clock(even + 2e-3 * noise, "'file'", "interpolate").rate_hz == 100.0
 
 
-def test_interpolation_bridges_a_gap_linearly() -> None:
+def test_interpolation_bridges_a_gap_linearly():
     stamps = np.delete(np.arange(300) / 100.0, np.s_[100:200])
     with pytest.raises(DataError, match="cut the range out or set clock: interpolate"):
         uniform_clock(stamps, "'file'")
@@ -68,7 +64,7 @@ def test_interpolation_bridges_a_gap_linearly() -> None:
     np.testing.assert_allclose(clock.align(5.0 * stamps), 5.0 * np.arange(300) / 100.0, atol=1e-12)
 
 
-def test_interpolation_keeps_every_measured_sample_of_a_slow_channel() -> None:
+def test_interpolation_keeps_every_measured_sample_of_a_slow_channel():
     stamps = np.arange(200) / 100.0 + 1e-3 * np.random.default_rng(0).uniform(-1, 1, 200)
     slow = np.where(np.arange(200) % 5 == 0, np.arange(200.0), np.nan)
     aligned = uniform_clock(stamps, "'file'", "interpolate").align(slow, gappy=True)
@@ -77,7 +73,7 @@ def test_interpolation_keeps_every_measured_sample_of_a_slow_channel() -> None:
     assert np.abs(np.flatnonzero(measured) - aligned[measured]).max() <= 1
 
 
-def test_units_and_signs_are_applied() -> None:
+def test_units_and_signs_are_applied():
     values = np.array([1.0, -2.0, 0.5])
     np.testing.assert_allclose(Column("a", "g", -1).to_si(values, "m/s²"), -9.80665 * values)
     np.testing.assert_allclose(Column("a", "deg/s").to_si(values, "rad/s"), np.deg2rad(values))
@@ -91,13 +87,13 @@ def test_units_and_signs_are_applied() -> None:
         ({"vx": {"column": "a", "unit": "deg"}}, "unit 'deg' cannot be converted to 'm/s'"),
     ],
 )
-def test_a_misspelt_map_of_columns_is_refused_in_one_line(entries: dict[str, object], what: str) -> None:
+def test_a_misspelt_map_of_columns_is_refused_in_one_line(entries, what):
     message = refusal(lambda: columns_from_config(entries, "mine"), ConfigurationError)
     assert message.startswith("data set 'mine'")
     assert what in message
 
 
-def test_a_time_column_has_a_unit_of_time() -> None:
+def test_a_time_column_has_a_unit_of_time():
     assert column_from_config({"column": "t", "unit": "ms"}, "here", "s") == Column("t", "ms")
     with pytest.raises(ConfigurationError, match="here: unit 'km/h' cannot be converted to 's'"):
         column_from_config({"column": "t", "unit": "km/h"}, "here", "s")
@@ -121,13 +117,13 @@ EVEN = np.arange(1000) / 100.0
     ],
 )
 @pytest.mark.filterwarnings("error")
-def test_time_stamps_of_no_drive_are_refused_in_one_line_whatever_the_policy(policy: str, stamps: np.ndarray, said: str) -> None:
-    message = refusal(lambda: uniform_clock(stamps, "'lap.csv'", policy))  # type: ignore[arg-type]
+def test_time_stamps_of_no_drive_are_refused_in_one_line_whatever_the_policy(policy, stamps, said):
+    message = refusal(lambda: uniform_clock(stamps, "'lap.csv'", policy))
     assert message.startswith("'lap.csv': ")
     assert said in message
 
 
-def test_every_recording_of_a_source_keeps_the_rule(tmp_path: Path) -> None:
+def test_every_recording_of_a_source_keeps_the_rule(tmp_path):
     (tmp_path / "lap.csv").write_text("vx\n" + "1.0\n" * 100, encoding="utf-8")
     declared = {"name": "mine", "source": "tabular", "path": str(tmp_path), "channels": {"vx": {"column": "vx", "unit": "m/s"}}}
     assert open_source({**declared, "rate_hz": 9e4}).read("lap").rate_hz == 9e4
@@ -137,14 +133,14 @@ def test_every_recording_of_a_source_keeps_the_rule(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("rows", [1000, 400])
-def test_a_survey_names_a_stray_time_stamp(tmp_path: Path, rows: int) -> None:
+def test_a_survey_names_a_stray_time_stamp(tmp_path, rows):
     stamps = np.where(np.arange(1000) == rows - 1, 1e9, EVEN)
     np.savetxt(tmp_path / "lap.csv", np.stack([stamps, EVEN], axis=1), delimiter=",", header="time,vx", comments="", fmt="%.3f")
     with pytest.raises(DataError, match=rf"lap\.csv': time spans .* between sample {rows - 2} .* and {rows - 1} \(1000000000 s\)"):
         survey(tmp_path / "lap.csv")
 
 
-def test_an_even_clock_over_a_gap_stays_within_the_limit_of_samples() -> None:
+def test_an_even_clock_over_a_gap_stays_within_the_limit_of_samples():
     stamps = np.append(EVEN, 3e5)
     with pytest.raises(DataError, match=r"over 1001 rows would hold 30000001 samples, more than the limit .*: limits\.samples=NUMBER"):
         uniform_clock(stamps, "'lap.csv'", "interpolate")
@@ -161,11 +157,11 @@ def test_an_even_clock_over_a_gap_stays_within_the_limit_of_samples() -> None:
         (np.cumsum(np.linspace(0.00995, 0.01005, 5000)), "the clock drifts: at "),
     ],
 )
-def test_gaps_jitter_and_drift_are_found_with_their_size(stamps: np.ndarray, found: str) -> None:
+def test_gaps_jitter_and_drift_are_found_with_their_size(stamps, found):
     assert unevenness(stamps).startswith(found)
 
 
-def test_an_even_clock_withstands_a_stall() -> None:
+def test_an_even_clock_withstands_a_stall():
     times = np.arange(2000) / 100 * 1.00003
     stamps = times.copy()
     stamps[700:715] = stamps[715]  # 150 ms nothing, then all at once
@@ -185,7 +181,7 @@ def test_an_even_clock_withstands_a_stall() -> None:
         *((np.ceil(np.delete(np.arange(2000), at) / 100 / 0.00277) * 0.00277, "samples are missing or the") for at in (300, 1000, 1800)),
     ],
 )
-def test_stamps_without_an_even_clock_behind_them_are_refused(stamps: np.ndarray, said: str) -> None:
+def test_stamps_without_an_even_clock_behind_them_are_refused(stamps, said):
     message = refusal(lambda: uniform_times(stamps, 100.0, "topic"))
     assert message.startswith("topic: ")
     assert said in message

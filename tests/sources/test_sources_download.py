@@ -7,7 +7,6 @@ import hashlib
 import os
 import resource
 import threading
-from collections.abc import Iterator
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from urllib.parse import unquote
@@ -18,7 +17,7 @@ import yaml
 from refusals import refusal
 
 from place import run_vehest
-from vehest.data.errors import ConfigurationError, DataError, MissingError, VehestError
+from vehest.data.errors import ConfigurationError, DataError, MissingError
 from vehest.data.store import read_recording
 from vehest.sources import resuming
 from vehest.sources.base import open_source
@@ -29,7 +28,7 @@ SIZE = 300_000
 BYTES = np.random.default_rng(0).integers(0, 256, SIZE, dtype=np.uint8).tobytes()
 
 
-def sha256(content: bytes) -> str:
+def sha256(content):
     return hashlib.sha256(content).hexdigest()
 
 
@@ -38,7 +37,7 @@ class Server(ThreadingHTTPServer):
 
     daemon_threads = True
 
-    def __init__(self) -> None:
+    def __init__(self):
         super().__init__(("127.0.0.1", 0), Handler)
         self.contents: dict[str, bytes] = {"a.csv": BYTES}
         self.etag: str | None = '"one"'
@@ -54,14 +53,14 @@ class Server(ThreadingHTTPServer):
         self.sent: list[int] = []
 
     @property
-    def url(self) -> str:
+    def url(self):
         return f"http://127.0.0.1:{self.server_address[1]}"
 
 
 class Handler(BaseHTTPRequestHandler):
     server: Server
 
-    def do_GET(self) -> None:
+    def do_GET(self):
         server = self.server
         name = unquote(self.path.rsplit("/", 1)[-1])
         asked = self.headers.get("Range")
@@ -96,12 +95,12 @@ class Handler(BaseHTTPRequestHandler):
         if server.changed:
             server.contents["a.csv"], server.etag = server.changed
 
-    def log_message(self, format: str, *args: object) -> None:
+    def log_message(self, format, *args):
         """Nothing on standard error."""
 
 
 @pytest.fixture
-def server(monkeypatch: pytest.MonkeyPatch) -> Iterator[Server]:
+def server(monkeypatch):
     monkeypatch.setenv("NO_PROXY", "127.0.0.1")
     monkeypatch.setattr(resuming, "PAUSE", 0.0)
     made = Server()
@@ -113,34 +112,34 @@ def server(monkeypatch: pytest.MonkeyPatch) -> Iterator[Server]:
     made.server_close()
 
 
-def download(server: Server, folder: Path, *names: str, known: dict[str, str] | None = None) -> Download:
+def download(server, folder, *names, known=None):
     return Download(folder, server.url, names or ("a.csv",), known or {})
 
 
-def fetch(what: Download) -> list[Outcome]:
+def fetch(what):
     return list(what.fetch())
 
 
-def refused(what: Download, kind: type[VehestError] = MissingError) -> str:
+def refused(what, kind=MissingError):
     return refusal(lambda: fetch(what), kind)
 
 
-def files(folder: Path) -> dict[str, bytes]:
+def files(folder):
     return {str(file.relative_to(folder)): file.read_bytes() for file in folder.rglob("*") if file.is_file()}
 
 
-def assert_only(folder: Path, content: bytes = BYTES) -> None:
+def assert_only(folder, content=BYTES):
     assert files(folder) == {"a.csv": content, CHECKSUMS: f"a.csv {sha256(content)}\n".encode()}
 
 
-def test_a_file_arrives_byte_for_byte_and_is_recorded(server: Server, tmp_path: Path) -> None:
+def test_a_file_arrives_byte_for_byte_and_is_recorded(server, tmp_path):
     (outcome,) = fetch(download(server, tmp_path / "new" / "folder"))
     assert outcome == Outcome("a.csv", "fetched", sha256(BYTES), SIZE)
     assert_only(tmp_path / "new" / "folder")
     assert server.asked == [("/a.csv", None, None)]
 
 
-def test_a_server_that_breaks_off_again_and_again_is_asked_for_the_rest_as_long_as_bytes_come(server: Server, tmp_path: Path) -> None:
+def test_a_server_that_breaks_off_again_and_again_is_asked_for_the_rest_as_long_as_bytes_come(server, tmp_path):
     server.breaks = [CHUNK + 7] * (ATTEMPTS + 2)
     (outcome,) = fetch(download(server, tmp_path))
     assert_only(tmp_path)
@@ -148,7 +147,7 @@ def test_a_server_that_breaks_off_again_and_again_is_asked_for_the_rest_as_long_
     assert outcome.resumed_at == (ATTEMPTS + 2) * CHUNK
 
 
-def test_a_server_that_brings_nothing_new_is_given_up_and_the_next_run_goes_on(server: Server, tmp_path: Path) -> None:
+def test_a_server_that_brings_nothing_new_is_given_up_and_the_next_run_goes_on(server, tmp_path):
     server.breaks = [4 * CHUNK, 0, 0, 0, 0, 0]
     message = refused(download(server, tmp_path))
     assert message.startswith(f"cannot fetch {server.url}/a.csv: ")
@@ -162,7 +161,7 @@ def test_a_server_that_brings_nothing_new_is_given_up_and_the_next_run_goes_on(s
 
 
 @pytest.mark.parametrize("modified", [None, "Sat, 22 Feb 2014 10:00:00 GMT"])
-def test_a_server_without_ranges_starts_over(server: Server, tmp_path: Path, modified: str | None) -> None:
+def test_a_server_without_ranges_starts_over(server, tmp_path, modified):
     server.ranges, server.etag, server.modified = False, None, modified
     server.breaks = [200_000]
     (outcome,) = fetch(download(server, tmp_path))
@@ -172,7 +171,7 @@ def test_a_server_without_ranges_starts_over(server: Server, tmp_path: Path, mod
 
 
 @pytest.mark.parametrize(("size", "careless"), [(SIZE, False), (250_000, True), (100_000, False), (100_000, True)])
-def test_a_file_that_changes_between_attempts_is_never_mixed(server: Server, tmp_path: Path, size: int, careless: bool) -> None:
+def test_a_file_that_changes_between_attempts_is_never_mixed(server, tmp_path, size, careless):
     other = BYTES[::-1][:size]
     server.breaks, server.changed, server.careless = [200_000], (other, '"two"'), careless
     fetch(download(server, tmp_path))
@@ -180,7 +179,7 @@ def test_a_file_that_changes_between_attempts_is_never_mixed(server: Server, tmp
     assert server.asked[1][2] == '"one"'
 
 
-def test_two_processes_do_not_fetch_into_one_folder(server: Server, tmp_path: Path) -> None:
+def test_two_processes_do_not_fetch_into_one_folder(server, tmp_path):
     descriptor = os.open(tmp_path, os.O_RDONLY)
     fcntl.flock(descriptor, fcntl.LOCK_EX)
     assert "another process is fetching into" in refused(download(server, tmp_path))
@@ -189,7 +188,7 @@ def test_two_processes_do_not_fetch_into_one_folder(server: Server, tmp_path: Pa
     assert_only(tmp_path)
 
 
-def test_other_bytes_than_recorded_or_declared_are_refused_and_leave_nothing(server: Server, tmp_path: Path) -> None:
+def test_other_bytes_than_recorded_or_declared_are_refused_and_leave_nothing(server, tmp_path):
     message = refused(download(server, tmp_path, known={"a.csv": sha256(b"other")}), DataError)
     assert all(part in message for part in (f"{server.url}/a.csv", sha256(b"other"), sha256(BYTES), "known by download.sha256"))
     assert files(tmp_path) == {}
@@ -204,13 +203,13 @@ def test_other_bytes_than_recorded_or_declared_are_refused_and_leave_nothing(ser
     assert files(tmp_path) == {CHECKSUMS: f"a.csv {sha256(BYTES)}\n".encode()}
 
 
-def test_a_damaged_record_is_refused(server: Server, tmp_path: Path) -> None:
+def test_a_damaged_record_is_refused(server, tmp_path):
     (tmp_path / CHECKSUMS).write_bytes(b"a.csv")
     assert CHECKSUMS in refused(download(server, tmp_path), DataError)
     assert server.asked == []
 
 
-def test_a_web_page_and_an_answer_without_a_length_are_not_taken_for_data(server: Server, tmp_path: Path) -> None:
+def test_a_web_page_and_an_answer_without_a_length_are_not_taken_for_data(server, tmp_path):
     server.headers = {"Content-Type": "text/html; charset=utf-8"}
     assert "a.csv is a web page, not a file" in refused(download(server, tmp_path))
     server.headers, server.length = {}, False
@@ -218,7 +217,7 @@ def test_a_web_page_and_an_answer_without_a_length_are_not_taken_for_data(server
     assert files(tmp_path) == {}
 
 
-def test_a_refusal_of_the_server_is_one_line_and_not_tried_again_and_a_passing_one_is(server: Server, tmp_path: Path) -> None:
+def test_a_refusal_of_the_server_is_one_line_and_not_tried_again_and_a_passing_one_is(server, tmp_path):
     server.statuses = [503, 404]
     message = refused(download(server, tmp_path))
     assert message == f"cannot fetch {server.url}/a.csv: the server answers 404 Not Found; is the address right?"
@@ -226,7 +225,7 @@ def test_a_refusal_of_the_server_is_one_line_and_not_tried_again_and_a_passing_o
     assert files(tmp_path) == {}
 
 
-def test_a_full_disk_is_one_line_and_the_next_run_goes_on(server: Server, tmp_path: Path) -> None:
+def test_a_full_disk_is_one_line_and_the_next_run_goes_on(server, tmp_path):
     soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (200_000, hard))  # files may not grow beyond
     try:
@@ -243,7 +242,7 @@ TABULAR = {"name": "mine", "source": "tabular", "path": "there", "rate_hz": 10, 
 ENTRY = {"url": "https://example.org/folder", "files": ["a.csv"]}
 
 
-def test_an_entry_says_address_files_and_checksums() -> None:
+def test_an_entry_says_address_files_and_checksums():
     entry = {"url": "https://example.org/folder/", "files": ["a.csv", "b 1.csv"], "sha256": {"a.csv": "AB" * 32}}
     what = download_of(open_source({**TABULAR, "download": entry}))
     assert (what.folder, what.files, what.sha256) == (Path("there"), ("a.csv", "b 1.csv"), {"a.csv": "ab" * 32})
@@ -258,7 +257,7 @@ def test_an_entry_says_address_files_and_checksums() -> None:
         *(({**ENTRY, "files": [name]}, "is not the name of a file in one folder") for name in ("../a.csv", CHECKSUMS, "a\n.csv")),
     ],
 )
-def test_an_entry_that_makes_no_sense_is_refused_in_one_line(entry: object, said: str) -> None:
+def test_an_entry_that_makes_no_sense_is_refused_in_one_line(entry, said):
     assert said in refusal(lambda: download_of(open_source({**TABULAR, "download": entry})), ConfigurationError)
 
 
@@ -268,9 +267,7 @@ DRIVE = "time,vx,yaw_rate,ay,ax\n" + "".join(
 )
 
 
-def test_ingest_fetches_what_is_missing_then_ingests(
-    server: Server, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_ingest_fetches_what_is_missing_then_ingests(server, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     server.contents = {"one.csv": DRIVE.encode(), "two.csv": DRIVE.replace("20.", "21.").encode()}
     entry = {"url": f"{server.url}/files", "files": ["one.csv", "two.csv"]}

@@ -1,10 +1,7 @@
 """MAT files of version 5 to 7, other formats and more than the limits, read by SciPy in the limited process."""
 
-from __future__ import annotations
-
 import struct
 import zlib
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -17,11 +14,11 @@ from vehest.sources.readers.mat_files import read_channels
 from vehest.sources.revs.mat_layout import read_mat_columns
 
 
-def refused(file: Path) -> str:
+def refused(file):
     return refusal(lambda: read_mat_columns(file, ["vxCG"], Column("time", "s")))
 
 
-def test_whole_numbers_come_back_as_doubles(tmp_path: Path) -> None:
+def test_whole_numbers_come_back_as_doubles(tmp_path):
     savemat(tmp_path / "a.mat", {"s": {"one": {"value": np.arange(9, dtype="u8")[:, None], "time": np.arange(9.0)[:, None]}}})
     arrays, summary = read_channels(tmp_path / "a.mat", ["one"], "time")
     assert summary["names"] == {"one": "s.one"}
@@ -36,12 +33,12 @@ def test_whole_numbers_come_back_as_doubles(tmp_path: Path) -> None:
         (b"MATLAB 7.3 MAT-file".ljust(124) + struct.pack("<H", 0x0200) + b"IM" + bytes(384) + b"\x89HDF\r\n\x1a\n", "version 7.3"),
     ],
 )
-def test_other_formats_are_named(tmp_path: Path, content: bytes, said: str) -> None:
+def test_other_formats_are_named(tmp_path, content, said):
     (tmp_path / "a.mat").write_bytes(content)
     assert said in refused(tmp_path / "a.mat")
 
 
-def test_more_than_the_limits_is_refused(tmp_path: Path) -> None:
+def test_more_than_the_limits_is_refused(tmp_path):
     stamps = np.arange(50) / 100
     savemat(tmp_path / "b.mat", {"insData": {"vxCG": {"value": stamps, "time": stamps}}}, do_compression=True)
     with use_limits(Limits(samples=49)):

@@ -1,17 +1,12 @@
 """MDF files of asammdf's own writer: groups of several rasters on one clock, and one clear line for what cannot be used."""
 
-from __future__ import annotations
-
 import tempfile
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 from mdf_log import ONE, read_mdf, write_mdf
 from refusals import refusal
 
-from vehest.constants import FloatArray
 from vehest.data.errors import ConfigurationError
 from vehest.sources.unit_spellings import plain_unit
 
@@ -22,28 +17,28 @@ SLOW = 0.513 + np.arange(0, 950) / 50.0  # to 19.493 s
 JITTER = np.sort(0.2 + np.arange(0, 1960) / 100.0 + np.random.default_rng(0).uniform(-0.005, 0.005, 1960))  # intervals of 0 to 20 ms
 
 
-def speed(t: FloatArray) -> FloatArray:
+def speed(t):
     return 25.0 + 4.0 * np.sin(0.5 * t)  # m/s
 
 
-def yaw_rate(t: FloatArray) -> FloatArray:
+def yaw_rate(t):
     return 0.3 * np.sin(1.1 * t)  # rad/s
 
 
-def lateral(t: FloatArray) -> FloatArray:
+def lateral(t):
     return 6.0 * np.sin(1.1 * t + 0.2)  # m/s²
 
 
-def signal(name: str, t: FloatArray, samples: Any, unit: str = "", **more: Any) -> Any:
+def signal(name, t, samples, unit="", **more):
     return asammdf.Signal(np.asarray(samples), t, name=name, unit=unit, **more)
 
 
-GROUPS: dict[str, list[Any]] = {
+GROUPS = {
     "Powertrain": [signal("VehSpd", FAST, 3.6 * speed(FAST), "km/h"), signal("LongAcc", FAST, np.cos(0.5 * FAST), "m/s^2")],
     "Gateway": [signal("YawRate", SLOW, np.degrees(yaw_rate(SLOW)), "°/s"), signal("VehSpd", SLOW, 3.7 * speed(SLOW), "kph")],
     "Imu": [signal("LatAcc", JITTER, -lateral(JITTER) / 9.80665, "g")],
 }
-CHANNELS: dict[str, Any] = {
+CHANNELS = {
     "vx": {"column": "VehSpd", "group": "Powertrain", "unit": "km/h"},
     "yaw_rate": {"column": "YawRate", "unit": "deg/s"},
     "ay": {"column": "LatAcc", "unit": "g", "sign": -1, "max_gap": 0.05},
@@ -52,23 +47,23 @@ CHANNELS: dict[str, Any] = {
 THIRDS = np.arange(2001) % 3
 
 
-def one(file: Path, t: FloatArray, samples: Any, unit: str = "m/s", **more: Any) -> Path:
+def one(file, t, samples, unit="m/s", **more):
     return write_mdf(file, {"Only": [signal("v", t, samples, unit, **more)]})
 
 
-def refused(file: Path, **options: Any) -> str:
+def refused(file, **options):
     message = refusal(lambda: read_mdf(file, **options))
     assert file.name in message
     return message
 
 
 @pytest.fixture(scope="module")
-def drive(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def drive(tmp_path_factory):
     return write_mdf(tmp_path_factory.mktemp("mdf") / "drive.mf4", GROUPS)
 
 
 @pytest.fixture(autouse=True)
-def tidy(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Any:
+def tidy(tmp_path, monkeypatch):
     """Whatever a test reads, nothing is left in the current folder or among temporary files."""
     here, temporary = tmp_path / "here", tmp_path / "temporary"
     here.mkdir()
@@ -80,7 +75,7 @@ def tidy(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Any:
     assert {file.name for file in here.iterdir()} <= {"conf", "outputs"}
 
 
-def test_three_rasters_come_to_one_clock_as_their_formulas_say(drive: Path) -> None:
+def test_three_rasters_come_to_one_clock_as_their_formulas_say(drive):
     recording = read_mdf(drive, channels=CHANNELS, vehicle="kart", citation="me")
     assert (recording.rate_hz, recording.start_time, recording.vehicle) == (100.0, 0.52, "kart")  # ticks count from the measurement's start
     assert len(recording) == round((19.49 - 0.52) * 100) + 1
@@ -94,7 +89,7 @@ def test_three_rasters_come_to_one_clock_as_their_formulas_say(drive: Path) -> N
     np.testing.assert_allclose(recording["ay"], lateral(t), rtol=0, atol=widest**2 / 8 * 6.0 * 1.1**2)
 
 
-def test_the_clock_of_a_channel_can_be_taken_as_it_is(drive: Path) -> None:
+def test_the_clock_of_a_channel_can_be_taken_as_it_is(drive):
     recording = read_mdf(drive, channels=CHANNELS, rate_hz=None, raster="yaw_rate", accept=["aliasing"])
     assert (recording.rate_hz, recording.start_time, len(recording)) == (50.0, SLOW[0], len(SLOW))
     np.testing.assert_array_equal(recording["yaw_rate"], np.radians(1.0) * np.degrees(yaw_rate(SLOW)))
@@ -102,7 +97,7 @@ def test_the_clock_of_a_channel_can_be_taken_as_it_is(drive: Path) -> None:
     assert "group 2 'Imu', whose clock is taken, does not come evenly: " in refused(drive, channels=CHANNELS, rate_hz=None, raster="ay")
 
 
-def test_a_name_in_several_groups_needs_its_group(drive: Path) -> None:
+def test_a_name_in_several_groups_needs_its_group(drive):
     without = {**CHANNELS, "vx": {"column": "VehSpd", "unit": "km/h"}}
     message = refused(drive, channels=without)
     assert "signal 'VehSpd' stands 2 times, in group 0 'Powertrain', 1 'Gateway'; say which" in message
@@ -112,7 +107,7 @@ def test_a_name_in_several_groups_needs_its_group(drive: Path) -> None:
     assert "signal 'VehSpd' is not in group '2', but in 0 'Powertrain', 1 'Gateway'" in message
 
 
-def test_an_absent_signal_is_answered_with_near_ones(drive: Path, tmp_path: Path) -> None:
+def test_an_absent_signal_is_answered_with_near_ones(drive, tmp_path):
     assert "has no signal 'Vehspeed' (near it: VehSpd)" in refused(drive, channels={"vx": {"column": "Vehspeed", "unit": "km/h"}})
     assert "has no signal 'time'" in refused(drive, channels={"vx": {"column": "time", "unit": "km/h"}})  # a master is no signal
     frames = write_mdf(tmp_path / "bus.mf4", {"CAN": [signal("CAN_DataFrame.ID", FAST, FAST)]})
@@ -132,12 +127,12 @@ def test_an_absent_signal_is_answered_with_near_ones(drive: Path, tmp_path: Path
     ],
     ids=["linear", "table", "rational"],
 )
-def test_physical_values_are_read(tmp_path: Path, raw: Any, conversion: Any, physical: FloatArray) -> None:
+def test_physical_values_are_read(tmp_path, raw, conversion, physical):
     recording = read_mdf(one(tmp_path / "a.mf4", FAST, raw, conversion=conversion))
     np.testing.assert_allclose(recording["vx"], physical, rtol=1e-12)
 
 
-def test_text_is_refused(tmp_path: Path) -> None:
+def test_text_is_refused(tmp_path):
     gear = {"val_0": 0, "text_0": b"N", "val_1": 1, "text_1": b"D", "default": b"?"}
     table = one(tmp_path / "a.mf4", FAST, np.arange(2001) % 2, conversion=gear)
     plain = one(tmp_path / "b.mf4", FAST, np.array([b"on"] * 2001), encoding="utf-8")
@@ -148,13 +143,13 @@ def test_text_is_refused(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("version", ["2.14", "3.30"])
-def test_other_versions_of_the_format_are_read(tmp_path: Path, drive: Path, version: str) -> None:
+def test_other_versions_of_the_format_are_read(tmp_path, drive, version):
     recording = read_mdf(write_mdf(tmp_path / "a.mf4", GROUPS, version), channels=CHANNELS)
     for name, samples in read_mdf(drive, channels=CHANNELS).channels.items():
         np.testing.assert_allclose(recording[name], samples, rtol=1e-9, atol=1e-9)
 
 
-def test_a_unit_that_the_file_contradicts_is_refused(tmp_path: Path) -> None:
+def test_a_unit_that_the_file_contradicts_is_refused(tmp_path):
     file = one(tmp_path / "a.mf4", FAST, FAST, "km/h")
     message = refused(file)
     assert "signal 'v' of group 0 'Only', for channel 'vx', is in 'km/h' by the file and in 'm/s' by conf/dataset" in message
@@ -175,17 +170,17 @@ def test_a_unit_that_the_file_contradicts_is_refused(tmp_path: Path) -> None:
         ("mPa", "another unit"),
     ],
 )
-def test_spellings_are_known_where_they_mean_one_thing(text: str, plain: str | None) -> None:
+def test_spellings_are_known_where_they_mean_one_thing(text, plain):
     assert plain_unit(text) == plain
 
 
-def test_disordered_time_stamps_are_refused_with_their_group(tmp_path: Path) -> None:
+def test_disordered_time_stamps_are_refused_with_their_group(tmp_path):
     stamps = np.concatenate([FAST[:50], FAST[49:]])
     message = refused(one(tmp_path / "a.mf4", stamps, np.ones(len(stamps))))
     assert "signal 'v' of group 0 'Only': time repeats 1 times, first at sample 50 (0.49 s)" in message
 
 
-def test_a_long_gap_must_be_declared(tmp_path: Path) -> None:
+def test_a_long_gap_must_be_declared(tmp_path):
     kept = np.delete(FAST, np.s_[500:530])
     file = one(tmp_path / "a.mf4", kept, 3.0 * kept)
     message = refused(file)
@@ -195,7 +190,7 @@ def test_a_long_gap_must_be_declared(tmp_path: Path) -> None:
     np.testing.assert_allclose(bridged["vx"], 3.0 * bridged.time, rtol=0, atol=1e-12)
 
 
-def test_invalid_samples_are_missing_values(tmp_path: Path) -> None:
+def test_invalid_samples_are_missing_values(tmp_path):
     bits = (np.arange(2001) >= 500) & (np.arange(2001) < 520)
     values = np.where(bits, 1e6, 10.0 + FAST)  # what stands at an invalid sample must never be seen
     file = one(tmp_path / "a.mf4", FAST, values, invalidation_bits=bits)
@@ -205,7 +200,7 @@ def test_invalid_samples_are_missing_values(tmp_path: Path) -> None:
     np.testing.assert_allclose(recording["vx"], expected, rtol=1e-12)
 
 
-def test_a_slow_gappy_signal_stands_at_its_nearest_ticks_and_nowhere_else(tmp_path: Path) -> None:
+def test_a_slow_gappy_signal_stands_at_its_nearest_ticks_and_nowhere_else(tmp_path):
     slow = 0.003 + np.arange(1, 15)  # a GNSS at 1 Hz, 3 ms late, from 1 s to 14 s
     file = write_mdf(tmp_path / "a.mf4", {"A": [signal("v", FAST, FAST)], "G": [signal("w", slow, slow)]})
     recording = read_mdf(file, channels={**ONE, "vx_ref": {"column": "w", "unit": "m/s"}}, gappy=["vx_ref"])
@@ -223,7 +218,7 @@ def test_a_slow_gappy_signal_stands_at_its_nearest_ticks_and_nowhere_else(tmp_pa
         ({"gappy": ["steer"]}, "gappy names 'steer'"),
     ],
 )
-def test_a_misspelt_data_set_is_refused_in_one_line(tmp_path: Path, changes: dict[str, Any], said: str) -> None:
+def test_a_misspelt_data_set_is_refused_in_one_line(tmp_path, changes, said):
     message = refusal(lambda: read_mdf(tmp_path / "a.mf4", **{"channels": CHANNELS, **changes}), ConfigurationError)
     assert said in message
     assert "data set 'mine'" in message

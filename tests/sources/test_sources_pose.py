@@ -1,16 +1,10 @@
 """Tables with poses, held channels, rows that do not count and time that restarts, written with a motion in closed form."""
 
-from __future__ import annotations
-
-from pathlib import Path
-from typing import Any
-
 import numpy as np
 import pandas as pd
 import pytest
 
 from vehest.data.errors import ConfigurationError, DataError, MissingError
-from vehest.data.recording import Recording
 from vehest.sources.base import origin_in_words
 from vehest.sources.tabular import TabularSource
 
@@ -22,7 +16,7 @@ POSE = {"x": {"column": "px", "unit": "m"}, "y": {"column": "py", "unit": "m"}, 
 TIME = {"column": "t", "unit": "s"}
 
 
-def circle(seconds: float = 10.0, lever: tuple[float, float] = (0.0, 0.0), turned: float = 0.0) -> pd.DataFrame:
+def circle(seconds=10.0, lever=(0.0, 0.0), turned=0.0):
     """A car on a circle to the left; poses are those of a body ``lever`` ahead and to the left of it, turned by ``turned``."""
     time = np.arange(round(seconds * RATE)) / RATE
     course = SPEED / RADIUS * time
@@ -33,18 +27,18 @@ def circle(seconds: float = 10.0, lever: tuple[float, float] = (0.0, 0.0), turne
     return pd.DataFrame({"t": time, "px": x, "py": y, "yaw": wrapped, "vx": SPEED * np.cos(SLIP)})
 
 
-def source(folder: Path, **options: Any) -> TabularSource:
+def source(folder, **options):
     channels = {"vx": {"column": "vx", "unit": "m/s"}}
     declared = {"name": "mine", "source": "tabular", "path": str(folder), "files": "*.csv", "time": TIME, "channels": channels}
     return TabularSource({**declared, **options})
 
 
-def read(table: pd.DataFrame, folder: Path, **options: Any) -> Recording:
+def read(table, folder, **options):
     table.to_csv(folder / "lap.csv", index=False)
     return source(folder, **options).read("lap")
 
 
-def test_a_pose_on_a_circle_gives_the_velocities_of_its_closed_form(tmp_path: Path) -> None:
+def test_a_pose_on_a_circle_gives_the_velocities_of_its_closed_form(tmp_path):
     recording = read(circle(), tmp_path, pose=POSE)
     inner = slice(5, -5)
     assert recording["vx_ref"][inner] == pytest.approx(SPEED * np.cos(SLIP), abs=1e-3)
@@ -53,7 +47,7 @@ def test_a_pose_on_a_circle_gives_the_velocities_of_its_closed_form(tmp_path: Pa
     assert recording["yaw_rate_ref"] == pytest.approx(SPEED / RADIUS, abs=1e-9)
 
 
-def test_lever_and_turn_of_the_body_are_taken_off(tmp_path: Path) -> None:
+def test_lever_and_turn_of_the_body_are_taken_off(tmp_path):
     table = circle(lever=(0.115, -0.01), turned=0.05)
     pose = POSE | {"yaw_offset": -0.05, "lever_x": -0.115, "lever_y": 0.01, "channels": ["vx_ref", "vy_ref"]}
     recording = read(table, tmp_path, pose=pose)
@@ -64,7 +58,7 @@ def test_lever_and_turn_of_the_body_are_taken_off(tmp_path: Path) -> None:
     assert (away["vy_ref"] - recording["vy_ref"])[5:-5] == pytest.approx(0.115 * SPEED / RADIUS, abs=1e-3)
 
 
-def test_late_stamps_of_even_rows_do_no_harm(tmp_path: Path) -> None:
+def test_late_stamps_of_even_rows_do_no_harm(tmp_path):
     table = circle()
     table["t"] = 1.7e9 + table["t"] + np.random.default_rng(0).exponential(1e-3, len(table))
     even = read(table, tmp_path, pose=POSE, clock="uniform")
@@ -78,12 +72,12 @@ def test_late_stamps_of_even_rows_do_no_harm(tmp_path: Path) -> None:
             read(table.drop(index=range(500, 500 + lost)), tmp_path, clock="uniform")
 
 
-def test_a_misspelt_pose_is_refused(tmp_path: Path) -> None:
+def test_a_misspelt_pose_is_refused(tmp_path):
     with pytest.raises(ConfigurationError, match="window must be an odd number"):
         source(tmp_path, pose=POSE | {"window": 4})
 
 
-def held_table(delay_rows: int, every: int = 10, n: int = 1000) -> tuple[pd.DataFrame, np.ndarray]:
+def held_table(delay_rows, every=10, n=1000):
     """A yaw rate that its sensor samples in every tenth row and that arrives later, with the sensor's own clock beside it."""
     time = np.arange(n) / RATE
     truth = np.sin(2 * np.pi * 0.5 * time)
@@ -96,7 +90,7 @@ HELD_CHANNELS = {"vx": {"column": "vx", "unit": "m/s"}, "yaw_rate": {"column": "
 
 
 @pytest.mark.parametrize("updated", ["sensor", None])
-def test_held_samples_are_taken_once_and_where_they_were_measured(tmp_path: Path, updated: str | None) -> None:
+def test_held_samples_are_taken_once_and_where_they_were_measured(tmp_path, updated):
     table, truth = held_table(delay_rows=4)
     held = {"channels": ["yaw_rate"], "updated": updated, "delay": 0.04}
     recording = read(table, tmp_path, channels=HELD_CHANNELS, held=held)
@@ -112,14 +106,14 @@ def test_held_samples_are_taken_once_and_where_they_were_measured(tmp_path: Path
     assert np.abs(steps).max() > 10 * bound
 
 
-def test_a_misspelt_held_channel_is_refused(tmp_path: Path) -> None:
+def test_a_misspelt_held_channel_is_refused(tmp_path):
     with pytest.raises(ConfigurationError, match="names 'ay', which is not one of the data set's channels"):
         source(tmp_path, channels=HELD_CHANNELS, held={"channels": ["ay"]})
     with pytest.raises(ConfigurationError, match="delay names 'yaw_rate'"):
         source(tmp_path, channels=HELD_CHANNELS, held={"channels": ["vx"], "delay": {"yaw_rate": 0.1}})
 
 
-def test_time_that_restarts_begins_a_run_and_declared_rows_do_not_count(tmp_path: Path) -> None:
+def test_time_that_restarts_begins_a_run_and_declared_rows_do_not_count(tmp_path):
     table = pd.concat([circle(2.0), circle(3.0), circle(1.0)], ignore_index=True)
     table.loc[[200, 500], "vx"] = 5596.0
     table.to_csv(tmp_path / "laps.csv", index=False)
@@ -132,14 +126,14 @@ def test_time_that_restarts_begins_a_run_and_declared_rows_do_not_count(tmp_path
     assert recordings[1].provenance["dropped_rows"] == [201, "501-"]
 
 
-def test_rows_that_are_not_there_are_refused(tmp_path: Path) -> None:
+def test_rows_that_are_not_there_are_refused(tmp_path):
     with pytest.raises(DataError, match="has 1000 data rows, and drop_rows names row 1001"):
         read(circle(), tmp_path, drop_rows={"lap": [1001]})
     with pytest.raises(MissingError, match="drop_rows names 'lap2', which no file is called"):
         source(tmp_path, drop_rows={"lap2": [1]}).ids()
 
 
-def test_excluded_files_are_no_recordings(tmp_path: Path) -> None:
+def test_excluded_files_are_no_recordings(tmp_path):
     for name in ("lap_1", "lap_2", "still"):
         circle(1.0).to_csv(tmp_path / f"{name}.csv", index=False)
     assert source(tmp_path, exclude=["still"]).ids() == ["lap_1", "lap_2"]
@@ -160,5 +154,5 @@ def test_excluded_files_are_no_recordings(tmp_path: Path) -> None:
          ["reference measured 0.4 m ahead of and 0.1 m to the right of the centre of gravity, moved to it"]),
     ],
 )  # fmt: skip
-def test_where_channels_were_measured_is_said_in_words(tmp_path: Path, options: dict[str, Any], said: list[str]) -> None:
+def test_where_channels_were_measured_is_said_in_words(tmp_path, options, said):
     assert origin_in_words(read(circle(), tmp_path, pose=POSE, **options)) == said

@@ -1,9 +1,6 @@
 """Opening a source by name, simulated drives, and the data sets that are shipped."""
 
-from __future__ import annotations
-
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -24,17 +21,17 @@ DATASETS = sorted((CONF / "dataset").glob("*.yaml"))
 VEHICLE = yaml.safe_load((CONF / "vehicle" / "bmw_320i_low.yaml").read_text(encoding="utf-8"))
 
 
-def simulated(**changes: object) -> dict[str, Any]:
+def simulated(**changes):
     drives = [drive("a", 3.0, seed=1), drive("b", 2.5, seed=2)]
     return {"name": "sim", "source": "simulated", "vehicle": VEHICLE, "rate_hz": 50, "drives": drives, **changes}
 
 
-def drive(name: str, duration: float = 2.0, **more: object) -> dict[str, object]:
+def drive(name, duration=2.0, **more):
     return {"id": name, "manoeuvre": {"name": "laps", "course": "handling", "duration": duration}, **more}
 
 
 @pytest.mark.parametrize("file", DATASETS, ids=lambda file: file.stem)
-def test_every_data_set_that_is_shipped_opens(file: Path) -> None:
+def test_every_data_set_that_is_shipped_opens(file):
     config = compose_config("ingest", [f"dataset={file.stem}", "root=elsewhere"])["dataset"]
     assert config["name"] == file.stem
     assert config["licence"]
@@ -43,19 +40,19 @@ def test_every_data_set_that_is_shipped_opens(file: Path) -> None:
         assert open_source(config).name == file.stem
 
 
-def test_every_source_has_a_module_that_opens() -> None:
+def test_every_source_has_a_module_that_opens():
     assert set(source_names()) >= {"revs", "tabular", "simulated"}
     for name in source_names():
         with pytest.raises(ConfigurationError, match="has no option 'spam'"):
             open_source({"name": "x", "source": name, "spam": 1})
 
 
-def test_an_unknown_source_is_refused_with_those_there_are() -> None:
+def test_an_unknown_source_is_refused_with_those_there_are():
     with pytest.raises(ConfigurationError, match="is not one of: can, mdf, revs, rosbag, simulated, tabular"):
         source_class({"name": "x", "source": "revz"})
 
 
-def test_a_simulated_drive_is_a_recording_of_the_asked_length_and_rate() -> None:
+def test_a_simulated_drive_is_a_recording_of_the_asked_length_and_rate():
     source = open_source(simulated())
     assert source.ids() == ["a", "b"]
     recording = source.read("b")
@@ -64,20 +61,20 @@ def test_a_simulated_drive_is_a_recording_of_the_asked_length_and_rate() -> None
     assert [finding for finding in checks_of_recording(recording) if finding.level == "error"] == []
 
 
-def test_a_simulated_drive_is_the_same_every_time_and_another_with_another_seed() -> None:
+def test_a_simulated_drive_is_the_same_every_time_and_another_with_another_seed():
     source = open_source(simulated())
     np.testing.assert_array_equal(source.read("b")["ay"], source.read("b")["ay"])
     other = open_source(simulated(drives=[drive("b", 2.5, seed=3)]))
     assert not np.array_equal(other.read("b")["ay"], source.read("b")["ay"])
 
 
-def test_count_makes_as_many_drives_with_seeds_of_their_own() -> None:
+def test_count_makes_as_many_drives_with_seeds_of_their_own():
     source = SimulatedSource(simulated(drives=[drive("a", count=3)]))
     assert source.ids() == ["a_001", "a_002", "a_003"]
     assert len({source.seed_of(name) for name in source.ids()}) == 3
 
 
-def test_of_several_vehicles_each_drive_has_the_one_it_names() -> None:
+def test_of_several_vehicles_each_drive_has_the_one_it_names():
     heavier = {**VEHICLE, "name": "heavier"}
     config = simulated(vehicles={"one": VEHICLE, "other": heavier}, drives=[drive("a", vehicle="one"), drive("b", vehicle="other")])
     del config["vehicle"]
@@ -86,7 +83,7 @@ def test_of_several_vehicles_each_drive_has_the_one_it_names() -> None:
         SimulatedSource({**config, "drives": [drive("a")]})
 
 
-def test_every_car_of_the_fleet_weighs_what_its_parts_weigh_and_differs_at_both_axles() -> None:
+def test_every_car_of_the_fleet_weighs_what_its_parts_weigh_and_differs_at_both_axles():
     dataset = compose_config("ingest", ["dataset=sim_fleet"])["dataset"]
     vehicle, vary = vehicle_from_configuration(dataset["vehicle"]), variations_from_config(dataset["vary"])
     cars = [compiled_parameters(varied(vehicle, vary, seed)) for seed in range(50)]
@@ -98,14 +95,14 @@ def test_every_car_of_the_fleet_weighs_what_its_parts_weigh_and_differs_at_both_
     assert all(car.tire_rear.p_dy1 > 0.99 * car.tire.p_dy1 for car in cars), "the front axle lets go first, or about when the rear one does"
 
 
-def test_nobody_can_call_a_simulation_real() -> None:
+def test_nobody_can_call_a_simulation_real():
     with pytest.raises(ConfigurationError, match="simulated"):
         SimulatedSource(simulated(kind="real"))
     assert kind_of({"source": "simulated"}) == "simulated"
     assert kind_of({"source": "tabular"}) == "real"
 
 
-def test_sensors_of_a_fleet_differ_and_references_do_not() -> None:
+def test_sensors_of_a_fleet_differ_and_references_do_not():
     levels = SensorLevels()
     variation = SensorVariation.from_config({"noise": [2.0, 3.0], "delay": [0.0, 0.0]})
     changed = variation.applied(levels, 3)
@@ -124,7 +121,7 @@ def test_sensors_of_a_fleet_differ_and_references_do_not() -> None:
         ({"vary": [{"parameters": ["nope"], "factor": [1, 1]}]}, "data set 'sim': vary: 'nope' is no parameter"),
     ],
 )
-def test_a_misspelt_simulation_is_refused_in_one_line(changes: dict[str, object], said: str) -> None:
+def test_a_misspelt_simulation_is_refused_in_one_line(changes, said):
     assert said in refusal(lambda: SimulatedSource(simulated(**changes)), ConfigurationError)
 
 
@@ -136,6 +133,6 @@ def test_a_misspelt_simulation_is_refused_in_one_line(changes: dict[str, object]
     ],
     ids=str,
 )
-def test_a_simulation_that_asks_for_too_much_is_refused_before_it_begins(changes: dict[str, Any], limit: str) -> None:
+def test_a_simulation_that_asks_for_too_much_is_refused_before_it_begins(changes, limit):
     with pytest.raises(ConfigurationError, match=rf"if that is meant, raise it: limits\.{limit}=NUMBER"):
         open_source(simulated(**changes))

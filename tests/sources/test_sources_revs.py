@@ -1,9 +1,6 @@
 """The Revs database as re-laid text: a file a channel, a number a line."""
 
-from __future__ import annotations
-
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -11,8 +8,7 @@ import yaml
 from refusals import refusal
 
 from vehest.alignment.checks import checks_of_recording
-from vehest.data.errors import DataError, MissingError, VehestError
-from vehest.data.recording import Recording
+from vehest.data.errors import DataError, MissingError
 from vehest.sources.base import open_source
 from vehest.sources.revs import RevsSource
 
@@ -20,7 +16,7 @@ CONFIGURATION = Path(__file__).parents[2] / "conf" / "dataset" / "ferrari_250lm.
 N = 300
 
 
-def configuration(root: Path, **changes: object) -> dict[str, Any]:
+def configuration(root, **changes):
     channels = {"vx": {"column": "vx", "unit": "m/s"}, "ay": {"column": "ayCG", "unit": "g", "sign": -1}}
     base = {
         "name": "mine",
@@ -35,7 +31,7 @@ def configuration(root: Path, **changes: object) -> dict[str, Any]:
 
 
 @pytest.fixture
-def folder(tmp_path: Path) -> Path:
+def folder(tmp_path):
     """A recording of three seconds."""
     lap = tmp_path / "lap"
     lap.mkdir()
@@ -45,11 +41,11 @@ def folder(tmp_path: Path) -> Path:
     return tmp_path
 
 
-def refused(folder: Path, kind: type[VehestError] = DataError, **changes: object) -> str:
+def refused(folder, kind=DataError, **changes):
     return refusal(lambda: RevsSource(configuration(folder, **changes)).read("lap"), kind)
 
 
-def test_a_folder_of_text_files_is_a_recording(folder: Path) -> None:
+def test_a_folder_of_text_files_is_a_recording(folder):
     source = open_source(configuration(folder))
     assert isinstance(source, RevsSource)
     assert source.ids() == ["lap"]
@@ -61,7 +57,7 @@ def test_a_folder_of_text_files_is_a_recording(folder: Path) -> None:
     assert dict(recording.provenance) == {"dataset": "mine", "source": "revs", "layout": "text"}
 
 
-def test_a_missing_or_empty_channel_file_is_named(folder: Path) -> None:
+def test_a_missing_or_empty_channel_file_is_named(folder):
     (folder / "lap" / "vx.txt").unlink()
     assert "vx.txt" in refused(folder, MissingError)
     (folder / "lap" / "vx.txt").touch()
@@ -70,7 +66,7 @@ def test_a_missing_or_empty_channel_file_is_named(folder: Path) -> None:
     assert "vx.txt' has no rows" in refused(folder)
 
 
-def test_an_incomplete_copy_is_refused_with_both_counts(folder: Path) -> None:
+def test_an_incomplete_copy_is_refused_with_both_counts(folder):
     np.savetxt(folder / "lap" / "vx.txt", np.zeros(N - 3))
     assert f"holds {N - 3} samples, the time file {N}" in refused(folder)
     (folder / "lap" / "vx.txt").write_text("1\n" * 41 + "spam\n")
@@ -78,18 +74,18 @@ def test_an_incomplete_copy_is_refused_with_both_counts(folder: Path) -> None:
 
 
 @pytest.fixture(scope="module")
-def ferrari(data_root: Path) -> Recording:
+def ferrari(data_root):
     config = yaml.safe_load(CONFIGURATION.read_text(encoding="utf-8").replace("${root}", str(data_root)))
     source = open_source(config)
     (recording,) = source.recordings()
     return recording
 
 
-def test_the_ferraris_bias_of_ay_is_that_of_the_paper(ferrari: Recording) -> None:
+def test_the_ferraris_bias_of_ay_is_that_of_the_paper(ferrari):
     derived = (ferrari["vy_ref"][2:] - ferrari["vy_ref"][:-2]) * 50.0
     residual = derived - (ferrari["ay"] - ferrari["yaw_rate"] * ferrari["vx"])[1:-1]
     assert residual.mean() == pytest.approx(-0.028, abs=5e-4)  # -0.03 in Table I of Da Lio et al. 2023
 
 
-def test_the_ferrari_passes_every_check(ferrari: Recording) -> None:
+def test_the_ferrari_passes_every_check(ferrari):
     assert [finding for finding in checks_of_recording(ferrari) if finding.level != "note"] == []

@@ -1,20 +1,13 @@
 """The official CSV and MAT layouts of the Revs database: known values in, SI units out; whatever is malformed is one line."""
 
-from __future__ import annotations
-
 import re
-from collections.abc import Callable, Mapping
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 from refusals import refusal
 from scipy.io import savemat
 
 from revs_files import COLUMNS, PREAMBLE, Drive, smooth_drive, write_csv, write_mat, write_vehicle_parameters
-from vehest.data.recording import Recording
 from vehest.run.config import compose_config
 from vehest.sources.base import open_source
 from vehest.sources.revs import RevsSource
@@ -24,7 +17,7 @@ SECONDS, BLANK = 4.0, 37
 ONE_ROUNDING = {"rtol": 4e-16, "atol": 1e-300}  # degrees and back: two multiplications by π/180 or its inverse
 
 
-def source(root: Path, *overrides: str, dataset: str = "revs_targa_2014", **changes: Any) -> RevsSource:
+def source(root, *overrides, dataset="revs_targa_2014", **changes):
     """The source of a data set in conf/, of one recording below ``root``."""
     config = compose_config("ingest", [f"dataset={dataset}", f"root={root}", *overrides])["dataset"]
     found = open_source({**config, "recordings": [NAME], **changes})
@@ -32,31 +25,31 @@ def source(root: Path, *overrides: str, dataset: str = "revs_targa_2014", **chan
     return found
 
 
-def read(root: Path, *overrides: str, **changes: Any) -> Recording:
+def read(root, *overrides, **changes):
     return source(root, *overrides, **changes).read(NAME)
 
 
-def refused(root: Path, **changes: Any) -> str:
+def refused(root, **changes):
     return refusal(lambda: read(root, **changes))
 
 
 @pytest.fixture
-def root(tmp_path: Path) -> Path:
+def root(tmp_path):
     (tmp_path / "revs").mkdir()
     return tmp_path
 
 
 @pytest.fixture
-def csv(root: Path) -> Path:
+def csv(root):
     return root / "revs" / f"{NAME}.csv"
 
 
 @pytest.fixture
-def mat(root: Path) -> Path:
+def mat(root):
     return root / "revs" / f"{NAME}.mat"
 
 
-def test_the_csv_files_angles_in_degrees_become_radians_and_its_held_values_stay(root: Path, csv: Path) -> None:
+def test_the_csv_files_angles_in_degrees_become_radians_and_its_held_values_stay(root, csv):
     drive, truth = smooth_drive(SECONDS, start_time=12.5)
     write_csv(csv, drive, blank_rows=BLANK)
     recording = read(root)
@@ -70,7 +63,7 @@ def test_the_csv_files_angles_in_degrees_become_radians_and_its_held_values_stay
         np.testing.assert_allclose(recording[name], expected, **ONE_ROUNDING, err_msg=name)
 
 
-def test_the_mat_file_is_read_at_the_rate_of_the_ins_and_has_the_road_wheel_angle(root: Path, mat: Path) -> None:
+def test_the_mat_file_is_read_at_the_rate_of_the_ins_and_has_the_road_wheel_angle(root, mat):
     drive, truth = smooth_drive(SECONDS, start_time=12.5)
     write_mat(mat, drive)
     recording = read(root, layout="mat")
@@ -82,7 +75,7 @@ def test_the_mat_file_is_read_at_the_rate_of_the_ins_and_has_the_road_wheel_angl
     assert recording.provenance["native_rates_hz"]["handwheelAngle"] == 1000.0
 
 
-def test_a_sample_of_a_mat_file_is_the_last_value_at_or_before_it(root: Path, mat: Path) -> None:
+def test_a_sample_of_a_mat_file_is_the_last_value_at_or_before_it(root, mat):
     fast, slow = np.arange(10_000.0), np.arange(1000.0)
     structs = {
         "insData": {"vxCG": {"value": slow, "time": 3.0 + np.arange(1000) / 100}},
@@ -97,7 +90,7 @@ def test_a_sample_of_a_mat_file_is_the_last_value_at_or_before_it(root: Path, ma
     np.testing.assert_array_equal(both["handwheel"], 9.0 + 10.0 * np.arange(999))  # at 3.01 s the value of 3.0094 s holds
 
 
-def test_gappy_channels_keep_their_blanks_and_hold_up_no_other(root: Path, csv: Path, mat: Path) -> None:
+def test_gappy_channels_keep_their_blanks_and_hold_up_no_other(root, csv, mat):
     drive, _ = smooth_drive(SECONDS)
     roll = np.array(drive.signals["rollAngle"])
     roll[200:230] = np.nan
@@ -113,7 +106,7 @@ def test_gappy_channels_keep_their_blanks_and_hold_up_no_other(root: Path, csv: 
     np.testing.assert_array_equal(np.flatnonzero(np.isnan(read(root, layout="mat", gappy=["roll"])["roll"])), np.arange(200, 230))
 
 
-def test_provenance_tells_session_parameters_and_file(root: Path, csv: Path) -> None:
+def test_provenance_tells_session_parameters_and_file(root, csv):
     write_csv(csv, smooth_drive(1.0)[0])
     write_vehicle_parameters(root / "revs" / "250lm.csv")
     assert set(source(root).inputs()) == {f"{NAME}.csv", "250lm.csv"}
@@ -126,10 +119,10 @@ def test_provenance_tells_session_parameters_and_file(root: Path, csv: Path) -> 
     assert "vehicle_parameters" not in read(root).provenance
 
 
-def with_cell(line: int, column: str, text: str) -> Callable[[bytes], bytes]:
+def with_cell(line, column, text):
     """Put ``text`` into a cell; lines count from 1."""
 
-    def change(content: bytes) -> bytes:
+    def change(content):
         lines = content.splitlines(keepends=True)
         cells = lines[line - 1].rstrip(b"\r\n").split(b",")
         cells[list(COLUMNS).index(column)] = text.encode("latin-1")
@@ -139,15 +132,15 @@ def with_cell(line: int, column: str, text: str) -> Callable[[bytes], bytes]:
     return change
 
 
-def without_lines(first: int, last: int) -> Callable[[bytes], bytes]:
+def without_lines(first, last):
     return lambda content: b"".join(line for number, line in enumerate(content.splitlines(True), 1) if not first <= number <= last)
 
 
-def cut_in_row(content: bytes) -> bytes:
+def cut_in_row(content):
     return content[: content.rindex(b",", 0, len(content) - 200)]
 
 
-MALFORMED: dict[str, tuple[Callable[[bytes], bytes], str]] = {
+MALFORMED = {
     "cut in a row": (cut_in_row, r"Row #\d+: Expected 55 columns, got \d+.* is it truncated"),
     "text": (with_cell(500, "vyCG", "n/a?"), r"column 'vyCG' holds the text 'n/a\?' in data row 488"),
     "blank after the head": (with_cell(500, "vyCG", ""), r"channel 'vy_ref' holds 1 NaN between 0.487 s and 0.487 s"),
@@ -157,7 +150,7 @@ MALFORMED: dict[str, tuple[Callable[[bytes], bytes], str]] = {
 
 
 @pytest.fixture(scope="module")
-def one_second(tmp_path_factory: pytest.TempPathFactory) -> bytes:
+def one_second(tmp_path_factory):
     """A file of 1,000 rows below 12 lines."""
     path = tmp_path_factory.mktemp("csv") / "a.csv"
     write_csv(path, smooth_drive(1.0)[0])
@@ -165,7 +158,7 @@ def one_second(tmp_path_factory: pytest.TempPathFactory) -> bytes:
 
 
 @pytest.mark.parametrize("case", MALFORMED)
-def test_a_malformed_csv_is_one_line(root: Path, csv: Path, one_second: bytes, case: str) -> None:
+def test_a_malformed_csv_is_one_line(root, csv, one_second, case):
     change, said = MALFORMED[case]
     csv.write_bytes(change(one_second))
     message = refused(root)
@@ -173,18 +166,18 @@ def test_a_malformed_csv_is_one_line(root: Path, csv: Path, one_second: bytes, c
     assert re.search(said, message), message
 
 
-def test_the_files_own_row_of_units_must_not_contradict_the_declared_ones(root: Path, csv: Path, one_second: bytes) -> None:
+def test_the_files_own_row_of_units_must_not_contradict_the_declared_ones(root, csv, one_second):
     csv.write_bytes(with_cell(12, "yawRate", "rad/s")(one_second))
     assert "column 'yawRate' is in 'rad/s' by the file and in 'deg/s' by conf/dataset" in refused(root)
     assert len(read(root, units_row="ignore")) == 1000 - BLANK
 
 
-def signal(values: NDArray[Any], rate: float = 100.0, start: float = 0.0) -> dict[str, NDArray[Any]]:
+def signal(values, rate=100.0, start=0.0):
     return {"value": values, "time": start + np.arange(len(values)) / rate}
 
 
 STEADY = np.linspace(1, 2, 100)
-ODD_MAT: dict[str, tuple[Mapping[str, Any], str]] = {
+ODD_MAT = {
     "no time": ({"insData": {"vxCG": {"value": STEADY}}}, "has no channel 'vxCG' with a field 'time' (it has insData.vxCG)"),
     "twice": ({name: {"vxCG": signal(STEADY)} for name in ("a", "b")}, "more than once (a.vxCG, b.vxCG); name its struct too"),
     "text": ({"insData": {"vxCG": {"value": "fast", "time": STEADY}}}, "'insData.vxCG.value' is no row or column of real numbers"),
@@ -193,7 +186,7 @@ ODD_MAT: dict[str, tuple[Mapping[str, Any], str]] = {
 
 
 @pytest.mark.parametrize("case", ODD_MAT)
-def test_an_odd_mat_file_is_one_line(root: Path, mat: Path, case: str) -> None:
+def test_an_odd_mat_file_is_one_line(root, mat, case):
     content, said = ODD_MAT[case]
     savemat(mat, dict(content), oned_as="column")
     message = refused(root, layout="mat", channels={"vx": {"column": "vxCG", "unit": "m/s"}}, extra_channels={})
@@ -209,7 +202,7 @@ def test_an_odd_mat_file_is_one_line(root: Path, mat: Path, case: str) -> None:
         ("mass\nkg\n1\0\n", "is no table of vehicle parameters"),
     ],
 )
-def test_a_malformed_table_of_vehicle_parameters_is_one_line(root: Path, csv: Path, one_second: bytes, content: str, said: str) -> None:
+def test_a_malformed_table_of_vehicle_parameters_is_one_line(root, csv, one_second, content, said):
     csv.write_bytes(one_second)
     (root / "revs" / "250lm.csv").write_text(content)
     message = refused(root)

@@ -8,10 +8,8 @@ import runpy
 import shutil
 import sqlite3
 import sys
-from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -20,9 +18,8 @@ from numpy.typing import NDArray
 from refusals import refusal
 
 from vehest.alignment.checks import checks_of_recording
-from vehest.data.errors import ConfigurationError, DataError, VehestError
+from vehest.data.errors import ConfigurationError, DataError
 from vehest.data.limits import Limits, use_limits
-from vehest.data.recording import Recording
 from vehest.sources.base import open_source
 from vehest.sources.rosbag import RosbagSource
 
@@ -67,7 +64,7 @@ class Topic:
     fields: dict[str, NDArray[np.float64]]
 
 
-def drive(seconds: float = SECONDS) -> dict[str, Topic]:
+def drive(seconds=SECONDS):
     """A circle in closed form; every topic has a rate and a phase of its own."""
     imu, motor = np.arange(0.0007, seconds, 1 / 400), np.arange(0.0, seconds, 1 / 100)
     servo, body = np.arange(0.003, seconds, 0.05), np.arange(0.0042, seconds, 1 / 100)
@@ -94,9 +91,7 @@ def drive(seconds: float = SECONDS) -> dict[str, Topic]:
     }
 
 
-def write_bag(
-    folder: Path, topics: Mapping[str, Topic], storage: str = "sqlite3", layouts: Mapping[str, str] = LAYOUTS, name: str = "lap"
-) -> Path:
+def write_bag(folder, topics, storage="sqlite3", layouts=LAYOUTS, name="lap"):
     """A bag's folder."""
     types = get_typestore(Stores.ROS2_HUMBLE)
     for typename, text in layouts.items():
@@ -116,12 +111,12 @@ def write_bag(
     return path
 
 
-def _message(types: Any, name: str, values: Mapping[str, Any], prefix: str = "") -> Any:
+def _message(types, name, values, prefix=""):
     """A message with these values, zero or empty where there are none."""
     if name == "builtin_interfaces/msg/Time":
         nanoseconds = START_NS + round(values.get(prefix.rstrip("."), 0.0) * 1e9)
         return types.types[name](sec=nanoseconds // 10**9, nanosec=nanoseconds % 10**9)
-    arguments: dict[str, Any] = {}
+    arguments = {}
     for member, (kind, detail) in types.fielddefs[name][1]:
         path = f"{prefix}{member}"
         if kind.name == "NAME":
@@ -134,7 +129,7 @@ def _message(types: Any, name: str, values: Mapping[str, Any], prefix: str = "")
     return types.types[name](**arguments)
 
 
-def configuration(folder: Path, **changes: Any) -> dict[str, Any]:
+def configuration(folder, **changes):
     base = {
         "name": "mine",
         "source": "rosbag",
@@ -150,22 +145,22 @@ def configuration(folder: Path, **changes: Any) -> dict[str, Any]:
     return base | changes
 
 
-def source(folder: Path, **changes: Any) -> RosbagSource:
+def source(folder, **changes):
     opened = open_source(configuration(folder, **changes))
     assert isinstance(opened, RosbagSource)
     return opened
 
 
-def read(folder: Path, **changes: Any) -> Recording:
+def read(folder, **changes):
     (recording,) = source(folder, **changes).recordings()
     return recording
 
 
-def topic_options(name: str, **options: Any) -> dict[str, Any]:
+def topic_options(name, **options):
     return TOPICS | {name: TOPICS[name] | options}
 
 
-def refused(folder: Path, kind: type[VehestError] = DataError, **changes: Any) -> str:
+def refused(folder, kind=DataError, **changes):
     before = sorted(folder.rglob("*"))
     message = refusal(lambda: read(folder, **changes), kind)
     assert sorted(folder.rglob("*")) == before
@@ -173,29 +168,29 @@ def refused(folder: Path, kind: type[VehestError] = DataError, **changes: Any) -
 
 
 @pytest.fixture(scope="module")
-def bags(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def bags(tmp_path_factory):
     """A folder with the circle's bag, which tests leave as it is."""
     return write_bag(tmp_path_factory.mktemp("bags"), drive()).parent
 
 
 @pytest.fixture
-def folder(bags: Path, tmp_path: Path) -> Path:
+def folder(bags, tmp_path):
     """The same, to be changed."""
     return Path(shutil.copytree(bags, tmp_path / "bags"))
 
 
-def filter_gain(pulsation: float) -> float:
+def filter_gain(pulsation):
     """What a Savitzky-Golay derivative of second order makes of a rotation: its slope is Σ k·x_k / Σ k²."""
     k = np.arange(1, WINDOW // 2 + 1)
     return float((k * np.sin(pulsation * k / 100.0)).sum() / (k**2).sum() * 100.0 / pulsation)
 
 
-def inside(recording: Recording, name: str) -> NDArray[np.float64]:
+def inside(recording, name):
     """Samples that no end of the filter touches."""
     return recording[name][WINDOW:-WINDOW]
 
 
-def test_a_circle_comes_back_from_its_poses(bags: Path) -> None:
+def test_a_circle_comes_back_from_its_poses(bags):
     """In body axes the velocity is constant: what is left is the filter's gain, 0.9996 here, and the stamps' nanoseconds."""
     recording = read(bags)
     gain = filter_gain(YAW_RATE)
@@ -206,7 +201,7 @@ def test_a_circle_comes_back_from_its_poses(bags: Path) -> None:
     np.testing.assert_allclose(inside(recording, "sideslip_ref"), np.arctan2(VY, VX), rtol=0, atol=1e-6)
 
 
-def test_sensors_come_back_in_si_units_with_signs_zeros_and_factors(bags: Path) -> None:
+def test_sensors_come_back_in_si_units_with_signs_zeros_and_factors(bags):
     """Straight lines are exact; a line between samples 2.5 ms apart misses a sine by up to A·(ω·dt)²/8 = 1e-4 m/s²."""
     recording = read(bags)
     missed = ACCELERATION * (PULSATION / 400) ** 2 / 8
@@ -219,7 +214,7 @@ def test_sensors_come_back_in_si_units_with_signs_zeros_and_factors(bags: Path) 
 
 
 @pytest.mark.parametrize(("storage", "form"), [("sqlite3", "zip"), ("sqlite3", "file"), ("mcap", "folder"), ("mcap", "file")])
-def test_storage_and_packing_make_no_difference(bags: Path, tmp_path: Path, storage: str, form: str) -> None:
+def test_storage_and_packing_make_no_difference(bags, tmp_path, storage, form):
     expected = read(bags)
     bag = write_bag(tmp_path / "made", drive(), storage)
     (data,) = [file for file in bag.iterdir() if file.suffix in (".db3", ".mcap")]
@@ -235,14 +230,14 @@ def test_storage_and_packing_make_no_difference(bags: Path, tmp_path: Path, stor
         np.testing.assert_array_equal(recording[name], samples)
 
 
-def test_a_command_is_held_and_a_range_is_cut_out(folder: Path) -> None:
+def test_a_command_is_held_and_a_range_is_cut_out(folder):
     recording = read(folder, topics=topic_options("servo", interpolation="hold"), start=1.0, stop=2.0)
     assert (recording.start_time, len(recording)) == (1.01, 95)  # poses at 1.0042 s to servo at 1.953 s
     sent = 0.003 + 0.05 * np.floor((recording.time - 0.003) / 0.05 + 1e-6)
     np.testing.assert_allclose(recording["steer"], np.radians(6.0 * sent), rtol=0, atol=1e-8)
 
 
-def test_a_moving_average_removes_what_would_alias(tmp_path: Path) -> None:
+def test_a_moving_average_removes_what_would_alias(tmp_path):
     """Vibration at 100 Hz looks like a constant to a recording of 100 Hz; an average over its period removes it."""
     topics = drive()
     imu = topics["/imu"]
@@ -256,7 +251,7 @@ def test_a_moving_average_removes_what_would_alias(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(("storage", "share"), [("sqlite3", 0.999), ("mcap", 0.3), ("mcap", 0.999)])
-def test_a_truncated_bag_is_refused(tmp_path: Path, storage: str, share: float) -> None:
+def test_a_truncated_bag_is_refused(tmp_path, storage, share):
     bag = write_bag(tmp_path, drive(1.0), storage)
     (data,) = [file for file in bag.iterdir() if file.suffix in (".db3", ".mcap")]
     data.write_bytes(data.read_bytes()[: int(share * data.stat().st_size)])
@@ -264,7 +259,7 @@ def test_a_truncated_bag_is_refused(tmp_path: Path, storage: str, share: float) 
     assert "truncated" in message or "is damaged" in message
 
 
-def test_an_absent_or_empty_topic_is_named_with_those_there_are(tmp_path: Path) -> None:
+def test_an_absent_or_empty_topic_is_named_with_those_there_are(tmp_path):
     topics = drive()
     del topics["/motor"]
     servo = topics["/servo"]
@@ -273,14 +268,14 @@ def test_an_absent_or_empty_topic_is_named_with_those_there_are(tmp_path: Path) 
     assert "holds no messages of topic '/servo'" in refused(write_bag(tmp_path / "empty", topics).parent)
 
 
-def test_a_layout_that_the_bag_contradicts_is_refused(tmp_path: Path) -> None:
+def test_a_layout_that_the_bag_contradicts_is_refused(tmp_path):
     """Without this, numbers would come from the wrong bytes."""
     other = LAYOUTS | {"car_msgs/msg/Motor": "float64[2] currents\nfloat64 rpm\nstring name\n"}
     bags = write_bag(tmp_path, drive(), "mcap", other).parent
     assert "the bag's own layout of 'car_msgs/msg/Motor' is not the declared one" in refused(bags)
 
 
-def test_a_long_gap_is_not_bridged(folder: Path) -> None:
+def test_a_long_gap_is_not_bridged(folder):
     assert "topic '/motor': field 'motor.rpm' has a gap of 0.01 s" in refused(folder, topics=topic_options("motor", max_gap=0.009))
 
 
@@ -295,7 +290,7 @@ ENDLESS = "WITH RECURSIVE c(id) AS (SELECT 1 UNION ALL SELECT id + 1 FROM c) SEL
         (["UPDATE message_definitions SET encoded_message_definition = 'float64 __import__(\"os\")'"], "is damaged"),
     ],
 )
-def test_a_hostile_database_ends_in_one_line(folder: Path, statements: list[str], said: str) -> None:
+def test_a_hostile_database_ends_in_one_line(folder, statements, said):
     with contextlib.closing(sqlite3.connect(folder / "lap" / "lap.db3")) as database, database:
         for statement in statements:
             database.execute(statement)
@@ -310,7 +305,7 @@ def test_a_hostile_database_ends_in_one_line(folder: Path, statements: list[str]
         ("- lap.db3", "- ../../../etc/passwd", "files are missing"),  # it is looked for in the bag's own folder
     ],
 )
-def test_metadata_that_lie_are_refused(folder: Path, before: str, after: str, said: str) -> None:
+def test_metadata_that_lie_are_refused(folder, before, after, said):
     metadata = folder / "lap" / "metadata.yaml"
     content = metadata.read_text()
     assert before in content
@@ -318,16 +313,16 @@ def test_metadata_that_lie_are_refused(folder: Path, before: str, after: str, sa
     assert said in refused(folder)
 
 
-def test_more_than_the_limits_is_refused(folder: Path) -> None:
+def test_more_than_the_limits_is_refused(folder):
     with use_limits(Limits(samples=250)):
         assert "raise it: limits.samples=NUMBER" in refused(folder)
 
 
-def test_a_bag_that_ros_compressed_is_read_up_to_the_limits(folder: Path) -> None:
+def test_a_bag_that_ros_compressed_is_read_up_to_the_limits(folder):
     zstd = importlib.import_module("compression.zstd" if sys.version_info >= (3, 14) else "backports.zstd")
     expected, data, metadata = read(folder), folder / "lap" / "lap.db3", folder / "lap" / "metadata.yaml"
     about = yaml.safe_load(metadata.read_text())
-    told: dict[str, Any] = {"compression_format": "zstd", "compression_mode": "file", "relative_file_paths": ["lap.db3.zstd"]}
+    told = {"compression_format": "zstd", "compression_mode": "file", "relative_file_paths": ["lap.db3.zstd"]}
     about["rosbag2_bagfile_information"] |= told
     metadata.write_text(yaml.safe_dump(about))
     content = data.read_bytes()
@@ -345,25 +340,22 @@ def test_a_bag_that_ros_compressed_is_read_up_to_the_limits(folder: Path) -> Non
         ({"topics": topic_options("body", average=0.02)}, "orientations cannot be averaged"),
         ({"channels": {"vx_ref": CHANNELS["vx"]}}, "'vx_ref' comes both from channels and from pose"),
         # what only the message types can tell
-        (
-            {"channels": {"vx": CHANNELS["vx"] | {"field": "motor.speed"}}},
-            "has no field 'motor.speed': 'speed' is none of: rpm, currents",
-        ),
+        ({"channels": {"vx": CHANNELS["vx"] | {"field": "motor.speed"}}}, "has no field 'motor.speed': 'speed' is none of: rpm, currents"),
         ({"channels": {"vx": CHANNELS["vx"] | {"field": "motor.name"}}}, "is not a number"),
         ({"topics": topic_options("servo", stamps="header")}, "have no header; set stamps: received"),
     ],
 )
-def test_a_misspelt_declaration_is_refused(folder: Path, changes: dict[str, Any], said: str) -> None:
+def test_a_misspelt_declaration_is_refused(folder, changes, said):
     assert said in refused(folder, ConfigurationError, **changes)
 
 
-def real_configuration(root: Path) -> dict[str, Any]:
+def real_configuration(root):
     text = CONFIGURATION.read_text(encoding="utf-8").replace("${root}", str(root))
-    loaded: dict[str, Any] = yaml.safe_load(text)
+    loaded = yaml.safe_load(text)
     return loaded
 
 
-def test_the_real_bag_has_no_errors_and_its_velocities_follow_its_imu(data_root: Path) -> None:
+def test_the_real_bag_has_no_errors_and_its_velocities_follow_its_imu(data_root):
     (recording,) = open_source(real_configuration(data_root)).recordings()
     findings = checks_of_recording(recording)
     assert not [finding for finding in findings if finding.level == "error"]
@@ -371,7 +363,7 @@ def test_the_real_bag_has_no_errors_and_its_velocities_follow_its_imu(data_root:
 
 
 @pytest.mark.slow
-def test_declared_constants_are_those_that_the_data_show(data_root: Path) -> None:
+def test_declared_constants_are_those_that_the_data_show(data_root):
     """Within two of the standard deviations that the script prints; what the publishers' files fix exactly, to a millionth."""
     identified = runpy.run_path(str(ROOT / "docs" / "identify_f1tenth.py"))["identify"](data_root / "f1tenth")
     declared = real_configuration(data_root)

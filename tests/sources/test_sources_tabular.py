@@ -1,9 +1,6 @@
 """Tables of any make: what pandas reads, in SI units and ISO 8855 signs; and one clear line for what cannot be used."""
 
-from __future__ import annotations
-
 import gzip
-from pathlib import Path
 
 import numpy as np
 import pandas as pd
@@ -21,36 +18,36 @@ HEADER = "time,vx,ay\n"
 N = 200
 
 
-def table() -> pd.DataFrame:
+def table():
     """Two seconds of noise at 100 Hz."""
     generator = np.random.default_rng(0)
     channels = {name: generator.normal(0.0, 3.0, N) for name in ("vx", "yaw_rate", "ay")}
     return pd.DataFrame({"time": np.round(5.0 + np.arange(N) / 100.0, 2), **channels})
 
 
-def rows(count: int, start: int = 0) -> str:
+def rows(count, start=0):
     return "".join(f"{k / 100:.2f},{k},{2 * k}\n" for k in range(start, start + count))
 
 
-def source(folder: Path, **options: object) -> TabularSource:
+def source(folder, **options):
     return TabularSource({"name": "mine", "source": "tabular", "path": str(folder), "files": "*", "time": TIME, **options})
 
 
-def read(file: Path, **options: object) -> Recording:
+def read(file, **options):
     return source(file.parent, **options).read(file.stem)
 
 
-def written(folder: Path, content: str | bytes, name: str = "lap.csv") -> Path:
+def written(folder, content, name="lap.csv"):
     file = folder / name
     file.write_bytes(content if isinstance(content, bytes) else content.encode())
     return file
 
 
-def assert_reads_as(recording: Recording, frame: pd.DataFrame) -> None:
+def assert_reads_as(recording, frame):
     pd.testing.assert_frame_equal(pd.DataFrame(dict(recording.channels)), frame.drop(columns="time"), check_exact=True, check_like=True)
 
 
-def test_a_csv_file_reads_as_pandas_reads_it(tmp_path: Path) -> None:
+def test_a_csv_file_reads_as_pandas_reads_it(tmp_path):
     table().to_csv(tmp_path / "lap.csv", index=False)
     recording = read(tmp_path / "lap.csv", vehicle="kart", kind="real", citation="me")
     assert_reads_as(recording, pd.read_csv(tmp_path / "lap.csv"))
@@ -58,12 +55,12 @@ def test_a_csv_file_reads_as_pandas_reads_it(tmp_path: Path) -> None:
     assert dict(recording.provenance) == {"dataset": "mine", "source": "tabular", "file": "lap.csv"}
 
 
-def test_a_parquet_file_reads_as_pandas_reads_it(tmp_path: Path) -> None:
+def test_a_parquet_file_reads_as_pandas_reads_it(tmp_path):
     table().astype({"ay": "float32"}).to_parquet(tmp_path / "lap.pq")
     assert_reads_as(read(tmp_path / "lap.pq"), pd.read_parquet(tmp_path / "lap.pq").astype("float64"))
 
 
-def test_decimal_commas_delimiters_skipped_rows_and_latin_1_are_read(tmp_path: Path) -> None:
+def test_decimal_commas_delimiters_skipped_rows_and_latin_1_are_read(tmp_path):
     body = "\n".join(f"{k / 100:.2f};{k * 0.5:.1f}" for k in range(20)).replace(".", ",")
     content = f"Messung vom 3. März\n\nZeit [s];Querbeschl. [m/s²]\n{body}\n".encode("latin-1")
     file = written(tmp_path, content)
@@ -75,13 +72,13 @@ def test_decimal_commas_delimiters_skipped_rows_and_latin_1_are_read(tmp_path: P
     assert (recording.rate_hz, recording.start_time) == (100.0, 0.0)
 
 
-def test_without_a_time_column_the_rate_is_given(tmp_path: Path) -> None:
+def test_without_a_time_column_the_rate_is_given(tmp_path):
     table().drop(columns="time").to_csv(tmp_path / "lap.csv", index=False)
     recording = read(tmp_path / "lap.csv", time=None, rate_hz=125)
     assert (recording.rate_hz, recording.start_time, len(recording)) == (125.0, 0.0, N)
 
 
-def test_a_stored_recording_is_read_as_what_it_is(tmp_path: Path) -> None:
+def test_a_stored_recording_is_read_as_what_it_is(tmp_path):
     kept = Recording("lap", "kart", 20.0, 450.0, {"ay": np.arange(4.0)}, "simulated", provenance={"seed": 3})
     write_recording(kept, tmp_path / "lap.parquet")
     recording = read(tmp_path / "lap.parquet")
@@ -89,7 +86,7 @@ def test_a_stored_recording_is_read_as_what_it_is(tmp_path: Path) -> None:
     assert (recording.rate_hz, recording.start_time, recording.kind) == (20.0, 450.0, "simulated")
 
 
-def test_recordings_are_the_stems_in_order(tmp_path: Path) -> None:
+def test_recordings_are_the_stems_in_order(tmp_path):
     for name in ("b.csv", "a.csv", "a.txt"):
         written(tmp_path, HEADER + rows(3), name)
     found = source(tmp_path, files="*.csv")
@@ -111,7 +108,7 @@ BAD_TABLES = {
 
 
 @pytest.mark.parametrize("fault", BAD_TABLES)
-def test_a_table_that_cannot_be_used_is_refused_in_one_line_that_says_where(tmp_path: Path, fault: str) -> None:
+def test_a_table_that_cannot_be_used_is_refused_in_one_line_that_says_where(tmp_path, fault):
     content, said = BAD_TABLES[fault]
     file = written(tmp_path, content)
     columns = {"vx": {"column": "vx", "unit": "m/s"}, "ay": {"column": "ay", "unit": "m/s²"}}
@@ -130,20 +127,20 @@ def test_a_table_that_cannot_be_used_is_refused_in_one_line_that_says_where(tmp_
         ({"files": "/data/*.csv"}, "files must be a pattern inside path"),
     ],
 )
-def test_a_misspelt_data_set_is_refused_before_any_file_is_read(tmp_path: Path, options: dict[str, object], said: str) -> None:
+def test_a_misspelt_data_set_is_refused_before_any_file_is_read(tmp_path, options, said):
     message = refusal(lambda: source(tmp_path, **options), ConfigurationError)
     assert said in message
     assert "data set 'mine'" in message
 
 
-def runs_csv(tmp_path: Path, runs: list[object]) -> TabularSource:
+def runs_csv(tmp_path, runs):
     """A row a run number, 100 Hz, vx counting the rows."""
     lines = [f"{row / 100:.2f},{row},{run}" for row, run in enumerate(runs)]
     written(tmp_path, "time,vx,run_id\n" + "\n".join(lines) + "\n")
     return source(tmp_path, files="*.csv", runs="run_id")
 
 
-def test_each_run_becomes_a_recording_with_its_own_start(tmp_path: Path) -> None:
+def test_each_run_becomes_a_recording_with_its_own_start(tmp_path):
     found = runs_csv(tmp_path, [7] * 20 + [3] * 30 + [4] * 10)
     assert found.ids() == ["lap_run_7", "lap_run_3", "lap_run_4"]
     recordings = list(found.recordings())
@@ -159,12 +156,12 @@ def test_each_run_becomes_a_recording_with_its_own_start(tmp_path: Path) -> None
         ([1, 1, 1.5, 1.5], "column 'run_id' holds 1.5 in data row 3; runs are counted in whole numbers"),
     ],
 )
-def test_runs_that_cannot_be_told_apart_are_refused(tmp_path: Path, runs: list[object], said: str) -> None:
+def test_runs_that_cannot_be_told_apart_are_refused(tmp_path, runs, said):
     message = refusal(runs_csv(tmp_path, runs).ids)
     assert f"'{tmp_path / 'lap.csv'}': {said}" in message
 
 
-def test_a_single_file_must_hold_one_run(tmp_path: Path) -> None:
+def test_a_single_file_must_hold_one_run(tmp_path):
     assert len(runs_csv(tmp_path, [4] * 9).read_file(tmp_path / "lap.csv")) == 9
     message = refusal(lambda: runs_csv(tmp_path, [4] * 9 + [5] * 9).read_file(tmp_path / "lap.csv"))
     assert "holds 2 runs (4, 5); keep the rows of one" in message
@@ -180,11 +177,11 @@ def test_a_single_file_must_hold_one_run(tmp_path: Path) -> None:
     ],
     ids=["endless line", "columns", "escape", "quote"],
 )
-def test_a_table_that_is_none_is_refused_in_one_line(tmp_path: Path, content: str, said: str) -> None:
+def test_a_table_that_is_none_is_refused_in_one_line(tmp_path, content, said):
     assert said in refusal(lambda: read(written(tmp_path, content)))
 
 
-def test_a_packed_table_is_read_and_unpacks_to_no_more_than_it_may(tmp_path: Path) -> None:
+def test_a_packed_table_is_read_and_unpacks_to_no_more_than_it_may(tmp_path):
     assert len(read(written(tmp_path, gzip.compress((HEADER + rows(50)).encode()), "lap.csv.gz"))) == 50
     bomb = written(tmp_path, gzip.compress(HEADER.encode() + (b"0,1,1" + b" " * 995 + b"\n") * 80_000, 9), "bomb.csv.gz")
     with use_limits(Limits(memory=10_000_000)):

@@ -1,9 +1,6 @@
 """Logs of a VBOX: what is read, in which units and on which clock; what is left out, found and refused."""
 
-from __future__ import annotations
-
 import re
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -11,17 +8,16 @@ from refusals import refusal
 from vbo_log import COLUMNS, UNITS, dataset, drive, write_log
 
 from vehest.data.errors import DataError
-from vehest.data.recording import Recording
 from vehest.sources.base import open_source
 from vehest.sources.surveys import survey
 from vehest.sources.vbo import read_log
 
 
-def read(folder: Path, **more: object) -> Recording:
+def read(folder, **more):
     return next(open_source(dataset(folder, **more)).recordings())
 
 
-def test_channels_are_in_si_units_and_iso_axes_on_the_clock_of_the_day(tmp_path: Path) -> None:
+def test_channels_are_in_si_units_and_iso_axes_on_the_clock_of_the_day(tmp_path):
     write_log(tmp_path / "lap.vbo")
     recording, true = read(tmp_path), drive()
     assert (recording.id, recording.rate_hz, len(recording)) == ("lap", 100.0, 1000)
@@ -33,20 +29,20 @@ def test_channels_are_in_si_units_and_iso_axes_on_the_clock_of_the_day(tmp_path:
     assert (about["created"], about["rows_dropped_at_the_end"]) == ("File created on 12/09/2018 @ 12:47", 0)
 
 
-def test_time_goes_on_past_midnight(tmp_path: Path) -> None:
+def test_time_goes_on_past_midnight(tmp_path):
     write_log(tmp_path / "lap.VBO", 86_395.0)
     recording = read(tmp_path)
     assert (recording.start_time, recording.rate_hz, len(recording)) == (86_395.0, 100.0, 1000)
 
 
 @pytest.mark.parametrize("end", ["053 104", "053 104900.000" + " +0.0" * 16])
-def test_a_last_row_that_is_cut_off_or_late_is_left_out_and_counted(tmp_path: Path, end: str) -> None:
+def test_a_last_row_that_is_cut_off_or_late_is_left_out_and_counted(tmp_path, end):
     write_log(tmp_path / "lap.vbo", end=end)
     recording = read(tmp_path)
     assert (len(recording), recording.provenance["rows_dropped_at_the_end"]) == (1000, 1)
 
 
-def test_units_belong_to_the_last_columns_and_must_not_contradict_the_declaration(tmp_path: Path) -> None:
+def test_units_belong_to_the_last_columns_and_must_not_contradict_the_declaration(tmp_path):
     write_log(tmp_path / "lap.vbo")
     units = read_log(tmp_path / "lap.vbo").units
     assert units == {"velocity": "km/h", "vert-vel": "km/h", "Longacc": "g", "Latacc": "g"} | dict(
@@ -57,9 +53,9 @@ def test_units_belong_to_the_last_columns_and_must_not_contradict_the_declaratio
         read(tmp_path)
 
 
-def test_slip_whose_offsets_changed_places_is_found_and_right_slip_is_not(tmp_path: Path) -> None:
+def test_slip_whose_offsets_changed_places_is_found_and_right_slip_is_not(tmp_path):
     write_log(tmp_path / "lap.vbo", swapped=True)
-    channels = dataset(tmp_path)["channels"] | {"sideslip_ref": {"column": "Slip_FL", "unit": "deg"}}  # type: ignore[operator]
+    channels = dataset(tmp_path)["channels"] | {"sideslip_ref": {"column": "Slip_FL", "unit": "deg"}}
     with pytest.raises(DataError, match=r"slip at the front and the rear left wheel differs by .* changed places") as refused:
         read(tmp_path, channels=channels)
     assert "accept: [slip_offsets]" in str(refused.value)
@@ -70,7 +66,7 @@ def test_slip_whose_offsets_changed_places_is_found_and_right_slip_is_not(tmp_pa
     assert "changed places" in log.skipped[0]
 
 
-def test_columns_of_a_bus_are_the_car_s_own(tmp_path: Path) -> None:
+def test_columns_of_a_bus_are_the_car_s_own(tmp_path):
     write_log(tmp_path / "lap.vbo")
     assert {column.device for column in survey(tmp_path / "lap.vbo").columns} == {""}
     content = (tmp_path / "lap.vbo").read_bytes()
@@ -91,7 +87,7 @@ def test_columns_of_a_bus_are_the_car_s_own(tmp_path: Path) -> None:
         (b"053 104751.450 ", b"053 ", r"Row #101: Expected 18 columns, got 17"),
     ],
 )
-def test_a_damaged_log_is_one_clear_line(tmp_path: Path, old: bytes, new: bytes, message: str) -> None:
+def test_a_damaged_log_is_one_clear_line(tmp_path, old, new, message):
     write_log(tmp_path / "lap.vbo")
     content = (tmp_path / "lap.vbo").read_bytes()
     assert old in content

@@ -1,9 +1,5 @@
 """Logs as a VBOX writes them, of a car that turns; for tests."""
 
-from __future__ import annotations
-
-from pathlib import Path
-
 import numpy as np
 
 RATE = 100.0
@@ -12,20 +8,20 @@ COLUMNS = "sats time lat long velocity heading height vert-vel Longacc Latacc ev
 UNITS = ("rad", "km/h", "°/s", "g", "g", "°", "°")
 
 
-def drive(seconds: float = 10.0) -> dict[str, np.ndarray]:
+def drive(seconds=10.0):
     """Speed [m/s], yaw rate [rad/s], lateral velocity at the antenna [m/s], accelerations [m/s²], in ISO 8855 axes, (T,) each."""
     t = np.arange(round(seconds * RATE)) / RATE
     vx, yaw_rate, vy = 20.0 + np.sin(t / 3.0), 0.3 * np.sin(t), 0.2 * np.sin(t + 0.3)
     return {"vx": vx, "yaw_rate": yaw_rate, "vy": vy, "ax": np.cos(t / 3.0) / 3.0, "ay": vx * yaw_rate}
 
 
-def clock(seconds: np.ndarray) -> list[str]:
+def clock(seconds):
     """Clock times, hhmmss.sss."""
     ms = np.rint(seconds * 1000.0).astype(int) % 86_400_000
     return [f"{k // 3_600_000:02d}{k // 60_000 % 60:02d}{k // 1000 % 60:02d}.{k % 1000:03d}" for k in ms]
 
 
-def write_log(file: Path, first: float = 38_870.45, *, swapped: bool = False, units: tuple[str, ...] = UNITS, end: str = "") -> None:
+def write_log(file, first=38870.45, *, swapped=False, units=UNITS, end=""):
     """Write a log.
 
     Args:
@@ -55,7 +51,7 @@ def write_log(file: Path, first: float = 38_870.45, *, swapped: bool = False, un
     file.write_bytes((text + "\r\n" + end).encode("latin-1", "replace"))
 
 
-def dataset(folder: Path, **more: object) -> dict[str, object]:
+def dataset(folder, **more):
     """The configuration of a data set of such logs."""
     channels = {
         "vx": {"column": "velocity", "unit": "km/h"},

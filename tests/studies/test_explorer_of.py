@@ -1,13 +1,9 @@
-from __future__ import annotations
-
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
 from measured_drive import CHANNELS, RATE, measured_drive
 
-from vehest.data.recording import Recording
 from vehest.data.splits import Span, Split
 from vehest.data.store import write_recording
 from vehest.evaluation.metrics import Protocol, pieces_of
@@ -20,7 +16,7 @@ FROZEN = 60.0  # s, from which on the yaw rate stands still
 SPANS = (Span("toy", "lap", 20.0, 40.0), Span("toy", "lap", 50.0, 90.0))
 
 
-def comparison_on(drive: Recording, folder: Path, rate_hz: float) -> tuple[PartArtefacts, EvaluatedModel]:
+def comparison_on(drive, folder, rate_hz):
     """One calibrated model on two ranges of a drive."""
     write_recording(drive, folder / "lap.parquet")
     health = learn_health([measured_drive(0), measured_drive(1)], [measured_drive(2)], CHANNELS, RATE)
@@ -29,18 +25,18 @@ def comparison_on(drive: Recording, folder: Path, rate_hz: float) -> tuple[PartA
     split = Split("toy", (), (), {"test": SPANS})
     protocol = Protocol(rate_hz=rate_hz, warm_up_seconds=2.0, skip_seconds=1.5)
     references = {("toy", "lap"): folder / "lap.parquet"}
-    part = PartArtefacts("toy", "", "", "", split, protocol, {"toy": "simulated"}, {}, None, [model], references, [])  # type: ignore[arg-type]
+    part = PartArtefacts("toy", "", "", "", split, protocol, {"toy": "simulated"}, {}, None, [model], references, [])
     return part, model
 
 
-def frozen_drive() -> Recording:
+def frozen_drive():
     drive = measured_drive(3)
     yaw_rate = np.array(drive["yaw_rate"])
     yaw_rate[drive.time >= FROZEN] = yaw_rate[drive.time >= FROZEN][0]
     return replace(drive, channels={**drive.channels, "yaw_rate": yaw_rate})
 
 
-def test_health_on_the_page_flags_a_frozen_channel_from_its_onset_on(tmp_path: Path) -> None:
+def test_health_on_the_page_flags_a_frozen_channel_from_its_onset_on(tmp_path):
     drive = frozen_drive()
     part, model = comparison_on(drive, tmp_path, RATE)
     found = health_over(model, list(pieces_of(SPANS, lambda span: drive, part.protocol)), part, 5)
@@ -55,7 +51,7 @@ def test_health_on_the_page_flags_a_frozen_channel_from_its_onset_on(tmp_path: P
     assert np.isnan(found[lengths[0] : lengths[0] + 5]).all()
 
 
-def test_no_health_is_shown_of_a_model_that_reads_another_rate_or_was_not_calibrated(tmp_path: Path) -> None:
+def test_no_health_is_shown_of_a_model_that_reads_another_rate_or_was_not_calibrated(tmp_path):
     drive = measured_drive(3)
     part, model = comparison_on(drive, tmp_path, RATE)
     pieces = list(pieces_of(SPANS, lambda span: drive, part.protocol))
@@ -64,5 +60,5 @@ def test_no_health_is_shown_of_a_model_that_reads_another_rate_or_was_not_calibr
     assert health_over(replace(model, calibration_folder=None), pieces, part, 5) is None
 
 
-def test_ranges_are_chained_with_a_gap_between_two_and_none_at_the_ends() -> None:
+def test_ranges_are_chained_with_a_gap_between_two_and_none_at_the_ends():
     assert chained([np.ones(2), np.zeros(1)], 2).tolist() == pytest.approx([1.0, 1.0, np.nan, np.nan, 0.0], nan_ok=True)

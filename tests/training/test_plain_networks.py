@@ -1,14 +1,11 @@
 """Networks over windows in plain PyTorch: trained, estimated, run online and trained as members without a hook of their own."""
 
-from __future__ import annotations
-
 from functools import cache
-from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
-from torch import Tensor, nn
+from torch import nn
 
 from conftest import planar_drive
 from vehest.data.errors import ConfigurationError
@@ -27,11 +24,11 @@ DATA = FitData([planar_drive(20.0, seed=1, noise=0.05)], [planar_drive(10.0, see
 class Perceptron(nn.Module):
     """Sees the window as it was measured, in SI units."""
 
-    def __init__(self, dropout: float = 0.0) -> None:
+    def __init__(self, dropout=0.0):
         super().__init__()
         self.layers = nn.Sequential(nn.Flatten(), nn.Linear(4 * WINDOW, 6), nn.Dropout(dropout), nn.Tanh(), nn.Linear(6, 1))
 
-    def forward(self, windows: Tensor) -> Tensor:
+    def forward(self, windows):
         assert windows.shape[-2:] == (WINDOW, 4)
         return self.layers(windows)
 
@@ -39,11 +36,11 @@ class Perceptron(nn.Module):
 class Recurrent(StandardisedNetwork):
     """Torch's own recurrent layer, which `torch.func.vmap` cannot batch."""
 
-    def __init__(self, layer: type[nn.Module]) -> None:
+    def __init__(self, layer):
         super().__init__(4)
         self.layer, self.output = layer(4, 3, batch_first=True), nn.Linear(3, 1)
 
-    def forward(self, windows: Tensor) -> Tensor:
+    def forward(self, windows):
         states, _ = self.layer(windows)
         return self.output(states[:, -1]).squeeze(-1) * self.output_scale + self.output_mean
 
@@ -51,22 +48,22 @@ class Recurrent(StandardisedNetwork):
 class Attention(StandardisedNetwork):
     """Torch's own encoder layer, which takes another way where no gradient is wanted."""
 
-    def __init__(self, dropout: float = 0.0) -> None:
+    def __init__(self, dropout=0.0):
         super().__init__(4)
         self.embed = nn.Linear(4, 4)
         self.encoder = nn.TransformerEncoderLayer(4, 2, 8, dropout, batch_first=True)
         self.output = nn.Linear(4, 1)
 
-    def forward(self, windows: Tensor) -> Tensor:
+    def forward(self, windows):
         return self.output(self.encoder(self.embed(windows)).mean(1)).squeeze(-1) * self.output_scale + self.output_mean
 
 
 class Convolution(nn.Module):
-    def __init__(self) -> None:
+    def __init__(self):
         super().__init__()
         self.layers = nn.Sequential(nn.Conv1d(4, 3, 3), nn.Tanh(), nn.AdaptiveAvgPool1d(1), nn.Flatten(), nn.Linear(3, 1))
 
-    def forward(self, windows: Tensor) -> Tensor:
+    def forward(self, windows):
         return self.layers(windows.transpose(1, 2))
 
 
@@ -86,7 +83,7 @@ def estimator_of(network, seed=0):
         name = "plain"
         title = "Plain"
 
-        def new_network(self) -> nn.Module:
+        def new_network(self):
             return network()
 
     estimator = Plain.from_config({"window": WINDOW})
@@ -186,7 +183,7 @@ def test_dropout_counts_in_training_and_not_in_estimates():
 
 
 @pytest.mark.parametrize("name", ["perceptron", "dropout", "lstm"])
-def test_interrupted_training_goes_on_to_the_same_result(tmp_path: Path, name):
+def test_interrupted_training_goes_on_to_the_same_result(tmp_path, name):
     whole, _ = fit(NETWORKS[name], [0, 1])
     left = iter(range(15))
     folders = [tmp_path / str(seed) for seed in range(2)]
@@ -209,12 +206,12 @@ def test_weights_read_back_estimate_the_same(name):
 class Frozen(Perceptron):
     """A random projection that is not trained, and a buffer that each member draws for itself."""
 
-    def __init__(self) -> None:
+    def __init__(self):
         super().__init__()
         self.layers[1].requires_grad_(False)
         self.register_buffer("offset", torch.randn(()))
 
-    def forward(self, windows: Tensor) -> Tensor:
+    def forward(self, windows):
         return super().forward(windows) + self.offset
 
 
@@ -233,24 +230,24 @@ def test_frozen_parameters_and_buffers_stay_each_member_s_own():
 
 
 class Normalised(nn.Module):
-    def __init__(self) -> None:
+    def __init__(self):
         super().__init__()
         self.norm, self.output = nn.BatchNorm1d(4), nn.Linear(4, 1)
 
 
 class Masked(nn.Module):
-    def __init__(self) -> None:
+    def __init__(self):
         super().__init__()
         self.output = nn.Linear(4, 1)
         self.register_buffer("mask", torch.ones(4, dtype=torch.bool))
 
 
 class Sequence(nn.Module):
-    def __init__(self) -> None:
+    def __init__(self):
         super().__init__()
         self.output = nn.Linear(4, 1)
 
-    def forward(self, windows: Tensor) -> Tensor:
+    def forward(self, windows):
         return self.output(windows).squeeze(-1)
 
 

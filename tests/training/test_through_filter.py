@@ -1,9 +1,5 @@
 """Training through a filter: truncation, curriculum, placing, what learns in which phase, and that a killed training ends the same."""
 
-from __future__ import annotations
-
-from pathlib import Path
-
 import numpy as np
 import pytest
 import torch
@@ -23,7 +19,7 @@ ONE_STEP = PhaseSettings(learning_rate=5e-3, max_epochs=3)
 THROUGH = PhaseSettings(learning_rate=1e-3, max_epochs=2)
 
 
-def settings(**changes) -> ThroughFilterSettings:
+def settings(**changes):
     known = {
         "one_step": ONE_STEP,
         "one_step_batch": 100,
@@ -39,17 +35,17 @@ def settings(**changes) -> ThroughFilterSettings:
     return ThroughFilterSettings(**known | changes)
 
 
-def estimator(seed: int = 0, **config) -> LearnedUkf:
+def estimator(seed=0, **config):
     made = LearnedUkf.from_config({"width": 8} | config)
     made.seed(seed)
     return made
 
 
-def weights_of(made: LearnedUkf) -> np.ndarray:
+def weights_of(made):
     return np.concatenate([values.ravel() for values in made.weights().values()])
 
 
-def drives(made: LearnedUkf, steps: int = 40) -> Drive:
+def drives(made, steps=40):
     """Sequences, and the filter made ready for them."""
     parts = [made.drive(recording, torch.float64) for recording in DATA.train]
     made.filter.to(torch.float64).reset(torch.Generator().manual_seed(0))
@@ -57,7 +53,7 @@ def drives(made: LearnedUkf, steps: int = 40) -> Drive:
     return sequences_of(parts, steps)
 
 
-def numbered(*lengths: int) -> list[Drive]:
+def numbered(*lengths):
     """Drives of which state 0 is the sample's number, state 1 the drive's."""
     made = []
     for number, length in enumerate(lengths):
@@ -69,7 +65,7 @@ def numbered(*lengths: int) -> list[Drive]:
 # What is learnt from
 
 
-def test_drives_are_cut_from_their_start_and_remainders_are_left_out() -> None:
+def test_drives_are_cut_from_their_start_and_remainders_are_left_out():
     cut = sequences_of(numbered(25, 9, 10), 10)
     assert cut.states[:, 0].tolist() == [[0.0, 0.0], [10.0, 0.0], [0.0, 2.0]]
     assert cut.inputs.shape == (3, 10, 1)
@@ -77,8 +73,8 @@ def test_drives_are_cut_from_their_start_and_remainders_are_left_out() -> None:
         sequences_of(numbered(25, 9), 26)
 
 
-def test_random_places_are_reproducible_fit_and_keep_each_drives_share() -> None:
-    def drawn(seed: int) -> Drive:
+def test_random_places_are_reproducible_fit_and_keep_each_drives_share():
+    def drawn(seed):
         return placed(numbered(45, 9, 20), 10, torch.Generator().manual_seed(seed))
 
     one, again, other = drawn(1), drawn(1), drawn(2)
@@ -88,7 +84,7 @@ def test_random_places_are_reproducible_fit_and_keep_each_drives_share() -> None
     assert (one.states[:, 1:, 0] - one.states[:, :-1, 0] == 1.0).all(), "each is uninterrupted"
 
 
-def test_fixed_placing_gives_the_same_sequences_each_epoch_and_random_others() -> None:
+def test_fixed_placing_gives_the_same_sequences_each_epoch_and_random_others():
     made = estimator()
     drives(made)
     parts = [made.drive(recording, torch.float64) for recording in DATA.train]
@@ -99,14 +95,14 @@ def test_fixed_placing_gives_the_same_sequences_each_epoch_and_random_others() -
         assert (epochs[0] == epochs[1]) == same
 
 
-def phases_of(made: LearnedUkf, parts: list[Drive], training: ThroughFilterSettings):
+def phases_of(made, parts, training):
     from vehest.training.through_filter import Weights
 
     weights = Weights(*[torch.ones(5, dtype=torch.float64)] * 3)
     return filter_phases(made.filter, parts, parts, weights, training, training.through, lambda name: True, "through_filter")
 
 
-def test_the_friction_starts_off_by_at_most_the_spread_and_the_other_states_true() -> None:
+def test_the_friction_starts_off_by_at_most_the_spread_and_the_other_states_true():
     made = estimator()
     drives(made)
     parts = [made.drive(recording, torch.float64) for recording in DATA.train]
@@ -118,7 +114,7 @@ def test_the_friction_starts_off_by_at_most_the_spread_and_the_other_states_true
     assert off[:, 4].unique().numel() == len(off)
 
 
-def test_a_share_of_sequences_is_seen_in_a_mirror() -> None:
+def test_a_share_of_sequences_is_seen_in_a_mirror():
     made = estimator()
     drives(made)
     parts = [made.drive(recording, torch.float64) for recording in DATA.train]
@@ -140,7 +136,7 @@ def test_a_share_of_sequences_is_seen_in_a_mirror() -> None:
 # Truncation
 
 
-def test_truncated_training_has_the_same_estimates_and_other_gradients() -> None:
+def test_truncated_training_has_the_same_estimates_and_other_gradients():
     made = estimator()
     sequences = drives(made)
     results = {}
@@ -156,7 +152,7 @@ def test_truncated_training_has_the_same_estimates_and_other_gradients() -> None
     assert 1e-4 < off < 2.0
 
 
-def test_truncated_gradients_do_not_reach_the_start() -> None:
+def test_truncated_gradients_do_not_reach_the_start():
     made = estimator()
     sequences = drives(made)
     start = sequences.states[:, 0].clone().requires_grad_()
@@ -169,7 +165,7 @@ def test_truncated_gradients_do_not_reach_the_start() -> None:
 # Noise
 
 
-def test_surprise_is_the_log_density_of_errors_under_the_covariance() -> None:
+def test_surprise_is_the_log_density_of_errors_under_the_covariance():
     generator = np.random.default_rng(0)
     errors, factors = generator.standard_normal((7, 3)), generator.standard_normal((7, 3, 3))
     covariances = factors @ factors.swapaxes(1, 2) + 0.1 * np.eye(3)
@@ -177,7 +173,7 @@ def test_surprise_is_the_log_density_of_errors_under_the_covariance() -> None:
     assert float(gaussian_surprise(torch.from_numpy(errors), torch.from_numpy(covariances))) == pytest.approx(expected, rel=1e-9)
 
 
-def test_likelihood_teaches_the_filter_how_sure_to_be() -> None:
+def test_likelihood_teaches_the_filter_how_sure_to_be():
     """With the term the filter's own variances come nearer to its squared errors in training; without it they are left where they are."""
     ratios = {}
     for weight in (0.0, 0.05):
@@ -191,7 +187,7 @@ def test_likelihood_teaches_the_filter_how_sure_to_be() -> None:
     assert ratios[0.05] < ratios[0.0] - 0.1
 
 
-def test_noise_starts_where_the_models_residuals_say() -> None:
+def test_noise_starts_where_the_models_residuals_say():
     made = estimator(dynamics="pacejka", noise="constant")
     parts = [made.drive(recording, torch.float64) for recording in DATA.train]
     made.filter.to(torch.float64).begin_noise(parts, 0.0)
@@ -208,7 +204,7 @@ def test_noise_starts_where_the_models_residuals_say() -> None:
     assert torch.allclose(off, torch.diag(torch.tensor([0.0, 0.0, 0.0, 1e-3], dtype=torch.float64)), atol=2e-7)
 
 
-def test_noise_given_is_not_started_from_residuals() -> None:
+def test_noise_given_is_not_started_from_residuals():
     made = estimator()
     fitted = made.fit(DATA, settings(through=PhaseSettings(max_epochs=1, learning_rate=1e-12), start_noise="given"))
     assert np.isfinite(fitted.metrics["best_validation_loss"])
@@ -221,7 +217,7 @@ def test_noise_given_is_not_started_from_residuals() -> None:
 # Phases
 
 
-def test_noise_alone_leaves_the_dynamics_as_the_one_step_training_left_them() -> None:
+def test_noise_alone_leaves_the_dynamics_as_the_one_step_training_left_them():
     nothing = PhaseSettings(max_epochs=1, learning_rate=1e-300)
     alone, after = estimator(through_filter=False), estimator(through_filter=False)
     alone.fit(DATA, settings(noise=nothing))
@@ -231,7 +227,7 @@ def test_noise_alone_leaves_the_dynamics_as_the_one_step_training_left_them() ->
     assert all("noise" in name for name in changed)
 
 
-def test_through_the_filter_dynamics_and_noise_learn() -> None:
+def test_through_the_filter_dynamics_and_noise_learn():
     before, after = estimator(), estimator()
     before.fit(DATA, settings(through=PhaseSettings(max_epochs=1, learning_rate=1e-300)))
     record = after.fit(DATA, settings(through=PhaseSettings(max_epochs=4, learning_rate=2e-3)))
@@ -240,7 +236,7 @@ def test_through_the_filter_dynamics_and_noise_learn() -> None:
     assert changed >= {"dynamics.network.0.weight", "dynamics.car.learnt.log_yaw_inertia", "process_noise.constant.factor"}
 
 
-def test_a_curriculum_trains_on_shorter_sequences_first() -> None:
+def test_a_curriculum_trains_on_shorter_sequences_first():
     made = estimator()
     drives(made)
     parts = [made.drive(recording, torch.float64) for recording in DATA.train]
@@ -255,12 +251,12 @@ def test_a_curriculum_trains_on_shorter_sequences_first() -> None:
 
 
 @pytest.mark.parametrize("stop", [2, 4], ids=["in the one-step phase", "through the filter"])
-def test_killed_training_goes_on_to_the_same_weights(tmp_path: Path, stop: int) -> None:
+def test_killed_training_goes_on_to_the_same_weights(tmp_path, stop):
     whole = estimator(seed=3)
     record = whole.fit(DATA, settings())
     left = stop
 
-    def die(progress) -> None:
+    def die(progress):
         nonlocal left
         left -= 1
         if not left:
@@ -285,6 +281,6 @@ def test_killed_training_goes_on_to_the_same_weights(tmp_path: Path, stop: int) 
         ({"drop_steps": 10, "curriculum": [10]}, r"lengths above drop_steps \(10\)"),
     ],
 )
-def test_settings_that_make_no_sense_are_refused(changes: dict, message: str) -> None:
+def test_settings_that_make_no_sense_are_refused(changes, message):
     with pytest.raises(ConfigurationError, match=message):
         settings_from_config(ThroughFilterSettings, {"steps": 40} | changes, "training")

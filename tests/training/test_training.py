@@ -1,9 +1,5 @@
 """Training: members as if alone, early stopping, checkpoints that go on to the same result, clean stops."""
 
-from __future__ import annotations
-
-from pathlib import Path
-
 import numpy as np
 import pytest
 import torch
@@ -106,10 +102,10 @@ def test_gamma_1_stays_in_its_range():
 class _StopAfter:
     """Asks to stop after so many batches."""
 
-    def __init__(self, batches: int) -> None:
+    def __init__(self, batches):
         self.left = batches
 
-    def __call__(self) -> bool:
+    def __call__(self):
         self.left -= 1
         return self.left < 0
 
@@ -123,7 +119,7 @@ def test_how_many_batches_are_taken_together_changes_no_bit(name, config, monkey
 
 
 @pytest.mark.parametrize(("name", "config"), SHAPES)
-def test_interrupted_training_goes_on_to_the_same_result(tmp_path: Path, name, config):
+def test_interrupted_training_goes_on_to_the_same_result(tmp_path, name, config):
     settings = SupervisedSettings(max_epochs=12, patience=4)
     whole, whole_records = _fit(name, config, [0, 1, 2], settings)
     folders = [tmp_path / str(seed) for seed in range(3)]
@@ -138,7 +134,7 @@ def test_interrupted_training_goes_on_to_the_same_result(tmp_path: Path, name, c
         assert record.history == resumed_record.history
 
 
-def test_member_goes_on_alone_from_a_checkpoint_it_shared(tmp_path: Path):
+def test_member_goes_on_alone_from_a_checkpoint_it_shared(tmp_path):
     settings = SupervisedSettings(max_epochs=10, patience=10)
     (whole,), _ = _fit("ksnn", {}, [1], settings)
     folders = [tmp_path / str(seed) for seed in range(3)]
@@ -148,7 +144,7 @@ def test_member_goes_on_alone_from_a_checkpoint_it_shared(tmp_path: Path):
     assert np.array_equal(_weights(whole), _weights(resumed))
 
 
-def test_damaged_checkpoint_starts_anew(tmp_path: Path):
+def test_damaged_checkpoint_starts_anew(tmp_path):
     settings = SupervisedSettings(max_epochs=4)
     _fit("ksnn", {}, [0], settings, FitContext([tmp_path], should_stop=_StopAfter(20)))
     file = tmp_path / "checkpoint.safetensors"
@@ -195,10 +191,7 @@ def test_direct_search_stays_in_its_box():
 
 @pytest.mark.parametrize(
     ("config", "message"),
-    [
-        ({"learning_rate": -1.0}, "learning_rate must be positive"),
-        ({"averaging": 1.0}, "averaging must lie between 0 and 1"),
-    ],
+    [({"learning_rate": -1.0}, "learning_rate must be positive"), ({"averaging": 1.0}, "averaging must lie between 0 and 1")],
 )
 def test_training_settings_that_make_no_sense_are_refused(config, message):
     with pytest.raises(ConfigurationError, match=message):
@@ -282,7 +275,7 @@ def test_members_with_averaged_weights_equal_training_each_alone(name, config):
 
 
 @pytest.mark.parametrize("batches", [2, 25])
-def test_interrupted_training_with_averaged_weights_goes_on_to_the_same_result(tmp_path: Path, batches):
+def test_interrupted_training_with_averaged_weights_goes_on_to_the_same_result(tmp_path, batches):
     settings = SupervisedSettings(max_epochs=12, patience=4, averaging=0.95)
     whole, whole_records = _fit("lstm", {"n_states": 2}, [0, 1, 2], settings)
     folders = [tmp_path / str(seed) for seed in range(3)]

@@ -1,9 +1,6 @@
 """Training in phases: resumed ones end as undisturbed ones, frozen parameters stay, the best is kept, bad steps are skipped."""
 
-from __future__ import annotations
-
 import math
-from pathlib import Path
 
 import pytest
 import torch
@@ -19,12 +16,12 @@ X = torch.linspace(-2, 2, 48).unsqueeze(1)
 Y = torch.sin(2 * X)
 
 
-def _network() -> nn.Module:
+def _network():
     torch.manual_seed(0)
     return nn.Sequential(nn.Linear(1, 8), nn.Tanh(), nn.Linear(8, 1))
 
 
-def _phase(network: nn.Module, name: str = "fit", trainable=None, loss=None, validation=None, **settings) -> Phase:
+def _phase(network, name="fit", trainable=None, loss=None, validation=None, **settings):
     def batches(generator):
         for rows in torch.randperm(len(X), generator=generator).split(16):
             yield X[rows], Y[rows] + 0.1 * torch.randn(len(rows), 1, generator=generator)
@@ -39,7 +36,7 @@ def _phase(network: nn.Module, name: str = "fit", trainable=None, loss=None, val
     return Phase(name, PhaseSettings(**{**defaults, **settings}), network, batches, loss or squared, validation or judge, trainable)
 
 
-def _two_phases(network: nn.Module) -> list[Phase]:
+def _two_phases(network):
     """The read-out first, then all together from a wrapper that shares its parameters."""
     first = _phase(network, "read-out", lambda name: name.startswith("2."), max_epochs=7, validate_every=2)
     return [first, _phase(nn.ModuleDict({"inner": network})["inner"], "all", patience=6, schedule="cosine")]
@@ -48,15 +45,15 @@ def _two_phases(network: nn.Module) -> list[Phase]:
 class _StopAfter:
     """Asks to stop after so many questions."""
 
-    def __init__(self, left: int) -> None:
+    def __init__(self, left):
         self.left = left
 
-    def __call__(self) -> bool:
+    def __call__(self):
         self.left -= 1
         return self.left < 0
 
 
-def _flat(network: nn.Module) -> torch.Tensor:
+def _flat(network):
     return torch.cat([value.detach().reshape(-1) for value in network.parameters()])
 
 
@@ -65,7 +62,7 @@ def _without_times(records):
 
 
 @pytest.mark.parametrize("often", [0.0, 1e9], ids=["checkpoint after every epoch", "checkpoint when stopped"])
-def test_stopped_training_goes_on_to_the_same_bits_across_a_phase_boundary(tmp_path: Path, often: float) -> None:
+def test_stopped_training_goes_on_to_the_same_bits_across_a_phase_boundary(tmp_path, often):
     whole = _network()
     records = train_phases(_two_phases(whole), 3, FitContext())
     assert [record.name for record in records] == ["read-out", "all"]
@@ -80,12 +77,12 @@ def test_stopped_training_goes_on_to_the_same_bits_across_a_phase_boundary(tmp_p
     assert _without_times(again) == _without_times(records)
 
 
-def test_killed_training_goes_on_from_its_last_checkpoint_to_the_same_bits(tmp_path: Path) -> None:
+def test_killed_training_goes_on_from_its_last_checkpoint_to_the_same_bits(tmp_path):
     whole = _network()
     train_phases(_two_phases(whole), 3, FitContext())
     killed, left = _network(), 11
 
-    def die(progress) -> None:
+    def die(progress):
         nonlocal left
         left -= 1
         if not left:
@@ -99,7 +96,7 @@ def test_killed_training_goes_on_from_its_last_checkpoint_to_the_same_bits(tmp_p
     assert torch.equal(_flat(whole), _flat(resumed))
 
 
-def test_finished_training_is_not_done_again(tmp_path: Path) -> None:
+def test_finished_training_is_not_done_again(tmp_path):
     one, other = _network(), _network()
     records = train_phases(_two_phases(one), 3, FitContext([tmp_path]))
     assert resume_epoch(tmp_path) == -1
@@ -109,7 +106,7 @@ def test_finished_training_is_not_done_again(tmp_path: Path) -> None:
     assert torch.equal(_flat(one), _flat(other))
 
 
-def test_members_keep_checkpoints_of_their_own_and_draw_other_batches(tmp_path: Path) -> None:
+def test_members_keep_checkpoints_of_their_own_and_draw_other_batches(tmp_path):
     folders = [tmp_path / "0", tmp_path / "1"]
     networks = [_network(), _network()]
     for index, network in enumerate(networks):
@@ -118,7 +115,7 @@ def test_members_keep_checkpoints_of_their_own_and_draw_other_batches(tmp_path: 
     assert not torch.allclose(_flat(networks[0]), _flat(networks[1]))
 
 
-def test_checkpoint_of_another_network_starts_anew(tmp_path: Path) -> None:
+def test_checkpoint_of_another_network_starts_anew(tmp_path):
     train_phases([_phase(_network())], 0, FitContext([tmp_path], should_stop=_StopAfter(9)))
     assert resume_epoch(tmp_path) > 0
     other = nn.Linear(1, 1)
@@ -126,7 +123,7 @@ def test_checkpoint_of_another_network_starts_anew(tmp_path: Path) -> None:
     assert record.epochs == 12
 
 
-def test_frozen_parameters_stay_and_learn_again_afterwards() -> None:
+def test_frozen_parameters_stay_and_learn_again_afterwards():
     network = _network()
     before = {name: value.detach().clone() for name, value in network.named_parameters()}
     asked = {}
@@ -143,11 +140,11 @@ def test_frozen_parameters_stay_and_learn_again_afterwards() -> None:
         assert value.requires_grad
 
 
-def test_best_validation_is_kept_and_the_start_is_a_candidate() -> None:
+def test_best_validation_is_kept_and_the_start_is_a_candidate():
     network, seen = _network(), []
     losses = iter([5.0, 4.0, 2.0, 3.0, math.nan, 2.5])
 
-    def validation() -> float:
+    def validation():
         seen.append(_flat(network))
         return next(losses)
 
@@ -160,12 +157,12 @@ def test_best_validation_is_kept_and_the_start_is_a_candidate() -> None:
     assert torch.equal(_flat(network), start)
 
 
-def test_validation_every_third_epoch_and_after_the_last() -> None:
+def test_validation_every_third_epoch_and_after_the_last():
     (record,) = train_phases([_phase(_network(), validate_every=3, max_epochs=8)], 0, FitContext())
     assert [math.isfinite(loss) for loss in record.validation_loss] == [False, False, True, False, False, True, False, True]
 
 
-def test_gradients_are_clipped_element_by_element() -> None:
+def test_gradients_are_clipped_element_by_element():
     """Of two elements one is over the bound: AdamW's first moment holds a tenth of the bound and of the other as it is."""
     line = nn.Linear(2, 1, bias=False)
     gradient = torch.tensor([[50.0, 0.5]])
@@ -184,7 +181,7 @@ def test_gradients_are_clipped_element_by_element() -> None:
 
 
 @pytest.mark.parametrize("where", ["loss", "gradient"])
-def test_step_that_is_not_finite_is_skipped_and_counted(where: str) -> None:
+def test_step_that_is_not_finite_is_skipped_and_counted(where):
     network, calls, held = _network(), 0, []
 
     def loss(batch):
@@ -203,14 +200,14 @@ def test_step_that_is_not_finite_is_skipped_and_counted(where: str) -> None:
     assert math.isfinite(record.train_loss[0])
 
 
-def test_twenty_steps_in_a_row_that_are_not_finite_are_an_error() -> None:
+def test_twenty_steps_in_a_row_that_are_not_finite_are_an_error():
     network = _network()
     phase = _phase(network, "through the filter", loss=lambda batch: network(batch[0]).sum() * math.inf)
     with pytest.raises(DataError, match=r"phase 'through the filter', epoch 7, step 2: .* 20 times in a row; lower its learning_rate"):
         train_phases([phase], 0, FitContext())
 
 
-def test_bad_steps_with_good_ones_between_them_end_nothing() -> None:
+def test_bad_steps_with_good_ones_between_them_end_nothing():
     network, calls = _network(), 0
 
     def loss(batch):
@@ -222,12 +219,12 @@ def test_bad_steps_with_good_ones_between_them_end_nothing() -> None:
     assert record.skipped_steps == 24, "two of three in twelve epochs"
 
 
-def test_phase_without_a_finite_validation_is_an_error() -> None:
+def test_phase_without_a_finite_validation_is_an_error():
     with pytest.raises(DataError, match="no finite validation loss in 12 epochs"):
         train_phases([_phase(_network(), validation=lambda: math.nan)], 0, FitContext())
 
 
-def test_cosine_schedule_falls_from_the_full_step_size_to_zero() -> None:
+def test_cosine_schedule_falls_from_the_full_step_size_to_zero():
     rates = []
     step = torch.optim.AdamW.step
 
@@ -242,7 +239,7 @@ def test_cosine_schedule_falls_from_the_full_step_size_to_zero() -> None:
     assert rates == pytest.approx(expected)
 
 
-def test_stop_leaves_the_best_so_far_and_says_so(tmp_path: Path) -> None:
+def test_stop_leaves_the_best_so_far_and_says_so(tmp_path):
     network = _network()
     records = train_phases([_phase(network)], 0, FitContext([tmp_path], should_stop=_StopAfter(15)))
     assert records[-1].interrupted
@@ -253,14 +250,14 @@ def test_stop_leaves_the_best_so_far_and_says_so(tmp_path: Path) -> None:
     assert math.isclose(records[-1].best_loss, float((network(X) - Y).square().mean().detach()), rel_tol=1e-6)
 
 
-def test_progress_counts_epochs_over_all_phases() -> None:
+def test_progress_counts_epochs_over_all_phases():
     told = []
     train_phases(_two_phases(_network()), 3, FitContext(on_progress=told.append))
     assert [progress.epoch for progress in told] == list(range(1, len(told) + 1))
     assert told[0].max_epochs == 19
 
 
-def test_phases_that_make_no_sense_are_refused() -> None:
+def test_phases_that_make_no_sense_are_refused():
     network = _network()
     with pytest.raises(ConfigurationError, match="different names"):
         train_phases([_phase(network), _phase(network)], 0, FitContext())

@@ -1,14 +1,11 @@
 """Drives of a linear single track with noise on every channel, and with wheel speeds where they are wanted."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from functools import cache
 
 import numpy as np
 
 from single_track_drive import linear_drive
-from vehest.data.recording import Recording
 
 RATE = 50.0
 CHANNELS = ("yaw_rate", "vx", "ay", "ax", "steer")
@@ -20,7 +17,7 @@ WHEEL_NOISE = 0.1  # rad/s
 
 
 @cache
-def measured_drive(seed: int = 0, seconds: float = 120.0) -> Recording:
+def measured_drive(seed=0, seconds=120.0):
     """Swerves at 19 to 37 m/s; channels of `CHANNELS` and `WHEELS`."""
     generator = np.random.default_rng(seed + 1000)
     drive = linear_drive(seconds, RATE, seed, QUIET)[0]

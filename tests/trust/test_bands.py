@@ -1,7 +1,5 @@
 """Bands: calibration against planted scales and exchangeable blocks, kernel against numpy, and what is written and read back."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 
@@ -17,7 +15,6 @@ from vehest.trust.bands import (
     OTHER_VEHICLE,
     SHOWN_LEVEL,
     TERMS,
-    Bands,
     Piece,
     band_inputs,
     band_rows,
@@ -35,7 +32,7 @@ CHANNELS = ("yaw_rate", "vx", "ay", "ax", "steer")
 ORIGIN = {"vehicles": ("my car",), "datasets": ("mine",), "scaled_on": ("one (all)",), "calibrated_on": ("two (all)",), "horizon_steps": 0}
 
 
-def piece_of(rng: np.random.Generator, n: int, deviation: float = 0.1, variance: float = math.nan) -> Piece:
+def piece_of(rng, n, deviation=0.1, variance=math.nan):
     """A range at 20 Hz whose error grows with |ay|, σ² = deviation² + (0.05 ay)²; one error a block of 100 samples, and noise."""
     rows = rng.standard_normal((n, 5)) * [0.3, 3.0, 3.0, 1.0, 0.05] + [0.0, 25.0, 0.0, 0.0, 0.0]
     sigma = np.sqrt(deviation**2 + (0.05 * rows[:, 2]) ** 2)
@@ -47,7 +44,7 @@ def piece_of(rng: np.random.Generator, n: int, deviation: float = 0.1, variance:
     )
 
 
-def bands_of(seed: int = 0, **changes):
+def bands_of(seed=0, **changes):
     rng = np.random.default_rng(seed)
     return calibrated([piece_of(rng, 6000, **changes)], [piece_of(rng, 4000, **changes)], CHANNELS, **ORIGIN)
 
@@ -140,7 +137,7 @@ def test_band_is_wider_where_errors_are():
     assert hard / calm == pytest.approx(math.sqrt(0.1**2 + 0.3**2) / 0.1, rel=0.25)
 
 
-def by_numpy(bands: Bands, rows: np.ndarray, vy: np.ndarray, variance: np.ndarray, *, elsewhere: bool) -> np.ndarray:
+def by_numpy(bands, rows, vy, variance, *, elsewhere):
     """Half widths at the level that is shown, (T, 2), by the formulas of `vehest.trust.bands`."""
     terms = terms_of(rows, vy, variance, bands.packed().columns)
     largest = np.array([bands.largest.get(name, 0.0) for name in TERMS])

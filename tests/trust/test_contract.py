@@ -1,7 +1,5 @@
 """The contract of running online, held for every family by one wrapper."""
 
-from __future__ import annotations
-
 import math
 import warnings
 from functools import cache
@@ -14,8 +12,7 @@ from scipy import signal
 from conftest import planar_drive
 from every_estimator import drive_for, fitted
 from vehest.data.errors import ConfigurationError, DataError
-from vehest.data.recording import Recording
-from vehest.estimators.base import Estimator, Stepper
+from vehest.estimators.base import Stepper
 from vehest.estimators.registry import estimator_names
 from vehest.trust.contract import GuardedStepper, estimate_guarded
 from vehest.trust.front_end import FrontEnd
@@ -26,15 +23,15 @@ HOSTILE = (math.nan, math.inf, -math.inf, 1e6, -1e30, 0.0)
 
 
 @cache
-def ready(name: str) -> Estimator:
+def ready(name):
     return fitted(name)
 
 
-def columns(estimator: Estimator, drive: Recording) -> dict[str, np.ndarray]:
+def columns(estimator, drive):
     return {name: drive[name].copy() for name in estimator.channels}
 
 
-def hostile_columns(estimator: Estimator, drive: Recording, seed: int) -> dict[str, np.ndarray]:
+def hostile_columns(estimator, drive, seed):
     """Bursts of senseless values of 1 sample to 1.5 s, the drive's last third left whole."""
     generator = np.random.default_rng(seed)
     samples, rate = columns(estimator, drive), estimator.settings.rate_hz
@@ -46,7 +43,7 @@ def hostile_columns(estimator: Estimator, drive: Recording, seed: int) -> dict[s
     return samples
 
 
-def online(estimator: Estimator, samples: dict[str, np.ndarray]) -> np.ndarray:
+def online(estimator, samples):
     stepper = GuardedStepper(estimator)
     steps = len(next(iter(samples.values())))
     vy = [stepper.step({name: values[k] for name, values in samples.items()})["vy"] for k in range(steps)]
@@ -94,7 +91,7 @@ def test_one_bad_sample_does_no_lasting_harm(name):
 class Constant(Stepper):
     """Says what it is told to; counts how often it was begun."""
 
-    def __init__(self, owner: Saying) -> None:
+    def __init__(self, owner):
         self.owner, self.steps = owner, 0
         owner.begun += 1
 
@@ -109,18 +106,18 @@ class Saying:
 
     channels, skippable, causal, warm_up_steps, horizon_steps, name = ("yaw_rate", "vx", "ay"), (), True, 0, 0, "saying"
 
-    def __init__(self, says) -> None:
+    def __init__(self, says):
         self.says, self.begun = says, 0
         self.settings = type("Settings", (), {"rate_hz": 20.0})()
 
-    def online(self) -> Constant:
+    def online(self):
         return Constant(self)
 
 
 SAMPLE = {"yaw_rate": 0.2, "vx": 20.0, "ay": 4.0}
 
 
-def moving(k: int) -> dict[str, float]:
+def moving(k):
     return {"yaw_rate": 0.2 + 1e-4 * k, "vx": 20.0 + 1e-3 * k, "ay": 4.0 + 1e-3 * k}
 
 
@@ -135,7 +132,7 @@ def test_an_estimate_never_exceeds_what_the_speed_allows_and_a_lost_estimator_st
 
 
 def test_an_estimator_that_raises_starts_anew():
-    def says(step: int) -> float:
+    def says(step):
         if step == 5:
             raise RuntimeError("singular")
         return float(step)
@@ -151,7 +148,7 @@ def test_an_estimator_that_raises_starts_anew():
 
 
 def test_programming_errors_are_not_swallowed():
-    def says(step: int) -> float:
+    def says(step):
         raise KeyError("a name")
 
     with pytest.raises(KeyError):

@@ -1,11 +1,8 @@
 """Each kind of fault does to its channel what it says, nothing to any other, and the same for the same seed."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -21,7 +18,7 @@ FIRST, END = 200, 360
 
 
 @pytest.fixture
-def samples() -> dict[str, Any]:
+def samples():
     """A drive of 30 s at 20 Hz, with a wheel and a steering angle."""
     drive = planar_drive(30.0, RATE, noise=0.01)
     return {
@@ -31,9 +28,9 @@ def samples() -> dict[str, Any]:
     }
 
 
-def faulted(samples: dict[str, Any], kind: str, channel: str, severity: str = "medium", **options: Any) -> tuple[Any, Any]:
+def faulted(samples, kind, channel, severity="medium", **options):
     """The channel while the fault lasts: before, and after it was injected."""
-    fault = Fault(kind, channel, severity, ONSET, DURATION, **options)  # type: ignore[arg-type]
+    fault = Fault(kind, channel, severity, ONSET, DURATION, **options)
     return samples[channel][FIRST:END], inject(samples, RATE, fault)[channel][FIRST:END]
 
 
@@ -306,7 +303,7 @@ def test_a_channel_that_is_not_there_is_named(samples):
 # What the page says
 
 
-def cells(start: str) -> list[str]:
+def cells(start):
     """Cells of the row of docs/trust.md that begins with this."""
     text = (Path(__file__).parents[2] / "docs" / "trust.md").read_text(encoding="utf-8")
     row = next(line for line in text.splitlines() if line.startswith(f"| {start}"))

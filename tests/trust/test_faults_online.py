@@ -1,14 +1,11 @@
 """Under every fault a recording is estimated as it is online, sample by sample, and stays finite."""
 
-from __future__ import annotations
-
 from functools import cache
 
 import numpy as np
 import pytest
 
 from every_estimator import drive_for, fitted
-from vehest.estimators.base import Estimator
 from vehest.trust.contract import GuardedStepper, estimate_guarded
 from vehest.trust.faults import KINDS, Fault, applies, inject
 
@@ -16,7 +13,7 @@ FAMILIES = ("ksnn", "kalman", "velocity_gru")
 
 
 @cache
-def ready(name: str) -> Estimator:
+def ready(name):
     return fitted(name)
 
 

@@ -1,7 +1,5 @@
 """What is believed of a sample before an estimator sees it."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np
@@ -15,11 +13,11 @@ CHANNELS = ("yaw_rate", "vx", "ay", "ax")
 RATE = 20.0
 
 
-def rows_of(drive: Recording) -> np.ndarray:
+def rows_of(drive):
     return np.ascontiguousarray(drive.stack(CHANNELS))
 
 
-def guard(skippable: tuple[str, ...] = (), limits: GuardLimits | None = None) -> Guard:
+def guard(skippable=(), limits=None):
     return Guard(CHANNELS, skippable, limits or usual_limits(CHANNELS, RATE), RATE)
 
 

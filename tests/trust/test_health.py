@@ -1,7 +1,5 @@
 """Health: healthy drives are not flagged, faults are, each with its reason; online agrees with batch to the last bit."""
 
-from __future__ import annotations
-
 import math
 import os
 import subprocess
@@ -9,7 +7,6 @@ import sys
 from collections import Counter
 from dataclasses import asdict, replace
 from functools import cache
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -19,7 +16,6 @@ from measured_drive import CHANNELS, RATE, WHEELS, measured_drive
 from real_drives import real_drive
 from small_car_drive import small_car_drive
 from vehest.data.errors import DataError
-from vehest.data.recording import Recording
 from vehest.data.schema import validated
 from vehest.run.downsample import transforms_of
 from vehest.trust import health_kernel as kernel
@@ -44,37 +40,37 @@ ONSET = 2000  # sample, 40 s
 
 
 @cache
-def model_of(channels: tuple[str, ...] = CHANNELS) -> HealthModel:
+def model_of(channels=CHANNELS):
     return learn_health([measured_drive(0), measured_drive(1)], [measured_drive(2)], channels, RATE)
 
 
-def judged(model: HealthModel, drive: Recording, **faulty: np.ndarray) -> Health:
+def judged(model, drive, **faulty):
     """Health along a drive in which some channels are replaced."""
     rows = np.stack([faulty.get(name, np.asarray(drive[name])) for name in model.channels], axis=1)
     return health_rows(model.packed(), np.ascontiguousarray(rows), np.isfinite(rows), model.start())
 
 
-def after(values: np.ndarray, change: object) -> np.ndarray:
+def after(values, change):
     """The same samples, changed from the onset on."""
     changed = np.array(values)
     changed[ONSET:] = change(changed[ONSET:]) if callable(change) else change
     return changed
 
 
-def reason_kind(code: float) -> int:
+def reason_kind(code):
     return round(code) // 10_000
 
 
-def reason_channel(code: float) -> str:
+def reason_channel(code):
     return NAMES.get(round(code) % 10_000 // 100, "")
 
 
-def usual_reason(found: Health, begin: int, end: int) -> float:
+def usual_reason(found, begin, end):
     return Counter(found.reason[begin:end].tolist()).most_common(1)[0][0]
 
 
 @pytest.mark.parametrize("seed", [3, 4, 5])
-def test_a_healthy_drive_that_was_not_learnt_from_is_valid(seed: int) -> None:
+def test_a_healthy_drive_that_was_not_learnt_from_is_valid(seed):
     found = judged(model_of(), measured_drive(seed))
     assert np.mean(found.status == VALID) > 0.999
 
@@ -92,7 +88,7 @@ FAULTS = {
 
 
 @pytest.mark.parametrize("fault", FAULTS)
-def test_planted_faults_are_flagged_with_their_reason(fault: str) -> None:
+def test_planted_faults_are_flagged_with_their_reason(fault):
     channel, change, kind, seconds = FAULTS[fault]
     drive = measured_drive(3)
     found = judged(model_of(), drive, **{channel: after(drive[channel], change)})
@@ -102,14 +98,14 @@ def test_planted_faults_are_flagged_with_their_reason(fault: str) -> None:
     assert (reason_kind(reason), reason_channel(reason)) == (kind, channel), reason_in_words(reason)
 
 
-def test_without_a_steering_angle_ay_and_yaw_rate_contradict_each_other() -> None:
+def test_without_a_steering_angle_ay_and_yaw_rate_contradict_each_other():
     model, drive = model_of(("yaw_rate", "vx", "ay", "ax")), measured_drive(3)
     found = judged(model, drive, ay=after(drive["ay"], np.negative))
     reason = usual_reason(found, ONSET + round(2 * RATE), ONSET + round(6 * RATE))
     assert reason_in_words(reason) == "ay and yaw_rate contradict each other"
 
 
-def sliding(seed: int, slide: float = 0.0) -> Recording:
+def sliding(seed, slide=0.0):
     """A drive in which v grows by ``slide`` [m/s] and back within 2 s while the car turns, without a change of r or u."""
     drive, ramp = measured_drive(seed), np.zeros(len(measured_drive(seed)))
     first = ONSET + int(np.argmax(np.abs(drive["yaw_rate"][ONSET : ONSET + 1000]))) - 50
@@ -119,7 +115,7 @@ def sliding(seed: int, slide: float = 0.0) -> Recording:
 
 
 @pytest.mark.parametrize(("channels", "accused"), [(("yaw_rate", "vx", "ay", "ax"), False), (("yaw_rate", "vx", "ax"), True)])
-def test_a_slide_does_not_accuse_the_longitudinal_acceleration_where_ay_tells_of_it(channels: tuple[str, ...], accused: bool) -> None:
+def test_a_slide_does_not_accuse_the_longitudinal_acceleration_where_ay_tells_of_it(channels, accused):
     """v r of a slide of 3 m/s is in ax. It is known from ay; without ay it has to go with r², which it does in grip alone."""
     model = learn_health([sliding(0), sliding(1)], [sliding(2)], channels, RATE)
     rows = np.ascontiguousarray(sliding(3, 3.0).stack(channels))
@@ -129,7 +125,7 @@ def test_a_slide_does_not_accuse_the_longitudinal_acceleration_where_ay_tells_of
     assert bool((statistics[:, at] > np.array(model.limits)[at]).any()) is accused
 
 
-def test_a_channel_that_is_lost_degrades_at_once_and_invalidates_after_half_a_second() -> None:
+def test_a_channel_that_is_lost_degrades_at_once_and_invalidates_after_half_a_second():
     drive = measured_drive(3)
     found = judged(model_of(), drive, ay=after(drive["ay"], math.nan))
     assert found.status[ONSET] == DEGRADED
@@ -137,7 +133,7 @@ def test_a_channel_that_is_lost_degrades_at_once_and_invalidates_after_half_a_se
     assert reason_in_words(found.reason[ONSET]) == "ay is not measured"
 
 
-def test_noise_is_flagged_as_noise_and_a_spike_as_a_jump() -> None:
+def test_noise_is_flagged_as_noise_and_a_spike_as_a_jump():
     drive, generator = measured_drive(3), np.random.default_rng(0)
     noisy = judged(model_of(), drive, ax=after(drive["ax"], lambda part: part + 1.0 * generator.standard_normal(len(part))))
     assert reason_in_words(noisy.reason[ONSET + round(RATE)]) in {
@@ -149,7 +145,7 @@ def test_noise_is_flagged_as_noise_and_a_spike_as_a_jump() -> None:
     assert judged(model_of(), drive, steer=spiky).status[ONSET] > VALID
 
 
-def test_a_flag_is_taken_back_after_the_fault() -> None:
+def test_a_flag_is_taken_back_after_the_fault():
     drive = measured_drive(3)
     part = np.array(drive["yaw_rate"])
     part[ONSET : ONSET + 100] += 0.05
@@ -159,7 +155,7 @@ def test_a_flag_is_taken_back_after_the_fault() -> None:
     assert not found.status[ONSET + round(20 * RATE) :].any()
 
 
-def test_one_row_at_a_time_gives_the_bits_of_all_at_once() -> None:
+def test_one_row_at_a_time_gives_the_bits_of_all_at_once():
     model, drive = model_of(), measured_drive(4)
     rows = np.ascontiguousarray(drive.stack(CHANNELS))
     rows[1000:1200, 2] = np.nan
@@ -174,7 +170,7 @@ def test_one_row_at_a_time_gives_the_bits_of_all_at_once() -> None:
     assert np.isfinite(whole.ratio).all()
 
 
-def test_without_compilation_health_is_the_same(tmp_path: Path) -> None:
+def test_without_compilation_health_is_the_same(tmp_path):
     """As under a debugger; 6 s of a drive with a fault."""
     model, drive = model_of(), measured_drive(3)
     rows = np.ascontiguousarray(np.stack([np.asarray(drive[name]) for name in model.channels], axis=1)[:300])
@@ -193,7 +189,7 @@ def test_without_compilation_health_is_the_same(tmp_path: Path) -> None:
     assert (compiled.status != VALID).any()
 
 
-def test_senseless_values_leave_nothing_behind() -> None:
+def test_senseless_values_leave_nothing_behind():
     model, drive = model_of(), measured_drive(4)
     rows = np.ascontiguousarray(drive.stack(CHANNELS))
     healthy = health_rows(model.packed(), rows, np.isfinite(rows), model.start())
@@ -206,14 +202,14 @@ def test_senseless_values_leave_nothing_behind() -> None:
     np.testing.assert_allclose(found.ratio[later], healthy.ratio[later], rtol=0.2, atol=0.05)
 
 
-def test_a_channel_that_never_moved_in_training_can_be_learnt_and_watched() -> None:
+def test_a_channel_that_never_moved_in_training_can_be_learnt_and_watched():
     drives = [replace(drive, channels={**drive.channels, "steer": np.zeros(len(drive))}) for drive in map(measured_drive, range(4))]
     model = learn_health(drives[:2], drives[2:3], CHANNELS, RATE)
     assert not judged(model, drives[3]).status.any()
     assert (judged(model, drives[3], steer=after(drives[3]["steer"], 0.01)).status[ONSET:] > VALID).any()
 
 
-def test_a_car_without_a_measured_speed_is_judged_by_its_motor() -> None:
+def test_a_car_without_a_measured_speed_is_judged_by_its_motor():
     channels = ("ax", "ay", "yaw_rate", "steer", "motor_speed", "motor_current")
     drives = [small_car_drive(60.0, seed) for seed in range(4)]
     model = learn_health(drives[:2], drives[2:3], channels, 100.0)
@@ -224,7 +220,7 @@ def test_a_car_without_a_measured_speed_is_judged_by_its_motor() -> None:
 
 
 @pytest.mark.parametrize("braking", [False, True])
-def test_a_locked_wheel_is_told_from_a_lost_one(braking: bool) -> None:
+def test_a_locked_wheel_is_told_from_a_lost_one(braking):
     model, drive = model_of((*CHANNELS, *WHEELS)), measured_drive(3)
     slows = np.clip(1.0 - np.arange(len(drive) - ONSET) / (0.2 * RATE), 0.0, 1.0)
     faulty = {"wheel_speed_fl": after(drive["wheel_speed_fl"], lambda part: part * slows)}
@@ -240,7 +236,7 @@ def test_a_locked_wheel_is_told_from_a_lost_one(braking: bool) -> None:
     assert words == ("locked wheel: wheel_speed_fl" if braking else "lost wheel: wheel_speed_fl")
 
 
-def test_a_glitch_of_the_recording_is_no_limit() -> None:
+def test_a_glitch_of_the_recording_is_no_limit():
     drive = measured_drive(0)
     steer = np.array(drive["steer"])
     steer[1234] += 0.2
@@ -249,7 +245,7 @@ def test_a_glitch_of_the_recording_is_no_limit() -> None:
     np.testing.assert_allclose(model.limits, model_of().limits, rtol=0.25)
 
 
-def test_what_lies_outside_training_is_said_in_one_line() -> None:
+def test_what_lies_outside_training_is_said_in_one_line():
     model, drive = model_of(), measured_drive(3)
     fast = {name: np.array(drive[name]) for name in CHANNELS}
     assert domain_verdict(model, fast) == ""
@@ -257,29 +253,29 @@ def test_what_lies_outside_training_is_said_in_one_line() -> None:
     assert domain_verdict(model, fast).startswith("25 % of the drive outside what the model learnt: |ay| above ")
 
 
-def test_a_model_comes_back_from_a_file_as_it_was() -> None:
+def test_a_model_comes_back_from_a_file_as_it_was():
     model = model_of()
     read = validated(HealthModel, yaml.safe_load(yaml.safe_dump(plain(asdict(model)))), "'trust.yaml'")
     np.testing.assert_array_equal(read.packed(), model.packed())
 
 
-def plain(value: object) -> object:
+def plain(value):
     """Lists for tuples, as a writer of files has them."""
     if isinstance(value, dict):
         return {key: plain(inner) for key, inner in value.items()}
     return [plain(inner) for inner in value] if isinstance(value, (tuple, list)) else value
 
 
-def test_another_rate_is_refused() -> None:
+def test_another_rate_is_refused():
     with pytest.raises(DataError, match="is sampled at 50 Hz, health is learnt at 20 Hz"):
         learn_health([measured_drive(0)], [], CHANNELS, 20.0)
 
 
-def ferrari(data_root: Path, start: float, stop: float) -> Recording:
+def ferrari(data_root, start, stop):
     return real_drive(data_root).cut(start, stop).without_references()
 
 
-def test_the_ferrari_is_flagged_where_its_own_steering_angle_glitches_and_hardly_anywhere_else(data_root: Path) -> None:
+def test_the_ferrari_is_flagged_where_its_own_steering_angle_glitches_and_hardly_anywhere_else(data_root):
     train, validation = ferrari(data_root, 150.0, 450.0), ferrari(data_root, 450.0, 550.0)
     model = learn_health([train], [validation], CHANNELS, 100.0)
     found = judged(model, validation)
@@ -291,7 +287,7 @@ def test_the_ferrari_is_flagged_where_its_own_steering_angle_glitches_and_hardly
     assert turned.status[ONSET] == INVALID
 
 
-def test_f1tenth_runs_are_judged_without_a_measured_speed(data_root: Path) -> None:
+def test_f1tenth_runs_are_judged_without_a_measured_speed(data_root):
     runs = [real_drive(data_root, f"iros_hoons_1_with_friction_run_{k}", "f1tenth").without_references() for k in (1, 3, 4, 0)]
     channels = ("ax", "ay", "yaw_rate", "steer", "motor_speed", "motor_current")
     model = learn_health(runs[:3], runs[3:], channels, 100.0)
@@ -306,7 +302,7 @@ def test_f1tenth_runs_are_judged_without_a_measured_speed(data_root: Path) -> No
         assert (found.status[first : first + 300] > VALID).any(), channel
 
 
-def test_a_steering_at_its_lock_is_not_frozen(data_root: Path) -> None:
+def test_a_steering_at_its_lock_is_not_frozen(data_root):
     runs = [real_drive(data_root, f"iros_hoons_1_with_friction_run_{k}", "f1tenth").without_references() for k in (1, 2, 3, 4, 0)]
     model = learn_health(runs[:4], runs[4:], ("ax", "ay", "yaw_rate", "steer", "motor_speed", "motor_current"), 100.0)
     assert model.stops[3] == pytest.approx((-0.531, 0.531), rel=3e-3)
@@ -319,7 +315,7 @@ def test_a_steering_at_its_lock_is_not_frozen(data_root: Path) -> None:
     assert any(reason_kind(code) == kernel.FROZEN and reason_channel(code) == "steer" for code in frozen.reason[400:])
 
 
-def test_healthy_samples_behind_the_filter_from_a_faster_bus_are_not_flagged() -> None:
+def test_healthy_samples_behind_the_filter_from_a_faster_bus_are_not_flagged():
     slow = RATE / 5.0
     resampled = [
         transform(measured_drive(number).select(CHANNELS))

@@ -1,7 +1,5 @@
 """The oracle against closed forms, and the autoregression against a planted one."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np
@@ -10,19 +8,19 @@ from measured_drive import CHANNELS, RATE, measured_drive
 
 from vehest.data.errors import DataError
 from vehest.trust.autoregression import Autoregression, fit_autoregression, learn_noise_levels
-from vehest_papers.trust.oracle import Oracle, filtered, known_test, learn_oracle, levels_at, motion_of
+from vehest_papers.trust.oracle import filtered, known_test, learn_oracle, levels_at, motion_of
 
 COEFFICIENTS = np.array([[[0.6, 0.2], [-0.1, 0.5]], [[0.2, 0.0], [0.1, 0.3]]])
 COVARIANCE = np.array([[1.0, 0.3], [0.3, 0.5]])
 
 
-def likelihood_ratio_delay(signature, innovations, covariance, threshold) -> int | None:
+def likelihood_ratio_delay(signature, innovations, covariance, threshold):
     """Samples from the onset of a known fault to its alarm; None if there is none."""
     above = np.flatnonzero(np.cumsum(known_test(signature, covariance)(innovations + signature)) > threshold)
     return int(above[0]) + 1 if len(above) else None
 
 
-def planted(samples: int, seed: int = 0) -> np.ndarray:
+def planted(samples, seed=0):
     """Samples of an autoregression of order 2 around (3, -1)."""
     generator = np.random.default_rng(seed)
     noise = generator.multivariate_normal(np.zeros(2), COVARIANCE, samples)
@@ -32,7 +30,7 @@ def planted(samples: int, seed: int = 0) -> np.ndarray:
     return found + np.array([3.0, -1.0])
 
 
-def test_the_planted_autoregression_is_found_with_its_order() -> None:
+def test_the_planted_autoregression_is_found_with_its_order():
     model = fit_autoregression([planted(20_000, seed) for seed in range(2)], max_order=6)
     assert model.order == 2
     np.testing.assert_allclose(model.coefficients, COEFFICIENTS, atol=0.03)
@@ -40,13 +38,13 @@ def test_the_planted_autoregression_is_found_with_its_order() -> None:
     np.testing.assert_allclose(np.linalg.solve(np.eye(2) - model.coefficients.sum(0), model.constant), [3.0, -1.0], atol=0.4)
 
 
-def test_outliers_hardly_move_the_coefficients() -> None:
+def test_outliers_hardly_move_the_coefficients():
     samples = planted(20_000)
     samples[[500, 7000, 12_000], 0] += 500.0
     np.testing.assert_allclose(fit_autoregression([samples], max_order=4).coefficients[:2], COEFFICIENTS, atol=0.05)
 
 
-def test_a_signature_moves_innovations_by_what_the_filter_makes_of_it() -> None:
+def test_a_signature_moves_innovations_by_what_the_filter_makes_of_it():
     model = fit_autoregression([planted(5000)], max_order=4)
     healthy, signature = planted(300, seed=5), np.zeros((300, 2))
     signature[100:, 1] = np.linspace(0.0, 5.0, 200)
@@ -54,19 +52,19 @@ def test_a_signature_moves_innovations_by_what_the_filter_makes_of_it() -> None:
     np.testing.assert_allclose(moved[model.order :], filtered(model, signature)[model.order :], atol=1e-9)
 
 
-def test_too_few_samples_are_refused() -> None:
+def test_too_few_samples_are_refused():
     with pytest.raises(DataError, match="too few for an autoregression of order 10 in 2 channels"):
         fit_autoregression([planted(60)], max_order=10)
 
 
-def test_noise_that_grows_with_the_speed_is_found() -> None:
+def test_noise_that_grows_with_the_speed_is_found():
     generator = np.random.default_rng(0)
     speed = generator.uniform(10.0, 50.0, 50_000)
     levels = learn_noise_levels((speed / 30.0 * generator.standard_normal(50_000))[:, None], np.ones((1, 1)), speed, 5)
     np.testing.assert_allclose(levels_at(levels, np.array([15.0, 30.0, 45.0]))[:, 0], [0.5, 1.0, 1.5], rtol=0.05)
 
 
-def test_delay_of_a_step_in_white_noise_is_that_of_the_closed_form() -> None:
+def test_delay_of_a_step_in_white_noise_is_that_of_the_closed_form():
     """Wald: the drift of the log-likelihood ratio is Δ²/(2 σ²) a sample, so that log A takes 2 log A σ²/Δ² samples on average."""
     generator = np.random.default_rng(1)
     step, deviation, threshold, drives = 0.3, 1.5, 6.0, 400
@@ -82,7 +80,7 @@ def test_delay_of_a_step_in_white_noise_is_that_of_the_closed_form() -> None:
     assert abs(found.mean() - expected - overshoot) < 3.0 * found.std() / math.sqrt(drives)
 
 
-def test_a_correlated_channel_shortens_the_delay_as_the_information_says() -> None:
+def test_a_correlated_channel_shortens_the_delay_as_the_information_says():
     generator = np.random.default_rng(2)
     covariance = np.array([[1.0, 0.9], [0.9, 1.0]])
     signature = np.tile([0.1, 0.0], (6000, 1))
@@ -95,11 +93,11 @@ def test_a_correlated_channel_shortens_the_delay_as_the_information_says() -> No
 
 
 @pytest.fixture(scope="module")
-def oracle() -> Oracle:
+def oracle():
     return learn_oracle([measured_drive(0), measured_drive(1)], [measured_drive(2)], CHANNELS, RATE)
 
 
-def test_the_oracle_sees_larger_faults_sooner_and_small_ones_not_at_all(oracle: Oracle) -> None:
+def test_the_oracle_sees_larger_faults_sooner_and_small_ones_not_at_all(oracle):
     drive = {name: np.array(measured_drive(3)[name]) for name in CHANNELS}
     ramp = np.maximum(np.arange(len(drive["ay"])) - 2000, 0) / RATE
     seen = [oracle.sees(drive, {**drive, "ay": drive["ay"] + slope * ramp}, 2000) for slope in (1e-4, 0.3, 1.0, 5.0)]
@@ -107,14 +105,14 @@ def test_the_oracle_sees_larger_faults_sooner_and_small_ones_not_at_all(oracle: 
     assert seen[1].delay > seen[2].delay > seen[3].delay > 0.0
 
 
-def test_what_is_not_finite_is_seen_at_its_first_sample(oracle: Oracle) -> None:
+def test_what_is_not_finite_is_seen_at_its_first_sample(oracle):
     drive = {name: np.array(measured_drive(3)[name]) for name in CHANNELS}
     lost = np.array(drive["yaw_rate"])
     lost[2010:2020] = np.nan
     assert oracle.sees(drive, {**drive, "yaw_rate": lost}, 2000).delay == pytest.approx(11 / RATE)
 
 
-def test_random_noise_is_seen_by_its_size_and_not_by_its_draws(oracle: Oracle) -> None:
+def test_random_noise_is_seen_by_its_size_and_not_by_its_draws(oracle):
     drive = {name: np.array(measured_drive(3)[name]) for name in CHANNELS}
     added = np.random.default_rng(0).standard_normal(len(drive["ay"])) * (np.arange(len(drive["ay"])) >= 2000)
     loud, faint = (oracle.sees(drive, {**drive, "ay": drive["ay"] + size * added}, 2000, drawn=True) for size in (1.0, 0.01))
@@ -124,7 +122,7 @@ def test_random_noise_is_seen_by_its_size_and_not_by_its_draws(oracle: Oracle) -
     assert known.delay <= loud.delay
 
 
-def test_motion_keeps_swerves_and_drops_noise() -> None:
+def test_motion_keeps_swerves_and_drops_noise():
     time = np.arange(2000) / 100.0
     noise = np.random.default_rng(0).standard_normal(2000)
     swerve = 3.0 * np.sin(2.0 * np.pi * 0.4 * time)
@@ -132,7 +130,7 @@ def test_motion_keeps_swerves_and_drops_noise() -> None:
     assert left[200:-200].std() < 0.4
 
 
-def test_innovations_of_an_order_are_missing_for_as_many_samples() -> None:
+def test_innovations_of_an_order_are_missing_for_as_many_samples():
     model = Autoregression(np.zeros(1), np.array([[[0.5]], [[0.1]]]), np.ones((1, 1)))
     found = model.innovations(np.arange(5.0)[:, None])[:, 0]
     np.testing.assert_allclose(found[2:], [2 - 0.5 * 1 - 0.1 * 0, 3 - 0.5 * 2 - 0.1 * 1, 4 - 0.5 * 3 - 0.1 * 2])

@@ -1,7 +1,5 @@
 """What follows from health: who still gets a channel, who starts anew, how wide a band is."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np
@@ -10,11 +8,7 @@ import pytest
 from vehest.trust import health_kernel as kernel
 from vehest.trust.guard import RESTART, USE
 from vehest.trust.health import BEYOND_SPEED, NO_ESTIMATE, NUMBERS, TOO_WIDE, reason_in_words
-from vehest.trust.verdict import (
-    isolate_rows,
-    verdict_rows,
-    widen_rows,
-)
+from vehest.trust.verdict import isolate_rows, verdict_rows, widen_rows
 from vehest.trust.watch import CLIPPED, EXTRAPOLATED, SPINNING
 
 CHANNELS = ("yaw_rate", "vx", "ay")
@@ -23,11 +17,11 @@ STEPS = 60
 NUMBERS_OF = np.array([NUMBERS[name] for name in CHANNELS])
 
 
-def code(kind: int, channel: str) -> float:
+def code(kind, channel):
     return 10_000.0 * kind + 100.0 * NUMBERS[channel]
 
 
-def heeded(kind: int, channel: str, *, rollback: int = 0, starts_anew: bool = True, status: int = 2, first: int = 10, last: int = 40):
+def heeded(kind, channel, *, rollback=0, starts_anew=True, status=2, first=10, last=40):
     """Rows, what was measured and the flow after a fault that health sees from ``first`` to ``last``."""
     statuses, reasons = np.zeros(STEPS), np.zeros(STEPS)
     statuses[first:last], reasons[first:last] = status, code(kind, channel)
@@ -90,13 +84,7 @@ def test_the_verdict_names_what_guard_and_watch_know():
     verdict_rows(np.ones(5), marks, np.zeros(5, np.int8), measured, ~SKIPPABLE, NUMBERS_OF, status, reason)
     assert status.tolist() == [0, 1, 1, 2, 2]
     said = [reason_in_words(own) for own in reason]
-    assert said == [
-        "",
-        "vx is not measured",
-        "spin",
-        "the estimate exceeds what the speed allows",
-        "there is no estimate",
-    ]
+    assert said == ["", "vx is not measured", "spin", "the estimate exceeds what the speed allows", "there is no estimate"]
     assert reason[3] == BEYOND_SPEED * 10_000
     assert reason[4] == NO_ESTIMATE * 10_000
 

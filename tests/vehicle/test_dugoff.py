@@ -1,11 +1,8 @@
 """Dugoff's tyres and the single track on them: readable, compiled and through the filter the same, gradients finite at a slip of zero."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import torch
-from torch import Tensor
 
 from dugoff_drive import FRONT, dugoff_track
 from vehest.estimators.filtering.track_filter import TrackFilter
@@ -18,11 +15,11 @@ BOTH = pytest.mark.parametrize("tyres", ["plain", "smooth"])
 LOAD, SPEED = torch.tensor(9000.0, dtype=torch.float64), torch.tensor(25.0, dtype=torch.float64)
 
 
-def drawn(*shape: int, seed: int = 0) -> Tensor:
+def drawn(*shape, seed=0):
     return torch.randn(shape, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
 
 
-def driven(count: int) -> tuple[Tensor, Tensor]:
+def driven(count):
     """Points from straight ahead to a spin, and inputs from a standstill to fast."""
     points = drawn(count, 5, 2) * torch.tensor([3.0, 1.0])
     inputs = torch.stack([40.0 * torch.rand(count, dtype=torch.float64), 0.2 * drawn(count, seed=1), 4.0 * drawn(count, seed=2)], -1)
@@ -30,8 +27,8 @@ def driven(count: int) -> tuple[Tensor, Tensor]:
     return points, inputs
 
 
-def force(tangent: Tensor, tyres: str) -> Tensor:
-    return FRONT.force(tangent, LOAD, SPEED, tyres)  # type: ignore[arg-type]
+def force(tangent, tyres):
+    return FRONT.force(tangent, LOAD, SPEED, tyres)
 
 
 def test_tyres_are_those_of_the_paper():
@@ -96,7 +93,7 @@ def test_gradients_through_the_filter_reach_measurements_and_both_noises():
     given[0][0, 3, 2] = torch.nan
     weights = drawn(3, 8, 2, seed=6)
 
-    def outcome(parts: list[Tensor], *, compiled: bool = True) -> Tensor:
+    def outcome(parts, *, compiled=True):
         measurements, process, sensors = parts
         noises = (torch.diag_embed(part.square()) for part in (process, sensors))
         own = TrackFilter(track)
@@ -105,7 +102,7 @@ def test_gradients_through_the_filter_reach_measurements_and_both_noises():
         filtered = own.filtered(measurements, inputs, *noises)
         return (filtered.steps.filtered.mean * weights).sum()
 
-    def gradients(*, compiled: bool) -> list[Tensor]:
+    def gradients(*, compiled):
         leaves = [part.clone().requires_grad_() for part in given]
         return list(torch.autograd.grad(outcome(leaves, compiled=compiled), leaves))
 

@@ -1,7 +1,5 @@
 """The planar car with Pacejka's tyres against scipy's integrator, statics, symmetry and the linear single track."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np
@@ -21,16 +19,16 @@ TYRES |= {f"{name}_{axle}": value for axle in ("front", "rear") for name, value 
 
 
 @pytest.fixture
-def car() -> tuple[PlanarCar, PacejkaTyres]:
+def car():
     return PlanarCar().double().requires_grad_(False), PacejkaTyres(TYRES).double().requires_grad_(False)
 
 
-def rates(car, state: torch.Tensor, inputs: torch.Tensor) -> torch.Tensor:
+def rates(car, state, inputs):
     chassis, tyres = car
     return chassis.motion(state, inputs, tyres(chassis.slips(state, inputs), chassis.loads())).rates
 
 
-def tensor(*values: float) -> torch.Tensor:
+def tensor(*values):
     return torch.tensor(values, dtype=torch.float64)
 
 

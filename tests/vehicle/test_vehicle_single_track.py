@@ -1,7 +1,5 @@
 """The linear single track against Newton's laws, its characteristic polynomial and the steady-state yaw gain."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from scipy import linalg

@@ -4,8 +4,6 @@ Models in cars must stay usable. test_yesterdays_models.py compares; this script
 ``PYTHONPATH=tests:src python tests/yesterday/make_models.py FAMILY...``. It leaves folders that are there as they are.
 """
 
-from __future__ import annotations
-
 import sys
 from pathlib import Path
 
@@ -13,9 +11,7 @@ from conftest import planar_drive
 from every_estimator import drive_for, fitted
 from single_track_drive import linear_drive
 from small_car_drive import small_car_drive
-from vehest.data.recording import Recording
 from vehest.data.store import write_estimate, write_recording
-from vehest.estimators.base import Estimator
 from vehest.estimators.model_files import save_model
 from vehest.estimators.registry import estimator_names
 from vehest.run.calibrate import Stretch, learn_trust
@@ -27,13 +23,13 @@ SECONDS = 5.0
 PREPARATION = {"method": "polyphase", "transforms": []}
 
 
-def drive_name(estimator: Estimator) -> str:
+def drive_name(estimator):
     """File of the drive that suits an estimator's channels, at its rate."""
     kind = "small_car" if "motor_current" in estimator.channels else "steered" if "steer" in estimator.channels else "planar"
     return f"{kind}_{estimator.settings.rate_hz:g}hz.parquet"
 
 
-def _drives(estimator: Estimator) -> tuple[Recording, Recording]:
+def _drives(estimator):
     """Drives with reference to learn bands, limits and health from."""
     rate = estimator.settings.rate_hz
     if "motor_current" in estimator.channels:
@@ -43,7 +39,7 @@ def _drives(estimator: Estimator) -> tuple[Recording, Recording]:
     return planar_drive(20.0, rate, noise=0.05), planar_drive(15.0, rate, seed=1, noise=0.05)
 
 
-def main() -> None:
+def main():
     """Make what is missing."""
     for name in sys.argv[1:] or estimator_names():
         folder = HERE / "models" / name

@@ -1,7 +1,5 @@
 """Models that were saved before a refactoring give the estimates that they gave then, with their bands and their health."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 
@@ -21,13 +19,13 @@ MODELS = sorted(folder.name for folder in (HERE / "models").iterdir())
 TOLERANCE = 1e-6
 
 
-def drive_file(channels: tuple[str, ...], rate_hz: float) -> Path:
+def drive_file(channels, rate_hz):
     kind = "small_car" if "motor_current" in channels else "steered" if "steer" in channels else "planar"
     return HERE / "drives" / f"{kind}_{rate_hz:g}hz.parquet"
 
 
 @pytest.mark.parametrize("name", MODELS)
-def test_a_model_of_yesterday_estimates_as_it_did(name: str) -> None:
+def test_a_model_of_yesterday_estimates_as_it_did(name):
     folder, model, trust = open_model(str(HERE / "models" / name), HERE, print)
     drive = read_recording(drive_file(tuple(model.channels), model.settings.rate_hz))
     then = read_estimate(folder / "estimate.parquet")
@@ -41,7 +39,7 @@ def test_a_model_of_yesterday_estimates_as_it_did(name: str) -> None:
         np.testing.assert_allclose(now[channel], values, rtol=0.0, atol=TOLERANCE, equal_nan=True, err_msg=f"{name}: {channel}")
 
 
-def test_the_command_gives_the_same(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_command_gives_the_same(tmp_path, monkeypatch, capsys):
     folder = HERE / "models" / "ksnn"
     model = load_model(folder)
     drive = read_recording(drive_file(tuple(model.channels), model.settings.rate_hz))
@@ -56,7 +54,7 @@ def test_the_command_gives_the_same(tmp_path: Path, monkeypatch: pytest.MonkeyPa
         np.testing.assert_allclose(table[channel], wider.get(channel, 1.0) * then[channel], rtol=0.0, atol=TOLERANCE, equal_nan=True)
 
 
-def test_every_family_has_a_model_of_yesterday() -> None:
+def test_every_family_has_a_model_of_yesterday():
     from vehest.estimators.registry import estimator_class, estimator_names
 
     own = [name for name in estimator_names() if estimator_class(name).__module__.startswith("vehest.")]

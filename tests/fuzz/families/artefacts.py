@@ -1,40 +1,29 @@
 """What stands in an output root and beside it: manifests, models, checkpoints, files, links, the MLflow store, checksums."""
 
-from __future__ import annotations
-
 import hashlib
 import json
 import math
 import os
 import sqlite3
 import struct
-from collections.abc import Callable
-from pathlib import Path
-from random import Random
-from typing import Any
 
 import numpy as np
 import yaml
 from safetensors.numpy import load_file, save_file
 
-from fuzz.case import Case, Command, generator, template
+from fuzz.case import Command, generator, template
 from fuzz.honest import KSNN, drives, run, write_yaml
 from fuzz.mutations import NAMES, WRITABLE_NAMES, spoil_bytes, spoil_json, spoil_text, spoil_yaml
 from place import DATASET
 
 STAGES = ("ingest", "downsample", "train", "calibrate", "evaluate", "report")
 TRACKED = tuple(word for word in KSNN if not word.startswith("tracking"))
-STATEMENTS = (
-    "DELETE FROM experiments",
-    "DROP TABLE runs",
-    "UPDATE alembic_version SET version_num = 'x'",
-    "DROP TABLE alembic_version",
-)
+STATEMENTS = ("DELETE FROM experiments", "DROP TABLE runs", "UPDATE alembic_version SET version_num = 'x'", "DROP TABLE alembic_version")
 URLS = ("file:///etc", "ftp://x", "", "http://", "https://[", "x" * 9999, "https://\x1b[2J")
-SETTINGS: tuple[Any, ...] = (0, -1, 1, 10**9, 10**18, 1e-12, math.nan, math.inf, "a", None, [], True, 2.5)
+SETTINGS = (0, -1, 1, 10**9, 10**18, 1e-12, math.nan, math.inf, "a", None, [], True, 2.5)
 
 
-def _mend(folder: Path) -> None:
+def _mend(folder):
     """Let the manifest name the files as they are now, so that they are read."""
     file = folder / "manifest.json"
     content = json.loads(file.read_text())
@@ -44,14 +33,14 @@ def _mend(folder: Path) -> None:
     file.write_text(json.dumps(content))
 
 
-def _put(file: Path, how: int) -> None:
+def _put(file, how):
     """Something else in the place of a file: nothing, a folder, a pipe, a link."""
     file.unlink()
-    makers: list[Callable[[], None]] = [lambda: None, file.mkdir, lambda: os.mkfifo(file), file.touch]
+    makers = [lambda: None, file.mkdir, lambda: os.mkfifo(file), file.touch]
     [*makers, lambda: file.symlink_to("/dev/zero"), lambda: file.symlink_to(file.name)][how % 6]()
 
 
-def _rename(content: bytes, case: Case) -> bytes:
+def _rename(content, case):
     """Labels and file names in a manifest that lead elsewhere."""
     tree = json.loads(content)
     name = case.rng.choice([*NAMES, str(case.folder / "evil"), "../../../../evil", str(case.place / "raw" / "evil")])
@@ -62,7 +51,7 @@ def _rename(content: bytes, case: Case) -> bytes:
     return json.dumps(tree).encode()
 
 
-def _with_header(content: bytes, change: Callable[[bytes], bytes], rng: Random) -> bytes:
+def _with_header(content, change, rng):
     """A safetensors file whose JSON at the head, or its length, is another."""
     (length,) = struct.unpack("<Q", content[:8])
     header = change(content[8 : 8 + length])
@@ -72,7 +61,7 @@ def _with_header(content: bytes, change: Callable[[bytes], bytes], rng: Random) 
 
 
 @generator("study", weight=8)
-def manifest(case: Case) -> Command:
+def manifest(case):
     """Manifests and files of every stage; a file is spoilt while the manifest still agrees with its size."""
     case.copy("study")
     folder = case.rng.choice([folder for stage in STAGES for folder in sorted((case.place / "outputs" / stage).glob("*"))])
@@ -94,7 +83,7 @@ def manifest(case: Case) -> Command:
 
 
 @generator("study", weight=2)
-def leftovers(case: Case) -> Command:
+def leftovers(case):
     """Links, half-written folders and files among the artefacts; what stands where the output root belongs."""
     case.copy("study")
     outputs, elsewhere = case.place / "outputs", case.folder / "elsewhere"
@@ -115,7 +104,7 @@ def leftovers(case: Case) -> Command:
 
 
 @generator("study", weight=10)
-def model(case: Case) -> Command:
+def model(case):
     """model.yaml, model.safetensors with its header, manifest.json; names of models and folders that are none."""
     case.copy("study")
     folder, rng, how = case.rng.choice(sorted((case.place / "outputs" / "train").iterdir())), case.rng, case.idea(7)
@@ -144,7 +133,7 @@ def model(case: Case) -> Command:
     return Command(rng.choice(used))
 
 
-def _other_setting(content: bytes, rng: Random) -> bytes:
+def _other_setting(content, rng):
     """One setting of the model far outside of what makes sense, or another estimator."""
     tree = yaml.safe_load(content)
     tree["settings"][rng.choice(list(tree["settings"]))] = rng.choice(SETTINGS)
@@ -153,10 +142,10 @@ def _other_setting(content: bytes, rng: Random) -> bytes:
     return yaml.safe_dump(tree).encode()
 
 
-def _other_weights(file: Path, case: Case) -> None:
+def _other_weights(file, case):
     held, rng = load_file(file), case.rng
     name = rng.choice(list(held))
-    changes: list[dict[str, Any]] = [
+    changes = [
         {name: np.full_like(held[name], rng.choice([math.nan, 1e30, -1e30, math.inf]))},
         {name: held[name].ravel()[:1].copy()},
         {name: np.zeros((3, 0, 2))},
@@ -171,7 +160,7 @@ def _other_weights(file: Path, case: Case) -> None:
 
 
 @template
-def unfinished(folder: Path) -> None:
+def unfinished(folder):
     """An output root with the checkpoint of a training that was killed."""
     from vehest.run import group
 
@@ -188,14 +177,14 @@ def unfinished(folder: Path) -> None:
         file.unlink()
 
 
-def _other_values(header: bytes, rng: Random) -> bytes:
+def _other_values(header, rng):
     tree = json.loads(header)
     tree["__metadata__"]["values"] = spoil_json(tree["__metadata__"]["values"].encode(), rng).decode("utf-8", "replace")
     return json.dumps(tree).encode()
 
 
 @generator("unfinished", weight=3)
-def checkpoint(case: Case) -> Command:
+def checkpoint(case):
     case.copy("unfinished")
     file, change = sorted((case.place / "outputs" / "checkpoints").rglob("*.safetensors"))[0], case.rng.choice([_other_values, spoil_json])
     if case.rng.random() < 0.3:
@@ -206,7 +195,7 @@ def checkpoint(case: Case) -> Command:
 
 
 @template
-def tracked(folder: Path) -> None:
+def tracked(folder):
     """A training and its evaluation, logged in a local store."""
     drives(folder)
     run("train", *TRACKED, "--quiet")
@@ -214,7 +203,7 @@ def tracked(folder: Path) -> None:
 
 
 @generator("tracked", weight=2)
-def tracking_store(case: Case) -> Command:
+def tracking_store(case):
     """The store is damaged, or something else stands in its place: work goes on without it and says so."""
     case.copy("tracked")
     store, how = case.place / "outputs" / "mlflow.db", case.idea(4)
@@ -230,7 +219,7 @@ def tracking_store(case: Case) -> Command:
 
 
 @generator("drives", weight=2)
-def downloads(case: Case) -> Command:
+def downloads(case):
     """All files are there already; the record of their checksums, or what is declared, is spoilt. Nothing is fetched."""
     raw = case.copy("drives") / "raw"
     sums = {file.name: hashlib.sha256(file.read_bytes()).hexdigest() for file in sorted(raw.iterdir())}

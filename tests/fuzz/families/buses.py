@@ -1,21 +1,16 @@
 """Logs of a CAN bus with their DBC, and logs of a VBOX: bytes, lines, sections, numbers, clocks."""
 
-from __future__ import annotations
-
-from pathlib import Path
-from typing import Any
-
 import vbo_log
 from can_drive import SIGNALS, write_log
 
 from conftest import planar_drive
-from fuzz.case import Case, Command, generator, template
+from fuzz.case import Command, generator, template
 from fuzz.honest import write_yaml
 from fuzz.mutations import NAMES, WRITABLE_NAMES, spoil_bytes
 
 TOLD = "vx=Speed.VehSpd,yaw_rate=YawRate,ax=AccLong,ay=-AccLat"
 SUFFIXES = (".asc", ".blf", ".log")
-BUS: dict[str, Any] = {"name": "logs", "kind": "real", "vehicle": "car", "licence": "none", "citation": "none", "source": "can"}
+BUS = {"name": "logs", "kind": "real", "vehicle": "car", "licence": "none", "citation": "none", "source": "can"}
 BUS |= {"path": "${root}", "files": "drive.*", "dbc": "${root}/car.dbc", "rate_hz": 100}
 BUS |= {"channels": {name: SIGNALS[name] for name in ("vx", "yaw_rate", "ax", "ay")}}
 LINES_OF_A_LOG = (
@@ -36,13 +31,13 @@ CLOCKS = (0.0, 86_395.0, 86_399.99, 43_200.0)
 
 
 @template
-def can(folder: Path) -> None:
+def can(folder):
     """A drive of ten seconds in every format."""
     for suffix in SUFFIXES:
         write_log(planar_drive(10.0, 100.0, seed=1), folder / suffix[1:], suffix, jitter=0.0005, lost=0.003)
 
 
-def _swap(case: Case, file: Path, lines: tuple[tuple[bytes, bytes], ...]) -> None:
+def _swap(case, file, lines):
     """Replace one thing by another, once or everywhere; or spoil bytes."""
     if case.rng.random() < 0.5:
         case.spoil(file, spoil_bytes)
@@ -50,7 +45,7 @@ def _swap(case: Case, file: Path, lines: tuple[tuple[bytes, bytes], ...]) -> Non
         case.spoil(file, lambda content, rng: content.replace(*rng.choice(lines), rng.choice([1, 1, 5, -1]))[: 4 * 2**20])
 
 
-def _reads(case: Case, file: str) -> list[tuple[str, ...]]:
+def _reads(case, file):
     return [
         ("estimate", "pretrained", file, "dataset=logs", "-o", "out.csv"),
         ("ingest", "logs"),
@@ -59,7 +54,7 @@ def _reads(case: Case, file: str) -> list[tuple[str, ...]]:
 
 
 @generator("can", weight=5)
-def log_of_a_bus(case: Case) -> Command:
+def log_of_a_bus(case):
     suffix = SUFFIXES[case.visit % 3]
     folder = case.copy(f"can/{suffix[1:]}", "raw")
     write_yaml(case.place / "conf/dataset/logs.yaml", BUS)
@@ -75,7 +70,7 @@ def log_of_a_bus(case: Case) -> Command:
 
 
 @generator(weight=4)
-def vbo(case: Case) -> Command:
+def vbo(case):
     more = {} if case.honest or case.rng.random() < 0.8 else {"clock": "interpolate"}
     write_yaml(case.place / "conf/dataset/logs.yaml", vbo_log.dataset(case.place / "raw") | {"title": "Logs"} | more)
     units = vbo_log.UNITS

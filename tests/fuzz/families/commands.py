@@ -1,14 +1,9 @@
 """Words after commands: overrides in Hydra's grammar and out of it, options of every command in any combination, completion."""
 
-from __future__ import annotations
-
-import random
-from typing import Any
-
 import click
 import typer
 
-from fuzz.case import CANARY, Case, Command, generator
+from fuzz.case import CANARY, Command, generator
 from fuzz.honest import KALMAN, KSNN, LUENBERGER
 from fuzz.mutations import CALL, WRITABLE_NAMES
 from vehest.cli import app
@@ -39,12 +34,12 @@ FORMS = (
 )  # fmt: skip
 
 
-def _override(rng: random.Random) -> str:
+def _override(rng):
     form = "{key}={value}" if rng.random() < 0.6 else rng.choice(FORMS)
     return form.format(key=rng.choice(KEYS), value=rng.choice(VALUES))
 
 
-BASES: tuple[tuple[str, ...], ...] = (
+BASES = (
     ("train", *KSNN, "--dry-run"),
     ("train", *LUENBERGER, "--dry-run"),
     ("train", *KALMAN, "--dry-run"),
@@ -69,7 +64,7 @@ SWEEPS = (
 
 
 @generator("drives", "steered", weight=10)
-def overrides(case: Case) -> Command:
+def overrides(case):
     case.copy("drives")
     case.copy("steered")
     more = () if case.honest else (_override(case.rng) for _ in range(case.rng.choice([1, 1, 1, 2, 3])))
@@ -77,7 +72,7 @@ def overrides(case: Case) -> Command:
 
 
 @generator("study", "steered", weight=5)
-def settings(case: Case) -> Command:
+def settings(case):
     """A value far outside of what makes sense reaches a training or an evaluation that really runs, as small as it can be."""
     case.copy("study")
     case.copy("steered")
@@ -88,18 +83,18 @@ def settings(case: Case) -> Command:
 
 
 @generator("drives", weight=3)
-def sweep(case: Case) -> Command:
+def sweep(case):
     case.copy("drives")
     words = ("seed=0,1",) if case.honest else SWEEPS[case.visit % len(SWEEPS)].split()
     name = () if case.honest or case.rng.random() < 0.5 else ("--name", case.rng.choice(WRITABLE_NAMES))
     return Command(("sweep", *KSNN, *words, *name, "--dry-run"))
 
 
-def _commands() -> dict[tuple[str, ...], click.Command]:
+def _commands():
     """Every command of the application by its words."""
     root = typer.main.get_command(app)
-    found: dict[tuple[str, ...], click.Command] = {}
-    pending: list[tuple[tuple[str, ...], Any]] = [((), root)]
+    found = {}
+    pending = [((), root)]
     while pending:
         words, command = pending.pop()
         if hasattr(command, "commands"):
@@ -109,7 +104,7 @@ def _commands() -> dict[tuple[str, ...], click.Command]:
     return dict(sorted(found.items()))
 
 
-HONEST: dict[tuple[str, ...], tuple[str, ...]] = {
+HONEST = {
     ("ingest",): ("mine", "--quiet"),
     ("simulate",): ("sim_small", "--dry-run"),
     ("downsample",): ("mine", "rate_hz=20", "--json"),
@@ -130,13 +125,13 @@ HONEST: dict[tuple[str, ...], tuple[str, ...]] = {
 
 
 @generator("study", weight=8)
-def options(case: Case) -> Command:
+def options(case):
     """Options of a command, in any combination and with any value; arguments that are missing, wrong or too many."""
     case.copy("study")
     words, command = case.rng.choice([one for one in _commands().items() if one[0] != ("data", "list") or case.rng.random() < 0.1])
     if case.honest:
         return Command((*words, *HONEST.get(words, ("--help",))))
-    chosen: list[str] = []
+    chosen = []
     for parameter in command.params:
         if isinstance(parameter, click.Option):
             if case.rng.random() < 0.35:
@@ -152,7 +147,7 @@ def options(case: Case) -> Command:
     return Command((*words, *safe[:1], *dry, *safe[1:]), targets=("out.csv", "out.parquet", "out"))
 
 
-def _option(option: click.Option, rng: random.Random) -> list[str]:
+def _option(option, rng):
     name = rng.choice([*option.opts, *option.secondary_opts])
     if option.is_flag:
         return [name]
@@ -164,7 +159,7 @@ def _option(option: click.Option, rng: random.Random) -> list[str]:
     return rng.choice([[name, value], [f"{name}={value}"], [name]])
 
 
-def _argument(argument: click.Parameter, words: tuple[str, ...], rng: random.Random) -> list[str]:
+def _argument(argument, words, rng):
     sound = {"dataset": "mine", "source": "lap.csv", "pipeline": "small", "command": "train", "model": "lap.csv"}
     if argument.name == "overrides":
         return [_override(rng) for _ in range(rng.randrange(3))]
@@ -174,7 +169,7 @@ def _argument(argument: click.Parameter, words: tuple[str, ...], rng: random.Ran
 
 
 @generator("study", weight=2)
-def completion(case: Case) -> Command:
+def completion(case):
     """What a shell asks for while somebody types."""
     case.copy("study")
     words = ["vehest", *case.rng.choice(TYPED)]

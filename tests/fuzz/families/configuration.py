@@ -1,13 +1,10 @@
 """./conf, which Hydra alone reads: files of every group, spoilt; tags, interpolations, other encodings. ./pipelines, bombs of aliases."""
 
-from __future__ import annotations
-
 import os
-from typing import Any
 
 import yaml
 
-from fuzz.case import Case, Command, generator
+from fuzz.case import Command, generator
 from fuzz.honest import KSNN, LUENBERGER, PIPELINE, SPLIT, write_yaml
 from fuzz.mutations import NAMES, WRITABLE_NAMES, hostile, spoil_items, spoil_yaml, yaml_of
 from place import DATASET
@@ -21,7 +18,7 @@ DATASETS = (
     "tum", "f1tenth", "f1tenth_bag", "ferrari_250lm", "revs_targa_2014", "mdf", "sim_quickstart", "sim_small", "sim_fleet", "sim_bmw",
     "sim_two_cars", "sim_heavy", "sim_fleet_real",
 )  # fmt: skip
-DERIVED: dict[str, Any] = DATASET | {
+DERIVED = DATASET | {
     "transforms": [{"name": "acceleration_from_speed", "cutoff_hz": 5.0}, {"name": "sideslip_from_velocity"}],
     "reference_point": {"x": 0.4, "y": -0.1},
     "imu_point": "unknown",
@@ -29,14 +26,14 @@ DERIVED: dict[str, Any] = DATASET | {
     "time_restarts": True,
 }
 POSITION = {"x": {"column": "Speed", "unit": "m"}, "y": {"column": "Vy", "unit": "m"}, "yaw": {"column": "Yaw", "unit": "deg"}}
-MORE_DERIVED: tuple[dict[str, Any], ...] = (
+MORE_DERIVED = (
     {},
     {"held": {"channels": ["ay", "ax"], "updated": "Time", "delay": 0.01}},
     {"pose": {**POSITION, "window": 9, "order": 2, "channels": ["vx_ref", "yaw_rate_ref"]}},
     {"exclude": ["t*", "nobody*"]},
     {"transforms": [{"name": "scale_to_wheelbase", "wheelbase": 2.5, "to": 2.5}]},
 )
-SPLITS: tuple[dict[str, Any], ...] = (
+SPLITS = (
     SPLIT,
     SPLIT | {"train": [{"recordings": "o*", "keep": {"magnitude": {"vx": {"at_least": 1.0}}, "at_least_seconds": 2.0}}]},
     {"name": "mine", "dataset": "mine", "train": "60 %", "validation": "20%", "tests": {"test": "20 %"}},
@@ -46,7 +43,7 @@ SPLITS: tuple[dict[str, Any], ...] = (
 )
 PORTIONS = ("101 %", "-5 %", "1e999 %", "last 0 laps", "first " + "9" * 20, "0", "9 to 3", "last\nlap", "%", "NaN %")
 PARTS = {"parts": {part: {"split": "mine", "title": part, "sweeps": PIPELINE["sweeps"][:1]} for part in "ab"}}
-PIPELINES: tuple[dict[str, Any], ...] = (
+PIPELINES = (
     PIPELINE,
     {key: value for key, value in PIPELINE.items() if key not in ("split", "sweeps")} | PARTS,
     PIPELINE | {"about": "what", "publish": False, "based_on": "quickstart"},
@@ -54,7 +51,7 @@ PIPELINES: tuple[dict[str, Any], ...] = (
 )
 
 
-def _write(case: Case, name: str, tree: Any, head: str = "") -> None:
+def _write(case, name, tree, head=""):
     """Write a configuration file, spoilt unless the case is honest; of one that builds on others, the rest."""
     if case.honest:
         case.write(name, head + yaml_of(tree))
@@ -64,14 +61,14 @@ def _write(case: Case, name: str, tree: Any, head: str = "") -> None:
         case.write(name, head.encode() + spoil_yaml(tree, case.rng, bombs=name.startswith("pipelines/")))
 
 
-def _write_packaged(case: Case, group: str, name: str, **changes: Any) -> None:
+def _write_packaged(case, group, name, **changes):
     """A packaged file, with the line that it must begin with, in ./conf."""
     text = (packaged_conf() / group / f"{name}.yaml").read_text(encoding="utf-8")
     _write(case, f"conf/{group}/{name}.yaml", yaml.safe_load(text) | changes, HEAD if text.startswith(HEAD) else "")
 
 
 @generator("drives", weight=8)
-def dataset(case: Case) -> Command:
+def dataset(case):
     """A table's channels, transforms, points, poses, held channels, rows that are dropped, time that restarts."""
     case.copy("drives")
     _write(
@@ -85,7 +82,7 @@ def dataset(case: Case) -> Command:
 
 
 @generator(weight=6)
-def packaged_dataset(case: Case) -> Command:
+def packaged_dataset(case):
     """The data sets that come with vehest, whose files are not here, and the vehicles of the simulated ones."""
     name = case.rng.choice(DATASETS)
     if name.startswith("sim_") and case.rng.random() < 0.3:
@@ -99,7 +96,7 @@ def packaged_dataset(case: Case) -> Command:
 
 
 @generator("drives", weight=6)
-def split(case: Case) -> Command:
+def split(case):
     """Recordings, percentages, laps and folds; honest drives of half a minute have no laps."""
     case.copy("drives")
     tree = case.rng.choice(SPLITS[:1] + SPLITS[2:5] if case.honest else SPLITS)
@@ -110,7 +107,7 @@ def split(case: Case) -> Command:
 
 
 @generator("drives", "steered", weight=8)
-def estimator(case: Case) -> Command:
+def estimator(case):
     """conf/estimator and conf/training of every method."""
     case.copy("drives")
     case.copy("steered")
@@ -129,7 +126,7 @@ def estimator(case: Case) -> Command:
 
 
 @generator("drives", weight=5)
-def root_file(case: Case) -> Command:
+def root_file(case):
     """./conf/common.yaml, train.yaml and the like stand before the packaged ones; files of ./conf that hold any value at all."""
     case.copy("drives")
     commands = {"common": ("ingest", "mine"), "ingest": ("ingest", "mine"), "estimate": ("estimate", "lap.csv", "-o", "out.csv")}
@@ -154,7 +151,7 @@ def root_file(case: Case) -> Command:
 
 
 @generator("drives", weight=2)
-def odd_files(case: Case) -> Command:
+def odd_files(case):
     """Names, links, pipes and sizes of files in ./conf."""
     case.copy("drives")
     file, how = case.place / "conf" / "dataset" / "odd.yaml", case.idea(6)
@@ -175,7 +172,7 @@ def odd_files(case: Case) -> Command:
 
 
 @generator("drives", "study", weight=8)
-def pipeline(case: Case) -> Command:
+def pipeline(case):
     """Studies of one's own and packaged ones; titles and texts that end up in tables, figures and pages."""
     how = case.idea(8)
     case.copy("study" if how == 0 else "drives")

@@ -1,28 +1,23 @@
 """MDF files of versions 3 and 4: conversions, formulas that hold code, packed blocks, links that go round, flipped bytes."""
 
-from __future__ import annotations
-
 import struct
-from pathlib import Path
-from random import Random
-from typing import Any
 
 import numpy as np
 from mdf_log import ONE, write_mdf
 
-from fuzz.case import CANARY, Case, Command, generator, template
+from fuzz.case import CANARY, Command, generator, template
 from fuzz.honest import write_yaml
 from fuzz.mutations import CALL, WRITABLE_NAMES, spoil_bytes
 
 TIME = np.arange(0, 301) / 50.0
 FORMULA = "X1*1+" + "0" * 66
 CHANNELS = {**ONE, "yaw_rate": {"column": "r", "unit": "rad/s"}, "ay": {"column": "a", "unit": "m/s²"}}
-DECLARED: dict[str, Any] = {"name": "measured", "kind": "real", "vehicle": "car", "licence": "none", "citation": "none", "source": "mdf"}
+DECLARED = {"name": "measured", "kind": "real", "vehicle": "car", "licence": "none", "citation": "none", "source": "mdf"}
 DECLARED |= {"path": "${root}", "files": "*.m*", "rate_hz": 50, "raster": None, "channels": CHANNELS, "gappy": []}
 DECLARED |= {"file_units": "check", "accept": []}
 PAIRS = {"raw_0": 0, "phys_0": 5.0, "raw_1": 50, "phys_1": 90.0, "interpolation": True}
 RATIONAL = {"P1": 0.0, "P2": 2.0, "P3": 1.0, "P4": 0.0, "P5": 0.0, "P6": 1.0}
-CONVERSIONS: tuple[Any, ...] = (None, {"a": 0.5, "b": 1.0}, PAIRS, RATIONAL, {"formula": FORMULA})
+CONVERSIONS = (None, {"a": 0.5, "b": 1.0}, PAIRS, RATIONAL, {"formula": FORMULA})
 VERSIONS = {"v4": ("4.10", 0), "v4dz": ("4.10", 2), "v42": ("4.20", 1), "v3": ("3.30", 0)}
 PAYLOADS = (
     CALL, f"open('{CANARY}','w')", "().__class__.__base__.__subclasses__()", "9**9**9**9", "X1+__import__('sly').x",
@@ -30,7 +25,7 @@ PAYLOADS = (
 )  # fmt: skip
 
 
-def signals(conversion: Any = None, **more: Any) -> list[Any]:
+def signals(conversion=None, **more):
     import asammdf
 
     return [
@@ -41,7 +36,7 @@ def signals(conversion: Any = None, **more: Any) -> list[Any]:
 
 
 @template
-def mdf(folder: Path) -> None:
+def mdf(folder):
     """Measurements of versions 3 and 4, plain, packed, with every kind of conversion."""
     write_yaml(folder / "conf" / "dataset" / "measured.yaml", DECLARED)
     (folder / "files").mkdir()
@@ -51,12 +46,12 @@ def mdf(folder: Path) -> None:
             write_mdf(folder / "files" / f"{name}_{number}", {"Only": signals(conversion)}, version, **options)
 
 
-def _overwrite_formula(content: bytes, rng: Random) -> bytes:
+def _overwrite_formula(content, rng):
     text = rng.choice(PAYLOADS).encode()[: len(FORMULA)]
     return content.replace(FORMULA.encode(), text.ljust(len(FORMULA), rng.choice([b" ", b"\0"])))
 
 
-def _overwrite_field(content: bytes, rng: Random) -> bytes:
+def _overwrite_field(content, rng):
     """A number in a block of MDF 4, or near the head of MDF 3, becomes another: links, lengths, counts, types, flags, offsets of bits."""
     blocks, at = [], content.find(b"##")
     while at >= 0:
@@ -74,13 +69,13 @@ def _overwrite_field(content: bytes, rng: Random) -> bytes:
     return content[:field] + (value % 2 ** (8 * width)).to_bytes(width, "little") + content[field + width :]
 
 
-def _senseless(case: Case) -> list[Any]:
+def _senseless(case):
     """Signals for a sound file of the library's own writer whose contents make no sense."""
     import asammdf
 
     n, rest, name = len(TIME), signals()[1:], case.rng.choice(WRITABLE_NAMES) or "x"
     stamps = [np.where(np.arange(n) == 99, 1e9, TIME), TIME[::-1], np.zeros(n), np.full(n, np.nan), TIME * 1e12, TIME + 1e17]
-    ideas: list[list[Any]] = [
+    ideas = [
         *([asammdf.Signal(np.ones(n), clock, name=name) for name in "vra"] for clock in stamps),
         [asammdf.Signal(np.array([b"text"] * n), TIME, name="v", encoding="utf-8"), *rest],
         [asammdf.Signal(np.zeros(n, dtype=[("v", "(3,)<f8")]), TIME, name="v"), *rest],
@@ -94,7 +89,7 @@ def _senseless(case: Case) -> list[Any]:
 
 
 @generator("mdf", weight=12)
-def measurement(case: Case) -> Command:
+def measurement(case):
     case.copy("mdf/conf", "conf")
     how = case.idea(5)
     name = f"{case.rng.choice(list(VERSIONS))}_{4 if how == 0 else case.rng.randrange(4)}"

@@ -1,17 +1,12 @@
 """Names of files, special files, links, rights, streams, variables, and where outcomes are written to."""
 
-from __future__ import annotations
-
 import os
 import socket
-from collections.abc import Callable
-from pathlib import Path
-from typing import Any
 
-from fuzz.case import Case, Command, generator
+from fuzz.case import Command, generator
 from fuzz.honest import KSNN
 
-NAMES: tuple[bytes, ...] = (
+NAMES = (
     b"\xff\xfe.csv", b"lap\xe4.csv", b"a\nb.csv", b"\x1b[2J.csv", b" .csv", b"a b.csv", b"-x.csv", b"--out.csv", b"a=b.csv", b"~a.csv",
     b"a'b.csv", b'a"b.csv', b"[a].csv", b"*.csv", b"\xe2\x80\xaeevil.csv", b"x" * 200 + b".csv", b".csv", b".hidden.csv", b"LAP.CSV",
     b"lap.csv.csv", b"lap.", b"lap", b"lap.csv ", b"$(touch EXECUTED).csv", b"a;touch EXECUTED.csv", b"<b>.csv", b"[red]a[blue].csv",
@@ -41,7 +36,7 @@ VALUES = (
 )  # fmt: skip
 
 
-def _bind(path: Path) -> None:
+def _bind(path):
     made, here = socket.socket(socket.AF_UNIX), os.getcwd()
     os.chdir(path.parent)  # a socket's path must be short
     made.bind(path.name)
@@ -49,10 +44,10 @@ def _bind(path: Path) -> None:
     made.close()
 
 
-def _special(case: Case, folder: Path) -> Path:
+def _special(case, folder):
     """Something that is no file, or none that ends."""
     path = folder / "special.csv"
-    makers: list[Callable[[], Any]] = [
+    makers = [
         lambda: os.mkfifo(path),
         path.mkdir,
         lambda: _bind(path),
@@ -64,7 +59,7 @@ def _special(case: Case, folder: Path) -> Path:
 
 
 @generator("drives", weight=8)
-def files(case: Case) -> Command:
+def files(case):
     """Names of files that are read, alone or in a data set, where they become recordings' ids; special files in their place."""
     case.copy("drives")
     alone = case.visit // 8 % 2 == 0
@@ -86,7 +81,7 @@ def files(case: Case) -> Command:
 
 
 @generator("study", weight=4)
-def targets(case: Case) -> Command:
+def targets(case):
     """Where an estimate is written to, the output root, and standard output that takes nothing."""
     case.copy("study")
     place = case.place
@@ -107,7 +102,7 @@ def targets(case: Case) -> Command:
 
 
 @generator("study", weight=2)
-def environment(case: Case) -> Command:
+def environment(case):
     """Variables that vehest reads, with values that make no sense."""
     case.copy("study")
     variable, value = case.rng.choice(VARIABLES), case.rng.choice(VALUES)
@@ -121,7 +116,7 @@ def environment(case: Case) -> Command:
 
 
 @generator("drives")
-def rights(case: Case) -> Command:
+def rights(case):
     """Folders and files that may not be read or written."""
     case.copy("drives")
     (case.place / "outputs").mkdir()

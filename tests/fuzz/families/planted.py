@@ -1,19 +1,16 @@
 """Commands that misbehave on purpose, one for each verdict: they show that the harness notices. No part of a normal run."""
 
-from __future__ import annotations
-
 import os
 import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
 
-from fuzz.case import CANARY, Case, Command, generator
+from fuzz.case import CANARY, Command, generator
 from vehest.data.errors import DataError
 from vehest.data.limits import Limits, use_limits
 from vehest.sources.limited import read_limited
@@ -23,67 +20,67 @@ MUCH = 2400 * 2**20  # bytes
 
 
 @generator()
-def planted(case: Case) -> Command:
+def planted(case):
     name = list(MISDEEDS)[case.visit % len(MISDEEDS)]
     case.write("raw/given.csv", "time\n0\n")
     case.write("sly.py", "pass\n")
     return Command((f"PLANTED:{name}",))
 
 
-def _finish() -> None:
+def _finish():
     Path("outputs").mkdir()
     Path("outputs/model.txt").write_text("made")
     Path("out.csv").write_text("made")
     print("done")
 
 
-def _leave(code: int, said: str = "") -> None:
+def _leave(code, said=""):
     sys.stderr.write(said)
     sys.exit(code)
 
 
-def _import_a_module() -> None:
+def _import_a_module():
     sys.path.insert(0, os.getcwd())
     __import__("sly")
 
 
-def _raise() -> None:
+def _raise():
     raise ValueError("not caught")
 
 
-def _leave_half_a_file() -> None:
+def _leave_half_a_file():
     Path("outputs").mkdir()
     Path("outputs/.writing-1-aaaaaaaa-model").write_text("")
 
 
-def _read_by(reader: str) -> None:
+def _read_by(reader):
     with suppress(DataError), use_limits(Limits(memory=3_500_000_000)):
         read_limited(f"{__name__}:{reader}", Path("raw/given.csv"))
 
 
-def answer(*_: object, **__: object) -> Answer:
+def answer(*_, **__):
     return {"x": np.ones(3)}, {}
 
 
-def formula(file: Path) -> Answer:
+def formula(file):
     return {"x": np.full(3, eval(file.read_text().splitlines()[1]))}, {}
 
 
-def shell(_: Path) -> Answer:
+def shell(_):
     os.system("true")
     return {}, {}
 
 
-def write(_: Path) -> Answer:
+def write(_):
     os.mkdir("beside")
     return {}, {}
 
 
-def much(_: Path) -> Answer:
+def much(_):
     return {"x": np.ones(len(bytearray(b"x") * MUCH) // 2**30)}, {}
 
 
-MISDEEDS: dict[str, tuple[str, Callable[[], object]]] = {
+MISDEEDS = {
     "finishes": ("ok", _finish),
     "refuses_in_one_line": ("ok", lambda: _leave(3, "warning something else\nerror: 'raw/given.csv' holds nothing\n")),
     "evaluates": ("executed", lambda: eval("1 + 1")),

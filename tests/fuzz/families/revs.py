@@ -1,16 +1,12 @@
 """The Revs database: official CSV and MAT files, a folder of text files, tables of vehicle parameters."""
 
-from __future__ import annotations
-
 import os
 import struct
 import zlib
-from pathlib import Path
-from random import Random
 
 import numpy as np
 
-from fuzz.case import Case, Command, generator, template
+from fuzz.case import Command, generator, template
 from fuzz.honest import write_yaml
 from fuzz.mutations import spoil_bytes
 from revs_files import smooth_drive, write_csv, write_mat, write_vehicle_parameters
@@ -21,7 +17,7 @@ LINES = ("nan", "1e400", "a", "1 2", "\x1b[2J", "9" * 5000)
 
 
 @template
-def revs(folder: Path) -> None:
+def revs(folder):
     """A recording in both official layouts, its car's parameters, and a recording as text files."""
     files = folder / "raw" / "revs"
     (files / "lap").mkdir(parents=True)
@@ -39,18 +35,18 @@ def revs(folder: Path) -> None:
     write_yaml(folder / "conf" / "dataset" / "text.yaml", declared | {"channels": channels})
 
 
-def _element(kind: int, body: bytes) -> bytes:
+def _element(kind, body):
     return struct.pack("<II", kind, len(body)) + body + bytes(-len(body) % 8)
 
 
-def _made_up_mat(_: bytes, rng: Random) -> bytes:
+def _made_up_mat(_, rng):
     """Written by hand: a bomb, dimensions that multiply to more than there is, or thousands of elements."""
     flags, name = _element(6, struct.pack("<II", 6, 0)), _element(1, b"x")
 
-    def matrix(rows: int, columns: int, data: bytes) -> bytes:
+    def matrix(rows, columns, data):
         return _element(14, flags + _element(5, struct.pack("<ii", rows, columns)) + name + _element(9, data))
 
-    def bomb(megabytes: int) -> bytes:
+    def bomb(megabytes):
         packer, size = zlib.compressobj(9), megabytes * 2**20
         begin = struct.pack("<II", 14, size + 56) + flags + _element(5, struct.pack("<ii", size // 8, 1)) + name
         begun = packer.compress(begin + struct.pack("<II", 9, size))
@@ -65,7 +61,7 @@ def _made_up_mat(_: bytes, rng: Random) -> bytes:
     return b"MATLAB 5.0 MAT-file".ljust(124) + struct.pack("<H", 0x0100) + b"IM" + rng.choice(ideas)()
 
 
-def _spoil_text_file(file: Path, rng: Random) -> None:
+def _spoil_text_file(file, rng):
     lines = file.read_text().splitlines()
     ideas = [
         lambda: file.write_bytes(spoil_bytes(file.read_bytes(), rng)),
@@ -79,7 +75,7 @@ def _spoil_text_file(file: Path, rng: Random) -> None:
 
 
 @generator("revs", weight=10)
-def official_files(case: Case) -> Command:
+def official_files(case):
     """The CSV, the MAT file, plain or packed, the table of vehicle parameters, and text files."""
     folder, (file, layout) = (
         case.copy("revs") / "raw" / "revs",

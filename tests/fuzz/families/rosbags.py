@@ -1,7 +1,5 @@
 """ROS 2 bags: damaged databases, messages that lie about their lengths, metadata.yaml, layouts of messages; zip archives of bags."""
 
-from __future__ import annotations
-
 import shutil
 import sqlite3
 import stat
@@ -11,7 +9,7 @@ from pathlib import Path
 
 import yaml
 
-from fuzz.case import Case, Command, generator, template
+from fuzz.case import Command, generator, template
 from fuzz.honest import write_yaml
 from fuzz.mutations import CALL, NAMES, spoil_bytes, spoil_yaml, yaml_of
 
@@ -43,7 +41,7 @@ TYPES = (*NAMES, "os/msg/system", "a", "a/b", "a/msg/b\nfloat64 x", "std_msgs/ms
 
 
 @template
-def bags(folder: Path) -> None:
+def bags(folder):
     """A bag on sqlite, one on mcap, and the data set that reads them."""
     from test_sources_rosbag import configuration, drive, write_bag
 
@@ -53,7 +51,7 @@ def bags(folder: Path) -> None:
     write_yaml(folder / "conf" / "dataset" / "mine.yaml", declared)
 
 
-def _state(database: Path, case: Case) -> None:
+def _state(database, case):
     """The database is sound and holds something else than messages."""
     connection = sqlite3.connect(database)
     with suppress(sqlite3.IntegrityError):
@@ -62,14 +60,14 @@ def _state(database: Path, case: Case) -> None:
     connection.close()
 
 
-def _spoil_layout(content: bytes, case: Case) -> bytes:
+def _spoil_layout(content, case):
     """Definitions of messages, which the library turns into Python code."""
     tree = yaml.safe_load(content)
     tree["messages"][case.rng.choice([*tree["messages"], case.rng.choice(TYPES)])] = case.rng.choice(LAYOUTS)
     return yaml_of(tree).encode("utf-8", "replace")
 
 
-def _archive(case: Case, bag: Path, how: int) -> None:
+def _archive(case, bag, how):
     """Pack the bag's folder: damaged bytes, names that climb out, links, bombs, entries twice."""
     file = case.place / "raw" / "lap.zip"
     with zipfile.ZipFile(file, "w", zipfile.ZIP_DEFLATED) as archive:
@@ -97,7 +95,7 @@ def _archive(case: Case, bag: Path, how: int) -> None:
 
 
 @generator("bags", weight=8)
-def bag(case: Case) -> Command:
+def bag(case):
     how, storage = case.idea(6), case.rng.choice(["sqlite3", "mcap"])
     storage = "sqlite3" if how == 0 else storage
     case.copy("bags/conf", "conf")

@@ -1,17 +1,14 @@
 """Tables and recordings, CSV and Parquet: bytes, cells, clocks, types, descriptions, bombs."""
 
-from __future__ import annotations
-
 import math
 from datetime import datetime, timedelta
-from typing import Any
 
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
 from conftest import planar_drive
-from fuzz.case import Case, Command, generator
+from fuzz.case import Command, generator
 from fuzz.honest import lap
 from fuzz.mutations import spoil_bytes, spoil_json
 from vehest.data.store import write_recording
@@ -22,13 +19,13 @@ CELLS = (
 )  # fmt: skip
 
 
-def _reads(case: Case, file: str, *overrides: str) -> Command:
+def _reads(case, file, *overrides):
     """One of the commands that read a table."""
     words = [("estimate", file, "-o", "out.csv"), ("data", "check", file), ("data", "show", file, "--json")]
     return Command((*case.rng.choice([*words, ("data", "align", file, "-e", "offsets")]), *overrides))
 
 
-def _clock(time: np.ndarray, case: Case) -> np.ndarray:
+def _clock(time, case):
     """A clock that no recording should have."""
     n, at, rng = len(time), case.rng.randrange(1, len(time) - 1), case.rng
     here = np.arange(n) == at
@@ -47,7 +44,7 @@ def _clock(time: np.ndarray, case: Case) -> np.ndarray:
 
 
 @generator(weight=8)
-def csv(case: Case) -> Command:
+def csv(case):
     frame, how = lap(case.visit, 20.0), case.idea(3)
     if how == 0:
         frame["time"] = _clock(frame["time"].to_numpy(), case)
@@ -62,14 +59,14 @@ def csv(case: Case) -> Command:
     return _reads(case, "lap.csv", *(case.rng.choice([(), ("dataset.clock=interpolate",)]) if how == 0 else ()))
 
 
-def _wrong_types(n: int) -> list[Any]:
+def _wrong_types(n):
     instants = [datetime(2020, 1, 1) + timedelta(milliseconds=20 * k) for k in range(n)]
     values = [["a"] * n, instants, [timedelta(seconds=1)] * n, [[1.0]] * n, [{"a": 1.0}] * n, [math.nan] * n, [[0.0] * 1000] * n]
     return [*map(pa.array, values), pa.nulls(n, pa.float64()), pa.array(range(2**63 - n, 2**63)), pa.array(["a"] * n).dictionary_encode()]
 
 
 @generator(weight=8)
-def parquet(case: Case) -> Command:
+def parquet(case):
     """Bytes, most of all of the footer, which says how to read the rest; columns of other types; zeros that pack to next to nothing."""
     file, how, overrides = case.place / "lap.parquet", case.idea(4), ()
     if how == 0:
@@ -90,7 +87,7 @@ def parquet(case: Case) -> Command:
 
 
 @generator(weight=4)
-def recording(case: Case) -> Command:
+def recording(case):
     """What a recording, as vehest stores it, says of itself in its metadata."""
     file = case.place / "drive.parquet"
     write_recording(planar_drive(40.0, 20.0, seed=case.visit, noise=0.02), file)
