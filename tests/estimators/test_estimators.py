@@ -178,7 +178,8 @@ def test_window_network_has_no_state_to_start_from(drive):
 
 def test_registry_knows_names():
     first = "cnn_ukf, data_sheet, dugoff_ukf, ensemble_ukf, factor_graph, gru, kalman, kinematic, ksnn, learned_ukf"
-    names = f"{first}, learned_ukf_variant, lstm, luenberger, rational_ekf, sideslip_ffnn, static_map, velocity_gru, velocity_lstm, zero"
+    last = "self_calibrating, sideslip_ffnn, static_map, velocity_gru, velocity_lstm, zero"
+    names = f"{first}, learned_ukf_variant, lstm, luenberger, rational_ekf, {last}"
     assert ", ".join(sorted(estimator_names())) == names
     with pytest.raises(ConfigurationError, match=f"is not one of: {names}"):
         estimator_class("kalman_filter_from_the_future")
