@@ -34,8 +34,8 @@ TARGET = ROOT / "src" / "vehest" / "pretrained"
 FILTER = ROOT / "src" / "vehest" / "pretrained_filter"
 FILTER_NOTE = (
     "self-calibrating filter: finds your car's rear axle on the drive, without training on it or on any reference. Inside is a network "
-    "that learnt on simulated cars and not on this one. Errors on cars on which no choice was made: results/unseen_car; on cars of 1:8 "
-    "and 1:10 it is as bad as v = 0 or worse. The KS-NN inside is patented by its authors (PCT/IT2023/050058)."
+    "that learnt on simulated cars and not on this one. Errors: results/unseen_car; on cars of 1:8 and 1:10 it is many times "
+    "worse than v = 0 without their wheelbase, take data_sheet there. The KS-NN inside is patented by its authors (PCT/IT2023/050058)."
 )
 
 

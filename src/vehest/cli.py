@@ -86,7 +86,9 @@ def _complete_command(incomplete: str) -> list[str]:
 
 def _complete_model(incomplete: str) -> list[str]:
     output = Path(os.environ.get("VEHEST_OUTPUT", "outputs"))
-    return [folder.name for folder in sorted((output / "train").glob(f"{Path(incomplete).name}*")) if not folder.name.startswith(".")]
+    shipped = [name for name in ("pretrained", "self_calibrating") if name.startswith(incomplete)]
+    own = sorted((output / "train").glob(f"{Path(incomplete).name}*"))
+    return [*shipped, *(folder.name for folder in own if not folder.name.startswith("."))]
 
 
 def _complete_model_or_file(incomplete: str) -> list[str]:
@@ -291,7 +293,7 @@ def evaluate(
         typer.Option(
             "--model",
             "-m",
-            help="A model's folder, or the start of its name, or `pretrained`; without it, the model that the overrides train.",
+            help="A model's folder, or the start of its name, `pretrained` or `self_calibrating`; by default what the overrides train.",
             autocompletion=_complete_model,
         ),
     ] = None,
@@ -361,7 +363,7 @@ def replay(
         typer.Option(
             "--model",
             "-m",
-            help="A model's folder, or the start of its name; by default the pre-trained one.",
+            help="A model's folder, or the start of its name, `self_calibrating`; by default the pre-trained one.",
             autocompletion=_complete_model,
         ),
     ] = "pretrained",
@@ -433,7 +435,9 @@ def export(
     model: Annotated[
         str,
         typer.Argument(
-            help="A model's folder, or the start of its name; or pretrained.", autocompletion=_complete_model, show_default=False
+            help="A model's folder, or the start of its name; or pretrained, or self_calibrating.",
+            autocompletion=_complete_model,
+            show_default=False,
         ),
     ],
     out: Annotated[Path, typer.Option("--out", "-o", help="The folder to write; an earlier export there is replaced.")] = Path("export"),

@@ -114,8 +114,9 @@ for _function, _name in ((operator.iadd, "fadd"), (operator.isub, "fsub"), (oper
     _between(_function, lambda builder, one, other, name=_name: getattr(builder, name)(one, other, flags=_FUSED))
 for _function, _sign in ((operator.lt, "<"), (operator.le, "<="), (operator.gt, ">"), (operator.ge, ">="), (operator.eq, "==")):
     _between(_function, lambda builder, one, other, sign=_sign: builder.fcmp_ordered(sign, one, other), truth=True)
-_between(least, lambda builder, one, other: builder.select(builder.fcmp_ordered("<", one, other), one, other))
-_between(most, lambda builder, one, other: builder.select(builder.fcmp_ordered(">", one, other), one, other))
+# `one` where the two are not ordered, so that a NaN stays
+_between(least, lambda builder, one, other: builder.select(builder.fcmp_ordered(">", one, other), other, one))
+_between(most, lambda builder, one, other: builder.select(builder.fcmp_ordered("<", one, other), other, one))
 
 
 @infer_global(abs)

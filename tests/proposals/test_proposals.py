@@ -186,7 +186,7 @@ def test_a_log_without_reference_cannot_rank_anything(tmp_path):
     outcome, _ = write_files(examined, dry_run=True)
     assert outcome["estimators"] == []
     assert [Path(file).parts[0] for file in outcome["written"]] == ["conf"]
-    assert outcome["next"][-1].startswith("vehest estimate pretrained ")
+    assert outcome["next"][-1].startswith("vehest estimate ")
 
 
 def test_a_reference_is_made_of_positions_and_yaw_where_there_is_no_other(tmp_path):

@@ -58,7 +58,7 @@ def test_a_raised_version_of_a_training_retrains_those_trained_by_it(monkeypatch
     before = trainings()
     monkeypatch.setattr(SupervisedSettings, "version", "2")
     assert {name for name, text in trainings().items() if text != before[name]} == {"ksnn", "gru", "lstm"}
-    assert code_of_calibration("ksnn") == "calibrate=1 ksnn=1", "weights tell a calibration what changed"
+    assert code_of_calibration("ksnn") == "calibrate=2 ksnn=1", "weights tell a calibration what changed"
 
 
 def test_what_has_no_version_is_of_version_1():

@@ -29,7 +29,7 @@ SCALED = {
     **{"noise_vy": 0.25, "noise_vx": 0.25, "noise_delay": 0.75},
 }
 """Powers of the wheelbase over the typical one that scale settings: times and speeds go with its root, accelerations are alike."""
-WINDOW = 30  # samples that the network sees
+WINDOW, NETWORK_HZ = 30, 20.0  # samples that the network sees, and their rate
 UNMEASURED = 20.0  # m/s per √s: process noise of u where ax is not measured
 
 
@@ -139,6 +139,8 @@ class SelfCalibrating(Recursive):
         own = {name: float(value) for name, value in vars(self.settings).items() if isinstance(value, int | float)}
         own |= {"dt": 1.0 / self.rate_hz, "rear": self.rear, "rear_known": 1.0 if self.cg_to_rear_axle is not None else self.rear_share}
         own |= {"yaw_rate_max": self._width, "without_ax": float(not self.measured_ax)}
+        if self.rate_hz != NETWORK_HZ:
+            own["network_odds"] = 1e-300  # its weights hold for its own steps alone
         own.pop("cg_to_rear_axle", None)
         own |= {name: own[name] * (self.wheelbase / TYPICAL_WHEELBASE) ** power for name, power in SCALED.items()}
         if not self.measured_ax:

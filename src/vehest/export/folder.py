@@ -17,7 +17,7 @@ from vehest.export.measure import STRICT, TARGETS, Footprint, footprint
 from vehest.export.program import TOLERANCES, context_of, program_files, vector_files
 from vehest.export.rendering import Precision, render
 from vehest.export.vectors import SECONDS, in_float64
-from vehest.trust import health
+from vehest.trust import health, health_kernel
 from vehest.trust.contract import GuardedStepper
 from vehest.trust.record import Trust
 from vehest.version import __version__
@@ -126,7 +126,11 @@ def refuse_unresolved(trust: Trust | None) -> None:
 
 def _reasons() -> dict[int, str]:
     """Kind of a reason -> what it says."""
-    return {kind: text.format(channel="CHANNEL", partner="PARTNER") for kind, (text, _) in health.REASONS.items() if kind}
+    return {
+        kind: text.format(channel="CHANNEL", partner="PARTNER")
+        for kind, (text, _) in health.REASONS.items()
+        if kind and kind not in (health_kernel.SMOOTH, health_kernel.LATE)
+    }
 
 
 def _refuse_foreign(out: Path) -> None:

@@ -65,10 +65,12 @@ def find_model(name: str, output: Path, say: Callable[[str], None]) -> Path:
     given = Path(name)
     if given.is_dir():
         return given
-    if name in WITH_VEHEST:
-        return pretrained_folder(name)
     models = [folder for folder in sorted(output.glob("train/[!.]*")) if folder.is_dir()]
     found = [folder for folder in models if folder.match(f"{given.name}*")]
+    if name in WITH_VEHEST:
+        if found:
+            say(f"'{name}' is the model that comes with vehest; yours are {counted([folder.name for folder in found])}")
+        return pretrained_folder(name)
     if not found:
         known = f"'{output / 'train'}', which holds {counted([folder.name for folder in models])}"
         raise MissingError(f"there is no model '{name}', neither a folder nor in {known}; train one first")

@@ -19,7 +19,7 @@ from vehest.data.errors import ConfigurationError
 from vehest.data.limits import limits_from_config, use_limits
 from vehest.estimators.base import Estimator
 from vehest.run.config import Config, compose_config
-from vehest.run.estimate import PRETRAINED, open_model, pretrained_note
+from vehest.run.estimate import PRETRAINED, WITH_VEHEST, open_model, pretrained_note
 from vehest.sources.can.logs import read_frames
 from vehest.trust.contract import GuardedStepper
 
@@ -70,14 +70,14 @@ def replay_log(
         figures = Replay(frames, wanted, timing, bus, estimates, stopped).run(lambda: GuardedStepper(fitted, trust, faster), out, view)
     return {
         "log": str(log),
-        "model": PRETRAINED if model == PRETRAINED else str(folder),
+        "model": model if model in WITH_VEHEST else str(folder),
         "samples_hz": timing.rate_hz,
         "estimates_hz": fitted.settings.rate_hz,
         "delay_ms": round(1e3 * GuardedStepper(fitted, trust, faster).delay, 3),
         **figures.plain(),
         "stopped": stopped(),
         "written": [str(file) for file in written],
-        **({"note": pretrained_note()} if model == PRETRAINED else {}),
+        **({"note": pretrained_note(model)} if model in WITH_VEHEST else {}),
     }
 
 

@@ -307,9 +307,9 @@ def _test_set(artefacts: PartArtefacts, board: pd.DataFrame, test_set: str, line
     shown = _shown(finite, named)
     drive = _Drive.of(artefacts, shown, test_set, lines)
     if len(shown) < len(finite):
-        blocks.append(
-            f"The following figures show {len(shown)} of {len(finite)} estimators: those with the lowest RMSE(v) on the validation range."
-        )
+        which = f"{chosen[named][0]} and those" if named is not None and named in chosen else "those"
+        lowest = "with the lowest RMSE(v) on the validation range"
+        blocks.append(f"The following figures show {len(shown)} of {len(finite)} estimators: {which} {lowest}.")
     in_bands = {name: chosen[name] for name in drive.estimates}
     return [*blocks, *band_blocks(artefacts, test_set, in_bands, lines, file), *_figures_of(drive, shown, file, lines)]
 

@@ -13,7 +13,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from vehest.alignment.standstill import STANDSTILL_SPEED
 from vehest.constants import FloatArray
 from vehest.data.files import file_name
 from vehest.data.splits import Span
@@ -115,7 +114,7 @@ def verdict_of(part: PartArtefacts, test_set: str) -> Verdict:
     model = _to_go_on_with(part, ranking)
     name = (model.estimator, model.variant)
     expected = f"RMSE(β) {_figure(ranking, name)} for {_reach(part, test_set)}"
-    level = [titles[own] for own in (ranking.order[0], *ranking.not_told_apart) if own != name]
+    best, level = titles[ranking.order[0]], [titles[own] for own in ranking.not_told_apart]
     if ranking.winner is not None:
         words = f"**Use {titles[name]}.** Expected {expected}."
     elif ranking.order[0][0] in PLAIN:
@@ -123,8 +122,8 @@ def verdict_of(part: PartArtefacts, test_set: str) -> Verdict:
     elif level:
         others = listed(level) if len(level) <= 6 else f"{len(level)} others"
         words = (
-            f"**Take {titles[name]}**, expected {expected}. **No estimator can be called best:** it is not told apart from {others}; "
-            "of these it has the lowest RMSE(v) on validation."
+            f"**Take {titles[name]}**, expected {expected}. **No estimator can be called best:** {best} has the lowest error and is not "
+            f"told apart from {others}; of these {titles[name]} has the lowest RMSE(v) on validation."
         )
     else:
         words = f"**Take {titles[name]}**, which has the lowest error, {expected}. **No estimator can be called best.**"
@@ -139,16 +138,13 @@ def _figure(ranking: Ranking, name: Name) -> str:
 
 
 def _beaten(ranking: Ranking, name: Name, titles: Mapping[Name, str]) -> str:
-    """Which of the plain estimators that it was compared with are beaten by more than chance, and which are not."""
-    beats: list[str] = []
-    level: list[str] = []
+    """Which of the plain estimators that it was compared with it beats, and which beat it, by more than chance."""
+    sentences = {"lower": "It beats", "not told apart": "It is not told apart from", "higher": "It has a higher error than"}
+    found: dict[str, list[str]] = {verdict: [] for verdict in sentences}
     for other in (other for other in ranking.order if other[0] in PLAIN and name[0] not in PLAIN):
         if (name, other) in ranking.pairs:
-            called = BASELINE_TITLES.get(other[0], titles[other])
-            (beats if ranking.pairs[name, other].verdict == "lower" else level).append(called)
-    sentences = [f"It beats {listed(beats)}."] if beats else []
-    sentences += [f"It is not told apart from {listed(level)}."] if level else []
-    return " ".join(sentences)
+            found[ranking.pairs[name, other].verdict].append(BASELINE_TITLES.get(other[0], titles[other]))
+    return " ".join(f"{words} {listed(found[verdict])}." for verdict, words in sentences.items() if found[verdict])
 
 
 def _to_go_on_with(part: PartArtefacts, ranking: Ranking) -> EvaluatedModel:
@@ -171,7 +167,7 @@ def _counted(part: PartArtefacts, test_set: str) -> str:
     ranges = pieces_of(part.split.tests[test_set], lambda span: read_recording(part.references[span.dataset, span.recording]), protocol)
     for recording, piece in ranges:
         begin, (first, end) = recording.index_range(piece.start, piece.stop)[0], scored_range(recording, piece, protocol)
-        still = np.hypot(recording["vx"], recording["vy_ref"]) < STANDSTILL_SPEED
+        still = np.hypot(recording["vx"], recording["vy_ref"]) < protocol.least_speed
         sideslip = np.degrees(np.where(still, 0.0, np.abs(np.arctan2(recording["vy_ref"], recording["vx"]))))
         standing += int(still[first:end].sum())
         hidden.append(sideslip[begin:first])
@@ -190,10 +186,10 @@ def _counted(part: PartArtefacts, test_set: str) -> str:
 
 def _commands(part: PartArtefacts, study: str) -> list[str]:
     """What to run next, with the model of the first test set that has a verdict."""
-    models = [own.model for own in (verdict_of(part, name) for name in part.split.tests) if own.model is not None]
+    models = [(own, spans[0].dataset) for name, spans in part.split.tests.items() if (own := verdict_of(part, name).model) is not None]
     if not models:
         return []
-    name, dataset = models[0].model_folder.name, next(iter(part.split.tests.values()))[0].dataset
+    name, dataset = models[0][0].model_folder.name, models[0][1]
     return [
         f"vehest estimate {name} YOUR_LOG dataset={dataset} -o beta.csv   # v, β, bands, health; beta.mf4, beta.mat: in the log",
         f"vehest export {name} -o on_the_car    # the same in C99",

@@ -256,8 +256,8 @@ def scan(n, grips, prior, spread, decay, theta, state, samples, found, parameter
                 state.log_weights[j] = start[j] + (state.log_weights[j] - start[j]) * (1.0 - n.dt / n.memory) + likelihood
             else:
                 row[:] = 0.0
-                row[V] = 1.0
-                _update(x, p, row, n.rear * sample[0] - x[V], ROLLING**2, n.gate, False, scratch)
+                row[V], row[REAR] = 1.0, -sample[0]
+                _update(x, p, row, x[REAR] * sample[0] - x[V], ROLLING**2, n.gate, False, scratch)
         _normalise(state.log_weights, weights)
         _mixture(means, state.covariances, weights, parameters[t])
         values[BANK], values[NETWORK] = parameters[t, V], lags[PREDICTED]

@@ -115,22 +115,30 @@ def write(
     with use_limits(limits_from_config(compose_config("estimate")["limits"])):
         made = draft(examined)
     plan = _plan_of(made.contents, examined.vehicle, further) if "vy_ref" in made.channels and not _is_too_short(made) else Plan()
+    plan.lacking.update({own: "nothing can be compared on these recordings" for own in further if not plan.sweeps})
     texts = [_dataset_text(made, left)]
     if plan.sweeps:
         texts += [_split_text(made), _pipeline_text(name, plan, LEARNT * made.seconds / 60.0)]
     files = dict(zip(paths_of(name), texts, strict=False))
+    stale = [file for file in paths_of(name)[len(files) :] if file.exists()]  # of an earlier one, which these recordings do not allow
     if not dry_run:
         with ExitStack() as stack:
             for file, text in files.items():
                 stack.enter_context(written_aside(file)).write_text(text, encoding="utf-8")
-        for file in paths_of(name)[len(files) :]:  # of an earlier one by --force, which these recordings do not allow
-            file.unlink(missing_ok=True)
+        for file in stale:
+            file.unlink()
     following = _next_commands(made, plan)
-    plain = _plain(made, plan, left) | {"written": [str(file) for file in files], "next": following, "dry_run": dry_run}
+    plain = _plain(made, plan, left) | {
+        "written": [str(file) for file in files],
+        "removed": [str(file) for file in stale],
+        "next": following,
+        "dry_run": dry_run,
+    }
     purposes = ("channels, units and signs of the columns", "ranges for training, validation and test")
     lines = _words(made, plan, left)
     for file, purpose in zip(files, (*purposes, f"estimators: {', '.join(plan.estimators)}"), strict=False):
         lines.append(f"{'would write' if dry_run else 'wrote'} {file}: {purpose}")
+    lines += [f"{'would remove' if dry_run else 'removed'} {file}: these recordings do not allow it" for file in stale]
     return plain, [*lines, "next:", *(f"  {command}" for command in following)]
 
 
@@ -165,7 +173,7 @@ def _next_commands(made: Draft, plan: Plan) -> list[str]:
         return [*commands, f"vehest run {name} --minutes 15"]
     if file.is_dir() or not made.contents[0].channels.issuperset(PRETRAINED_CHANNELS):
         return commands
-    return [*commands, f"vehest estimate pretrained {file} dataset={name} -o estimate.parquet"]
+    return [*commands, f"vehest estimate {file} dataset={name} -o estimate.parquet"]
 
 
 def found_in(examined: Examined) -> dict[str, Any]:
@@ -284,7 +292,7 @@ def _limits(own: Draft) -> list[str]:
         lengths = f"{own.seconds:.0f} s in {len(own.durations)} recording{'s' if len(own.durations) > 1 else ''}"
         return [
             f"{lengths} are too short to train, stop and test on: record two minutes or more with bends, or three drives or more, "
-            "with the reference; until then vehest estimate pretrained runs the model that comes with vehest"
+            "with the reference; until then vehest estimate runs the filter that comes with vehest"
         ]
     if not missing and _are_short(own):
         return [f"the recordings are short, so the split takes whole recordings ({len(own.durations)}, {own.seconds:.0f} s in all)"]
@@ -296,7 +304,7 @@ def _limits(own: Draft) -> list[str]:
     lacking = ", ".join(name for name in PRETRAINED_CHANNELS if name not in own.contents[0].channels)
     return [
         "these recordings have no reference of lateral velocity or sideslip: nothing can be trained or ranked on them; "
-        f"the model that comes with vehest can estimate, vehest estimate pretrained{f'; it lacks {lacking}' if lacking else ''}"
+        f"the filter that comes with vehest can estimate, by vehest estimate{f'; it lacks {lacking}' if lacking else ''}"
     ]
 
 
