@@ -187,3 +187,13 @@ def test_refuses_weights_of_another_network():
     model = model_of()
     with pytest.raises(DataError, match="weights of 'self_calibrating' must be network, yaw_rate_max"):
         model.load_weights({"network": np.zeros((3, 20)), "yaw_rate_max": np.ones(1)})
+
+
+def test_a_slow_car_rolls_about_the_rear_axle_that_was_found():
+    model = SelfCalibrating.from_config({"cg_to_rear_axle": 1.3})
+    samples = np.tile([0.3, 2.0, 0.6, 0.0], (40, 1))  # yaw rate [rad/s], speed [m/s], ay and ax [m/s²] of v' = u' = 0
+    state = model.first_state(samples[0], {"vy": 0.3})
+    state.means[:, kernel.REAR] = 1.0  # the inertial unit sits 0.3 m behind the centre of gravity
+    state.covariances[:, kernel.REAR, kernel.REAR] = 1e-6
+    estimate, _ = model.run(samples, state)
+    assert estimate["vy"][-1] == pytest.approx((1.0 + 0.3) * 0.3, abs=0.01)
