@@ -470,6 +470,8 @@ def export(
 
     output = Path(_compose("estimate", overrides or [])["output"])
     folder, fitted, trust = open_model(model, output, note)
+    if onnx and vectors is not None:
+        raise ConfigurationError("--vectors are of C, --onnx writes none; leave one out")
     drive = None if vectors is None else prepared_recording(fitted, read_table(vectors, overrides or []), bus_rate)
     if onnx:
         from vehest.export.onnx_model import write_onnx

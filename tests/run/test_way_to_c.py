@@ -56,6 +56,9 @@ def test_two_commands_lead_to_a_verdict_and_those_it_names_to_an_estimate_and_to
     assert export is not None
     words = ("export", export[1], "-o", export[2], "--vectors", "lap.csv", "dataset=my_car")
     assert run_vehest(capsys, *words)[0] == 0
+    code, _, err = run_vehest(capsys, *words, "--onnx")
+    assert code != 0
+    assert "leave one out" in err
     online, batch = pd.read_csv(log / export[2] / "expected.csv"), pd.read_csv(log / "out.csv")
     assert np.isfinite(online["sideslip"]).sum() > 4000
     steps = len(online) - len(batch) + round(20 * (batch["time"][0] - 0.0))
