@@ -55,7 +55,7 @@ def test_completion_of_the_first_word_offers_models_and_recordings(place):
     (place.folder / "outputs" / "train" / "ksnn-a").mkdir(parents=True)
     for name in ("lap.csv", "lap.parquet", "notes.txt"):
         (place.folder / name).touch()
-    assert _complete_model_or_file("") == ["ksnn-a", "lap.csv", "lap.parquet"]
+    assert _complete_model_or_file("") == ["pretrained", "self_calibrating", "ksnn-a", "lap.csv", "lap.parquet"]
     assert _complete_model_or_file("la") == ["lap.csv", "lap.parquet"]
     assert _complete_model_or_file("raw/o") == ["raw/one.csv"]
     assert _complete_model_or_file("./la") == ["./lap.csv", "./lap.parquet"]
