@@ -1,5 +1,6 @@
 """The self-calibrating filter against a plain filter in NumPy, the network itself, and cars whose numbers are known."""
 
+import pickle
 from pathlib import Path
 
 import numpy as np
@@ -197,3 +198,8 @@ def test_a_slow_car_rolls_about_the_rear_axle_that_was_found():
     state.covariances[:, kernel.REAR, kernel.REAR] = 1e-6
     estimate, _ = model.run(samples, state)
     assert estimate["vy"][-1] == pytest.approx((1.0 + 0.3) * 0.3, abs=0.01)
+
+
+def test_compiled_code_is_found_again_in_the_next_process():
+    numbers = SelfCalibrating.from_config({}).numbers()
+    assert pickle.loads(pickle.dumps(type(numbers))) is type(numbers), "its type is in the key of the compiled code"

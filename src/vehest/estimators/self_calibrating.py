@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections import namedtuple
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -31,6 +31,16 @@ SCALED = {
 """Powers of the wheelbase over the typical one that scale settings: times and speeds go with its root, accelerations are alike."""
 WINDOW, NETWORK_HZ = 30, 20.0  # samples that the network sees, and their rate
 UNMEASURED = 20.0  # m/s per √s: process noise of u where ax is not measured
+
+NAMES = (
+    "rate_hz wheelbase measured_ax grip grip_deviation grip_excess exponent largest_share compliance compliance_deviation "
+    "leakage leakage_deviation rear_deviation imu_deviation rear_share offset_ay offset_ay_time offset_ax offset_ax_time "
+    "noise_vy noise_delay noise_vx noise_speed axle_lag axle_error_time axle_constant axle_per_speed axle_per_slip "
+    "axle_per_bend axle_per_slope axle_white axle_white_share gate memory minimum_speed angle_floor residual_time slow_time "
+    "residual_floor lateral_power longitudinal_power decision_time network_odds steady_odds dt rear rear_known yaw_rate_max "
+    "without_ax"
+)
+Numbers: Any = namedtuple("Numbers", NAMES)  # type: ignore[misc]  # importable by its name, else compiled code is not found again
 
 
 class SelfCalibrating(Recursive):
@@ -145,7 +155,7 @@ class SelfCalibrating(Recursive):
         own |= {name: own[name] * (self.wheelbase / TYPICAL_WHEELBASE) ** power for name, power in SCALED.items()}
         if not self.measured_ax:
             own |= {"noise_vx": UNMEASURED, "longitudinal_power": 0.0}
-        return _numbers_type(tuple(own))(*own.values())
+        return Numbers(**own)
 
     def first_state(self, sample: FloatArray, given: Mapping[str, float]) -> kernel.State:
         """The priors, v = 0 or what is given, and the measured speed."""
@@ -214,11 +224,6 @@ class SelfCalibrating(Recursive):
         if {name: values.shape for name, values in weights.items()} != {name: values.shape for name, values in expected.items()}:
             raise DataError(f"weights of '{self.name}' must be {', '.join(expected)} of the network that comes with vehest")
         self._network, self._width = np.ascontiguousarray(weights["network"]), float(weights["yaw_rate_max"][0])
-
-
-@cache
-def _numbers_type(names: Sequence[str]) -> Any:
-    return namedtuple("SelfCalibratingNumbers", names)
 
 
 @cache

@@ -92,7 +92,7 @@ def _of_jobs(configs: Sequence[Config]) -> Iterator[tuple[str, dict[str, str]]]:
         if first["split"].get("validation"):
             yield f"calibrate {name}", {CODE: code_of_calibration(name), CONFIGURATION: _hash(None)}
         code = code_of_evaluation(name)
-        conditions = {key: value for key, value in first["evaluation"].items() if key != "least_speed" or value}  # as `Protocol.plain`
+        conditions: Any = {key: value for key, value in first["evaluation"].items() if key != "least_speed" or value}  # as `Protocol.plain`
         if faults:
             code, conditions = code_under_faults(code), [conditions, *map(asdict, faults)]
         yield f"evaluate {name}", {CODE: code, CONFIGURATION: _hash(conditions)}
