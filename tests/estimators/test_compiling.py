@@ -1,6 +1,7 @@
 """Compilation that keeps a first training waiting is said beforehand, once, and what it compiles has the digits of every later run."""
 
 import ast
+import importlib
 import os
 import subprocess
 import sys
@@ -11,23 +12,31 @@ import pytest
 
 import vehest
 from vehest.estimators.kernels import planar_car
-from vehest.run.train import compiles_slowly
+from vehest.estimators.kernels.compiling import has_to_compile
+from vehest.estimators.registry import estimator_class, estimator_names
+from vehest.trust.health import SLOW_KERNEL
 
 
 def test_a_learned_filter_has_to_compile_until_its_code_is_kept(tmp_path, monkeypatch):
     monkeypatch.setattr(planar_car, "_transition", SimpleNamespace(stats=SimpleNamespace(cache_path=str(tmp_path))))
-    assert compiles_slowly("learned_ukf")
-    assert not compiles_slowly("luenberger")
+    assert has_to_compile(estimator_class("learned_ukf").slow_kernel)
+    assert not has_to_compile(estimator_class("luenberger").slow_kernel)
     (tmp_path / "planar_car._transition-1.py311.nbi").touch()
     os.utime(tmp_path / "planar_car._transition-1.py311.nbi", (0.0, 0.0))
-    assert compiles_slowly("learned_ukf")  # of an earlier installation
+    assert has_to_compile(estimator_class("learned_ukf").slow_kernel)  # of an earlier installation
     (tmp_path / "planar_car._transition-1.py311.nbi").touch()
-    assert not compiles_slowly("learned_ukf")
+    assert not has_to_compile(estimator_class("learned_ukf").slow_kernel)
+
+
+@pytest.mark.parametrize("where", sorted({SLOW_KERNEL, *(estimator_class(name).slow_kernel for name in estimator_names())} - {""}))
+def test_slow_kernels_are_entries_that_are_there(where):
+    module, _, name = where.partition(":")
+    assert hasattr(getattr(importlib.import_module(module), name), "stats")
 
 
 def test_nothing_has_to_compile_where_compilation_is_off(monkeypatch):
     monkeypatch.setattr(planar_car, "_transition", lambda: None)
-    assert not compiles_slowly("learned_ukf")
+    assert not has_to_compile(estimator_class("learned_ukf").slow_kernel)
 
 
 @pytest.mark.parametrize("kernels", ["networks", pytest.param("cars", marks=pytest.mark.slow)])

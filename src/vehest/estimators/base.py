@@ -93,7 +93,7 @@ class Estimator(ABC):
         may_be_nan: weights that may stay NaN, because each recording tells them.
         covariance_of: quantities that the covariances of `run` are of.
         ignores_initial_state: whether an initial state is left aside; else it is used, or refused as an error.
-        slow_kernel: module of a compiled function ``_transition`` that takes tens of seconds to compile; empty: none.
+        slow_kernel: ``module:function`` that takes tens of seconds to compile; empty: none.
         trials: in the first comparison on a new car; none: it is left out.
         notice: lines for users of the method, such as a patent.
         template: C template of a step, in ``export/templates/methods`` or beside the family's module; empty: it has none.

@@ -116,7 +116,7 @@ class LearnedUkf(Network, SigmaPointEstimator):
     skippable = channels
     refuses = ("infinite",)
     learns_from = REFERENCES
-    slow_kernel = "vehest.estimators.kernels.planar_car"
+    slow_kernel = "vehest.estimators.kernels.planar_car:_transition"
     template = "learned_ukf"
     states = STATES
     training_type = ThroughFilterSettings

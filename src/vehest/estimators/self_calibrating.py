@@ -58,6 +58,7 @@ class SelfCalibrating(Recursive):
     covariance_of = ("vy",)
     channels: tuple[str, ...] = ("yaw_rate", "vx", "ay", "ax")  # type: ignore[misc]  # ax may be absent
     notice = Ksnn.notice
+    slow_kernel = "vehest.estimators.kernels.self_calibrating:scan"
     template = "self_calibrating"
     refuses = ("NaN", "infinite")
     rate_hz: float = rate(20.0)

@@ -35,9 +35,8 @@ from vehest.run.estimate_log import LOGS, check_log_name, write_log
 from vehest.run.printing import complain, counted, note
 from vehest.run.train import STAGE as TRAIN
 from vehest.sources.base import read_single
-from vehest.trust import health_kernel
 from vehest.trust.contract import estimate_guarded
-from vehest.trust.health import domain_verdict, reason_in_words
+from vehest.trust.health import SLOW_KERNEL, domain_verdict, reason_in_words
 from vehest.trust.record import Trust, is_other_vehicle
 
 SUFFIXES = (".parquet", ".csv")
@@ -113,7 +112,7 @@ def estimate_file(words: Sequence[str], out: Path, *, strict: bool = False) -> d
         raise ConfigurationError(f"'{out}' is the recording itself; name another file")
     config = compose_config("estimate", overrides)
     folder, model, trust = open_model(name, Path(config["output"]), note)
-    if trust is not None and has_to_compile(health_kernel, "health_kernel"):
+    if has_to_compile(model.slow_kernel) or (trust is not None and has_to_compile(SLOW_KERNEL)):
         note("compiling once, about 20 s")
     if any(key_of(override).split(".")[0] == "downsample" for override in overrides):
         model.preparation = config["downsample"]

@@ -19,6 +19,7 @@ from vehest.data.split_files import Reader, dataset_names, split_from_config
 from vehest.data.splits import Split
 from vehest.data.store import read_recording
 from vehest.estimators.kernels.compiling import has_to_compile
+from vehest.estimators.registry import estimator_class
 from vehest.run.artefacts import Artefact, StagePlan, Status, ensured, find
 from vehest.run.config import Config, compose_config, missing_keys
 from vehest.run.console import Bars, Messages
@@ -34,11 +35,11 @@ from vehest.run.locks import Waiting
 from vehest.run.signals import DryRunStop, StopSignals, TimeLimit
 from vehest.run.tracking import Tracker, log_member, rmse_of_tests
 from vehest.run.train import STAGE as TRAIN
-from vehest.run.train import compiles_slowly, read_fit_metrics
+from vehest.run.train import read_fit_metrics
 from vehest.run.weights import PublishedWeights
 from vehest.sources.base import kind_of, open_source
 from vehest.training.context import Progress
-from vehest.trust import health_kernel
+from vehest.trust.health import SLOW_KERNEL
 from vehest.trust.record import read_trust
 
 Value = TypeVar("Value")
@@ -223,9 +224,9 @@ class Runner:
             self.messages.line("plan", "train", f"{len(labels)} in all", f"{n_there} more are there")
             raise DryRunStop
         for name in dict.fromkeys(str(group.jobs[0].estimator["name"]) for group in waiting):
-            if compiles_slowly(name):
+            if has_to_compile(estimator_class(name).slow_kernel):
                 self.messages.line("once", "compile", name, "tens of seconds before its first training; later ones load it")
-        if any(group.split.validation for group in waiting) and has_to_compile(health_kernel, "health_kernel"):
+        if any(group.split.validation for group in waiting) and has_to_compile(SLOW_KERNEL):
             self.messages.line("once", "compile", "health", "about 20 s before the first calibration; later ones load it")
         for split in dict.fromkeys(group.split.name for group in waiting if not group.split.validation):
             self.messages.line("note", "calibrate", split, "has no validation range: no bands")

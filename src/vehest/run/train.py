@@ -6,7 +6,6 @@ configuration, split, recordings -> TrainJob -> `fit_jobs` -> estimator and reco
 from __future__ import annotations
 
 import csv
-import importlib
 import json
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -19,7 +18,6 @@ from vehest.data.splits import Span, Split
 from vehest.data.store import read_recording
 from vehest.data.text_files import first_line, number_in, read_rows
 from vehest.estimators.base import Estimator, FitData, FitRecord
-from vehest.estimators.kernels.compiling import has_to_compile
 from vehest.estimators.model_files import save_model
 from vehest.estimators.registry import estimator_class
 from vehest.run.artefacts import MANIFEST, TIMINGS, Artefact, StagePlan
@@ -97,12 +95,6 @@ def code_of_training(estimator: str) -> str:
     """Version of a training of an estimator."""
     kind = estimator_class(estimator)
     return f"train={VERSION} {estimator}={kind.version} training={getattr(kind.training_type, 'version', '1')}"
-
-
-def compiles_slowly(estimator: str) -> bool:
-    """Whether an estimator's training compiles on this machine for tens of seconds before it starts; later ones load the result."""
-    name = estimator_class(estimator).slow_kernel
-    return bool(name) and has_to_compile(importlib.import_module(name), "_transition")
 
 
 def fit_jobs(jobs: Sequence[TrainJob], context: FitContext) -> list[tuple[Estimator, FitRecord]]:

@@ -70,6 +70,8 @@ _NAMES = {number: name for name, number in NUMBERS.items()}
 NO_ESTIMATE, BEYOND_SPEED, TOO_WIDE = 30, 31, 32
 """Kinds of reasons that follow from an estimate and not from its channels (`vehest.trust.verdict`)."""
 
+SLOW_KERNEL = "vehest.trust.health_kernel:health_kernel"  # compiles for tens of seconds
+
 REASONS: dict[int, tuple[str, float]] = {
     kernel.FREE: ("", 0.0),
     kernel.MISSING: ("{channel} is not measured", 0.0),

@@ -7,6 +7,7 @@ digits differ. So a callee is made part of its callers, and exists nowhere else.
 
 from __future__ import annotations
 
+import importlib
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -26,11 +27,15 @@ def part(**options: Any) -> Callable[[Callable[..., Any]], Any]:
     )
 
 
-def has_to_compile(module: Any, name: str) -> bool:
-    """Whether a module's entry compiles on this machine before it first runs; later runs load the result."""
-    function = getattr(module, name)
+def has_to_compile(where: str) -> bool:
+    """Whether an entry, ``module:function``, compiles on this machine before it first runs; later runs load the result."""
+    name, _, entry_name = where.partition(":")
+    if not name:
+        return False
+    module = importlib.import_module(name)
+    function = getattr(module, entry_name)
     if not hasattr(function, "stats"):  # NUMBA_DISABLE_JIT
         return False
-    folder, source = function.stats.cache_path, Path(module.__file__)
-    kept = [] if folder is None else Path(folder).glob(f"{source.stem}.{name}-*.nbi")
+    folder, source = function.stats.cache_path, Path(str(module.__file__))
+    kept = [] if folder is None else Path(folder).glob(f"{source.stem}.{entry_name}-*.nbi")
     return folder is not None and not any(index.stat().st_mtime >= source.stat().st_mtime for index in kept)
