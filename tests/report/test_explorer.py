@@ -4,9 +4,10 @@ import numpy as np
 import pandas as pd
 import pytest
 from hour import hour_of_driving
+from packed_columns import unpacked
 
 from vehest.report.document import Column, Document, Table, bars_of, write_document
-from vehest.report.explorer import Explorer, packed, reckoned_course, unpacked
+from vehest.report.explorer import Explorer, packed, reckoned_course
 
 
 def there_and_back(**columns):

@@ -9,12 +9,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 from hour import hour_of_driving
+from packed_columns import unpacked
 from test_report import FAMILIES, drive, study
 
 from chromium import WIDTHS, axe_violations, browser, complaints, opened
 from vehest.data.splits import Span
 from vehest.report.document import write_document
-from vehest.report.explorer import unpacked
 from vehest.studies.artefacts import StudyArtefacts
 from vehest.studies.drive import comparison, leaderboard
 from vehest.studies.own_car import documents

@@ -24,7 +24,7 @@ from vehest.evaluation.blocks import read_segments, segments_of, write_segments
 from vehest.evaluation.metrics import UNITS, Protocol, accuracy, score
 from vehest.report.document import Column, Document, Figure, Table, formatted, write_document
 from vehest.report.figures import decimated
-from vehest.report.style import MISSING, colour_of, decimals_for, fixed, lines_of, on_dark, significant
+from vehest.report.style import MISSING, decimals_for, fixed, line_of, lines_of, on_dark, significant
 from vehest.studies.artefacts import METRIC_COLUMNS, EvaluatedModel, PartArtefacts
 from vehest.studies.drive import comparison, leaderboard
 from vehest.studies.kit.timings import timings_of_study
@@ -579,8 +579,8 @@ def test_numbers_are_written_with_the_digits_asked_for():
 
 
 def test_each_family_has_one_hue_and_each_estimator_a_line_of_its_own():
-    assert colour_of("ksnn", "linear_no_bias_p2") != colour_of("ksnn", "linear_bias_p2")
-    assert colour_of("ksnn", "linear_bias_p2") == colour_of("ksnn", "linear_bias_p3")
+    assert line_of("ksnn", "linear_no_bias_p2").colour != line_of("ksnn", "linear_bias_p2").colour
+    assert line_of("ksnn", "linear_bias_p2").colour == line_of("ksnn", "linear_bias_p3").colour
     names = [("ksnn", f"nonlinear_bias_p{p}_q{q}") for p in range(2, 5) for q in range(1, 5)] + [("luenberger", ""), ("new", "x")]
     lines = lines_of(names)
     assert len(set(lines.values())) == len(names)
@@ -598,8 +598,8 @@ def test_colours_stand_out_on_dark_and_light_pages():
 
     ksnn = [("ksnn", f"{kind}_{bias}_p2") for kind in ("linear", "nonlinear") for bias in ("bias", "no_bias")]
     for name in [("luenberger", ""), ("gru", ""), ("lstm", ""), ("heavy_ekf", ""), *ksnn]:
-        assert contrast(colour_of(*name), "#ffffff") > 2.0, name
-        assert contrast(on_dark(colour_of(*name)), on_dark("#ffffff")) > 3.0, name
+        assert contrast(line_of(*name).colour, "#ffffff") > 2.0, name
+        assert contrast(on_dark(line_of(*name).colour), on_dark("#ffffff")) > 3.0, name
     assert contrast(on_dark("#000000"), on_dark("#ffffff")) > 10.0
 
 

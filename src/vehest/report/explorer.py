@@ -12,7 +12,6 @@ import json
 import zlib
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
@@ -108,17 +107,6 @@ def packed(columns: dict[str, FloatArray]) -> tuple[dict[str, list[float]], str]
         parts += [(differences & 0xFF).astype(np.uint8), (differences >> 8).astype(np.uint8)]
         described[name] = [low, scale]
     return described, base64.b64encode(zlib.compress(b"".join(part.tobytes() for part in parts), 9)).decode()
-
-
-def unpacked(content: dict[str, Any]) -> dict[str, FloatArray]:
-    """Columns of what `Explorer.to_json` says, as the page reads them."""
-    n = content["length"]
-    raw = np.frombuffer(zlib.decompress(base64.b64decode(content["data"])), np.uint8).reshape(-1, 2, n).astype(np.uint16)
-    codes = np.cumsum(raw[:, 0] + (raw[:, 1] << 8), axis=1, dtype=np.uint16)
-    return {
-        name: np.where(own == GAP, np.nan, low + scale * own.astype(np.float64))
-        for own, (name, (low, scale)) in zip(codes, content["columns"].items(), strict=True)
-    }
 
 
 def reckoned_course(vx: FloatArray, vy: FloatArray, yaw_rate: FloatArray, step: float) -> tuple[FloatArray, FloatArray]:

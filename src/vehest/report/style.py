@@ -78,11 +78,6 @@ class Line:
 REFERENCE = Line(REFERENCE_COLOUR)
 
 
-def colour_of(estimator: str, variant: str = "") -> str:
-    """Colour of an estimator; see `line_of`."""
-    return line_of(estimator, variant).colour
-
-
 def line_of(estimator: str, variant: str = "") -> Line:
     """Line of an estimator as its family declares it (`Estimator.line_style`), else one of a colour that depends on the name only."""
     drawn = estimator_class(estimator).line_style(variant) if estimator in estimator_names() else None
