@@ -77,6 +77,7 @@ CARS = (
     Car("F1TENTH, 1:8", "real", False, 0.33, 0.115, "f1tenth", slowest=1.0),
     Car("DART, 1:10", "real", False, 0.175, 0.094, "dart", slowest=0.5),
     Car("RoboRacer, 1:10", "real", False, 0.33, None, "roboracer", slowest=0.5),
+    Car("AutoRally, 1:5, smoothed signals", "real", False, 0.57, None, "autorally", slowest=1.0),
 )
 SHIPS_ON = ("Ferrari 250 LM", "DevBot, by TUM", "Corvette Grand Sport", "BMW 545i")
 LARGEST_RATIO = 1.1
@@ -104,6 +105,14 @@ def drives_of(car: Car, runner: Runner, root: str) -> Iterator[Recording]:
             )  # measured that far behind the point of the sideslip
             channels = {"yaw_rate": yaw_rate, "vx": speed, "ay": ay, "vy_ref": speed * np.tan(held["Sideslip_rad"])}
             yield resampled(Recording(file.stem, "audi_tts", 200.0, 0.0, channels), RATE, {"method": "polyphase", "transforms": []})
+        return
+    if car.dataset == "autorally":
+        for file in sorted((Path(root) / "autorally").glob("mppi_states_controls*.mat")):
+            states, accelerations = scipy.io.loadmat(file)["states"], scipy.io.loadmat(str(file).replace("states_controls", "accels"))["a"]
+            whole = slice(2000, -2000)  # poses, from which the states were made, blow up at both ends
+            channels = {"yaw_rate": states[2], "vx": states[0], "ay": -accelerations[1], "ax": accelerations[0], "vy_ref": states[1]}
+            channels = {name: np.ascontiguousarray(values[whole], dtype=float) for name, values in channels.items()}
+            yield resampled(Recording(file.stem, "autorally", 1000.0, 0.0, channels), RATE, {"method": "polyphase", "transforms": []})
         return
     made = runner.ingest(compose_config("ingest", [f"dataset={car.dataset}", f"root={root}", f"output={runner.output}", *car.overrides]))
     for name in made.outputs:
