@@ -149,11 +149,7 @@ def documents(artefacts: StudyArtefacts) -> dict[str, Document]:
 
 
 def steps_of(artefacts: StudyArtefacts) -> list[Step]:
-    """All steps in the order of the pipeline.
-
-    Raises:
-        DataError: the steps were not validated on the same ranges, or learnt or were validated on anything real.
-    """
+    """All steps in the order of the pipeline."""
     parts = artefacts.parts
     if len({(part.split.validation, part.split.tests[RACE_CARS]) for part in parts.values()}) > 1:
         raise DataError(f"study '{artefacts.study}': its parts stop or choose on different ranges, nothing can be chosen among them")

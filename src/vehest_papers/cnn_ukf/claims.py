@@ -375,11 +375,7 @@ def _ratio(one: FloatArray, other: FloatArray) -> float:
 
 
 def activity(outputs: OutputsOf, shifts: Mapping[str, Sequence[float]]) -> pd.DataFrame:
-    """What of each hybrid is active: shift of β for 1° of β_DD, and quantiles of its deviations.
-
-    Returns:
-        Columns: candidate, shift [deg] (median of seeds), distrust, process_vy, process_yaw_rate (5, 50 and 95 % over all seeds, in words).
-    """
+    """What of each hybrid is active: median shift of β for 1° of β_DD [deg], and quantiles of its deviations over all seeds, in words."""
     rows = []
     for name, seeds in outputs.items():
         every = [own for seed in seeds for own in seed]

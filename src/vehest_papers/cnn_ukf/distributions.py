@@ -56,11 +56,7 @@ def _driven(part: PartArtefacts, prepared: Prepared) -> tuple[FloatArray, FloatA
 
 
 def errors_figure(runs: Runs, name: str, number: int, title: str, data: str) -> tuple[Figure, pd.DataFrame]:
-    """Distribution of the error where |ay| ≥ 4 m/s², of the seed that validation chooses, with mean and standard deviation.
-
-    Returns:
-        The figure and its values.
-    """
+    """Distribution of the error where |ay| ≥ 4 m/s², of the seed that validation chooses, with mean and standard deviation."""
     picked = {candidate: chosen(own) for candidate, own in runs.items()}
     found = {name: error_distribution([part for parts in run.test.values() for part in parts]) for name, run in picked.items()}
     with new_figure(DOUBLE_COLUMN, 3.4) as figure:

@@ -25,12 +25,7 @@ WINDOW = 10
 
 
 def local(estimator: DugoffUkf) -> pd.DataFrame:
-    """Observability of the model in steady turns, about which it is linearised.
-
-    Returns:
-        Columns: speed [m/s], steer [deg], measured (``all`` or ``ay, yaw rate``), rank of the matrix of two samples, deviation of the
-        lateral velocity from 10 samples [m/s]; a row a speed, steering angle and set of measurements.
-    """
+    """Observability of the model in steady turns, a row a speed [m/s], steering angle [deg] and set of measurements."""
     track = estimator.track()
     levels = np.array([estimator.levels[name] for name in SENSORS[estimator.settings.inputs]])
     rows = []

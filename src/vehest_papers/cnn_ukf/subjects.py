@@ -103,11 +103,7 @@ Runs = Mapping[str, Sequence[Run]]
 
 
 def candidate_of(model: EvaluatedModel) -> str:
-    """What the paper calls a model, or what of its method is taken away; of a network's inputs z-scores are named.
-
-    Raises:
-        DataError: it has none like it.
-    """
+    """What the paper calls a model, or what of its method is taken away; of a network's inputs z-scores are named."""
     if model.estimator == "cnn_ukf":
         away = [words for name, words in PARTS_AWAY.items() if name in model.variant]
         if away:
@@ -124,11 +120,7 @@ def filter_of(fitted: Estimator) -> DugoffUkf | None:
 
 
 def runs_of(part: PartArtefacts, prepared: Prepared) -> dict[str, list[Run]]:
-    """Candidate -> its seeds, in the order of Table II.
-
-    Raises:
-        DataError: two models of one candidate have the same seed, a model is none of the paper's, or a recording has several test ranges.
-    """
+    """Candidate -> its seeds, in the order of Table II."""
     recordings = [span.recording for span in prepared.spans(TEST)]
     if len(set(recordings)) != len(recordings):
         raise DataError(f"study '{part.study}': a recording of the test set has several ranges, but a manoeuvre is one; correct the split")

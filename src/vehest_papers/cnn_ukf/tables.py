@@ -45,12 +45,7 @@ def kpi_values(runs: Runs, candidate: str, name: str) -> FloatArray:
 def accuracy(
     comparison: ManoeuvreErrors, published: Mapping[str, paper.Published], training: Mapping[str, float], name: str, caption: str
 ) -> Table:
-    """Table II or III: our figures with their intervals, the paper's in brackets, errors of validation and of training.
-
-    Args:
-        published: candidate -> the paper's figures.
-        training: candidate -> mean RMSE of a training manoeuvre [deg], of the seed that is drawn.
-    """
+    """Table II or III: our figures with their intervals, the paper's in brackets, errors of validation and of training [deg]."""
     rows = []
     for candidate, own in comparison.runs.items():
         row: dict[str, object] = {"candidate": candidate, "n_seeds": len(own)}

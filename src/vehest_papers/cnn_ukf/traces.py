@@ -27,11 +27,7 @@ LAP_SECONDS = 32.0  # what Fig. 10 shows of a lap
 
 
 def manoeuvre_of(part: PartArtefacts, prepared: Prepared, group: str) -> Span:
-    """The test manoeuvre of a group with the largest sideslip angle among those in which the car did not spin.
-
-    Raises:
-        DataError: there is none.
-    """
+    """The test manoeuvre of a group with the largest sideslip angle among those in which the car did not spin."""
     peaks = {}
     for span in part.split.tests[TEST]:
         drive = prepared.recording(span.dataset, span.recording)

@@ -47,11 +47,7 @@ class Filter:
 
 
 def filters_of(part: PartArtefacts) -> dict[str, Filter]:
-    """Name -> filter, in the order of `paper.VARIANTS`; of several of one variant the first.
-
-    Raises:
-        DataError: one of the paper's three is not there.
-    """
+    """Name -> filter, in the order of `paper.VARIANTS`; of several of one variant the first."""
     found: dict[str, Filter] = {}
     for model in part.models:
         if model.estimator == "rational_ekf" and model.variant in paper.VARIANTS:

@@ -157,13 +157,7 @@ def parameters_figure(
     name: str,
     caption: str,
 ) -> Figure:
-    """Estimated tyre parameters over time, a line a kind of tyre, with the plant's own dashed: Figures 8 and 9.
-
-    Args:
-        estimates: kind of tyre -> what the filter made of it.
-        own: kind of tyre -> the plant's own curves; empty where they are not known.
-        filter_name: of the filter.
-    """
+    """Estimated tyre parameters over time, a line a kind of tyre, with the plant's own, where they are known, dashed: Figures 8 and 9."""
     linear = filter_name == paper.LINT
     quantities = list(LINEAR_LABELS) if linear else list(QUANTITIES)
     with new_figure(DOUBLE_COLUMN, 2.3 if linear else 3.8) as figure:
@@ -202,12 +196,7 @@ def convergence_table(
     own: Mapping[str, OwnCurves],
     names: Sequence[str],
 ) -> Table:
-    """Start, end and the plant's own value of every estimated parameter, and from when on it stays near.
-
-    Args:
-        own: kind of tyre -> the plant's own curves.
-        names: filters whose parameters are states.
-    """
+    """Start, end and the plant's own value of every estimated parameter, and from when on it stays near."""
     rows = []
     for test, drive in drives.items():
         tyres = test.split("_")[0]

@@ -90,13 +90,7 @@ def _is_finite(part: Segments) -> bool:
 
 
 def masked_segments(parts: Sequence[Scored], masks: Sequence[FloatArray], rate_hz: float) -> Segments:
-    """Sums over segments as `vehest.evaluation.blocks.segments_of` makes them, of some of the scored samples alone.
-
-    Args:
-        parts: estimate and reference, in order.
-        masks: of each, which samples count, (K,), 0 or 1.
-        rate_hz: of the scored samples [Hz].
-    """
+    """Sums over segments as `vehest.evaluation.blocks.segments_of` makes them, of the scored samples where ``masks`` (K,) are 1."""
     marked = list(zip(parts, masks, strict=True))
     chosen = segments_of(
         [

@@ -70,15 +70,7 @@ def statistics(recordings: Sequence[Recording]) -> Statistics:
 
 
 def data_quality(sets: Mapping[str, Sequence[Recording]], source: str) -> list[Block]:
-    """Table I, then Figs. 4 and 5 by car, over all of its sets of one kind.
-
-    Args:
-        sets: name -> recordings at one rate with vx, yaw_rate, ay and vy_ref; ``C-1`` to ``F-2`` stand beside the paper's.
-        source: where the recordings come from, in words, for the captions.
-
-    Raises:
-        DataError: a channel is missing, or a recording is too short for a periodogram.
-    """
+    """Table I, then Figs. 4 and 5 by car, over all of its sets of one kind; ``C-1`` to ``F-2`` stand beside the paper's."""
     groups: dict[tuple[str, str], list[Recording]] = {}
     for recording in (recording for recordings in sets.values() for recording in recordings):
         groups.setdefault((recording.vehicle, recording.kind), []).append(recording)

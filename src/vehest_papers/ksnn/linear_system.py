@@ -116,11 +116,7 @@ class LocalModels:
         return np.where(small, self.slope(np.zeros(())), rise)
 
     def linearised(self, error: float = 0.0) -> LpvModel:
-        """The linear system that this is for linear feedback, and close to ``error`` otherwise: f(e) ≈ f(e₀) + f'(e₀)(e - e₀).
-
-        Args:
-            error: e₀, the difference û - u_m to linearise at [m/s].
-        """
+        """The linear system that this is for linear feedback, and close to ``error`` e₀ [m/s] otherwise: f(e) ≈ f(e₀) + f'(e₀)(e - e₀)."""
         at = np.asarray(error)
         slope = self.slope(at)
         return LpvModel(self.centres, self.gamma, self.beta, slope, self.feedback(at) - slope * error, self.step, self.n_window)

@@ -30,11 +30,7 @@ def _read(path: Path) -> dict[str, Segments]:
 
 
 def segments_on(model: EvaluatedModel, test: str) -> Segments:
-    """Errors of a model by segments of a test set, its file read once for all tests.
-
-    Raises:
-        DataError: the file is damaged, or has no such test set.
-    """
+    """Errors of a model by segments of a test set, its file read once for all tests."""
     found = _read(model.evaluation_folder / "blocks.csv")
     return found[test] if test in found else model.segments(test)
 

@@ -43,11 +43,7 @@ class Injected:
 
 
 def sensitivity_of(estimator: Estimator, yaw_rate: float, error: float = 0.0) -> NoiseSensitivity:
-    """Closed form of an estimator at constant yaw rate: a KS-NN's by its windows, linearised at û - u_m = ``error`` where it is not linear.
-
-    Raises:
-        ConfigurationError: it is neither a KS-NN nor a Luenberger observer.
-    """
+    """Closed form at constant yaw rate: a KS-NN's by its windows, linearised at û - u_m = ``error`` where it is not linear."""
     if isinstance(estimator, Ksnn):
         return ksnn_sensitivity(LocalModels.of(estimator).linearised(error), yaw_rate).truncated(estimator.settings.window)
     if isinstance(estimator, Luenberger):
@@ -80,16 +76,7 @@ def injected(
 
 
 def sensitivities(columns: Sequence[tuple[Trained, Trained]], *, n_samples: int = INJECTED_SAMPLES, error: float = 0.0) -> list[Block]:
-    """Magnitudes of H_Y and H_X, a column a training vehicle, with the check by injection.
-
-    Args:
-        columns: a KS-NN (linear, without bias, in the paper) and a Luenberger observer trained on the same data, by vehicle.
-        n_samples: length of the turns into which noise is injected.
-        error: û - u_m at which nonlinear networks are linearised, 0 or what is typical of a drive [m/s].
-
-    Raises:
-        ConfigurationError: an estimator is of another kind.
-    """
+    """Magnitudes of H_Y and H_X, a column a training vehicle (KS-NN and Luenberger observer), with the check by injection."""
     frames = [pd.DataFrame([row for own in pair for row in _rows(own, n_samples, error)]) for pair in columns]
     return [_figure(columns, error), _in_words(columns, frames), _table(pd.concat(frames, ignore_index=True), n_samples)]
 

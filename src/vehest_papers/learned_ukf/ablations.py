@@ -47,14 +47,7 @@ class Additions:
 
 
 def additions(name: str, part: PartArtefacts, beside: Mapping[str, PartArtefacts], errors: Mapping[str, Losses], kind: str) -> Additions:
-    """All comparisons of the parts that are there.
-
-    Args:
-        name: of the main part, and of files.
-        part: the main one.
-        beside: parts of the same data, by name.
-        errors: test set -> losses of the main part.
-    """
+    """All comparisons of the parts that are there."""
     own, groups = Additions(), models_by_candidate(part)
     main = {title: Subject.of(part, title, errors=errors) for title in groups}
     scratch = _alone(beside, SCRATCH)

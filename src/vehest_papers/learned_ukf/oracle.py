@@ -21,11 +21,7 @@ TRAINING = ThroughFilterSettings(
 
 
 def train_on(estimator: LearnedUkf, drives: Drive, skip: int, training: ThroughFilterSettings = TRAINING) -> LearnedUkf:
-    """Train a filter further, in place, on a test's own sequences (B, T, ...), and stop on them too; its friction is free.
-
-    Args:
-        skip: first samples of each that are not scored.
-    """
+    """Train a filter further, in place, on a test's own sequences (B, T, ...), and stop on them too; its friction is free."""
     length = drives.states.shape[1]
     training = replace(training, steps=min(training.steps, length), validation_steps=length, validation_drop_steps=skip)
     own = [Drive(*(part[row] for part in drives)) for row in range(len(drives.states))]

@@ -44,11 +44,7 @@ def hardest(errors: Sequence[Sequence[FloatArray]]) -> int:
 def hard_sequence(
     part: PartArtefacts, models: Mapping[str, EvaluatedModel], test: str, name: str, data: str
 ) -> tuple[Figure, pd.DataFrame]:
-    """Reference and estimates over the sequence on which the shown models together err most.
-
-    Returns:
-        The figure and its values.
-    """
+    """Reference and estimates over the sequence on which the shown models together err most."""
     losses = [[weighted_squared_errors(own) for own in part.scored(model, test)] for model in models.values()]
     position = hardest(losses)
     pieces = sequences(part.split.tests[test], lambda span: read_recording(part.references[span.dataset, span.recording]), part.protocol)

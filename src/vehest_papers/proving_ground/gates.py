@@ -91,12 +91,7 @@ def _quantities(own: Statistics) -> dict[str, float]:
 
 
 def gates(drives: Mapping[str, Mapping[str, Sequence[Recording]]], real: Sequence[Recording]) -> list[Gate]:
-    """All gates.
-
-    Args:
-        drives: data set -> set of drives, ``c1`` say -> its recordings at `RATE_HZ`.
-        real: the real Ferrari's, at the same rate; empty where it is missing, and the gate on its spectrum is then left out.
-    """
+    """All gates, of data sets at `RATE_HZ`; without the real Ferrari the gate on its spectrum is left out."""
     found = [gate for name, published in PUBLISHED.items() for gate in _of_table_one(name, published, drives)]
     by_car = {name: _by_car(sets) for name, sets in drives.items()}
     real_map = f"{left_by(static_map_of(real), real):.2f} (real Ferrari)" if real else "–"

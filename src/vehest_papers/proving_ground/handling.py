@@ -90,12 +90,7 @@ def wheelbase_of(vehicle: Vehicle) -> float:
 
 
 def characteristic(vehicle: Vehicle, friction: float, label: str) -> Characteristic:
-    """Ramps to either side up to the largest lateral acceleration.
-
-    Args:
-        friction: scale of the tyres' friction.
-        label: for the figure.
-    """
+    """Ramps to either side up to the largest lateral acceleration."""
     plant = MultiBodyPlant(vehicle)
     speed = min(RAMP_SPEED, 0.5 * float(plant.parameters.longitudinal.v_max))
     halves = []

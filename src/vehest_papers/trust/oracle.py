@@ -145,16 +145,7 @@ def learn_oracle(
     channels: Sequence[str],
     rate_hz: float,
 ) -> Oracle:
-    """Fit relations and autoregression to training drives; healthy drives are these and those of validation.
-
-    Args:
-        train, validation: at ``rate_hz``.
-        channels: that an estimator reads.
-        rate_hz: [Hz].
-
-    Raises:
-        DataError: a channel is missing or there are too few samples.
-    """
+    """Fit relations and autoregression to training drives; healthy drives are these and those of validation."""
     names = tuple(channels)
     train, validation = ([without_glitches(recording, names) for recording in part] for part in (train, validation))
     least_speed = least_speed_of(train, names)
