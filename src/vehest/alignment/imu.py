@@ -150,12 +150,7 @@ class Signals:
 
 
 def signals_of(recording: Recording, settings: AlignmentSettings) -> Signals:
-    """Signals of a recording.
-
-    Raises:
-        DataError: a channel is missing or has gaps, or the recording is too short.
-        ConfigurationError: the cut-off is too high for the recording's rate, or it or the largest delay asks for more than the limits.
-    """
+    """Signals of a recording."""
     asked = ", ".join(settings.kinematic)
     if "vy_ref" not in recording:
         raise DataError(f"recording '{recording.id}' has no reference channel 'vy_ref', which {asked} are estimated against")

@@ -62,16 +62,7 @@ class CrossSpectra:
 
 
 def cross_spectra(signals: Mapping[str, FloatArray], rate_hz: float, used: BoolArray | None = None) -> CrossSpectra | None:
-    """Welch's cross-spectra in the band, from segments under a Hann window that overlap by half.
-
-    Args:
-        signals: name -> samples without gaps, (T,) each.
-        rate_hz: sampling rate.
-        used: samples that a segment may hold, (T,); all if not given.
-
-    Returns:
-        None where the recording is too short or sampled too slowly to say anything.
-    """
+    """Welch's cross-spectra in the band, from segments of ``used`` samples under a Hann window; None where the recording is too short."""
     duration = len(next(iter(signals.values()), ())) / rate_hz
     if duration < SHORTEST_DRIVE or rate_hz < LOWEST_RATE:
         return None

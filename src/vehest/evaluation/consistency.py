@@ -52,11 +52,5 @@ def normalised_innovation_squared(nis: FloatArray, dof: FloatArray) -> float:
 
 
 def coverage(errors: FloatArray, variance: FloatArray, n_sigma: float) -> float:
-    """Fraction of errors within ``n_sigma`` standard deviations; `COVERAGE` says what is expected of Gaussian ones.
-
-    Args:
-        errors: shape (K,).
-        variance: what the filter gives each, shape (K,).
-        n_sigma: half width of the band in standard deviations.
-    """
+    """Fraction of errors within ``n_sigma`` standard deviations; `COVERAGE` says what is expected of Gaussian ones."""
     return float(np.mean(np.square(errors) <= n_sigma**2 * variance))

@@ -103,11 +103,7 @@ class Drive:
 
 
 def drives_of(spans: Sequence[Span], recording_of: Callable[[Span], Recording], protocol: Protocol) -> list[Drive]:
-    """The ranges or sequences of a test set, as `score_all` counts them.
-
-    Args:
-        recording_of: of a range: its recording at ``protocol.rate_hz``, references included.
-    """
+    """The ranges or sequences of a test set, as `score_all` counts them."""
     return [drive_of(reference, piece, protocol) for reference, piece in pieces_of(spans, recording_of, protocol)]
 
 
@@ -332,12 +328,7 @@ def _levels(drives: Sequence[Drive], inputs: set[str], car: bool) -> _Levels:
 
 
 def _unexplained(series: Sequence[tuple[FloatArray, FloatArray, FloatArray]], rate_hz: float) -> list[FloatArray]:
-    """What a rate leaves of the change of a velocity [m/s²], a scale of the sensor (roll and pitch with it) taken out.
-
-    Args:
-        series: velocity, rate and sensor of each stretch, (T,) each.
-        rate_hz: sampling rate [Hz].
-    """
+    """What a rate leaves of the change of a velocity [m/s²], a scale of the sensor (roll and pitch with it) taken out."""
     left = [np.diff(velocity) * rate_hz - _middle(rate) for velocity, rate, _ in series]
     sensor = [_middle(own) for *_, own in series]
     power = sum(float(own @ own) for own in sensor)

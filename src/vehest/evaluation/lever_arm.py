@@ -40,14 +40,7 @@ def point_is_unknown(reference: Recording) -> bool:
 def best_lever_arm(
     parts: Sequence[Scored], yaw_rates: Sequence[FloatArray], speeds: Sequence[FloatArray], least_speed: float = 0.0
 ) -> LeverArm:
-    """The lever arm x that leaves the least error: argmin of the mean of (v̂ - v - x·r)², that is Σ(v̂ - v)r / Σr², within `LONGEST`.
-
-    Args:
-        parts: estimate and reference, of all ranges of a test set.
-        yaw_rates: r [rad/s] at the same samples.
-        speeds: u [m/s], by which sideslip is made of v.
-        least_speed: see `Protocol`.
-    """
+    """The lever arm x that leaves the least error: argmin of the mean of (v̂ - v - x·r)², that is Σ(v̂ - v)r / Σr², within `LONGEST`."""
     error = np.concatenate([part.vy - part.vy_ref for part in parts])
     turning = np.concatenate(list(yaw_rates))
     power = float(turning @ turning)
@@ -62,10 +55,6 @@ def best_lever_arm(
 
 def lever_arm_figures(parts: Sequence[Scored], pieces: Iterable[tuple[Recording, Span]], protocol: Protocol) -> dict[str, float]:
     """Errors with the best lever arm, and the lever arm, of a test set whose references were all measured at unknown points.
-
-    Args:
-        parts: estimate and reference, of each piece.
-        pieces: whole recordings at ``protocol.rate_hz`` and the ranges, or sequences, in them, as `pieces_of` counts them.
 
     Returns:
         metric -> value, with ``lever_arm`` [m]; nothing where a reference's point is known or undeclared, or a recording has no yaw rate.

@@ -157,14 +157,7 @@ class Scored:
 
 
 def sequences(spans: Sequence[Span], recording_of: Callable[[Span], Recording], protocol: Protocol) -> list[Span]:
-    """The stretches that estimates are made of, one after another: the ranges, or the sequences that they are cut into.
-
-    Args:
-        recording_of: of a range: its recording at ``protocol.rate_hz``; asked for only if ranges are cut.
-
-    Raises:
-        DataError: no range is as long as a sequence.
-    """
+    """The stretches that estimates are made of: the ranges, or the sequences that they are cut into; `DataError` if all are too short."""
     if protocol.sequence_seconds is None:
         return list(spans)
     steps = round(protocol.sequence_seconds * protocol.rate_hz)
@@ -184,11 +177,7 @@ def sequences(spans: Sequence[Span], recording_of: Callable[[Span], Recording], 
 
 
 def reference_state(reference: Recording, span: Span) -> dict[str, float]:
-    """The state that a protocol hands over at the first sample of a range: ``vx``, ``vy`` [m/s], ``yaw_rate`` [rad/s].
-
-    Raises:
-        DataError: a reference channel is missing, or has a gap there.
-    """
+    """The state that a protocol hands over at the first sample: ``vx``, ``vy`` [m/s], ``yaw_rate`` [rad/s]; `DataError` in a gap."""
     first = reference.index_range(span.start, span.stop)[0]
     state = {}
     for name, channel in REFERENCES.items():
@@ -204,15 +193,7 @@ def reference_state(reference: Recording, span: Span) -> dict[str, float]:
 def score_all(
     estimate_of: Callable[[int], Estimate], spans: Sequence[Span], recording_of: Callable[[Span], Recording], protocol: Protocol
 ) -> list[Scored]:
-    """Score the estimates of a test set, one a range or one a sequence, as `sequences` counts them.
-
-    Args:
-        estimate_of: position among the sequences -> estimate.
-        recording_of: of a range: its recording at ``protocol.rate_hz``, references included.
-
-    Raises:
-        DataError: as `score` and `sequences` say.
-    """
+    """Score the estimates of a test set by position among its `sequences`; ``recording_of`` a range is at ``protocol.rate_hz``."""
     return [
         score(estimate_of(position), reference, piece, protocol)
         for position, (reference, piece) in enumerate(pieces_of(spans, recording_of, protocol))
@@ -220,14 +201,7 @@ def score_all(
 
 
 def pieces_of(spans: Sequence[Span], recording_of: Callable[[Span], Recording], protocol: Protocol) -> Iterator[tuple[Recording, Span]]:
-    """Each range, or sequence, of a test set with the whole recording that it lies in, one recording in memory at a time.
-
-    Args:
-        recording_of: of a range: its recording at ``protocol.rate_hz``, references included.
-
-    Raises:
-        DataError: as `sequences` says.
-    """
+    """Each range, or sequence, of a test set with the whole recording that it lies in, one recording in memory at a time."""
     read = lru_cache(maxsize=1)(lambda dataset, recording: recording_of(Span(dataset, recording)))  # a range's sequences stand together
 
     def cached(span: Span) -> Recording:
@@ -336,20 +310,12 @@ def accuracy(parts: Sequence[Scored]) -> dict[str, float]:
 
 
 def weighted_squared_errors(part: Scored) -> FloatArray:
-    """Squared errors of vx, vy and yaw rate times `WEIGHTS`, summed at each sample; shape (K,).
-
-    Raises:
-        DataError: an estimate or its reference is missing.
-    """
+    """Squared errors of vx, vy and yaw rate times `WEIGHTS`, summed at each sample, (K,); `DataError` where one is missing."""
     return _weighted(part, np.square)
 
 
 def weighted_absolute_errors(part: Scored) -> FloatArray:
-    """Absolute errors of vx, vy and yaw rate times `WEIGHTS`, summed at each sample; shape (K,).
-
-    Raises:
-        DataError: an estimate or its reference is missing.
-    """
+    """Absolute errors of vx, vy and yaw rate times `WEIGHTS`, summed at each sample, (K,); `DataError` where one is missing."""
     return _weighted(part, np.abs)
 
 

@@ -88,7 +88,6 @@ def rank(
 
     Args:
         segments: of each seed of each estimator, all over the same samples.
-        rate_hz: of the scored samples [Hz].
         asked: further pairs to compare, such as those whose order a paper claims; left out where one of the two is missing.
     """
     first = next(iter(segments.values()))[0]

@@ -50,10 +50,6 @@ REGIMES = ("straight", "turning", *AY_BANDS, "transient", "steady")
 def regimes_of(reference: Recording, span: Span, protocol: Protocol) -> dict[str, Mask]:
     """Which scored samples of a range lie in which regime.
 
-    Args:
-        reference: the recording at ``protocol.rate_hz``.
-        span: the range.
-
     Returns:
         Regime -> (K,); without yaw rate neither straight nor turning, without lateral acceleration no bands, without both none.
     """
@@ -96,11 +92,6 @@ def filled(samples: FloatArray) -> FloatArray:
 
 def errors_by_regime(parts: Sequence[Scored], masks: Sequence[Mapping[str, Mask]], rate_hz: float) -> dict[str, dict[str, float]]:
     """Regime -> `METRICS` and the share of the samples that lie in it, over all parts together.
-
-    Args:
-        parts: estimate and reference of each range or sequence.
-        masks: of each, from `regimes_of`.
-        rate_hz: of the scored samples [Hz].
 
     Returns:
         Only regimes that every part tells, and of which there are `LEAST_SECONDS` of samples.

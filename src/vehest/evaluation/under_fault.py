@@ -76,11 +76,6 @@ def flags_under_fault(parts: Sequence[Scored], flagged: Sequence[Flagged], windo
     ranges that were valid before: ``missed_detections`` share in which nothing is flagged before the fault's end, ``detection_delay`` mean
     time to the first flag of the others [s], ``max_error_sideslip_undetected`` largest error before it [deg]. Only figures that there
     is something for.
-
-    Args:
-        parts: estimate under the fault and reference, of each range or sequence.
-        flagged: band and health of each.
-        rate_hz: of the scored samples [Hz].
     """
     inside, valid, delays, undetected = [], [], [], []
     for part, own, window in zip(parts, flagged, windows, strict=True):

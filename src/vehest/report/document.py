@@ -110,7 +110,6 @@ def write_documents(documents: Mapping[str, Document], folder: Path, *, on_page:
     """Write documents that link to each other as ``NAME.md``; their tables and figures lie side by side.
 
     Args:
-        documents: name of the file -> document; ``report`` is the one to start with.
         on_page: text and tables that the page of ``report`` alone ends with, and no other file holds.
 
     Raises:
@@ -172,11 +171,7 @@ def as_code(text: str) -> str:
 
 
 def formatted(table: Table) -> tuple[list[str], list[list[str]], list[bool]]:
-    """What a table shows.
-
-    Returns:
-        Headers, rows of cells, and for each column whether it holds numbers.
-    """
+    """Headers of a table, rows of cells, and for each column whether it holds numbers."""
     from pandas.api.types import is_bool_dtype, is_numeric_dtype
 
     shown = table.columns or {str(name): Column(str(name)) for name in table.frame.columns}

@@ -31,14 +31,7 @@ class Panel:
 def heat_map(
     panels: Sequence[Panel], columns: Sequence[str], rows: Sequence[str], column_label: str, row_label: str, quantity: str
 ) -> MatplotlibFigure:
-    """Panels on one scale of colours, the darker the larger; logarithmic where the largest value is 20 times the smallest.
-
-    Args:
-        panels: of shape (R, C) each.
-        columns: ticks of the horizontal axis, C of them.
-        rows: ticks of the vertical axis from below, R of them.
-        quantity: what the colours show, with its unit.
-    """
+    """Panels on one scale of colours, the darker the larger; logarithmic where the largest value is 20 times the smallest."""
     import matplotlib
     from matplotlib.cm import ScalarMappable
     from matplotlib.colors import LinearSegmentedColormap

@@ -97,9 +97,6 @@ def compose_config(command: str, overrides: Sequence[str] = ()) -> Config:
 
     Returns:
         Plain dicts, lists, strings and numbers; and under `GIVEN` the rates that overrides name, if any.
-
-    Raises:
-        ConfigurationError: an unknown key or choice, a wrong value, or bad syntax.
     """
     parsed = parse(overrides)
     for override in parsed:

@@ -63,10 +63,6 @@ def publish_study(publication: Publication | None, report: Artefact, messages: M
 
     A published report that shows data which this run could not read stays. Where keys and all other files are the same, the provenance
     stays that of the first run with these results.
-
-    Raises:
-        MissingError: it cannot be written.
-        ConfigurationError: the folder holds something else, or is reached through a link.
     """
     if publication is None:
         return None

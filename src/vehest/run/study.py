@@ -109,12 +109,7 @@ Jobs = Mapping[str, Sequence[Job]]
 
 
 def read_study(name: str, overrides: Sequence[str] = ()) -> Study:
-    """Read a pipeline by path or name; ``overrides`` are those of the command.
-
-    Raises:
-        MissingError: there is none of that name.
-        ConfigurationError: the file is not a pipeline.
-    """
+    """Read a pipeline by path or name; ``overrides`` are those of the command."""
     file, content = _content_of(name)
     read = validated(PipelineFile, content, f"'{file}'", error=ConfigurationError)
     shown = [*read.datasets, *read.optional_datasets]
@@ -203,11 +198,7 @@ def _folds_of(part: Part, file: Path) -> dict[str, Part]:
 
 
 def jobs_of(study: Study, overrides: Sequence[str]) -> Jobs:
-    """Every job of a pipeline; further overrides apply to the sweeps, or data sets, that have their key.
-
-    Raises:
-        ConfigurationError: an override that suits none of them, or jobs of a part that differ in split, evaluation or downsampling.
-    """
+    """Every job of a pipeline; further overrides apply to the sweeps, or data sets, that have their key."""
     what, fixed = ("data set", "dataset") if study.datasets else ("sweep", "split")
     if fixed in map(key_of, overrides):
         raise ConfigurationError(
@@ -270,10 +261,6 @@ def sweep_of(overrides: Sequence[str], name: str | None = None) -> tuple[Study, 
     """A study with one sweep: all combinations of overrides over their seeds, in the order of the command.
 
     A combination that its estimator refuses stays in the list with the reason. By default the study is named after estimators and split.
-
-    Raises:
-        ConfigurationError: a key is named twice, a key takes several values that cannot, the name is none for files, or no combination can
-            be trained.
     """
     with use_limits(limits_of(overrides)):
         check_jobs(count(overrides), "these overrides stand")

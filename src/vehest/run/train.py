@@ -56,12 +56,7 @@ def new_estimator(config: Mapping[str, Any]) -> Estimator:
 
 
 def plan_train(config: Mapping[str, Any], split: Split, data: Mapping[str, Artefact]) -> TrainJob:
-    """A training and its artefact.
-
-    Raises:
-        ConfigurationError: a setting that makes no sense, a training that does not suit the estimator, or nothing to learn from.
-        DataError: the split names a recording that the data set does not have.
-    """
+    """A training and its artefact."""
     estimator, seed = new_estimator(config["estimator"]), config["seed"]
     settings_from_config(estimator.training_type, config["training"], "training")
     if not isinstance(seed, int) or isinstance(seed, bool) or not 0 <= seed < 2**63:

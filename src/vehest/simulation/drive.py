@@ -146,12 +146,7 @@ def drive(
     stability_control: bool = False,
     stint: Stint | None = None,
 ) -> Trip:
-    """Drive a car through a manoeuvre and keep its true motion.
-
-    Raises:
-        ConfigurationError: rate or step make no sense, or the car cannot do the manoeuvre.
-        SimulationError: the car rolled over, or a state is not finite.
-    """
+    """Drive a car through a manoeuvre and keep its true motion."""
     per_command = whole_steps(DRIVER_RATE_HZ, plant.step, "driver's")
     per_sample = whole_steps(rate_hz, plant.step, "sampling")
     controller = manoeuvre.controller(car_of(plant), surface, seed)
@@ -283,11 +278,7 @@ class _Ride:
 
 
 def whole_steps(rate_hz: float, step: float, what: str) -> int:
-    """Steps of the plant [s] between two ticks of a rate.
-
-    Raises:
-        ConfigurationError: no whole number of steps lies between them; ``what`` names the rate.
-    """
+    """Steps of the plant [s] between two ticks of a rate."""
     n_steps = round(1.0 / (rate_hz * step)) if rate_hz > 0 else 0
     if n_steps < 1 or abs(n_steps * step * rate_hz - 1.0) > 1e-9:
         raise ConfigurationError(

@@ -42,10 +42,6 @@ def unpacked(file: Path, *, most_bytes: int = MOST_BYTES) -> Iterator[Path]:
 
     All entries are checked before anything is written: no path outside the folder, no links or special files, no more bytes or files than
     the limits. zipfile unpacks no entry beyond its stated size, and checks its checksum. Archives inside stay packed.
-
-    Raises:
-        DataError: the archive is refused, truncated or corrupt.
-        MissingError: the archive cannot be opened, or there is no room to unpack it.
     """
     with temporary_folder(file) as folder:
         try:

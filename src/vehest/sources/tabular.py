@@ -104,12 +104,7 @@ class TabularSource(FileSource):
         return self._read(*found[recording_id])
 
     def read_raw_file(self, file: Path) -> Recording:
-        """Read a table wherever it is.
-
-        Raises:
-            MissingError: it is not there or empty.
-            DataError: it cannot be read, lacks a column, holds text where numbers belong, or holds several runs.
-        """
+        """Read a table wherever it is."""
         runs = list(self._runs_of(file))
         if len(runs) > 1:
             raise DataError(f"'{file}' holds {len(runs)} runs ({listed([str(run) for run in runs])}); keep the rows of one")
@@ -198,16 +193,7 @@ class TabularSource(FileSource):
 
 
 def unused_columns(dataset: Mapping[str, Any], file: Path | None = None) -> list[str]:
-    """Names of columns that could be declared as channels; none where the source of the data set is not ``tabular``.
-
-    Args:
-        dataset: its configuration.
-        file: the table; the first of the data set if none is given.
-
-    Raises:
-        MissingError: there is no such file.
-        DataError: it cannot be read.
-    """
+    """Names of columns that could be declared as channels; none where the source of the data set is not ``tabular``."""
     source = open_source(dataset)
     if type(source) is not TabularSource:
         return []

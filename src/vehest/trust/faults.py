@@ -66,11 +66,7 @@ WHEEL_FACTORS: Sizes = (1.0 / math.tau, math.tau / 60.0, 60.0 / math.tau)
 
 @dataclass(frozen=True)
 class Fault:
-    """A fault of one channel: kind, size and time.
-
-    Raises:
-        ConfigurationError: an unknown kind, channel or severity, a kind that makes no sense for the channel, or a number that makes none.
-    """
+    """A fault of one channel: kind, size and time; `ConfigurationError` for one that makes no sense."""
 
     kind: str  # one of `KINDS`
     channel: str  # never a reference
@@ -141,11 +137,7 @@ def size_of(kind: str, channel: str, severity: Severity) -> float:
 
 
 def inject(samples: Mapping[str, FloatArray], rate_hz: float, fault: Fault) -> dict[str, FloatArray]:
-    """Samples, channel -> (T,) [SI], with a fault in one channel, which may hold NaN and infinite values then.
-
-    Raises:
-        ConfigurationError: there is no such channel.
-    """
+    """Samples, channel -> (T,) [SI], with a fault in one channel (else `ConfigurationError`), which may then hold any value."""
     if fault.channel not in samples:
         raise ConfigurationError(f"fault '{fault.condition}': there is no channel '{fault.channel}'; there are: {', '.join(samples)}")
     values = np.array(samples[fault.channel], dtype=np.float64)

@@ -74,11 +74,7 @@ class Draft:
 
 
 def draft(examined: Examined) -> Draft:
-    """A data set by the proposals, read as an ingest reads it.
-
-    Raises:
-        VehestError: it cannot be read.
-    """
+    """A data set by the proposals, read as an ingest reads it."""
     proposals, vehicle = examined.proposals, examined.vehicle
     if not proposals.channels:
         raise ConfigurationError("no column is left that would be a channel")

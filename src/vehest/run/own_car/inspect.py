@@ -81,19 +81,7 @@ class Examined:
 
 
 def inspect(name: str, files: Sequence[Path], vehicle: Mapping[str, float | None] | None = None, *, force: bool = False) -> Examined:
-    """Read logs and propose a channel, unit and sign for each column.
-
-    Args:
-        name: of the data set.
-        files: of one format and one set of columns, a recording each.
-        vehicle: known values of `VEHICLE`.
-        force: whether files of a data set of that name may exist.
-
-    Raises:
-        ConfigurationError: the name is taken or cannot be part of a file's name, or the files differ in format or folder.
-        MissingError: a file does not exist.
-        DataError: a file cannot be read, or differs in layout or columns.
-    """
+    """Read logs, of one format and one set of columns, and propose a channel, unit and sign for each column."""
     check_name(name, "data set")
     existing = [file for file in paths_of(name) if os.path.lexists(file)]
     if existing and not force:
@@ -140,12 +128,7 @@ def rate_of(stamps: FloatArray) -> float:
 
 
 def _longest(logs: Sequence[Log]) -> Log:
-    """The longest log, with source and options for all.
-
-    Raises:
-        ConfigurationError: the logs differ in format.
-        DataError: they differ in layout.
-    """
+    """The longest log, with source and options for all."""
     formats = {"text" if log.source in TABLES and not is_parquet(log) else log.source for log in logs}
     if len(formats) > 1:
         raise ConfigurationError(f"the files are of several formats ({', '.join(sorted(formats))}); make a data set of each")
@@ -185,11 +168,7 @@ def _notes(longest: Log, logs: Sequence[Log]) -> Iterator[str]:
 
 
 def _place(files: Sequence[Path], source: str) -> dict[str, Any]:
-    """Folder of the files, pattern that they match, and stems of further files that match.
-
-    Raises:
-        ConfigurationError: they lie in several folders, two have the same stem, or no pattern separates them from other files.
-    """
+    """Folder of the files, pattern that they match, and stems of further files that match."""
     folder, *further = sorted({file.resolve().parent for file in files})
     if further:
         listed = ", ".join(map(str, (folder, *further)))

@@ -49,19 +49,7 @@ class Question:
 
 
 def ask(examined: Examined, answers: Sequence[str] = (), *, interactive: bool) -> tuple[Examined, tuple[Question, ...]]:
-    """Answer the questions that logs leave open.
-
-    Args:
-        examined: the logs.
-        answers: given beforehand, as ``KEY=ANSWER``.
-        interactive: whether the other questions, and those of the vehicle, are asked at the terminal.
-
-    Returns:
-        The logs after the answers, and the questions left open.
-
-    Raises:
-        ConfigurationError: an answer makes no sense, or there is no terminal.
-    """
+    """Answer the questions that logs leave open, by ``KEY=ANSWER`` or at the terminal; returns the logs and the questions left open."""
     questions = list(questions_of(examined))
     keys = [question.key for question in questions]
     given: dict[str, str] = {}
@@ -135,11 +123,7 @@ def _ask_at_terminal(question: Question, examined: Examined) -> Examined:
 
 
 def _answered(examined: Examined, question: Question, answer: str) -> Examined:
-    """The logs after an answer; an empty one takes the proposal.
-
-    Raises:
-        ConfigurationError: the answer makes no sense.
-    """
+    """The logs after an answer; an empty one takes the proposal."""
     key, answer, proposals = question.key, answer.strip(), examined.proposals
     if answer in ("", question.proposed):
         return examined

@@ -75,11 +75,7 @@ class Plan:
 
 
 def registered(word: str) -> str:
-    """The name of an estimator that is given by its name or as ``package.module:Class``.
-
-    Raises:
-        ConfigurationError: no installed package declares it, or it has no file in conf/estimator.
-    """
+    """The name of an estimator that is given by its name or as ``package.module:Class``."""
     name = next((point.name for point in entry_points(group=ENTRY_POINTS) if point.value == word), word)
     if name not in estimator_names():
         declared = f'NAME = "{word if ":" in word else "package.module:Class"}"'
@@ -96,21 +92,7 @@ def registered(word: str) -> str:
 def write(
     examined: Examined, left: Sequence[Question] = (), further: Sequence[str] = (), *, dry_run: bool = False
 ) -> tuple[dict[str, Any], list[str]]:
-    """Write data set, split and pipeline, all or none; the data set alone where nothing can be trained.
-
-    Args:
-        examined: logs after the answers.
-        left: questions without an answer.
-        further: estimators to compare beside those that every new car gets.
-        dry_run: whether to write nothing.
-
-    Returns:
-        The outcome for JSON and for a terminal.
-
-    Raises:
-        MissingError: the disk is full, or a folder cannot be written to.
-        VehestError: the data set cannot be read.
-    """
+    """Write data set, split and pipeline, all or none (only the data set where nothing can be trained); returns JSON and lines."""
     name = examined.name
     with use_limits(limits_from_config(compose_config("estimate")["limits"])):
         made = draft(examined)
@@ -337,11 +319,7 @@ def _pipeline_text(name: str, plan: Plan, minutes: float) -> str:
 
 
 def _yaml(content: Mapping[str, Any], head: Sequence[str], comments: Mapping[str, str] | None = None) -> str:
-    """YAML below a comment, with further comments behind some keys.
-
-    Raises:
-        ConfigurationError: a value would be read as a reference.
-    """
+    """YAML below a comment, with further comments behind some keys."""
     lines = yaml.safe_dump(dict(content), default_flow_style=None, allow_unicode=True, width=10_000, sort_keys=False).splitlines()
     for line in lines:
         if "${" in line:

@@ -60,11 +60,6 @@ class Car:
         """Road-wheel angle [rad] of a steady turn; beyond the grip as much as at the grip.
 
         Friction scales forces and slip angles alike, because a tyre's cornering stiffness hardly depends on it.
-
-        Args:
-            curvature: positive to the left [1/m].
-            lateral_acceleration: that the tyres must give, positive to the left [m/s²].
-            friction: scale of the tyres' friction.
         """
         excess = self._at(self.excess_steer, lateral_acceleration, friction)
         return self.wheelbase * curvature + math.copysign(friction * excess, lateral_acceleration)
@@ -87,11 +82,7 @@ class Car:
 
 
 def car_of(plant: MultiBodyPlant) -> Car:
-    """The car as its driver knows it; measured once a process for each vehicle and step.
-
-    Raises:
-        ConfigurationError: the vehicle's ``driver`` values make no sense, or it cannot be driven around a corner.
-    """
+    """The car as its driver knows it; measured once a process for each vehicle and step."""
     own = dict(plant.vehicle.driver)
     key = json.dumps([plant.vehicle.name, plant.vehicle.parameter_set, plant.vehicle.overrides, own, plant.step], sort_keys=True)
     if key not in _KNOWN:

@@ -116,22 +116,14 @@ SIDE_CHOICES = ("left", "right", "either")
 
 
 def require_one_of(manoeuvre: Any, key: str, choices: tuple[Any, ...]) -> None:
-    """Refuse a parameter that is none of its choices.
-
-    Raises:
-        ConfigurationError: it is not.
-    """
+    """Refuse a parameter that is none of its choices, by a `ConfigurationError`."""
     value = getattr(manoeuvre, key)
     if value not in choices:
         raise ConfigurationError(f"manoeuvre '{manoeuvre.name}': {key} '{value}' is not one of: {', '.join(map(str, choices))}")
 
 
 def require(manoeuvre: Any, **limits: tuple[float, float]) -> None:
-    """Refuse parameters outside their limits, both ends of a range included.
-
-    Raises:
-        ConfigurationError: one of them is.
-    """
+    """Refuse parameters outside their limits, both ends of a range included, by a `ConfigurationError`."""
     for key, (lowest, highest) in limits.items():
         value = getattr(manoeuvre, key)
         low, high = as_range(value)

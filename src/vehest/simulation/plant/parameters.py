@@ -96,11 +96,7 @@ class Vehicle:
 
 
 def vehicle_from_configuration(configuration: Mapping[str, Any]) -> Vehicle:
-    """A vehicle from the keys ``name``, ``parameter_set`` and (optional) ``overrides``, ``driver`` and ``relaxation`` (front, rear).
-
-    Raises:
-        ConfigurationError: a key is missing or unknown, or see Vehicle.
-    """
+    """A vehicle from the keys ``name``, ``parameter_set`` and (optional) ``overrides``, ``driver`` and ``relaxation`` (front, rear)."""
     known = {"name", "parameter_set", "overrides", "driver", "relaxation"}
     unknown = sorted(set(configuration) - known)
     missing = sorted({"name", "parameter_set"} - set(configuration))
@@ -122,9 +118,6 @@ def loaded(vehicle: Vehicle, mass: float, forward: float, up: float) -> Vehicle:
     Args:
         mass: of the payload [kg].
         forward, up: its place from the centre of gravity [m].
-
-    Raises:
-        ConfigurationError: the mass is negative, or an axle would carry nothing.
     """
     if mass == 0.0:
         return vehicle

@@ -140,14 +140,7 @@ class Inputs:
 
 
 class PlanarPlant:
-    """A car and its equations of motion.
-
-    Args:
-        step: of the integration [s].
-
-    Raises:
-        ConfigurationError: the step is not positive.
-    """
+    """A car and its equations of motion."""
 
     def __init__(self, car: PlanarCar, step: float = 1e-3) -> None:
         if not step > 0.0:

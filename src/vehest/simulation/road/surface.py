@@ -77,11 +77,7 @@ SURFACES: dict[str, Surface] = {
 
 
 def surface_from_config(configuration: str | Mapping[str, Any] | None) -> Surface:
-    """A surface from its name, or from a mapping of Surface's arguments; none is the dry road.
-
-    Raises:
-        ConfigurationError: no such surface or argument, or see Surface.
-    """
+    """A surface from its name, or from a mapping of Surface's arguments; none is the dry road."""
     if configuration is None:
         return SURFACES["dry"]
     if isinstance(configuration, str):

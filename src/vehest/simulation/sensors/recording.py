@@ -75,10 +75,6 @@ def specific_force(motion: Motion, tilt: Tilt | None = None) -> FloatArray:
 
     The road's axes follow from level ones by grade, then bank, the body's from the road's by pitch, then roll. Accelerations of the body
     along its vertical axis are left out.
-
-    Args:
-        motion: whose ax and ay are those in the road's plane.
-        tilt: which angles count; by default all.
     """
     tilt = tilt or Tilt()
     grade, bank = motion.grade * tilt.grade, motion.bank * tilt.bank
@@ -96,10 +92,6 @@ def body_rates(motion: Motion, tilt: Tilt | None = None) -> FloatArray:
     """Angular velocity about the body's forward, left and upward axes [rad/s], (3, T).
 
     ``motion`` has the rates of roll, pitch and yaw angle. In a steady turn a rolled body also turns about its own lateral axis.
-
-    Args:
-        motion: whose yaw rate is that about the road's normal.
-        tilt: which angles count, roll and pitch; by default all.
     """
     tilt = tilt or Tilt()
     roll, pitch = motion.roll * tilt.roll, motion.pitch * tilt.pitch

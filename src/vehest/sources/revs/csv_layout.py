@@ -29,16 +29,12 @@ def read_csv(
     """Columns from the first row on in which all of them hold a value.
 
     Args:
-        file: official CSV file.
         columns: names of columns, the one of time first.
         gappy: columns that wait for nothing.
         preamble_lines: lines about the drive, above the names.
 
     Returns:
         Columns, shape (T,) in the units of the file; those units; and the provenance: lines about the drive, rows dropped at the head.
-
-    Raises:
-        DataError: it has other lines, lacks a column, a cell cannot be read, or a column begins after half of the rows.
     """
     time, head = columns[0], read_head(file).split(b"\n")[: preamble_lines + 2]
     lines = [_decoded(line).strip() for line in (*head, *[b""] * (preamble_lines + 2))]
@@ -68,9 +64,6 @@ def read_vehicle_parameters(file: Path) -> dict[str, dict[str, Any]]:
 
     A parameter with several values (a curve, such as road-wheel angles over the angle of the steering wheel) has a list of them.
     Cells below a column's last value are blank; text is kept as text.
-
-    Raises:
-        DataError: it is no such table.
     """
     text = _decoded(read_head(file))
     try:

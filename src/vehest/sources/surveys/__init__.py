@@ -26,12 +26,7 @@ DEGREES = {"heading": "deg"}  # of a VBOX, which does not say so: a compass's, c
 
 
 def survey(path: Path) -> Log:
-    """Columns of one file, or of a bag's folder.
-
-    Raises:
-        MissingError: it is not there or empty, or a package is missing that its format needs.
-        DataError: it is of no format that is read, damaged, holds no numbers, or a time stamp is a stray one.
-    """
+    """Columns of one file, or of a bag's folder."""
     if not path.exists():
         raise MissingError(f"there is no file '{path}'")
     require_no_spreadsheet(path)

@@ -20,15 +20,7 @@ def ranking_of(
     test_set: str,
     asked: Sequence[tuple[Name, Name]] = (),
 ) -> Ranking:
-    """Candidates of a comparison, ranked on a test set by RMSE(β) over all their seeds; those with errors that are not finite are left out.
-
-    Args:
-        test_set: to rank on.
-        asked: pairs to compare beside those that any ranking compares.
-
-    Raises:
-        DataError: errors by segment are missing or damaged.
-    """
+    """Candidates of a comparison, ranked on a test set by RMSE(β) over all their seeds; those with infinite errors are left out."""
     segments = {name: [model.segments(test_set) for model in own] for name, own in by_name(artefacts.models).items()}
     finite = {name: own for name, own in segments.items() if all(math.isfinite(float(part.squared_error_sideslip.sum())) for part in own)}
     return rank(finite, artefacts.protocol.rate_hz, asked=asked)
