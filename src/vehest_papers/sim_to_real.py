@@ -43,10 +43,7 @@ SHIPPED = "third"
 WANTED_FVU = 0.10
 GOAL_FVU = 0.06
 
-PUBLISHED = (
-    ("KS-NN that learnt on another real car", 0.145),
-    ("KS-NN that learnt on the same real car", 0.06),
-)
+PUBLISHED = (("KS-NN that learnt on another real car", 0.145), ("KS-NN that learnt on the same real car", 0.06))
 """FVU on a real Ferrari 250 LM in Da Lio et al. 2023, on two recordings of it, one of which is ours."""
 
 REASONS = {

@@ -76,11 +76,7 @@ class Ranking:
         return [name for name in self.order[1:] if name in self.against_best and self.against_best[name].verdict == "not told apart"]
 
 
-def rank(
-    segments: Mapping[Name, Sequence[Segments]],
-    rate_hz: float,
-    asked: Sequence[tuple[Name, Name]] = (),
-) -> Ranking:
+def rank(segments: Mapping[Name, Sequence[Segments]], rate_hz: float, asked: Sequence[tuple[Name, Name]] = ()) -> Ranking:
     """Compare estimators on one test set by RMSE(β).
 
     Every pair is compared on the same blocks, drawn together, with the seeds of each drawn on their own (`paired_difference`). Corrected

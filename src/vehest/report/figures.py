@@ -104,11 +104,7 @@ def traces_figure(time: FloatArray, reference: Traces, estimates: Sequence[Trace
 
 
 def zoom_figure(
-    time: FloatArray,
-    ay: FloatArray | None,
-    reference: Traces,
-    estimates: Sequence[Traces],
-    time_label: str,
+    time: FloatArray, ay: FloatArray | None, reference: Traces, estimates: Sequence[Traces], time_label: str
 ) -> MatplotlibFigure:
     """Reference and all estimates over a short while: lateral velocity, sideslip, its error, and the lateral acceleration."""
     from matplotlib.ticker import MaxNLocator

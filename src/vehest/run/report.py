@@ -54,10 +54,7 @@ SCORES = ("rmse_sideslip", "rmse_vy", "fvu")
 
 
 def draw_report(
-    study: Study,
-    comparisons: Mapping[str, Comparison],
-    datasets: Sequence[StoredDataset | AbsentDataset],
-    runner: Runner,
+    study: Study, comparisons: Mapping[str, Comparison], datasets: Sequence[StoredDataset | AbsentDataset], runner: Runner
 ) -> tuple[Artefact, TerminalSummary]:
     """Draw a study, unless its report is there, and sum it up for the terminal; parts without a comparison are named as absent."""
     shown = {name: part for name, part in comparisons.items() if part.members}
@@ -105,12 +102,7 @@ def _plan(
         "titles": artefacts.titles,
         "absent": [{"name": name, "title": artefacts.titles[name]} for name in artefacts.absent],
         "parts": {
-            name: {
-                "training": list(part.facts),
-                "failed": part.failed,
-                "data_titles": part.data_titles,
-                "protocol": part.protocol.plain,
-            }
+            name: {"training": list(part.facts), "failed": part.failed, "data_titles": part.data_titles, "protocol": part.protocol.plain}
             for name, part in artefacts.parts.items()
         },
         "datasets": {dataset.name: [dataset.title, dataset.kind] for dataset in artefacts.datasets},

@@ -17,15 +17,7 @@ from vehest.data.recording import Recording
 from vehest.data.store import is_stored_recording, read_recording
 from vehest.sources.base import open_source, require_files
 from vehest.sources.clocks import Clock, ClockPolicy, uniform_clock
-from vehest.sources.columns import (
-    ChannelMap,
-    ChannelNames,
-    Column,
-    ColumnName,
-    Positive,
-    column_from_config,
-    columns_from_config,
-)
+from vehest.sources.columns import ChannelMap, ChannelNames, Column, ColumnName, Positive, column_from_config, columns_from_config
 from vehest.sources.file_source import FileSource
 from vehest.sources.sample_and_hold import held_from_config
 from vehest.sources.table_pose import table_pose_from_config

@@ -32,11 +32,7 @@ RATE = "du/dt"
 SLIDE = "v r"
 DRAG = ("r²", "u²", SLIDE)
 _SYMBOLS = dict(
-    zip(
-        FEATURES,
-        ("", "r", "u", ("u", "r"), ("u", "r"), ("r", "u"), ("ay",), ("ay", "u"), ("ay",), "r", "u", ("ax",), "r"),
-        strict=True,
-    )
+    zip(FEATURES, ("", "r", "u", ("u", "r"), ("u", "r"), ("r", "u"), ("ay",), ("ay", "u"), ("ay",), "r", "u", ("ax",), "r"), strict=True)
 )
 _SYMBOLS[RATE] = "u"
 

@@ -36,10 +36,7 @@ def limited(full: Runs, learnt: Runs, prepared: Prepared) -> Limited:
     filters = {name: full[name] for name in (paper.MODEL, paper.SMOOTH, paper.ZERO, paper.STATIC_MAP) if name in full}
     of_full = {run.model.seed: run for run in full[paper.DEEP]}
     pairs = [(run, of_full[run.model.seed]) for run in learnt[paper.DEEP] if run.model.seed in of_full]
-    scaling = {
-        AS_TUNED: [run for run, _ in pairs],
-        OF_THE_FULL_SET: [_with_scaling_of(other, run, prepared) for run, other in pairs],
-    }
+    scaling = {AS_TUNED: [run for run, _ in pairs], OF_THE_FULL_SET: [_with_scaling_of(other, run, prepared) for run, other in pairs]}
     return Limited(
         ManoeuvreErrors({**filters, **learnt}, "test"),
         learnt,

@@ -41,13 +41,7 @@ def local(estimator: DugoffUkf) -> pd.DataFrame:
             for words, kept in (("ay, yaw rate, both forces", slice(0, 4)), ("ay, yaw rate", slice(0, 2))):
                 found = {
                     steps: observability_along(
-                        track.transition,
-                        partial(_observed, track, kept),
-                        states,
-                        driven,
-                        sizes=SIZES,
-                        noise=levels[kept],
-                        steps=steps,
+                        track.transition, partial(_observed, track, kept), states, driven, sizes=SIZES, noise=levels[kept], steps=steps
                     )
                     for steps in (2, WINDOW)
                 }

@@ -9,14 +9,7 @@ HELD = "RATTE, in bends"
 ORDER = (RATTE, RATT, LINT)
 """From the smallest RMSE(β) to the largest."""
 
-VARIANTS = {
-    "lint": LINT,
-    "ratt": RATT,
-    "ratte": RATTE,
-    "ratmu": "RATT with friction",
-    "ratte_ukf": UNSCENTED,
-    "ratte_held": HELD,
-}
+VARIANTS = {"lint": LINT, "ratt": RATT, "ratte": RATTE, "ratmu": "RATT with friction", "ratte_ukf": UNSCENTED, "ratte_held": HELD}
 """Variant of the estimator -> what it is called in the report; the first three are the paper's."""
 
 LAPS = {RATTE: "below 0.5", RATT: "below 0.89", LINT: "below 1.43"}

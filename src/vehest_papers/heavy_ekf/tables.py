@@ -102,12 +102,7 @@ def errors_table(
 
 
 def order_in_words(
-    rmse: Rmse,
-    errors: pd.DataFrame,
-    fit: TyreFit,
-    own: Mapping[str, OwnCurves],
-    drives: Mapping[str, Recording],
-    wander: float,
+    rmse: Rmse, errors: pd.DataFrame, fit: TyreFit, own: Mapping[str, OwnCurves], drives: Mapping[str, Recording], wander: float
 ) -> str:
     """Where the order of the three is the paper's, where it is not, and why; ``wander`` is RATTE's level of noise of its tyres [1/√s]."""
     tests = [f"{tyres}_{drive}" for tyres in TYRES for drive in DRIVES]

@@ -191,10 +191,7 @@ def convergence_time(time: FloatArray, values: FloatArray, target: float) -> flo
 
 
 def convergence_table(
-    drives: Mapping[str, Recording],
-    estimates: Mapping[str, Mapping[str, Estimate]],
-    own: Mapping[str, OwnCurves],
-    names: Sequence[str],
+    drives: Mapping[str, Recording], estimates: Mapping[str, Mapping[str, Estimate]], own: Mapping[str, OwnCurves], names: Sequence[str]
 ) -> Table:
     """Start, end and the plant's own value of every estimated parameter, and from when on it stays near."""
     rows = []

@@ -122,10 +122,7 @@ def without_biases(scheme: Scheme, categories: Sequence[str], test: str) -> tupl
         Candidates ``CATEGORY, as measured`` and ``CATEGORY, corrected``; biases by ``own`` and ``other``.
     """
     part = scheme.part
-    biases = {
-        "own": mean_bias(recordings_of(part, part.split.train)),
-        "other": mean_bias(recordings_of(part, part.split.validation)),
-    }
+    biases = {"own": mean_bias(recordings_of(part, part.split.train)), "other": mean_bias(recordings_of(part, part.split.validation))}
     segments: dict[str, list[Segments]] = {}
     for category in categories:
         for model in scheme.models(category)[:MOST_SEEDS]:

@@ -48,10 +48,7 @@ def on_accuracy(schemes: Sequence[Scheme]) -> list[Statement | Claim]:
         Statement("no biases: lower FVU on the other", "−37, −33 %; −61, −46 %", data, _biases(schemes, own=False)),
         Statement("with biases below GRU, LSTM on the own car", "0.082, 0.077 against 0.112", first, _better_than_plain(schemes[0])),
         Statement(
-            "with biases below Luenberger on the other",
-            "−5, −15 %",
-            first,
-            _pairs(schemes[:1], paper.WITH_BIAS, paper.LUENBERGER, "lower"),
+            "with biases below Luenberger on the other", "−5, −15 %", first, _pairs(schemes[:1], paper.WITH_BIAS, paper.LUENBERGER, "lower")
         ),
         Statement("no biases: the cars further alike, FVU other over own", "1.1 against 2.9; 3.1 against 11", data, _alike(schemes)),
         Statement(

@@ -165,14 +165,7 @@ def on_noise(schemes: Sequence[Scheme]) -> Claim:
     if ratios:
         low, high = np.min(np.concatenate(ratios), axis=0), np.max(np.concatenate(ratios), axis=0)
         words = f"ratios over seeds: a_y {short(low[0])} to {short(high[0])}, a_x {short(low[1])} to {short(high[1])}"
-    return counted(
-        claim,
-        "“significantly lower”",
-        words,
-        schemes[0].kind,
-        found,
-        "every seed, or not",
-    )
+    return counted(claim, "“significantly lower”", words, schemes[0].kind, found, "every seed, or not")
 
 
 def on_spectra(schemes: Sequence[Scheme]) -> list[Claim | Statement]:

@@ -81,14 +81,7 @@ TABLE_V: Mapping[str, Published] = {
     NONLINEAR: Published("P = 2, Q = 2", 28, 0.182, 0.208, 0.059, 0.171),
 }
 
-TABLE_VI: Mapping[str, float] = {
-    FACTOR_GRAPH: 0.57,
-    KALMAN: 0.87,
-    LUENBERGER: 0.73,
-    GRU: 0.57,
-    LSTM: 0.52,
-    NONLINEAR: 0.40,
-}
+TABLE_VI: Mapping[str, float] = {FACTOR_GRAPH: 0.57, KALMAN: 0.87, LUENBERGER: 0.73, GRU: 0.57, LSTM: 0.52, NONLINEAR: 0.40}
 """RMSE of the sideslip angle on F-2 [deg]."""
 
 TABLE_VII: Mapping[tuple[str, bool], Published] = {

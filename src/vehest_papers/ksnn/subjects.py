@@ -19,11 +19,7 @@ CAR_COLOURS = {
     ("ferrari", "simulated"): "#ee8a4c",
 }
 OTHER_CARS = ("#00876c", "#a6761d", "#5b8c00", "#6d4c41")
-CAR_TITLES = {
-    "corvette_grand_sport": "Corvette Grand Sport",
-    "ferrari_250_lm": "Ferrari 250 LM",
-    "ferrari_250lm": "Ferrari 250 LM",
-}
+CAR_TITLES = {"corvette_grand_sport": "Corvette Grand Sport", "ferrari_250_lm": "Ferrari 250 LM", "ferrari_250lm": "Ferrari 250 LM"}
 
 
 @dataclass(frozen=True, eq=False)

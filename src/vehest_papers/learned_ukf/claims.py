@@ -132,11 +132,7 @@ def friction_claims(median: Interval, final: Interval, data: str) -> list[Claim]
         near = "reproduced"
     elif final.high < low or final.low > high:
         near = "not reproduced"
-    words = {
-        "reproduced": "interval within",
-        "not reproduced": "interval beyond",
-        "undecided": "interval holds a limit",
-    }
+    words = {"reproduced": "interval within", "not reproduced": "interval beyond", "undecided": "interval holds a limit"}
     time = f"{with_interval(median.value, median.low, median.high, 2)} s"
     end = with_interval(final.value, final.low, final.high, 2)
     where = f"{data}, tyre D"

@@ -30,14 +30,7 @@ def train_on(estimator: LearnedUkf, drives: Drive, skip: int, training: ThroughF
     every = torch.cat([weights, nothing])
     judged = torch.cat([weights[:3], nothing, nothing])
     phases = filter_phases(
-        estimator.filter,
-        own,
-        own,
-        Weights(every, every, judged),
-        training,
-        training.through,
-        lambda name: True,
-        "oracle",
+        estimator.filter, own, own, Weights(every, every, judged), training, training.through, lambda name: True, "oracle"
     )
     train_phases(phases, 0, FitContext())
     return estimator

@@ -139,12 +139,7 @@ def motion_of(samples: Mapping[str, FloatArray], rate_hz: float) -> dict[str, Fl
     return {name: signal.sosfiltfilt(band, values) for name, values in samples.items()}
 
 
-def learn_oracle(
-    train: Sequence[Recording],
-    validation: Sequence[Recording],
-    channels: Sequence[str],
-    rate_hz: float,
-) -> Oracle:
+def learn_oracle(train: Sequence[Recording], validation: Sequence[Recording], channels: Sequence[str], rate_hz: float) -> Oracle:
     """Fit relations and autoregression to training drives; healthy drives are these and those of validation."""
     names = tuple(channels)
     train, validation = ([without_glitches(recording, names) for recording in part] for part in (train, validation))

@@ -145,10 +145,7 @@ def _measure(plant: MultiBodyPlant, speed: float) -> tuple[tuple[float, ...], tu
     grip = (MARGIN if len(astray) and limit > 0.9 * end else 1.0) * float(steady[limit])
     if grip < 1.0:
         raise ConfigurationError(f"vehicle '{plant.vehicle.name}' cannot be driven around a corner at {speed:.3g} m/s: it does not follow")
-    ramp_values = (
-        ramp.steer - plant.wheelbase * ramp.yaw_rate / ramp.vx,
-        (float(plant.parameters.b) * ramp.yaw_rate - ramp.vy) / ramp.vx,
-    )
+    ramp_values = (ramp.steer - plant.wheelbase * ramp.yaw_rate / ramp.vx, (float(plant.parameters.b) * ramp.yaw_rate - ramp.vy) / ramp.vx)
     grid = np.append(np.arange(0.0, grip - 0.05, 0.25), grip)
     rising = np.maximum.accumulate(steady[: limit + 1])
     steers, slips = (np.interp(grid, rising, values[: limit + 1]).tolist() for values in ramp_values)

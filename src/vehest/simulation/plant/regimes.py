@@ -159,12 +159,7 @@ def _forces_needed(x, u, inputs, p):  # type: ignore[no-untyped-def]
     across = p.m * (vy_change + x[VX] * x[YAW_RATE] - inputs[4])
     moment, wheelbase = p.I_z * yaw_acceleration, p.a + p.b
     front_share = p.T_sb if along < 0.0 else p.T_se
-    return (
-        front_share * along,
-        (1.0 - front_share) * along,
-        (across * p.b + moment) / wheelbase,
-        (across * p.a - moment) / wheelbase,
-    )
+    return (front_share * along, (1.0 - front_share) * along, (across * p.b + moment) / wheelbase, (across * p.a - moment) / wheelbase)
 
 
 @_kernel

@@ -68,11 +68,7 @@ class Surface:
         return np.append(ends[inside], around), scales[: int(inside.sum()) + 1]
 
 
-SURFACES: dict[str, Surface] = {
-    "dry": Surface(),
-    "wet": Surface("wet", 0.7),
-    "patchy": Surface("patchy", 1.0, patches=0.5),
-}
+SURFACES: dict[str, Surface] = {"dry": Surface(), "wet": Surface("wet", 0.7), "patchy": Surface("patchy", 1.0, patches=0.5)}
 """Named surfaces; the scales are assumed: wet asphalt has about seven tenths of the dry road's friction, puddles or gravel half."""
 
 

@@ -25,12 +25,7 @@ def measure(motion: Motion, levels: SensorLevels, seed: int) -> dict[str, FloatA
     speed = _speed_of_wheels(motion) if levels.speed_of_wheels else motion.vx
     true = {"vx": speed, "steer": motion.steer, **_inertial(motion, levels, seed)}
     sensor_of = {name: name for name in true}
-    for sensor, values in (
-        ("wheel_speed", motion.wheel_speed),
-        ("fx", motion.tyre_fx),
-        ("fy", motion.tyre_fy),
-        ("fz", motion.tyre_fz),
-    ):
+    for sensor, values in (("wheel_speed", motion.wheel_speed), ("fx", motion.tyre_fx), ("fy", motion.tyre_fy), ("fz", motion.tyre_fz)):
         for place, wheel in enumerate(WHEELS):
             true[f"{sensor}_{wheel}"] = values[:, place]
             sensor_of[f"{sensor}_{wheel}"] = sensor
@@ -79,11 +74,7 @@ def specific_force(motion: Motion, tilt: Tilt | None = None) -> FloatArray:
     tilt = tilt or Tilt()
     grade, bank = motion.grade * tilt.grade, motion.bank * tilt.bank
     road = np.stack(
-        [
-            motion.ax - GRAVITY * np.sin(grade),
-            motion.ay + GRAVITY * np.cos(grade) * np.sin(bank),
-            GRAVITY * np.cos(grade) * np.cos(bank),
-        ]
+        [motion.ax - GRAVITY * np.sin(grade), motion.ay + GRAVITY * np.cos(grade) * np.sin(bank), GRAVITY * np.cos(grade) * np.cos(bank)]
     )
     return _turned(road, motion.roll * (tilt.roll * tilt.roll_share), motion.pitch * tilt.pitch)
 
