@@ -47,11 +47,6 @@ def hybrid_of(run: Run) -> NetworkUkf:
     return fitted
 
 
-def pseudo_measurements_of(run: Run, drives: Sequence[Recording]) -> list[PseudoMeasurement]:
-    """What a hybrid's network adds to the measurements of drives."""
-    return hybrid_of(run).pseudo_measurements(drives)
-
-
 def rows_of(part: Scored, drive: Recording) -> NDArray[np.int64]:
     """Samples of a drive that are scored."""
     return np.rint((part.time - drive.start_time) * drive.rate_hz).astype(np.int64)
@@ -61,7 +56,7 @@ def outputs_of(run: Run, prepared: Prepared) -> list[Outputs]:
     """Outputs of a hybrid's network on each test manoeuvre."""
     drives, spans = prepared.seen(TEST), prepared.spans(TEST)
     found = []
-    for drive, span, own in zip(drives, spans, pseudo_measurements_of(run, drives), strict=True):
+    for drive, span, own in zip(drives, spans, hybrid_of(run).pseudo_measurements(drives), strict=True):
         (part,) = run.test[span.recording]
         at = rows_of(part, drive)
         found.append(
@@ -129,6 +124,5 @@ def _fitted_to_the_test(run: Run, prepared: Prepared) -> Run:
     assert isinstance(model, DugoffUkf)
     estimator = DugoffUkf(model.settings)
     estimator.seed(run.model.seed)
-    drives = prepared.tested()
-    estimator.fit(FitData(drives, []), IDENTIFICATION, FitContext())
+    estimator.fit(FitData(prepared.ranges(TEST), []), IDENTIFICATION, FitContext())
     return prepared.estimated_by(estimator, run, paper.ORACLE_FILTER)

@@ -13,6 +13,7 @@ import pandas as pd
 from vehest.constants import FloatArray
 from vehest.data.errors import DataError
 from vehest.data.recording import Recording
+from vehest.data.splits import VALIDATION
 from vehest.estimators.base import Estimator
 from vehest.estimators.dugoff_ukf import finite
 from vehest.estimators.ensemble_ukf import BOX, EnsembleUkf, scaled_variance
@@ -101,7 +102,7 @@ def perturbed(runs: Runs, prepared: Prepared) -> Perturbed:
         for words, factors in BODIES.items()
     }
     tuned = []
-    judged = prepared.judged()
+    judged = prepared.ranges(VALIDATION)
     for run, model in zip(own.get(paper.DEEP, []), fitted.get(paper.DEEP, []), strict=True):
         assert isinstance(model, EnsembleUkf)
         softer = with_stiffness(model, *COMBINATIONS[SOFTEST])

@@ -201,19 +201,9 @@ class Prepared:
             for span in self.spans(test)
         ]
 
-    def learnt(self) -> list[Recording]:
-        """The ranges of the training, references included."""
-        return self._ranges(self._part.split.train)
-
-    def judged(self) -> list[Recording]:
-        """The ranges of the validation, references included."""
-        return self._ranges(self._part.split.validation)
-
-    def tested(self) -> list[Recording]:
-        """The ranges of the test, references included, for oracles."""
-        return self._ranges(self._part.split.tests[TEST])
-
-    def _ranges(self, spans: Sequence[Span]) -> list[Recording]:
+    def ranges(self, test: str) -> list[Recording]:
+        """The ranges of training, validation or a test set, references included."""
+        spans = self._part.split.train if test == "train" else self.spans(test)
         return [self.recording(span.dataset, span.recording).cut(span.start, span.stop) for span in spans]
 
     def estimated_by(self, estimator: Estimator, run: Run, candidate: str = "") -> Run:

@@ -18,7 +18,7 @@ from vehest.report.style import DOUBLE_COLUMN, REFERENCE, fixed, legend_above, n
 from vehest.studies.artefacts import PartArtefacts
 from vehest_papers.cnn_ukf import paper
 from vehest_papers.cnn_ukf.manoeuvres import group_of
-from vehest_papers.cnn_ukf.networks import pseudo_measurements_of
+from vehest_papers.cnn_ukf.networks import hybrid_of
 from vehest_papers.cnn_ukf.subjects import TEST, Prepared, Run, line_of, plain_name
 from vehest_papers.kit.reading import sideslip_error
 
@@ -39,7 +39,7 @@ def manoeuvre_of(part: PartArtefacts, prepared: Prepared, group: str) -> Span:
     return max(peaks, key=peaks.__getitem__)
 
 
-def compared(runs: Mapping[str, Run], span: Span, name: str, number: int, what: str, data: str) -> Figure:
+def compared(runs: Mapping[str, Run], span: Span, number: int, what: str, data: str) -> Figure:
     """Reference and all estimates of one manoeuvre."""
     parts = {candidate: run.test[span.recording][0] for candidate, run in runs.items()}
     with new_figure(DOUBLE_COLUMN, 3.9) as figure:
@@ -54,25 +54,13 @@ def compared(runs: Mapping[str, Run], span: Span, name: str, number: int, what: 
             axes.margins(x=0.0)
         legend_above(figure, upper, columns=4)
     caption = f"{what} (Figure {number} of the paper), {as_code(span.recording)}. {_squares(runs, parts)} Data: {data}."
-    return Figure(name, caption, figure)
+    return Figure(f"figure_{number}", caption, figure)
 
 
-def inner_life(
-    runs: Mapping[str, Run],
-    prepared: Prepared,
-    warm_up: float,
-    span: Span,
-    name: str,
-    number: int,
-    what: str,
-    constant: FloatArray,
-    data: str,
-) -> Figure:
+def inner_life(runs: Mapping[str, Run], prepared: Prepared, warm_up: float, span: Span, constant: FloatArray, data: str) -> Figure:
     """Outputs of the hybrids' networks in one manoeuvre: β_DD beside β, both deviations of the process noise, distrust (Figure 8).
 
-    Args:
-        warm_up: of the estimates [s].
-        constant: deviations of the filter's process noise where no network gives them, (2,).
+    ``constant``, (2,), are deviations of the filter's process noise where no network gives them.
     """
     hybrids = {candidate: run for candidate, run in runs.items() if plain_name(candidate) in paper.HYBRIDS}
     outputs = _network_outputs(hybrids, prepared, warm_up, span)
@@ -101,29 +89,25 @@ def inner_life(
             axes.set_xlabel("time [s]")
         legend_above(figure, grid[0, 0], columns=3)
     caption = (
-        f"{what} (Figure {number} of the paper), {as_code(span.recording)}: (a) sideslip angle of filter and network, (b) and (d) "
-        "deviations of the process noise of a step, (c) deviation of the network's angle as the filter takes it for a measurement. "
-        f"DE-UKF's process noise is constant. Data: {data}."
+        f"The slalom of Figure 7, hybrids (Figure 8 of the paper), {as_code(span.recording)}: (a) sideslip angle of filter and network, "
+        "(b) and (d) deviations of the process noise of a step, (c) deviation of the network's angle as the filter takes it for a "
+        f"measurement. DE-UKF's process noise is constant. Data: {data}."
     )
-    return Figure(name, caption, figure)
+    return Figure("figure_8", caption, figure)
 
 
-def angles_of_networks(
-    runs: Mapping[str, Run], prepared: Prepared, warm_up: float, span: Span, name: str, number: int, what: str, data: str
-) -> Figure:
+def angles_of_networks(runs: Mapping[str, Run], prepared: Prepared, warm_up: float, span: Span, data: str) -> Figure:
     """β of both hybrids and β_DD of their networks (Figure 13)."""
-    hybrids = {candidate: run for candidate, run in runs.items() if plain_name(candidate) in paper.HYBRIDS}
-    parts = {candidate: run.test[span.recording][0] for candidate, run in hybrids.items()}
     with new_figure(DOUBLE_COLUMN, 2.7) as figure:
         axes = figure.subplots()
-        _angles(axes, parts)
-        for candidate, (time, output) in _network_outputs(hybrids, prepared, warm_up, span).items():
+        _angles(axes, {candidate: run.test[span.recording][0] for candidate, run in runs.items()})
+        for candidate, (time, output) in _network_outputs(runs, prepared, warm_up, span).items():
             label = f"{candidate}, its network's"
             axes.plot(time, np.degrees(output.sideslip), color=line_of(candidate).colour, linewidth=0.8, alpha=0.6, label=label)
         axes.set_xlabel("time [s]")
         axes.margins(x=0.0)
         legend_above(figure, axes, columns=5)
-    return Figure(name, f"{what} (Figure {number} of the paper), {as_code(span.recording)}. Data: {data}.", figure)
+    return Figure("figure_13", f"The same J-turn (Figure 13 of the paper), {as_code(span.recording)}. Data: {data}.", figure)
 
 
 def lap(runs: Mapping[str, Run], prepared: Prepared, warm_up: float, span: Span, data: str) -> Figure:
@@ -167,7 +151,7 @@ def _network_outputs(
     found = {}
     for candidate, run in hybrids.items():
         scored = _within(run.test[span.recording][0], window)
-        (output,) = pseudo_measurements_of(run, [drive])
+        (output,) = hybrid_of(run).pseudo_measurements([drive])
         kept = (drive.time >= scored.time[0] - 1e-9) & (drive.time <= scored.time[-1] + 1e-9)
         process = None if output.process is None else output.process[kept]
         found[candidate] = drive.time[kept] - scored.time[0], PseudoMeasurement(output.sideslip[kept], output.variance[kept], process)

@@ -91,7 +91,8 @@ class Factorial:
 @cache
 def factorial() -> Factorial:
     """Tune, drive and filter everything; minutes, once a process."""
-    found = {words: _tuned(plain=words == PLAIN_ONLY) for words in (ONCE, PLAIN_ONLY)}
+    drives = {words: tuning_drives(plain=words == PLAIN_ONLY) for words in (ONCE, PLAIN_ONLY)}
+    found = {words: {name: tuned(name, own) for name in (*FILTERS, ORACLE)} for words, own in drives.items()}
     cells = [cell for plant in PLANTS for slip in SLIPS for cell in _cells(found, Conditions(slip, *plant))]
     return Factorial(found, cells)
 
@@ -99,11 +100,6 @@ def factorial() -> Factorial:
 def plant_of(conditions: Conditions) -> tuple[bool, bool, bool]:
     """Payload, wet patches, crossfall."""
     return conditions.payload, conditions.wet_patches, conditions.crossfall
-
-
-def _tuned(*, plain: bool) -> dict[str, Tuned]:
-    drives = tuning_drives(plain=plain)
-    return {name: tuned(name, drives) for name in (*FILTERS, ORACLE)}
 
 
 def _cells(found: Mapping[str, Mapping[str, Tuned]], conditions: Conditions) -> list[Cell]:

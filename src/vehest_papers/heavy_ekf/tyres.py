@@ -109,17 +109,10 @@ def _band(fit: TyreFit, axle: Literal["front", "rear"], grid: FloatArray, row: i
     """Curve ± 1.96 standard deviations to first order in the parameters."""
     values = getattr(fit, axle)
     curve = fit.curve(axle, grid)
-    slopes = np.stack(
-        [(axle_force(fit.kind, values * _nudged(i, len(values)), grid) - curve) / (1e-4 * values[i]) for i in range(len(values))]
-    )
+    nudged = values * (1.0 + 1e-4 * np.eye(len(values)))
+    slopes = np.stack([(axle_force(fit.kind, own, grid) - curve) / (1e-4 * value) for own, value in zip(nudged, values, strict=True)])
     half = 1.96 * np.sqrt(np.maximum(np.einsum("ig,ij,jg->g", slopes, fit.covariance[row], slopes), 0.0))
     return curve - half, curve + half
-
-
-def _nudged(index: int, count: int) -> FloatArray:
-    factor = np.ones(count)
-    factor[index] += 1e-4
-    return factor
 
 
 def table_1(fit: TyreFit, own: OwnCurves | None, name: str, data: str) -> Table:

@@ -8,7 +8,6 @@ from dataclasses import replace
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 
 from vehest.constants import FloatArray
 from vehest.data.recording import Recording
@@ -48,11 +47,7 @@ def luenberger_of(scheme: Scheme) -> Luenberger | None:
 
 
 def at_low_yaw_rate(scheme: Scheme, threshold: float, categories: Sequence[str], test: str) -> tuple[SegmentErrors, float]:
-    """SegmentErrors where |ω| lies below a threshold, and the share of such samples.
-
-    Args:
-        threshold: of the observer, below which it is reset [rad/s].
-    """
+    """SegmentErrors where |ω| lies below the observer's threshold [rad/s], and the share of such samples."""
     part, rate = scheme.part, scheme.part.protocol.rate_hz
     recordings = [reference for reference, _ in pieces_of(part.split.tests[test], lambda span: _reference(scheme, span), part.protocol)]
     segments: dict[str, list[Segments]] = {}
@@ -99,12 +94,7 @@ def _with_window(estimator: WindowedEstimator, recording: Recording, length: int
         series = prepare(network, torch.as_tensor(recording.stack(estimator.channels), dtype=dtype))
         windows = series.unfold(0, length, 1).transpose(1, 2)[ends - length]
         vy = network(windows).double().numpy().reshape(-1)
-    return _scored(recording, ends, vy)
-
-
-def _scored(recording: Recording, ends: NDArray[np.int64], vy: FloatArray) -> Scored:
-    speed, reference = recording["vx"][ends], recording["vy_ref"][ends]
-    ay = recording["ay"][ends]
+    speed, reference, ay = (recording[name][ends] for name in ("vx", "vy_ref", "ay"))
     return Scored(recording.time[ends], vy, reference, np.arctan2(vy, speed), np.arctan2(reference, speed), ay)
 
 

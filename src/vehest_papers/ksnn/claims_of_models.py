@@ -32,6 +32,7 @@ SLACK = -0.05
 BANDS_HZ = tuple(float(own) for own in 10.0 ** (np.arange(-10, 9) / 10.0))
 """Centres of thirds of an octave, 0.1 to 6.3 Hz."""
 P2 = "linear_no_bias_p2"
+BIASES = {"before": "as measured", "after": "corrected"}
 
 
 def at_low_yaw_rates(schemes: Sequence[Scheme]) -> tuple[Statement, Table | None]:
@@ -118,13 +119,7 @@ def on_biases(schemes: Sequence[Scheme]) -> tuple[Statement, Table | None]:
             if category in (paper.NONLINEAR, paper.NONLINEAR_BIAS, paper.LSTM):
                 tests.append(Compared(f"S{scheme.name[-1]} {category.removeprefix('KS-NN ')}", change))
             row = {"scheme": scheme.title, "own": biases["own"], "other": biases["other"], "model": category, "change": change.in_percent()}
-            rows.append(
-                row
-                | {
-                    word: errors.in_words(f"{category}, {key}", "rmse_vy")
-                    for word, key in (("before", "as measured"), ("after", "corrected"))
-                }
-            )
+            rows.append(row | {word: errors.in_words(f"{category}, {key}", "rmse_vy") for word, key in BIASES.items()})
     claim = "biases of a_y removed (by the reference): RMSE(v) on the other car falls"
     statement = Statement(claim, "“expected”", schemes[0].kind, tests)
     columns = {

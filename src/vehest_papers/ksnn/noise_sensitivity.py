@@ -53,10 +53,6 @@ class NoiseSensitivity:
         """The same for an estimator that sees windows of N samples: lags 0 to N of the impulse response."""
         return replace(self, memory=n_window)
 
-    def endless(self) -> NoiseSensitivity:
-        """The recursion's own, for a window of any length."""
-        return replace(self, memory=None)
-
     @property
     def poles(self) -> ComplexArray:
         """Poles of the recursion, the larger first."""

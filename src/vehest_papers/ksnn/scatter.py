@@ -5,10 +5,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
-import pandas as pd
-
 from vehest.report.document import Figure
-from vehest.report.style import DOUBLE_COLUMN, Line, line_of, new_figure
+from vehest.report.style import DOUBLE_COLUMN, line_of, new_figure
 from vehest_papers.ksnn import paper
 from vehest_papers.ksnn.candidates import chosen
 from vehest_papers.ksnn.schemes import Scheme
@@ -17,7 +15,7 @@ from vehest_papers.ksnn.tables import SETS
 METRICS = {"r2": "R²", "rmse_vy": "RMSE(v) [m/s]"}
 
 
-def two_tests(schemes: Sequence[Scheme], caption: str) -> Figure:
+def two_tests(schemes: Sequence[Scheme]) -> Figure:
     """R² above, RMSE of v below; one column a scheme, the car that was learnt on over the other one."""
     with new_figure(DOUBLE_COLUMN, 6.4) as figure:
         axes = figure.subplots(2, len(schemes), squeeze=False)
@@ -29,6 +27,11 @@ def two_tests(schemes: Sequence[Scheme], caption: str) -> Figure:
             axes[0, column].set_title(scheme.title)
         handles, labels = axes[0, 0].get_legend_handles_labels()
         figure.legend(handles, labels, loc="outside lower center", ncols=4)
+    caption = (
+        f"The candidates on the two test sets (Figure 6 of the paper), ours on {schemes[0].kind.upper()} cars: filled marks, the seed "
+        f"that validation chooses of each structure; faint ones, the other seeds; hollow ones, the paper's most general models. Above the "
+        f"dashed line the own car is estimated better."
+    )
     return Figure("figure_6", caption, figure)
 
 
@@ -39,7 +42,8 @@ def _draw(axes: Any, scheme: Scheme, metric: str) -> None:
     for name in paper.CATEGORIES:
         if name not in groups:
             continue
-        own, line = groups[name], _line(groups[name])
+        own, first = groups[name], groups[name].iloc[0]
+        line = line_of(str(first["estimator"]), str(first["variant"]))
         axes.scatter(own[x], own[y], s=5, marker=line.marker, color=line.colour, alpha=0.25, linewidths=0, zorder=2)
         picked = [chosen(runs) for _, runs in own.groupby(["estimator", "variant"], sort=False)]
         axes.scatter(
@@ -58,8 +62,3 @@ def _draw(axes: Any, scheme: Scheme, metric: str) -> None:
     axes.set_xlim(limits)
     axes.set_ylim(limits)
     axes.set_aspect("equal")
-
-
-def _line(runs: pd.DataFrame) -> Line:
-    first = runs.iloc[0]
-    return line_of(str(first["estimator"]), str(first["variant"]))

@@ -61,11 +61,6 @@ class Scheme:
         """``real``, ``simulated`` or both."""
         return words_of_kinds(self.part)
 
-    @property
-    def has_third(self) -> bool:
-        """Whether a third car is tested."""
-        return THIRD in self.part.split.tests
-
     def models(self, category: str) -> list[EvaluatedModel]:
         """All seeds of the structure that validation chooses of a category; none where it is not there."""
         run = self.chosen.get(category)
@@ -103,12 +98,8 @@ class Scheme:
         """From one category to another on a test set."""
         return self.errors(test).change(self.name_of(first), self.name_of(second), metric)
 
-    def other_over_own(self, category: str) -> Change | None:
-        """How many times the FVU on the own car is left on the other one."""
-        return self.ratio(self.name_of(category))
-
-    def ratio(self, name: str) -> Change | None:
-        """The same of any structure."""
+    def other_over_own(self, name: str) -> Change | None:
+        """How many times a structure's FVU on the own car is left on the other one."""
         other, own = (self.errors(test).get(name, "fvu") for test in (self.other, self.own))
         return Change.of(other, own) if other is not None and own is not None else None
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pandas as pd
@@ -137,7 +137,7 @@ def _figure(columns: Sequence[tuple[Trained, Trained]], error: float) -> Figure:
                 line = line_of(own.estimator.name, own.estimator.variant)
                 for yaw_rate, dash in zip(YAW_RATES, DASHES, strict=False):
                     windowed = sensitivity_of(own.estimator, yaw_rate, error)
-                    strong = windowed.endless() if _settles(windowed) else windowed
+                    strong = replace(windowed, memory=None) if _settles(windowed) else windowed
                     label = f"{own.estimator.title}, |ω| = {yaw_rate:g} rad/s"
                     for axes, response, cut in zip(column, strong.response(frequency), windowed.response(frequency), strict=True):
                         axes.loglog(frequency, np.abs(response), color=line.colour, linestyle=dash, label=label)

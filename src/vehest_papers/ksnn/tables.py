@@ -51,9 +51,9 @@ def instances(runs: pd.DataFrame) -> Table:
 def across_cars(schemes: Sequence[Scheme], name: str, caption: str, without: Sequence[str] = ()) -> Table:
     """Tables IV and V and Figure 6 in one: of each category the structure chosen by validation, over all seeds, with 95 % intervals."""
     rows = []
-    third, published = any(scheme.has_third for scheme in schemes), any(scheme.published for scheme in schemes)
+    third, published = any(THIRD in scheme.part.split.tests for scheme in schemes), any(scheme.published for scheme in schemes)
     for scheme in schemes:
-        tests = {"own": scheme.own, "other": scheme.other} | ({"third": THIRD} if scheme.has_third else {})
+        tests = {"own": scheme.own, "other": scheme.other} | ({"third": THIRD} if THIRD in scheme.part.split.tests else {})
         for category, run in scheme.chosen.items():
             if category in without:
                 continue
