@@ -24,8 +24,7 @@ from vehest_papers.cnn_ukf.manoeuvres import is_nonlinear
 from vehest_papers.cnn_ukf.subjects import TEST, Prepared, Run, Runs
 from vehest_papers.kit.reading import sideslip_error
 
-IDENTIFICATION = IdentificationSettings(trials=20, restarts=1, error="recordings")
-"""Of the oracle filter."""
+IDENTIFICATION = IdentificationSettings(trials=20, restarts=1, error="recordings")  # of the oracle filter
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,6 +46,11 @@ def hybrid_of(run: Run) -> NetworkUkf:
     return fitted
 
 
+def pseudo_measurements_of(run: Run, drives: Sequence[Recording]) -> list[PseudoMeasurement]:
+    """What a hybrid's network adds to the measurements of drives."""
+    return hybrid_of(run).pseudo_measurements(drives)
+
+
 def rows_of(part: Scored, drive: Recording) -> NDArray[np.int64]:
     """Samples of a drive that are scored."""
     return np.rint((part.time - drive.start_time) * drive.rate_hz).astype(np.int64)
@@ -56,7 +60,7 @@ def outputs_of(run: Run, prepared: Prepared) -> list[Outputs]:
     """Outputs of a hybrid's network on each test manoeuvre."""
     drives, spans = prepared.seen(TEST), prepared.spans(TEST)
     found = []
-    for drive, span, own in zip(drives, spans, hybrid_of(run).pseudo_measurements(drives), strict=True):
+    for drive, span, own in zip(drives, spans, pseudo_measurements_of(run, drives), strict=True):
         (part,) = run.test[span.recording]
         at = rows_of(part, drive)
         found.append(

@@ -18,7 +18,7 @@ from vehest.report.style import DOUBLE_COLUMN, REFERENCE, fixed, legend_above, n
 from vehest.studies.artefacts import PartArtefacts
 from vehest_papers.cnn_ukf import paper
 from vehest_papers.cnn_ukf.manoeuvres import group_of
-from vehest_papers.cnn_ukf.networks import hybrid_of
+from vehest_papers.cnn_ukf.networks import pseudo_measurements_of
 from vehest_papers.cnn_ukf.subjects import TEST, Prepared, Run, line_of, plain_name
 from vehest_papers.kit.reading import sideslip_error
 
@@ -151,7 +151,7 @@ def _network_outputs(
     found = {}
     for candidate, run in hybrids.items():
         scored = _within(run.test[span.recording][0], window)
-        (output,) = hybrid_of(run).pseudo_measurements([drive])
+        (output,) = pseudo_measurements_of(run, [drive])
         kept = (drive.time >= scored.time[0] - 1e-9) & (drive.time <= scored.time[-1] + 1e-9)
         process = None if output.process is None else output.process[kept]
         found[candidate] = drive.time[kept] - scored.time[0], PseudoMeasurement(output.sideslip[kept], output.variance[kept], process)

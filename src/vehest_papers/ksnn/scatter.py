@@ -15,7 +15,7 @@ from vehest_papers.ksnn.tables import SETS
 METRICS = {"r2": "R²", "rmse_vy": "RMSE(v) [m/s]"}
 
 
-def two_tests(schemes: Sequence[Scheme]) -> Figure:
+def two_tests(schemes: Sequence[Scheme], caption: str) -> Figure:
     """R² above, RMSE of v below; one column a scheme, the car that was learnt on over the other one."""
     with new_figure(DOUBLE_COLUMN, 6.4) as figure:
         axes = figure.subplots(2, len(schemes), squeeze=False)
@@ -27,11 +27,6 @@ def two_tests(schemes: Sequence[Scheme]) -> Figure:
             axes[0, column].set_title(scheme.title)
         handles, labels = axes[0, 0].get_legend_handles_labels()
         figure.legend(handles, labels, loc="outside lower center", ncols=4)
-    caption = (
-        f"The candidates on the two test sets (Figure 6 of the paper), ours on {schemes[0].kind.upper()} cars: filled marks, the seed "
-        f"that validation chooses of each structure; faint ones, the other seeds; hollow ones, the paper's most general models. Above the "
-        f"dashed line the own car is estimated better."
-    )
     return Figure("figure_6", caption, figure)
 
 
