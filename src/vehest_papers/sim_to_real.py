@@ -28,17 +28,14 @@ from vehest_papers.kit.methods import bullets, scoring
 from vehest_papers.kit.reading import metric_values
 
 TAKES = "parts"
-RACE_CARS = "race_cars"
-"""Test set of simulated race cars, which make the second choice."""
+RACE_CARS = "race_cars"  # test set of simulated race cars, which make the second choice
 
 OTHER_SIMULATOR = "other_simulator"
 """Test set of a car of another simulation, which makes the third choice; parts that learn on that car have none."""
 
-ADDED = ("level",)
-"""Parts that were added after the real recording had been looked at; the first choice leaves them out."""
+ADDED = ("level",)  # parts that were added after the real recording had been looked at; the first choice leaves them out
 
-SHIPPED = "third"
-"""The choice whose model comes with vehest."""
+SHIPPED = "third"  # the choice whose model comes with vehest
 
 WANTED_FVU = 0.10
 GOAL_FVU = 0.06

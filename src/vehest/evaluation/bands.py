@@ -21,8 +21,7 @@ from vehest.trust.bands import block_labels as manoeuvre_labels
 
 CONFIDENCE = 0.95
 IN_REGIMES = ("coverage_90", "width_90", "interval_score")
-SUFFIXES = {"sideslip": "", "vy": "_vy"}
-"""Quantity -> what its figures' names end in."""
+SUFFIXES = {"sideslip": "", "vy": "_vy"}  # quantity -> what its figures' names end in
 
 
 @dataclass(frozen=True, eq=False)

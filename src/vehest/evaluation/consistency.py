@@ -6,8 +6,7 @@ import numpy as np
 
 from vehest.constants import FloatArray
 
-COVERAGE = {1: 0.6827, 2: 0.9545}
-"""Number of standard deviations -> fraction of Gaussian errors within them."""
+COVERAGE = {1: 0.6827, 2: 0.9545}  # number of standard deviations -> fraction of Gaussian errors within them
 
 
 def normalised_error_squared(errors: FloatArray, covariance: FloatArray) -> FloatArray:

@@ -47,8 +47,7 @@ from vehest.filters.gaussian import Gaussian
 from vehest.filters.kalman import LinearModel
 from vehest.filters.kalman_scan import kalman_scan
 
-INPUTS = ("vx", "yaw_rate", "ay", "ax", "steer")
-"""Channels that a bound knows what to make of; the first two are needed."""
+INPUTS = ("vx", "yaw_rate", "ay", "ax", "steer")  # channels that a bound knows what to make of; the first two are needed
 SETS = (
     ("vx", "yaw_rate"),
     ("vx", "yaw_rate", "ay"),

@@ -17,8 +17,7 @@ from vehest.data.recording import Recording
 from vehest.data.splits import Span
 from vehest.evaluation.metrics import Protocol, Scored, accuracy, scored_range
 
-CONDITION = "best_lever_arm"
-"""What rows of such errors say in the column ``condition``."""
+CONDITION = "best_lever_arm"  # what rows of such errors say in the column ``condition``
 LONGEST = 0.5  # m, ahead of the reference's point or behind it
 METRICS = ("rmse_vy", "rmse_sideslip", "fvu")
 

@@ -12,8 +12,7 @@ from vehest.constants import FloatArray
 from vehest.evaluation.blocks import LEAST_BLOCKS, Segments, block_labels, block_sums, effective_blocks
 from vehest.evaluation.significance import CONFIDENCE, Pair, differences_of_blocks, holm, root_intervals
 
-Name = tuple[str, str]
-"""Estimator and variant."""
+Name = tuple[str, str]  # estimator and variant
 
 Verdict = Literal["lower", "higher", "not told apart"]
 BASELINES = ("zero", "static_map")

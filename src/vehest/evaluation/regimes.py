@@ -43,8 +43,7 @@ def band_name(low: float, high: float) -> str:
 AY_BANDS = {band_name(low, high): (low, high) for low, high in itertools.pairwise(AY_EDGES)}
 """Name of a band of lateral acceleration -> its ends [m/s²]."""
 
-REGIMES = ("straight", "turning", *AY_BANDS, "transient", "steady")
-"""In the order of tables."""
+REGIMES = ("straight", "turning", *AY_BANDS, "transient", "steady")  # in the order of tables
 
 
 def regimes_of(reference: Recording, span: Span, protocol: Protocol) -> dict[str, Mask]:

@@ -40,8 +40,7 @@ UNITS = {
 
 _CLOCK = 1e-6  # s, within which times are the same
 
-Window = tuple[float, float]
-"""Start and end of a fault on a recording's clock [s]."""
+Window = tuple[float, float]  # start and end of a fault on a recording's clock [s]
 
 
 def errors_under_fault(parts: Sequence[Scored], nominal: Sequence[Scored], windows: Sequence[Window]) -> dict[str, dict[str, float]]:

@@ -26,8 +26,7 @@ PATENT_NOTE = (
 )
 """What every report with a KS-NN ends with."""
 
-REPORT = "report"
-"""Document of a study that one starts with."""
+REPORT = "report"  # document of a study that one starts with
 
 LONGEST_AXIS = 6.0  # times the median error, beyond which a bar is cut
 PNG_DPI = 150

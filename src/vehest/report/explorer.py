@@ -20,8 +20,7 @@ from vehest.data.runs import true_runs
 from vehest.report.style import Line, on_dark
 
 LEVELS = 65_534
-GAP = 65_535
-"""Code of a value that is not there."""
+GAP = 65_535  # code of a value that is not there
 
 
 @dataclass(frozen=True, eq=False)

@@ -29,8 +29,7 @@ from vehest.run.usable import lack
 NO_TIME = "not done yet: no time was left, the same command goes on"
 TOLERANCE = 1e-9  # relative, between two rates that are the same
 
-Note = tuple[str, str]
-"""An estimator, or ``evaluation``, whose rate was lowered, and the sentence that goes on from there."""
+Note = tuple[str, str]  # an estimator, or ``evaluation``, whose rate was lowered, and the sentence that goes on from there
 
 
 @dataclass

@@ -104,8 +104,7 @@ class Job:
     training: TrainJob | None = None  # once it is planned
 
 
-Jobs = Mapping[str, Sequence[Job]]
-"""Part of a study -> its jobs; the one part of a study without parts is called ``""``."""
+Jobs = Mapping[str, Sequence[Job]]  # part of a study -> its jobs; the one part of a study without parts is called ``""``
 
 
 def read_study(name: str, overrides: Sequence[str] = ()) -> Study:

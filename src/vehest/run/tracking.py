@@ -36,8 +36,7 @@ VALUES_A_REQUEST = 100  # a server takes no more parameters at a time
 VALUE_LENGTH = 500
 KEY_TAG, STAGE_TAG, DIGEST_TAG, OUTPUT_TAG, STUDY_TAG = "vehest.key", "vehest.stage", "vehest.digest", "vehest.output", "vehest.study"
 Metrics = Callable[[], Mapping[str, float]]
-Figures = Mapping[str, Callable[[], Any]]
-"""File name -> function that draws a matplotlib figure, or gives none."""
+Figures = Mapping[str, Callable[[], Any]]  # file name -> function that draws a matplotlib figure, or gives none
 
 
 @dataclass(eq=False)

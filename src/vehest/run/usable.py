@@ -20,8 +20,7 @@ from vehest.run.config_files import choices
 from vehest.run.printing import TerminalTable
 from vehest.run.train import new_estimator
 
-SCORED = ("vx", "vy_ref")
-"""Channels that every estimate is scored by."""
+SCORED = ("vx", "vy_ref")  # channels that every estimate is scored by
 
 
 @dataclass(frozen=True)

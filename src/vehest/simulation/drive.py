@@ -29,14 +29,10 @@ from vehest.simulation.road.surface import SURFACES, Surface
 from vehest.simulation.sensors.levels import PRESETS, SensorLevels
 from vehest.simulation.sensors.recording import described, measure
 
-RATE_HZ = 100.0
-"""Default sampling rate of recordings [Hz]."""
-AFTER_STAND = 1.0
-"""Recorded after the car has come to its stand [s]."""
-LONGEST_STOP = 60.0
-"""Within which a car stands that spun or left the road [s]."""
-STOPPING_SHARE = 0.7
-"""Share of the grip with which a driver brakes after a spin or beside the road; assumed."""
+RATE_HZ = 100.0  # default sampling rate of recordings [Hz]
+AFTER_STAND = 1.0  # recorded after the car has come to its stand [s]
+LONGEST_STOP = 60.0  # within which a car stands that spun or left the road [s]
+STOPPING_SHARE = 0.7  # share of the grip with which a driver brakes after a spin or beside the road; assumed
 
 
 @dataclass(frozen=True)

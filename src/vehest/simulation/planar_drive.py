@@ -19,14 +19,12 @@ from vehest.simulation.road.surface import SURFACES, Surface
 from vehest.simulation.sensors.levels import PRESETS, SensorLevels
 from vehest.simulation.sensors.recording import measure
 
-PLANAR_MANOEUVRES: Mapping[str, type[Freestyle]] = {Freestyle.name: Freestyle}
-"""Manoeuvres of the planar plant's cars by name."""
+PLANAR_MANOEUVRES: Mapping[str, type[Freestyle]] = {Freestyle.name: Freestyle}  # manoeuvres of the planar plant's cars by name
 
 CHANNELS = ("vx", "yaw_rate", "ax", "ay", "steer", "motor_speed", "motor_current", "vx_ref", "vy_ref", "yaw_rate_ref")
 """Channels of such a car: it has no sensor at its single wheels, and the inertial unit's other axes are not kept."""
 
-SPUN = np.pi / 2.0
-"""Sideslip angle beyond which a drive counts as one with a spin [rad]."""
+SPUN = np.pi / 2.0  # sideslip angle beyond which a drive counts as one with a spin [rad]
 
 
 def simulate_planar_drive(

@@ -23,10 +23,8 @@ from vehest.sources.clocks import require_clock
 
 NO_TABLES = (".vbo", ".mf4", ".mdf", ".dat", ".bag", ".db3", ".mcap")
 SPREADSHEETS = (".xlsx", ".xls", ".xlsm", ".ods")
-DERIVED = "derived"
-"""Key of a recording's provenance: transforms of its data set, and where its channels were measured."""
-SIMULATED = "simulated"
-"""Name of the source whose recordings are never real."""
+DERIVED = "derived"  # key of a recording's provenance: transforms of its data set, and where its channels were measured
+SIMULATED = "simulated"  # name of the source whose recordings are never real
 
 
 def kind_of(dataset: Mapping[str, Any]) -> Kind:

@@ -15,8 +15,7 @@ from vehest.data.errors import DataError
 
 UpAxis = Literal["y", "z"]
 PoseChannel = Literal["vx_ref", "vy_ref", "yaw_rate_ref", "sideslip_ref"]
-POSE_CHANNELS: tuple[PoseChannel, ...] = get_args(PoseChannel)
-"""Channels that poses give."""
+POSE_CHANNELS: tuple[PoseChannel, ...] = get_args(PoseChannel)  # channels that poses give
 
 
 @dataclass(frozen=True)

@@ -28,8 +28,7 @@ from vehest.sources.tables import TextLayout, read_columns, require_columns
 from vehest.sources.unit_spellings import require_unit
 
 LONGEST_HEAD = 1 << 20  # bytes before the rows
-UNITS = {"velocity": "km/h", "vert-vel": "km/h", "Longacc": "g", "Latacc": "g"}
-"""Units that the format has without saying so."""
+UNITS = {"velocity": "km/h", "vert-vel": "km/h", "Longacc": "g", "Latacc": "g"}  # units that the format has without saying so
 JUMP = 1.5  # intervals by which the last row may come late
 KMH = 3.6
 FASTEST_STILL, LEAST_TURN = 5.0, 0.05  # m/s, rad/s: below, slip at two wheels says nothing

@@ -24,8 +24,7 @@ from vehest.studies.transfer_figure import transfer_figure
 
 TAKES = "parts"
 SHOWS_FAILED = True
-REFERENCES = ("zero", "static_map", "kinematic", "data_sheet")
-"""Baselines, in the order in which tables show them first."""
+REFERENCES = ("zero", "static_map", "kinematic", "data_sheet")  # baselines, in the order in which tables show them first
 
 
 def documents(artefacts: StudyArtefacts) -> dict[str, Document]:

@@ -47,8 +47,7 @@ OFFSETS: dict[str, Sizes] = {
 OFFSETS_OF_SPEED: Sizes = (0.02, 0.08, 0.25)
 """Offsets of angular speeds of wheels and motor, as shares of the largest size in the samples: their radii differ by a factor of ten."""
 
-OFFSETS_OF_RANGE: Sizes = (0.01, 0.05, 0.2)
-"""Offsets of all other channels, as shares of the largest size that `CHANNELS` allows."""
+OFFSETS_OF_RANGE: Sizes = (0.01, 0.05, 0.2)  # offsets of all other channels, as shares of the largest size that `CHANNELS` allows
 
 UNIT_FACTORS: dict[str, Sizes] = {
     "m/s": (2.236936, 1.0 / 3.6, 3.6),

@@ -23,14 +23,12 @@ from vehest_papers.kit.reading import with_interval
 from vehest_papers.kit.statements import Change, Compared, Expected, Measured, Statement, short
 
 LEVEL = 0.10
-UNCLAIMED = "not in it"
-"""In the place of the paper's figure, where it claims nothing."""
+UNCLAIMED = "not in it"  # in the place of the paper's figure, where it claims nothing
 HEADERS = {MSE: "MSE", MSE_NL: "MSE_nl", ME: "ME", ME_NL: "ME_nl"}
 WEAK = ("braking in the turn", "J-turn", "skidpad")
 AROUND_PEAK = 10  # samples before and after
 HIGH, LOW = 5.0, 1.0  # deg of |β|
-OutputsOf = Mapping[str, Sequence[Sequence[Outputs]]]
-"""Hybrid -> outputs of its networks, seed by seed, manoeuvre by manoeuvre."""
+OutputsOf = Mapping[str, Sequence[Sequence[Outputs]]]  # hybrid -> outputs of its networks, seed by seed, manoeuvre by manoeuvre
 
 
 def on_accuracy(main: ManoeuvreErrors, data: str) -> list[Statement | Claim]:

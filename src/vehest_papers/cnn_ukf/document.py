@@ -44,8 +44,7 @@ RENAMED = {
     STANDARD: {paper.DATA: paper.Z_SCORES},
 }
 """Part -> what its candidates are called beside those of the full set."""
-NETWORKS = (paper.DATA, paper.Z_SCORES, paper.RECURRENT)
-"""Networks without a filter, in a table of their own."""
+NETWORKS = (paper.DATA, paper.Z_SCORES, paper.RECURRENT)  # networks without a filter, in a table of their own
 IN_TABLE_II = tuple(name for name in paper.CANDIDATES if name not in tables.ORACLES)
 NOTE = (
     "Changes are CNN-UKF's to the other's unless stated. Seeds 3 and 4 of the hybrids and the limited set were added after the test "

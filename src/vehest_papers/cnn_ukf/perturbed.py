@@ -29,8 +29,7 @@ from vehest_papers.cnn_ukf.measures import MSE, MSE_NL, ManoeuvreErrors
 from vehest_papers.cnn_ukf.subjects import Prepared, Run, Runs, chosen, filter_of, line_of
 
 STEPS = (-paper.STIFFNESS_STEP, 0.0, paper.STIFFNESS_STEP)
-COMBINATIONS = tuple(itertools.product(STEPS, STEPS))
-"""Shares by which the front and the rear axle's cornering stiffness are off."""
+COMBINATIONS = tuple(itertools.product(STEPS, STEPS))  # shares by which the front and the rear axle's cornering stiffness are off
 NOMINAL = COMBINATIONS.index((0.0, 0.0))
 LABELS = [f"{100 * front:+.0f} / {100 * rear:+.0f} %" for front, rear in COMBINATIONS]
 SOFTEST = COMBINATIONS.index((-paper.STIFFNESS_STEP, -paper.STIFFNESS_STEP))

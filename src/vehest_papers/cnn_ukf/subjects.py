@@ -43,8 +43,7 @@ LINES = {
     paper.STATIC_MAP: Line("#6b7682", "dashed", "+"),
     paper.ZERO: Line("#c3cad2", "dotted", "."),
 }
-OWN = ", its own filter"
-"""What follows the name of a hybrid that is its own filter."""
+OWN = ", its own filter"  # what follows the name of a hybrid that is its own filter
 
 
 def plain_name(candidate: str) -> str:
@@ -60,8 +59,7 @@ def line_of(candidate: str) -> Line:
 KPIS = {"mse": "MSE [deg²]", "mse_nonlinear": "MSE_nl [deg²]", "max_error": "ME [deg]", "max_error_nonlinear": "ME_nl [deg]"}
 """Attribute of `Kpis` and of `paper.Published` -> header."""
 
-Manoeuvres = Mapping[str, Sequence[Scored]]
-"""Recording -> what was scored of it: one range."""
+Manoeuvres = Mapping[str, Sequence[Scored]]  # recording -> what was scored of it: one range
 
 _NAMES = {
     ("dugoff_ukf", False): paper.MODEL,
@@ -98,8 +96,7 @@ class Run:
         return kpis(self.test)
 
 
-Runs = Mapping[str, Sequence[Run]]
-"""Candidate -> its seeds."""
+Runs = Mapping[str, Sequence[Run]]  # candidate -> its seeds
 
 
 def candidate_of(model: EvaluatedModel) -> str:

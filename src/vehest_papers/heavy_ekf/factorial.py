@@ -38,8 +38,7 @@ SEEDS = 20
 PLANTS = tuple((payload, wet, crossfall) for payload in (False, True) for wet in (False, True) for crossfall in (False, True))
 """Payload, wet patches, crossfall: each without and with."""
 PLAIN = PLANTS[0]
-ONCE, PLAIN_ONLY = "all roads and loads", "dry, flat, without payload"
-"""What the levels of noise were tuned on."""
+ONCE, PLAIN_ONLY = "all roads and loads", "dry, flat, without payload"  # what the levels of noise were tuned on
 PAIRS = ((paper.RATTE, paper.RATT), (paper.RATTE, paper.LINT), (paper.RATT, paper.LINT))
 LOST_DEGREES = 20.0  # an error of β by which a filter counts as lost
 ABSORBED_SLIP = 5.0

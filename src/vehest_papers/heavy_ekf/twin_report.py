@@ -38,8 +38,7 @@ from vehest_papers.kit.reading import with_interval
 DATA = "SIMULATED, the paper's single track"
 LIMIT = 100.0  # %, where the colours end
 CLAIMED = ((paper.RATTE, paper.RATT), (paper.RATTE, paper.LINT))
-SHOWN = ((2.0, -0.2), (5.0, -0.2), (8.0, -0.2), (5.0, 0.0))
-"""Slip and mismatch of the cells whose rows are shown."""
+SHOWN = ((2.0, -0.2), (5.0, -0.2), (8.0, -0.2), (5.0, 0.0))  # slip and mismatch of the cells whose rows are shown
 ROWS = (ZERO, STATIC_MAP, DATA_SHEET, *FILTERS, ORACLE)
 Changes = dict[tuple[int, tuple[str, str]], Change]
 

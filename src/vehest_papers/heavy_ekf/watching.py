@@ -21,8 +21,7 @@ from vehest_papers.heavy_ekf.subjects import CORNERING, LINES, Filter, corners
 from vehest_papers.kit.observability import Observability, observability_along
 
 WINDOW_SECONDS = 1.0
-SIZES = (0.02, 0.1, 0.1, 0.3)
-"""Typical sideslip angle [rad], yaw rate [rad/s], and their rates."""
+SIZES = (0.02, 0.1, 0.1, 0.3)  # typical sideslip angle [rad], yaw rate [rad/s], and their rates
 PARAMETER_SIZE = 0.1  # of the logarithm: 10 %
 MONITOR_SECONDS = 10.0
 MARGIN = 1.5  # over the largest mean of nis/dof in drives that are in order

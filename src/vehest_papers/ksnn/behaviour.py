@@ -27,14 +27,10 @@ from vehest_papers.ksnn import paper
 from vehest_papers.ksnn.comparing import SegmentErrors, masked_segments, yaw_rates
 from vehest_papers.ksnn.schemes import Scheme, segments_on
 
-WINDOWS = (5, 10, 15, 20, 30, 45, 60, 90)
-"""Samples after the start at v = 0 at which errors are read."""
-STRIDE = 4
-"""Every so many samples of a test drive end windows."""
-MOST_SEEDS = 3
-"""Seeds of a candidate that are run again here."""
-HIGHEST_SHARE = 0.999
-"""Share of low yaw rates from which on nothing else is left."""
+WINDOWS = (5, 10, 15, 20, 30, 45, 60, 90)  # samples after the start at v = 0 at which errors are read
+STRIDE = 4  # every so many samples of a test drive end windows
+MOST_SEEDS = 3  # seeds of a candidate that are run again here
+HIGHEST_SHARE = 0.999  # share of low yaw rates from which on nothing else is left
 
 
 def luenberger_of(scheme: Scheme) -> Luenberger | None:

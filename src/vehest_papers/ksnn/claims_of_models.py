@@ -26,11 +26,9 @@ from vehest_papers.ksnn.linear_system import LocalModels
 from vehest_papers.ksnn.schemes import Scheme
 from vehest_papers.ksnn.sensitivities import HIGHEST_HZ, YAW_RATES, sensitivity_of
 
-ENOUGH, LONGER = "30", "60"
-"""Samples of a window: the paper's 1.5 s, and twice that."""
+ENOUGH, LONGER = "30", "60"  # samples of a window: the paper's 1.5 s, and twice that
 SLACK = -0.05
-BANDS_HZ = tuple(float(own) for own in 10.0 ** (np.arange(-10, 9) / 10.0))
-"""Centres of thirds of an octave, 0.1 to 6.3 Hz."""
+BANDS_HZ = tuple(float(own) for own in 10.0 ** (np.arange(-10, 9) / 10.0))  # centres of thirds of an octave, 0.1 to 6.3 Hz
 P2 = "linear_no_bias_p2"
 BIASES = {"before": "as measured", "after": "corrected"}
 

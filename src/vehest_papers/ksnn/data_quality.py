@@ -19,8 +19,7 @@ from vehest_papers.ksnn.subjects import car_colours, car_title, kinds_of, plain_
 
 NOISE_COLOUR = "#555555"
 READ_AT_HZ = (0.1, 0.3, 1.0, 3.0)
-HIGHEST_HZ = 8.0
-"""Frequencies above are not shown: resampling to 20 Hz has removed them."""
+HIGHEST_HZ = 8.0  # frequencies above are not shown: resampling to 20 Hz has removed them
 MOST_POINTS = 5000
 AY_WIDTH, LEAST_SAMPLES = 1.0, 50
 COMPARED_AY = 8.0

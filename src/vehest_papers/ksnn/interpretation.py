@@ -35,10 +35,8 @@ PART_WORDS = {
     "speed": "third (speed and yaw rate)",
     "bias": "third (learned offsets)",
 }
-SPEED = 25.0
-"""Forward speed for which the third sub-model's steady value is given [m/s]."""
-STEADY_YAW_RATE = 0.4
-"""Yaw rate for it where the last centre is at zero [rad/s]."""
+SPEED = 25.0  # forward speed for which the third sub-model's steady value is given [m/s]
+STEADY_YAW_RATE = 0.4  # yaw rate for it where the last centre is at zero [rad/s]
 
 
 def interpretation(

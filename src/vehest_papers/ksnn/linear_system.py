@@ -42,8 +42,7 @@ from vehest.data.errors import DataError
 from vehest.data.recording import Recording
 from vehest.estimators.ksnn import Ksnn
 
-SMALL_ERROR = 1e-6
-"""Below it the secant of a feedback function is taken to be its tangent at 0 [m/s]."""
+SMALL_ERROR = 1e-6  # below it the secant of a feedback function is taken to be its tangent at 0 [m/s]
 
 
 @dataclass(frozen=True, eq=False)

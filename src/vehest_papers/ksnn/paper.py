@@ -11,11 +11,9 @@ LINEAR, NONLINEAR = "KS-NN linear no bias", "KS-NN nonlinear no bias"
 KALMAN, FACTOR_GRAPH = "Kalman filter (KF)", "Factor graph (FG)"
 FIXED_LAG = "Factor graph (FG), fixed lag of"
 ZERO, STATIC_MAP, KINEMATIC = "v = 0", "Static map", "Kinematic integration"
-BASELINES = (ZERO, STATIC_MAP, KINEMATIC)
-"""Not in the paper; they stand in every table."""
+BASELINES = (ZERO, STATIC_MAP, KINEMATIC)  # not in the paper; they stand in every table
 
-CATEGORIES = (LUENBERGER, GRU, LSTM, LINEAR_BIAS, NONLINEAR_BIAS, LINEAR, NONLINEAR)
-"""In the order of Tables IV and V."""
+CATEGORIES = (LUENBERGER, GRU, LSTM, LINEAR_BIAS, NONLINEAR_BIAS, LINEAR, NONLINEAR)  # in the order of Tables IV and V
 
 STRUCTURED = (LINEAR_BIAS, NONLINEAR_BIAS, LINEAR, NONLINEAR)
 WITHOUT_BIAS, WITH_BIAS = (LINEAR, NONLINEAR), (LINEAR_BIAS, NONLINEAR_BIAS)

@@ -19,8 +19,7 @@ from vehest_papers.ksnn.candidates import chosen_by_category, runs_of
 from vehest_papers.ksnn.comparing import SegmentErrors
 from vehest_papers.ksnn.paper import Published
 
-THIRD = "j1"
-"""Test set of a car that no network learns or stops on, where there is one."""
+THIRD = "j1"  # test set of a car that no network learns or stops on, where there is one
 SET_TITLES = {"c2": "C-2", "f2": "F-2", THIRD: "third car"}
 
 

@@ -21,15 +21,12 @@ from vehest_papers.ksnn.linear_system import LocalModels
 from vehest_papers.ksnn.noise_sensitivity import NoiseSensitivity, ksnn_sensitivity, luenberger_sensitivity
 from vehest_papers.ksnn.subjects import Trained
 
-YAW_RATES = (0.2, 0.4)
-"""As in the paper: about the median of |ω| in its drives, and twice that [rad/s]."""
+YAW_RATES = (0.2, 0.4)  # as in the paper: about the median of |ω| in its drives, and twice that [rad/s]
 LOWEST_HZ, HIGHEST_HZ = 0.01, 10.0
 CHANNELS = ("ay", "ax")
 INJECTED_SAMPLES = 200_000
-INJECTED_SIZE = 0.5
-"""Standard deviation of the injected noise [m/s²]."""
-SPEED = 25.0
-"""Forward speed of the turn into which noise is injected [m/s]."""
+INJECTED_SIZE = 0.5  # standard deviation of the injected noise [m/s²]
+SPEED = 25.0  # forward speed of the turn into which noise is injected [m/s]
 SETTLING_SAMPLES = 2000
 DASHES = ("solid", "dashed", "dashdot", "dotted")
 

@@ -20,8 +20,7 @@ from vehest.studies.artefacts import EvaluatedModel, PartArtefacts
 from vehest.training.through_filter import Drive
 from vehest.vehicle.dynamics import STATES
 
-MOVING = STATES[:4]
-"""States that are measured or referenced: all but the friction."""
+MOVING = STATES[:4]  # states that are measured or referenced: all but the friction
 
 
 class Swapped(PointModel):

@@ -23,8 +23,7 @@ BEFORE, AFTER = paper.NNTF, paper.NNTF_U
 PLAIN_BLUE, THROUGH_RED = "#0b4f9c", "#b3122a"
 TASKS = {"one_step": "one-step prediction", "estimation": "estimation"}
 
-Pair = tuple[LearnedUkf, LearnedUkf]
-"""NNTF and NNTF_U of one seed."""
+Pair = tuple[LearnedUkf, LearnedUkf]  # NNTF and NNTF_U of one seed
 
 
 @dataclass(frozen=True)

@@ -23,8 +23,7 @@ ANGLE_WIDTH, ANGLE_LIMIT = 0.1, 10.0  # deg
 AY_EDGES: FloatArray = np.arange(-AY_LIMIT, AY_LIMIT + AY_WIDTH / 2, AY_WIDTH)
 ANGLE_EDGES: FloatArray = np.linspace(-ANGLE_LIMIT, ANGLE_LIMIT, round(2 * ANGLE_LIMIT / ANGLE_WIDTH) + 1)
 
-SLOWEST = 5.0
-"""Speed from which on samples count [m/s]."""
+SLOWEST = 5.0  # speed from which on samples count [m/s]
 STEADY_ACCELERATION, STEADY_YAW, SMOOTHED_SECONDS = 1.0, 0.1, 0.3
 """Steady is a turn with |ax|, |ay - vx·yaw rate| [m/s²] and the change of the yaw rate [rad/s²] below, averaged over so long [s]."""
 LEAST_SAMPLES = 50

@@ -112,8 +112,7 @@ class Oracle:
         return highest
 
 
-Test = Callable[[FloatArray], FloatArray]
-"""Innovations as received, (T, C) -> growth of the log-likelihood ratio at each sample, (T,)."""
+Test = Callable[[FloatArray], FloatArray]  # innovations as received, (T, C) -> growth of the log-likelihood ratio at each sample, (T,)
 
 
 def known_test(signature: FloatArray, covariance: FloatArray) -> Test:

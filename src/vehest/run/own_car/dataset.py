@@ -33,8 +33,7 @@ LEAST_GAP = 0.05  # s
 LONGEST_GAP = 1.0  # s that signals of a measurement may be missing
 MOST_STRAY = 0.002  # of the rows
 POSE_SECONDS = 0.15  # of the filter that differentiates poses
-CONTRADICTIONS = ("sign", "unit", "impossible")
-"""Checks that contradict a proposal."""
+CONTRADICTIONS = ("sign", "unit", "impossible")  # checks that contradict a proposal
 REMARKS = (*CONTRADICTIONS, "dropout", "stuck", "held")
 
 

@@ -39,8 +39,7 @@ HEIGHT = 0.2  # of the centre of gravity over the wheelbase; assumed
 PRETRAINED = "training.start_from=pretrained"
 PRETRAINED_HZ = 20.0
 GIVEN = Trial(1, "given by --with")
-MINUTES = (0.5, 1.0, 2.0, 5.0)
-"""Of reference, parts of the pipeline where there are more."""
+MINUTES = (0.5, 1.0, 2.0, 5.0)  # of reference, parts of the pipeline where there are more
 DATASET_COMMENTS = {
     "time": "unit: s, ms, us or ns; null: no column of times",
     "clock": "strict | interpolate (bridges gaps and jitter) | uniform",

@@ -19,22 +19,16 @@ from vehest.data.errors import ConfigurationError
 from vehest.simulation.plant.handling import ramp_steer
 from vehest.simulation.plant.multi_body import MultiBodyPlant
 
-TEST_SPEED = 25.0
-"""Of the measurement [m/s], or half of the top speed if that is less; assumed."""
-USEFUL_SHARE = 0.985
-"""Share of the largest lateral acceleration that counts as the grip: the last bit takes far more steering; assumed."""
-UNSTEADY = 0.5
-"""Difference between lateral acceleration and speed times yaw rate [m/s²] from which on a car spins; assumed."""
+TEST_SPEED = 25.0  # of the measurement [m/s], or half of the top speed if that is less; assumed
+USEFUL_SHARE = 0.985  # share of the largest lateral acceleration that counts as the grip: the last bit takes far more steering; assumed
+UNSTEADY = 0.5  # difference between lateral acceleration and speed times yaw rate [m/s²] from which on a car spins; assumed
 MARGIN = 0.85
 """Share of the lateral acceleration at which a car began to spin, or lifted a wheel, that a driver counts as all of the grip; assumed."""
-TRACTION_SHARE = 0.8
-"""Share of the driven axle's static grip that a driver uses for accelerating straight ahead; assumed."""
+TRACTION_SHARE = 0.8  # share of the driven axle's static grip that a driver uses for accelerating straight ahead; assumed
 DRAG_AREA = 0.25
 """Drag coefficient times frontal area, per square of the width; assumed: 0.7 m² for a car 1.7 m wide. ``driver: drag_area`` replaces it."""
-AIR_DENSITY = 1.2
-"""[kg/m³]"""
-POWER_SHARE = 0.9
-"""Share of the engine's power that a driver uses; assumed."""
+AIR_DENSITY = 1.2  # [kg/m³]
+POWER_SHARE = 0.9  # share of the engine's power that a driver uses; assumed
 
 
 @dataclass(frozen=True)

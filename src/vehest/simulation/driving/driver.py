@@ -20,14 +20,11 @@ from vehest.data.errors import ConfigurationError
 from vehest.simulation.driving.car import Car
 from vehest.simulation.road.course import Course
 
-DRIVER_RATE_HZ = 100.0
-"""Rate of a driver's decisions [Hz]."""
+DRIVER_RATE_HZ = 100.0  # rate of a driver's decisions [Hz]
 
-LOWEST_CORRECTION, HIGHEST_CORRECTION = 0.5, 2.0
-"""Frequencies between which a driver corrects [Hz]; assumed."""
+LOWEST_CORRECTION, HIGHEST_CORRECTION = 0.5, 2.0  # frequencies between which a driver corrects [Hz]; assumed
 
-WAVELENGTHS = (310.0, 470.0, 1130.0)
-"""Of the variations along a drive [m]; assumed, and none divides a lap."""
+WAVELENGTHS = (310.0, 470.0, 1130.0)  # of the variations along a drive [m]; assumed, and none divides a lap
 
 
 @dataclass(frozen=True)

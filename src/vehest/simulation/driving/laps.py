@@ -27,8 +27,7 @@ from vehest.simulation.road.course import Course, course_by_name
 from vehest.simulation.road.surface import Surface
 
 _TRAFFIC_STREAM = 5  # of a drive's seed; 0 to 4 are the style's, the sensors', the surface's, the manoeuvre's and the fleet's
-TRAFFIC_LENGTH = (50.0, 400.0)
-"""Of a stretch behind a slower car [m]; assumed."""
+TRAFFIC_LENGTH = (50.0, 400.0)  # of a stretch behind a slower car [m]; assumed
 
 
 @dataclass(frozen=True)
@@ -203,8 +202,7 @@ class FastLap(Manoeuvre):
         return LapDriver(plan(high), car, driver, course.length, 2.0 * course.length, {"severity": high, "driver": asdict(driver)})
 
 
-FASTEST_SEVERITY = 0.95
-"""Share of the grip that a fast lap may take."""
+FASTEST_SEVERITY = 0.95  # share of the grip that a fast lap may take
 
 
 class LapDriver(Follower):

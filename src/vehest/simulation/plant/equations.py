@@ -46,8 +46,7 @@ from vehest.simulation.plant.regimes import (
 SMALLEST_WHEEL_VELOCITY = 0.5
 """Smallest divisor of slips [m/s]; below it a rolling wheel still has no slip, and slip stiffness stays finite."""
 
-SMALLEST_LOAD = 1.0
-"""Of a wheel, also in the air [N]: tyre formulas divide by the load."""
+SMALLEST_LOAD = 1.0  # of a wheel, also in the air [N]: tyre formulas divide by the load
 
 HEAVE_RATE = 12
 JOINT_FRONT, JOINT_REAR = 27, 28

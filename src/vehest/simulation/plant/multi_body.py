@@ -56,8 +56,7 @@ STEADY_SHARE = 0.93
 The rest goes into the drag of the steered front wheels, its yaw moment, and the load that driving against it takes."""
 
 HEAVE_FRONT, HEAVE_REAR = 16, 21
-MIRRORED = (1, 0, 3, 2)
-"""The library's left front, right front, left rear and right rear wheel in the order of motion.WHEELS."""
+MIRRORED = (1, 0, 3, 2)  # the library's left front, right front, left rear and right rear wheel in the order of motion.WHEELS
 
 
 def _state(place: int, meaning: str) -> Any:

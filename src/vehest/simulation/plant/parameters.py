@@ -26,8 +26,7 @@ from vehest.constants import FloatArray
 from vehest.data.errors import ConfigurationError
 
 LIBRARY = "commonroad-vehicle-models"
-LIBRARY_VERSION = metadata.version(LIBRARY)
-"""Of the package whose parameter files are read."""
+LIBRARY_VERSION = metadata.version(LIBRARY)  # of the package whose parameter files are read
 
 PUBLISHED_SETS: Mapping[int, str] = MappingProxyType({1: "Ford Escort", 2: "BMW 320i", 3: "VW Vanagon"})
 """Sets for which CommonRoad publishes all multi-body values (Althoff and Würsching 2020, appendix)."""

@@ -69,8 +69,7 @@ class PlanarCar:
         return {name: float(getattr(self, name)) for name in PARAMETERS}
 
 
-PARAMETERS = tuple(entry.name for entry in fields(PlanarCar) if entry.name != "name")
-"""Names of the plant's parameters, in order."""
+PARAMETERS = tuple(entry.name for entry in fields(PlanarCar) if entry.name != "name")  # names of the plant's parameters, in order
 
 
 @dataclass(frozen=True)

@@ -12,14 +12,10 @@ from scipy.linalg import cho_solve_banded, cholesky_banded
 
 from vehest.constants import FloatArray
 
-SPACING = 0.5
-"""Of the samples of a line [m]."""
-CLEARANCE = 0.15
-"""Room between the car and a cone [m]; assumed."""
-_KNOTS = 1.5
-"""Spacing of the points that are sought for the smoothest line [m]."""
-_SMOOTH = 6.0
-"""Length [m] over which a change of curvature weighs as much as curvature itself; assumed, a fifth of a second at 30 m/s."""
+SPACING = 0.5  # of the samples of a line [m]
+CLEARANCE = 0.15  # room between the car and a cone [m]; assumed
+_KNOTS = 1.5  # spacing of the points that are sought for the smoothest line [m]
+_SMOOTH = 6.0  # length [m] over which a change of curvature weighs as much as curvature itself; assumed, a fifth of a second at 30 m/s
 
 
 @dataclass(frozen=True)

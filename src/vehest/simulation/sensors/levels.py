@@ -218,8 +218,7 @@ class SensorLevels:
     speed_of_wheels: bool = False
 
 
-NO_ERRORS = ("kind", "drift_time")
-"""Fields that are no errors and stay when the others are switched off."""
+NO_ERRORS = ("kind", "drift_time")  # fields that are no errors and stay when the others are switched off
 
 
 def without_errors(level: Any) -> Any:

@@ -46,8 +46,7 @@ def described(levels: SensorLevels, motion: Motion) -> dict[str, Any]:
     return {name: _without_idle(value) for name, value in asdict(levels).items() if name not in absent}
 
 
-_IDLE = {"gain": 0.0, "bias": 0.0, "roll_share": 1.0}
-"""Values without effect, left out."""
+_IDLE = {"gain": 0.0, "bias": 0.0, "roll_share": 1.0}  # values without effect, left out
 
 
 def _without_idle(value: Any) -> Any:

@@ -12,11 +12,9 @@ from vehest.data.errors import DataError
 from vehest.data.splits import VALIDATION
 from vehest.studies.artefacts import EvaluatedModel, PartArtefacts
 
-Name = tuple[str, str]
-"""Estimator and variant."""
+Name = tuple[str, str]  # estimator and variant
 
-Runs = dict[tuple[str, str, int, str], dict[str, float]]
-"""(estimator, variant, seed, test set) -> metric -> value."""
+Runs = dict[tuple[str, str, int, str], dict[str, float]]  # (estimator, variant, seed, test set) -> metric -> value
 
 
 def runs_of(artefacts: PartArtefacts, column: str = "value") -> Runs:
