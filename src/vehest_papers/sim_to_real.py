@@ -162,7 +162,6 @@ def steps_of(artefacts: StudyArtefacts) -> list[Step]:
 
 
 def _real(part: PartArtefacts) -> str:
-    """The test set of the real car."""
     (name,) = (name for name in part.split.tests if name not in (RACE_CARS, OTHER_SIMULATOR))
     return name
 

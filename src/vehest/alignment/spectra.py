@@ -190,7 +190,6 @@ def smoothed(values: FloatArray) -> FloatArray:
 
 
 def _coarse(cross: ComplexArray, omega: FloatArray, *, low_pass: bool) -> tuple[float, float]:
-    """The best point of a grid."""
     delays = np.linspace(-LARGEST_LAG, LARGEST_LAG, 41)
     constants = np.concatenate([[0.0], np.geomspace(0.05, LONGEST_TIME_CONSTANT, 15)]) if low_pass else np.zeros(1)
     advance = np.exp(1j * np.multiply.outer(delays, omega)) * cross

@@ -152,8 +152,6 @@ def _between(spans: Sequence[Span], begin: float, end: float) -> list[Span]:
 
 
 class _Ranges:
-    """Makes spans of the ranges of a configuration."""
-
     def __init__(self, file: SplitFile, catalogue: Catalogue | None) -> None:
         self._file, self._catalogue, self._where = file, catalogue, f"split '{file.name}'"
         self._known: dict[str, Mapping[str, Reader]] = {}
@@ -191,7 +189,6 @@ class _Ranges:
         return replace(span, start=max(span.start, recording.start_time), stop=min(span.stop, recording.end_time))
 
     def _spans(self, role: str, entries: Sequence[RangeFile]) -> tuple[Span, ...]:
-        """The spans of one role."""
         spans: list[Span] = []
         for entry in entries:
             dataset = self._file.dataset_of(entry)
@@ -201,7 +198,6 @@ class _Ranges:
         return tuple(spans)
 
     def _bounds(self, dataset: str, name: str, entry: RangeFile) -> tuple[float, float]:
-        """Start and stop of an entry in one recording [s]."""
         if entry.laps is not None:
             return self._laps(dataset, name, entry.laps)
         return self._time(dataset, name, entry.start), self._time(dataset, name, entry.stop)

@@ -86,7 +86,7 @@ def band_figures(
 def coverage_intervals(own: Mapping[str, Banded], parts: Sequence[Scored], rate_hz: float) -> dict[str, tuple[float, float]]:
     """95 % intervals of coverages over blocks of the drive, the blocks of `evaluation.blocks`; nothing where there are too few."""
     segments, found = segments_of(parts, rate_hz), {}
-    starts = _segment_starts(segments.samples)
+    starts = np.concatenate([[0], np.cumsum(segments.samples)[:-1]]).astype(np.int64)
     for name, suffix in SUFFIXES.items():
         errors, half = own[name].together
         for k, level in enumerate(LEVELS):
@@ -177,7 +177,3 @@ def proportion_interval(sums: FloatArray, sizes: FloatArray) -> tuple[float, flo
 
 def _sums(values: FloatArray, labels: NDArray[np.int64]) -> FloatArray:
     return np.asarray(np.bincount(labels, weights=values), dtype=np.float64)
-
-
-def _segment_starts(samples: FloatArray) -> NDArray[np.int64]:
-    return np.concatenate([[0], np.cumsum(samples)[:-1]]).astype(np.int64)

@@ -403,8 +403,6 @@ def _model_of(drive: Drive, inputs: set[str], levels: _Levels) -> tuple[LinearMo
 
 
 class _Blocks:
-    """States and measurements of a linear model, put together one by one."""
-
     def __init__(self, steps: int) -> None:
         self.steps = steps
         self.transition: dict[tuple[int, int], FloatArray | float] = {}
@@ -447,12 +445,10 @@ def _in_steps(process: Noise, step: float) -> tuple[float, float]:
 
 
 def _middle(samples: FloatArray) -> FloatArray:
-    """Means of neighbours, (T - 1,)."""
     return 0.5 * (samples[1:] + samples[:-1])
 
 
 def _joined(drives: Sequence[Drive]) -> tuple[FloatArray, FloatArray]:
-    """v_ref and u of all scored samples."""
     parts = [drive.scored for drive in drives]
     return np.concatenate([own.vy_ref for own in parts]), np.concatenate([own.inputs["vx"] for own in parts])
 

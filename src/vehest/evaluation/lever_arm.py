@@ -30,12 +30,6 @@ class LeverArm:
     parts: tuple[Scored, ...]  # the estimates at the reference's point
 
 
-def point_is_unknown(reference: Recording) -> bool:
-    """Whether a recording's data set declares that the point at which its reference was measured is unknown."""
-    derived = reference.provenance.get("derived")
-    return isinstance(derived, dict) and derived.get("reference_point") == "unknown"
-
-
 def best_lever_arm(
     parts: Sequence[Scored], yaw_rates: Sequence[FloatArray], speeds: Sequence[FloatArray], least_speed: float = 0.0
 ) -> LeverArm:
@@ -61,7 +55,8 @@ def lever_arm_figures(parts: Sequence[Scored], pieces: Iterable[tuple[Recording,
     yaw_rates, speeds = [], []
     for reference, span in pieces:
         turning = next((name for name in ("yaw_rate_ref", "yaw_rate") if name in reference), None)
-        if turning is None or not point_is_unknown(reference):
+        derived = reference.provenance.get("derived")  # from the data set's declaration
+        if turning is None or not isinstance(derived, dict) or derived.get("reference_point") != "unknown":
             return {}
         first, end = scored_range(reference, span, protocol)
         yaw_rates.append(reference[turning][first:end])

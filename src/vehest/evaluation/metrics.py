@@ -23,53 +23,28 @@ REFERENCES = {"vx": "vx_ref", "vy": "vy_ref", "yaw_rate": "yaw_rate_ref"}  # qua
 WEIGHTS = {"vx": 0.2225, "vy": 0.5064, "yaw_rate": 0.1566}
 """Weights of squared and absolute errors in SI units (Węgrzynowski et al. 2024, the authors' public code)."""
 
-UNITS: dict[str, str] = {
-    "rmse_vy": "m/s",
-    "fvu": "1",
-    "r2": "1",
-    "rmse_sideslip": "deg",
-    "mse_sideslip": "deg²",
-    "mse_sideslip_nonlinear": "deg²",
-    "max_error_sideslip": "deg",
-    "max_error_sideslip_nonlinear": "deg",
-    "p99_sideslip": "deg",
-    "rmse_vx": "m/s",
-    "rmse_yaw_rate": "rad/s",
-    "mse_weighted": "1",
-    "mae_weighted": "1",
-    "ae99_weighted": "1",
-    "nees": "1",
-    "nis": "1",
-    "coverage_1sigma": "1",
-    "coverage_2sigma": "1",
-    **{
-        f"{name}{suffix}": unit.format(of)
-        for suffix, of in (("", "deg"), ("_vy", "m/s"))
-        for name, unit in {
-            "coverage_50": "1",
-            "coverage_68": "1",
-            "coverage_90": "1",
-            "coverage_95": "1",
-            "coverage_90_p10": "1",
-            "coverage_90_p90": "1",
-            "width_90": "{}",
-            "interval_score": "{}",
-            "crps": "{}",
-            "error_icc": "1",
-            "band_blocks": "1",
-        }.items()
-    },
-    "share": "1",
-    "floor_reference": "deg",
-    "floor_reference_vy": "m/s",
-    "floor_cramer_rao": "deg",
-    "floor_cramer_rao_vy": "m/s",
-    "lever_arm": "m",
-    "n_sequences": "1",
-    "n_parameters": "1",
-    "epochs": "1",
-    "train_seconds": "s",
-    "step_seconds": "s",
+_NAMES = {
+    "1": (
+        *("fvu", "r2", "mse_weighted", "mae_weighted", "ae99_weighted", "nees", "nis", "coverage_1sigma", "coverage_2sigma", "share"),
+        *("n_sequences", "n_parameters", "epochs"),
+    ),
+    "deg": ("rmse_sideslip", "max_error_sideslip", "max_error_sideslip_nonlinear", "p99_sideslip", "floor_reference", "floor_cramer_rao"),
+    "deg²": ("mse_sideslip", "mse_sideslip_nonlinear"),
+    "m/s": ("rmse_vy", "rmse_vx", "floor_reference_vy", "floor_cramer_rao_vy"),
+    "rad/s": ("rmse_yaw_rate",),
+    "m": ("lever_arm",),
+    "s": ("train_seconds", "step_seconds"),
+}
+_OF_BANDS = {
+    "1": ("coverage_50", "coverage_68", "coverage_90", "coverage_95", "coverage_90_p10", "coverage_90_p90", "error_icc", "band_blocks"),
+    "{}": ("width_90", "interval_score", "crps"),  # in the unit of the quantity
+}
+UNITS: dict[str, str] = {name: unit for unit, names in _NAMES.items() for name in names}
+UNITS |= {
+    f"{name}{suffix}": unit.format(of)
+    for suffix, of in (("", "deg"), ("_vy", "m/s"))
+    for unit, names in _OF_BANDS.items()
+    for name in names
 }
 
 

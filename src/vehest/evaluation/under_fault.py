@@ -52,8 +52,10 @@ def errors_under_fault(parts: Sequence[Scored], nominal: Sequence[Scored], windo
         nominal: the same without the fault.
     """
     found = {}
-    for subset, inside in ((FAULTED, _during), (AFTER, _after)):
-        masks = [inside(part.time, window) for part, window in zip(parts, windows, strict=True)]
+    pairs = list(zip(parts, windows, strict=True))
+    during = [_during(part.time, window) for part, window in pairs]
+    after = [part.time >= window[1] + SETTLED_SECONDS - _CLOCK for part, window in pairs]
+    for subset, masks in ((FAULTED, during), (AFTER, after)):
         if any(mask.any() for mask in masks):
             usual = {f"{name}_nominal": value for name, value in _errors(nominal, masks).items()}
             found[subset] = _errors(parts, masks) | usual
@@ -100,10 +102,6 @@ def flags_under_fault(parts: Sequence[Scored], flagged: Sequence[Flagged], windo
 
 def _during(time: FloatArray, window: Window) -> NDArray[np.bool_]:
     return (time >= window[0] - _CLOCK) & (time < window[1] - _CLOCK)
-
-
-def _after(time: FloatArray, window: Window) -> NDArray[np.bool_]:
-    return time >= window[1] + SETTLED_SECONDS - _CLOCK
 
 
 def _errors(parts: Sequence[Scored], masks: Sequence[NDArray[np.bool_]]) -> dict[str, float]:

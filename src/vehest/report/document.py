@@ -17,7 +17,6 @@ from vehest.report.style import MISSING, REFERENCE_COLOUR, decimals_for, fixed, 
 
 if TYPE_CHECKING:
     import pandas as pd
-    from markdown_it import MarkdownIt
     from matplotlib.figure import Figure as MatplotlibFigure
 
 PATENT_NOTE = (
@@ -304,9 +303,10 @@ def _spoken(caption: str) -> str:
 
 def _page(document: Document, numbers: Mapping[int, str], images: Mapping[str, bytes]) -> str:
     from jinja2 import Environment, PackageLoader, StrictUndefined
+    from markdown_it import MarkdownIt
     from markupsafe import Markup
 
-    markdown = _markdown_parser()
+    markdown = MarkdownIt("commonmark", {"html": False}).enable("table").disable("image")
     blocks: list[dict[str, Any]] = []
     for position, block in enumerate(document.blocks):
         if isinstance(block, str):
@@ -337,12 +337,6 @@ def _page(document: Document, numbers: Mapping[int, str], images: Mapping[str, b
         plots_style=Markup(_packaged("uplot.css")) if interactive else "",
         missing=MISSING,
     )
-
-
-def _markdown_parser() -> MarkdownIt:
-    from markdown_it import MarkdownIt
-
-    return MarkdownIt("commonmark", {"html": False}).enable("table").disable("image")
 
 
 def _no_formula(cell: Any) -> Any:

@@ -121,7 +121,6 @@ def reckoned_course(vx: FloatArray, vy: FloatArray, yaw_rate: FloatArray, step: 
 
 
 def _integral(values: FloatArray, step: float) -> FloatArray:
-    """By the trapezoidal rule, from zero."""
     steps = 0.5 * step * (values[1:] + values[:-1])
     whole: FloatArray = np.concatenate([[0.0], np.cumsum(steps)])
     return whole

@@ -116,7 +116,6 @@ def read_estimate_table(file: Path, vx: Recording) -> Estimate:
 
 
 def _unit_in(name: str) -> str | None:
-    """A unit in brackets behind a name, as vehest spells it."""
     written = re.search(r"[\[(](.*?)[\])]", name)
     if written is None:
         return None

@@ -228,7 +228,6 @@ def _rows_of_parts(
 def _rows_under_faults(
     estimator: Estimator, job: EvaluateJob, head: Mapping[str, Any], spans: Sequence[Span], nominal: Sequence[Scored], trust: Trust | None
 ) -> list[dict[str, Any]]:
-    """Rows of one test set under each fault."""
     if not job.how.faults:
         return []
     rows: list[dict[str, Any]] = []
@@ -242,7 +241,6 @@ def _rows_under_faults(
 
 
 def _head(job: EvaluateJob, estimator: Estimator, name: str, spans: Sequence[Span]) -> dict[str, Any]:
-    """The columns that rows of one test set have in common."""
     about = read_description(job.model.folder).about
     datasets = dict.fromkeys(span.dataset for span in spans)
     kinds = dict.fromkeys(job.how.kinds[name] for name in datasets)

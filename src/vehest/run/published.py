@@ -61,7 +61,6 @@ def keys_of_study(study: Study, jobs: Jobs, absent: Collection[str], runner: Run
 
 
 def _ingests(study: Study, jobs: Jobs, absent: Collection[str], runner: Runner) -> dict[str, Config]:
-    """Data set -> the configuration of its ingest."""
     if study.datasets:
         return {name: config for name, config in _by_dataset(jobs[""]).items() if name not in absent}
     firsts = [jobs[name][0].config for name in study.parts if name not in absent]

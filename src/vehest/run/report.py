@@ -92,7 +92,6 @@ def draw_report(
 def _plan(
     artefacts: StudyArtefacts, module: str, comparisons: Mapping[str, Comparison], ingested: Sequence[Artefact], output: Path
 ) -> StagePlan:
-    """What a report is made from."""
     config: dict[str, Any] = {
         "study": artefacts.study,
         "title": artefacts.title,
@@ -273,7 +272,6 @@ def draw_sweep(study: Study, comparison: Comparison, runner: Runner) -> tuple[Ar
 
 
 def _job_table(comparison: Comparison) -> pd.DataFrame:
-    """One row a job, in the order of the command."""
     split = comparison.evaluation.split
     sets = [*([VALIDATION] if split.validation else []), *split.tests]
     rows = []

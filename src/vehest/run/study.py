@@ -290,8 +290,11 @@ def sweep_of(overrides: Sequence[str], name: str | None = None) -> tuple[Study, 
 
 
 def _combination(overrides: Sequence[str], swept: Sequence[str], number: int) -> Job:
-    """A combination of values; the seed is each job's own."""
-    values = {key_of(override): _value(override) for override in overrides if key_of(override) in swept}
+    values: dict[str, Value] = {}
+    for override in overrides:
+        if key_of(override) in swept:
+            value = value_of(override)
+            values[key_of(override)] = value if isinstance(value, bool | int | float | str) else override.split("=", 1)[-1]
     names = short_names(list(values))
     label = ", ".join(f"{names[key]}={shown_value(value)}" for key, value in values.items())
     try:
@@ -302,9 +305,3 @@ def _combination(overrides: Sequence[str], swept: Sequence[str], number: int) ->
     except ConfigurationError as error:
         return Job({}, label or "this", values, number, failure_of(error))
     return Job(config, label or estimator.full_title, values, number)
-
-
-def _value(override: str) -> Value:
-    """A plain value, or the text of any other."""
-    value = value_of(override)
-    return value if isinstance(value, bool | int | float | str) else override.split("=", 1)[-1]

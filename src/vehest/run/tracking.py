@@ -121,7 +121,6 @@ class Tracker:
         return tags | ({STUDY_TAG: self.study, "mlflow.parentRunId": self._parent()} if self.study else {})
 
     def _parent(self) -> str:
-        """The run of the study in this output root."""
         tags = {STUDY_TAG: self.study, STAGE_TAG: "study"}
         own = self._runs(tags)[1]
         if not own:

@@ -126,7 +126,6 @@ def write_model(job: TrainJob, estimator: Estimator, record: FitRecord, folder: 
 
 
 def _preparation(data: Mapping[str, Artefact]) -> dict[str, Any]:
-    """Method and transforms of the recordings, as in ``downsample`` of the configuration."""
     config = next(iter(data.values())).config  # the same for all data sets of a job
     return {"method": config["method"], "transforms": [dict(entry) for entry in config["transforms"]]}
 

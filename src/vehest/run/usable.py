@@ -187,7 +187,6 @@ def _recordings(spans: Sequence[Span], contents: Mapping[str, Sequence[Recording
 
 
 def _built(config: Config) -> tuple[Estimator, Any]:
-    """Estimator and settings of its training."""
     estimator = new_estimator(config["estimator"])
     return estimator, settings_from_config(estimator.training_type, config["training"], "training")
 

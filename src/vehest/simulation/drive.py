@@ -169,8 +169,6 @@ def drive(
 
 
 class _Ride:
-    """A car and its driver during a drive."""
-
     def __init__(
         self, plant: MultiBodyPlant, manoeuvre: Manoeuvre, controller: Controller, control: StabilityControl | None, stint: Stint | None
     ) -> None:
@@ -191,7 +189,7 @@ class _Ride:
 
     def decide(self, time: float) -> bool:
         """The driver's next command [s]; false if the drive is over."""
-        seen = _observe(self.state)
+        seen = Observation(*self.state.values[[X, Y, YAW, VX, VY, YAW_RATE, STEER]].tolist())
         decision = self._controller.command(time, seen)
         if self._stint is not None:
             decision = decision._replace(friction=decision.friction * self._stint.friction_at(time))
@@ -282,8 +280,3 @@ def whole_steps(rate_hz: float, step: float, what: str) -> int:
             f"lie between two samples (with 0.001 s: 10, 20, 25, 40, 50, 100, 125, 200, 250, 500 or 1000 Hz)"
         )
     return n_steps
-
-
-def _observe(state: PlantState) -> Observation:
-    values = state.values.tolist()
-    return Observation(values[X], values[Y], values[YAW], values[VX], values[VY], values[YAW_RATE], values[STEER])

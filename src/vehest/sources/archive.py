@@ -77,7 +77,6 @@ def temporary_folder(file: Path) -> Iterator[Path]:
 
 
 def _checked_path(file: Path, entry: zipfile.ZipInfo) -> PurePosixPath:
-    """Path of an entry inside the folder."""
     name, kind = entry.filename, stat.S_IFMT(entry.external_attr >> 16)
     path = PurePosixPath(name.replace("\\", "/"))
     leaves = path.is_absolute() or PureWindowsPath(name).drive or ".." in path.parts or not path.parts or not name.isprintable()

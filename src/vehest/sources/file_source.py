@@ -39,7 +39,6 @@ class FileSource(Source):
         raise self._no_recording(recording_id)
 
     def _files(self) -> list[Path]:
-        """Files of the data set, in alphabetical order."""
         folder = existing_folder(self.dataset.get("path"), self.name)
         files = self._matching(folder)
         if not files:

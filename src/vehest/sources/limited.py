@@ -97,7 +97,6 @@ def require_package(module: str, extra: str, what: str) -> None:
 
 
 def _ended(file: Path, code: int, seconds: float, memory: float) -> DataError:
-    """The error of a reading process that gave no answer."""
     if code in (-getattr(signal, "SIGXCPU", 0), -getattr(signal, "SIGKILL", 0)):
         return DataError(f"'{file}' takes more than {seconds:.0f} s to read, too long for its size; it is damaged, or of another format")
     if code == NO_MEMORY:

@@ -55,11 +55,6 @@ def counted_runs(numbers: FloatArray, column: str, file: Path) -> dict[int | Non
     return runs
 
 
-def restarted_runs(stamps: FloatArray) -> dict[int | None, slice]:
-    """Rows of each run, counted from 0, where a new one begins as time goes backwards."""
-    return dict(enumerate(stretches(np.diff(stamps) < 0, len(stamps))))
-
-
 def stretches(begins: NDArray[np.bool_], n_rows: int) -> list[slice]:
     """Rows of uninterrupted runs in their order, of whether a run begins with the next row, (N - 1,)."""
     edges = np.concatenate([[0], np.flatnonzero(begins) + 1, [n_rows]]).tolist()

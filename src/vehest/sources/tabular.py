@@ -8,6 +8,7 @@ from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import Annotated, Any
 
+import numpy as np
 from pydantic import AfterValidator, Field
 
 from vehest.constants import FloatArray
@@ -21,7 +22,7 @@ from vehest.sources.columns import ChannelMap, ChannelNames, Column, ColumnName,
 from vehest.sources.file_source import FileSource
 from vehest.sources.sample_and_hold import held_from_config
 from vehest.sources.table_pose import table_pose_from_config
-from vehest.sources.table_rows import counted_runs, dropped_rows_from_config, kept_rows, restarted_runs
+from vehest.sources.table_rows import counted_runs, dropped_rows_from_config, kept_rows, stretches
 from vehest.sources.tables import TextLayout, column_names, listed, read_columns
 
 
@@ -179,8 +180,10 @@ class TabularSource(FileSource):
         if file not in self._known_runs:
             require_files([file], self.name)
             numbers = self._values(file, [counter])[counter]
-            restarts = self.options.time_restarts
-            self._known_runs[file] = restarted_runs(numbers) if restarts else counted_runs(numbers, counter, file)
+            if self.options.time_restarts:  # a run begins where time goes backwards
+                self._known_runs[file] = {**dict(enumerate(stretches(np.diff(numbers) < 0, len(numbers))))}
+            else:
+                self._known_runs[file] = counted_runs(numbers, counter, file)
         return self._known_runs[file]
 
 

@@ -89,7 +89,6 @@ def overview(
 
 
 def _left_out(parts: Mapping[str, PartArtefacts], folds: Mapping[Name, object], titles: Mapping[Name, str]) -> list[str]:
-    """What is not in the table, and why."""
     lines = [f"{as_text(part.title)}: {line}" for part in parts.values() for line in warnings_of(part) if "is left out" in line]
     lost = [titles[name] for name in titles if name not in folds]
     return [*lines, *([f"Not in every fold with a finite error, and so not in the table: {listed(lost)}."] if lost else [])]

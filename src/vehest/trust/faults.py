@@ -255,10 +255,8 @@ def _turns(channel: str) -> bool:
 
 
 def _reach(values: FloatArray) -> float:
-    """Largest size among finite values; 0 where there are none."""
     return float(np.abs(values[np.isfinite(values)]).max(initial=0.0))
 
 
 def _range(channel: Channel) -> float:
-    """Largest size that a channel can have."""
     return max(abs(channel.low), abs(channel.high))

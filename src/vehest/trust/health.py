@@ -339,7 +339,6 @@ def _embedded(model: Autoregression, names: Sequence[str], usable: Sequence[str]
 
 
 def _plain(values: FloatArray) -> Any:
-    """Tuples of tuples of numbers."""
     return tuple(_plain(part) for part in values) if values.ndim > 1 else tuple(values.tolist())
 
 

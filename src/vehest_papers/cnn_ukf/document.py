@@ -259,7 +259,6 @@ def _appendices(
     drawn: Mapping[str, Run],
     data: dict[str, pd.DataFrame],
 ) -> list[Block]:
-    """The paper's figures on the full set."""
     part, own = artefacts.parts[FULL], prepared[FULL]
     kind, title = words_of_kinds(part).upper(), artefacts.titles[FULL].lower()
     shown = {titles[name]: runs[name] for name in (*paper.TABLE_II, paper.SMOOTH, paper.FREE) if name in runs}
@@ -282,7 +281,6 @@ def _appendices(
 
 
 def _limited(artefacts: StudyArtefacts, learnt: Limited, prepared: Prepared, kind: str) -> list[Block]:
-    """Table III and Figures 11 to 13."""
     part, words, runs = artefacts.parts[LIMITED], kind.upper(), learnt.comparison.runs
     drawn = {name: own for name, own in runs.items() if name in paper.TABLE_III or name == paper.SMOOTH}
     picked = {name: chosen(own) for name, own in drawn.items()}
@@ -307,7 +305,6 @@ def _limited(artefacts: StudyArtefacts, learnt: Limited, prepared: Prepared, kin
 
 
 def _networks_and_oracles(parts: Mapping[str, Runs], prepared: Mapping[str, Prepared], main: ManoeuvreErrors, kind: str) -> list[Block]:
-    """Networks without a filter and their search; oracles."""
     words, blocks = kind.upper(), list[Block]()
     if len(known := {name: main.runs[name] for name in NETWORKS if name in main}) > 1 or any(map(search.is_point, parts)):
         blocks.append("## Appendix: networks without a filter")

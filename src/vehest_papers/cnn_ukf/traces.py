@@ -170,7 +170,6 @@ def _from_start(part: Scored) -> FloatArray:
 
 
 def _angles(axes: Any, parts: Mapping[str, Scored]) -> None:
-    """Reference and estimates."""
     first = next(iter(parts.values()))
     axes.plot(_from_start(first), np.degrees(first.sideslip_ref), color=REFERENCE.colour, linewidth=1.5, label="reference")
     for candidate, part in parts.items():

@@ -100,7 +100,6 @@ def _flat(grid: Sequence[Sequence[Cell]]) -> list[Cell]:
 
 
 def _map_cells(cells: Sequence[Cell], found: Changes) -> pd.DataFrame:
-    """The figures of the map, a row a cell and pair."""
     return pd.DataFrame(
         {
             "slip_deg": cells[at].conditions.slip,
@@ -190,7 +189,6 @@ def _in_words(found: Changes) -> str:
 
 
 def _rows(own: Factorial) -> Table:
-    """All candidates in the shown cells, with intervals."""
     grid = own.grid()
     cells = [grid[MISMATCHES.index(mismatch)][SLIPS.index(slip)] for slip, mismatch in SHOWN]
     rows = []

@@ -85,7 +85,6 @@ def additions(name: str, part: PartArtefacts, beside: Mapping[str, PartArtefacts
 
 
 def _alone(beside: Mapping[str, PartArtefacts], name: str) -> Subject | None:
-    """The only candidate of a part, if the part is there."""
     if name not in beside:
         return None
     candidate = next(iter(models_by_candidate(beside[name])))

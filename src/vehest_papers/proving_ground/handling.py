@@ -31,19 +31,17 @@ RAMP_SPEED = 25.0
 """Of the slow ramp [m/s], or half the top speed if that is less: that at which the driver's knowledge of the car was measured."""
 
 
+def _no_samples() -> Counts:
+    return np.zeros((len(AY_EDGES) - 1, len(ANGLE_EDGES) - 1), dtype=np.int64)
+
+
 @dataclass
 class HandlingPoints:
-    """Samples of recordings over centripetal acceleration and understeer angle; does not grow with them.
+    """Samples of recordings over centripetal acceleration and understeer angle, (bins of ay, bins of angle); does not grow with them."""
 
-    Args:
-        wheelbase: [m].
-        everything: all samples above `SLOWEST`, (bins of ay, bins of angle).
-        steady: those of quasi-steady turns.
-    """
-
-    wheelbase: float
-    everything: Counts = field(default_factory=lambda: np.zeros((len(AY_EDGES) - 1, len(ANGLE_EDGES) - 1), dtype=np.int64))
-    steady: Counts = field(default_factory=lambda: np.zeros((len(AY_EDGES) - 1, len(ANGLE_EDGES) - 1), dtype=np.int64))
+    wheelbase: float  # [m]
+    everything: Counts = field(default_factory=_no_samples)  # all samples above `SLOWEST`
+    steady: Counts = field(default_factory=_no_samples)  # those of quasi-steady turns
 
     def add(self, recording: Recording) -> None:
         """Count a recording in; it is to be about as free of noise as one at 20 Hz."""

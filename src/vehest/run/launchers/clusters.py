@@ -195,7 +195,6 @@ class RayLauncher:
         self._messages.line("note", "cluster", ray.get_runtime_context().gcs_address, machines)
 
     def _print(self, data: Mapping[str, Any], **_: Any) -> None:
-        """Print what Ray says of a lost worker or machine."""
         self._messages.line("again", "ray", str(data["lines"][0]).partition("\n")[0])
 
     def _begin(self, position: int, group: Group) -> Any:

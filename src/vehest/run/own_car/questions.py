@@ -24,23 +24,14 @@ LEAVE_OUT = "-"
 
 @dataclass(frozen=True)
 class Question:
-    """A question about logs or their car.
+    """A question about logs or their car."""
 
-    Args:
-        key: ``left_right``, ``rate``, ``time``, ``radius``, a column's name, or a value of the vehicle.
-        text: for people.
-        proposed: answer that Enter takes; empty where nothing is proposed.
-        candidates: other answers.
-        evidence: for the proposal.
-        hint: form of an answer.
-    """
-
-    key: str
-    text: str
-    proposed: str
-    candidates: tuple[str, ...] = ()
-    evidence: tuple[str, ...] = ()
-    hint: str = "a number"
+    key: str  # ``left_right``, ``rate``, ``time``, ``radius``, a column's name, or a value of the vehicle
+    text: str  # for people
+    proposed: str  # answer that Enter takes; empty where nothing is proposed
+    candidates: tuple[str, ...] = ()  # other answers
+    evidence: tuple[str, ...] = ()  # for the proposal
+    hint: str = "a number"  # form of an answer
 
     def as_plain(self) -> dict[str, Any]:
         """For JSON."""
@@ -123,7 +114,6 @@ def _ask_at_terminal(question: Question, examined: Examined) -> Examined:
 
 
 def _answered(examined: Examined, question: Question, answer: str) -> Examined:
-    """The logs after an answer; an empty one takes the proposal."""
     key, answer, proposals = question.key, answer.strip(), examined.proposals
     if answer in ("", question.proposed):
         return examined

@@ -124,12 +124,10 @@ def write(
 
 
 def _are_short(made: Draft) -> bool:
-    """Whether some recording is too short to be cut into blocks."""
     return 0.2 * min(made.durations) < LEAST_BLOCK
 
 
 def _is_too_short(made: Draft) -> bool:
-    """Whether there is too little to train, stop and test on."""
     return made.seconds < LEAST_SECONDS or (_are_short(made) and len(made.durations) < len(ROLES_OF_THREE))
 
 
@@ -231,7 +229,6 @@ def _plan_of(contents: Sequence[RecordingSummary], vehicle: Mapping[str, float |
 
 
 def _car(vehicle: Mapping[str, float | None]) -> dict[str, str]:
-    """Parameters of the car; with wheelbase and mass the others are assumed."""
     wheelbase, mass = vehicle["wheelbase"] or 0.0, vehicle["mass"] or 0.0
     half, stiffness = 0.5 * wheelbase, 0.5 * STIFFNESS * mass * GRAVITY
     values = {"mass": mass, "yaw_inertia": mass * half * half, "cg_height": HEIGHT * wheelbase}
@@ -241,7 +238,6 @@ def _car(vehicle: Mapping[str, float | None]) -> dict[str, str]:
 
 
 def _lack(name: str, words: Sequence[str], contents: Sequence[RecordingSummary]) -> str:
-    """Channels that an estimator lacks; empty if none."""
     first = [word if "[" in word else word.split(",")[0] for word in words if not word.startswith("seed=")]
     try:
         found = usability(name, compose_config("train", [f"estimator={name}", *first]), contents)
@@ -266,7 +262,6 @@ def _pipeline_of(name: str, plan: Plan, minutes: float) -> dict[str, Any]:
 
 
 def _limits(own: Draft) -> list[str]:
-    """Comparisons that the recordings do not allow."""
     made = {"vy_ref"} if "sideslip_ref" in own.channels else set()  # with vx
     missing = [name for name in SCORED if name not in own.channels | made]
     if not missing and _is_too_short(own):

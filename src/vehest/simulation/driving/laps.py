@@ -245,13 +245,8 @@ class LapDriver(Follower):
         if self._stop is None:
             self._stop = (time, seen.speed)
         begin, speed = self._stop
-        return decision._replace(acceleration=even_stop(time - begin, speed, self._stop_time, seen.speed))
-
-
-def even_stop(since: float, speed_before: float, stop_time: float, speed: float) -> float:
-    """Acceleration [m/s²] of a driver who brakes evenly from a speed to the stand within a time."""
-    rate = speed_before / stop_time
-    return -rate + 3.0 * min(speed_before - rate * since - speed, 0.0)
+        rate = speed / self._stop_time
+        return decision._replace(acceleration=-rate + 3.0 * min(speed - rate * (time - begin) - seen.speed, 0.0))
 
 
 def _course(name: str, flat: bool) -> Course:

@@ -129,7 +129,6 @@ def _tyre_forces(slip, angle, camber, load, tyre):  # type: ignore[no-untyped-de
 
 @_kernel
 def _axles(p):  # type: ignore[no-untyped-def]
-    """Front and rear axle."""
     both = 2.0 * (p.a + p.b)
     return (
         _Axle(

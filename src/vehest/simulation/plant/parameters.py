@@ -59,23 +59,15 @@ POSITIVE = ("m", "m_s", "m_uf", "m_ur", "a", "b", "I_z", "I_Phi_s", "I_y_s", "I_
 class Vehicle:
     """A car that the multi-body plant can drive.
 
-    Args:
-        name: in recordings.
-        parameter_set: number of the published set it starts from.
-        overrides: values that replace the published ones, by the library's names; a mapping inside it replaces
-            values of a group (``tire``, ``tire_rear``, ``steering``, ``longitudinal``).
-        driver: values of this car for its driver (car.py); the plant does not read them.
-        relaxation: way over which a tyre's lateral force follows its slip, front and rear [m]; zero for at once.
-
-    Raises:
-        ConfigurationError: no such set, no such parameter, or a value that is not a finite number.
+    ``overrides`` replace the published values, by the library's names; a mapping inside it replaces values of a group (``tire``,
+    ``tire_rear``, ``steering``, ``longitudinal``). `ConfigurationError` for an unknown set or parameter, or what is no finite number.
     """
 
-    name: str
-    parameter_set: int
+    name: str  # in recordings
+    parameter_set: int  # number of the published set it starts from
     overrides: Mapping[str, Any] = field(default_factory=dict)
-    driver: Mapping[str, float] = field(default_factory=dict)
-    relaxation: tuple[float, float] = (0.0, 0.0)
+    driver: Mapping[str, float] = field(default_factory=dict)  # values of this car for its driver (car.py); the plant does not read them
+    relaxation: tuple[float, float] = (0.0, 0.0)  # way over which tyres' lateral forces follow their slip, front and rear [m]; 0: at once
 
     def __post_init__(self) -> None:
         for name, mapping in (("overrides", self.overrides), ("driver", self.driver)):
@@ -190,7 +182,6 @@ def parameter_vector(parameters: Any) -> FloatArray:
 
 
 def _plain(value: Any) -> Any:
-    """Mappings as dictionaries, all else as it is."""
     return {name: _plain(inner) for name, inner in value.items()} if isinstance(value, Mapping) else value
 
 

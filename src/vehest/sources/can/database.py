@@ -111,7 +111,6 @@ def _identifier(message: Any) -> tuple[int, bool]:
 
 
 def _only_one(known: Mapping[str, Sequence[tuple[Any, str]]], wanted: str, file: Path) -> tuple[Any, str]:
-    """The message and the signal that a name stands for."""
     found = known.get(wanted, ())
     if len(found) > 1:
         names = ", ".join(f"{message.name}.{signal}" for message, signal in found[:8])

@@ -129,7 +129,6 @@ def _part(message: Any, part: str) -> Any:
 
 
 def _getter(types: Any, topic: str, kind: str, path: str) -> Callable[[Any], Any]:
-    """What takes a number out of a message."""
     node, detail, parts = Nodetype.NAME, kind, path.split(".")
     for part in parts:
         inner: dict[str, Any] = {}

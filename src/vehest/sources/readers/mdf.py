@@ -149,7 +149,6 @@ def _refuse_formulas(measurement: Any, file: Path) -> None:
 
 
 def _conversions(conversion: Any) -> Iterator[Any]:
-    """A conversion and those within it."""
     waiting, seen = [conversion], set()
     while waiting:
         found = waiting.pop()
@@ -300,7 +299,6 @@ def _group_name(measurement: Any, group: int) -> str:
 
 
 def _title(measurement: Any, group: int) -> str:
-    """Number and name of a group, for messages."""
     name = _group_name(measurement, group)
     return f"{group} '{_shown(name)}'" if name else str(group)
 

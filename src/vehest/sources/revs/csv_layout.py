@@ -83,7 +83,6 @@ def read_vehicle_parameters(file: Path) -> dict[str, dict[str, Any]]:
 
 
 def _value(cells: list[str], where: str) -> Any:
-    """A column's value, or its values."""
     while cells and not cells[-1]:
         cells.pop()
     if len(cells) == 1:
@@ -96,7 +95,6 @@ def _value(cells: list[str], where: str) -> Any:
 
 
 def _decoded(content: bytes) -> str:
-    """Text in UTF-8 or else Latin-1."""
     try:
         return content.decode("utf-8-sig")
     except UnicodeDecodeError:
@@ -104,7 +102,6 @@ def _decoded(content: bytes) -> str:
 
 
 def _number(text: str) -> float | None:
-    """A finite number; None of other text."""
     try:
         value = float(text)
     except ValueError:

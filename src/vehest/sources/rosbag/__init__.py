@@ -139,7 +139,6 @@ class RosbagSource(FileSource):
         return Series(topic, times - topic.delay, rate_hz, values, about)
 
     def _reference(self, pose: Pose, series: Series, grid: FloatArray, path: Path) -> dict[str, FloatArray]:
-        """Reference channels from the poses."""
         where = f"'{path}': topic '{series.topic.topic}'"
         values = np.stack([series.fields[f"{pose.field}.{part}"] for part in POSE_FIELDS], axis=1)
         plane, yaw = ground_plane(values[:, :3], values[:, 3:], pose.up, where)

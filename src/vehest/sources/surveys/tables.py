@@ -190,7 +190,6 @@ def _is_unit(text: str) -> bool:
 
 
 def _decoded(head: bytes, file: Path) -> tuple[str, str]:
-    """Encoding and text."""
     if head.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
         return "utf-16", head.decode("utf-16", errors="replace")
     if b"\0" in head or len(CONTROLS.findall(head)) > MOST_CONTROLS * len(head):
