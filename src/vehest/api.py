@@ -42,8 +42,7 @@ __all__ = [
 ]
 
 
-_TRUST: WeakKeyDictionary[Estimator, Trust] = WeakKeyDictionary()
-"""What was learnt with the estimators that were trained or loaded here."""
+_TRUST: WeakKeyDictionary[Estimator, Trust] = WeakKeyDictionary()  # what was learnt with the estimators that were trained or loaded here
 
 
 def load_model(model: str | Path = PRETRAINED, output: str | Path | None = None) -> Estimator:

@@ -691,7 +691,7 @@ def doctor(as_json: AsJson = False) -> None:
     """Check the environment: working and missing parts on this machine."""
     from vehest.run.doctor import examine
 
-    items = examine()
+    items = list(examine())
     emit(as_json, [asdict(item) for item in items], [f"{item.level:<7} {item.name}: {item.message}" for item in items])
     if any(item.level == "error" for item in items):
         raise typer.Exit(4)

@@ -28,25 +28,19 @@ from vehest_papers.kit.methods import bullets, scoring
 from vehest_papers.kit.reading import metric_values
 
 TAKES = "parts"
-RACE_CARS = "race_cars"
-"""Test set of simulated race cars, which make the second choice."""
+RACE_CARS = "race_cars"  # test set of simulated race cars, which make the second choice
 
 OTHER_SIMULATOR = "other_simulator"
 """Test set of a car of another simulation, which makes the third choice; parts that learn on that car have none."""
 
-ADDED = ("level",)
-"""Parts that were added after the real recording had been looked at; the first choice leaves them out."""
+ADDED = ("level",)  # parts that were added after the real recording had been looked at; the first choice leaves them out
 
-SHIPPED = "third"
-"""The choice whose model comes with vehest."""
+SHIPPED = "third"  # the choice whose model comes with vehest
 
 WANTED_FVU = 0.10
 GOAL_FVU = 0.06
 
-PUBLISHED = (
-    ("KS-NN that learnt on another real car", 0.145),
-    ("KS-NN that learnt on the same real car", 0.06),
-)
+PUBLISHED = (("KS-NN that learnt on another real car", 0.145), ("KS-NN that learnt on the same real car", 0.06))
 """FVU on a real Ferrari 250 LM in Da Lio et al. 2023, on two recordings of it, one of which is ours."""
 
 REASONS = {
@@ -149,11 +143,7 @@ def documents(artefacts: StudyArtefacts) -> dict[str, Document]:
 
 
 def steps_of(artefacts: StudyArtefacts) -> list[Step]:
-    """All steps in the order of the pipeline.
-
-    Raises:
-        DataError: the steps were not validated on the same ranges, or learnt or were validated on anything real.
-    """
+    """All steps in the order of the pipeline."""
     parts = artefacts.parts
     if len({(part.split.validation, part.split.tests[RACE_CARS]) for part in parts.values()}) > 1:
         raise DataError(f"study '{artefacts.study}': its parts stop or choose on different ranges, nothing can be chosen among them")
@@ -172,7 +162,6 @@ def steps_of(artefacts: StudyArtefacts) -> list[Step]:
 
 
 def _real(part: PartArtefacts) -> str:
-    """The test set of the real car."""
     (name,) = (name for name in part.split.tests if name not in (RACE_CARS, OTHER_SIMULATOR))
     return name
 

@@ -247,9 +247,6 @@ def _align_steering(recording: Recording, settings: AlignmentSettings) -> tuple[
     """Least squares of channel = ratio·(atan(wheelbase·r/vx) + K·ay) + offset where the car drives calmly.
 
     A term in the derivative of the angle is fitted beside it: in transients the steering leads.
-
-    Raises:
-        DataError: a channel is missing or has gaps, there is too little calm driving, or it cannot tell the parameters apart.
     """
     assert settings.wheelbase is not None
     source = settings.steering_channel or ("handwheel" if "handwheel" in recording else "steer")

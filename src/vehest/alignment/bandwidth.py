@@ -101,10 +101,6 @@ def held_rate(samples: FloatArray, rate_hz: float) -> float | None:
 
     A held channel hardly ever changes twice in a row, and then by any amount. A quantised one does so too while it moves slowly, but
     by one quantum at a time.
-
-    Args:
-        samples: of one channel, (T,); a gap ends a hold.
-        rate_hz: sampling rate.
     """
     steps = np.diff(samples[np.isfinite(samples)])
     changes = np.flatnonzero(steps)

@@ -38,16 +38,6 @@ class Delay:
     delay: Measured  # lateness of the channel, negative if the other is the late one [s]
 
     @property
-    def established(self) -> bool:
-        """Whether the whole interval lies beyond `LONGEST_UNREPORTED`."""
-        return abs(self.delay.value) - self.delay.half_width > LONGEST_UNREPORTED
-
-    @property
-    def on_time(self) -> bool:
-        """Whether the whole interval lies within it."""
-        return abs(self.delay.value) + self.delay.half_width < LONGEST_UNREPORTED
-
-    @property
     def turned(self) -> Delay:
         """The same seen from the other channel."""
         return Delay(self.against, self.channel, self.signals, Measured(-self.delay.value, self.delay.half_width))
@@ -111,7 +101,6 @@ def delays_of(motion: Motion, spectra: CrossSpectra, slow: frozenset[str] = froz
 
 
 def _lateral(motion: Motion) -> list[Delay]:
-    """Between ay, yaw rate and lateral velocity."""
     lateness = lateral_lateness(motion)
     if lateness is None or not all(_sound(measured) for measured in lateness):
         return []
@@ -164,21 +153,20 @@ def _late(delays: Sequence[Delay]) -> list[Late]:
 
     The reference's channels have one clock: a yaw rate that is surely on time beside yaw_rate_ref is not late behind vy_ref.
     """
-    late = [delay if delay.delay.value > 0.0 else delay.turned for delay in delays if delay.established]
+    beyond = [own for own in delays if abs(own.delay.value) - own.delay.half_width > LONGEST_UNREPORTED]  # with its whole interval
+    late = [delay if delay.delay.value > 0.0 else delay.turned for delay in beyond]
     late = [delay for delay in late if delay.against not in SLIPPING or (delay.channel, delay.against) == ("ax", "vx")]
-    punctual = {delay.channel for delay in delays if delay.on_time and delay.against.endswith(REFERENCE_SUFFIX)}
+    within = [own for own in delays if abs(own.delay.value) + own.delay.half_width < LONGEST_UNREPORTED]
+    punctual = {delay.channel for delay in within if delay.against.endswith(REFERENCE_SUFFIX)}
     late = [delay for delay in late if not (delay.channel in punctual and delay.against.endswith(REFERENCE_SUFFIX))]
     found = []
     for channel in dict.fromkeys(delay.channel for delay in late):
         own = [delay for delay in late if delay.channel == channel]
         signals = "; ".join(dict.fromkeys(delay.signals for delay in own if delay.signals != "both"))
-        figures = " and ".join(f"{_milliseconds(delay.delay)} behind {delay.against}" for delay in own)
+        intervals = [(delay.against, *(1e3 * ms for ms in (delay.delay.value, delay.delay.low, delay.delay.high))) for delay in own]
+        figures = " and ".join(f"{ms:.0f} ms (95 %: {low:.0f} to {high:.0f}) behind {name}" for name, ms, low, high in intervals)
         text = f"is late{' with the other wheels' if channel in DELAYED else ''}, {figures}" + (f", from {signals}" if signals else "")
         if [delay.against for delay in own] == ["vx"]:
             text += "; or vx comes from wheels, whose slip makes it lead"
         found.append(Late(DELAYED.get(channel, (channel,)), round(max(delay.delay.value for delay in own), 3), text))
     return found
-
-
-def _milliseconds(measured: Measured) -> str:
-    return f"{1e3 * measured.value:.0f} ms (95 %: {1e3 * measured.low:.0f} to {1e3 * measured.high:.0f})"

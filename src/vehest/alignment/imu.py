@@ -150,12 +150,7 @@ class Signals:
 
 
 def signals_of(recording: Recording, settings: AlignmentSettings) -> Signals:
-    """Signals of a recording.
-
-    Raises:
-        DataError: a channel is missing or has gaps, or the recording is too short.
-        ConfigurationError: the cut-off is too high for the recording's rate, or it or the largest delay asks for more than the limits.
-    """
+    """Signals of a recording."""
     asked = ", ".join(settings.kinematic)
     if "vy_ref" not in recording:
         raise DataError(f"recording '{recording.id}' has no reference channel 'vy_ref', which {asked} are estimated against")
@@ -237,7 +232,6 @@ class ImuModel:
 
 
 def _axiswise(factors: complex, plane: ComplexArray) -> ComplexArray:
-    """Each axis times a factor of its own."""
     return factors.real * plane.real + 1j * factors.imag * plane.imag
 
 
@@ -382,7 +376,7 @@ def _noise_of_columns(signals: Signals) -> dict[str, tuple[float, float, float]]
     """
     speed_noise, side_noise = _noise(signals.velocity.real), _noise(signals.velocity.imag)
     rate_noise = _noise(signals.gyro if signals.reference_rate is None else signals.reference_rate)
-    level, slope, bend = (signals.smoothing.noise_gain(order) for order in range(3))
+    level, slope, bend = (float(np.linalg.norm(signals.smoothing.kernel(order))) for order in range(3))
     speed, turning = rms(np.abs(signals.velocity)), rms(signals.gyro)
     ahead, aside = slope * speed_noise, math.hypot(slope * side_noise, level * speed * rate_noise)
     arm = math.hypot(2.0 * turning * level * rate_noise, slope * rate_noise) / math.sqrt(2.0)
@@ -527,15 +521,12 @@ class Smoothing:
         step = step or self.step
         inside = samples[margin - self.reach : len(samples) - margin + self.reach]
         padding = -2 * self.reach % step  # the first sample whose kernel is whole is to be the first of a step
-        smooth = signal.upfirdn(self._kernel(order), np.concatenate([np.zeros(padding), inside]), down=step)
+        smooth = signal.upfirdn(self.kernel(order), np.concatenate([np.zeros(padding), inside]), down=step)
         first, count = (padding + 2 * self.reach) // step, -(-(len(samples) - 2 * margin) // step)
         return smooth[first : first + count]
 
-    def noise_gain(self, order: int) -> float:
-        """Standard deviation of the derivative of low-passed white noise of standard deviation 1."""
-        return float(np.linalg.norm(self._kernel(order)))
-
-    def _kernel(self, order: int) -> FloatArray:
+    def kernel(self, order: int) -> FloatArray:
+        """Impulse response of a derivative of the low-pass; its norm is the deviation that white noise of deviation 1 has after it."""
         impulse = np.zeros(2 * self.reach + 1)
         impulse[self.reach] = 1.0
         kernel = gaussian_filter1d(impulse, self.deviation, order=order, mode="constant", truncate=KERNEL_REACH)

@@ -62,16 +62,7 @@ class CrossSpectra:
 
 
 def cross_spectra(signals: Mapping[str, FloatArray], rate_hz: float, used: BoolArray | None = None) -> CrossSpectra | None:
-    """Welch's cross-spectra in the band, from segments under a Hann window that overlap by half.
-
-    Args:
-        signals: name -> samples without gaps, (T,) each.
-        rate_hz: sampling rate.
-        used: samples that a segment may hold, (T,); all if not given.
-
-    Returns:
-        None where the recording is too short or sampled too slowly to say anything.
-    """
+    """Welch's cross-spectra in the band, from segments of ``used`` samples under a Hann window; None where the recording is too short."""
     duration = len(next(iter(signals.values()), ())) / rate_hz
     if duration < SHORTEST_DRIVE or rate_hz < LOWEST_RATE:
         return None
@@ -199,7 +190,6 @@ def smoothed(values: FloatArray) -> FloatArray:
 
 
 def _coarse(cross: ComplexArray, omega: FloatArray, *, low_pass: bool) -> tuple[float, float]:
-    """The best point of a grid."""
     delays = np.linspace(-LARGEST_LAG, LARGEST_LAG, 41)
     constants = np.concatenate([[0.0], np.geomspace(0.05, LONGEST_TIME_CONSTANT, 15)]) if low_pass else np.zeros(1)
     advance = np.exp(1j * np.multiply.outer(delays, omega)) * cross

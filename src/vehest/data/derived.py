@@ -93,11 +93,7 @@ class SpeedFromWheels:
     relative_tolerance: ClassVar[float] = 0.05
 
     def corrected(self, recording: Recording) -> FloatArray:
-        """Speeds of the centre of gravity by each wheel, (4, T) [m/s]: front left, front right, rear left, rear right; NaN without it.
-
-        Raises:
-            DataError: there is no wheel speed at all, or tracks are given and ``yaw_rate`` is missing.
-        """
+        """Speeds of the centre of gravity by each wheel, (4, T) [m/s]: front left, front right, rear left, rear right; NaN without it."""
         names = [f"wheel_speed_{wheel}" for wheel in WHEELS]
         if not set(names) & set(recording.channels):
             raise DataError(f"recording '{recording.id}' has no wheel speed to make vx of; declare one of {', '.join(names)}")
@@ -111,11 +107,7 @@ class SpeedFromWheels:
         return wheels + sides[:, None] * recording["yaw_rate"]
 
     def __call__(self, recording: Recording) -> Recording:
-        """Set ``vx``; it has no gaps, since wheels that were not measured do not count.
-
-        Raises:
-            DataError: a channel is missing, or no wheel was ever measured.
-        """
+        """Set ``vx``, without gaps, since wheels that were not measured do not count; `DataError` if none ever was."""
         speeds = self.corrected(recording)
         with warnings.catch_warnings(action="ignore", category=RuntimeWarning):  # where no wheel was measured the median is NaN
             medians = np.nanmedian(speeds, axis=0)
@@ -184,11 +176,7 @@ class VelocityFromSideslip:
     """
 
     def __call__(self, recording: Recording) -> Recording:
-        """Set ``vy_ref``, by ``vx_ref`` or, without one, ``vx``; it has gaps where the angle or the speed has them.
-
-        Raises:
-            DataError: the angle or the speed is missing, or the angle reaches 90 degrees, where it says nothing.
-        """
+        """Set ``vy_ref``, by ``vx_ref`` or, without one, ``vx``; it has gaps where the angle or the speed has them."""
         angle, speed = recording["sideslip_ref"], speed_of_reference(recording)
         if np.nanmax(np.abs(angle), initial=0.0) >= 0.5 * np.pi:
             worst = int(np.nanargmax(np.abs(angle)))
@@ -202,11 +190,7 @@ class SideslipFromVelocity:
     """Make the reference ``sideslip_ref`` from ``vy_ref``: β = atan2(v, u)."""
 
     def __call__(self, recording: Recording) -> Recording:
-        """Set ``sideslip_ref``, by ``vx_ref`` or, without one, ``vx``; it has gaps where they have them.
-
-        Raises:
-            DataError: the velocity or the speed is missing.
-        """
+        """Set ``sideslip_ref``, by ``vx_ref`` or else ``vx``; gaps where they have them; `DataError` where one is missing."""
         speed = speed_of_reference(recording)
         return recording.with_channels({"sideslip_ref": np.arctan2(recording["vy_ref"], recording[speed])}, made_of=("vy_ref", speed))
 

@@ -1,4 +1,8 @@
-"""Errors that a user can act on; each message is one line that names the cause and the remedy."""
+"""Errors that a user can act on; each message is one line that names the cause and the remedy.
+
+Functions that read a file raise `MissingError` where it is not there, and `DataError` where it is damaged, more than the limits or lacks
+something. Functions that take plain values of a configuration (``…_from_config``, settings) raise `ConfigurationError`.
+"""
 
 from __future__ import annotations
 

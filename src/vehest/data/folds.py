@@ -31,11 +31,7 @@ class FoldsFile:
 
 
 def blocks_of(folds: FoldsFile, recordings: Iterable[tuple[Span, Recording]]) -> list[Span]:
-    """The blocks of recordings, each with the span that names it, in order, with start and stop.
-
-    Raises:
-        DataError: laps are asked for and a recording lacks speed or yaw rate.
-    """
+    """The blocks of recordings, each with the span that names it, in order; `DataError` where laps need a missing speed or yaw rate."""
     blocks = []
     for whole, recording in recordings:
         bounds = [recording.start_time, recording.end_time]
@@ -53,9 +49,6 @@ def fold_of(blocks: Sequence[Span], folds: FoldsFile, fold: int, where: str) -> 
     """Training, validation and test of the fold, from 0, that is tested: blocks stay in order and folds last about equally long.
 
     The fold after the tested one (the first after the last) is the one to stop on.
-
-    Raises:
-        ConfigurationError: there is no such fold, or too few blocks to fill them.
     """
     if not 0 <= fold < folds.number:
         raise ConfigurationError(f"{where}: fold {fold} is not one of 0 to {folds.number - 1}")

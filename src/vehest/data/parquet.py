@@ -25,12 +25,7 @@ ROWS_AT_A_TIME = 1 << 17
 
 @contextmanager
 def parquet_file(path: Path) -> Iterator[pq.ParquetFile]:
-    """Open a Parquet file for reading; what it raises while it is read is one line, too.
-
-    Raises:
-        MissingError: there is no such file.
-        DataError: it is not a regular file, empty, damaged, encrypted, or its description is longer than the limit.
-    """
+    """Open a Parquet file for reading; what it raises while it is read is a `MissingError` or a `DataError` of one line, too."""
     size = regular_file(path).stat().st_size
     try:
         with open(path, "rb") as stream:
@@ -47,11 +42,7 @@ def parquet_file(path: Path) -> Iterator[pq.ParquetFile]:
 
 
 def read_numbers(path: Path, file: pq.ParquetFile, names: Sequence[str]) -> dict[str, NDArray[np.float64]]:
-    """Columns of numbers that are there once each, inside the block of `parquet_file`: float64 of shape (T,); what is missing is NaN.
-
-    Raises:
-        DataError: a column holds something else than numbers, the file is more than the limits, or holds other rows than it says.
-    """
+    """Columns of numbers that are there once each, float64 of shape (T,), missing values NaN; `DataError` for anything else."""
     for name in names:
         kind = file.schema_arrow.field(name).type
         if not (pa.types.is_floating(kind) or pa.types.is_integer(kind)):

@@ -30,12 +30,7 @@ def summary_of(recording: Recording) -> RecordingSummary:
 
 
 def stored_summary(path: Path) -> RecordingSummary:
-    """Summary of a recording in the store, from the description in its file; ``gappy`` are those channels that may have gaps.
-
-    Raises:
-        MissingError: there is no such file.
-        DataError: the file is damaged, or not a recording.
-    """
+    """Summary of a recording in the store, from the description in its file; ``gappy`` are those channels that may have gaps."""
     with parquet_file(path) as file:
         schema = file.schema_arrow
     described = description_of(schema, path, RecordingDescription)

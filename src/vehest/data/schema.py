@@ -51,11 +51,7 @@ def validated(kind: type[Schema], content: Any, where: str, *, error: type[Vehes
 
 
 def settings_from_config(kind: type[Schema], config: Any, group: str) -> Schema:
-    """Settings of an estimator or a training from plain values, without the ``name`` that a choice of conf/ has, also in groups in them.
-
-    Raises:
-        ConfigurationError: an unknown key, a value of the wrong type, or one that makes no sense.
-    """
+    """Settings from plain values, without the ``name`` that a choice of conf/ has, also in groups in them; `ConfigurationError`."""
     return validated(kind, _without_names(config, kind), "", error=ConfigurationError, group=group)
 
 
@@ -68,11 +64,7 @@ def _without_names(content: Any, kind: Any) -> Any:
 
 
 def check_format(found: Any, newest: int, where: str, *, oldest: int = 1) -> int:
-    """The version of a file's layout, as the file states it.
-
-    Raises:
-        DataError: it is no version, a newer one than is written now, or one that is no longer read.
-    """
+    """The version of a file's layout, as the file states it; `DataError` unless it is between ``oldest`` and ``newest``."""
     if isinstance(found, bool) or not isinstance(found, int) or found < 0:
         raise DataError(f"{where}: format must be a whole number, not {str(found)[:40]!r}")
     if found > newest:

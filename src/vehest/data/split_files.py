@@ -30,11 +30,7 @@ LEAST_SECONDS = 3.0  # of a piece of limited minutes; shorter ones hold no windo
 
 @dataclass(frozen=True)
 class RangeFile:
-    """One range of conf/split/*.yaml: a recording, or a pattern of several; from start to stop [s or %], or some of its laps.
-
-    Raises:
-        ValueError: it names no recording, or one and a pattern; or it has laps and times.
-    """
+    """One range of conf/split/*.yaml: a recording, or a pattern of several; from start to stop [s or %], or some of its laps."""
 
     dataset: str | None = None
     recording: str | None = None
@@ -124,24 +120,14 @@ def split_from_config(config: Mapping[str, Any], catalogue: Catalogue | None = N
 
 
 def dataset_names(config: Mapping[str, Any]) -> list[str]:
-    """Names of the data sets that a split's plain values draw on, sorted.
-
-    Raises:
-        ConfigurationError: as `split_from_config`, where a range names none.
-    """
+    """Names of the data sets that a split's plain values draw on, sorted."""
     file = _read(config)
     entries = [entry for entries in (file.train, file.validation, *file.tests.values()) for entry in entries]
     return [file.dataset_of()] if file.folds else sorted({file.dataset_of(entry) for entry in entries})
 
 
 def limit_minutes(spans: Sequence[Span], seconds: float, at: float) -> tuple[Span, ...]:
-    """A stretch of ranges laid end to end; it goes on at their start where it reaches their end. Ends of a few seconds are left out.
-
-    Args:
-        spans: ranges with ends.
-        seconds: time to keep [s], less than there is.
-        at: share of the ranges after which to begin, 0 to 1.
-    """
+    """A stretch of ranges laid end to end, ``seconds`` long from the share ``at`` on; it wraps around, and ends of seconds are left out."""
     total = _seconds_of(spans)
     begin = at * total
     kept = _between(spans, begin, min(begin + seconds, total))
@@ -166,8 +152,6 @@ def _between(spans: Sequence[Span], begin: float, end: float) -> list[Span]:
 
 
 class _Ranges:
-    """Makes spans of the ranges of a configuration."""
-
     def __init__(self, file: SplitFile, catalogue: Catalogue | None) -> None:
         self._file, self._catalogue, self._where = file, catalogue, f"split '{file.name}'"
         self._known: dict[str, Mapping[str, Reader]] = {}
@@ -205,7 +189,6 @@ class _Ranges:
         return replace(span, start=max(span.start, recording.start_time), stop=min(span.stop, recording.end_time))
 
     def _spans(self, role: str, entries: Sequence[RangeFile]) -> tuple[Span, ...]:
-        """The spans of one role."""
         spans: list[Span] = []
         for entry in entries:
             dataset = self._file.dataset_of(entry)
@@ -215,7 +198,6 @@ class _Ranges:
         return tuple(spans)
 
     def _bounds(self, dataset: str, name: str, entry: RangeFile) -> tuple[float, float]:
-        """Start and stop of an entry in one recording [s]."""
         if entry.laps is not None:
             return self._laps(dataset, name, entry.laps)
         return self._time(dataset, name, entry.start), self._time(dataset, name, entry.stop)

@@ -137,11 +137,7 @@ def read_estimate(path: Path) -> Estimate:
 
 
 def description_of(schema: pa.Schema, path: Path, kind: type[_Description]) -> _Description:
-    """The description of a recording or an estimate beside its table.
-
-    Raises:
-        DataError: it is not of this kind, or of another format, or the description is damaged.
-    """
+    """The description of a recording or an estimate beside its table; `DataError` if it is damaged or of another kind or format."""
     content = "recording" if kind is RecordingDescription else "estimate"
     found = _metadata(schema, path)
     if found.get("content") != content:

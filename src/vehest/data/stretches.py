@@ -45,11 +45,7 @@ class Condition:
 
 
 def stretches_where(recording: Recording, condition: Condition, first: int, end: int) -> list[tuple[int, int]]:
-    """Longest runs [first, end) of samples, as indices, that all meet a condition; samples that were not measured do not.
-
-    Raises:
-        DataError: the recording lacks a channel of the condition.
-    """
+    """Longest runs [first, end) of samples, as indices, that all meet a condition; samples that were not measured do not."""
     holds = np.ones(max(end - first, 0), dtype=bool)
     for channel, bounds in condition.magnitude.items():
         size = np.abs(recording[channel][first:end])

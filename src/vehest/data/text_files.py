@@ -21,12 +21,7 @@ _Loader: Any = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
 
 
 def read_text(path: Path) -> str:
-    """A text file, as UTF-8.
-
-    Raises:
-        MissingError: there is no such file.
-        DataError: it is not a regular file, too long or not UTF-8.
-    """
+    """A regular text file within the limits, as UTF-8; else `MissingError` or `DataError`."""
     size = regular_file(path).stat().st_size
     check_limit("text_bytes", size, f"'{path}' is {size} bytes long")
     try:
@@ -86,11 +81,7 @@ def parse_json(text: str | bytes, where: str) -> Any:
 
 
 def read_rows(path: Path, columns: Sequence[str] = ()) -> list[dict[str, str]]:
-    """Rows of a CSV file whose first line names its columns, such as vehest writes them.
-
-    Raises:
-        DataError: it is not CSV, lacks a column, or a row is of another length; and what `read_text` raises.
-    """
+    """Rows of a CSV file whose first line names its columns, such as vehest writes them; `DataError` if one is missing or short."""
     try:
         reader = csv.DictReader(io.StringIO(read_text(path), newline=""), strict=True)
         rows, header = list(reader), list(reader.fieldnames or [])

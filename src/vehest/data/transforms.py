@@ -62,13 +62,7 @@ class Resample:
             raise ConfigurationError(f"resampling: rate_hz must be a positive number, not {self.rate_hz:g}")
 
     def __call__(self, recording: Recording) -> Recording:
-        """Resample every channel.
-
-        Raises:
-            DataError: the ratio is not one of small whole numbers, a gappy channel would need filtering, or the outcome or the filter
-                would be longer than the limits.
-            ConfigurationError: decimation by a ratio that is not whole.
-        """
+        """Resample every channel; errors where the outcome or the filter is more than the limits, or a gappy channel needs filtering."""
         expected = len(recording) * (self.rate_hz / recording.rate_hz)
         what = f"recording '{recording.id}' would hold {expected:.6g} samples at {self.rate_hz:g} Hz"
         check_limit("samples", expected, what)
@@ -132,13 +126,7 @@ class LowPass:
             raise ConfigurationError("a low-pass of design fir sees as far ahead as back; use design=butterworth for a causal one")
 
     def __call__(self, recording: Recording) -> Recording:
-        """Filter the channels.
-
-        Raises:
-            ConfigurationError: the cut-off is not below the Nyquist frequency, or so low, or the reach so long, that the filter is longer
-                than the limit.
-            DataError: a channel is missing or has gaps.
-        """
+        """Filter the channels; errors where one is missing or has gaps, or the cut-off does not suit the rate or the limits."""
         where, rate_hz = f"recording '{recording.id}'", recording.rate_hz
         if not 0 < self.cutoff_hz < rate_hz / 2:
             raise ConfigurationError(f"{where}: low-pass at {self.cutoff_hz:g} Hz must lie between 0 and {rate_hz / 2:g} Hz")
@@ -177,12 +165,7 @@ class RemoveOutliers:
     channels: tuple[str, ...] = ()  # which channels; all measured ones if empty, never references
 
     def __call__(self, recording: Recording) -> Recording:
-        """Clean the channels.
-
-        Raises:
-            ConfigurationError: the windows hold more samples than the limits allow.
-            DataError: a channel is missing or has gaps.
-        """
+        """Clean the channels; errors where one is missing or has gaps, or the windows are more than the limits."""
         width = 2 * self.half_window + 1
         what = f"recording '{recording.id}': outlier removal over windows of {width} samples"
         check_limit("filter_samples", width, what, ConfigurationError)
@@ -243,11 +226,7 @@ class ReferenceLever:
     lever_y: float = 0.0  # leftward offset [m]
 
     def __call__(self, recording: Recording) -> Recording:
-        """Correct vy_ref, and vx_ref and sideslip_ref where they are there, by yaw_rate_ref or, without one, yaw_rate.
-
-        Raises:
-            DataError: vy_ref or the yaw rate is missing.
-        """
+        """Correct vy_ref, and vx_ref and sideslip_ref where they are there, by yaw_rate_ref or, without one, yaw_rate."""
         turning = "yaw_rate_ref" if "yaw_rate_ref" in recording else "yaw_rate"
         moved = {"vx_ref": recording["vx_ref"] + recording[turning] * self.lever_y} if "vx_ref" in recording else {}
         moved["vy_ref"] = recording["vy_ref"] - recording[turning] * self.lever_x
@@ -277,11 +256,7 @@ class DelayCorrection:
     kaiser_beta: ClassVar[float] = 7.0
 
     def __call__(self, recording: Recording) -> Recording:
-        """Shift the channels, and cut the recording to the samples that then exist.
-
-        Raises:
-            DataError: a channel is missing or has gaps, or the recording is too short.
-        """
+        """Shift the channels, and cut the recording to the samples that then exist."""
         length, position = len(recording), self.delay * recording.rate_hz
         whole = round(min(max(position, -length), length))
         fraction = position - whole

@@ -31,12 +31,7 @@ class WindowSet:
 
 
 def windows_of(recordings: Sequence[Recording], channels: Sequence[str], target: str, n_window: int) -> WindowSet:
-    """Cut recordings into windows r[k-N+1 … k] with target[k+1] (Da Lio et al. 2023, Fig. 1).
-
-    Raises:
-        DataError: no recording is long enough, a window is longer than the limit, or a gappy channel has gaps: a network cannot read
-            "not measured".
-    """
+    """Cut recordings into windows r[k-N+1 … k] with target[k+1] (Da Lio et al. 2023, Fig. 1)."""
     check_limit("filter_samples", n_window, f"a window of {n_window} samples is asked for")
     series, targets, starts, offset = [], [], [], 0
     for recording in recordings:

@@ -21,8 +21,7 @@ from vehest.trust.bands import block_labels as manoeuvre_labels
 
 CONFIDENCE = 0.95
 IN_REGIMES = ("coverage_90", "width_90", "interval_score")
-SUFFIXES = {"sideslip": "", "vy": "_vy"}
-"""Quantity -> what its figures' names end in."""
+SUFFIXES = {"sideslip": "", "vy": "_vy"}  # quantity -> what its figures' names end in
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,12 +44,7 @@ class Banded:
 
 
 def banded(parts: Sequence[Scored], bands: Bands) -> dict[str, Banded]:
-    """Errors and bands of ``vy`` [m/s] and ``sideslip`` [deg].
-
-    Args:
-        parts: estimate and reference of each range or sequence, with 90 % bands.
-        bands: that they are of; all levels are in proportion.
-    """
+    """Errors and 90 % bands of ``vy`` [m/s] and ``sideslip`` [deg]; all levels are in proportion."""
     turned = [np.remainder(part.sideslip - part.sideslip_ref + np.pi, 2.0 * np.pi) - np.pi for part in parts]
     errors = {"vy": [part.vy - part.vy_ref for part in parts], "sideslip": [np.degrees(own) for own in turned]}
     unit = {"vy": 1.0, "sideslip": np.degrees(1.0)}
@@ -66,12 +60,6 @@ def band_figures(
     ``coverage_…`` fraction of errors inside; ``width_90`` mean full width; ``interval_score`` and ``crps`` as below; ``coverage_90_p10``
     and ``…_p90`` 10 and 90 % quantiles of the coverage of manoeuvres, which are the blocks that bands are calibrated by; ``error_icc``
     intraclass correlation of squared normalised errors between them; ``band_blocks`` how many equal manoeuvres these are spread over.
-
-    Args:
-        own: of `banded`.
-        parts: the same ranges or sequences.
-        turns: yaw rate of each [rad/s], None where it was not measured.
-        rate_hz: of the samples [Hz].
     """
     labels = np.concatenate(manoeuvre_labels(turns, [len(part.time) for part in parts], rate_hz)[0])
     figures: dict[str, float] = {}
@@ -98,7 +86,7 @@ def band_figures(
 def coverage_intervals(own: Mapping[str, Banded], parts: Sequence[Scored], rate_hz: float) -> dict[str, tuple[float, float]]:
     """95 % intervals of coverages over blocks of the drive, the blocks of `evaluation.blocks`; nothing where there are too few."""
     segments, found = segments_of(parts, rate_hz), {}
-    starts = _segment_starts(segments.samples)
+    starts = np.concatenate([[0], np.cumsum(segments.samples)[:-1]]).astype(np.int64)
     for name, suffix in SUFFIXES.items():
         errors, half = own[name].together
         for k, level in enumerate(LEVELS):
@@ -131,8 +119,6 @@ def interval_score(errors: FloatArray, half: FloatArray, level: float) -> FloatA
     """Width of each interval, and 2/α times by how far it missed; the lowest on average is the true central interval's.
 
     Args:
-        errors: (N,), in the unit of the score.
-        half: half widths, (N,).
         level: 1 - α.
 
     Source: Gneiting & Raftery, Strictly proper scoring rules, prediction, and estimation, JASA 102 (477), 2007, Eq. 43.
@@ -191,7 +177,3 @@ def proportion_interval(sums: FloatArray, sizes: FloatArray) -> tuple[float, flo
 
 def _sums(values: FloatArray, labels: NDArray[np.int64]) -> FloatArray:
     return np.asarray(np.bincount(labels, weights=values), dtype=np.float64)
-
-
-def _segment_starts(samples: FloatArray) -> NDArray[np.int64]:
-    return np.concatenate([[0], np.cumsum(samples)[:-1]]).astype(np.int64)

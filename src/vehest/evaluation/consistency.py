@@ -6,8 +6,7 @@ import numpy as np
 
 from vehest.constants import FloatArray
 
-COVERAGE = {1: 0.6827, 2: 0.9545}
-"""Number of standard deviations -> fraction of Gaussian errors within them."""
+COVERAGE = {1: 0.6827, 2: 0.9545}  # number of standard deviations -> fraction of Gaussian errors within them
 
 
 def normalised_error_squared(errors: FloatArray, covariance: FloatArray) -> FloatArray:
@@ -52,11 +51,5 @@ def normalised_innovation_squared(nis: FloatArray, dof: FloatArray) -> float:
 
 
 def coverage(errors: FloatArray, variance: FloatArray, n_sigma: float) -> float:
-    """Fraction of errors within ``n_sigma`` standard deviations; `COVERAGE` says what is expected of Gaussian ones.
-
-    Args:
-        errors: shape (K,).
-        variance: what the filter gives each, shape (K,).
-        n_sigma: half width of the band in standard deviations.
-    """
+    """Fraction of errors within ``n_sigma`` standard deviations; `COVERAGE` says what is expected of Gaussian ones."""
     return float(np.mean(np.square(errors) <= n_sigma**2 * variance))

@@ -47,8 +47,7 @@ from vehest.filters.gaussian import Gaussian
 from vehest.filters.kalman import LinearModel
 from vehest.filters.kalman_scan import kalman_scan
 
-INPUTS = ("vx", "yaw_rate", "ay", "ax", "steer")
-"""Channels that a bound knows what to make of; the first two are needed."""
+INPUTS = ("vx", "yaw_rate", "ay", "ax", "steer")  # channels that a bound knows what to make of; the first two are needed
 SETS = (
     ("vx", "yaw_rate"),
     ("vx", "yaw_rate", "ay"),
@@ -103,11 +102,7 @@ class Drive:
 
 
 def drives_of(spans: Sequence[Span], recording_of: Callable[[Span], Recording], protocol: Protocol) -> list[Drive]:
-    """The ranges or sequences of a test set, as `score_all` counts them.
-
-    Args:
-        recording_of: of a range: its recording at ``protocol.rate_hz``, references included.
-    """
+    """The ranges or sequences of a test set, as `score_all` counts them."""
     return [drive_of(reference, piece, protocol) for reference, piece in pieces_of(spans, recording_of, protocol)]
 
 
@@ -332,12 +327,7 @@ def _levels(drives: Sequence[Drive], inputs: set[str], car: bool) -> _Levels:
 
 
 def _unexplained(series: Sequence[tuple[FloatArray, FloatArray, FloatArray]], rate_hz: float) -> list[FloatArray]:
-    """What a rate leaves of the change of a velocity [m/s²], a scale of the sensor (roll and pitch with it) taken out.
-
-    Args:
-        series: velocity, rate and sensor of each stretch, (T,) each.
-        rate_hz: sampling rate [Hz].
-    """
+    """What a rate leaves of the change of a velocity [m/s²], a scale of the sensor (roll and pitch with it) taken out."""
     left = [np.diff(velocity) * rate_hz - _middle(rate) for velocity, rate, _ in series]
     sensor = [_middle(own) for *_, own in series]
     power = sum(float(own @ own) for own in sensor)
@@ -413,8 +403,6 @@ def _model_of(drive: Drive, inputs: set[str], levels: _Levels) -> tuple[LinearMo
 
 
 class _Blocks:
-    """States and measurements of a linear model, put together one by one."""
-
     def __init__(self, steps: int) -> None:
         self.steps = steps
         self.transition: dict[tuple[int, int], FloatArray | float] = {}
@@ -457,12 +445,10 @@ def _in_steps(process: Noise, step: float) -> tuple[float, float]:
 
 
 def _middle(samples: FloatArray) -> FloatArray:
-    """Means of neighbours, (T - 1,)."""
     return 0.5 * (samples[1:] + samples[:-1])
 
 
 def _joined(drives: Sequence[Drive]) -> tuple[FloatArray, FloatArray]:
-    """v_ref and u of all scored samples."""
     parts = [drive.scored for drive in drives]
     return np.concatenate([own.vy_ref for own in parts]), np.concatenate([own.inputs["vx"] for own in parts])
 

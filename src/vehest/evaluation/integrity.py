@@ -12,25 +12,13 @@ from vehest.constants import FloatArray
 
 
 def detection_delay(flagged: NDArray[np.bool_], onset: int, end: int, rate_hz: float) -> float:
-    """Time from the first faulty sample to the end of the sample that is flagged first [s]; infinite if none is before ``end``.
-
-    Args:
-        flagged: (T,).
-        onset: index of the first faulty sample.
-        end: index before which a flag counts.
-        rate_hz: [Hz].
-    """
+    """Time from the first faulty sample to the end of the sample that is flagged first [s]; infinite if none is before ``end``."""
     found = np.flatnonzero(flagged[onset:end])
     return (int(found[0]) + 1) / rate_hz if len(found) else math.inf
 
 
 def missed_detections(delays: Sequence[float], within: Sequence[float] | float = math.inf) -> float:
-    """Share of faults that were not flagged, or not in time; NaN without faults.
-
-    Args:
-        delays: of `detection_delay`, one a fault [s].
-        within: longest delay that counts as in time, for all or one a fault [s].
-    """
+    """Share of faults that were not flagged, or not in time; NaN without faults."""
     if not len(delays):
         return math.nan
     found = np.asarray(delays, np.float64)
@@ -38,14 +26,7 @@ def missed_detections(delays: Sequence[float], within: Sequence[float] | float =
 
 
 def error_while_undetected(error: FloatArray, flagged: NDArray[np.bool_], onset: int, end: int) -> tuple[float, float]:
-    """Root mean square and largest size of the error from a fault's onset to its first flag, or to ``end``; 0 if it is flagged at once.
-
-    Args:
-        error: (T,); NaN does not count.
-        flagged: (T,).
-        onset: index of the first faulty sample.
-        end: index before which errors count.
-    """
+    """Root mean square and largest size of the error from a fault's onset to its first flag, or to ``end``; 0 if it is flagged at once."""
     found = np.flatnonzero(flagged[onset:end])
     own = error[onset : onset + int(found[0]) if len(found) else end]
     own = own[~np.isnan(own)]

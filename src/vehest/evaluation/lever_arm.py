@@ -17,8 +17,7 @@ from vehest.data.recording import Recording
 from vehest.data.splits import Span
 from vehest.evaluation.metrics import Protocol, Scored, accuracy, scored_range
 
-CONDITION = "best_lever_arm"
-"""What rows of such errors say in the column ``condition``."""
+CONDITION = "best_lever_arm"  # what rows of such errors say in the column ``condition``
 LONGEST = 0.5  # m, ahead of the reference's point or behind it
 METRICS = ("rmse_vy", "rmse_sideslip", "fvu")
 
@@ -31,23 +30,10 @@ class LeverArm:
     parts: tuple[Scored, ...]  # the estimates at the reference's point
 
 
-def point_is_unknown(reference: Recording) -> bool:
-    """Whether a recording's data set declares that the point at which its reference was measured is unknown."""
-    derived = reference.provenance.get("derived")
-    return isinstance(derived, dict) and derived.get("reference_point") == "unknown"
-
-
 def best_lever_arm(
     parts: Sequence[Scored], yaw_rates: Sequence[FloatArray], speeds: Sequence[FloatArray], least_speed: float = 0.0
 ) -> LeverArm:
-    """The lever arm x that leaves the least error: argmin of the mean of (v̂ - v - x·r)², that is Σ(v̂ - v)r / Σr², within `LONGEST`.
-
-    Args:
-        parts: estimate and reference, of all ranges of a test set.
-        yaw_rates: r [rad/s] at the same samples.
-        speeds: u [m/s], by which sideslip is made of v.
-        least_speed: see `Protocol`.
-    """
+    """The lever arm x that leaves the least error: argmin of the mean of (v̂ - v - x·r)², that is Σ(v̂ - v)r / Σr², within `LONGEST`."""
     error = np.concatenate([part.vy - part.vy_ref for part in parts])
     turning = np.concatenate(list(yaw_rates))
     power = float(turning @ turning)
@@ -63,17 +49,14 @@ def best_lever_arm(
 def lever_arm_figures(parts: Sequence[Scored], pieces: Iterable[tuple[Recording, Span]], protocol: Protocol) -> dict[str, float]:
     """Errors with the best lever arm, and the lever arm, of a test set whose references were all measured at unknown points.
 
-    Args:
-        parts: estimate and reference, of each piece.
-        pieces: whole recordings at ``protocol.rate_hz`` and the ranges, or sequences, in them, as `pieces_of` counts them.
-
     Returns:
         metric -> value, with ``lever_arm`` [m]; nothing where a reference's point is known or undeclared, or a recording has no yaw rate.
     """
     yaw_rates, speeds = [], []
     for reference, span in pieces:
         turning = next((name for name in ("yaw_rate_ref", "yaw_rate") if name in reference), None)
-        if turning is None or not point_is_unknown(reference):
+        derived = reference.provenance.get("derived")  # from the data set's declaration
+        if turning is None or not isinstance(derived, dict) or derived.get("reference_point") != "unknown":
             return {}
         first, end = scored_range(reference, span, protocol)
         yaw_rates.append(reference[turning][first:end])

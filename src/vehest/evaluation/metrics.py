@@ -18,59 +18,33 @@ from vehest.evaluation.consistency import coverage, normalised_error_squared, no
 
 NONLINEAR_AY = 4.0  # m/s², from which tyres are taken to be in their nonlinear range (Bertipaglia et al. 2024, Section V)
 
-REFERENCES = {"vx": "vx_ref", "vy": "vy_ref", "yaw_rate": "yaw_rate_ref"}
-"""Quantity of an estimate -> channel that it is measured against."""
+REFERENCES = {"vx": "vx_ref", "vy": "vy_ref", "yaw_rate": "yaw_rate_ref"}  # quantity of an estimate -> channel that it is measured against
 
 WEIGHTS = {"vx": 0.2225, "vy": 0.5064, "yaw_rate": 0.1566}
 """Weights of squared and absolute errors in SI units (Węgrzynowski et al. 2024, the authors' public code)."""
 
-UNITS: dict[str, str] = {
-    "rmse_vy": "m/s",
-    "fvu": "1",
-    "r2": "1",
-    "rmse_sideslip": "deg",
-    "mse_sideslip": "deg²",
-    "mse_sideslip_nonlinear": "deg²",
-    "max_error_sideslip": "deg",
-    "max_error_sideslip_nonlinear": "deg",
-    "p99_sideslip": "deg",
-    "rmse_vx": "m/s",
-    "rmse_yaw_rate": "rad/s",
-    "mse_weighted": "1",
-    "mae_weighted": "1",
-    "ae99_weighted": "1",
-    "nees": "1",
-    "nis": "1",
-    "coverage_1sigma": "1",
-    "coverage_2sigma": "1",
-    **{
-        f"{name}{suffix}": unit.format(of)
-        for suffix, of in (("", "deg"), ("_vy", "m/s"))
-        for name, unit in {
-            "coverage_50": "1",
-            "coverage_68": "1",
-            "coverage_90": "1",
-            "coverage_95": "1",
-            "coverage_90_p10": "1",
-            "coverage_90_p90": "1",
-            "width_90": "{}",
-            "interval_score": "{}",
-            "crps": "{}",
-            "error_icc": "1",
-            "band_blocks": "1",
-        }.items()
-    },
-    "share": "1",
-    "floor_reference": "deg",
-    "floor_reference_vy": "m/s",
-    "floor_cramer_rao": "deg",
-    "floor_cramer_rao_vy": "m/s",
-    "lever_arm": "m",
-    "n_sequences": "1",
-    "n_parameters": "1",
-    "epochs": "1",
-    "train_seconds": "s",
-    "step_seconds": "s",
+_NAMES = {
+    "1": (
+        *("fvu", "r2", "mse_weighted", "mae_weighted", "ae99_weighted", "nees", "nis", "coverage_1sigma", "coverage_2sigma", "share"),
+        *("n_sequences", "n_parameters", "epochs"),
+    ),
+    "deg": ("rmse_sideslip", "max_error_sideslip", "max_error_sideslip_nonlinear", "p99_sideslip", "floor_reference", "floor_cramer_rao"),
+    "deg²": ("mse_sideslip", "mse_sideslip_nonlinear"),
+    "m/s": ("rmse_vy", "rmse_vx", "floor_reference_vy", "floor_cramer_rao_vy"),
+    "rad/s": ("rmse_yaw_rate",),
+    "m": ("lever_arm",),
+    "s": ("train_seconds", "step_seconds"),
+}
+_OF_BANDS = {
+    "1": ("coverage_50", "coverage_68", "coverage_90", "coverage_95", "coverage_90_p10", "coverage_90_p90", "error_icc", "band_blocks"),
+    "{}": ("width_90", "interval_score", "crps"),  # in the unit of the quantity
+}
+UNITS: dict[str, str] = {name: unit for unit, names in _NAMES.items() for name in names}
+UNITS |= {
+    f"{name}{suffix}": unit.format(of)
+    for suffix, of in (("", "deg"), ("_vy", "m/s"))
+    for unit, names in _OF_BANDS.items()
+    for name in names
 }
 
 
@@ -157,14 +131,7 @@ class Scored:
 
 
 def sequences(spans: Sequence[Span], recording_of: Callable[[Span], Recording], protocol: Protocol) -> list[Span]:
-    """The stretches that estimates are made of, one after another: the ranges, or the sequences that they are cut into.
-
-    Args:
-        recording_of: of a range: its recording at ``protocol.rate_hz``; asked for only if ranges are cut.
-
-    Raises:
-        DataError: no range is as long as a sequence.
-    """
+    """The stretches that estimates are made of: the ranges, or the sequences that they are cut into; `DataError` if all are too short."""
     if protocol.sequence_seconds is None:
         return list(spans)
     steps = round(protocol.sequence_seconds * protocol.rate_hz)
@@ -184,11 +151,7 @@ def sequences(spans: Sequence[Span], recording_of: Callable[[Span], Recording], 
 
 
 def reference_state(reference: Recording, span: Span) -> dict[str, float]:
-    """The state that a protocol hands over at the first sample of a range: ``vx``, ``vy`` [m/s], ``yaw_rate`` [rad/s].
-
-    Raises:
-        DataError: a reference channel is missing, or has a gap there.
-    """
+    """The state that a protocol hands over at the first sample: ``vx``, ``vy`` [m/s], ``yaw_rate`` [rad/s]; `DataError` in a gap."""
     first = reference.index_range(span.start, span.stop)[0]
     state = {}
     for name, channel in REFERENCES.items():
@@ -204,15 +167,7 @@ def reference_state(reference: Recording, span: Span) -> dict[str, float]:
 def score_all(
     estimate_of: Callable[[int], Estimate], spans: Sequence[Span], recording_of: Callable[[Span], Recording], protocol: Protocol
 ) -> list[Scored]:
-    """Score the estimates of a test set, one a range or one a sequence, as `sequences` counts them.
-
-    Args:
-        estimate_of: position among the sequences -> estimate.
-        recording_of: of a range: its recording at ``protocol.rate_hz``, references included.
-
-    Raises:
-        DataError: as `score` and `sequences` say.
-    """
+    """Score the estimates of a test set by position among its `sequences`; ``recording_of`` a range is at ``protocol.rate_hz``."""
     return [
         score(estimate_of(position), reference, piece, protocol)
         for position, (reference, piece) in enumerate(pieces_of(spans, recording_of, protocol))
@@ -220,14 +175,7 @@ def score_all(
 
 
 def pieces_of(spans: Sequence[Span], recording_of: Callable[[Span], Recording], protocol: Protocol) -> Iterator[tuple[Recording, Span]]:
-    """Each range, or sequence, of a test set with the whole recording that it lies in, one recording in memory at a time.
-
-    Args:
-        recording_of: of a range: its recording at ``protocol.rate_hz``, references included.
-
-    Raises:
-        DataError: as `sequences` says.
-    """
+    """Each range, or sequence, of a test set with the whole recording that it lies in, one recording in memory at a time."""
     read = lru_cache(maxsize=1)(lambda dataset, recording: recording_of(Span(dataset, recording)))  # a range's sequences stand together
 
     def cached(span: Span) -> Recording:
@@ -336,20 +284,12 @@ def accuracy(parts: Sequence[Scored]) -> dict[str, float]:
 
 
 def weighted_squared_errors(part: Scored) -> FloatArray:
-    """Squared errors of vx, vy and yaw rate times `WEIGHTS`, summed at each sample; shape (K,).
-
-    Raises:
-        DataError: an estimate or its reference is missing.
-    """
+    """Squared errors of vx, vy and yaw rate times `WEIGHTS`, summed at each sample, (K,); `DataError` where one is missing."""
     return _weighted(part, np.square)
 
 
 def weighted_absolute_errors(part: Scored) -> FloatArray:
-    """Absolute errors of vx, vy and yaw rate times `WEIGHTS`, summed at each sample; shape (K,).
-
-    Raises:
-        DataError: an estimate or its reference is missing.
-    """
+    """Absolute errors of vx, vy and yaw rate times `WEIGHTS`, summed at each sample, (K,); `DataError` where one is missing."""
     return _weighted(part, np.abs)
 
 

@@ -12,8 +12,7 @@ from vehest.constants import FloatArray
 from vehest.evaluation.blocks import LEAST_BLOCKS, Segments, block_labels, block_sums, effective_blocks
 from vehest.evaluation.significance import CONFIDENCE, Pair, differences_of_blocks, holm, root_intervals
 
-Name = tuple[str, str]
-"""Estimator and variant."""
+Name = tuple[str, str]  # estimator and variant
 
 Verdict = Literal["lower", "higher", "not told apart"]
 BASELINES = ("zero", "static_map")
@@ -76,11 +75,7 @@ class Ranking:
         return [name for name in self.order[1:] if name in self.against_best and self.against_best[name].verdict == "not told apart"]
 
 
-def rank(
-    segments: Mapping[Name, Sequence[Segments]],
-    rate_hz: float,
-    asked: Sequence[tuple[Name, Name]] = (),
-) -> Ranking:
+def rank(segments: Mapping[Name, Sequence[Segments]], rate_hz: float, asked: Sequence[tuple[Name, Name]] = ()) -> Ranking:
     """Compare estimators on one test set by RMSE(β).
 
     Every pair is compared on the same blocks, drawn together, with the seeds of each drawn on their own (`paired_difference`). Corrected
@@ -88,7 +83,6 @@ def rank(
 
     Args:
         segments: of each seed of each estimator, all over the same samples.
-        rate_hz: of the scored samples [Hz].
         asked: further pairs to compare, such as those whose order a paper claims; left out where one of the two is missing.
     """
     first = next(iter(segments.values()))[0]

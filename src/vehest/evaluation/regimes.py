@@ -33,26 +33,16 @@ TRANSIENT = {"yaw_rate": 0.1, "ay": 2.0}  # rad/s², m/s³
 SLOPE_SECONDS = 0.5
 LEAST_SECONDS = 2.0  # of samples in a regime, below which it has no errors
 METRICS = ("rmse_vy", "rmse_sideslip")
+_OF_SAMPLES = ("time", "vy", "vy_ref", "sideslip", "sideslip_ref", "ay")
 
+AY_BANDS = {f"ay_{low:g}_{high:g}".removesuffix("inf"): (low, high) for low, high in itertools.pairwise(AY_EDGES)}
+"""Name of a band of lateral acceleration, ``ay_2_4`` or ``ay_6_`` without upper end -> its ends [m/s²]."""
 
-def band_name(low: float, high: float) -> str:
-    """``ay_2_4``; ``ay_6_`` for a band without upper end."""
-    return f"ay_{low:g}_{high:g}" if math.isfinite(high) else f"ay_{low:g}_"
-
-
-AY_BANDS = {band_name(low, high): (low, high) for low, high in itertools.pairwise(AY_EDGES)}
-"""Name of a band of lateral acceleration -> its ends [m/s²]."""
-
-REGIMES = ("straight", "turning", *AY_BANDS, "transient", "steady")
-"""In the order of tables."""
+REGIMES = ("straight", "turning", *AY_BANDS, "transient", "steady")  # in the order of tables
 
 
 def regimes_of(reference: Recording, span: Span, protocol: Protocol) -> dict[str, Mask]:
     """Which scored samples of a range lie in which regime.
-
-    Args:
-        reference: the recording at ``protocol.rate_hz``.
-        span: the range.
 
     Returns:
         Regime -> (K,); without yaw rate neither straight nor turning, without lateral acceleration no bands, without both none.
@@ -97,11 +87,6 @@ def filled(samples: FloatArray) -> FloatArray:
 def errors_by_regime(parts: Sequence[Scored], masks: Sequence[Mapping[str, Mask]], rate_hz: float) -> dict[str, dict[str, float]]:
     """Regime -> `METRICS` and the share of the samples that lie in it, over all parts together.
 
-    Args:
-        parts: estimate and reference of each range or sequence.
-        masks: of each, from `regimes_of`.
-        rate_hz: of the scored samples [Hz].
-
     Returns:
         Only regimes that every part tells, and of which there are `LEAST_SECONDS` of samples.
     """
@@ -110,15 +95,11 @@ def errors_by_regime(parts: Sequence[Scored], masks: Sequence[Mapping[str, Mask]
     for name in REGIMES:
         if not all(name in own for own in masks):
             continue
-        inside = [_only(part, own[name]) for part, own in zip(parts, masks, strict=True)]
+        chosen = [(part, own[name]) for part, own in zip(parts, masks, strict=True)]
+        inside = [Scored(*(getattr(part, column)[mask] for column in _OF_SAMPLES)) for part, mask in chosen]
         count = sum(len(part.time) for part in inside)
         if count < max(LEAST_SECONDS * rate_hz, 1.0):
             continue
         figures = accuracy(inside)
         found[name] = {**{metric: figures[metric] for metric in METRICS}, "share": count / total}
     return found
-
-
-def _only(part: Scored, chosen: Mask) -> Scored:
-    columns = (getattr(part, name)[chosen] for name in ("time", "vy", "vy_ref", "sideslip", "sideslip_ref", "ay"))
-    return Scored(*columns)

@@ -21,23 +21,14 @@ DRAWN_AT_ONCE = 2_000_000  # block counts of so many resamples are held at once
 
 @dataclass(frozen=True)
 class Interval:
-    """A figure, or a difference first - second, and how well it is known.
+    """A figure, or a difference first - second, and how well it is known."""
 
-    Args:
-        value: the figure; of a difference, negative where the first has the lower loss.
-        low: lower end of the 95 % interval.
-        high: its upper end.
-        p_value: two-sided, of the hypothesis that there is no difference; below 0.05 exactly if the interval leaves 0 out.
-        error: standard error.
-        dof: degrees of freedom of Student's t.
-    """
-
-    value: float
-    low: float
-    high: float
-    p_value: float
-    error: float = 0.0
-    dof: float = np.inf
+    value: float  # the figure; of a difference, negative where the first has the lower loss
+    low: float  # lower end of the 95 % interval
+    high: float  # its upper end
+    p_value: float  # two-sided, of the hypothesis that there is no difference; below 0.05 exactly if the interval leaves 0 out
+    error: float = 0.0  # standard error
+    dof: float = np.inf  # degrees of freedom of Student's t
 
     def at(self, confidence: float) -> tuple[float, float]:
         """Both ends at another confidence than 95 %."""
@@ -47,22 +38,13 @@ class Interval:
 
 @dataclass(frozen=True)
 class Difference:
-    """How the losses of two estimators differ.
+    """How the losses of two estimators differ."""
 
-    Args:
-        mean: of their mean losses over all seeds and samples.
-        median: of the medians over seeds of their mean losses over samples.
-        root: of the square roots of their mean losses over all seeds and samples, an RMSE where losses are squared errors; NaN where a
-            loss is negative.
-        n_blocks: blocks that were resampled.
-        dof: degrees of freedom of Student's t behind both intervals.
-    """
-
-    mean: Interval
-    median: Interval
-    root: Interval
-    n_blocks: int
-    dof: float
+    mean: Interval  # of their mean losses over all seeds and samples
+    median: Interval  # of the medians over seeds of their mean losses over samples
+    root: Interval  # of the square roots of their mean losses, RMSEs where losses are squared errors; NaN where a loss is negative
+    n_blocks: int  # blocks that were resampled
+    dof: float  # degrees of freedom of Student's t behind both intervals
 
 
 def paired_difference(

@@ -40,8 +40,7 @@ UNITS = {
 
 _CLOCK = 1e-6  # s, within which times are the same
 
-Window = tuple[float, float]
-"""Start and end of a fault on a recording's clock [s]."""
+Window = tuple[float, float]  # start and end of a fault on a recording's clock [s]
 
 
 def errors_under_fault(parts: Sequence[Scored], nominal: Sequence[Scored], windows: Sequence[Window]) -> dict[str, dict[str, float]]:
@@ -53,8 +52,10 @@ def errors_under_fault(parts: Sequence[Scored], nominal: Sequence[Scored], windo
         nominal: the same without the fault.
     """
     found = {}
-    for subset, inside in ((FAULTED, _during), (AFTER, _after)):
-        masks = [inside(part.time, window) for part, window in zip(parts, windows, strict=True)]
+    pairs = list(zip(parts, windows, strict=True))
+    during = [_during(part.time, window) for part, window in pairs]
+    after = [part.time >= window[1] + SETTLED_SECONDS - _CLOCK for part, window in pairs]
+    for subset, masks in ((FAULTED, during), (AFTER, after)):
         if any(mask.any() for mask in masks):
             usual = {f"{name}_nominal": value for name, value in _errors(nominal, masks).items()}
             found[subset] = _errors(parts, masks) | usual
@@ -76,11 +77,6 @@ def flags_under_fault(parts: Sequence[Scored], flagged: Sequence[Flagged], windo
     ranges that were valid before: ``missed_detections`` share in which nothing is flagged before the fault's end, ``detection_delay`` mean
     time to the first flag of the others [s], ``max_error_sideslip_undetected`` largest error before it [deg]. Only figures that there
     is something for.
-
-    Args:
-        parts: estimate under the fault and reference, of each range or sequence.
-        flagged: band and health of each.
-        rate_hz: of the scored samples [Hz].
     """
     inside, valid, delays, undetected = [], [], [], []
     for part, own, window in zip(parts, flagged, windows, strict=True):
@@ -106,10 +102,6 @@ def flags_under_fault(parts: Sequence[Scored], flagged: Sequence[Flagged], windo
 
 def _during(time: FloatArray, window: Window) -> NDArray[np.bool_]:
     return (time >= window[0] - _CLOCK) & (time < window[1] - _CLOCK)
-
-
-def _after(time: FloatArray, window: Window) -> NDArray[np.bool_]:
-    return time >= window[1] + SETTLED_SECONDS - _CLOCK
 
 
 def _errors(parts: Sequence[Scored], masks: Sequence[NDArray[np.bool_]]) -> dict[str, float]:

@@ -39,11 +39,7 @@ _BEFORE, _AFTER, _REST = LUENBERGER_GREY, LINEAR_BLUES[1], NONLINEAR_ORANGES[0]
 
 
 def alignment_figure(alignment: Alignment) -> MatplotlibFigure:
-    """Cross-correlation and spectra of the residuals side by side, residuals over time below, and the steering relation.
-
-    Args:
-        alignment: with residuals, a steering relation, or both.
-    """
+    """Cross-correlation and spectra of the residuals side by side, residuals over time below, and the steering relation."""
     residuals, steering = alignment.residuals, alignment.steering
     heights = [*([OVERVIEW_HEIGHT] if residuals else []), *([1.0] * len(residuals)), *([STEERING_HEIGHT] if steering else [])]
     with new_figure(DOUBLE_COLUMN, 0.3 + 1.25 * sum(heights)) as figure:

@@ -17,7 +17,6 @@ from vehest.report.style import MISSING, REFERENCE_COLOUR, decimals_for, fixed, 
 
 if TYPE_CHECKING:
     import pandas as pd
-    from markdown_it import MarkdownIt
     from matplotlib.figure import Figure as MatplotlibFigure
 
 PATENT_NOTE = (
@@ -26,8 +25,7 @@ PATENT_NOTE = (
 )
 """What every report with a KS-NN ends with."""
 
-REPORT = "report"
-"""Document of a study that one starts with."""
+REPORT = "report"  # document of a study that one starts with
 
 LONGEST_AXIS = 6.0  # times the median error, beyond which a bar is cut
 PNG_DPI = 150
@@ -110,7 +108,6 @@ def write_documents(documents: Mapping[str, Document], folder: Path, *, on_page:
     """Write documents that link to each other as ``NAME.md``; their tables and figures lie side by side.
 
     Args:
-        documents: name of the file -> document; ``report`` is the one to start with.
         on_page: text and tables that the page of ``report`` alone ends with, and no other file holds.
 
     Raises:
@@ -172,11 +169,7 @@ def as_code(text: str) -> str:
 
 
 def formatted(table: Table) -> tuple[list[str], list[list[str]], list[bool]]:
-    """What a table shows.
-
-    Returns:
-        Headers, rows of cells, and for each column whether it holds numbers.
-    """
+    """Headers of a table, rows of cells, and for each column whether it holds numbers."""
     from pandas.api.types import is_bool_dtype, is_numeric_dtype
 
     shown = table.columns or {str(name): Column(str(name)) for name in table.frame.columns}
@@ -310,9 +303,10 @@ def _spoken(caption: str) -> str:
 
 def _page(document: Document, numbers: Mapping[int, str], images: Mapping[str, bytes]) -> str:
     from jinja2 import Environment, PackageLoader, StrictUndefined
+    from markdown_it import MarkdownIt
     from markupsafe import Markup
 
-    markdown = _markdown_parser()
+    markdown = MarkdownIt("commonmark", {"html": False}).enable("table").disable("image")
     blocks: list[dict[str, Any]] = []
     for position, block in enumerate(document.blocks):
         if isinstance(block, str):
@@ -343,12 +337,6 @@ def _page(document: Document, numbers: Mapping[int, str], images: Mapping[str, b
         plots_style=Markup(_packaged("uplot.css")) if interactive else "",
         missing=MISSING,
     )
-
-
-def _markdown_parser() -> MarkdownIt:
-    from markdown_it import MarkdownIt
-
-    return MarkdownIt("commonmark", {"html": False}).enable("table").disable("image")
 
 
 def _no_formula(cell: Any) -> Any:

@@ -20,8 +20,7 @@ from vehest.data.runs import true_runs
 from vehest.report.style import Line, on_dark
 
 LEVELS = 65_534
-GAP = 65_535
-"""Code of a value that is not there."""
+GAP = 65_535  # code of a value that is not there
 
 
 @dataclass(frozen=True, eq=False)
@@ -110,17 +109,7 @@ def packed(columns: dict[str, FloatArray]) -> tuple[dict[str, list[float]], str]
 
 
 def reckoned_course(vx: FloatArray, vy: FloatArray, yaw_rate: FloatArray, step: float) -> tuple[FloatArray, FloatArray]:
-    """Where the car went, by integrating its velocities from the origin, heading along x; NaN stays a gap, after which it starts anew.
-
-    Args:
-        vx: forward velocity [m/s], shape (K,).
-        vy: lateral velocity [m/s], (K,).
-        yaw_rate: [rad/s], (K,).
-        step: between two samples [s].
-
-    Returns:
-        x and y [m], (K,) each.
-    """
+    """Where the car went, x and y (K,) [m], by integrating velocities from the origin, heading along x; after NaN it starts anew."""
     x, y = np.full(len(vx), np.nan), np.full(len(vx), np.nan)
     known = np.isfinite(vx) & np.isfinite(vy) & np.isfinite(yaw_rate)
     for first, end in true_runs(known).tolist():
@@ -132,7 +121,6 @@ def reckoned_course(vx: FloatArray, vy: FloatArray, yaw_rate: FloatArray, step: 
 
 
 def _integral(values: FloatArray, step: float) -> FloatArray:
-    """By the trapezoidal rule, from zero."""
     steps = 0.5 * step * (values[1:] + values[:-1])
     whole: FloatArray = np.concatenate([[0.0], np.cumsum(steps)])
     return whole

@@ -87,11 +87,7 @@ def spread_figure(rows: Sequence[Spread], quantity: str) -> MatplotlibFigure:
 
 
 def traces_figure(time: FloatArray, reference: Traces, estimates: Sequence[Traces], time_label: str) -> MatplotlibFigure:
-    """Reference and estimate over a whole test set, one row an estimator: lateral velocity left, sideslip right.
-
-    Args:
-        time: [s], shape (K,).
-    """
+    """Reference and estimate over a whole test set, one row an estimator: lateral velocity left, sideslip right."""
     with new_figure(DOUBLE_COLUMN, 0.75 + 0.68 * max(len(estimates), 2)) as figure:
         grid = figure.subplots(len(estimates), 2, sharex=True, sharey="col", squeeze=False)
         for (left, right), estimate in zip(grid, estimates, strict=True):
@@ -108,18 +104,9 @@ def traces_figure(time: FloatArray, reference: Traces, estimates: Sequence[Trace
 
 
 def zoom_figure(
-    time: FloatArray,
-    ay: FloatArray | None,
-    reference: Traces,
-    estimates: Sequence[Traces],
-    time_label: str,
+    time: FloatArray, ay: FloatArray | None, reference: Traces, estimates: Sequence[Traces], time_label: str
 ) -> MatplotlibFigure:
-    """Reference and all estimates over a short while: lateral velocity, sideslip, its error, and the lateral acceleration.
-
-    Args:
-        time: [s], shape (K,).
-        ay: measured lateral acceleration [m/s²], shape (K,); None leaves its axes out.
-    """
+    """Reference and all estimates over a short while: lateral velocity, sideslip, its error, and the lateral acceleration."""
     from matplotlib.ticker import MaxNLocator
 
     heights = (1.5, 1.5, 1.2, 0.6) if ay is not None else (1.5, 1.5, 1.2)
@@ -173,12 +160,7 @@ def error_histogram(estimates: Sequence[Errors]) -> MatplotlibFigure:
 
 
 def error_over_ay(ay: FloatArray, estimates: Sequence[Errors]) -> MatplotlibFigure:
-    """RMSE of the sideslip in bins of |a_y| of 1 m/s², and how many samples each bin holds; bins of fewer than 20 samples show none.
-
-    Args:
-        ay: lateral acceleration at the scored times [m/s²], shape (K,).
-        estimates: errors at the same times.
-    """
+    """RMSE of the sideslip in bins of |a_y| of 1 m/s², and how many samples each bin holds; bins of fewer than 20 samples show none."""
     n_bins = max(math.ceil(float(np.abs(ay).max())), 1)
     edges = np.arange(n_bins + 1)
     centres = edges[:-1] + 0.5
@@ -226,16 +208,7 @@ def learning_curves(runs: Sequence[Learning], quantity: str) -> MatplotlibFigure
 
 
 def decimated(time: FloatArray, values: FloatArray, n_points: int) -> tuple[FloatArray, FloatArray]:
-    """Fewer points of a time series that keep its peaks: lowest and highest value of each stretch, in their order.
-
-    Args:
-        time: shape (K,).
-        values: shape (K,); a stretch that is NaN throughout stays a gap.
-        n_points: about how many points to keep.
-
-    Returns:
-        Times and values, unchanged if there are not more than ``n_points``.
-    """
+    """Fewer points of a time series that keep its peaks: lowest and highest value of each stretch, in their order."""
     if len(values) <= n_points:
         return time, values
     kept: list[int] = []

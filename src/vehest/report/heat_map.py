@@ -16,6 +16,7 @@ LOGARITHMIC_FROM = 20.0
 MOST_COLUMNS_SIDE_BY_SIDE = 6
 CELL_HEIGHT = 0.42  # in
 NO_VALUE = "#ececec"
+LUMINANCE = (0.2126, 0.7152, 0.0722)  # of red, green and blue
 
 
 @dataclass(frozen=True, eq=False)
@@ -31,14 +32,7 @@ class Panel:
 def heat_map(
     panels: Sequence[Panel], columns: Sequence[str], rows: Sequence[str], column_label: str, row_label: str, quantity: str
 ) -> MatplotlibFigure:
-    """Panels on one scale of colours, the darker the larger; logarithmic where the largest value is 20 times the smallest.
-
-    Args:
-        panels: of shape (R, C) each.
-        columns: ticks of the horizontal axis, C of them.
-        rows: ticks of the vertical axis from below, R of them.
-        quantity: what the colours show, with its unit.
-    """
+    """Panels on one scale of colours, the darker the larger; logarithmic where the largest value is 20 times the smallest."""
     import matplotlib
     from matplotlib.cm import ScalarMappable
     from matplotlib.colors import LinearSegmentedColormap
@@ -91,7 +85,7 @@ def _draw(axes: Any, panel: Panel, colours: Any, decimals: int) -> None:
         words = fixed(mean, decimals) if math.isfinite(mean) else MISSING
         if math.isfinite(mean) and math.isfinite(half):
             words += f"\n±{fixed(half, decimals)}"
-        ink = "white" if math.isfinite(mean) and _luminance(colour) < 0.45 else "#111111"
+        ink = "white" if math.isfinite(mean) and float(np.dot(LUMINANCE, colour[:3])) < 0.45 else "#111111"
         axes.text(column, row, words, ha="center", va="center", fontsize=6.5, color=ink, linespacing=1.1)
     if panel.marked is not None:
         row, column = panel.marked
@@ -102,8 +96,3 @@ def _draw(axes: Any, panel: Panel, colours: Any, decimals: int) -> None:
     axes.grid(visible=False)
     axes.tick_params(length=0)
     axes.spines[:].set_visible(False)
-
-
-def _luminance(colour: Any) -> float:
-    red, green, blue = colour[:3]
-    return float(0.2126 * red + 0.7152 * green + 0.0722 * blue)

@@ -26,11 +26,7 @@ class Reliability:
 
 
 def reliability_figure(levels: Sequence[float], rows: Sequence[Reliability]) -> MatplotlibFigure:
-    """Coverage over nominal level, one line an estimator with its name at the end; on the diagonal bands say what they hold.
-
-    Args:
-        levels: nominal, ascending.
-    """
+    """Coverage over nominal level, one line an estimator with its name at the end; on the diagonal bands say what they hold."""
     nominal = np.array(levels)
     with new_figure(SINGLE_COLUMN * 1.55, 3.2) as figure:
         axes = figure.add_subplot()

@@ -103,11 +103,7 @@ def lines_of(names: Iterable[tuple[str, str]]) -> dict[tuple[str, str], Line]:
 
 
 def on_dark(colour: str) -> str:
-    """The colour that stands for ``colour`` on a dark page: greys change places with their opposites, hues get lighter.
-
-    Args:
-        colour: hexadecimal, of a figure on white.
-    """
+    """The colour that stands for ``colour`` on a dark page: greys change places with their opposites, hues get lighter."""
     red, green, blue = (int(colour[start : start + 2], 16) for start in (1, 3, 5))
     if max(red, green, blue) - min(red, green, blue) <= 12:
         level = _DARK_INK + (_DARK_PAPER - _DARK_INK) * (red + green + blue) / (3 * 255)

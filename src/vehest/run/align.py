@@ -25,16 +25,7 @@ FILES = ("alignment.md", "alignment.csv", "alignment.yaml", "alignment.png", "al
 
 
 def align_recording(source: str, overrides: Sequence[str], recording_id: str | None, settings: AlignmentSettings) -> Alignment:
-    """Estimate quantities from one recording.
-
-    Args:
-        source: a data set, or a CSV or Parquet file.
-        overrides: of the configuration that reads it.
-        recording_id: which recording of a data set; not needed where it has one.
-
-    Raises:
-        VehestError: there is no such recording, it cannot be read, or it does not determine them.
-    """
+    """Estimate quantities from one recording."""
     with reading(source, overrides) as config:
         recording = _one_recording(source, config, recording_id)
         for finding in checks_of_recording(recording):
@@ -85,12 +76,7 @@ def as_plain(alignment: Alignment) -> dict[str, Any]:
 
 
 def write_alignment(alignment: Alignment, folder: Path) -> None:
-    """Write the report, its table, the transforms and the figure into a folder of their own, all or nothing.
-
-    Raises:
-        ConfigurationError: the folder holds other files than those of a former alignment, or is none.
-        MissingError: it cannot be written.
-    """
+    """Write the report, its table, the transforms and the figure into a folder of their own, all or nothing."""
     import pandas as pd
 
     from vehest.report.alignment_figures import alignment_figure, figure_files

@@ -137,12 +137,7 @@ def find(plan: StagePlan) -> Artefact | None:
 
 
 def read_artefact(folder: Path) -> Artefact:
-    """Read a stage's folder.
-
-    Raises:
-        MissingError: there is no manifest.
-        DataError: the manifest is damaged, or names a file that is not in the folder, is a link or has another size.
-    """
+    """Read a stage's folder."""
     path = folder / MANIFEST
     try:
         content = read_json(path)
@@ -168,15 +163,7 @@ def _files(folder: Path) -> list[Path]:
 
 
 def make(plan: StagePlan, write: Callable[[Path], Status | None]) -> Artefact:
-    """Run a stage: ``write`` fills an empty folder, which gets its manifest and then its final name.
-
-    Args:
-        write: fills the folder; returns ``interrupted`` if it was stopped.
-
-    Raises:
-        MissingError: the disk is full or not writable.
-        VehestError: of ``write``; nothing is left behind then.
-    """
+    """Run a stage: ``write`` fills an empty folder, which then gets its manifest and its final name; ``interrupted`` if it was stopped."""
     started = time.monotonic()
     remove_leftovers(plan.folder.parent)
     with written_aside(plan.folder, replace_folder=True) as aside:
@@ -203,11 +190,7 @@ def ensured(
     should_stop: Callable[[], bool],
     on_wait: Callable[[Waiting], None],
 ) -> Artefact | None:
-    """Make an artefact under its lock, or take the one of another process; none if ``should_stop`` ended the wait for it.
-
-    Raises:
-        VehestError: as `make` does.
-    """
+    """Make an artefact under its lock, or take the one of another process; none if ``should_stop`` ended the wait for it."""
     with held(plan.lock, should_stop, on_wait) as mine:
         if not mine:
             return None

@@ -90,9 +90,6 @@ def read_estimate_table(file: Path, vx: Recording) -> Estimate:
 
     Columns are found by name, whatever their case; units in brackets behind a name count, else v is in m/s and β in rad. Where only
     β is there, v = u tan β with the recording's u.
-
-    Raises:
-        DataError: it has neither v nor β, or no time, or cannot be read.
     """
     if file.suffix == ".parquet":
         with suppress(DataError):  # a table of another tool
@@ -119,7 +116,6 @@ def read_estimate_table(file: Path, vx: Recording) -> Estimate:
 
 
 def _unit_in(name: str) -> str | None:
-    """A unit in brackets behind a name, as vehest spells it."""
     written = re.search(r"[\[(](.*?)[\])]", name)
     if written is None:
         return None
@@ -130,10 +126,6 @@ def compare_estimates(drive: Recording, estimates: Mapping[str, Estimate]) -> Co
     """Score estimates on the clock of ``drive`` where all of them have values, beside v = 0 and a static map.
 
     The map is fitted on one half of the scored range and scored on the other, and vice versa, so that its samples are held out.
-
-    Raises:
-        DataError: no reference, too little in common, or gaps within what is in common.
-        ConfigurationError: there is nothing to compare, or a name is that of a baseline.
     """
     if not estimates:
         raise ConfigurationError("name at least one estimate to compare")

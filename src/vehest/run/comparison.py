@@ -29,8 +29,7 @@ from vehest.run.usable import lack
 NO_TIME = "not done yet: no time was left, the same command goes on"
 TOLERANCE = 1e-9  # relative, between two rates that are the same
 
-Note = tuple[str, str]
-"""An estimator, or ``evaluation``, whose rate was lowered, and the sentence that goes on from there."""
+Note = tuple[str, str]  # an estimator, or ``evaluation``, whose rate was lowered, and the sentence that goes on from there
 
 
 @dataclass
@@ -71,13 +70,7 @@ class Comparison:
         return {name: failure.message for name, failure in named_failures(self.jobs)} | dict.fromkeys(self.unfinished, NO_TIME)
 
     def plan(self, runner: Runner) -> None:
-        """Fit jobs to the recordings of their split, find those that lack something, and plan trainings; data are made on the way.
-
-        Raises:
-            ConfigurationError: a setting makes no sense, or two trainings have one name.
-            DataError: no job can be done, or the evaluation is to read estimates more often than recordings are sampled.
-            DryRunStop: in a dry run, if data would have to be made, after printing what would be trained.
-        """
+        """Fit jobs to the recordings of their split, find those that lack something, and plan trainings; data are made on the way."""
         usable, names = self.usable, dict[Any, Any]()
         self._print_failures(self.jobs, runner)
         evaluated = "evaluation" in usable[0].config
@@ -165,12 +158,7 @@ def slowest(contents: Mapping[str, Sequence[RecordingSummary]]) -> RecordingSumm
 
 
 def lower_rate(config: Config, group: str, limit: RecordingSummary) -> tuple[Config, list[Note]]:
-    """A configuration whose ``GROUP.rate_hz`` is no higher than that of a recording, and a note if it was.
-
-    Raises:
-        DataError: an override asks for a higher rate, or a setting makes no sense at that of the recordings.
-        ConfigurationError: a setting makes no sense.
-    """
+    """A configuration whose ``GROUP.rate_hz`` is no higher than that of a recording, and a note if it was."""
     rate, key, lowest = config.get(group, {}).get("rate_hz"), f"{group}.rate_hz", limit.rate_hz
     if not isinstance(rate, int | float) or not rate > lowest * (1.0 + TOLERANCE):
         return config, []
@@ -206,13 +194,7 @@ def print_notes(notes: Iterable[Note], runner: Runner) -> None:
 
 
 def plan_training(config: Mapping[str, Any], split: Split, data: Mapping[str, Artefact]) -> TrainJob:
-    """A training, be it from scratch or from another model's weights, whose digest is then one of its inputs; see `plan_train`.
-
-    Raises:
-        ConfigurationError: a setting that makes no sense.
-        DataError: the split names a recording that the data set does not have.
-        MissingError: the model to start from is not there.
-    """
+    """A training, be it from scratch or from another model's weights, whose digest is then one of its inputs; see `plan_train`."""
     job = plan_train(config, split, data)
     start = config["training"].get("start_from")
     if start is None:

@@ -37,8 +37,7 @@ Config = dict[str, Any]
 COMMAND_OPTIONS = ("dry-run", "download", "force", "jobs", "json", "model", "name", "out", "quiet")
 """Options of commands that are easily mistaken for keys of the configuration."""
 
-GIVEN = "given"
-"""Key of a configuration: the rates that overrides set; only a default may be lowered to the rate of the recordings."""
+GIVEN = "given"  # key of a configuration: the rates that overrides set; only a default may be lowered to the rate of the recordings
 
 RATES = ("estimator.rate_hz", "evaluation.rate_hz")
 OWN_SEARCH_PATH = "hydra.searchpath=[]"  # the first one counts; a package named by another, in a file or an override, would be imported
@@ -97,9 +96,6 @@ def compose_config(command: str, overrides: Sequence[str] = ()) -> Config:
 
     Returns:
         Plain dicts, lists, strings and numbers; and under `GIVEN` the rates that overrides name, if any.
-
-    Raises:
-        ConfigurationError: an unknown key or choice, a wrong value, or bad syntax.
     """
     parsed = parse(overrides)
     for override in parsed:

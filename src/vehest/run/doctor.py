@@ -35,12 +35,8 @@ class Item:
     message: str
 
 
-def examine() -> list[Item]:
+def examine() -> Iterator[Item]:
     """Check everything that vehest relies on."""
-    return list(_items())
-
-
-def _items() -> Iterator[Item]:
     import torch
 
     from vehest.run.launchers.local import default_jobs

@@ -32,17 +32,7 @@ from vehest.evaluation.blocks import segments_of, write_segments
 from vehest.evaluation.floors import cramer_rao_floor, drives_of, inputs_of, reference_floor
 from vehest.evaluation.intervals import figure_intervals
 from vehest.evaluation.lever_arm import CONDITION, lever_arm_figures
-from vehest.evaluation.metrics import (
-    UNITS,
-    Protocol,
-    Scored,
-    accuracy,
-    pieces_of,
-    reference_state,
-    score_all,
-    scored_range,
-    sequences,
-)
+from vehest.evaluation.metrics import UNITS, Protocol, Scored, accuracy, pieces_of, reference_state, score_all, scored_range, sequences
 from vehest.evaluation.regimes import errors_by_regime, regimes_of
 from vehest.evaluation.under_fault import UNITS as UNITS_UNDER_FAULT
 from vehest.run.artefacts import TIMINGS, Artefact, StagePlan
@@ -238,7 +228,6 @@ def _rows_of_parts(
 def _rows_under_faults(
     estimator: Estimator, job: EvaluateJob, head: Mapping[str, Any], spans: Sequence[Span], nominal: Sequence[Scored], trust: Trust | None
 ) -> list[dict[str, Any]]:
-    """Rows of one test set under each fault."""
     if not job.how.faults:
         return []
     rows: list[dict[str, Any]] = []
@@ -252,7 +241,6 @@ def _rows_under_faults(
 
 
 def _head(job: EvaluateJob, estimator: Estimator, name: str, spans: Sequence[Span]) -> dict[str, Any]:
-    """The columns that rows of one test set have in common."""
     about = read_description(job.model.folder).about
     datasets = dict.fromkeys(span.dataset for span in spans)
     kinds = dict.fromkeys(job.how.kinds[name] for name in datasets)
@@ -263,10 +251,7 @@ def _head(job: EvaluateJob, estimator: Estimator, name: str, spans: Sequence[Spa
 
 
 def _rows(
-    head: Mapping[str, Any],
-    figures: Mapping[str, float],
-    intervals: Mapping[str, tuple[float, float]] | None = None,
-    **columns: str,
+    head: Mapping[str, Any], figures: Mapping[str, float], intervals: Mapping[str, tuple[float, float]] | None = None, **columns: str
 ) -> list[dict[str, Any]]:
     """Rows of `COLUMNS`, one a figure; ``columns`` replace those of the head."""
     rows = []

@@ -61,12 +61,7 @@ def open_streams() -> None:
 
 
 def emit(as_json: bool, outcome: Any, shown: Iterable[str | TerminalTable] | None = None) -> None:
-    """Print the outcome of a command, as one JSON object or in lines and tables; by default a line for each key.
-
-    Raises:
-        MissingError: the disk behind standard output is full.
-        OutputClosed: its reader has closed it.
-    """
+    """Print the outcome of a command, as one JSON object or in lines and tables; by default a line for each key."""
     if as_json:
         echo(as_json_text(outcome), keep="\n")
         return
@@ -207,7 +202,6 @@ def _records(table: pd.DataFrame) -> list[dict[str, Any]]:
 
 
 def _cell(value: Any) -> str:
-    """A value of a table, numbers with four significant digits."""
     if isinstance(value, float):
         return f"{value:.4g}" if math.isfinite(value) else "–"
     return str(value)

@@ -46,13 +46,7 @@ State = Literal["up to date", "stale", "not known"]
 
 
 def keys_of_study(study: Study, jobs: Jobs, absent: Collection[str], runner: Runner, inputs: Mapping[str, Mapping[str, str]]) -> Keys:
-    """Keys of everything that determines the results of a study.
-
-    Args:
-        absent: parts or data sets that it goes on without.
-        runner: composes the configurations of data sets.
-        inputs: data set -> raw file or library -> digest or version; without those whose raw files are missing.
-    """
+    """Keys of everything that determines the results of a study."""
     ingests = _ingests(study, jobs, absent, runner)
     keys = {f"ingest {name}": _of_ingest(config["dataset"], inputs.get(name)) for name, config in ingests.items()}
     about: dict[str, Any] = {name: getattr(study, name) for name in ("study", "title", "about", "report")} | {"file": study.file.name}
@@ -67,7 +61,6 @@ def keys_of_study(study: Study, jobs: Jobs, absent: Collection[str], runner: Run
 
 
 def _ingests(study: Study, jobs: Jobs, absent: Collection[str], runner: Runner) -> dict[str, Config]:
-    """Data set -> the configuration of its ingest."""
     if study.datasets:
         return {name: config for name, config in _by_dataset(jobs[""]).items() if name not in absent}
     firsts = [jobs[name][0].config for name in study.parts if name not in absent]
@@ -143,16 +136,7 @@ class Verdict:
 
 
 def check_published(names: Sequence[str], overrides: Sequence[str] = ()) -> list[Verdict]:
-    """Compare the recorded keys of published studies with those of today's code, configuration and raw files.
-
-    Args:
-        names: of studies, or pipelines by name or path; if empty, all studies that are published in ./results.
-        overrides: ``root=FOLDER``, where raw files lie outside ``VEHEST_DATA``.
-
-    Raises:
-        ConfigurationError: an override that would change the results.
-        MissingError: a name is neither a pipeline's nor that of a published study; or nothing is published.
-    """
+    """Compare the recorded keys of published studies with those of today's code, configuration and raw files."""
     if content_overrides(overrides):
         raise ConfigurationError(f"'{content_overrides(overrides)[0]}' changes the results, which are published without overrides")
     published = sorted(file.parent.name for file in RESULTS.glob(f"*/{PROVENANCE}"))

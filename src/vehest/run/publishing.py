@@ -63,10 +63,6 @@ def publish_study(publication: Publication | None, report: Artefact, messages: M
 
     A published report that shows data which this run could not read stays. Where keys and all other files are the same, the provenance
     stays that of the first run with these results.
-
-    Raises:
-        MissingError: it cannot be written.
-        ConfigurationError: the folder holds something else, or is reached through a link.
     """
     if publication is None:
         return None
@@ -83,7 +79,6 @@ def publish_study(publication: Publication | None, report: Artefact, messages: M
 
 
 def _publish(report: Artefact, folder: Path, keys: Mapping[str, Mapping[str, str]]) -> bool:
-    """Publish a report, unless that changes nothing."""
     if any(part.is_symlink() for part in (folder, folder.parent)):
         raise ConfigurationError(f"'{folder}' leads elsewhere through a link; remove the link or set publish: false")
     names = [name for name in report.outputs if name != TIMINGS and not name.endswith(PAGE_ENDING)]

@@ -54,10 +54,7 @@ SCORES = ("rmse_sideslip", "rmse_vy", "fvu")
 
 
 def draw_report(
-    study: Study,
-    comparisons: Mapping[str, Comparison],
-    datasets: Sequence[StoredDataset | AbsentDataset],
-    runner: Runner,
+    study: Study, comparisons: Mapping[str, Comparison], datasets: Sequence[StoredDataset | AbsentDataset], runner: Runner
 ) -> tuple[Artefact, TerminalSummary]:
     """Draw a study, unless its report is there, and sum it up for the terminal; parts without a comparison are named as absent."""
     shown = {name: part for name, part in comparisons.items() if part.members}
@@ -95,7 +92,6 @@ def draw_report(
 def _plan(
     artefacts: StudyArtefacts, module: str, comparisons: Mapping[str, Comparison], ingested: Sequence[Artefact], output: Path
 ) -> StagePlan:
-    """What a report is made from."""
     config: dict[str, Any] = {
         "study": artefacts.study,
         "title": artefacts.title,
@@ -105,12 +101,7 @@ def _plan(
         "titles": artefacts.titles,
         "absent": [{"name": name, "title": artefacts.titles[name]} for name in artefacts.absent],
         "parts": {
-            name: {
-                "training": list(part.facts),
-                "failed": part.failed,
-                "data_titles": part.data_titles,
-                "protocol": part.protocol.plain,
-            }
+            name: {"training": list(part.facts), "failed": part.failed, "data_titles": part.data_titles, "protocol": part.protocol.plain}
             for name, part in artefacts.parts.items()
         },
         "datasets": {dataset.name: [dataset.title, dataset.kind] for dataset in artefacts.datasets},
@@ -281,7 +272,6 @@ def draw_sweep(study: Study, comparison: Comparison, runner: Runner) -> tuple[Ar
 
 
 def _job_table(comparison: Comparison) -> pd.DataFrame:
-    """One row a job, in the order of the command."""
     split = comparison.evaluation.split
     sets = [*([VALIDATION] if split.validation else []), *split.tests]
     rows = []

@@ -161,10 +161,6 @@ class Runner:
         Returns:
             Key of a training -> its member, and key of a training -> why it failed. Where the time is up, members lack what was not
             made, and trainings that were not begun are in neither.
-
-        Raises:
-            MissingError: a command has to be run first, and not one member is there.
-            Stopped: a signal came; finished artefacts stay.
         """
         if self.weights is not None and TRAIN not in self.force:
             self._take_published([job.plan for group in groups for job in group.jobs], self.weights)

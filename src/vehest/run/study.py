@@ -104,17 +104,11 @@ class Job:
     training: TrainJob | None = None  # once it is planned
 
 
-Jobs = Mapping[str, Sequence[Job]]
-"""Part of a study -> its jobs; the one part of a study without parts is called ``""``."""
+Jobs = Mapping[str, Sequence[Job]]  # part of a study -> its jobs; the one part of a study without parts is called ``""``
 
 
 def read_study(name: str, overrides: Sequence[str] = ()) -> Study:
-    """Read a pipeline by path or name; ``overrides`` are those of the command.
-
-    Raises:
-        MissingError: there is none of that name.
-        ConfigurationError: the file is not a pipeline.
-    """
+    """Read a pipeline by path or name; ``overrides`` are those of the command."""
     file, content = _content_of(name)
     read = validated(PipelineFile, content, f"'{file}'", error=ConfigurationError)
     shown = [*read.datasets, *read.optional_datasets]
@@ -203,11 +197,7 @@ def _folds_of(part: Part, file: Path) -> dict[str, Part]:
 
 
 def jobs_of(study: Study, overrides: Sequence[str]) -> Jobs:
-    """Every job of a pipeline; further overrides apply to the sweeps, or data sets, that have their key.
-
-    Raises:
-        ConfigurationError: an override that suits none of them, or jobs of a part that differ in split, evaluation or downsampling.
-    """
+    """Every job of a pipeline; further overrides apply to the sweeps, or data sets, that have their key."""
     what, fixed = ("data set", "dataset") if study.datasets else ("sweep", "split")
     if fixed in map(key_of, overrides):
         raise ConfigurationError(
@@ -270,10 +260,6 @@ def sweep_of(overrides: Sequence[str], name: str | None = None) -> tuple[Study, 
     """A study with one sweep: all combinations of overrides over their seeds, in the order of the command.
 
     A combination that its estimator refuses stays in the list with the reason. By default the study is named after estimators and split.
-
-    Raises:
-        ConfigurationError: a key is named twice, a key takes several values that cannot, the name is none for files, or no combination can
-            be trained.
     """
     with use_limits(limits_of(overrides)):
         check_jobs(count(overrides), "these overrides stand")
@@ -304,8 +290,11 @@ def sweep_of(overrides: Sequence[str], name: str | None = None) -> tuple[Study, 
 
 
 def _combination(overrides: Sequence[str], swept: Sequence[str], number: int) -> Job:
-    """A combination of values; the seed is each job's own."""
-    values = {key_of(override): _value(override) for override in overrides if key_of(override) in swept}
+    values: dict[str, Value] = {}
+    for override in overrides:
+        if key_of(override) in swept:
+            value = value_of(override)
+            values[key_of(override)] = value if isinstance(value, bool | int | float | str) else override.split("=", 1)[-1]
     names = short_names(list(values))
     label = ", ".join(f"{names[key]}={shown_value(value)}" for key, value in values.items())
     try:
@@ -316,9 +305,3 @@ def _combination(overrides: Sequence[str], swept: Sequence[str], number: int) ->
     except ConfigurationError as error:
         return Job({}, label or "this", values, number, failure_of(error))
     return Job(config, label or estimator.full_title, values, number)
-
-
-def _value(override: str) -> Value:
-    """A plain value, or the text of any other."""
-    value = value_of(override)
-    return value if isinstance(value, bool | int | float | str) else override.split("=", 1)[-1]

@@ -206,12 +206,7 @@ def _publication(
 
 
 def train_one(overrides: Sequence[str], options: RunOptions) -> dict[str, Any]:
-    """Train and calibrate one estimator; empty where it was stopped before its first epoch was over.
-
-    Raises:
-        VehestError: the training failed, in its own words.
-        DryRunStop: in a dry run.
-    """
+    """Train and calibrate one estimator; empty where it was stopped before its first epoch was over."""
     config = compose_config("train", overrides)
     with open_runner(config, options, ("train", "calibrate")) as runner:
         members, failures = runner.run([_only_group(config, runner)])
@@ -228,12 +223,7 @@ def train_one(overrides: Sequence[str], options: RunOptions) -> dict[str, Any]:
 
 
 def evaluate_one(overrides: Sequence[str], model: str | None, options: RunOptions, note: Callable[[str], None]) -> dict[str, Any]:
-    """Evaluate a model by folder or start of its name, or the one that the overrides train, on the tests of a split.
-
-    Raises:
-        MissingError: the model is not there.
-        DryRunStop: in a dry run.
-    """
+    """Evaluate a model by folder or start of its name, or the one that the overrides train, on the tests of a split."""
     config = compose_config("eval", overrides)
     with open_runner(config, options, ("calibrate", "evaluate")) as runner:
         split = runner.split(config)

@@ -36,8 +36,7 @@ VALUES_A_REQUEST = 100  # a server takes no more parameters at a time
 VALUE_LENGTH = 500
 KEY_TAG, STAGE_TAG, DIGEST_TAG, OUTPUT_TAG, STUDY_TAG = "vehest.key", "vehest.stage", "vehest.digest", "vehest.output", "vehest.study"
 Metrics = Callable[[], Mapping[str, float]]
-Figures = Mapping[str, Callable[[], Any]]
-"""File name -> function that draws a matplotlib figure, or gives none."""
+Figures = Mapping[str, Callable[[], Any]]  # file name -> function that draws a matplotlib figure, or gives none
 
 
 @dataclass(eq=False)
@@ -122,7 +121,6 @@ class Tracker:
         return tags | ({STUDY_TAG: self.study, "mlflow.parentRunId": self._parent()} if self.study else {})
 
     def _parent(self) -> str:
-        """The run of the study in this output root."""
         tags = {STUDY_TAG: self.study, STAGE_TAG: "study"}
         own = self._runs(tags)[1]
         if not own:

@@ -56,12 +56,7 @@ def new_estimator(config: Mapping[str, Any]) -> Estimator:
 
 
 def plan_train(config: Mapping[str, Any], split: Split, data: Mapping[str, Artefact]) -> TrainJob:
-    """A training and its artefact.
-
-    Raises:
-        ConfigurationError: a setting that makes no sense, a training that does not suit the estimator, or nothing to learn from.
-        DataError: the split names a recording that the data set does not have.
-    """
+    """A training and its artefact."""
     estimator, seed = new_estimator(config["estimator"]), config["seed"]
     settings_from_config(estimator.training_type, config["training"], "training")
     if not isinstance(seed, int) or isinstance(seed, bool) or not 0 <= seed < 2**63:
@@ -131,7 +126,6 @@ def write_model(job: TrainJob, estimator: Estimator, record: FitRecord, folder: 
 
 
 def _preparation(data: Mapping[str, Artefact]) -> dict[str, Any]:
-    """Method and transforms of the recordings, as in ``downsample`` of the configuration."""
     config = next(iter(data.values())).config  # the same for all data sets of a job
     return {"method": config["method"], "transforms": [dict(entry) for entry in config["transforms"]]}
 

@@ -20,8 +20,7 @@ from vehest.run.config_files import choices
 from vehest.run.printing import TerminalTable
 from vehest.run.train import new_estimator
 
-SCORED = ("vx", "vy_ref")
-"""Channels that every estimate is scored by."""
+SCORED = ("vx", "vy_ref")  # channels that every estimate is scored by
 
 
 @dataclass(frozen=True)
@@ -92,14 +91,7 @@ def all_usabilities(recordings: Sequence[RecordingSummary]) -> list[Usability]:
 def usability(
     name: str, config: Config, recordings: Sequence[RecordingSummary], to_estimate: Sequence[RecordingSummary] | None = None
 ) -> Usability:
-    """Whether the estimator of a configuration can be trained on recordings and used on them.
-
-    Args:
-        name: of the estimator, for people.
-        config: as composed for ``train``.
-        recordings: to train on, at least one unless others are given to estimate on.
-        to_estimate: recordings to estimate on; by default the same.
-    """
+    """Whether the estimator of a configuration can be trained on recordings and used on them."""
     to_estimate = recordings if to_estimate is None else to_estimate
     both, own = [*recordings, *to_estimate], str(config["estimator"]["name"])
     try:
@@ -160,16 +152,7 @@ def _cells(row: Usability) -> list[str]:
 
 
 def lack(config: Config, split: Split, contents: Mapping[str, Sequence[RecordingSummary]]) -> str:
-    """Channels that recordings of a split lack and its estimator needs, as one line; empty if none.
-
-    Args:
-        config: as composed for ``train`` or ``eval``; with ``evaluation`` the tests count too.
-        split: ranges to learn from, and to test on.
-        contents: data set -> its recordings.
-
-    Raises:
-        ConfigurationError: a setting makes no sense.
-    """
+    """Channels that recordings of a split lack and its estimator needs, as one line; empty if none."""
     estimator, training = _built(config)
     tested = [span for spans in split.tests.values() for span in spans] if "evaluation" in config else []
     scored = _recordings([*tested, *split.validation] if tested else [], contents)
@@ -204,7 +187,6 @@ def _recordings(spans: Sequence[Span], contents: Mapping[str, Sequence[Recording
 
 
 def _built(config: Config) -> tuple[Estimator, Any]:
-    """Estimator and settings of its training."""
     estimator = new_estimator(config["estimator"])
     return estimator, settings_from_config(estimator.training_type, config["training"], "training")
 

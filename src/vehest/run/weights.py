@@ -47,11 +47,7 @@ def write_weights(models: Iterable[Artefact], path: Path) -> None:
 
 
 class PublishedWeights:
-    """The models of a published study by the keys of their trainings; none where there is no such file.
-
-    Raises:
-        DataError: the file is damaged.
-    """
+    """The models of a published study by the keys of their trainings; none where there is no such file."""
 
     def __init__(self, path: Path) -> None:
         self.path = path

@@ -29,14 +29,10 @@ from vehest.simulation.road.surface import SURFACES, Surface
 from vehest.simulation.sensors.levels import PRESETS, SensorLevels
 from vehest.simulation.sensors.recording import described, measure
 
-RATE_HZ = 100.0
-"""Default sampling rate of recordings [Hz]."""
-AFTER_STAND = 1.0
-"""Recorded after the car has come to its stand [s]."""
-LONGEST_STOP = 60.0
-"""Within which a car stands that spun or left the road [s]."""
-STOPPING_SHARE = 0.7
-"""Share of the grip with which a driver brakes after a spin or beside the road; assumed."""
+RATE_HZ = 100.0  # default sampling rate of recordings [Hz]
+AFTER_STAND = 1.0  # recorded after the car has come to its stand [s]
+LONGEST_STOP = 60.0  # within which a car stands that spun or left the road [s]
+STOPPING_SHARE = 0.7  # share of the grip with which a driver brakes after a spin or beside the road; assumed
 
 
 @dataclass(frozen=True)
@@ -146,12 +142,7 @@ def drive(
     stability_control: bool = False,
     stint: Stint | None = None,
 ) -> Trip:
-    """Drive a car through a manoeuvre and keep its true motion.
-
-    Raises:
-        ConfigurationError: rate or step make no sense, or the car cannot do the manoeuvre.
-        SimulationError: the car rolled over, or a state is not finite.
-    """
+    """Drive a car through a manoeuvre and keep its true motion."""
     per_command = whole_steps(DRIVER_RATE_HZ, plant.step, "driver's")
     per_sample = whole_steps(rate_hz, plant.step, "sampling")
     controller = manoeuvre.controller(car_of(plant), surface, seed)
@@ -178,8 +169,6 @@ def drive(
 
 
 class _Ride:
-    """A car and its driver during a drive."""
-
     def __init__(
         self, plant: MultiBodyPlant, manoeuvre: Manoeuvre, controller: Controller, control: StabilityControl | None, stint: Stint | None
     ) -> None:
@@ -200,7 +189,7 @@ class _Ride:
 
     def decide(self, time: float) -> bool:
         """The driver's next command [s]; false if the drive is over."""
-        seen = _observe(self.state)
+        seen = Observation(*self.state.values[[X, Y, YAW, VX, VY, YAW_RATE, STEER]].tolist())
         decision = self._controller.command(time, seen)
         if self._stint is not None:
             decision = decision._replace(friction=decision.friction * self._stint.friction_at(time))
@@ -283,11 +272,7 @@ class _Ride:
 
 
 def whole_steps(rate_hz: float, step: float, what: str) -> int:
-    """Steps of the plant [s] between two ticks of a rate.
-
-    Raises:
-        ConfigurationError: no whole number of steps lies between them; ``what`` names the rate.
-    """
+    """Steps of the plant [s] between two ticks of a rate."""
     n_steps = round(1.0 / (rate_hz * step)) if rate_hz > 0 else 0
     if n_steps < 1 or abs(n_steps * step * rate_hz - 1.0) > 1e-9:
         raise ConfigurationError(
@@ -295,8 +280,3 @@ def whole_steps(rate_hz: float, step: float, what: str) -> int:
             f"lie between two samples (with 0.001 s: 10, 20, 25, 40, 50, 100, 125, 200, 250, 500 or 1000 Hz)"
         )
     return n_steps
-
-
-def _observe(state: PlantState) -> Observation:
-    values = state.values.tolist()
-    return Observation(values[X], values[Y], values[YAW], values[VX], values[VY], values[YAW_RATE], values[STEER])

@@ -19,14 +19,12 @@ from vehest.simulation.road.surface import SURFACES, Surface
 from vehest.simulation.sensors.levels import PRESETS, SensorLevels
 from vehest.simulation.sensors.recording import measure
 
-PLANAR_MANOEUVRES: Mapping[str, type[Freestyle]] = {Freestyle.name: Freestyle}
-"""Manoeuvres of the planar plant's cars by name."""
+PLANAR_MANOEUVRES: Mapping[str, type[Freestyle]] = {Freestyle.name: Freestyle}  # manoeuvres of the planar plant's cars by name
 
 CHANNELS = ("vx", "yaw_rate", "ax", "ay", "steer", "motor_speed", "motor_current", "vx_ref", "vy_ref", "yaw_rate_ref")
 """Channels of such a car: it has no sensor at its single wheels, and the inertial unit's other axes are not kept."""
 
-SPUN = np.pi / 2.0
-"""Sideslip angle beyond which a drive counts as one with a spin [rad]."""
+SPUN = np.pi / 2.0  # sideslip angle beyond which a drive counts as one with a spin [rad]
 
 
 def simulate_planar_drive(
@@ -75,12 +73,7 @@ def simulate_planar_drive(
 def drive_freely(
     plant: PlanarPlant, manoeuvre: Freestyle, seed: int, *, rate_hz: float = RATE_HZ, surface: Surface = SURFACES["dry"]
 ) -> Trip:
-    """Drive a car for the time of a recording and keep its true motion; it starts from standstill, SETTLING_TIME before the first sample.
-
-    Raises:
-        ConfigurationError: rate or step make no sense.
-        SimulationError: a state is not finite.
-    """
+    """Drive a car for the time of a recording and keep its true motion; it starts from standstill, SETTLING_TIME before."""
     per_command = whole_steps(COMMAND_RATE_HZ, plant.step, "driver's")
     per_sample = whole_steps(rate_hz, plant.step, "sampling")
     stride = int(np.gcd(per_command, per_sample))

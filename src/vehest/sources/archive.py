@@ -42,10 +42,6 @@ def unpacked(file: Path, *, most_bytes: int = MOST_BYTES) -> Iterator[Path]:
 
     All entries are checked before anything is written: no path outside the folder, no links or special files, no more bytes or files than
     the limits. zipfile unpacks no entry beyond its stated size, and checks its checksum. Archives inside stay packed.
-
-    Raises:
-        DataError: the archive is refused, truncated or corrupt.
-        MissingError: the archive cannot be opened, or there is no room to unpack it.
     """
     with temporary_folder(file) as folder:
         try:
@@ -81,7 +77,6 @@ def temporary_folder(file: Path) -> Iterator[Path]:
 
 
 def _checked_path(file: Path, entry: zipfile.ZipInfo) -> PurePosixPath:
-    """Path of an entry inside the folder."""
     name, kind = entry.filename, stat.S_IFMT(entry.external_attr >> 16)
     path = PurePosixPath(name.replace("\\", "/"))
     leaves = path.is_absolute() or PureWindowsPath(name).drive or ".." in path.parts or not path.parts or not name.isprintable()

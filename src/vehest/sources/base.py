@@ -23,10 +23,8 @@ from vehest.sources.clocks import require_clock
 
 NO_TABLES = (".vbo", ".mf4", ".mdf", ".dat", ".bag", ".db3", ".mcap")
 SPREADSHEETS = (".xlsx", ".xls", ".xlsm", ".ods")
-DERIVED = "derived"
-"""Key of a recording's provenance: transforms of its data set, and where its channels were measured."""
-SIMULATED = "simulated"
-"""Name of the source whose recordings are never real."""
+DERIVED = "derived"  # key of a recording's provenance: transforms of its data set, and where its channels were measured
+SIMULATED = "simulated"  # name of the source whose recordings are never real
 
 
 def kind_of(dataset: Mapping[str, Any]) -> Kind:
@@ -200,11 +198,7 @@ class Source(ABC):
 
 
 def open_source(dataset: Mapping[str, Any]) -> Source:
-    """The source that a data set's configuration names.
-
-    Raises:
-        ConfigurationError: an unknown source or option.
-    """
+    """The source that a data set's configuration names."""
     return source_class(dataset)(dataset)
 
 
@@ -230,11 +224,7 @@ def require_no_spreadsheet(file: Path) -> None:
 
 
 def source_class(dataset: Mapping[str, Any]) -> type[Source]:
-    """The class of a data set's source: ``SOURCE`` of the module ``vehest.sources.NAME``.
-
-    Raises:
-        ConfigurationError: there is none of that name.
-    """
+    """The class of a data set's source: ``SOURCE`` of the module ``vehest.sources.NAME``."""
     name = str(dataset.get("source"))
     found: type[Source] | None = _source_of(name) if name in _modules() else None
     if found is None:
@@ -267,12 +257,7 @@ def existing_folder(path: Any, dataset: str) -> Path:
 
 
 def require_files(files: Sequence[Path], dataset: str) -> None:
-    """Refuse missing and empty files.
-
-    Raises:
-        MissingError: one is not there or is empty.
-        DataError: one is a pipe, a device or a folder.
-    """
+    """Refuse files that are missing or empty (`MissingError`), and pipes, devices and folders (`DataError`)."""
     for file in files:
         try:
             size = regular_file(file).stat().st_size

@@ -18,9 +18,6 @@ def seconds_of_text(column: pa.ChunkedArray) -> FloatArray | None:
     """Times ``10:59:30.25``, ``2024-05-03T10:59:30.25Z`` or ``3.5.2024 10:59:30,25`` in seconds, (N,); None for other text.
 
     With a date they count from 1970, without one from midnight, and on beyond the next. The zone is not read.
-
-    Args:
-        column: strings, (N,).
     """
     from pyarrow import compute
 

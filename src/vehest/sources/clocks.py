@@ -40,11 +40,7 @@ RATE_TOLERANCE = 5e-3
 
 
 def require_clock(stamps: FloatArray, where: str, fix: str = SORT, *, may_repeat: bool = False) -> None:
-    """Refuse time stamps that have a `clock_fault`; ``where`` names file and signal.
-
-    Raises:
-        DataError: they have one.
-    """
+    """Refuse time stamps that have a `clock_fault`, by a `DataError`; ``where`` names file and signal."""
     if fault := clock_fault(stamps, fix, may_repeat=may_repeat):
         raise DataError(f"{where}: {fault}")
 
@@ -69,11 +65,7 @@ def clock_fault(stamps: FloatArray, fix: str = SORT, *, may_repeat: bool = False
 
 
 def span_fault(stamps: FloatArray) -> str:
-    """A stray one among time stamps, more than 1e8 median steps from the others, in words; empty where none is.
-
-    Args:
-        stamps: in any unit, at least two, shape (T,); they may repeat.
-    """
+    """A stray one among time stamps, more than 1e8 median steps from the others, in words; empty where none is."""
     steps = np.diff(stamps)
     step = float(np.median(steps)) or float(steps.mean())
     if not stamps[-1] - stamps[0] > MOST_STEPS * step:
@@ -117,11 +109,7 @@ def unevenness(stamps: FloatArray) -> str:
 
 
 def require_samples(values: FloatArray, times: FloatArray, longest: float, where: str) -> None:
-    """Refuse samples, shape (T,), that are no finite numbers or whose increasing times [s] lie further apart than ``longest`` [s].
-
-    Raises:
-        DataError: there are such; ``where`` names file and signal.
-    """
+    """Refuse samples, shape (T,), that are no finite numbers or whose increasing times [s] lie further apart than ``longest`` [s]."""
     bad, steps = np.flatnonzero(~np.isfinite(values)), np.diff(times)
     if len(bad):
         what = f"{len(bad)} samples between {times[bad[0]]:.6g} s and {times[bad[-1]]:.6g} s that are marked invalid or no finite numbers"
@@ -261,11 +249,7 @@ def common_span(spans: Mapping[str, tuple[float, float]], where: str) -> tuple[f
 
 
 def ticks_within(begin: float, end: float, rate_hz: float, where: str) -> FloatArray:
-    """Whole multiples of a sampling interval from ``begin`` to ``end`` [s], shape (T,).
-
-    Raises:
-        DataError: they are fewer than two or more than the limits allow.
-    """
+    """Whole multiples of a sampling interval from ``begin`` to ``end`` [s], (T,); `DataError` below two or above the limits."""
     n_samples = (end - begin) * rate_hz
     check_limit("samples", n_samples, f"{where} would become {n_samples:.0f} samples from {begin:.6g} s to {end:.6g} s at {rate_hz:g} Hz")
     ticks = np.arange(math.ceil(begin * rate_hz - SLACK), math.floor(end * rate_hz + SLACK) + 1) / rate_hz
@@ -301,10 +285,6 @@ def plain_rate(rate: float, tolerance: float) -> float:
     """The rate that was meant: the nearest whole number of Hz, ms, mHz or µs, the coarse ones first.
 
     A double holds unix time to 0.24 µs, so that the rate computed from time stamps would not be a rational multiple of any other.
-
-    Args:
-        rate: as computed from time stamps [Hz].
-        tolerance: relative deviation that is put down to the stamps.
     """
     for scale in (1.0, 1e3):
         hertz = round(rate * scale) / scale

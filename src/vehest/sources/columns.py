@@ -39,11 +39,7 @@ class Column:
 
 
 def columns_from_config(entries: Mapping[str, Any], dataset: str, kind: type[Column] = Column) -> dict[str, Column]:
-    """Channel -> its declaration of ``kind``, as a data set declares them.
-
-    Raises:
-        ConfigurationError: an unknown channel, unit or key.
-    """
+    """Channel -> its declaration of ``kind``, as a data set declares them; `ConfigurationError` for an unknown channel, unit or key."""
     columns = {}
     for name, entry in entries.items():
         where = f"data set '{dataset}': channel '{name}'"
@@ -55,11 +51,7 @@ def columns_from_config(entries: Mapping[str, Any], dataset: str, kind: type[Col
 
 
 def column_from_config(entry: Any, where: str, si_unit: str, kind: type[Column] = Column) -> Column:
-    """A declaration of ``kind`` whose unit is convertible to ``si_unit``.
-
-    Raises:
-        ConfigurationError: a key is missing or unknown, or the unit is of another quantity.
-    """
+    """A declaration of ``kind`` whose unit is convertible to ``si_unit``."""
     column = validated(kind, entry, where, error=ConfigurationError)
     if column.factor == 0:
         raise ConfigurationError(f"{where}: factor must be a number other than 0")

@@ -74,11 +74,7 @@ class Download:
         return f"{self.url.rstrip('/')}/{quote(name)}"
 
     def missing(self) -> list[str]:
-        """Files that are not there; those that are there are checked. Writes nothing.
-
-        Raises:
-            DataError: a file, or the record of checksums, is damaged or another one.
-        """
+        """Files that are not there; those that are there are checked. Writes nothing."""
         return [name for name in self.files if self._checked(name) is None]
 
     def fetch(self, progress: Progress | None = None) -> Iterator[Outcome]:
@@ -140,12 +136,7 @@ class Download:
 
 
 def download_of(source: Source) -> Download:
-    """Option ``download`` of a data set.
-
-    Raises:
-        ConfigurationError: it is missing or makes no sense.
-        MissingError: no data root is set.
-    """
+    """Option ``download`` of a data set."""
     where = f"data set '{source.name}'"
     options = validated(DownloadOptions, source.dataset.get("download"), where, error=ConfigurationError, group="dataset.download")
     try:

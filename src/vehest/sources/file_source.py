@@ -32,24 +32,13 @@ class FileSource(Source):
         return {file.name: file for file in self._files()}
 
     def read_raw(self, recording_id: str) -> Recording:
-        """Read one file by its name.
-
-        Raises:
-            MissingError: there is none of that name.
-            DataError: it cannot be used.
-        """
+        """Read one file by its name."""
         for file in self._files():
             if self._id_of(file) == recording_id:
                 return self.read_raw_file(file)
         raise self._no_recording(recording_id)
 
     def _files(self) -> list[Path]:
-        """Files of the data set, in alphabetical order.
-
-        Raises:
-            MissingError: there is no folder, or no file matches.
-            DataError: two files have the same name.
-        """
         folder = existing_folder(self.dataset.get("path"), self.name)
         files = self._matching(folder)
         if not files:

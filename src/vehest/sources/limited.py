@@ -91,17 +91,12 @@ def read_limited(reader: str, file: Path, **request: Any) -> Reading:
 
 
 def require_package(module: str, extra: str, what: str) -> None:
-    """See that an optional package is installed.
-
-    Raises:
-        MissingError: it is not.
-    """
+    """See that an optional package is installed."""
     if find_spec(module) is None:
         raise MissingError(f"{what} needs the package {module}; install it with: pip install 'vehest[{extra}]'")
 
 
 def _ended(file: Path, code: int, seconds: float, memory: float) -> DataError:
-    """The error of a reading process that gave no answer."""
     if code in (-getattr(signal, "SIGXCPU", 0), -getattr(signal, "SIGKILL", 0)):
         return DataError(f"'{file}' takes more than {seconds:.0f} s to read, too long for its size; it is damaged, or of another format")
     if code == NO_MEMORY:

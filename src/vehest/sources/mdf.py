@@ -51,16 +51,10 @@ def read_measurement(file: Path, wanted: Wanted | None) -> tuple[dict[str, Signa
     """Signals of a measurement.
 
     Args:
-        file: of version 2, 3 or 4.
         wanted: where each signal stands; None for every signal of numbers whose group has times.
 
     Returns:
         Signals by their keys, what was not read and why, and ``version``, ``start`` and, by key, ``signals`` of the file.
-
-    Raises:
-        MissingError: there is no such file, or asammdf is not installed.
-        DataError: the file cannot be read, holds a formula or is more than the limits, or a wanted signal is not there, ambiguous, no
-            number, or without usable times.
     """
     require_package("asammdf", "mdf", f"reading '{file}'")
     reading = read_limited("vehest.sources.readers.mdf:read", regular_file(file), wanted=wanted)

@@ -15,8 +15,7 @@ from vehest.data.errors import DataError
 
 UpAxis = Literal["y", "z"]
 PoseChannel = Literal["vx_ref", "vy_ref", "yaw_rate_ref", "sideslip_ref"]
-POSE_CHANNELS: tuple[PoseChannel, ...] = get_args(PoseChannel)
-"""Channels that poses give."""
+POSE_CHANNELS: tuple[PoseChannel, ...] = get_args(PoseChannel)  # channels that poses give
 
 
 @dataclass(frozen=True)
@@ -57,12 +56,7 @@ class PoseOptions:
         Args:
             positions: of the rigid body's origin, x and y with z up [m], evenly sampled, shape (T, 2).
             yaw: of the rigid body, unwrapped [rad], shape (T,).
-            interval: between two samples [s].
             turned: from the rigid body's x axis to the car's forward axis, counter-clockwise [rad].
-            where: file and topic, for messages.
-
-        Raises:
-            DataError: there are fewer poses than the window holds.
 
         Source:
             Savitzky & Golay, Smoothing and differentiation of data by simplified least squares procedures, Anal. Chem. 36 (8), 1964.
@@ -87,13 +81,9 @@ def ground_plane(positions: FloatArray, orientations: FloatArray, up: UpAxis, wh
         positions: x, y, z in the world [m], shape (T, 3).
         orientations: quaternions x, y, z, w from the rigid body's axes to the world's, shape (T, 4).
         up: the world's and the rigid body's upward axis; ``y`` is usual in motion capture, ``z`` in ROS.
-        where: file and topic, for messages.
 
     Returns:
         positions, shape (T, 2), and yaw [rad], shape (T,), both with z up.
-
-    Raises:
-        DataError: a quaternion is not of unit length.
     """
     with np.errstate(over="ignore"):
         length = np.linalg.norm(orientations, axis=1)

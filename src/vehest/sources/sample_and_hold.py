@@ -43,14 +43,9 @@ class SampleAndHold:
         Args:
             columns: of the held channels.
             values: of a table's columns, shape (T,).
-            clock: of the recording.
-            where: file, for messages.
 
         Returns:
             Channels on every tick, NaN outside their samples; the ticks between two samples of every channel; rate of the samples [Hz].
-
-        Raises:
-            DataError: the channels change in fewer than two rows, or no tick lies between two samples of each.
         """
         markers = {column.column for column in columns.values()} if self.updated is None else {str(self.updated)}
         rows = np.flatnonzero(np.any([np.diff(values[name]) != 0 for name in markers], axis=0)) + 1  # the first row's sample may be older
@@ -72,11 +67,7 @@ class SampleAndHold:
 
 
 def held_from_config(entry: Any, known: Sequence[str], where: str) -> SampleAndHold:
-    """A data set's declaration of held channels.
-
-    Raises:
-        ConfigurationError: it names a channel that the data set does not declare, or makes no sense.
-    """
+    """A data set's declaration of held channels."""
     held = validated(SampleAndHold, entry, where, error=ConfigurationError)
     if unknown := [name for name in held.channels if name not in known]:
         raise ConfigurationError(f"{where} names '{unknown[0]}', which is not one of the data set's channels")

@@ -86,12 +86,7 @@ class SignalSource(FileSource):
             raise ConfigurationError(f"{self.where}: raster must name one of its channels that is not gappy, not '{options.raster}'")
 
     def read_raw_file(self, file: Path) -> Recording:
-        """Read a file of signals wherever it is.
-
-        Raises:
-            MissingError: it is not there or empty.
-            DataError: it is damaged, more than the limits, lacks a signal, or its signals cannot be brought to one clock.
-        """
+        """Read a file of signals wherever it is."""
         require_files([file], self.name)
         signals, provenance = self._read_signals(file)
         if self.options.file_units == "check":
@@ -108,11 +103,7 @@ class SignalSource(FileSource):
 
     @abstractmethod
     def _read_signals(self, file: Path) -> tuple[dict[str, Signal], dict[str, Any]]:
-        """The signal of each channel, with stamps that pass `require_clock`, and an entry for the provenance.
-
-        Raises:
-            DataError: it is damaged, more than the limits, or lacks a signal.
-        """
+        """The signal of each channel, with stamps that pass `require_clock`, and an entry for the provenance."""
 
     def _clock(self, signals: Mapping[str, Signal], file: Path) -> tuple[FloatArray, FloatArray, float]:
         """Stamps [s] at which every signal that is not gappy has values, the even clock behind them [s], and its rate [Hz]."""

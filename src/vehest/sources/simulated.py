@@ -113,7 +113,6 @@ class SimulatedSource(Source):
         return int(np.random.SeedSequence([self.options.seed, zlib.crc32(drive_id.encode())]).generate_state(1)[0]) if own is None else own
 
     def _simulation(self, drive_id: str, variations: Sequence[Any]) -> partial[Recording]:
-        """The simulation of a drive, with its vehicle varied."""
         from vehest.simulation.road.surface import surface_from_config
         from vehest.simulation.sensors.config import sensor_levels_from_config
 

@@ -33,11 +33,7 @@ class TablePose(PoseOptions):
         return {"x": self.x, "y": self.y, "yaw": self.yaw}
 
     def made_of(self, values: Mapping[str, FloatArray], clock: Clock, where: str) -> dict[str, FloatArray]:
-        """Reference channels on the recording's clock, on which poses are differentiated: offline, by half a window.
-
-        Raises:
-            DataError: a pose is missing, or there are fewer than the filter's window.
-        """
+        """Reference channels on the recording's clock, on which poses are differentiated: offline, by half a window."""
         poses = {name: column.to_si(values[column.column], UNITS[name]) for name, column in self.columns.items()}
         for name, samples in poses.items():
             odd = np.flatnonzero(~np.isfinite(samples))
@@ -50,11 +46,7 @@ class TablePose(PoseOptions):
 
 
 def table_pose_from_config(entry: Any, where: str) -> TablePose:
-    """A data set's declaration of poses in columns.
-
-    Raises:
-        ConfigurationError: it lacks a column or a unit, or says something else.
-    """
+    """A data set's declaration of poses in columns."""
     pose = validated(TablePose, entry, where, error=ConfigurationError)
     for name, unit in UNITS.items():
         column_from_config(entry[name], f"{where}: {name}", unit)

@@ -17,11 +17,7 @@ RANGE = re.compile(r"([1-9]\d*)(?:-(\d*))?")
 
 
 def dropped_rows_from_config(entries: Mapping[str, Iterable[int | str]], where: str) -> dict[str, list[slice]]:
-    """Rows that a data set leaves out, by the stem of their file: numbers from 1 below the header, or ranges of them.
-
-    Raises:
-        ConfigurationError: a row is neither a number nor a range such as ``"700-750"`` or ``"8143-"``, the rest of the file.
-    """
+    """Rows that a data set leaves out, by the stem of their file: numbers from 1 below the header, or ranges of them."""
     return {str(stem): [_rows(row, f"{where}: drop_rows of '{stem}'") for row in rows] for stem, rows in entries.items()}
 
 
@@ -57,11 +53,6 @@ def counted_runs(numbers: FloatArray, column: str, file: Path) -> dict[int | Non
             raise DataError(f"'{file}': run {run} begins again in data row {rows.start + 1}; a run is uninterrupted, sort the rows")
         runs[run] = rows
     return runs
-
-
-def restarted_runs(stamps: FloatArray) -> dict[int | None, slice]:
-    """Rows of each run, counted from 0, where a new one begins as time goes backwards."""
-    return dict(enumerate(stretches(np.diff(stamps) < 0, len(stamps))))
 
 
 def stretches(begins: NDArray[np.bool_], n_rows: int) -> list[slice]:

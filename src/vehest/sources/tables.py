@@ -48,12 +48,7 @@ def is_parquet(file: Path) -> bool:
 
 
 def column_names(file: Path, layout: TextLayout = TextLayout()) -> list[str]:
-    """Names of a table's columns, in order.
-
-    Raises:
-        MissingError: there is no such file.
-        DataError: it cannot be read, or has too many columns.
-    """
+    """Names of a table's columns, in order."""
     if layout.names is not None:
         names = list(layout.names)
     elif is_parquet(file):
@@ -71,12 +66,7 @@ def column_names(file: Path, layout: TextLayout = TextLayout()) -> list[str]:
 
 
 def read_head(file: Path, size: int = BLOCK) -> bytes:
-    """First bytes of a table, unpacked.
-
-    Raises:
-        MissingError: there is no such file.
-        DataError: it cannot be read.
-    """
+    """First bytes of a table, unpacked."""
     try:
         with table_stream(file) as stream:
             return bytes(stream.read(size))
@@ -148,13 +138,7 @@ def parse_table(opened: Callable[[], pa.NativeFile], layout: TextLayout, convert
 
 
 def table_stream(file: Path) -> pa.NativeFile:
-    """Text of a table; one whose name ends in ``.gz``, ``.bz2``, ``.zst`` or ``.lz4`` is unpacked into memory, within the limits.
-
-    Raises:
-        MissingError: there is no such file.
-        DataError: it is a pipe, a device or a folder, or unpacks to more than it may.
-        OSError: it cannot be opened, or is damaged.
-    """
+    """Text of a table; one whose name ends in ``.gz``, ``.bz2``, ``.zst`` or ``.lz4`` is unpacked into memory, within the limits."""
     packed = PACKED.get(regular_file(file).suffix.lower())
     stream = pa.input_stream(open(file, "rb"), compression=packed)  # noqa: SIM115 (pyarrow opens no name that is not UTF-8)
     if packed is None:

@@ -8,6 +8,7 @@ from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import Annotated, Any
 
+import numpy as np
 from pydantic import AfterValidator, Field
 
 from vehest.constants import FloatArray
@@ -17,19 +18,11 @@ from vehest.data.recording import Recording
 from vehest.data.store import is_stored_recording, read_recording
 from vehest.sources.base import open_source, require_files
 from vehest.sources.clocks import Clock, ClockPolicy, uniform_clock
-from vehest.sources.columns import (
-    ChannelMap,
-    ChannelNames,
-    Column,
-    ColumnName,
-    Positive,
-    column_from_config,
-    columns_from_config,
-)
+from vehest.sources.columns import ChannelMap, ChannelNames, Column, ColumnName, Positive, column_from_config, columns_from_config
 from vehest.sources.file_source import FileSource
 from vehest.sources.sample_and_hold import held_from_config
 from vehest.sources.table_pose import table_pose_from_config
-from vehest.sources.table_rows import counted_runs, dropped_rows_from_config, kept_rows, restarted_runs
+from vehest.sources.table_rows import counted_runs, dropped_rows_from_config, kept_rows, stretches
 from vehest.sources.tables import TextLayout, column_names, listed, read_columns
 
 
@@ -104,12 +97,7 @@ class TabularSource(FileSource):
         return self._read(*found[recording_id])
 
     def read_raw_file(self, file: Path) -> Recording:
-        """Read a table wherever it is.
-
-        Raises:
-            MissingError: it is not there or empty.
-            DataError: it cannot be read, lacks a column, holds text where numbers belong, or holds several runs.
-        """
+        """Read a table wherever it is."""
         runs = list(self._runs_of(file))
         if len(runs) > 1:
             raise DataError(f"'{file}' holds {len(runs)} runs ({listed([str(run) for run in runs])}); keep the rows of one")
@@ -192,22 +180,15 @@ class TabularSource(FileSource):
         if file not in self._known_runs:
             require_files([file], self.name)
             numbers = self._values(file, [counter])[counter]
-            restarts = self.options.time_restarts
-            self._known_runs[file] = restarted_runs(numbers) if restarts else counted_runs(numbers, counter, file)
+            if self.options.time_restarts:  # a run begins where time goes backwards
+                self._known_runs[file] = {**dict(enumerate(stretches(np.diff(numbers) < 0, len(numbers))))}
+            else:
+                self._known_runs[file] = counted_runs(numbers, counter, file)
         return self._known_runs[file]
 
 
 def unused_columns(dataset: Mapping[str, Any], file: Path | None = None) -> list[str]:
-    """Names of columns that could be declared as channels; none where the source of the data set is not ``tabular``.
-
-    Args:
-        dataset: its configuration.
-        file: the table; the first of the data set if none is given.
-
-    Raises:
-        MissingError: there is no such file.
-        DataError: it cannot be read.
-    """
+    """Names of columns that could be declared as channels; none where the source of the data set is not ``tabular``."""
     source = open_source(dataset)
     if type(source) is not TabularSource:
         return []

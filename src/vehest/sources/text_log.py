@@ -16,8 +16,7 @@ from pydantic import Field
 from vehest.constants import FloatArray
 from vehest.sources.tabular import TabularOptions, TabularSource
 
-CLOCK = "clock"
-"""Unit of times that are written as a clock's."""
+CLOCK = "clock"  # unit of times that are written as a clock's
 LONGEST_BRIDGE = 10.0  # s
 
 

@@ -45,18 +45,7 @@ def plain_unit(text: str) -> str | None:
 
 
 def require_unit(written: str, column: Column, si_unit: str, where: str, fix: str) -> None:
-    """Refuse a declared unit that contradicts the file's; unknown spellings pass.
-
-    Args:
-        written: unit in the file.
-        column: declaration; one with a factor other than 1 is in another unit than its file on purpose.
-        si_unit: of the channel.
-        where: file and signal, for messages.
-        fix: how to let it pass, for messages.
-
-    Raises:
-        DataError: the units differ.
-    """
+    """Refuse a declared unit that contradicts the file's; unknown spellings pass."""
     plain = plain_unit(written)
     if plain is None or column.factor != 1.0:
         return

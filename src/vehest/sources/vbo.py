@@ -28,8 +28,7 @@ from vehest.sources.tables import TextLayout, read_columns, require_columns
 from vehest.sources.unit_spellings import require_unit
 
 LONGEST_HEAD = 1 << 20  # bytes before the rows
-UNITS = {"velocity": "km/h", "vert-vel": "km/h", "Longacc": "g", "Latacc": "g"}
-"""Units that the format has without saying so."""
+UNITS = {"velocity": "km/h", "vert-vel": "km/h", "Longacc": "g", "Latacc": "g"}  # units that the format has without saying so
 JUMP = 1.5  # intervals by which the last row may come late
 KMH = 3.6
 FASTEST_STILL, LEAST_TURN = 5.0, 0.05  # m/s, rad/s: below, slip at two wheels says nothing
@@ -77,13 +76,7 @@ class VboSource(FileSource):
         self._require_pattern()
 
     def read_raw_file(self, file: Path) -> Recording:
-        """Read a log wherever it is.
-
-        Raises:
-            MissingError: it is not there or empty.
-            DataError: it is damaged, lacks a column, is in another unit than declared, its clock is uneven, or its slip angles were
-                computed with offsets that change places (unless ``accept`` holds ``slip_offsets``).
-        """
+        """Read a log wherever it is."""
         require_files([file], self.name)
         log = read_log(file)
         used = [column.column for column in self.columns.values()]
@@ -102,9 +95,6 @@ def read_log(file: Path) -> Log:
     """Everything in a log.
 
     A last row that is cut off, or comes more than half an interval late, as loggers write when they are stopped, is left out.
-
-    Raises:
-        DataError: it is no such file, is damaged, or is more than the limits allow.
     """
     head, mark, rows = regular_file(file).read_bytes().partition(b"[data]")
     if not mark or len(head) > LONGEST_HEAD:
@@ -148,9 +138,6 @@ def require_slip_offsets(log: Log, where: str) -> None:
 
     The logger computes slip at points whose offsets from the antenna were entered as {lateral, longitudinal}. Where the two change places,
     front and rear wheel of a side have the same longitudinal offset, and the same slip.
-
-    Raises:
-        DataError: slip is the same at both though the car turns.
     """
     needed = ("Slip_FL", "Slip_RL", "YawRate", "velocity")
     if not {"FL", "RL"} <= set(log.offsets) or not set(needed) <= set(log.columns):

@@ -21,16 +21,7 @@ from vehest.evaluation.metrics import Protocol, Scored, score_all
 
 
 def read_frame(path: Path, columns: Iterable[str] = (), *, numbers: Iterable[str] = ()) -> pd.DataFrame:
-    """A table that vehest wrote as CSV, its numbers bit for bit.
-
-    Args:
-        columns: that it must have.
-        numbers: those of them that must hold numbers.
-
-    Raises:
-        MissingError: there is no such file.
-        DataError: it cannot be read, or a column is not there or holds text.
-    """
+    """A table that vehest wrote as CSV, its numbers bit for bit, with ``columns`` of which ``numbers`` hold numbers; else an error."""
     text = read_text(path)
     try:
         table = pd.read_csv(io.StringIO(text), float_precision="round_trip")
@@ -155,11 +146,7 @@ class StoredDataset:
     citation: str = ""  # what to cite
 
     def recordings(self, channels: Iterable[str] | None = None) -> Iterator[Recording]:
-        """All recordings, one at a time, with all or some of their channels.
-
-        Raises:
-            DataError: a file is damaged or lacks a channel.
-        """
+        """All recordings, one at a time, with all or some of their channels."""
         wanted = None if channels is None else list(channels)
         for file in self.files.values():
             yield read_recording(file, wanted)

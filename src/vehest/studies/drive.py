@@ -52,7 +52,6 @@ def comparison(artefacts: PartArtefacts, named: Mapping[str, Name] | None = None
     """The report of a comparison: headline, then each test set, then the training; how it was made is the appendix.
 
     Args:
-        artefacts: of the comparison.
         named: test set -> estimator that its traces begin with.
 
     Raises:
@@ -80,9 +79,6 @@ def leaderboard(artefacts: PartArtefacts) -> pd.DataFrame:
     ``epochs`` is NaN for a method without. ``start`` is ``reference`` if the protocol hands the true
     initial state over, else ``own``.
     Sideslip in deg, velocities in m/s.
-
-    Raises:
-        DataError: two different values for one metric of one run, or no validation metrics to choose a seed by.
     """
     runs, start = runs_of(artefacts), "reference" if artefacts.protocol.initial_state else "own"
     rankings = {test_set: ranking_of(artefacts, test_set) for test_set in artefacts.split.tests}

@@ -30,11 +30,7 @@ TEST = "test"
 
 
 def documents(artefacts: StudyArtefacts) -> dict[str, Document]:
-    """The report: verdict over all folds, the table, errors of each fold; ranges and budgets are the appendix.
-
-    Raises:
-        DataError: no estimator was scored on all folds, or errors by segment are missing or damaged.
-    """
+    """The report: verdict over all folds, the table, errors of each fold; ranges and budgets are the appendix."""
     parts = artefacts.parts
     folds = segments_of_folds(parts)
     first = next(iter(parts.values()))
@@ -62,11 +58,7 @@ def documents(artefacts: StudyArtefacts) -> dict[str, Document]:
 
 
 def segments_of_folds(parts: Mapping[str, PartArtefacts]) -> dict[Name, list[list[Segments]]]:
-    """Errors by segment, a list a seed and in it one a fold, of the candidates with finite errors in every fold.
-
-    Raises:
-        DataError: there are none.
-    """
+    """Errors by segment, a list a seed and in it one a fold, of the candidates with finite errors in every fold."""
     groups = [{name: {model.seed: model for model in own} for name, own in by_name(part.models).items()} for part in parts.values()]
     found = {}
     for name in groups[0]:
@@ -97,7 +89,6 @@ def overview(
 
 
 def _left_out(parts: Mapping[str, PartArtefacts], folds: Mapping[Name, object], titles: Mapping[Name, str]) -> list[str]:
-    """What is not in the table, and why."""
     lines = [f"{as_text(part.title)}: {line}" for part in parts.values() for line in warnings_of(part) if "is left out" in line]
     lost = [titles[name] for name in titles if name not in folds]
     return [*lines, *([f"Not in every fold with a finite error, and so not in the table: {listed(lost)}."] if lost else [])]

@@ -33,8 +33,7 @@ from vehest.studies.kit.warnings import cannot_rank
 TAKES = "parts"
 SHOWS_FAILED = True
 HARD = 4.0  # m/s², from which on driving says something of the tyres
-PLAIN = (*BASELINES, "kinematic", "data_sheet")
-"""Estimators that others have to beat."""
+PLAIN = (*BASELINES, "kinematic", "data_sheet")  # estimators that others have to beat
 
 VERSION = "3"
 leaderboard = drive.leaderboard

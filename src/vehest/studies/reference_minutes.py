@@ -21,10 +21,7 @@ def documents(artefacts: StudyArtefacts) -> dict[str, Document]:
     curves = curves_of(list(artefacts.parts.values()))
     rows = [{"curve": f"{curve.title}, {curve.test_set}", **row} for curve in curves for row in rows_of_curve(curve)]
     overview = Table(
-        "overview",
-        "RMSE(β) by minutes of reference, all curves.",
-        pd.DataFrame(rows),
-        {"curve": Column("test set"), **COLUMNS},
+        "overview", "RMSE(β) by minutes of reference, all curves.", pd.DataFrame(rows), {"curve": Column("test set"), **COLUMNS}
     )
     data = list(dict.fromkeys(data_sentence(part) for part in artefacts.parts.values()))
     blocks: list[Block] = [artefacts.about, "\n\n".join(data)]

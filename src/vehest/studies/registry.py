@@ -16,7 +16,7 @@ from __future__ import annotations
 
 import importlib
 from functools import cache
-from importlib.metadata import EntryPoint, entry_points
+from importlib.metadata import entry_points
 from types import ModuleType
 
 from vehest.data.errors import ConfigurationError
@@ -35,11 +35,7 @@ def study_module(name: str) -> ModuleType:
     """The module behind a name; raises `ConfigurationError` where the name is unknown."""
     if name in OWN:
         return importlib.import_module(f"{ENTRY_POINTS}.{name}")
-    point = _entry_point(name)
+    point = next((point for point in entry_points(group=ENTRY_POINTS) if point.name == name), None)
     if point is None:
         raise ConfigurationError(f"there is no study module '{name}'; there are: {', '.join(study_names())}")
     return importlib.import_module(point.module)
-
-
-def _entry_point(name: str) -> EntryPoint | None:
-    return next((point for point in entry_points(group=ENTRY_POINTS) if point.name == name), None)

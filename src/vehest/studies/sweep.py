@@ -102,9 +102,6 @@ def is_of_fault(key: str) -> bool:
 def interval(values: FloatArray) -> tuple[float, float]:
     """Mean, and half the two-sided 95 % confidence interval of the mean, from Student's t distribution with n - 1 degrees of freedom.
 
-    Args:
-        values: one a seed, shape (n,). One that is not finite makes the mean NaN: no seed is left out silently.
-
     Returns:
         Mean and half interval; NaN where there are no values, half NaN for one value.
     """

@@ -24,16 +24,11 @@ from vehest.studies.transfer_figure import transfer_figure
 
 TAKES = "parts"
 SHOWS_FAILED = True
-REFERENCES = ("zero", "static_map", "kinematic", "data_sheet")
-"""Baselines, in the order in which tables show them first."""
+REFERENCES = ("zero", "static_map", "kinematic", "data_sheet")  # baselines, in the order in which tables show them first
 
 
 def documents(artefacts: StudyArtefacts) -> dict[str, Document]:
-    """The report: what carried over, a table estimator x vehicle with the baselines first, each vehicle by itself, then how it was made.
-
-    Raises:
-        DataError: errors by segment are missing or damaged.
-    """
+    """The report: what carried over, a table estimator x vehicle with the baselines first, each vehicle by itself, then how it was made."""
     parts = artefacts.parts
     rankings = {(name, test_set): ranking_of(part, test_set) for name, part in parts.items() for test_set in part.split.tests}
     board = overview(parts, rankings)

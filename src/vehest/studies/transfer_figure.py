@@ -15,11 +15,7 @@ ROW = 0.16  # in, height of an estimator
 
 
 def transfer_figure(board: pd.DataFrame) -> MatplotlibFigure:
-    """A panel a test, a row an estimator: RMSE(β) over that of v = 0 with its interval, and the static map as a vertical line.
-
-    Args:
-        board: rows with part, title, test_set, estimator, variant, estimator_title, rmse_sideslip and its interval.
-    """
+    """A panel a test, a row an estimator: RMSE(β) over that of v = 0 with its interval, and the static map as a vertical line."""
     places = list(dict.fromkeys(zip(board["part"], board["test_set"], strict=True)))
     names = list(dict.fromkeys(zip(board["estimator"], board["variant"], board["estimator_title"], strict=True)))
     names = [name for name in names if name[0] != "zero"]

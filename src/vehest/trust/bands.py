@@ -165,11 +165,7 @@ def band_rows(rows, vy, variance, columns, numbers, bands):  # type: ignore[no-u
 
 
 def with_bands(estimate: Estimate, measured: Recording, bands: Bands, *, elsewhere: bool = False) -> Estimate:
-    """An estimate of ``measured`` with its 90 % half widths as ``band_vy`` [m/s] and ``band_sideslip`` [rad].
-
-    Raises:
-        DataError: the estimate is not on the recording's clock, or the recording lacks a channel.
-    """
+    """An estimate of ``measured`` with its 90 % half widths as ``band_vy`` [m/s] and ``band_sideslip`` [rad]."""
     rows, vy, variance = band_inputs(estimate, measured, bands.channels, bands.horizon_steps)
     half = bands.half_widths(rows, vy, variance, elsewhere=elsewhere)
     return replace(estimate, channels={**estimate.channels, "band_vy": half[:, 0].copy(), "band_sideslip": half[:, 1].copy()})
@@ -181,9 +177,6 @@ def band_inputs(
     """Rows (T, C), estimates (T,) and their variances (T,), NaN where the method gives none, as bands take them.
 
     A row is the last sample that the estimate was made of, so that online they are the same.
-
-    Raises:
-        DataError: the estimate is not on the recording's clock, or the recording lacks a channel.
     """
     if len(estimate) != len(measured):
         raise DataError(f"the estimate of '{estimate.recording_id}' has {len(estimate)} samples, the recording {len(measured)}")
@@ -224,9 +217,6 @@ def calibrated(training: Sequence[Piece], validation: Sequence[Piece], channels:
     """Bands of a model: scale and domain from training ranges, factors from validation ranges that it has not learnt from.
 
     ``channels`` are the columns of the rows; ``origin`` holds what else `Bands` says of the model and its recordings.
-
-    Raises:
-        DataError: there is no sample whose error is known, in one of the two.
     """
     for pieces, what in ((training, "training"), (validation, "validation")):
         if not any(piece.known.any() for piece in pieces):

@@ -90,8 +90,6 @@ def estimate_guarded(
 
 
 class _Run:
-    """Estimates a recording piece by piece between the estimator's starts."""
-
     def __init__(
         self, estimator: Estimator, recording: Recording, cleaned: Cleaned, watch: Watch, initial_state: Mapping[str, float] | None
     ) -> None:

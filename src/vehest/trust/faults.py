@@ -47,8 +47,7 @@ OFFSETS: dict[str, Sizes] = {
 OFFSETS_OF_SPEED: Sizes = (0.02, 0.08, 0.25)
 """Offsets of angular speeds of wheels and motor, as shares of the largest size in the samples: their radii differ by a factor of ten."""
 
-OFFSETS_OF_RANGE: Sizes = (0.01, 0.05, 0.2)
-"""Offsets of all other channels, as shares of the largest size that `CHANNELS` allows."""
+OFFSETS_OF_RANGE: Sizes = (0.01, 0.05, 0.2)  # offsets of all other channels, as shares of the largest size that `CHANNELS` allows
 
 UNIT_FACTORS: dict[str, Sizes] = {
     "m/s": (2.236936, 1.0 / 3.6, 3.6),
@@ -66,11 +65,7 @@ WHEEL_FACTORS: Sizes = (1.0 / math.tau, math.tau / 60.0, 60.0 / math.tau)
 
 @dataclass(frozen=True)
 class Fault:
-    """A fault of one channel: kind, size and time.
-
-    Raises:
-        ConfigurationError: an unknown kind, channel or severity, a kind that makes no sense for the channel, or a number that makes none.
-    """
+    """A fault of one channel: kind, size and time; `ConfigurationError` for one that makes no sense."""
 
     kind: str  # one of `KINDS`
     channel: str  # never a reference
@@ -141,11 +136,7 @@ def size_of(kind: str, channel: str, severity: Severity) -> float:
 
 
 def inject(samples: Mapping[str, FloatArray], rate_hz: float, fault: Fault) -> dict[str, FloatArray]:
-    """Samples, channel -> (T,) [SI], with a fault in one channel, which may hold NaN and infinite values then.
-
-    Raises:
-        ConfigurationError: there is no such channel.
-    """
+    """Samples, channel -> (T,) [SI], with a fault in one channel (else `ConfigurationError`), which may then hold any value."""
     if fault.channel not in samples:
         raise ConfigurationError(f"fault '{fault.condition}': there is no channel '{fault.channel}'; there are: {', '.join(samples)}")
     values = np.array(samples[fault.channel], dtype=np.float64)
@@ -264,10 +255,8 @@ def _turns(channel: str) -> bool:
 
 
 def _reach(values: FloatArray) -> float:
-    """Largest size among finite values; 0 where there are none."""
     return float(np.abs(values[np.isfinite(values)]).max(initial=0.0))
 
 
 def _range(channel: Channel) -> float:
-    """Largest size that a channel can have."""
     return max(abs(channel.low), abs(channel.high))

@@ -37,15 +37,13 @@ REACHED = {"m/s²": (25.0, 200.0, 6.0), "rad/s": (4.0, 15.0, 0.5), "rad": (1.0, 
 FREE = ("wheel_", "motor_", "handwheel", "brake_", "fx_", "fy_", "fz_")
 """Starts of names whose ranges and changes differ too much between cars; their limits have to be learnt."""
 
-STEERING = ("steer", "handwheel")
-"""Channels with stops: at its lock, a steering may stand still."""
+STEERING = ("steer", "handwheel")  # channels with stops: at its lock, a steering may stand still
 
 ENDLESS = 1e300  # stops of channels that have none
 
 STANDSTILL_SPEED, STANDSTILL_YAW_RATE = 0.5, 0.05  # m/s, rad/s: below both, nothing is expected to move
 
-USE, WAIT, RESTART = 0, 1, 2
-"""Action of an estimator on a row: use it; wait, since too much is missing; start anew with it."""
+USE, WAIT, RESTART = 0, 1, 2  # action of an estimator on a row: use it; wait, since too much is missing; start anew with it
 
 
 @dataclass(frozen=True)

@@ -57,14 +57,12 @@ HEAVIEST = 5.0  # of the mean weight of a sample, that one sample may have in a 
 STILL = {"yaw_rate": 0.05, "ay": 0.5}  # rad/s, m/s²: below which a car may be taken to stand
 
 MAX_ORDER = 10
-MOST_COEFFICIENTS = 700
-"""Of the autoregression: what a step can afford."""
+MOST_COEFFICIENTS = 700  # of the autoregression: what a step can afford
 
 MODELLED = ("yaw_rate", "vx", "ay", "ax", "steer", "handwheel", "motor_speed", "motor_current")
 """Channels that the autoregression holds, beside the wheels' speeds; of others only range, gaps and standing still are watched."""
 
-NUMBERS = {name: number for number, name in enumerate(CHANNELS, start=1)}
-"""Number of a channel in a reason's code."""
+NUMBERS = {name: number for number, name in enumerate(CHANNELS, start=1)}  # number of a channel in a reason's code
 _NAMES = {number: name for name, number in NUMBERS.items()}
 
 NO_ESTIMATE, BEYOND_SPEED, TOO_WIDE = 30, 31, 32
@@ -341,7 +339,6 @@ def _embedded(model: Autoregression, names: Sequence[str], usable: Sequence[str]
 
 
 def _plain(values: FloatArray) -> Any:
-    """Tuples of tuples of numbers."""
     return tuple(_plain(part) for part in values) if values.ndim > 1 else tuple(values.tolist())
 
 

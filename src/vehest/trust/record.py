@@ -51,12 +51,7 @@ def write_trust(trust: Trust, folder: Path) -> None:
 
 
 def read_trust(folder: Path) -> Trust:
-    """Read trust.yaml of a folder back.
-
-    Raises:
-        MissingError: there is none.
-        DataError: it is damaged, or of another format.
-    """
+    """Read trust.yaml of a folder back."""
     path = folder / TRUST
     content = read_yaml(path)
     if not isinstance(content, dict) or "format" not in content:

@@ -16,6 +16,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 
 import numpy as np
 import scipy
@@ -32,11 +33,7 @@ RATE = "du/dt"
 SLIDE = "v r"
 DRAG = ("r²", "u²", SLIDE)
 _SYMBOLS = dict(
-    zip(
-        FEATURES,
-        ("", "r", "u", ("u", "r"), ("u", "r"), ("r", "u"), ("ay",), ("ay", "u"), ("ay",), "r", "u", ("ax",), "r"),
-        strict=True,
-    )
+    zip(FEATURES, ("", "r", "u", ("u", "r"), ("u", "r"), ("r", "u"), ("ay",), ("ay", "u"), ("ay",), "r", "u", ("ax",), "r"), strict=True)
 )
 _SYMBOLS[RATE] = "u"
 
@@ -169,7 +166,9 @@ def learn_relations(recordings: Sequence[Recording], channels: Sequence[str], ra
         used.append(known)
 
     def smoothed(name: str) -> FloatArray:
-        return np.concatenate([_smoothed(part[name], forget)[known] for part, known in zip(parts, used, strict=True)])
+        pairs = [(part[name], known) for part, known in zip(parts, used, strict=True)]
+        low_pass = partial(scipy.signal.lfilter, [forget], [1.0, forget - 1.0])
+        return np.concatenate([low_pass(values, zi=[(1.0 - forget) * values[0]])[0][known] for values, known in pairs])
 
     joined = {name: smoothed(name) for name in parts[0]}
     found: list[Relation] = []
@@ -193,10 +192,6 @@ def _held(samples: FloatArray) -> FloatArray:
         return np.zeros_like(samples)
     place = np.maximum(np.searchsorted(known, np.arange(len(samples)), side="right") - 1, 0)
     return samples[known[place]]
-
-
-def _smoothed(values: FloatArray, forget: float) -> FloatArray:
-    return scipy.signal.lfilter([forget], [1.0, forget - 1.0], values, zi=[(1.0 - forget) * values[0]])[0]
 
 
 def _robust(design: FloatArray, target: FloatArray) -> FloatArray:

@@ -24,16 +24,14 @@ from vehest.trust.health import BEYOND_SPEED, DEGRADED, INVALID, NO_ESTIMATE, NU
 from vehest.trust.record import Trust
 from vehest.trust.watch import CLIPPED, EXTRAPOLATED, SPINNING, Watched
 
-BAND_FACTORS = (1.0, 2.0, 4.0)
-"""Factor of the band of a valid, a degraded, an invalid estimate."""
+BAND_FACTORS = (1.0, 2.0, 4.0)  # factor of the band of a valid, a degraded, an invalid estimate
 
 WIDEST = math.radians(6.0)
 """Half width of the band of β beyond which an estimate is invalid: what it says of the car is no more than v = 0 does."""
 
 ROLLED_BACK_SECONDS = 1.0
 
-NO_FAULTS = np.array([kernel.FREE, kernel.MISSING, kernel.OUTSIDE, kernel.SPIN])
-"""Kinds of reasons that accuse no sensor."""
+NO_FAULTS = np.array([kernel.FREE, kernel.MISSING, kernel.OUTSIDE, kernel.SPIN])  # kinds of reasons that accuse no sensor
 
 
 def starts_anew(estimator: Estimator) -> bool:

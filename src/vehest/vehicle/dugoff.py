@@ -65,8 +65,7 @@ class LoadedCar:
         return self.mass * (front - transfer).clamp(min=LEAST_LOAD * front), self.mass * (rear + transfer).clamp(min=LEAST_LOAD * rear)
 
 
-BMW_545I = LoadedCar()
-"""BMW 545i of Bertipaglia et al. 2024."""
+BMW_545I = LoadedCar()  # BMW 545i of Bertipaglia et al. 2024
 
 
 class DugoffAxle(NamedTuple):

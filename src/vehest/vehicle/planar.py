@@ -30,8 +30,7 @@ class Chassis:
     wheel_radius: float  # R [m]
 
 
-F1TENTH = Chassis(mass=5.1, wheelbase=0.33, wheel_radius=0.05)
-"""As in the public code of Węgrzynowski et al. 2024; the paper says 4.5 kg."""
+F1TENTH = Chassis(mass=5.1, wheelbase=0.33, wheel_radius=0.05)  # as in the public code of Węgrzynowski et al. 2024; the paper says 4.5 kg
 
 F1TENTH_START: Mapping[str, float] = {
     "yaw_inertia": 0.46,

@@ -9,8 +9,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor, nn
 
-STILL = 1e-6
-"""Added to speeds that slips are divided by [m/s]."""
+STILL = 1e-6  # added to speeds that slips are divided by [m/s]
 
 
 class Slips(NamedTuple):

@@ -23,14 +23,12 @@ from vehest_papers.kit.reading import with_interval
 from vehest_papers.kit.statements import Change, Compared, Expected, Measured, Statement, short
 
 LEVEL = 0.10
-UNCLAIMED = "not in it"
-"""In the place of the paper's figure, where it claims nothing."""
+UNCLAIMED = "not in it"  # in the place of the paper's figure, where it claims nothing
 HEADERS = {MSE: "MSE", MSE_NL: "MSE_nl", ME: "ME", ME_NL: "ME_nl"}
 WEAK = ("braking in the turn", "J-turn", "skidpad")
 AROUND_PEAK = 10  # samples before and after
 HIGH, LOW = 5.0, 1.0  # deg of |β|
-OutputsOf = Mapping[str, Sequence[Sequence[Outputs]]]
-"""Hybrid -> outputs of its networks, seed by seed, manoeuvre by manoeuvre."""
+OutputsOf = Mapping[str, Sequence[Sequence[Outputs]]]  # hybrid -> outputs of its networks, seed by seed, manoeuvre by manoeuvre
 
 
 def on_accuracy(main: ManoeuvreErrors, data: str) -> list[Statement | Claim]:
@@ -40,7 +38,7 @@ def on_accuracy(main: ManoeuvreErrors, data: str) -> list[Statement | Claim]:
         tests = [Compared(other, main.change(paper.CNN, other, indicator)) for other in (paper.MODEL, paper.DATA, paper.DEEP)]
         known = ", ".join(_known(paper.CNN, other, indicator) for other in (paper.MODEL, paper.DATA, paper.DEEP))
         found.append(Statement(f"CNN-UKF lowest: {header}", f"{known} %", data, tests))
-    below = [_to_limit(main, paper.CNN, indicator, 1.0) for indicator in (ME, ME_NL)]
+    below = [Compared(HEADERS[own], Change.of(main.get(paper.CNN, own), None), "lower", shown="ratio") for own in (ME, ME_NL)]
     found.append(Statement("CNN-UKF's ME and ME_nl below 1°", "0.979°, 0.776°", data, below))
     tests = [
         Compared(f"{HEADERS[indicator]} {other}", main.change(paper.DEEP, other, indicator))
@@ -145,16 +143,9 @@ def on_robustness(found: Perturbed, data: str) -> list[Statement | Claim]:
         Claim("CNN-UKF below DE-UKF in MSE_nl in all nine combinations", "all", ours, data, verdict_of_all(verdicts), "intervals")
     )
     if found.tuned:
-        from_there = next(runs for runs in found.stiffness if runs is found.stiffness[0])
-        own = ManoeuvreErrors({"tuned": found.tuned, "as trained": from_there[paper.DEEP]}, "test")
-        entries.append(
-            Statement(
-                "MSE_nl lower with p₁, p₂ tuned anew where stiffness is off by −10 %",
-                "IV-C",
-                data,
-                [Compared("", own.change("tuned", "as trained", MSE_NL))],
-            )
-        )
+        own = ManoeuvreErrors({"tuned": found.tuned, "as trained": found.stiffness[0][paper.DEEP]}, "test")
+        words, tests = "MSE_nl lower with p₁, p₂ tuned anew where stiffness is off by −10 %", own.change("tuned", "as trained", MSE_NL)
+        entries.append(Statement(words, "IV-C", data, [Compared("", tests)]))
     return entries
 
 
@@ -177,7 +168,7 @@ def on_limited(limited: Limited | None, data: str) -> list[Statement | Claim]:
         for indicator in (MSE, MSE_NL)
         for other in (paper.MODEL, *paper.HYBRIDS)
     ]
-    angles = {name: own.measured(*_squares(limited.outputs[name])) for name in paper.HYBRIDS}
+    angles = {name: own.measured(*squares(limited.outputs[name])) for name in paper.HYBRIDS}
     tuned = limited.scaling.change(AS_TUNED, OF_THE_FULL_SET, MSE_NL)
     return [
         Statement("limited set: data-driven last: MSE, MSE_nl", "+29 to +43 %", data, last),
@@ -229,11 +220,6 @@ def _known(first: str, second: str, indicator: str) -> str:
     return fixed(change, 0 if abs(change) >= 1 else 1)
 
 
-def _to_limit(main: ManoeuvreErrors, candidate: str, indicator: str, limit: float) -> Compared:
-    change = Change.of(main.get(candidate, indicator), None, limit)
-    return Compared(HEADERS[indicator], change, "lower", shown="ratio", limit=limit)
-
-
 def _of_ends(words: str, known: str, ours: str, data: str, ends: Sequence[tuple[float, float]], limit: float) -> Claim:
     """The claim that all of some figures lie above a limit, by their intervals."""
     verdict = verdict_of_all([verdict_below(-high, -low, -limit) for low, high in ends])
@@ -272,12 +258,12 @@ def _nearest_zero(main: ManoeuvreErrors, data: str) -> Claim:
 
     means = {name: main.of_statistic(name, statistic) for name in paper.OF_FOUR}
     ours = "; ".join(f"{name} {with_interval(*own, 3)}°" for name, own in means.items())
-    _, low, high = means[paper.CNN]
-    largest = max(abs(low), abs(high))
-    others = [(0.0 if low <= 0.0 <= high else min(abs(low), abs(high))) for name, (_, low, high) in means.items() if name != paper.CNN]
-    reach = [max(abs(low), abs(high)) for name, (_, low, high) in means.items() if name != paper.CNN]
-    least = 0.0 if low <= 0.0 <= high else min(abs(low), abs(high))
-    verdict: Verdict = "reproduced" if largest < min(others) else "not reproduced" if least > min(reach) else "undecided"
+    farthest = {name: max(abs(low), abs(high)) for name, (_, low, high) in means.items()}
+    nearest = {name: 0.0 if low <= 0.0 <= high else min(abs(low), abs(high)) for name, (_, low, high) in means.items()}
+    largest, least = farthest.pop(paper.CNN), nearest.pop(paper.CNN)
+    verdict: Verdict = "undecided"
+    if largest < min(nearest.values()) or least > min(farthest.values()):
+        verdict = "reproduced" if largest < min(nearest.values()) else "not reproduced"
     return Claim("Fig. 5: CNN-UKF's mean error nearest zero (non-linear)", "yes", ours, data, verdict, "intervals")
 
 
@@ -320,7 +306,7 @@ def _difference(worst: ManoeuvreErrors, nominal: ManoeuvreErrors, candidate: str
     return Measured(max(one.value - other.value, 1e-9), draws, each, one.n_blocks)
 
 
-def _squares(outputs: Sequence[Sequence[Outputs]]) -> tuple[FloatArray, FloatArray]:
+def squares(outputs: Sequence[Sequence[Outputs]]) -> tuple[FloatArray, FloatArray]:
     """Sums of β_DD's squared errors, (S, M), and samples, (M,)."""
     sums = np.array([[float(np.square(own.error).sum()) for own in seed] for seed in outputs])
     return sums, np.array([float(len(own.error)) for own in outputs[0]])
@@ -375,11 +361,7 @@ def _ratio(one: FloatArray, other: FloatArray) -> float:
 
 
 def activity(outputs: OutputsOf, shifts: Mapping[str, Sequence[float]]) -> pd.DataFrame:
-    """What of each hybrid is active: shift of β for 1° of β_DD, and quantiles of its deviations.
-
-    Returns:
-        Columns: candidate, shift [deg] (median of seeds), distrust, process_vy, process_yaw_rate (5, 50 and 95 % over all seeds, in words).
-    """
+    """What of each hybrid is active: median shift of β for 1° of β_DD [deg], and quantiles of its deviations over all seeds, in words."""
     rows = []
     for name, seeds in outputs.items():
         every = [own for seed in seeds for own in seed]

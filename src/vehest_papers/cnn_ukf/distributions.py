@@ -55,12 +55,8 @@ def _driven(part: PartArtefacts, prepared: Prepared) -> tuple[FloatArray, FloatA
     return np.concatenate(sideslip), np.concatenate([piece["ay"] for piece in pieces])
 
 
-def errors_figure(runs: Runs, name: str, number: int, title: str, data: str) -> tuple[Figure, pd.DataFrame]:
-    """Distribution of the error where |ay| ≥ 4 m/s², of the seed that validation chooses, with mean and standard deviation.
-
-    Returns:
-        The figure and its values.
-    """
+def errors_figure(runs: Runs, number: int, title: str, data: str) -> tuple[Figure, pd.DataFrame]:
+    """Distribution of the error where |ay| ≥ 4 m/s², of the seed that validation chooses, with mean and standard deviation."""
     picked = {candidate: chosen(own) for candidate, own in runs.items()}
     found = {name: error_distribution([part for parts in run.test.values() for part in parts]) for name, run in picked.items()}
     with new_figure(DOUBLE_COLUMN, 3.4) as figure:
@@ -91,10 +87,10 @@ def errors_figure(runs: Runs, name: str, number: int, title: str, data: str) -> 
         for candidate, own in found.items()
         for low, count in zip(own.edges[:-1].tolist(), own.counts.tolist(), strict=True)
     ]
-    return Figure(name, caption, figure), pd.DataFrame(rows)
+    return Figure(f"figure_{number}", caption, figure), pd.DataFrame(rows)
 
 
-def groups(runs: Runs, name: str, title: str, data: str, number: int | None = None) -> tuple[Figure, Table]:
+def groups(runs: Runs, title: str, data: str) -> tuple[Figure, Table]:
     """MSE_nl by group of manoeuvres, of all seeds, as bars and as a table."""
     of_run = {candidate: [kpis_by_group(run.test) for run in own] for candidate, own in runs.items()}
     known = list(next(iter(of_run.values()))[0])
@@ -117,7 +113,6 @@ def groups(runs: Runs, name: str, title: str, data: str, number: int | None = No
         axes.set_ylabel("MSE$_{nl}$ [deg²]")
         axes.set_yscale("log")
         legend_above(figure, axes, columns=5)
-    paper_figure = f" (Figure {number} of the paper)" if number else ""
     rows = [
         {"group": group, "n": counted[group]}
         | {candidate: median_and_range(values[candidate, group], 3) for candidate in of_run}
@@ -125,5 +120,5 @@ def groups(runs: Runs, name: str, title: str, data: str, number: int | None = No
         for group in known
     ]
     columns = {"group": Column("manoeuvres"), "n": Column("of them", decimals=0), **{candidate: Column(candidate) for candidate in of_run}}
-    caption = f"MSE_nl [deg²] by group of manoeuvres{paper_figure}, {title}: median of seeds, lowest and highest. Data: {data}."
-    return Figure(name, caption, figure), Table(name, caption, pd.DataFrame(rows), columns)
+    caption = f"MSE_nl [deg²] by group of manoeuvres (Figure 6 of the paper), {title}: median of seeds, lowest and highest. Data: {data}."
+    return Figure("figure_6", caption, figure), Table("figure_6", caption, pd.DataFrame(rows), columns)

@@ -29,24 +29,14 @@ AS_TUNED, OF_THE_FULL_SET = "tuned on the limited set", "p₁, p₂ of the full 
 
 
 def limited(full: Runs, learnt: Runs, prepared: Prepared) -> Limited:
-    """Hold what learnt on the limited set beside the filters of the full set.
-
-    Args:
-        prepared: recordings; the test of both is the same.
-
-    Raises:
-        DataError: one of the three methods that learn is missing.
-    """
+    """Hold what learnt on the limited set beside the filters of the full set; the test of both is the same."""
     missing = [name for name in (paper.DATA, *paper.HYBRIDS) if name not in learnt]
     if missing:
         raise DataError(f"no {' and no '.join(missing)} among the models of part 'limited'; it needs all three methods that learn")
     filters = {name: full[name] for name in (paper.MODEL, paper.SMOOTH, paper.ZERO, paper.STATIC_MAP) if name in full}
     of_full = {run.model.seed: run for run in full[paper.DEEP]}
     pairs = [(run, of_full[run.model.seed]) for run in learnt[paper.DEEP] if run.model.seed in of_full]
-    scaling = {
-        AS_TUNED: [run for run, _ in pairs],
-        OF_THE_FULL_SET: [_with_scaling_of(other, run, prepared) for run, other in pairs],
-    }
+    scaling = {AS_TUNED: [run for run, _ in pairs], OF_THE_FULL_SET: [_with_scaling_of(other, run, prepared) for run, other in pairs]}
     return Limited(
         ManoeuvreErrors({**filters, **learnt}, "test"),
         learnt,

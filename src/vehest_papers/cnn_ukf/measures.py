@@ -18,11 +18,9 @@ from vehest_papers.kit.statements import Change, Measured, short
 
 N_RESAMPLES = 4000
 MSE, MSE_NL, ME, ME_NL = "mse", "mse_nonlinear", "max_error", "max_error_nonlinear"
-BALANCED = "balanced"
-"""Mean over manoeuvres of their RMSE, by which seeds and settings are chosen."""
+BALANCED = "balanced"  # mean over manoeuvres of their RMSE, by which seeds and settings are chosen
 
-Sums = tuple[FloatArray, FloatArray]
-"""Of each manoeuvre a sum and what it is divided by, (M,) each."""
+Sums = tuple[FloatArray, FloatArray]  # of each manoeuvre a sum and what it is divided by, (M,) each
 
 
 def sums_of(manoeuvres: Manoeuvres, indicator: str) -> Sums:

@@ -24,8 +24,7 @@ from vehest_papers.cnn_ukf.manoeuvres import is_nonlinear
 from vehest_papers.cnn_ukf.subjects import TEST, Prepared, Run, Runs
 from vehest_papers.kit.reading import sideslip_error
 
-IDENTIFICATION = IdentificationSettings(trials=20, restarts=1, error="recordings")
-"""Of the oracle filter."""
+IDENTIFICATION = IdentificationSettings(trials=20, restarts=1, error="recordings")  # of the oracle filter
 
 
 @dataclass(frozen=True, eq=False)
@@ -129,6 +128,5 @@ def _fitted_to_the_test(run: Run, prepared: Prepared) -> Run:
     assert isinstance(model, DugoffUkf)
     estimator = DugoffUkf(model.settings)
     estimator.seed(run.model.seed)
-    drives = prepared.tested()
-    estimator.fit(FitData(drives, []), IDENTIFICATION, FitContext())
+    estimator.fit(FitData(prepared.ranges(TEST), []), IDENTIFICATION, FitContext())
     return prepared.estimated_by(estimator, run, paper.ORACLE_FILTER)

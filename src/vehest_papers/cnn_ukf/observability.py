@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from functools import partial
 
 import numpy as np
 import pandas as pd
@@ -13,8 +12,7 @@ from torch import Tensor
 from vehest.estimators.dugoff_ukf import SENSORS, DugoffUkf
 from vehest.report.document import Column, Table
 from vehest.report.style import fixed
-from vehest.vehicle.dugoff import DugoffTrack
-from vehest_papers.kit.claims import Claim
+from vehest_papers.kit.claims import Claim, Verdict
 from vehest_papers.kit.observability import observability_along
 
 SPEEDS = (5.0, 10.0, 20.0, 30.0)
@@ -25,12 +23,7 @@ WINDOW = 10
 
 
 def local(estimator: DugoffUkf) -> pd.DataFrame:
-    """Observability of the model in steady turns, about which it is linearised.
-
-    Returns:
-        Columns: speed [m/s], steer [deg], measured (``all`` or ``ay, yaw rate``), rank of the matrix of two samples, deviation of the
-        lateral velocity from 10 samples [m/s]; a row a speed, steering angle and set of measurements.
-    """
+    """Observability of the model in steady turns, a row a speed [m/s], steering angle [deg] and set of measurements."""
     track = estimator.track()
     levels = np.array([estimator.levels[name] for name in SENSORS[estimator.settings.inputs]])
     rows = []
@@ -43,17 +36,13 @@ def local(estimator: DugoffUkf) -> pd.DataFrame:
             if not 0.0 <= abs(float(state[0])) < 0.2 * speed:
                 continue  # no steady turn: beyond what the tyres can do
             states, driven = (np.repeat(own.numpy()[None], WINDOW, axis=0) for own in (state, inputs))
-            for words, kept in (("ay, yaw rate, both forces", slice(0, 4)), ("ay, yaw rate", slice(0, 2))):
+            for words, n in (("ay, yaw rate, both forces", 4), ("ay, yaw rate", 2)):
+
+                def observed(states: Tensor, inputs: Tensor, n: int = n) -> Tensor:
+                    return track.observation(states, inputs)[..., :n]
+
                 found = {
-                    steps: observability_along(
-                        track.transition,
-                        partial(_observed, track, kept),
-                        states,
-                        driven,
-                        sizes=SIZES,
-                        noise=levels[kept],
-                        steps=steps,
-                    )
+                    steps: observability_along(track.transition, observed, states, driven, sizes=SIZES, noise=levels[:n], steps=steps)
                     for steps in (2, WINDOW)
                 }
                 rows.append(
@@ -66,11 +55,6 @@ def local(estimator: DugoffUkf) -> pd.DataFrame:
                     }
                 )
     return pd.DataFrame(rows)
-
-
-def _observed(track: DugoffTrack, kept: slice, states: Tensor, inputs: Tensor) -> Tensor:
-    """Some of what the track measures."""
-    return track.observation(states, inputs)[..., kept]
 
 
 def observability_table(found: pd.DataFrame) -> Table:
@@ -94,22 +78,11 @@ def claims(found: pd.DataFrame) -> list[Claim]:
     steered, straight = found[found["steer"] > 0], found[found["steer"] == 0]
     full, lost = int((steered["rank"] == 2).sum()), int((straight["rank"] < 2).sum())
     worst = float(straight["deviation"].max() / found[found["steer"] == min(steered["steer"])]["deviation"].max())
-    why = "exact"
+    ours = f"rank 2 in {full} of {len(steered)} steady turns"
+    beside = f"deviation of V_y there {fixed(worst, 2)} times that at {min(steered['steer']):g}°"
+    verdict: Verdict = "reproduced" if lost == len(straight) else "not reproduced" if lost == 0 else "undecided"
+    steers: Verdict = "reproduced" if full == len(steered) else "not reproduced"
     return [
-        Claim(
-            "III-B: observable where the car steers (rank 2)",
-            "yes",
-            f"rank 2 in {full} of {len(steered)} steady turns",
-            "computed",
-            "reproduced" if full == len(steered) else "not reproduced",
-            why,
-        ),
-        Claim(
-            "III-B: unobservable at δ = 0",
-            "yes",
-            f"rank below 2 in {lost} of {len(straight)}; deviation of V_y there {fixed(worst, 2)} times that at {min(steered['steer']):g}°",
-            "computed",
-            "reproduced" if lost == len(straight) else "not reproduced" if lost == 0 else "undecided",
-            why,
-        ),
+        Claim("III-B: observable where the car steers (rank 2)", "yes", ours, "computed", steers, "exact"),
+        Claim("III-B: unobservable at δ = 0", "yes", f"rank below 2 in {lost} of {len(straight)}; {beside}", "computed", verdict, "exact"),
     ]

@@ -6,12 +6,10 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 MODEL, DATA, DEEP, CNN = "Model-based", "Data-driven", "DE-UKF", "CNN-UKF"
-SMOOTH = "Model-based, smooth tyres"
-"""Not in the paper: the filter of the CNN-UKF alone."""
+SMOOTH = "Model-based, smooth tyres"  # not in the paper: the filter of the CNN-UKF alone
 FREE = "Model-based, free noise"
 """Not in the paper: the same filter, whose process noise may be as large as serves it best, far beyond the paper's."""
-CNN_FREE = "CNN-UKF, free noise"
-"""Not in the paper: CNN-UKF whose process noise starts from that of the filter with free noise."""
+CNN_FREE = "CNN-UKF, free noise"  # not in the paper: CNN-UKF whose process noise starts from that of the filter with free noise
 BEFORE = "not trained through the filter"
 Z_SCORES = "Data-driven, z-scores"
 RECURRENT = "Recurrent network"
@@ -23,8 +21,7 @@ CANDIDATES = (MODEL, SMOOTH, FREE, DATA, DEEP, CNN, CNN_FREE, DATA_SHEET, STATIC
 """In the order of Table II, then those that are not in it and those that have to be beaten."""
 OF_FOUR = (MODEL, DATA, DEEP, CNN)
 HYBRIDS = (DEEP, CNN)
-OWN_FILTER = {DEEP: MODEL, CNN: SMOOTH, CNN_FREE: FREE}
-"""Hybrid -> what is left of it without its network."""
+OWN_FILTER = {DEEP: MODEL, CNN: SMOOTH, CNN_FREE: FREE}  # hybrid -> what is left of it without its network
 
 
 @dataclass(frozen=True)
@@ -53,11 +50,9 @@ TABLE_III: Mapping[str, Published] = {
 }
 """Limited set."""
 
-TABLES: Mapping[str, Mapping[str, Published]] = {"full": TABLE_II, "limited": TABLE_III}
-"""Part -> its table."""
+TABLES: Mapping[str, Mapping[str, Published]] = {"full": TABLE_II, "limited": TABLE_III}  # part -> its table
 
-SCALING: Mapping[str, tuple[float, float]] = {"full": (-4.2690, 0.7901), "limited": (-1.4353, 1.465)}
-"""Part -> p₁ and p₂ of Eq. 11."""
+SCALING: Mapping[str, tuple[float, float]] = {"full": (-4.2690, 0.7901), "limited": (-1.4353, 1.465)}  # part -> p₁ and p₂ of Eq. 11
 
 LEVELS: Mapping[str, float] = {
     "process_vy": 7e-4,
@@ -69,11 +64,8 @@ LEVELS: Mapping[str, float] = {
 }
 """Deviations of a step's process noise [m/s, rad/s] and of the sensors [m/s², rad/s, N, N] (Sections III-B and III-C)."""
 
-MEMBER_EPOCHS = 30
-"""Epochs of each network of the ensemble (Section IV-C)."""
+MEMBER_EPOCHS = 30  # epochs of each network of the ensemble (Section IV-C)
 
-BATCH = 256
-"""Of both phases of the CNN-UKF's training (Section III-C)."""
+BATCH = 256  # of both phases of the CNN-UKF's training (Section III-C)
 
-STIFFNESS_STEP = 0.1
-"""By which share both axles' cornering stiffnesses are off in Fig. 14."""
+STIFFNESS_STEP = 0.1  # by which share both axles' cornering stiffnesses are off in Fig. 14

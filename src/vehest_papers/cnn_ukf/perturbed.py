@@ -13,6 +13,7 @@ import pandas as pd
 from vehest.constants import FloatArray
 from vehest.data.errors import DataError
 from vehest.data.recording import Recording
+from vehest.data.splits import VALIDATION
 from vehest.estimators.base import Estimator
 from vehest.estimators.dugoff_ukf import finite
 from vehest.estimators.ensemble_ukf import BOX, EnsembleUkf, scaled_variance
@@ -28,8 +29,7 @@ from vehest_papers.cnn_ukf.measures import MSE, MSE_NL, ManoeuvreErrors
 from vehest_papers.cnn_ukf.subjects import Prepared, Run, Runs, chosen, filter_of, line_of
 
 STEPS = (-paper.STIFFNESS_STEP, 0.0, paper.STIFFNESS_STEP)
-COMBINATIONS = tuple(itertools.product(STEPS, STEPS))
-"""Shares by which the front and the rear axle's cornering stiffness are off."""
+COMBINATIONS = tuple(itertools.product(STEPS, STEPS))  # shares by which the front and the rear axle's cornering stiffness are off
 NOMINAL = COMBINATIONS.index((0.0, 0.0))
 LABELS = [f"{100 * front:+.0f} / {100 * rear:+.0f} %" for front, rear in COMBINATIONS]
 SOFTEST = COMBINATIONS.index((-paper.STIFFNESS_STEP, -paper.STIFFNESS_STEP))
@@ -59,11 +59,7 @@ def with_stiffness(fitted: Estimator, front: float, rear: float) -> Estimator:
 
 
 def with_body(fitted: Estimator, mass: float, inertia: float) -> Estimator:
-    """A copy of a filter that takes the car's mass and yaw inertia for so many times what they are; its tyres stay as they were found.
-
-    Raises:
-        DataError: it has no filter.
-    """
+    """A copy of a filter that takes the car's mass and yaw inertia for so many times what they are; its tyres stay as they were found."""
     changed = copy.deepcopy(fitted)
     of_filter = filter_of(changed)
     if of_filter is None:
@@ -105,7 +101,7 @@ def perturbed(runs: Runs, prepared: Prepared) -> Perturbed:
         for words, factors in BODIES.items()
     }
     tuned = []
-    judged = prepared.judged()
+    judged = prepared.ranges(VALIDATION)
     for run, model in zip(own.get(paper.DEEP, []), fitted.get(paper.DEEP, []), strict=True):
         assert isinstance(model, EnsembleUkf)
         softer = with_stiffness(model, *COMBINATIONS[SOFTEST])

@@ -15,8 +15,7 @@ from vehest_papers.cnn_ukf import paper
 from vehest_papers.cnn_ukf.measures import BALANCED, ManoeuvreErrors
 from vehest_papers.cnn_ukf.subjects import Run, Runs, balanced
 
-PREFIX = "search_"
-"""Parts whose names begin so are points of the search, one network each."""
+PREFIX = "search_"  # parts whose names begin so are points of the search, one network each
 
 
 def is_point(part: str) -> bool:

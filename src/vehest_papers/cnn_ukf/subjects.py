@@ -43,8 +43,7 @@ LINES = {
     paper.STATIC_MAP: Line("#6b7682", "dashed", "+"),
     paper.ZERO: Line("#c3cad2", "dotted", "."),
 }
-OWN = ", its own filter"
-"""What follows the name of a hybrid that is its own filter."""
+OWN = ", its own filter"  # what follows the name of a hybrid that is its own filter
 
 
 def plain_name(candidate: str) -> str:
@@ -60,8 +59,7 @@ def line_of(candidate: str) -> Line:
 KPIS = {"mse": "MSE [deg²]", "mse_nonlinear": "MSE_nl [deg²]", "max_error": "ME [deg]", "max_error_nonlinear": "ME_nl [deg]"}
 """Attribute of `Kpis` and of `paper.Published` -> header."""
 
-Manoeuvres = Mapping[str, Sequence[Scored]]
-"""Recording -> what was scored of it: one range."""
+Manoeuvres = Mapping[str, Sequence[Scored]]  # recording -> what was scored of it: one range
 
 _NAMES = {
     ("dugoff_ukf", False): paper.MODEL,
@@ -98,16 +96,11 @@ class Run:
         return kpis(self.test)
 
 
-Runs = Mapping[str, Sequence[Run]]
-"""Candidate -> its seeds."""
+Runs = Mapping[str, Sequence[Run]]  # candidate -> its seeds
 
 
 def candidate_of(model: EvaluatedModel) -> str:
-    """What the paper calls a model, or what of its method is taken away; of a network's inputs z-scores are named.
-
-    Raises:
-        DataError: it has none like it.
-    """
+    """What the paper calls a model, or what of its method is taken away; of a network's inputs z-scores are named."""
     if model.estimator == "cnn_ukf":
         away = [words for name, words in PARTS_AWAY.items() if name in model.variant]
         if away:
@@ -124,11 +117,7 @@ def filter_of(fitted: Estimator) -> DugoffUkf | None:
 
 
 def runs_of(part: PartArtefacts, prepared: Prepared) -> dict[str, list[Run]]:
-    """Candidate -> its seeds, in the order of Table II.
-
-    Raises:
-        DataError: two models of one candidate have the same seed, a model is none of the paper's, or a recording has several test ranges.
-    """
+    """Candidate -> its seeds, in the order of Table II."""
     recordings = [span.recording for span in prepared.spans(TEST)]
     if len(set(recordings)) != len(recordings):
         raise DataError(f"study '{part.study}': a recording of the test set has several ranges, but a manoeuvre is one; correct the split")
@@ -209,19 +198,9 @@ class Prepared:
             for span in self.spans(test)
         ]
 
-    def learnt(self) -> list[Recording]:
-        """The ranges of the training, references included."""
-        return self._ranges(self._part.split.train)
-
-    def judged(self) -> list[Recording]:
-        """The ranges of the validation, references included."""
-        return self._ranges(self._part.split.validation)
-
-    def tested(self) -> list[Recording]:
-        """The ranges of the test, references included, for oracles."""
-        return self._ranges(self._part.split.tests[TEST])
-
-    def _ranges(self, spans: Sequence[Span]) -> list[Recording]:
+    def ranges(self, test: str) -> list[Recording]:
+        """The ranges of training, validation or a test set, references included."""
+        spans = self._part.split.train if test == "train" else self.spans(test)
         return [self.recording(span.dataset, span.recording).cut(span.start, span.stop) for span in spans]
 
     def estimated_by(self, estimator: Estimator, run: Run, candidate: str = "") -> Run:

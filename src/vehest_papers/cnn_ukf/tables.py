@@ -9,7 +9,6 @@ import numpy as np
 import pandas as pd
 
 from vehest.constants import FloatArray
-from vehest.data.errors import DataError
 from vehest.estimators.dugoff_ukf import LEVELS, SENSORS, TYRES
 from vehest.estimators.ensemble_ukf import EnsembleUkf
 from vehest.estimators.model_files import load_model
@@ -18,7 +17,7 @@ from vehest.report.document import Column, Table
 from vehest.report.style import MISSING, fixed, significant
 from vehest.studies.artefacts import PartArtefacts
 from vehest_papers.cnn_ukf import paper
-from vehest_papers.cnn_ukf.claims import OutputsOf
+from vehest_papers.cnn_ukf.claims import OutputsOf, squares
 from vehest_papers.cnn_ukf.measures import ManoeuvreErrors
 from vehest_papers.cnn_ukf.subjects import KPIS, TEST, Prepared, Run, Runs, balanced, chosen, filter_of
 from vehest_papers.kit.reading import median_and_range, metric_values, with_interval
@@ -37,20 +36,10 @@ LEVEL_HEADERS = {
 }
 
 
-def kpi_values(runs: Runs, candidate: str, name: str) -> FloatArray:
-    """A figure of `KPIS`, one a seed."""
-    return np.array([getattr(run.kpis, name) for run in runs[candidate]])
-
-
 def accuracy(
     comparison: ManoeuvreErrors, published: Mapping[str, paper.Published], training: Mapping[str, float], name: str, caption: str
 ) -> Table:
-    """Table II or III: our figures with their intervals, the paper's in brackets, errors of validation and of training.
-
-    Args:
-        published: candidate -> the paper's figures.
-        training: candidate -> mean RMSE of a training manoeuvre [deg], of the seed that is drawn.
-    """
+    """Table II or III: our figures with their intervals, the paper's in brackets, errors of validation and of training [deg]."""
     rows = []
     for candidate, own in comparison.runs.items():
         row: dict[str, object] = {"candidate": candidate, "n_seeds": len(own)}
@@ -62,19 +51,15 @@ def accuracy(
         row["validation"] = fixed(float(np.median(judged)), 3) if candidate not in ORACLES else MISSING
         row["training"] = fixed(training[candidate], 3) if candidate in training else MISSING
         rows.append(row)
-    columns = {"candidate": Column("method")}
-    columns |= {kpi: Column(header) for kpi, header in KPIS.items()}
-    columns |= {
-        "validation": Column("RMSE, validation [deg]"),
-        "training": Column("training [deg]"),
-        "n_seeds": Column("seeds", decimals=0),
-    }
+    columns = {"candidate": Column("method")} | {kpi: Column(header) for kpi, header in KPIS.items()}
+    columns |= {"validation": Column("RMSE, validation [deg]"), "training": Column("training [deg]")}
+    columns["n_seeds"] = Column("seeds", decimals=0)
     return Table(name, caption, pd.DataFrame(rows), columns)
 
 
 def training_error(run: Run, prepared: Prepared) -> float:
     """Mean over training manoeuvres of their RMSE(β) [deg]."""
-    drives = prepared.learnt()
+    drives = prepared.ranges("train")
     estimates = load_model(run.model.model_folder).estimate([drive.without_references() for drive in drives])
     errors = [
         np.degrees(estimate["sideslip"] - np.arctan2(drive["vy_ref"], drive["vx"]))
@@ -106,7 +91,7 @@ def ablation(comparison: ManoeuvreErrors, active: pd.DataFrame, caption: str) ->
     return Table("ablation", caption, pd.DataFrame(rows), columns)
 
 
-def consistency(part: PartArtefacts, runs: Runs, name: str, caption: str) -> Table:
+def consistency(part: PartArtefacts, runs: Runs, data: str) -> Table:
     """Against the reference as measured: MSE, coverage of the bands of vy and NIS, from the evaluation's own metrics."""
     known = metric_values(part)
     rows: list[dict[str, object]] = [
@@ -122,16 +107,19 @@ def consistency(part: PartArtefacts, runs: Runs, name: str, caption: str) -> Tab
         row |= {f"cover_{n}": median_and_range(values(f"coverage_{n}sigma"), 3) for n in (1, 2)}
         rows.append(row | {"nis": median_and_range(values("nis"), 2)})
     columns = {"candidate": Column("method"), "mse": Column("MSE against the unfiltered reference [deg²]")}
-    columns |= {f"cover_{n}": Column(f"within {n}σ") for n in (1, 2)}
-    return Table(name, caption, pd.DataFrame(rows), columns | {"nis": Column("NIS")})
+    columns |= {f"cover_{n}": Column(f"within {n}σ") for n in (1, 2)} | {"nis": Column("NIS")}
+    caption = (
+        "What the paper does not report: MSE against the reference as it was measured, over all that was driven, share of vy's errors "
+        f"within one and two of the filter's own standard deviations, normalised innovations squared (1 if consistent). Data: {data}."
+    )
+    return Table("consistency_full", caption, pd.DataFrame(rows), columns)
 
 
 def networks_alone(comparison: ManoeuvreErrors, outputs: OutputsOf, name: str, caption: str) -> Table:
     """Squared errors of the hybrids' networks, beside those of their filters, and the networks' deviations."""
     rows = []
     for candidate, seeds in outputs.items():
-        sizes = np.array([float(len(own.error)) for own in seeds[0]])
-        measured = comparison.measured(np.array([[float(np.square(own.error).sum()) for own in seed] for seed in seeds]), sizes)
+        measured = comparison.measured(*squares(seeds))
         every = [own for seed in seeds for own in seed]
         beyond = np.concatenate([own.nonlinear for own in every])
         error, distrust = np.concatenate([own.error for own in every]), np.concatenate([own.distrust for own in every])
@@ -154,12 +142,12 @@ def networks_alone(comparison: ManoeuvreErrors, outputs: OutputsOf, name: str, c
     return Table(name, caption, pd.DataFrame(rows), columns)
 
 
-def filters(parts: Mapping[str, tuple[str, Runs]], name: str, caption: str) -> Table:
-    """Tyres and levels of noise of the filters, each seed a row, below what the paper gives; ``parts``: name -> title and runs."""
+def filters(parts: Sequence[tuple[str, Runs]], data: str) -> Table:
+    """Tyres and levels of noise of the filters, each seed a row, below what the paper gives; ``parts``: title and runs."""
     rows: list[dict[str, object]] = [
         {"part": "paper (real)", "candidate": paper.MODEL, **dict.fromkeys((*TYRES, *LEVELS), math.nan), **paper.LEVELS}
     ]
-    for title, runs in parts.values():
+    for title, runs in parts:
         for candidate, own in runs.items():
             for run in own:
                 of_filter = filter_of(load_model(run.model.model_folder))
@@ -177,10 +165,14 @@ def filters(parts: Mapping[str, tuple[str, Runs]], name: str, caption: str) -> T
             f"reduction_{axle}": Column(f"e_r, {axle} [s/m]", decimals=4),
         }
     columns |= {f"shown_{level}": Column(header) for level, header in LEVEL_HEADERS.items()}
-    return Table(name, caption, pd.DataFrame(rows), columns)
+    caption = (
+        "Tyres and levels of noise of the filters; the paper does not give its tyres. A network that gives the process noise takes the "
+        f"filter's for its start alone. Variances of the sensors are 10 times those of these levels. Data: {data}."
+    )
+    return Table("filters", caption, pd.DataFrame(rows), columns)
 
 
-def scaling(parts: Mapping[str, tuple[str, Runs]], name: str, caption: str) -> Table:
+def scaling(parts: Mapping[str, tuple[str, Runs]], data: str) -> Table:
     """p₁ and p₂ of Eq. 11 of each set."""
     rows = []
     for part, (title, runs) in parts.items():
@@ -192,15 +184,18 @@ def scaling(parts: Mapping[str, tuple[str, Runs]], name: str, caption: str) -> T
             rows.append({"part": title, "seed": run.model.seed, "paper_p1": known[0], "p1": p1, "paper_p2": known[1], "p2": p2})
     columns = {"part": Column("part"), "seed": Column("seed")}
     columns |= {"paper_p1": Column("p₁, paper", decimals=3), "p1": Column("p₁, ours", decimals=3)}
-    return Table(
-        name, caption, pd.DataFrame(rows), columns | {"paper_p2": Column("p₂, paper", decimals=3), "p2": Column("p₂, ours", decimals=3)}
+    columns |= {"paper_p2": Column("p₂, paper", decimals=3), "p2": Column("p₂, ours", decimals=3)}
+    caption = (
+        "Scaling of the ensemble's variance (Eq. 11), tuned on validation manoeuvres; ours is in rad², the paper's unit is not known. "
+        f"Data: {data}."
     )
+    return Table("scaling", caption, pd.DataFrame(rows), columns)
 
 
-def budget(parts: Mapping[str, tuple[str, PartArtefacts, Runs]], name: str, caption: str) -> Table:
+def budget(parts: Sequence[tuple[str, PartArtefacts, Runs]], data: str) -> Table:
     """Seeds, epochs and parameters, by part and candidate."""
     rows = []
-    for title, part, runs in parts.values():
+    for title, part, runs in parts:
         known = metric_values(part)
         for candidate, own in runs.items():
             fits = [run.model.fit_metrics() for run in own]
@@ -223,7 +218,7 @@ def budget(parts: Mapping[str, tuple[str, PartArtefacts, Runs]], name: str, capt
         "lost": Column("lost sequences and skipped steps", decimals=0),
         "n_parameters": Column("parameters", decimals=0),
     }
-    return Table(name, caption, pd.DataFrame(rows), columns)
+    return Table("budget", f"What was spent: seeds and epochs. Data: {data}.", pd.DataFrame(rows), columns)
 
 
 def _epochs(runs: Sequence[Run]) -> str:
@@ -265,8 +260,7 @@ def given_as_found(full: Runs) -> str:
 
 
 def process_levels(run: Run) -> FloatArray:
-    """Deviations of a step's process noise where they are constant, (2,) [m/s, rad/s]; raises `DataError` where the run has no filter."""
+    """Deviations of a step's process noise of a filter where they are constant, (2,) [m/s, rad/s]."""
     of_filter = filter_of(load_model(run.model.model_folder))
-    if of_filter is None:
-        raise DataError(f"'{run.candidate}' has no filter, and so no process noise")
+    assert of_filter is not None
     return np.array([of_filter.levels[level] for level in PROCESS])

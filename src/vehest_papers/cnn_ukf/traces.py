@@ -27,11 +27,7 @@ LAP_SECONDS = 32.0  # what Fig. 10 shows of a lap
 
 
 def manoeuvre_of(part: PartArtefacts, prepared: Prepared, group: str) -> Span:
-    """The test manoeuvre of a group with the largest sideslip angle among those in which the car did not spin.
-
-    Raises:
-        DataError: there is none.
-    """
+    """The test manoeuvre of a group with the largest sideslip angle among those in which the car did not spin."""
     peaks = {}
     for span in part.split.tests[TEST]:
         drive = prepared.recording(span.dataset, span.recording)
@@ -43,7 +39,7 @@ def manoeuvre_of(part: PartArtefacts, prepared: Prepared, group: str) -> Span:
     return max(peaks, key=peaks.__getitem__)
 
 
-def compared(runs: Mapping[str, Run], span: Span, name: str, number: int, what: str, data: str) -> Figure:
+def compared(runs: Mapping[str, Run], span: Span, number: int, what: str, data: str) -> Figure:
     """Reference and all estimates of one manoeuvre."""
     parts = {candidate: run.test[span.recording][0] for candidate, run in runs.items()}
     with new_figure(DOUBLE_COLUMN, 3.9) as figure:
@@ -58,25 +54,13 @@ def compared(runs: Mapping[str, Run], span: Span, name: str, number: int, what: 
             axes.margins(x=0.0)
         legend_above(figure, upper, columns=4)
     caption = f"{what} (Figure {number} of the paper), {as_code(span.recording)}. {_squares(runs, parts)} Data: {data}."
-    return Figure(name, caption, figure)
+    return Figure(f"figure_{number}", caption, figure)
 
 
-def inner_life(
-    runs: Mapping[str, Run],
-    prepared: Prepared,
-    warm_up: float,
-    span: Span,
-    name: str,
-    number: int,
-    what: str,
-    constant: FloatArray,
-    data: str,
-) -> Figure:
+def inner_life(runs: Mapping[str, Run], prepared: Prepared, warm_up: float, span: Span, constant: FloatArray, data: str) -> Figure:
     """Outputs of the hybrids' networks in one manoeuvre: β_DD beside β, both deviations of the process noise, distrust (Figure 8).
 
-    Args:
-        warm_up: of the estimates [s].
-        constant: deviations of the filter's process noise where no network gives them, (2,).
+    ``constant``, (2,), are deviations of the filter's process noise where no network gives them.
     """
     hybrids = {candidate: run for candidate, run in runs.items() if plain_name(candidate) in paper.HYBRIDS}
     outputs = _network_outputs(hybrids, prepared, warm_up, span)
@@ -105,29 +89,25 @@ def inner_life(
             axes.set_xlabel("time [s]")
         legend_above(figure, grid[0, 0], columns=3)
     caption = (
-        f"{what} (Figure {number} of the paper), {as_code(span.recording)}: (a) sideslip angle of filter and network, (b) and (d) "
-        "deviations of the process noise of a step, (c) deviation of the network's angle as the filter takes it for a measurement. "
-        f"DE-UKF's process noise is constant. Data: {data}."
+        f"The slalom of Figure 7, hybrids (Figure 8 of the paper), {as_code(span.recording)}: (a) sideslip angle of filter and network, "
+        "(b) and (d) deviations of the process noise of a step, (c) deviation of the network's angle as the filter takes it for a "
+        f"measurement. DE-UKF's process noise is constant. Data: {data}."
     )
-    return Figure(name, caption, figure)
+    return Figure("figure_8", caption, figure)
 
 
-def angles_of_networks(
-    runs: Mapping[str, Run], prepared: Prepared, warm_up: float, span: Span, name: str, number: int, what: str, data: str
-) -> Figure:
+def angles_of_networks(runs: Mapping[str, Run], prepared: Prepared, warm_up: float, span: Span, data: str) -> Figure:
     """β of both hybrids and β_DD of their networks (Figure 13)."""
-    hybrids = {candidate: run for candidate, run in runs.items() if plain_name(candidate) in paper.HYBRIDS}
-    parts = {candidate: run.test[span.recording][0] for candidate, run in hybrids.items()}
     with new_figure(DOUBLE_COLUMN, 2.7) as figure:
         axes = figure.subplots()
-        _angles(axes, parts)
-        for candidate, (time, output) in _network_outputs(hybrids, prepared, warm_up, span).items():
+        _angles(axes, {candidate: run.test[span.recording][0] for candidate, run in runs.items()})
+        for candidate, (time, output) in _network_outputs(runs, prepared, warm_up, span).items():
             label = f"{candidate}, its network's"
             axes.plot(time, np.degrees(output.sideslip), color=line_of(candidate).colour, linewidth=0.8, alpha=0.6, label=label)
         axes.set_xlabel("time [s]")
         axes.margins(x=0.0)
         legend_above(figure, axes, columns=5)
-    return Figure(name, f"{what} (Figure {number} of the paper), {as_code(span.recording)}. Data: {data}.", figure)
+    return Figure("figure_13", f"The same J-turn (Figure 13 of the paper), {as_code(span.recording)}. Data: {data}.", figure)
 
 
 def lap(runs: Mapping[str, Run], prepared: Prepared, warm_up: float, span: Span, data: str) -> Figure:
@@ -190,7 +170,6 @@ def _from_start(part: Scored) -> FloatArray:
 
 
 def _angles(axes: Any, parts: Mapping[str, Scored]) -> None:
-    """Reference and estimates."""
     first = next(iter(parts.values()))
     axes.plot(_from_start(first), np.degrees(first.sideslip_ref), color=REFERENCE.colour, linewidth=1.5, label="reference")
     for candidate, part in parts.items():

@@ -15,13 +15,13 @@ from vehest.evaluation.significance import root_interval
 from vehest.report.document import Column, Table
 from vehest.report.style import MISSING, fixed
 from vehest_papers.heavy_ekf import paper
-from vehest_papers.kit.claims import Claim, Verdict, verdict_below
+from vehest_papers.heavy_ekf.subjects import CORNERING, corners
+from vehest_papers.kit.claims import Claim, verdict_below
 from vehest_papers.kit.reading import with_interval
 
 LAPS = 3
 SKIP_SECONDS = 1.5
 BLOCK_SECONDS = 10.0
-CORNERING = 1.5  # m/s²
 STANDS = 0.3  # m/s
 WINDOWS = ((5.0, 3.0), (3.0, 1.0), (1.0, 0.4), (0.4, 0.0))  # s before the stop
 RESAMPLES = 4000
@@ -47,7 +47,9 @@ def per_lap_table(drives: Mapping[str, Recording], estimates: Estimates, names: 
             row: dict[str, object] = {"test": test.replace("_", ", "), "lap": number, "speed": speed}
             for name in names:
                 error = np.degrees(estimates[test][name]["sideslip"] - drive["sideslip_ref"])
-                row[name] = with_interval(*_rmse(error[scored], drive.rate_hz), 3)
+                sizes = _sums(np.ones(int(scored.sum())), drive.rate_hz)
+                own = root_interval(_sums(np.square(error[scored]), drive.rate_hz)[None], sizes)
+                row[name] = with_interval(own.value, own.low, own.high, 3)
             rows.append(row)
     columns = {"test": Column("drive"), "lap": Column("lap", decimals=0), "speed": Column("mean speed [km/h]", decimals=0)}
     columns |= {name: Column(f"{name} [deg]") for name in names}
@@ -74,7 +76,7 @@ def gains_of(
     """(test, filter) -> gain Σ β̂ β/Σ β² of β's variation about its mean while cornering, with its 95 % interval over blocks of 10 s."""
     found = {}
     for test, drive in drives.items():
-        turning = np.abs(np.convolve(drive["ay"], np.full(11, 1 / 11), "same")) > CORNERING
+        turning = corners(drive)
         true = drive["sideslip_ref"] - float(np.mean(drive["sideslip_ref"][turning]))
         for name in names:
             own = estimates[test][name]["sideslip"]
@@ -123,11 +125,8 @@ def stop_table(drives: Mapping[str, Recording], estimates: Estimates, names: Seq
         before = stop_of(drive) - drive.time
         for begin, end in WINDOWS:
             chosen = (before <= begin) & (before > end)
-            row: dict[str, object] = {
-                "test": test.replace("_", ", "),
-                "window": f"{begin:g} to {end:g} s",
-                "speed": float(drive["vx_ref"][chosen].mean()),
-            }
+            row: dict[str, object] = {"test": test.replace("_", ", "), "window": f"{begin:g} to {end:g} s"}
+            row["speed"] = float(drive["vx_ref"][chosen].mean())
             for name in names:
                 error = np.degrees(estimates[test][name]["sideslip"] - drive["sideslip_ref"])[chosen]
                 row[name] = float(np.sqrt(np.mean(np.square(error))))
@@ -160,20 +159,15 @@ def stop_of(drive: Recording) -> float:
 
 def not_testable() -> list[Claim]:
     """Claims of the paper that these data cannot test."""
-    missing: Verdict = "not testable on this data"
-    laps = "the recordings are not public"
+    ratio = ("eigenvalue ratio 1 above 6 m/s, up to 1.3 below", "1; 1.3", "see Table `eigenvalues`", "assumed vehicle")
+    laps = {
+        "the truck's real three laps": "RATTE < 0.5°, −44 %, −65 %",
+        "the truck's real fast lap": "0.62°; others above 1°",
+        "tyre parameters vary little on the real laps": "Figures 8 and 9",
+    }
     return [
-        Claim("the truck's real three laps", "RATTE < 0.5°, −44 %, −65 %", MISSING, "none", missing, laps),
-        Claim("the truck's real fast lap", "0.62°; others above 1°", MISSING, "none", missing, laps),
-        Claim("tyre parameters vary little on the real laps", "Figures 8 and 9", MISSING, "none", missing, laps),
-        Claim(
-            "eigenvalue ratio 1 above 6 m/s, up to 1.3 below",
-            "1; 1.3",
-            "see Table `eigenvalues`",
-            "assumed vehicle",
-            missing,
-            "mass, inertia, wheelbase chosen for it",
-        ),
+        *[Claim(*own, MISSING, "none", "not testable on this data", "the recordings are not public") for own in laps.items()],
+        Claim(*ratio, "not testable on this data", "mass, inertia, wheelbase chosen for it"),
     ]
 
 
@@ -186,11 +180,6 @@ def _counts(n_blocks: int) -> FloatArray:
     """How often blocks are drawn; the first row has each once."""
     drawn = np.random.default_rng(0).multinomial(n_blocks, np.full(n_blocks, 1.0 / n_blocks), size=RESAMPLES)
     return np.concatenate([np.ones((1, n_blocks)), drawn]).astype(np.float64)
-
-
-def _rmse(error: FloatArray, rate_hz: float) -> tuple[float, float, float]:
-    own = root_interval(_sums(np.square(error), rate_hz)[None], _sums(np.ones(len(error)), rate_hz))
-    return own.value, own.low, own.high
 
 
 def _drawn_rmse(error: FloatArray, rate_hz: float) -> FloatArray:

@@ -109,11 +109,7 @@ def baselines(tuning: Sequence[Drive]) -> dict[str, Callable[[Drive], FloatArray
 
 
 def tuning_drives(*, plain: bool = False) -> list[tuple[float, Drive]]:
-    """Mismatch and drive of 18 cells between those of the map, on seeds that none of its cells has.
-
-    Args:
-        plain: all without payload, wet patches and crossfall; otherwise over all combinations of these.
-    """
+    """Mismatch and drive of 18 cells between those of the map, on other seeds; ``plain``: without payload, wet patches and crossfall."""
     conditions = [(False, False, False)] if plain else list(itertools.product((False, True), repeat=3))
     found = []
     for number, (slip, mismatch, _) in enumerate(itertools.product(TUNED_SLIPS, TUNED_MISMATCHES, range(2))):

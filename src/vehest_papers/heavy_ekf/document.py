@@ -10,7 +10,7 @@ from vehest.data.derived import SpeedFromWheels
 from vehest.data.errors import DataError
 from vehest.data.estimate import Estimate
 from vehest.data.recording import Recording
-from vehest.report.document import REPORT, Block, Column, Document, Figure, Table, as_code, as_text
+from vehest.report.document import REPORT, Block, Column, Document, Table, as_code, as_text
 from vehest.studies.artefacts import PartArtefacts, StudyArtefacts
 from vehest_papers.heavy_ekf import accuracy, claims, draws, laps, paper, tables, twin_report, tyres, vehicle, watching
 from vehest_papers.heavy_ekf.factorial import every_cell, factorial
@@ -22,7 +22,6 @@ from vehest_papers.kit.reading import spans_in_words, words_of_kinds
 TRUCK, DRAWS, FERRARI, WHEELED = "truck", "seeds", "ferrari", "av21"
 WHEELS = SpeedFromWheels(wheel_radius=0.48, track_front=2.08, track_rear=2.08)  # as in conf/vehicle/heavy_truck.yaml
 NOMINAL = "nominal_laps"
-REAL_TRACE = "sideslip_ferrari"
 
 
 def documents(artefacts: StudyArtefacts) -> dict[str, Document]:
@@ -45,7 +44,7 @@ def documents(artefacts: StudyArtefacts) -> dict[str, Document]:
     drives = {test: whole_drive(truck, test) for test in tests}
     shown = {name: own for name, own in filters.items() if name in (*paper.ORDER, paper.HELD)}
     estimates = {test: {name: own.of(drive) for name, own in shown.items()} for test, drive in drives.items()}
-    of_ferrari = _ferrari(real, real_filters, real_rmse) if real else []
+    traces, of_ferrari = _ferrari(real, real_filters, real_rmse) if real else ([], [])
     errors = {**rmse, **claims.baseline_errors(truck)}
     real_errors = {**real_rmse, **claims.baseline_errors(real)} if real else {}
     twin = factorial()
@@ -62,7 +61,7 @@ def documents(artefacts: StudyArtefacts) -> dict[str, Document]:
     blocks: list[Block] = [
         *_asked(artefacts),
         claimed,
-        *[block for block in of_ferrari if _is_real_trace(block)],
+        *traces,
         tables.overview(errors, real_errors, [*filters, *(title for title, test in claims.baseline_errors(truck) if test == NOMINAL)]),
         *twin_front,
         f"## Appendix: the best filter\n\n{best}",
@@ -75,7 +74,7 @@ def documents(artefacts: StudyArtefacts) -> dict[str, Document]:
         vehicle.eigenvalues_table(filters[paper.RATTE].fitted.settings.car),
         *wheels,
         *_truck(truck, filters, rmse, drives, estimates),
-        *[block for block in of_ferrari if not _is_real_trace(block)],
+        *of_ferrari,
         *_how_it_was_made(artefacts),
     ]
     return {REPORT: Document(artefacts.title, blocks, {**twin_data, "twin_cells": every_cell(twin)})}
@@ -97,11 +96,6 @@ def _lap_by_lap(
     ratte, three = estimates[NOMINAL][paper.RATTE], drives[NOMINAL]
     faster = accuracy.faster_is_better_claim(three, ratte, slowest)
     return blocks, [faster, *accuracy.underestimation_claims(gains), accuracy.stop_claim(three, ratte)]
-
-
-def _is_real_trace(block: Block) -> bool:
-    """Whether a block is the figure of a real car's sideslip angle, which stands on the first page."""
-    return isinstance(block, Figure) and block.name == REAL_TRACE
 
 
 def _asked(artefacts: StudyArtefacts) -> list[Block]:
@@ -158,7 +152,6 @@ def _truck(
     own = {kind: tyres.OwnCurves.of([drives[f"{kind}_{drive}"] for drive in tables.DRIVES], car, slowest) for kind in TYRES}
     three, fast = drives[NOMINAL], drives["nominal_fast"]
     fit = curves_of(filters[paper.RATTE].fitted, [drive for drive in sound if drive.vehicle == three.vehicle])
-    shown = {test: laps.chosen_estimates(laps.DRAWN, of) for test, of in estimates.items()}
     by_tyres = {kind: drives[f"{kind}_laps"] for kind in TYRES}
     adaptive = [name for name in (paper.LINT, paper.RATTE, paper.HELD) if name in filters]
     errors = tables.errors_table(drives, estimates, [name for name in (*paper.ORDER, paper.HELD) if name in filters], slowest)
@@ -169,8 +162,8 @@ def _truck(
         "## Appendix: speed from the wheels",
         laps.figure_5(three, WHEELS, data),
         "## Appendix: three laps",
-        laps.figure_6(three, shown[NOMINAL], slowest, data),
-        laps.speed_and_acceleration(three, "figure_7", 7, "three laps at constant speed", data),
+        laps.figure_6(three, laps.drawn(estimates[NOMINAL]), slowest, data),
+        laps.speed_and_acceleration(three, 7, "three laps at constant speed", data),
         tables.table_3(rmse, list(filters), data),
         tables.gains_table(rmse),
         errors,
@@ -190,11 +183,12 @@ def _truck(
         caption = f"The same of {paper.HELD}: parameters are held while |u r| is below {above:g} m/s², three laps, {data}. Dashed as above."
         of = {kind: estimates[f"{kind}_laps"][paper.HELD] for kind in TYRES}
         blocks.append(tyres.parameters_figure(by_tyres, of, own, paper.HELD, "figure_9_held", caption))
+    caption = f"Measured and estimated sideslip angle during a high-speed lap (Figure 10 of the paper), {data}, '{fast.id}'."
     blocks += [
         tyres.convergence_table(drives, estimates, own, adaptive),
         "## Appendix: the fast lap",
-        laps.figure_10(fast, shown["nominal_fast"], slowest, data),
-        laps.speed_and_acceleration(fast, "figure_11", 11, "the high-speed lap", data),
+        laps.sideslip_figure(fast, laps.drawn(estimates["nominal_fast"]), slowest, "figure_10", caption),
+        laps.speed_and_acceleration(fast, 11, "the high-speed lap", data),
     ]
     watched = {name: filters[name] for name in reversed(paper.ORDER)}
     blocks += ["## Appendix: where the parameters can move", *watching.observability_blocks(watched, three, slowest, data)]
@@ -202,9 +196,9 @@ def _truck(
     return blocks
 
 
-def _ferrari(part: PartArtefacts, filters: Mapping[str, Filter], rmse: tables.Rmse) -> list[Block]:
+def _ferrari(part: PartArtefacts, filters: Mapping[str, Filter], rmse: tables.Rmse) -> tuple[list[Block], list[Block]]:
+    """The sideslip angle, which stands on the first page, and an appendix."""
     data = words_of_kinds(part).upper()
-    settings = filters[paper.RATTE].fitted.settings
     span = part.split.tests["test"][0]
     drive = whole_drive(part, "test").cut(span.start - part.protocol.warm_up_seconds, span.stop)
     estimates = {name: own.of(drive) for name, own in filters.items()}
@@ -214,16 +208,15 @@ def _ferrari(part: PartArtefacts, filters: Mapping[str, Filter], rmse: tables.Rm
     columns["validation"] = Column("RMSE(β), validation [deg]", decimals=3)
     learnt, tested = spans_in_words(part.split.train), spans_in_words(part.split.tests["test"])
     caption = f"The real Ferrari at 20 Hz, {data}: learnt on {learnt}, tested on {tested}."
-    shown = laps.chosen_estimates(laps.DRAWN, estimates)
     trace = f"Measured and estimated sideslip angle on the test range and the seconds before it, {data}, '{drive.id}'."
     wander = f"Rational tyre model parameters, RATTE filter, on the same range, {data}; what is true of these tyres is not known."
-    return [
+    slowest = filters[paper.RATTE].fitted.settings.minimum_speed
+    return [laps.sideslip_figure(drive, laps.drawn(estimates), slowest, "sideslip_ferrari", trace)], [
         "## Appendix: the same filters on a real car",
         "The filters need steering, yaw rate, lateral acceleration and speed only, so they run on a car as well; the first page "
         "compares them and shows the sideslip angle.",
         Table("ferrari", caption, rows, columns),
         tyres.figure_3(fit, None, "figure_3_ferrari", data),
         tyres.table_1(fit, None, "table_1_ferrari", data),
-        laps.sideslip_figure(drive, shown, settings.minimum_speed, REAL_TRACE, trace),
         tyres.parameters_figure({"as it is": drive}, {"as it is": estimates[paper.RATTE]}, {}, paper.RATTE, "parameters_ferrari", wander),
     ]

@@ -25,12 +25,7 @@ from vehest_papers.kit.statements import corrected
 
 
 def draws_blocks(part: PartArtefacts, cg_to_rear_axle: float) -> tuple[list[Block], list[Claim]]:
-    """Table ``draws`` and the claims of order, both over the draws of each test set.
-
-    Args:
-        part: models of the truck, evaluated on several drives of each test set.
-        cg_to_rear_axle: of the truck [m].
-    """
+    """Table ``draws`` and the claims of order, both over the draws of each test set."""
     titles = titles_of(part)
     models = {titles[model.estimator, model.variant]: model for model in part.models}
     sums = {test: {title: by_drive(part, model, test) for title, model in models.items()} for test in part.split.tests}
@@ -69,11 +64,7 @@ Sums = Mapping[str, tuple[FloatArray, FloatArray]]
 
 
 def compared(sums: Mapping[str, Sums]) -> dict[tuple[str, tuple[str, str]], tuple[Interval, bool]]:
-    """(test, pair of the paper's order) -> difference of RMSE(β) with the interval that Holm asks of it, and whether that excludes 0.
-
-    Args:
-        sums: test -> title -> what `by_drive` gives.
-    """
+    """(test, pair of the paper's order) -> difference of RMSE(β) with the interval that Holm asks of it, and whether that excludes 0."""
     asked = [(test, pair) for test in sums for pair in paper.GAINS]
     differences = []
     for test, (first, second) in asked:

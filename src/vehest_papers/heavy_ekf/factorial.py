@@ -38,8 +38,7 @@ SEEDS = 20
 PLANTS = tuple((payload, wet, crossfall) for payload in (False, True) for wet in (False, True) for crossfall in (False, True))
 """Payload, wet patches, crossfall: each without and with."""
 PLAIN = PLANTS[0]
-ONCE, PLAIN_ONLY = "all roads and loads", "dry, flat, without payload"
-"""What the levels of noise were tuned on."""
+ONCE, PLAIN_ONLY = "all roads and loads", "dry, flat, without payload"  # what the levels of noise were tuned on
 PAIRS = ((paper.RATTE, paper.RATT), (paper.RATTE, paper.LINT), (paper.RATT, paper.LINT))
 LOST_DEGREES = 20.0  # an error of β by which a filter counts as lost
 ABSORBED_SLIP = 5.0
@@ -91,7 +90,8 @@ class Factorial:
 @cache
 def factorial() -> Factorial:
     """Tune, drive and filter everything; minutes, once a process."""
-    found = {words: _tuned(plain=words == PLAIN_ONLY) for words in (ONCE, PLAIN_ONLY)}
+    drives = {words: tuning_drives(plain=words == PLAIN_ONLY) for words in (ONCE, PLAIN_ONLY)}
+    found = {words: {name: tuned(name, own) for name in (*FILTERS, ORACLE)} for words, own in drives.items()}
     cells = [cell for plant in PLANTS for slip in SLIPS for cell in _cells(found, Conditions(slip, *plant))]
     return Factorial(found, cells)
 
@@ -99,11 +99,6 @@ def factorial() -> Factorial:
 def plant_of(conditions: Conditions) -> tuple[bool, bool, bool]:
     """Payload, wet patches, crossfall."""
     return conditions.payload, conditions.wet_patches, conditions.crossfall
-
-
-def _tuned(*, plain: bool) -> dict[str, Tuned]:
-    drives = tuning_drives(plain=plain)
-    return {name: tuned(name, drives) for name in (*FILTERS, ORACLE)}
 
 
 def _cells(found: Mapping[str, Mapping[str, Tuned]], conditions: Conditions) -> list[Cell]:

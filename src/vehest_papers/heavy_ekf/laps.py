@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -94,22 +94,21 @@ def figure_6(drive: Recording, estimates: Mapping[str, Estimate], minimum_speed:
     return Figure("figure_6", caption, figure)
 
 
-def speed_and_acceleration(drive: Recording, name: str, number: int, what: str, data: str) -> Figure:
+def speed_and_acceleration(drive: Recording, number: int, what: str, data: str) -> Figure:
     """Speed and lateral acceleration along a drive: Figures 7 and 11."""
     with new_figure(DOUBLE_COLUMN * 0.8, 2.9) as figure:
         panels = figure.subplots(2, 1, sharex=True)
         panels[0].plot(*decimated(drive.time, 3.6 * drive["vx"], POINTS), color="#0b4f9c")
         panels[1].plot(*decimated(drive.time, drive["ay"], POINTS), color="#b8480b", linewidth=0.8)
-        panels[0].set_ylabel("speed [km/h]")
-        panels[1].set_ylabel("$a_y$ [m/s²]")
-        panels[1].set_xlabel("time [s]")
-        for axes in panels:
+        for axes, label in zip(panels, ("speed [km/h]", "$a_y$ [m/s²]"), strict=True):
+            axes.set_ylabel(label)
             axes.margins(x=0.0)
+        panels[1].set_xlabel("time [s]")
     caption = (
         f"Vehicle speed and lateral acceleration during {what} (Figure {number} of the paper), {data}, '{drive.id}': mean speed "
         f"{fixed(3.6 * float(drive['vx'].mean()), 0)} km/h, largest {fixed(3.6 * float(drive['vx'].max()), 0)} km/h."
     )
-    return Figure(name, caption, figure)
+    return Figure(f"figure_{number}", caption, figure)
 
 
 def sideslip_figure(drive: Recording, estimates: Mapping[str, Estimate], minimum_speed: float, name: str, caption: str) -> Figure:
@@ -129,12 +128,6 @@ def sideslip_figure(drive: Recording, estimates: Mapping[str, Estimate], minimum
         figure.align_ylabels()
         legend_above(figure, top)
     return Figure(name, caption, figure)
-
-
-def figure_10(drive: Recording, estimates: Mapping[str, Estimate], minimum_speed: float, data: str) -> Figure:
-    """β during the fast lap."""
-    caption = f"Measured and estimated sideslip angle during a high-speed lap (Figure 10 of the paper), {data}, '{drive.id}'."
-    return sideslip_figure(drive, estimates, minimum_speed, "figure_10", caption)
 
 
 def _sideslip(
@@ -165,9 +158,6 @@ def _track(drive: Recording) -> tuple[FloatArray, FloatArray]:
     return np.cumsum(vx * np.cos(yaw) - vy * np.sin(yaw)) * step, np.cumsum(vx * np.sin(yaw) + vy * np.cos(yaw)) * step
 
 
-def chosen_estimates(names: Sequence[str], estimates: Mapping[str, Estimate]) -> dict[str, Estimate]:
-    """Those of some filters, in this order, which later ones are drawn over."""
-    return {name: estimates[name] for name in names}
-
-
-DRAWN = tuple(reversed(paper.ORDER))
+def drawn(estimates: Mapping[str, Estimate]) -> dict[str, Estimate]:
+    """Those of the paper's filters, the best last, which is drawn over the others."""
+    return {name: estimates[name] for name in reversed(paper.ORDER)}

@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from vehest.constants import FloatArray
 from vehest.data.errors import DataError
@@ -29,6 +30,7 @@ LINES = {
     paper.HELD: Line("#8e24aa", "solid", "v"),
 }
 MEASURED = REFERENCE
+CORNERING = 1.5  # m/s²
 TYRES = {"nominal": "nominal tyres", "worn": "worn tyres", "wet": "wet road"}
 TYRE_COLOURS = {"nominal": "#0b4f9c", "worn": "#b8480b", "wet": "#17a2b8"}
 
@@ -47,11 +49,7 @@ class Filter:
 
 
 def filters_of(part: PartArtefacts) -> dict[str, Filter]:
-    """Name -> filter, in the order of `paper.VARIANTS`; of several of one variant the first.
-
-    Raises:
-        DataError: one of the paper's three is not there.
-    """
+    """Name -> filter, in the order of `paper.VARIANTS`; of several of one variant the first."""
     found: dict[str, Filter] = {}
     for model in part.models:
         if model.estimator == "rational_ekf" and model.variant in paper.VARIANTS:
@@ -86,6 +84,11 @@ def curves_of(own: RationalFilter, drives: Sequence[Recording]) -> TyreFit:
     left = [axle_force("rational", values, slip) - force for values, slip, force in zip(axles, motion.slip, motion.force, strict=True)]
     rms = np.sqrt(np.mean(np.square(left), axis=1))
     return TyreFit("rational", axles[0], axles[1], np.stack(blocks), rms, motion.slip, motion.force)
+
+
+def corners(drive: Recording) -> NDArray[np.bool_]:
+    """Whether the smoothed |a_y| exceeds `CORNERING`, (T,)."""
+    return np.abs(np.convolve(drive["ay"], np.full(11, 1 / 11), "same")) > CORNERING
 
 
 def moving(drive: Recording, minimum_speed: float) -> FloatArray:

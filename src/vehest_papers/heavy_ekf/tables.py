@@ -15,7 +15,7 @@ from vehest.estimators.filtering.tyre_fit import TyreFit
 from vehest.report.document import Column, Table
 from vehest.report.style import MISSING, fixed, listed
 from vehest_papers.heavy_ekf import paper
-from vehest_papers.heavy_ekf.subjects import TYRES
+from vehest_papers.heavy_ekf.subjects import TYRES, corners
 from vehest_papers.heavy_ekf.tyres import OwnCurves
 from vehest_papers.kit.reading import percent_below
 
@@ -51,11 +51,8 @@ def overview(rmse: Rmse, ferrari: Rmse, names: list[str]) -> Table:
     for title, test, values in tests:
         row: dict[str, object] = {"test": title} | {name: values.get((name, test), math.nan) for name in names}
         rows.append(row | {"order": " < ".join(sorted(paper.ORDER, key=lambda name, of=values, on=test: of[name, on]))})  # type: ignore[misc]
-    columns = {
-        "test": Column("test"),
-        **{name: Column(f"{name} [deg]", decimals=3) for name in names},
-        "order": Column("order of the three"),
-    }
+    columns = {"test": Column("test"), **{name: Column(f"{name} [deg]", decimals=3) for name in names}}
+    columns["order"] = Column("order of the three")
     return Table("overview", "Summary: RMSE(β) on every test; the paper's order is RATTE < RATT < LINT.", pd.DataFrame(rows), columns)
 
 
@@ -80,14 +77,11 @@ def errors_table(
     """Errors of β as their mean and what varies about it, and where the car corners."""
     rows = []
     for test, drive in drives.items():
+        scored = drive["vx"] >= minimum_speed
         for name in names:
-            error, cornering = _errors(drive, estimates[test][name], minimum_speed)
-            row: dict[str, object] = {
-                "test": test.replace("_", ", "),
-                "filter": name,
-                "mean": float(error.mean()),
-                "std": float(error.std()),
-            }
+            error, cornering = np.degrees(estimates[test][name]["sideslip"] - drive["sideslip_ref"])[scored], corners(drive)[scored]
+            row: dict[str, object] = {"test": test.replace("_", ", "), "filter": name}
+            row |= {"mean": float(error.mean()), "std": float(error.std())}
             rows.append(row | {"cornering": _rms(error[cornering]), "straight": _rms(error[~cornering])})
     columns = {
         "test": Column("drive"),
@@ -102,12 +96,7 @@ def errors_table(
 
 
 def order_in_words(
-    rmse: Rmse,
-    errors: pd.DataFrame,
-    fit: TyreFit,
-    own: Mapping[str, OwnCurves],
-    drives: Mapping[str, Recording],
-    wander: float,
+    rmse: Rmse, errors: pd.DataFrame, fit: TyreFit, own: Mapping[str, OwnCurves], drives: Mapping[str, Recording], wander: float
 ) -> str:
     """Where the order of the three is the paper's, where it is not, and why; ``wander`` is RATTE's level of noise of its tyres [1/√s]."""
     tests = [f"{tyres}_{drive}" for tyres in TYRES for drive in DRIVES]
@@ -174,9 +163,8 @@ def _parts(errors: pd.DataFrame, test: str, name: str) -> tuple[float, float]:
 
 def _curvature(fit: TyreFit) -> str:
     words = []
-    for row, axle in enumerate(("front", "rear")):
-        values = fit.front if axle == "front" else fit.rear
-        reach = float(np.quantile(np.abs(fit.slip[row]), 0.999))
+    for axle, values, slip in zip(("front", "rear"), (fit.front, fit.rear), fit.slip, strict=True):
+        reach = float(np.quantile(np.abs(slip), 0.999))
         lost = reach**2 / (reach**2 + 2.0 * float(values[0]))
         words.append(f"{axle} {fixed(math.degrees(reach), 1)}°, where the fitted curve lies {fixed(100 * lost, 0)} % below its tangent")
     return f"In the validation drives the slip angles reach (99.9 % of samples) {'; '.join(words)}."
@@ -235,14 +223,6 @@ def _pull(drive: Recording) -> float:
     driven = drive["vx"] > 5.0
     slope = np.gradient(drive["vy_ref"]) * drive.rate_hz
     return float(np.mean((drive["ay"] - drive["vx_ref"] * drive["yaw_rate"] - slope)[driven]))
-
-
-def _errors(drive: Recording, estimate: Estimate, minimum_speed: float) -> tuple[FloatArray, np.ndarray[tuple[int], np.dtype[np.bool_]]]:
-    """Errors of β [deg] at the scored speeds, and whether the car corners there."""
-    scored = drive["vx"] >= minimum_speed
-    error = np.degrees(estimate["sideslip"] - drive["sideslip_ref"])[scored]
-    smooth = np.convolve(drive["ay"], np.full(11, 1 / 11), "same")
-    return error, (np.abs(smooth) > 1.5)[scored]
 
 
 def _rms(values: FloatArray) -> float:

@@ -38,8 +38,7 @@ from vehest_papers.kit.reading import with_interval
 DATA = "SIMULATED, the paper's single track"
 LIMIT = 100.0  # %, where the colours end
 CLAIMED = ((paper.RATTE, paper.RATT), (paper.RATTE, paper.LINT))
-SHOWN = ((2.0, -0.2), (5.0, -0.2), (8.0, -0.2), (5.0, 0.0))
-"""Slip and mismatch of the cells whose rows are shown."""
+SHOWN = ((2.0, -0.2), (5.0, -0.2), (8.0, -0.2), (5.0, 0.0))  # slip and mismatch of the cells whose rows are shown
 ROWS = (ZERO, STATIC_MAP, DATA_SHEET, *FILTERS, ORACLE)
 Changes = dict[tuple[int, tuple[str, str]], Change]
 
@@ -101,8 +100,7 @@ def _flat(grid: Sequence[Sequence[Cell]]) -> list[Cell]:
 
 
 def _map_cells(cells: Sequence[Cell], found: Changes) -> pd.DataFrame:
-    """The figures of the map, a row a cell and pair."""
-    rows = [
+    return pd.DataFrame(
         {
             "slip_deg": cells[at].conditions.slip,
             "mismatch_percent": 100.0 * cells[at].mismatch,
@@ -116,8 +114,7 @@ def _map_cells(cells: Sequence[Cell], found: Changes) -> pd.DataFrame:
             "told_apart": change.told_apart,
         }
         for (at, pair), change in found.items()
-    ]
-    return pd.DataFrame(rows)
+    )
 
 
 def _map(cells: Sequence[Cell], found: Changes, name: str, tuned_on: str) -> Figure:
@@ -147,9 +144,8 @@ def _drawn(values: dict[tuple[str, str], FloatArray], apart: dict[tuple[str, str
         for axes, pair in zip(panels, CLAIMED, strict=True):
             for (row, column), value in np.ndenumerate(values[pair]):
                 colour = colours.to_rgba(float(np.clip(value, -LIMIT, LIMIT)))
-                significant = bool(apart[pair][row, column])
                 box = Rectangle((column - 0.5, row - 0.5), 1.0, 1.0, facecolor=colour, edgecolor="white", linewidth=0.8)
-                if not significant:
+                if not apart[pair][row, column]:
                     box.set(hatch="////", edgecolor="#333333", linewidth=0.0)
                 axes.add_patch(box)
                 ink = "white" if abs(value) > 65.0 else "#111111"
@@ -172,9 +168,9 @@ def _drawn(values: dict[tuple[str, str], FloatArray], apart: dict[tuple[str, str
     return figure
 
 
-def _counts(cells: Sequence[Cell], found: Changes, pair: tuple[str, str]) -> tuple[int, int, int]:
+def _counts(found: Changes, pair: tuple[str, str]) -> tuple[int, int, int]:
     """Cells in which the first is better, worse, and better by as much as in the paper; each by more than chance."""
-    own = [found[at, pair] for at in range(len(cells))]
+    own = [change for (_, of), change in found.items() if of == pair]
     better, worse = (sum(change.told_apart and sign * change.percent > 0.0 for change in own) for sign in (-1.0, 1.0))
     return better, worse, sum(change.told_apart and change.percent <= -paper.GAINS.get(pair, math.inf) for change in own)
 
@@ -183,7 +179,7 @@ def _in_words(found: Changes) -> str:
     sentences = []
     for pair in CLAIMED:
         own = [found[at, pair] for at in range(len(SLIPS) * len(MISMATCHES))]
-        better, worse, claimed = _counts([None] * len(own), found, pair)  # type: ignore[list-item]
+        better, worse, claimed = _counts(found, pair)
         low, high = min(change.percent for change in own), max(change.percent for change in own)
         sentences.append(
             f"**{pair[0]} lies below {pair[1]} in {better} of {len(own)} cells and above it in {worse}**, by more than chance; in "
@@ -193,7 +189,6 @@ def _in_words(found: Changes) -> str:
 
 
 def _rows(own: Factorial) -> Table:
-    """All candidates in the shown cells, with intervals."""
     grid = own.grid()
     cells = [grid[MISMATCHES.index(mismatch)][SLIPS.index(slip)] for slip, mismatch in SHOWN]
     rows = []
@@ -222,12 +217,10 @@ def _regions(own: Factorial) -> Table:
                 pairs = [(first + state, second + state) for first, second in CLAIMED]
                 found = changes(cells, pairs)
                 row: dict[str, object] = {"plant": _plant_name(plant), "state": "yes" if state else "no", "tuned": tuned_on}
-                for (first, second), (_, title) in zip(pairs, CLAIMED, strict=True):
-                    better, worse, _ = _counts(cells, found, (first, second))
-                    row[title] = f"{better} / {worse}"
-                row["median"] = float(np.median([cell.rmse(paper.RATTE + state) for cell in cells]))
-                row["median_lint"] = float(np.median([cell.rmse(paper.LINT + state) for cell in cells]))
-                row["oracle"] = float(np.median([cell.rmse(ORACLE) for cell in cells]))
+                for pair, (_, title) in zip(pairs, CLAIMED, strict=True):
+                    row[title] = "{} / {}".format(*_counts(found, pair))
+                for key, name in (("median", paper.RATTE + state), ("median_lint", paper.LINT + state), ("oracle", ORACLE)):
+                    row[key] = _median(cells, name)
                 row["lost"] = 100.0 * float(np.mean([cell.lost[paper.RATTE + state] for cell in cells]))
                 rows.append(row)
     columns = {
@@ -248,6 +241,10 @@ def _regions(own: Factorial) -> Table:
     return Table("twin_regions", caption, pd.DataFrame(rows), columns)
 
 
+def _median(cells: Sequence[Cell], name: str) -> float:
+    return float(np.median([cell.rmse(name) for cell in cells]))
+
+
 def _plant_name(plant: tuple[bool, bool, bool]) -> str:
     payload, wet, crossfall = plant
     return ", ".join(["wet patches" if wet else "dry", "1° crossfall" if crossfall else "flat", *(["payload"] if payload else [])])
@@ -259,15 +256,12 @@ def _crossfall_in_words(own: Factorial) -> str:
     for plant in ((False, False, True), (False, True, False), (True, False, False)):
         cells = _flat(own.grid(plant))
         found = changes(cells, CLAIMED)
-        better = [_counts(cells, found, pair)[:2] for pair in CLAIMED]
+        better = [_counts(found, pair)[:2] for pair in CLAIMED]
         moved.append(f"{_plant_name(plant)}: {better[0][0]} and {better[1][0]} (above in {better[0][1]} and {better[1][1]})")
     parts = []
     for plant in ((False, False, True), (True, True, True)):
         cells = _flat(own.grid(plant))
-        medians = [
-            float(np.median([cell.rmse(name) for cell in cells]))
-            for name in (paper.RATTE, f"{paper.RATTE}{WITH_STATE}", f"{paper.LINT}{WITH_STATE}")
-        ]
+        medians = [_median(cells, name) for name in (paper.RATTE, f"{paper.RATTE}{WITH_STATE}", f"{paper.LINT}{WITH_STATE}")]
         parts.append(
             f"{_plant_name(plant)}: RATTE {fixed(medians[0], 2)}°, with the state {fixed(medians[1], 2)}°, LINT with the state "
             f"{fixed(medians[2], 2)}°"

@@ -109,17 +109,10 @@ def _band(fit: TyreFit, axle: Literal["front", "rear"], grid: FloatArray, row: i
     """Curve ± 1.96 standard deviations to first order in the parameters."""
     values = getattr(fit, axle)
     curve = fit.curve(axle, grid)
-    slopes = np.stack(
-        [(axle_force(fit.kind, values * _nudged(i, len(values)), grid) - curve) / (1e-4 * values[i]) for i in range(len(values))]
-    )
+    nudged = values * (1.0 + 1e-4 * np.eye(len(values)))
+    slopes = np.stack([(axle_force(fit.kind, own, grid) - curve) / (1e-4 * value) for own, value in zip(nudged, values, strict=True)])
     half = 1.96 * np.sqrt(np.maximum(np.einsum("ig,ij,jg->g", slopes, fit.covariance[row], slopes), 0.0))
     return curve - half, curve + half
-
-
-def _nudged(index: int, count: int) -> FloatArray:
-    factor = np.ones(count)
-    factor[index] += 1e-4
-    return factor
 
 
 def table_1(fit: TyreFit, own: OwnCurves | None, name: str, data: str) -> Table:
@@ -157,13 +150,7 @@ def parameters_figure(
     name: str,
     caption: str,
 ) -> Figure:
-    """Estimated tyre parameters over time, a line a kind of tyre, with the plant's own dashed: Figures 8 and 9.
-
-    Args:
-        estimates: kind of tyre -> what the filter made of it.
-        own: kind of tyre -> the plant's own curves; empty where they are not known.
-        filter_name: of the filter.
-    """
+    """Estimated tyre parameters over time, a line a kind of tyre, with the plant's own, where they are known, dashed: Figures 8 and 9."""
     linear = filter_name == paper.LINT
     quantities = list(LINEAR_LABELS) if linear else list(QUANTITIES)
     with new_figure(DOUBLE_COLUMN, 2.3 if linear else 3.8) as figure:
@@ -197,17 +184,9 @@ def convergence_time(time: FloatArray, values: FloatArray, target: float) -> flo
 
 
 def convergence_table(
-    drives: Mapping[str, Recording],
-    estimates: Mapping[str, Mapping[str, Estimate]],
-    own: Mapping[str, OwnCurves],
-    names: Sequence[str],
+    drives: Mapping[str, Recording], estimates: Mapping[str, Mapping[str, Estimate]], own: Mapping[str, OwnCurves], names: Sequence[str]
 ) -> Table:
-    """Start, end and the plant's own value of every estimated parameter, and from when on it stays near.
-
-    Args:
-        own: kind of tyre -> the plant's own curves.
-        names: filters whose parameters are states.
-    """
+    """Start, end and the plant's own value of every estimated parameter, and from when on it stays near."""
     rows = []
     for test, drive in drives.items():
         tyres = test.split("_")[0]

@@ -17,16 +17,14 @@ from vehest.report.document import Block, Column, Figure, Table
 from vehest.report.figures import decimated
 from vehest.report.style import DOUBLE_COLUMN, MISSING, fixed, legend_above, listed, new_figure
 from vehest_papers.heavy_ekf.laps import POINTS
-from vehest_papers.heavy_ekf.subjects import LINES, Filter
+from vehest_papers.heavy_ekf.subjects import CORNERING, LINES, Filter, corners
 from vehest_papers.kit.observability import Observability, observability_along
 
 WINDOW_SECONDS = 1.0
-SIZES = (0.02, 0.1, 0.1, 0.3)
-"""Typical sideslip angle [rad], yaw rate [rad/s], and their rates."""
+SIZES = (0.02, 0.1, 0.1, 0.3)  # typical sideslip angle [rad], yaw rate [rad/s], and their rates
 PARAMETER_SIZE = 0.1  # of the logarithm: 10 %
 MONITOR_SECONDS = 10.0
 MARGIN = 1.5  # over the largest mean of nis/dof in drives that are in order
-CORNERING = 1.5  # m/s²
 
 
 def observability_of(own: RationalFilter, drive: Recording, minimum_speed: float) -> Observability:
@@ -49,7 +47,7 @@ def observability_of(own: RationalFilter, drive: Recording, minimum_speed: float
 def observability_blocks(filters: Mapping[str, Filter], drive: Recording, minimum_speed: float, data: str) -> list[Block]:
     """Smallest singular value along a drive, a line a filter, with the lateral acceleration; and in words."""
     found = {name: observability_of(own.fitted, drive, minimum_speed).smallest for name, own in filters.items()}
-    cornering = np.abs(np.convolve(drive["ay"], np.full(11, 1 / 11), "same")) > CORNERING
+    cornering = corners(drive)
     with new_figure(DOUBLE_COLUMN, 3.4) as figure:
         top, below = figure.subplots(2, 1, sharex=True, height_ratios=(2, 1))
         for name, values in found.items():
@@ -95,6 +93,13 @@ def faults(wheels: SpeedFromWheels) -> dict[str, Callable[[Recording], Recording
     def mean_of_wheels(drive: Recording) -> Recording:
         return replace(drive, channels={**drive.channels, "vx": wheels.corrected(drive).mean(0)})
 
+    def with_gap(drive: Recording) -> Recording:
+        where = slice(len(drive) // 3, len(drive) // 3 + round(10 * drive.rate_hz))
+        channels = {name: samples.copy() for name, samples in drive.channels.items()}
+        for name in ("yaw_rate", "ay"):
+            channels[name][where] = np.nan
+        return replace(drive, channels=channels, gappy=drive.gappy | {"yaw_rate", "ay"})
+
     def backwards(drive: Recording) -> Recording:
         turned = {name: samples[::-1].copy() for name, samples in drive.channels.items()}
         opposite = ("vx", "vx_ref", "vy_ref", "yaw_rate", "yaw_rate_ref")
@@ -117,18 +122,10 @@ def faults(wheels: SpeedFromWheels) -> dict[str, Callable[[Recording], Recording
         "steering 5° off": changed(steer=lambda samples: samples + np.radians(5.0)),
         "yaw rate of the other sign": changed(yaw_rate=np.negative),
         "lateral acceleration saturated at 2 m/s²": changed(ay=lambda samples: np.clip(samples, -2.0, 2.0)),
-        "yaw rate and lateral acceleration missing for 10 s": _with_gap,
+        "yaw rate and lateral acceleration missing for 10 s": with_gap,
         "30 s at a standstill, from one sample to the next": standing,
         "the drive backwards": backwards,
     }
-
-
-def _with_gap(drive: Recording) -> Recording:
-    where = slice(len(drive) // 3, len(drive) // 3 + round(10 * drive.rate_hz))
-    channels = {name: samples.copy() for name, samples in drive.channels.items()}
-    for name in ("yaw_rate", "ay"):
-        channels[name][where] = np.nan
-    return replace(drive, channels=channels, gappy=drive.gappy | {"yaw_rate", "ay"})
 
 
 def monitor(nis: FloatArray, dof: FloatArray, rate_hz: float) -> FloatArray:
@@ -145,7 +142,7 @@ def bad_input_table(
     """Effect of each fault on each filter, and which check detects it."""
     limits = {}
     for name, own in filters.items():
-        means = [monitor(*_nis(own, other), other.rate_hz) for other in sound]
+        means = [monitor(estimate["nis"], estimate["nis_dof"], other.rate_hz) for other in sound for estimate in [own.of(other)]]
         limits[name] = MARGIN * float(np.nanmax(np.concatenate(means)))
     clean = {(finding.check, finding.channel) for finding in checks_of_recording(drive)}
     rows, silent = [], []
@@ -184,8 +181,3 @@ def bad_input_table(
     )
     words = "Neither the monitor nor the check detects: " + "; ".join(silent) + "." if silent else ""
     return [Table("bad_input", caption, pd.DataFrame(rows), columns), *([words] if words else [])]
-
-
-def _nis(own: Filter, drive: Recording) -> tuple[FloatArray, FloatArray]:
-    estimate = own.of(drive)
-    return estimate["nis"], estimate["nis_dof"]

@@ -40,16 +40,7 @@ def claims_table(claims: Sequence[Claim], note: str = "") -> Table:
 
 
 def order_claim(ranking: Ranking, lower: Name, higher: Name, titles: Mapping[Name, str], paper: str, data: str) -> Claim:
-    """The claim that one estimator has the lower RMSE(β) of two, by the corrected interval of their difference.
-
-    Args:
-        ranking: of the test set, with the two among its pairs (`vehest.evaluation.ranking.rank`).
-        lower: estimator and variant that the paper has below the other one.
-        higher: the other one.
-        titles: what both are called.
-        paper: the paper's figures, in words.
-        data: what the test set is.
-    """
+    """The claim that ``lower`` has the lower RMSE(β) of two estimators, by the corrected interval of their difference."""
     claim = f"{titles[lower]} below {titles[higher]}"
     own = ranking.pairs.get((lower, higher))
     if own is None:

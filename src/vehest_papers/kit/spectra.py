@@ -16,8 +16,7 @@ from vehest.constants import FloatArray
 from vehest.data.errors import DataError
 from vehest.data.recording import Recording
 
-SEGMENT_SECONDS = 25.6
-"""Length of a segment [s]: 512 samples at 20 Hz, a line every 0.04 Hz."""
+SEGMENT_SECONDS = 25.6  # length of a segment [s]: 512 samples at 20 Hz, a line every 0.04 Hz
 THIRD_OCTAVE = 2.0 ** (1.0 / 6.0)
 
 

@@ -16,8 +16,7 @@ from vehest_papers.ksnn.subjects import Trained, kinds_of
 
 LOCAL_COLOURS = ("#0b4f9c", "#b8480b", "#00876c", "#8e24aa", "#a6761d", "#d6336c", "#5b8c00", "#17a2b8")
 LOCAL_DASHES = ("solid", "dashed", "dashdot", "dotted")
-BEYOND = 1.12
-"""The axis ends so far beyond the last centre, where the last model stays alone."""
+BEYOND = 1.12  # the axis ends so far beyond the last centre, where the last model stays alone
 BINS = 40
 
 

@@ -22,8 +22,7 @@ from vehest_papers.ksnn.subjects import Trained
 
 STRETCH_SECONDS = 30.0
 TRAINED_ON = {"scheme_1": "Corvette C-1", "scheme_2": "Ferrari F-1"}
-TESTED_ON = {"scheme_1": "Ferrari F-2", "scheme_2": "Corvette C-2"}
-"""Part -> the test set of the car that it does not train on."""
+TESTED_ON = {"scheme_1": "Ferrari F-2", "scheme_2": "Corvette C-2"}  # part -> the test set of the car that it does not train on
 
 
 def of_the_data(artefacts: StudyArtefacts) -> list[Block]:

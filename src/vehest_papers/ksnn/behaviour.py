@@ -8,7 +8,6 @@ from dataclasses import replace
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 
 from vehest.constants import FloatArray
 from vehest.data.recording import Recording
@@ -28,14 +27,10 @@ from vehest_papers.ksnn import paper
 from vehest_papers.ksnn.comparing import SegmentErrors, masked_segments, yaw_rates
 from vehest_papers.ksnn.schemes import Scheme, segments_on
 
-WINDOWS = (5, 10, 15, 20, 30, 45, 60, 90)
-"""Samples after the start at v = 0 at which errors are read."""
-STRIDE = 4
-"""Every so many samples of a test drive end windows."""
-MOST_SEEDS = 3
-"""Seeds of a candidate that are run again here."""
-HIGHEST_SHARE = 0.999
-"""Share of low yaw rates from which on nothing else is left."""
+WINDOWS = (5, 10, 15, 20, 30, 45, 60, 90)  # samples after the start at v = 0 at which errors are read
+STRIDE = 4  # every so many samples of a test drive end windows
+MOST_SEEDS = 3  # seeds of a candidate that are run again here
+HIGHEST_SHARE = 0.999  # share of low yaw rates from which on nothing else is left
 
 
 def luenberger_of(scheme: Scheme) -> Luenberger | None:
@@ -48,11 +43,7 @@ def luenberger_of(scheme: Scheme) -> Luenberger | None:
 
 
 def at_low_yaw_rate(scheme: Scheme, threshold: float, categories: Sequence[str], test: str) -> tuple[SegmentErrors, float]:
-    """SegmentErrors where |ω| lies below a threshold, and the share of such samples.
-
-    Args:
-        threshold: of the observer, below which it is reset [rad/s].
-    """
+    """SegmentErrors where |ω| lies below the observer's threshold [rad/s], and the share of such samples."""
     part, rate = scheme.part, scheme.part.protocol.rate_hz
     recordings = [reference for reference, _ in pieces_of(part.split.tests[test], lambda span: _reference(scheme, span), part.protocol)]
     segments: dict[str, list[Segments]] = {}
@@ -99,12 +90,7 @@ def _with_window(estimator: WindowedEstimator, recording: Recording, length: int
         series = prepare(network, torch.as_tensor(recording.stack(estimator.channels), dtype=dtype))
         windows = series.unfold(0, length, 1).transpose(1, 2)[ends - length]
         vy = network(windows).double().numpy().reshape(-1)
-    return _scored(recording, ends, vy)
-
-
-def _scored(recording: Recording, ends: NDArray[np.int64], vy: FloatArray) -> Scored:
-    speed, reference = recording["vx"][ends], recording["vy_ref"][ends]
-    ay = recording["ay"][ends]
+    speed, reference, ay = (recording[name][ends] for name in ("vx", "vy_ref", "ay"))
     return Scored(recording.time[ends], vy, reference, np.arctan2(vy, speed), np.arctan2(reference, speed), ay)
 
 
@@ -122,10 +108,7 @@ def without_biases(scheme: Scheme, categories: Sequence[str], test: str) -> tupl
         Candidates ``CATEGORY, as measured`` and ``CATEGORY, corrected``; biases by ``own`` and ``other``.
     """
     part = scheme.part
-    biases = {
-        "own": mean_bias(recordings_of(part, part.split.train)),
-        "other": mean_bias(recordings_of(part, part.split.validation)),
-    }
+    biases = {"own": mean_bias(recordings_of(part, part.split.train)), "other": mean_bias(recordings_of(part, part.split.validation))}
     segments: dict[str, list[Segments]] = {}
     for category in categories:
         for model in scheme.models(category)[:MOST_SEEDS]:

@@ -10,7 +10,7 @@ import pandas as pd
 
 from vehest.report.document import Column, Table
 from vehest.report.style import fixed, listed
-from vehest_papers.kit.statements import Compared, Outcome, outcomes
+from vehest_papers.kit.statements import Compared, outcomes
 from vehest_papers.ksnn import paper
 from vehest_papers.ksnn.schemes import Scheme
 
@@ -24,26 +24,15 @@ NETWORKS = (*paper.WITHOUT_BIAS, *paper.WITH_BIAS, *paper.PLAIN)
 IN_WORDS = "KS-NN without biases before Luenberger before GRU and LSTM"
 
 
-def order_tests(scheme: Scheme) -> list[Compared]:
-    """The four comparisons that make the paper's order of families."""
-    return [Compared(f"{first} below {second}", scheme.change(first, second, scheme.other, "fvu")) for first, second in ORDER]
-
-
-def order_of(found: Sequence[Outcome]) -> Order:
-    """Order of families that four outcomes make."""
-    if "the other way round" in found:
-        return "does not come out"
-    return "comes out" if found and all(own == "as claimed" for own in found) else "is open"
-
-
 def orders(schemes: Sequence[Scheme]) -> dict[str, Order]:
-    """Name of a part -> what its order is, all comparisons corrected together by Holm."""
-    tests = [(scheme.name, own) for scheme in schemes for own in order_tests(scheme)]
-    found = outcomes([own for _, own in tests])
-    by_part: dict[str, list[Outcome]] = {scheme.name: [] for scheme in schemes}
-    for (name, _), (outcome, _) in zip(tests, found, strict=True):
-        by_part[name].append(outcome)
-    return {name: order_of(own) for name, own in by_part.items()}
+    """Name of a part -> what its order is, by four comparisons each that are corrected together by Holm."""
+    tests = [Compared(f"{lower} below {higher}", own.change(lower, higher, own.other, "fvu")) for own in schemes for lower, higher in ORDER]
+    found = [outcome for outcome, _ in outcomes(tests)]
+    states: dict[str, Order] = {}
+    for position, scheme in enumerate(schemes):
+        own = set(found[len(ORDER) * position : len(ORDER) * (position + 1)])
+        states[scheme.name] = "does not come out" if "the other way round" in own else "comes out" if own == {"as claimed"} else "is open"
+    return states
 
 
 def headline(schemes: Sequence[Scheme], ablations: Mapping[str, Sequence[Scheme]]) -> str:

@@ -26,12 +26,11 @@ from vehest_papers.ksnn.linear_system import LocalModels
 from vehest_papers.ksnn.schemes import Scheme
 from vehest_papers.ksnn.sensitivities import HIGHEST_HZ, YAW_RATES, sensitivity_of
 
-ENOUGH, LONGER = "30", "60"
-"""Samples of a window: the paper's 1.5 s, and twice that."""
+ENOUGH, LONGER = "30", "60"  # samples of a window: the paper's 1.5 s, and twice that
 SLACK = -0.05
-BANDS_HZ = tuple(float(own) for own in 10.0 ** (np.arange(-10, 9) / 10.0))
-"""Centres of thirds of an octave, 0.1 to 6.3 Hz."""
+BANDS_HZ = tuple(float(own) for own in 10.0 ** (np.arange(-10, 9) / 10.0))  # centres of thirds of an octave, 0.1 to 6.3 Hz
 P2 = "linear_no_bias_p2"
+BIASES = {"before": "as measured", "after": "corrected"}
 
 
 def at_low_yaw_rates(schemes: Sequence[Scheme]) -> tuple[Statement, Table | None]:
@@ -118,13 +117,7 @@ def on_biases(schemes: Sequence[Scheme]) -> tuple[Statement, Table | None]:
             if category in (paper.NONLINEAR, paper.NONLINEAR_BIAS, paper.LSTM):
                 tests.append(Compared(f"S{scheme.name[-1]} {category.removeprefix('KS-NN ')}", change))
             row = {"scheme": scheme.title, "own": biases["own"], "other": biases["other"], "model": category, "change": change.in_percent()}
-            rows.append(
-                row
-                | {
-                    word: errors.in_words(f"{category}, {key}", "rmse_vy")
-                    for word, key in (("before", "as measured"), ("after", "corrected"))
-                }
-            )
+            rows.append(row | {word: errors.in_words(f"{category}, {key}", "rmse_vy") for word, key in BIASES.items()})
     claim = "biases of a_y removed (by the reference): RMSE(v) on the other car falls"
     statement = Statement(claim, "“expected”", schemes[0].kind, tests)
     columns = {
@@ -165,14 +158,7 @@ def on_noise(schemes: Sequence[Scheme]) -> Claim:
     if ratios:
         low, high = np.min(np.concatenate(ratios), axis=0), np.max(np.concatenate(ratios), axis=0)
         words = f"ratios over seeds: a_y {short(low[0])} to {short(high[0])}, a_x {short(low[1])} to {short(high[1])}"
-    return counted(
-        claim,
-        "“significantly lower”",
-        words,
-        schemes[0].kind,
-        found,
-        "every seed, or not",
-    )
+    return counted(claim, "“significantly lower”", words, schemes[0].kind, found, "every seed, or not")
 
 
 def on_spectra(schemes: Sequence[Scheme]) -> list[Claim | Statement]:

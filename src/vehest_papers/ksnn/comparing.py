@@ -33,7 +33,9 @@ class SegmentErrors(SampledErrors):
     """
 
     def __init__(self, segments: Mapping[str, Sequence[Segments]], name: str, *, same_models: bool = False) -> None:
-        self.segments = {own: parts for own, parts in segments.items() if parts and all(_is_finite(part) for part in parts)}
+        sums = ("squared_error_vy", "squared_error_sideslip")
+        finite = {own: all(math.isfinite(getattr(part, name).sum()) for part in parts for name in sums) for own, parts in segments.items()}
+        self.segments = {own: parts for own, parts in segments.items() if parts and finite[own]}
         super().__init__(self.segments, paired=same_models)
         self.measured: dict[tuple[str, str], Measured] = {}
         self.n_blocks = 0
@@ -85,28 +87,10 @@ class SegmentErrors(SampledErrors):
         return with_interval(own.value, low, high, 3) if math.isfinite(low) else fixed(own.value, 3)
 
 
-def _is_finite(part: Segments) -> bool:
-    return math.isfinite(float(part.squared_error_vy.sum())) and math.isfinite(float(part.squared_error_sideslip.sum()))
-
-
 def masked_segments(parts: Sequence[Scored], masks: Sequence[FloatArray], rate_hz: float) -> Segments:
-    """Sums over segments as `vehest.evaluation.blocks.segments_of` makes them, of some of the scored samples alone.
-
-    Args:
-        parts: estimate and reference, in order.
-        masks: of each, which samples count, (K,), 0 or 1.
-        rate_hz: of the scored samples [Hz].
-    """
-    marked = list(zip(parts, masks, strict=True))
-    chosen = segments_of(
-        [
-            replace(
-                part, vy=part.vy * mask, vy_ref=part.vy_ref * mask, sideslip=part.sideslip * mask, sideslip_ref=part.sideslip_ref * mask
-            )
-            for part, mask in marked
-        ],
-        rate_hz,
-    )
+    """Sums over segments as `vehest.evaluation.blocks.segments_of` makes them, of the scored samples where ``masks`` (K,) are 1."""
+    marked, fields = list(zip(parts, masks, strict=True)), ("vy", "vy_ref", "sideslip", "sideslip_ref")
+    chosen = segments_of([replace(part, **{name: getattr(part, name) * mask for name in fields}) for part, mask in marked], rate_hz)
     counts = segments_of([replace(part, vy_ref=np.asarray(mask, dtype=np.float64)) for part, mask in marked], rate_hz).vy_ref
     return replace(chosen, samples=counts)
 

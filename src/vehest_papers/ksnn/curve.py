@@ -5,7 +5,9 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
+import numpy as np
 import pandas as pd
 
 from vehest.evaluation.blocks import Segments
@@ -83,20 +85,9 @@ def curve_figure(curve: Curve) -> Figure:
                 line = line_of(*name) if category != paper.STATIC_MAP else MAP_LINE
                 values = [own.value for _, own in points]
                 ends = [own.interval for _, own in points]
-                bars = [
-                    [value - low for value, (low, _) in zip(values, ends, strict=True)],
-                    [high - value for value, (_, high) in zip(values, ends, strict=True)],
-                ]
-                axes.errorbar(
-                    [minutes for minutes, _ in points],
-                    values,
-                    yerr=bars,
-                    color=line.colour,
-                    linestyle=line.dash,
-                    marker=line.marker,
-                    elinewidth=0.6,
-                    label=category,
-                )
+                bars = np.abs(np.array(ends) - np.array(values)[:, None]).T
+                looks: dict[str, Any] = {"color": line.colour, "linestyle": line.dash, "marker": line.marker, "elinewidth": 0.6}
+                axes.errorbar([minutes for minutes, _ in points], values, yerr=bars, label=category, **looks)
             axes.set_xscale("log")
             axes.set_yscale("log")
             axes.set_title(title, loc="left")

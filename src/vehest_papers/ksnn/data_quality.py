@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import asdict, dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -18,8 +19,7 @@ from vehest_papers.ksnn.subjects import car_colours, car_title, kinds_of, plain_
 
 NOISE_COLOUR = "#555555"
 READ_AT_HZ = (0.1, 0.3, 1.0, 3.0)
-HIGHEST_HZ = 8.0
-"""Frequencies above are not shown: resampling to 20 Hz has removed them."""
+HIGHEST_HZ = 8.0  # frequencies above are not shown: resampling to 20 Hz has removed them
 MOST_POINTS = 5000
 AY_WIDTH, LEAST_SAMPLES = 1.0, 50
 COMPARED_AY = 8.0
@@ -70,15 +70,7 @@ def statistics(recordings: Sequence[Recording]) -> Statistics:
 
 
 def data_quality(sets: Mapping[str, Sequence[Recording]], source: str) -> list[Block]:
-    """Table I, then Figs. 4 and 5 by car, over all of its sets of one kind.
-
-    Args:
-        sets: name -> recordings at one rate with vx, yaw_rate, ay and vy_ref; ``C-1`` to ``F-2`` stand beside the paper's.
-        source: where the recordings come from, in words, for the captions.
-
-    Raises:
-        DataError: a channel is missing, or a recording is too short for a periodogram.
-    """
+    """Table I, then Figs. 4 and 5 by car, over all of its sets of one kind; ``C-1`` to ``F-2`` stand beside the paper's."""
     groups: dict[tuple[str, str], list[Recording]] = {}
     for recording in (recording for recordings in sets.values() for recording in recordings):
         groups.setdefault((recording.vehicle, recording.kind), []).append(recording)
@@ -124,13 +116,7 @@ def _row(name: str, data: str, vehicle: str, own: Statistics) -> dict[str, objec
         "v": f"{fixed(own.v_low, 2)} to {fixed(own.v_high, 2)}",
         "yaw_rate": f"{fixed(own.yaw_rate_min, 2)} to {fixed(own.yaw_rate_max, 2)}",
     }
-    return {
-        "set": name,
-        "data": data,
-        "vehicle": vehicle,
-        **words,
-        **{own_field.name: getattr(own, own_field.name) for own_field in fields(own)},
-    }
+    return {"set": name, "data": data, "vehicle": vehicle, **words, **asdict(own)}
 
 
 def spectra_of(recordings: Sequence[Recording]) -> tuple[Periodogram, Periodogram]:
@@ -153,28 +139,9 @@ def _figure_4(
             shown = (rate.frequency > 1.5 * rate.frequency[1]) & (rate.frequency <= HIGHEST_HZ)
             hz, above, below = rate.frequency[shown], rate.density[shown], noise.density[shown]
             lowest = min(lowest, float(above.min()), float(below.min()))
-            axes.fill_between(
-                hz,
-                above,
-                below,
-                where=above >= below,
-                color=colours[vehicle, kind],
-                alpha=0.16,
-                linewidth=0,
-                interpolate=True,
-                label="signal above noise",
-            )
-            axes.fill_between(
-                hz,
-                above,
-                below,
-                where=above < below,
-                color=NOISE_COLOUR,
-                alpha=0.28,
-                linewidth=0,
-                interpolate=True,
-                label="noise above signal",
-            )
+            fill = partial(axes.fill_between, hz, above, below, linewidth=0, interpolate=True)
+            fill(where=above >= below, color=colours[vehicle, kind], alpha=0.16, label="signal above noise")
+            fill(where=above < below, color=NOISE_COLOUR, alpha=0.28, label="noise above signal")
             axes.loglog(hz, above, color=colours[vehicle, kind], label="$\\dot{v}$")
             axes.loglog(hz, below, color=NOISE_COLOUR, linestyle="dashed", label="process noise $\\dot{v} - (a_y - \\omega u_m)$")
             axes.set_title(f"{car_title(vehicle)}, {kind}", loc="left", color=colours[vehicle, kind], fontweight="bold")
@@ -219,15 +186,8 @@ def _figure_5(groups: Mapping[tuple[str, str], Sequence[Recording]], source: str
             point_colours += [colours[vehicle, kind]] * len(kept)
             centres, medians = _medians(ay, velocity)
             label = f"{car_title(vehicle)}, {kind}"
-            marker = ("o", "s", "^", "D")[position % 4]
-            looks: dict[str, Any] = {
-                "marker": marker,
-                "markeredgecolor": "white",
-                "markeredgewidth": 0.5,
-                "markersize": 4.5,
-                "linewidth": 1.4,
-            }
-            axes.plot(centres, medians, color=colours[vehicle, kind], label=label, zorder=3, **looks)
+            looks: dict[str, Any] = {"marker": "os^D"[position % 4], "markeredgecolor": "white", "markeredgewidth": 0.5, "markersize": 4.5}
+            axes.plot(centres, medians, color=colours[vehicle, kind], linewidth=1.4, label=label, zorder=3, **looks)
             reach = max(reach, float(np.quantile(np.abs(velocity), 0.9995)))
         order = np.random.default_rng(0).permutation(len(point_colours))  # so that no car hides another
         scattered = np.concatenate(points, axis=1)[:, order]

@@ -42,14 +42,22 @@ def documents(artefacts: StudyArtefacts) -> dict[str, Document]:
     curve = curve_of(parts["scheme_2"], {name: own for name, own in parts.items() if name.startswith("minutes_")})
     pairs = _pairs(parts)
     entries, found = _entries(schemes, parts, curve, pairs)
-    judged = decided(entries)
+    figure_6 = (
+        f"The candidates on the two test sets (Figure 6 of the paper), ours on {schemes[0].kind.upper()} cars: filled marks, the seed "
+        f"that validation chooses of each structure; faint ones, the other seeds; hollow ones, the paper's most general models. Above the "
+        f"dashed line the own car is estimated better."
+    )
+    overview = (
+        "FVU, with 95 % intervals over blocks of the drives and seeds, and RMSE(v), since v varies differently from car to car; of each "
+        f"category the structure that validation chooses; all figures are in the CSV. {schemes[0].kind.upper()}."
+    )
     blocks: list[Block] = [
         *_asked(artefacts),
         headline(schemes, ablations),
-        claims_table(judged, _note(schemes)),
+        claims_table(decided(entries), _note(schemes)),
         "## On the own car, on the other and on a third",
-        _figure_6(schemes),
-        tables.across_cars(schemes, "overview", _overview_caption(schemes), without=(paper.KINEMATIC,)),
+        scatter.two_tests(schemes, figure_6),
+        tables.across_cars(schemes, "overview", overview, without=(paper.KINEMATIC,)),
     ]
     if ablations:
         blocks += ["## Which difference between the cars matters", causes_table(schemes, ablations)]
@@ -130,22 +138,6 @@ def _note(schemes: Sequence[Scheme]) -> str:
     )
 
 
-def _figure_6(schemes: Sequence[Scheme]) -> Block:
-    caption = (
-        f"The candidates on the two test sets (Figure 6 of the paper), ours on {schemes[0].kind.upper()} cars: filled marks, the seed "
-        f"that validation chooses of each structure; faint ones, the other seeds; hollow ones, the paper's most general models. Above the "
-        f"dashed line the own car is estimated better."
-    )
-    return scatter.two_tests(schemes, caption)
-
-
-def _overview_caption(schemes: Sequence[Scheme]) -> str:
-    return (
-        "FVU, with 95 % intervals over blocks of the drives and seeds, and RMSE(v), since v varies differently from car to car; of each "
-        f"category the structure that validation chooses; all figures are in the CSV. {schemes[0].kind.upper()}."
-    )
-
-
 def _appendices(
     artefacts: StudyArtefacts, parts: Mapping[str, Scheme], schemes: Sequence[Scheme], curve: Curve | None, found: Sequence[Table]
 ) -> list[Block]:
@@ -163,20 +155,12 @@ def _appendices(
         blocks.append(tables.regularisation(runs["scheme_2"], runs["one_vehicle"]))
     others = [parts[name] for name in OTHER_CARS if name in parts]
     if others:
-        blocks += [
-            "## Appendix: a simulated DevBot and the real Ferrari",
-            tables.across_cars(
-                others, "devbot", "FVU and RMSE(v) with 95 % intervals, of each category the structure that validation chooses."
-            ),
-            *[tables.whether_an_order_means_anything(scheme) for scheme in others],
-        ]
+        caption = "FVU and RMSE(v) with 95 % intervals, of each category the structure that validation chooses."
+        blocks += ["## Appendix: a simulated DevBot and the real Ferrari", tables.across_cars(others, "devbot", caption)]
+        blocks += map(tables.whether_an_order_means_anything, others)
     pairs = _pairs(parts)
     if pairs:
-        blocks += [
-            "## Appendix: pairs of small cars",
-            tables.small_cars(pairs),
-            *[tables.whether_an_order_means_anything(own) for own in pairs],
-        ]
+        blocks += ["## Appendix: pairs of small cars", tables.small_cars(pairs), *map(tables.whether_an_order_means_anything, pairs)]
     blocks += ["## Appendix: noise of the accelerations", *analyses.of_sensitivities(schemes)]
     blocks += ["## Appendix: spectra of the residuals", *analyses.of_residuals(schemes)]
     blocks += ["## Appendix: what the networks have learnt", *analyses.of_interpretation(schemes)]
@@ -207,14 +191,8 @@ def _how_it_was_made(artefacts: StudyArtefacts) -> list[Block]:
 
 def _averaging(artefacts: StudyArtefacts) -> str:
     """Averaging of weights over training steps, where a training is configured with it."""
-    decays = sorted(
-        {
-            float(model.training.get("averaging") or 0.0)
-            for part in artefacts.parts.values()
-            for model in part.models
-            if "averaging" in model.training
-        }
-    )
+    trainings = [model.training for part in artefacts.parts.values() for model in part.models]
+    decays = sorted({float(own["averaging"] or 0.0) for own in trainings if "averaging" in own})
     if decays in ([], [0.0]):
         return "Networks keep the weights of their best epoch."
     words = listed([fixed(own, 4).rstrip("0") for own in decays])

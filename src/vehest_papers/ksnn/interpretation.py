@@ -15,16 +15,7 @@ from vehest.data.recording import Recording
 from vehest.data.runs import true_runs
 from vehest.estimators.ksnn import Ksnn
 from vehest.report.document import Block, Column, Figure, Table
-from vehest.report.style import (
-    DOUBLE_COLUMN,
-    REFERENCE_COLOUR,
-    fixed,
-    legend_above,
-    listed,
-    new_figure,
-    significant,
-    with_unit,
-)
+from vehest.report.style import DOUBLE_COLUMN, REFERENCE_COLOUR, fixed, legend_above, listed, new_figure, significant, with_unit
 from vehest_papers.ksnn.activation import LOCAL_COLOURS, LOCAL_DASHES
 from vehest_papers.ksnn.linear_system import LocalModels, LpvModel, SubModels, decomposed_estimate
 from vehest_papers.ksnn.subjects import Trained
@@ -44,28 +35,14 @@ PART_WORDS = {
     "speed": "third (speed and yaw rate)",
     "bias": "third (learned offsets)",
 }
-SPEED = 25.0
-"""Forward speed for which the third sub-model's steady value is given [m/s]."""
-STEADY_YAW_RATE = 0.4
-"""Yaw rate for it where the last centre is at zero [rad/s]."""
+SPEED = 25.0  # forward speed for which the third sub-model's steady value is given [m/s]
+STEADY_YAW_RATE = 0.4  # yaw rate for it where the last centre is at zero [rad/s]
 
 
 def interpretation(
     linear: Sequence[Trained], nonlinear: Sequence[Trained], drive: Recording, stretch: tuple[float, float], source: str
 ) -> list[Block]:
-    """Everything of Section IV: gains, sub-models of the first network along a drive, feedback functions.
-
-    Args:
-        linear: linear KS-NNs, one a training vehicle; may be empty.
-        nonlinear: nonlinear KS-NNs; may be empty.
-        drive: at the networks' rate, with ``vy_ref``.
-        stretch: of the drive, that is drawn [s].
-        source: what the drive is, with real or simulated, for captions.
-
-    Raises:
-        ConfigurationError: an estimator is no KS-NN of its kind.
-        DataError: the drive lacks a channel, has another rate or no samples in the stretch.
-    """
+    """Everything of Section IV: gains, sub-models of the first network along a drive, feedback functions; ``stretch`` [s] is drawn."""
     blocks = gain_curves(linear) if linear else []
     for own in (*linear, *nonlinear)[:1]:
         blocks += sub_models(own, drive, stretch, source)
@@ -79,11 +56,7 @@ def interpretation(
 
 
 def gain_curves(models: Sequence[Trained]) -> list[Block]:
-    """γ, β, w, b and the poles of linear KS-NNs over |ω|, and what they mean in words.
-
-    Raises:
-        ConfigurationError: one is no linear KS-NN.
-    """
+    """γ, β, w, b and the poles of linear KS-NNs over |ω|, and what they mean in words."""
     linear = [_linear(own) for own in models]
     with_bias = any(np.any(model.bias) for model in linear)
     panels = ["gamma", "beta", "weight", *(["bias"] if with_bias else []), "poles"]
@@ -232,18 +205,7 @@ def _poles(model: LpvModel, yaw_rate: FloatArray) -> FloatArray:
 
 
 def sub_models(own: Trained, drive: Recording, stretch: tuple[float, float], source: str) -> list[Block]:
-    """The parts that an estimate consists of along a drive, and what each contributes to its variance.
-
-    Args:
-        own: a KS-NN; nonlinear feedback counts with the gains that are in force.
-        drive: at its rate, with ``vy_ref``.
-        stretch: that is drawn [s].
-        source: what the drive is, for the caption.
-
-    Raises:
-        ConfigurationError: it is no KS-NN.
-        DataError: the drive lacks a channel, has another rate or no samples in the stretch.
-    """
+    """The parts that an estimate consists of along a drive, and what each contributes to its variance; ``stretch`` [s] is drawn."""
     estimator = _ksnn(own)
     parts = decomposed_estimate(estimator, drive)
     estimate = estimator.estimate([drive.without_references()])[0]["vy"]
@@ -331,15 +293,7 @@ def _table_of_parts(own: Trained, drive: Recording, parts: SubModels, source: st
 
 
 def feedback_functions(own: Trained, drive: Recording, source: str, *, name: str = "feedback") -> list[Block]:
-    """f₁ and f₂ of every local model over e = û - u_m, and how their gain varies where e lies along a drive.
-
-    Args:
-        own: a nonlinear KS-NN.
-        source: what the drive is, for the caption.
-
-    Raises:
-        ConfigurationError: it is no nonlinear KS-NN.
-    """
+    """f₁ and f₂ of every local model over e = û - u_m, and how their gain varies where e lies along a drive."""
     estimator = _ksnn(own)
     if not estimator.settings.n_hidden:
         raise ConfigurationError(f"{own.named} is linear; its feedback functions are straight lines")

@@ -42,8 +42,7 @@ from vehest.data.errors import DataError
 from vehest.data.recording import Recording
 from vehest.estimators.ksnn import Ksnn
 
-SMALL_ERROR = 1e-6
-"""Below it the secant of a feedback function is taken to be its tangent at 0 [m/s]."""
+SMALL_ERROR = 1e-6  # below it the secant of a feedback function is taken to be its tangent at 0 [m/s]
 
 
 @dataclass(frozen=True, eq=False)
@@ -116,11 +115,7 @@ class LocalModels:
         return np.where(small, self.slope(np.zeros(())), rise)
 
     def linearised(self, error: float = 0.0) -> LpvModel:
-        """The linear system that this is for linear feedback, and close to ``error`` otherwise: f(e) ≈ f(e₀) + f'(e₀)(e - e₀).
-
-        Args:
-            error: e₀, the difference û - u_m to linearise at [m/s].
-        """
+        """The linear system that this is for linear feedback, and close to ``error`` e₀ [m/s] otherwise: f(e) ≈ f(e₀) + f'(e₀)(e - e₀)."""
         at = np.asarray(error)
         slope = self.slope(at)
         return LpvModel(self.centres, self.gamma, self.beta, slope, self.feedback(at) - slope * error, self.step, self.n_window)

@@ -33,10 +33,8 @@ from vehest_papers.ksnn.linear_system import LpvModel
 
 ComplexArray = NDArray[np.complex128]
 
-NEGLIGIBLE = 1e-9
-"""Part of an impulse response that is left out at its end."""
-LONGEST = 1_000_000
-"""Samples after which an impulse response is no longer followed."""
+NEGLIGIBLE = 1e-9  # part of an impulse response that is left out at its end
+LONGEST = 1_000_000  # samples after which an impulse response is no longer followed
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,10 +50,6 @@ class NoiseSensitivity:
     def truncated(self, n_window: int) -> NoiseSensitivity:
         """The same for an estimator that sees windows of N samples: lags 0 to N of the impulse response."""
         return replace(self, memory=n_window)
-
-    def endless(self) -> NoiseSensitivity:
-        """The recursion's own, for a window of any length."""
-        return replace(self, memory=None)
 
     @property
     def poles(self) -> ComplexArray:

@@ -48,11 +48,7 @@ class Panel:
 
 
 def residuals(panels: Sequence[Panel]) -> list[Block]:
-    """Spectra of v and of the residuals, one panel a test set, and how far they lie apart.
-
-    Raises:
-        DataError: a range is shorter than a segment.
-    """
+    """Spectra of v and of the residuals, one panel a test set, and how far they lie apart."""
     spectra = [_spectra(panel) for panel in panels]
     frame = pd.DataFrame([row for panel, own in zip(panels, spectra, strict=True) for row in _rows(panel, own)])
     return [_figure(panels, spectra), _in_words(panels, spectra), _table(frame, panels)]

@@ -5,10 +5,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
-import pandas as pd
-
 from vehest.report.document import Figure
-from vehest.report.style import DOUBLE_COLUMN, Line, line_of, new_figure
+from vehest.report.style import DOUBLE_COLUMN, line_of, new_figure
 from vehest_papers.ksnn import paper
 from vehest_papers.ksnn.candidates import chosen
 from vehest_papers.ksnn.schemes import Scheme
@@ -39,7 +37,8 @@ def _draw(axes: Any, scheme: Scheme, metric: str) -> None:
     for name in paper.CATEGORIES:
         if name not in groups:
             continue
-        own, line = groups[name], _line(groups[name])
+        own, first = groups[name], groups[name].iloc[0]
+        line = line_of(str(first["estimator"]), str(first["variant"]))
         axes.scatter(own[x], own[y], s=5, marker=line.marker, color=line.colour, alpha=0.25, linewidths=0, zorder=2)
         picked = [chosen(runs) for _, runs in own.groupby(["estimator", "variant"], sort=False)]
         axes.scatter(
@@ -58,8 +57,3 @@ def _draw(axes: Any, scheme: Scheme, metric: str) -> None:
     axes.set_xlim(limits)
     axes.set_ylim(limits)
     axes.set_aspect("equal")
-
-
-def _line(runs: pd.DataFrame) -> Line:
-    first = runs.iloc[0]
-    return line_of(str(first["estimator"]), str(first["variant"]))

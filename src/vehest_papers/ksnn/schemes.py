@@ -19,8 +19,7 @@ from vehest_papers.ksnn.candidates import chosen_by_category, runs_of
 from vehest_papers.ksnn.comparing import SegmentErrors
 from vehest_papers.ksnn.paper import Published
 
-THIRD = "j1"
-"""Test set of a car that no network learns or stops on, where there is one."""
+THIRD = "j1"  # test set of a car that no network learns or stops on, where there is one
 SET_TITLES = {"c2": "C-2", "f2": "F-2", THIRD: "third car"}
 
 
@@ -30,11 +29,7 @@ def _read(path: Path) -> dict[str, Segments]:
 
 
 def segments_on(model: EvaluatedModel, test: str) -> Segments:
-    """Errors of a model by segments of a test set, its file read once for all tests.
-
-    Raises:
-        DataError: the file is damaged, or has no such test set.
-    """
+    """Errors of a model by segments of a test set, its file read once for all tests."""
     found = _read(model.evaluation_folder / "blocks.csv")
     return found[test] if test in found else model.segments(test)
 
@@ -64,11 +59,6 @@ class Scheme:
     def kind(self) -> str:
         """``real``, ``simulated`` or both."""
         return words_of_kinds(self.part)
-
-    @property
-    def has_third(self) -> bool:
-        """Whether a third car is tested."""
-        return THIRD in self.part.split.tests
 
     def models(self, category: str) -> list[EvaluatedModel]:
         """All seeds of the structure that validation chooses of a category; none where it is not there."""
@@ -107,12 +97,8 @@ class Scheme:
         """From one category to another on a test set."""
         return self.errors(test).change(self.name_of(first), self.name_of(second), metric)
 
-    def other_over_own(self, category: str) -> Change | None:
-        """How many times the FVU on the own car is left on the other one."""
-        return self.ratio(self.name_of(category))
-
-    def ratio(self, name: str) -> Change | None:
-        """The same of any structure."""
+    def other_over_own(self, name: str) -> Change | None:
+        """How many times a structure's FVU on the own car is left on the other one."""
         other, own = (self.errors(test).get(name, "fvu") for test in (self.other, self.own))
         return Change.of(other, own) if other is not None and own is not None else None
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pandas as pd
@@ -21,15 +21,12 @@ from vehest_papers.ksnn.linear_system import LocalModels
 from vehest_papers.ksnn.noise_sensitivity import NoiseSensitivity, ksnn_sensitivity, luenberger_sensitivity
 from vehest_papers.ksnn.subjects import Trained
 
-YAW_RATES = (0.2, 0.4)
-"""As in the paper: about the median of |ω| in its drives, and twice that [rad/s]."""
+YAW_RATES = (0.2, 0.4)  # as in the paper: about the median of |ω| in its drives, and twice that [rad/s]
 LOWEST_HZ, HIGHEST_HZ = 0.01, 10.0
 CHANNELS = ("ay", "ax")
 INJECTED_SAMPLES = 200_000
-INJECTED_SIZE = 0.5
-"""Standard deviation of the injected noise [m/s²]."""
-SPEED = 25.0
-"""Forward speed of the turn into which noise is injected [m/s]."""
+INJECTED_SIZE = 0.5  # standard deviation of the injected noise [m/s²]
+SPEED = 25.0  # forward speed of the turn into which noise is injected [m/s]
 SETTLING_SAMPLES = 2000
 DASHES = ("solid", "dashed", "dashdot", "dotted")
 
@@ -43,11 +40,7 @@ class Injected:
 
 
 def sensitivity_of(estimator: Estimator, yaw_rate: float, error: float = 0.0) -> NoiseSensitivity:
-    """Closed form of an estimator at constant yaw rate: a KS-NN's by its windows, linearised at û - u_m = ``error`` where it is not linear.
-
-    Raises:
-        ConfigurationError: it is neither a KS-NN nor a Luenberger observer.
-    """
+    """Closed form at constant yaw rate: a KS-NN's by its windows, linearised at û - u_m = ``error`` where it is not linear."""
     if isinstance(estimator, Ksnn):
         return ksnn_sensitivity(LocalModels.of(estimator).linearised(error), yaw_rate).truncated(estimator.settings.window)
     if isinstance(estimator, Luenberger):
@@ -80,16 +73,7 @@ def injected(
 
 
 def sensitivities(columns: Sequence[tuple[Trained, Trained]], *, n_samples: int = INJECTED_SAMPLES, error: float = 0.0) -> list[Block]:
-    """Magnitudes of H_Y and H_X, a column a training vehicle, with the check by injection.
-
-    Args:
-        columns: a KS-NN (linear, without bias, in the paper) and a Luenberger observer trained on the same data, by vehicle.
-        n_samples: length of the turns into which noise is injected.
-        error: û - u_m at which nonlinear networks are linearised, 0 or what is typical of a drive [m/s].
-
-    Raises:
-        ConfigurationError: an estimator is of another kind.
-    """
+    """Magnitudes of H_Y and H_X, a column a training vehicle (KS-NN and Luenberger observer), with the check by injection."""
     frames = [pd.DataFrame([row for own in pair for row in _rows(own, n_samples, error)]) for pair in columns]
     return [_figure(columns, error), _in_words(columns, frames), _table(pd.concat(frames, ignore_index=True), n_samples)]
 
@@ -150,7 +134,7 @@ def _figure(columns: Sequence[tuple[Trained, Trained]], error: float) -> Figure:
                 line = line_of(own.estimator.name, own.estimator.variant)
                 for yaw_rate, dash in zip(YAW_RATES, DASHES, strict=False):
                     windowed = sensitivity_of(own.estimator, yaw_rate, error)
-                    strong = windowed.endless() if _settles(windowed) else windowed
+                    strong = replace(windowed, memory=None) if _settles(windowed) else windowed
                     label = f"{own.estimator.title}, |ω| = {yaw_rate:g} rad/s"
                     for axes, response, cut in zip(column, strong.response(frequency), windowed.response(frequency), strict=True):
                         axes.loglog(frequency, np.abs(response), color=line.colour, linestyle=dash, label=label)

@@ -49,15 +49,11 @@ def instances(runs: pd.DataFrame) -> Table:
 
 
 def across_cars(schemes: Sequence[Scheme], name: str, caption: str, without: Sequence[str] = ()) -> Table:
-    """Tables IV and V and Figure 6 in one: of each category the structure that validation chooses, over all its seeds, with 95 % intervals.
-
-    Args:
-        without: categories that are left out.
-    """
+    """Tables IV and V and Figure 6 in one: of each category the structure chosen by validation, over all seeds, with 95 % intervals."""
     rows = []
-    third, published = any(scheme.has_third for scheme in schemes), any(scheme.published for scheme in schemes)
+    third, published = any(THIRD in scheme.part.split.tests for scheme in schemes), any(scheme.published for scheme in schemes)
     for scheme in schemes:
-        tests = {"own": scheme.own, "other": scheme.other} | ({"third": THIRD} if scheme.has_third else {})
+        tests = {"own": scheme.own, "other": scheme.other} | ({"third": THIRD} if THIRD in scheme.part.split.tests else {})
         for category, run in scheme.chosen.items():
             if category in without:
                 continue
@@ -128,14 +124,7 @@ def small_cars(pairs: Sequence[Scheme]) -> Table:
 
 
 def sideslip(schemes: pd.DataFrame, drive: pd.DataFrame | None, whole: pd.DataFrame | None, kind: str) -> Table:
-    """Table VI: RMSE of the sideslip angle.
-
-    Args:
-        schemes: runs of scheme 2; F-2 is read.
-        drive: runs of one drive of the real Ferrari, its test range ``test``.
-        whole: runs on the whole drive of the real Ferrari, of estimators that learn nothing.
-        kind: of the data of scheme 2, ``real`` or ``simulated``.
-    """
+    """Table VI: RMSE of the sideslip angle: F-2 of scheme 2, one drive of the real Ferrari, and its whole drive by what learns nothing."""
     rows = []
     lags = [name for name in dict.fromkeys(whole["category"]) if name.startswith(paper.FIXED_LAG)] if whole is not None else []
     for category in [*paper.BASELINES, *paper.TABLE_VI, *lags]:

@@ -47,14 +47,7 @@ class Additions:
 
 
 def additions(name: str, part: PartArtefacts, beside: Mapping[str, PartArtefacts], errors: Mapping[str, Losses], kind: str) -> Additions:
-    """All comparisons of the parts that are there.
-
-    Args:
-        name: of the main part, and of files.
-        part: the main one.
-        beside: parts of the same data, by name.
-        errors: test set -> losses of the main part.
-    """
+    """All comparisons of the parts that are there."""
     own, groups = Additions(), models_by_candidate(part)
     main = {title: Subject.of(part, title, errors=errors) for title in groups}
     scratch = _alone(beside, SCRATCH)
@@ -92,7 +85,6 @@ def additions(name: str, part: PartArtefacts, beside: Mapping[str, PartArtefacts
 
 
 def _alone(beside: Mapping[str, PartArtefacts], name: str) -> Subject | None:
-    """The only candidate of a part, if the part is there."""
     if name not in beside:
         return None
     candidate = next(iter(models_by_candidate(beside[name])))

@@ -125,13 +125,7 @@ def comparison_claims(comparisons: Sequence[Comparison], found: Corrected, data:
 
 
 def minima_claim(scratch: Subject, trained: Subject, data: str, share: float) -> Claim:
-    """That trainings from scratch end in local minima, by their validation losses.
-
-    Args:
-        scratch: those that ended.
-        trained: with pre-training.
-        share: samples learnt from, of those of the pre-trained; below 1 a minimum cannot be distinguished from a training that is not over.
-    """
+    """That trainings from scratch end in local minima, by their validation losses."""
     limit = float(trained.validation().max())
     k, n = int((scratch.validation() > limit).sum()), len(scratch.seeds)
     ends = stats.binomtest(k, n).proportion_ci(CONFIDENCE)

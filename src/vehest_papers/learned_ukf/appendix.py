@@ -24,13 +24,7 @@ from vehest_papers.learned_ukf.trials import step_size, trials_table
 
 
 def appendix_of_part(
-    title: str,
-    name: str,
-    part: PartArtefacts,
-    runs: pd.DataFrame,
-    errors: Mapping[str, Losses],
-    where: str,
-    data: dict[str, pd.DataFrame],
+    title: str, name: str, part: PartArtefacts, runs: pd.DataFrame, errors: Mapping[str, Losses], where: str, data: dict[str, pd.DataFrame]
 ) -> list[Block]:
     """Orders of all pairs, errors by state, consistency, slip angles and budgets of a main part."""
     kind = words_of_kinds(part).upper()

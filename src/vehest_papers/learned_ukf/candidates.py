@@ -29,8 +29,7 @@ from vehest_papers.kit.reading import metric_values
 from vehest_papers.learned_ukf import paper
 from vehest_papers.learned_ukf.errors import Losses
 
-SETS: Mapping[str, str] = {"tyre_a": "tyre A", "tyre_d": "tyre D"}
-"""Test set -> tyre."""
+SETS: Mapping[str, str] = {"tyre_a": "tyre A", "tyre_d": "tyre D"}  # test set -> tyre
 
 ACCURACY = ("mse_weighted", "mae_weighted", "ae99_weighted", "rmse_vx", "rmse_vy", "rmse_yaw_rate")
 CONSISTENCY = ("nees", "nis", "coverage_1sigma", "coverage_2sigma")

@@ -132,11 +132,7 @@ def friction_claims(median: Interval, final: Interval, data: str) -> list[Claim]
         near = "reproduced"
     elif final.high < low or final.low > high:
         near = "not reproduced"
-    words = {
-        "reproduced": "interval within",
-        "not reproduced": "interval beyond",
-        "undecided": "interval holds a limit",
-    }
+    words = {"reproduced": "interval within", "not reproduced": "interval beyond", "undecided": "interval holds a limit"}
     time = f"{with_interval(median.value, median.low, median.high, 2)} s"
     end = with_interval(final.value, final.low, final.high, 2)
     where = f"{data}, tyre D"
@@ -147,11 +143,7 @@ def friction_claims(median: Interval, final: Interval, data: str) -> list[Claim]
 
 
 def instability_claims(lost: Mapping[str, Sequence[tuple[int, int]]], data: str) -> list[Claim]:
-    """That the tyre network without friction becomes unstable on the unseen tyre.
-
-    Args:
-        lost: method -> of each seed, sequences that lose definiteness without repair, and all.
-    """
+    """That the tyre network without friction becomes unstable on the unseen tyre; ``lost``: sequences lost without repair, and all."""
     claims = []
     for method, seeds in lost.items():
         bad, k, n = sum(own > 0 for own, _ in seeds), sum(own for own, _ in seeds), sum(own for _, own in seeds)
@@ -164,11 +156,7 @@ def instability_claims(lost: Mapping[str, Sequence[tuple[int, int]]], data: str)
 
 
 def states_claim(claim: str, words: str, expected: Mapping[str, tuple[Interval, float, bool]], data: str) -> Claim:
-    """About several states of Figure 5.
-
-    Args:
-        expected: state -> difference of mean squares NNTF_U - NNTF, the error of NNTF, and whether the paper has it lower.
-    """
+    """About several states of Figure 5: difference of mean squares NNTF_U - NNTF, the error of NNTF, and whether the paper has it lower."""
     verdicts, shown = [], []
     for state, (own, before, lower) in expected.items():
         verdicts.append(verdict_below(own.low, own.high) if lower else verdict_below(-own.high, -own.low))

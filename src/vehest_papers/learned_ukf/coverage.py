@@ -16,11 +16,7 @@ from vehest_papers.learned_ukf.candidates import SETS, losses, scored_of
 
 
 def coverage_table(trained: Mapping[str, tuple[PartArtefacts, list[EvaluatedModel]]], candidate: str, name: str, data: str) -> Table:
-    """A row a tyre and training: weighted MSE, and the share of vy's errors within one and two deviations, with 95 % intervals.
-
-    Args:
-        trained: words for a training -> its part and the candidate's seeds.
-    """
+    """A row a tyre and training: weighted MSE, and the share of vy's errors within one and two deviations, with 95 % intervals."""
     rows: list[dict[str, object]] = []
     for test, tyre in SETS.items():
         for words, (part, models) in trained.items():

@@ -157,7 +157,6 @@ def _add_oracle(part: PartArtefacts, runs: pd.DataFrame, errors: Mapping[str, Lo
 
 
 def _accuracy(own: Outcome, name: str, errors: Mapping[str, Losses], kind: str, *, summary: bool) -> None:
-    """The best method, the summary, and Tables I and II."""
     own.front.append("## Tables I and II\n\n" + "\n\n".join(_standing(of_test, SETS[test]) for test, of_test in errors.items()))
     if summary:
         own.front.append(tables.overview(errors, kind))
@@ -233,7 +232,6 @@ def _instability(own: Outcome, part: PartArtefacts, kind: str) -> None:
 
 
 def _likelihood(own: Outcome, name: str, part: PartArtefacts, beside: Mapping[str, PartArtefacts], kind: str) -> None:
-    """Training with a likelihood term."""
     if LIKELIHOOD in beside:
         trained = {
             words: (which, models_by_candidate(which)[paper.NNTF_UH])
@@ -243,7 +241,6 @@ def _likelihood(own: Outcome, name: str, part: PartArtefacts, beside: Mapping[st
 
 
 def _prediction(own: Outcome, name: str, part: PartArtefacts, where: str, kind: str, data: dict[str, pd.DataFrame]) -> None:
-    """Figures 5 and 6, and the claims about them."""
     groups = models_by_candidate(part)
     by_seed = [{model.seed: model for model in groups.get(method, [])} for method in (prediction.BEFORE, prediction.AFTER)]
     seeds = sorted(set(by_seed[0]) & set(by_seed[1]))

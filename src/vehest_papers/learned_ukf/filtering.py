@@ -20,17 +20,11 @@ from vehest.studies.artefacts import EvaluatedModel, PartArtefacts
 from vehest.training.through_filter import Drive
 from vehest.vehicle.dynamics import STATES
 
-MOVING = STATES[:4]
-"""States that are measured or referenced: all but the friction."""
+MOVING = STATES[:4]  # states that are measured or referenced: all but the friction
 
 
 class Swapped(PointModel):
-    """Moves points by one model and expects measurements by another; without adjoints, so it cannot be trained.
-
-    Args:
-        predicting: its transition and its limits are taken.
-        observing: its observation is taken.
-    """
+    """Moves points by one model and expects measurements by another; without adjoints, so it cannot be trained."""
 
     def __init__(self, predicting: PointModel, observing: PointModel) -> None:
         self._predicting, self._observing = predicting, observing
@@ -58,12 +52,7 @@ class Swapped(PointModel):
 
 
 def loaded(model: EvaluatedModel) -> LearnedUkf:
-    """The filter of an evaluated model.
-
-    Raises:
-        MissingError: there is no model.
-        DataError: a file is damaged, or it is another estimator's.
-    """
+    """The filter of an evaluated model."""
     estimator = load_model(model.model_folder)
     if not isinstance(estimator, LearnedUkf):
         raise DataError(f"'{model.model_folder}' holds a model of '{estimator.name}', not of '{LearnedUkf.name}'")
@@ -71,12 +60,7 @@ def loaded(model: EvaluatedModel) -> LearnedUkf:
 
 
 def drives_of(part: PartArtefacts, estimator: LearnedUkf, test: str) -> Drive:
-    """The sequences of a test set, as the filter takes them, side by side: (B, T, ...).
-
-    Raises:
-        ConfigurationError: the protocol cuts no sequences, or has another rate than the filter.
-        DataError: a channel is missing or has gaps.
-    """
+    """The sequences of a test set, as the filter takes them, side by side: (B, T, ...)."""
     if part.protocol.sequence_seconds is None or part.protocol.rate_hz != estimator.settings.rate_hz:
         raise ConfigurationError(
             f"study '{part.study}' needs evaluation.sequence_seconds, and evaluation.rate_hz={estimator.settings.rate_hz:g} as its filters "

@@ -26,8 +26,7 @@ from vehest_papers.learned_ukf.prediction import over_sequences
 STARTS = (0.3, 0.6, 0.9)
 COLOURS = ("#0b4f9c", "#444444", "#b3122a")
 TRAINED_FROM, LOW = 0.6, 0.4  # starts of NNTF_UH and NNTF_UH*
-DEVIATIONS = (None, 0.03, 0.003)
-"""Of the friction at the start: as learnt, and two smaller ones, the last that of the authors' code."""
+DEVIATIONS = (None, 0.03, 0.003)  # of the friction at the start: as learnt, and two smaller ones, the last that of the authors' code
 LAST_SECONDS = 2.0
 N_RESAMPLES = 2000
 

@@ -21,11 +21,7 @@ TRAINING = ThroughFilterSettings(
 
 
 def train_on(estimator: LearnedUkf, drives: Drive, skip: int, training: ThroughFilterSettings = TRAINING) -> LearnedUkf:
-    """Train a filter further, in place, on a test's own sequences (B, T, ...), and stop on them too; its friction is free.
-
-    Args:
-        skip: first samples of each that are not scored.
-    """
+    """Train a filter further, in place, on a test's own sequences (B, T, ...), and stop on them too; its friction is free."""
     length = drives.states.shape[1]
     training = replace(training, steps=min(training.steps, length), validation_steps=length, validation_drop_steps=skip)
     own = [Drive(*(part[row] for part in drives)) for row in range(len(drives.states))]
@@ -34,14 +30,7 @@ def train_on(estimator: LearnedUkf, drives: Drive, skip: int, training: ThroughF
     every = torch.cat([weights, nothing])
     judged = torch.cat([weights[:3], nothing, nothing])
     phases = filter_phases(
-        estimator.filter,
-        own,
-        own,
-        Weights(every, every, judged),
-        training,
-        training.through,
-        lambda name: True,
-        "oracle",
+        estimator.filter, own, own, Weights(every, every, judged), training, training.through, lambda name: True, "oracle"
     )
     train_phases(phases, 0, FitContext())
     return estimator

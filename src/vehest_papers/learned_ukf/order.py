@@ -83,12 +83,7 @@ def pairs_table(pairs: pd.DataFrame, name: str, caption: str) -> Table:
 
 
 def order_in_words(pairs: pd.DataFrame, medians: Mapping[str, float], where: str) -> str:
-    """How many pairs are as in the paper, which are the other way round, and which of its neighbours cannot be told apart.
-
-    Args:
-        medians: candidate -> median over seeds of its mean loss, of all that are compared.
-        where: on which data, and of what, for people: ``on tyre A``.
-    """
+    """How many pairs are as in the paper, which are the other way round, and which of its neighbours cannot be told apart."""
     ours = sorted(medians, key=medians.__getitem__)
     shown = ", ".join(f"{name} ({fixed(medians[name], DECIMALS)})" for name in ours)
     words = f"Order {where} by the median of seeds, best first: {shown}."

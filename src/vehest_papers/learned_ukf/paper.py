@@ -14,8 +14,7 @@ GRU, LSTM = "GRU", "LSTM"
 ZERO, STATIC_MAP, DATA_SHEET, ORACLE = "zero", "static map", "data sheet", "oracle"
 BASELINES = (ZERO, STATIC_MAP, DATA_SHEET)
 
-CANDIDATES = (PC, PCR, NN, NN_U, NNT, NNT_U, NNTF, NNTF_U, NNTF_UH, NNTF_UH_LOW, GRU, LSTM)
-"""In the order of Table II."""
+CANDIDATES = (PC, PCR, NN, NN_U, NNT, NNT_U, NNTF, NNTF_U, NNTF_UH, NNTF_UH_LOW, GRU, LSTM)  # in the order of Table II
 
 
 @dataclass(frozen=True)
@@ -66,14 +65,10 @@ AUTHORS_CODE: Mapping[str, float] = {"tyre_a": 0.0158, "tyre_d": 0.0441}
 """Test set -> weighted MSE of NNTF_UH by the authors' public code on the files of split ``f1tenth_tyres``, as printed when it was run: 1000
 and 1000 epochs, one seed, on a CPU."""
 
-MINUTES = 52.0
-"""Of driving in the paper's data set (Section III-C), of which ..."""
-SHARE_OF_TYRE_A, SHARE_LEARNT = 0.201, 0.7
-"""... this share is on tyre A, and this share of that is learnt on (Sections III-C and IV-B)."""
+MINUTES = 52.0  # of driving in the paper's data set (Section III-C), of which ..
+SHARE_OF_TYRE_A, SHARE_LEARNT = 0.201, 0.7  # ... this share is on tyre A, and this share of that is learnt on (Sections III-C and IV-B)
 MINUTES_LEARNT = MINUTES * SHARE_OF_TYRE_A * SHARE_LEARNT
 
-NOMINAL_FRICTION: Mapping[str, float] = {"tyre_a": 0.65, "tyre_d": 0.45}
-"""Friction of the tyres (Section III-C)."""
+NOMINAL_FRICTION: Mapping[str, float] = {"tyre_a": 0.65, "tyre_d": 0.45}  # friction of the tyres (Section III-C)
 
-SLIP_99 = 40.0
-"""[deg] what the slip angle of the rear axle exceeds in the paper's whole data set, 99th percentile (Section III-C)."""
+SLIP_99 = 40.0  # [deg] what the slip angle of the rear axle exceeds in the paper's whole data set, 99th percentile (Section III-C)

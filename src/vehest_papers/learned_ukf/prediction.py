@@ -23,8 +23,7 @@ BEFORE, AFTER = paper.NNTF, paper.NNTF_U
 PLAIN_BLUE, THROUGH_RED = "#0b4f9c", "#b3122a"
 TASKS = {"one_step": "one-step prediction", "estimation": "estimation"}
 
-Pair = tuple[LearnedUkf, LearnedUkf]
-"""NNTF and NNTF_U of one seed."""
+Pair = tuple[LearnedUkf, LearnedUkf]  # NNTF and NNTF_U of one seed
 
 
 @dataclass(frozen=True)
@@ -51,11 +50,7 @@ def over_sequences(first: FloatArray, second: FloatArray) -> Interval:
 
 
 def compared(pairs: Mapping[int, Pair], drives: Mapping[str, Drive], protocol: Protocol) -> dict[str, Compared]:
-    """Losses of both models as predictors and in their filters, and of all four filters that can be put together of them.
-
-    Args:
-        protocol: how much of each sequence is not scored.
-    """
+    """Losses of both models as predictors and in their filters, and of all four filters that can be put together of them."""
     skip = round(protocol.skip_seconds * protocol.rate_hz)
     found = {}
     for test, own in drives.items():

@@ -14,16 +14,7 @@ from vehest.data.splits import Span
 from vehest.data.store import read_recording
 from vehest.evaluation.metrics import REFERENCES, sequences, weighted_squared_errors
 from vehest.report.document import Figure, as_code
-from vehest.report.style import (
-    DOUBLE_COLUMN,
-    NONLINEAR_ORANGES,
-    REFERENCE,
-    Line,
-    MatplotlibFigure,
-    fixed,
-    legend_above,
-    new_figure,
-)
+from vehest.report.style import DOUBLE_COLUMN, NONLINEAR_ORANGES, REFERENCE, Line, MatplotlibFigure, fixed, legend_above, new_figure
 from vehest.studies.artefacts import EvaluatedModel, PartArtefacts
 from vehest_papers.learned_ukf import paper
 
@@ -44,11 +35,7 @@ def hardest(errors: Sequence[Sequence[FloatArray]]) -> int:
 def hard_sequence(
     part: PartArtefacts, models: Mapping[str, EvaluatedModel], test: str, name: str, data: str
 ) -> tuple[Figure, pd.DataFrame]:
-    """Reference and estimates over the sequence on which the shown models together err most.
-
-    Returns:
-        The figure and its values.
-    """
+    """Reference and estimates over the sequence on which the shown models together err most."""
     losses = [[weighted_squared_errors(own) for own in part.scored(model, test)] for model in models.values()]
     position = hardest(losses)
     pieces = sequences(part.split.tests[test], lambda span: read_recording(part.references[span.dataset, span.recording]), part.protocol)

@@ -123,8 +123,7 @@ def handling(page: VehiclePage) -> MatplotlibFigure:
     return figure
 
 
-MOST_SIDESLIP = 20.0
-"""Beyond it a distribution of the sideslip angle is not drawn [deg]: cars that spin would press all others into a line."""
+MOST_SIDESLIP = 20.0  # beyond it a distribution of the sideslip angle is not drawn [deg]: cars that spin would press all others into a line
 
 
 def beyond(distributions: Sequence[Distribution], limit: float) -> float:

@@ -26,16 +26,12 @@ from vehest_papers.proving_ground.tally import MOVING
 
 BEFORE, AFTER = "sim_two_cars", "sim_race_cars"
 """Data sets whose gates are shown: the first simulated cars, and those that the study of the KS-NN learns on."""
-RATE_HZ = 20.0
-"""Rate of the paper's recordings, at which all is read."""
-BANDS_HZ = tuple(float(0.1 * 2.0 ** (step / 3.0)) for step in range(14))
-"""Centres of thirds of an octave, 0.1 to 2.0 Hz."""
+RATE_HZ = 20.0  # rate of the paper's recordings, at which all is read
+BANDS_HZ = tuple(float(0.1 * 2.0 ** (step / 3.0)) for step in range(14))  # centres of thirds of an octave, 0.1 to 2.0 Hz
 SPECTRUM_DB = 3.0
-MAP_RANGE = (0.08, 0.13)
-"""FVU of a static map fitted on the car itself; the real Ferrari: 0.10."""
+MAP_RANGE = (0.08, 0.13)  # FVU of a static map fitted on the car itself; the real Ferrari: 0.10
 BIAS_WITHIN = 0.03
-CARS = {"c": "Corvette", "f": "Ferrari", "j": "Jaguar"}
-"""First letter of a drive -> the car that it is like."""
+CARS = {"c": "Corvette", "f": "Ferrari", "j": "Jaguar"}  # first letter of a drive -> the car that it is like
 
 READ_AT_HZ = (0.1, 0.3, 1.0)
 
@@ -91,12 +87,7 @@ def _quantities(own: Statistics) -> dict[str, float]:
 
 
 def gates(drives: Mapping[str, Mapping[str, Sequence[Recording]]], real: Sequence[Recording]) -> list[Gate]:
-    """All gates.
-
-    Args:
-        drives: data set -> set of drives, ``c1`` say -> its recordings at `RATE_HZ`.
-        real: the real Ferrari's, at the same rate; empty where it is missing, and the gate on its spectrum is then left out.
-    """
+    """All gates, of data sets at `RATE_HZ`; without the real Ferrari the gate on its spectrum is left out."""
     found = [gate for name, published in PUBLISHED.items() for gate in _of_table_one(name, published, drives)]
     by_car = {name: _by_car(sets) for name, sets in drives.items()}
     real_map = f"{left_by(static_map_of(real), real):.2f} (real Ferrari)" if real else "–"

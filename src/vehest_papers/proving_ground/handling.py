@@ -23,8 +23,7 @@ ANGLE_WIDTH, ANGLE_LIMIT = 0.1, 10.0  # deg
 AY_EDGES: FloatArray = np.arange(-AY_LIMIT, AY_LIMIT + AY_WIDTH / 2, AY_WIDTH)
 ANGLE_EDGES: FloatArray = np.linspace(-ANGLE_LIMIT, ANGLE_LIMIT, round(2 * ANGLE_LIMIT / ANGLE_WIDTH) + 1)
 
-SLOWEST = 5.0
-"""Speed from which on samples count [m/s]."""
+SLOWEST = 5.0  # speed from which on samples count [m/s]
 STEADY_ACCELERATION, STEADY_YAW, SMOOTHED_SECONDS = 1.0, 0.1, 0.3
 """Steady is a turn with |ax|, |ay - vx·yaw rate| [m/s²] and the change of the yaw rate [rad/s²] below, averaged over so long [s]."""
 LEAST_SAMPLES = 50
@@ -32,19 +31,17 @@ RAMP_SPEED = 25.0
 """Of the slow ramp [m/s], or half the top speed if that is less: that at which the driver's knowledge of the car was measured."""
 
 
+def _no_samples() -> Counts:
+    return np.zeros((len(AY_EDGES) - 1, len(ANGLE_EDGES) - 1), dtype=np.int64)
+
+
 @dataclass
 class HandlingPoints:
-    """Samples of recordings over centripetal acceleration and understeer angle; does not grow with them.
+    """Samples of recordings over centripetal acceleration and understeer angle, (bins of ay, bins of angle); does not grow with them."""
 
-    Args:
-        wheelbase: [m].
-        everything: all samples above `SLOWEST`, (bins of ay, bins of angle).
-        steady: those of quasi-steady turns.
-    """
-
-    wheelbase: float
-    everything: Counts = field(default_factory=lambda: np.zeros((len(AY_EDGES) - 1, len(ANGLE_EDGES) - 1), dtype=np.int64))
-    steady: Counts = field(default_factory=lambda: np.zeros((len(AY_EDGES) - 1, len(ANGLE_EDGES) - 1), dtype=np.int64))
+    wheelbase: float  # [m]
+    everything: Counts = field(default_factory=_no_samples)  # all samples above `SLOWEST`
+    steady: Counts = field(default_factory=_no_samples)  # those of quasi-steady turns
 
     def add(self, recording: Recording) -> None:
         """Count a recording in; it is to be about as free of noise as one at 20 Hz."""
@@ -90,12 +87,7 @@ def wheelbase_of(vehicle: Vehicle) -> float:
 
 
 def characteristic(vehicle: Vehicle, friction: float, label: str) -> Characteristic:
-    """Ramps to either side up to the largest lateral acceleration.
-
-    Args:
-        friction: scale of the tyres' friction.
-        label: for the figure.
-    """
+    """Ramps to either side up to the largest lateral acceleration."""
     plant = MultiBodyPlant(vehicle)
     speed = min(RAMP_SPEED, 0.5 * float(plant.parameters.longitudinal.v_max))
     halves = []

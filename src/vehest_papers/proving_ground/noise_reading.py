@@ -17,12 +17,9 @@ from scipy import signal
 
 from vehest.constants import GRAVITY, FloatArray
 
-NOISE_ABOVE = 10.0
-"""A car's body hardly moves on purpose above this frequency [Hz]."""
-SLOW_BELOW = 0.5
-"""What is left of a kinematic residual below this frequency is drift [Hz]."""
-DELAY_BAND = (0.2, 2.0)
-"""Where the motion is strong and quick, for comparing the times of channels [Hz]."""
+NOISE_ABOVE = 10.0  # a car's body hardly moves on purpose above this frequency [Hz]
+SLOW_BELOW = 0.5  # what is left of a kinematic residual below this frequency is drift [Hz]
+DELAY_BAND = (0.2, 2.0)  # where the motion is strong and quick, for comparing the times of channels [Hz]
 WELCH_SECONDS = 20.0
 
 

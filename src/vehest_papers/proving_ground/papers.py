@@ -99,10 +99,7 @@ PROFILES: Mapping[str, Profile] = {
     "bmw_545i": Profile(
         title="BMW 545i-like car",
         source="Bertipaglia, Alirezaei, Happee and Shyrokau 2024",
-        sets=(
-            PaperSet("all", "all", {"drives": 216, "duration": 7200.0}),
-            PaperSet("test set", "test", {"drives": 23}),
-        ),
+        sets=(PaperSet("all", "all", {"drives": 216, "duration": 7200.0}), PaperSet("test set", "test", {"drives": 23})),
         cutoff_hz=5.0,
         prose=(
             "The paper's Fig. 4 shows the distributions of β and ay in bins of 1° and 1 m/s² on a logarithmic scale, of samples above 5 "

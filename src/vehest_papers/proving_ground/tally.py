@@ -14,8 +14,7 @@ from vehest.data.recording import Recording
 
 Counts = NDArray[np.int64]
 
-MOVING = 5.0
-"""Speed above which samples count in distributions and quantiles [m/s], as in Bertipaglia et al. 2024."""
+MOVING = 5.0  # speed above which samples count in distributions and quantiles [m/s], as in Bertipaglia et al. 2024
 FLAGS = ("spun", "left_road", "stood")
 
 

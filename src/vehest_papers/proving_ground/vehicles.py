@@ -12,13 +12,7 @@ import numpy as np
 from vehest.constants import FloatArray
 from vehest.data.recording import Recording
 from vehest.studies.artefacts import StoredDataset
-from vehest_papers.proving_ground.handling import (
-    Characteristic,
-    HandlingPoints,
-    characteristic,
-    vehicle_of,
-    wheelbase_of,
-)
+from vehest_papers.proving_ground.handling import Characteristic, HandlingPoints, characteristic, vehicle_of, wheelbase_of
 from vehest_papers.proving_ground.papers import counterpart_page, page_of, profile_of
 from vehest_papers.proving_ground.tally import Tally, flags_of
 

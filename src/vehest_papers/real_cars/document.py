@@ -15,19 +15,10 @@ from vehest.report.style import MISSING, fixed, listed
 from vehest.studies.artefacts import StoredDataset, StudyArtefacts
 from vehest_papers.real_cars.figure import distributions
 from vehest_papers.real_cars.planted import detections
-from vehest_papers.real_cars.statistics import (
-    DRIVEN,
-    LEAST_OVER_NOISE,
-    LEAST_SECONDS,
-    LEAST_SIDESLIP,
-    RATE,
-    Statistics,
-    statistics_of,
-)
+from vehest_papers.real_cars.statistics import DRIVEN, LEAST_OVER_NOISE, LEAST_SECONDS, LEAST_SIDESLIP, RATE, Statistics, statistics_of
 
 PLANTED_IN = "ferrari_250lm"
-RANGES = {"150 to 450 s": (150.0, 450.0), "450 to 550 s": (450.0, 550.0), "550 to 700 s": (550.0, 700.0)}
-"""Of the Ferrari's drive."""
+RANGES = {"150 to 450 s": (150.0, 450.0), "450 to 550 s": (450.0, 550.0), "550 to 700 s": (550.0, 700.0)}  # of the Ferrari's drive
 
 
 def documents(artefacts: StudyArtefacts) -> dict[str, Document]:

@@ -13,11 +13,7 @@ COLOURS = {"sideslip": "#b8480b", "ay": "#0b4f9c"}
 
 
 def distributions(rows: Sequence[tuple[str, str, Statistics]]) -> MatplotlibFigure:
-    """A row a data set: 50, 90 and 99 % quantiles of |β| and |ay| while driving, on logarithmic axes.
-
-    Args:
-        rows: title, ``real`` or ``simulated``, statistics; from top to bottom.
-    """
+    """A row a data set: 50, 90 and 99 % quantiles of |β| and |ay| while driving, on logarithmic axes."""
     from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
     with new_figure(DOUBLE_COLUMN, 0.6 + 0.3 * max(len(rows), 2)) as figure:

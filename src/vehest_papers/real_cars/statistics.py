@@ -18,8 +18,7 @@ from vehest.evaluation.metrics import Protocol
 from vehest.sources.base import origin_in_words
 
 RATE = 20.0  # Hz, at which everything here is read
-DRIVEN = 0.2
-"""Share of its 99th percentile that a recording's speed has to reach to count as driving; sideslip of a standing car is noise."""
+DRIVEN = 0.2  # share of its 99th percentile that a recording's speed has to reach to count as driving; sideslip of a standing car is noise
 QUANTILES = (0.5, 0.9, 0.99)
 
 # Rules by which a recording can rank estimators, set before the table was first drawn.

@@ -115,7 +115,6 @@ def _case(
 
 
 def _flags(model: HealthModel, guard: Guard, rows: FloatArray) -> NDArray[np.bool_]:
-    """Samples that are not valid, (T,)."""
     received = np.ascontiguousarray(rows)
     return np.asarray(health_rows(model.packed(), received, guard(received).measured, model.start()).status > 0)
 

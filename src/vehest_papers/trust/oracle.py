@@ -112,8 +112,7 @@ class Oracle:
         return highest
 
 
-Test = Callable[[FloatArray], FloatArray]
-"""Innovations as received, (T, C) -> growth of the log-likelihood ratio at each sample, (T,)."""
+Test = Callable[[FloatArray], FloatArray]  # innovations as received, (T, C) -> growth of the log-likelihood ratio at each sample, (T,)
 
 
 def known_test(signature: FloatArray, covariance: FloatArray) -> Test:
@@ -139,22 +138,8 @@ def motion_of(samples: Mapping[str, FloatArray], rate_hz: float) -> dict[str, Fl
     return {name: signal.sosfiltfilt(band, values) for name, values in samples.items()}
 
 
-def learn_oracle(
-    train: Sequence[Recording],
-    validation: Sequence[Recording],
-    channels: Sequence[str],
-    rate_hz: float,
-) -> Oracle:
-    """Fit relations and autoregression to training drives; healthy drives are these and those of validation.
-
-    Args:
-        train, validation: at ``rate_hz``.
-        channels: that an estimator reads.
-        rate_hz: [Hz].
-
-    Raises:
-        DataError: a channel is missing or there are too few samples.
-    """
+def learn_oracle(train: Sequence[Recording], validation: Sequence[Recording], channels: Sequence[str], rate_hz: float) -> Oracle:
+    """Fit relations and autoregression to training drives; healthy drives are these and those of validation."""
     names = tuple(channels)
     train, validation = ([without_glitches(recording, names) for recording in part] for part in (train, validation))
     least_speed = least_speed_of(train, names)

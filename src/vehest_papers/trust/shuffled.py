@@ -62,26 +62,13 @@ def scores_of(part: PartArtefacts, model: EvaluatedModel, test_set: str) -> Scor
 
 
 def holds_level(inside: NDArray[np.bool_], manoeuvres: NDArray[np.int64]) -> bool:
-    """Whether 0.90 lies in the 95 % interval of a share, by manoeuvres.
-
-    Args:
-        inside: (N,).
-        manoeuvres: which each sample belongs to, (N,), counted from 0.
-    """
+    """Whether 0.90 lies in the 95 % interval of a share, by manoeuvres counted from 0, (N,)."""
     low, high = _interval(inside, manoeuvres)
     return low <= SHOWN_LEVEL <= high
 
 
 def share_if_shuffled(calibration: Scores, test: Scores, draws: int = DRAWS, seed: int = 0) -> float:
-    """In which share of draws 0.90 lies in the test's interval, if manoeuvres are shuffled between calibration and test.
-
-    Args:
-        calibration: on the ranges that the band was calibrated on.
-        test: on others.
-
-    Returns:
-        NaN where one of the two has too few manoeuvres.
-    """
+    """In which share of draws 0.90 lies in the test's interval, if manoeuvres are shuffled between calibration and test; NaN if too few."""
     if min(calibration.number, test.number) < LEAST_MANOEUVRES:
         return float("nan")
     generator = np.random.default_rng(seed)

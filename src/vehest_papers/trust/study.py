@@ -36,8 +36,7 @@ SHOWS_FAILED = True
 
 OTHER = "another"
 FIGURES = ("coverage_90_p10", "coverage_90_p90", "width_90", "interval_score", "error_icc", "band_blocks", "rmse_sideslip")
-SHOWN = ("ksnn", "gru", "kalman", "rational_ekf", "static_map")
-"""Families of the figures."""
+SHOWN = ("ksnn", "gru", "kalman", "rational_ekf", "static_map")  # families of the figures
 
 
 def documents(artefacts: StudyArtefacts) -> dict[str, Document]:

@@ -175,7 +175,6 @@ def _as_steering(search: Search, column: Candidate) -> Offer | None:
 
 
 def _as_lateral(search: Search, column: Candidate) -> Offer | None:
-    """As lateral velocity or sideslip angle of a reference."""
     known = search.known
     is_named_otherwise = STRONG in column.hints.values()
     found = [

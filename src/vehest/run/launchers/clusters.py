@@ -75,12 +75,7 @@ def task_of(position: int, group: Group, output: Path, mark: Path) -> TaskSpec:
 
 
 def run_task(spec: TaskSpec, copies: Files | None, should_stop: Callable[[], bool]) -> Done:
-    """Run a group on a machine of a cluster; ``copies`` are the artefacts that it reads, none while machines are taken to share the root.
-
-    Raises:
-        MissingError: the machine has other versions, or copies cannot be written.
-        NotShared: it does not share the output root, and has no copies.
-    """
+    """Run a group on a machine of a cluster; ``copies`` are the artefacts that it reads, none where machines share the output root."""
     begun, here = time.monotonic(), versions_here()
     unlike = [f"{name} {here.get(name, 'missing')} instead of {own}" for name, own in spec.versions.items() if here.get(name) != own]
     if unlike:
@@ -122,12 +117,7 @@ def pack(folders: set[Path]) -> Files:
 
 
 def unpack(packed: Files) -> None:
-    """Put artefacts in their places, each whole or not at all, unless they are there.
-
-    Raises:
-        DataError: files are not those that a manifest names.
-        MissingError: they cannot be written.
-    """
+    """Put artefacts in their places, each whole or not at all, unless they are there."""
     for folder, files in packed.items():
         if not (folder / MANIFEST).is_file() or (folder / MANIFEST).read_bytes() != files[MANIFEST]:
             remove_leftovers(folder.parent)
@@ -205,7 +195,6 @@ class RayLauncher:
         self._messages.line("note", "cluster", ray.get_runtime_context().gcs_address, machines)
 
     def _print(self, data: Mapping[str, Any], **_: Any) -> None:
-        """Print what Ray says of a lost worker or machine."""
         self._messages.line("again", "ray", str(data["lines"][0]).partition("\n")[0])
 
     def _begin(self, position: int, group: Group) -> Any:
@@ -252,11 +241,7 @@ def _line(error: BaseException) -> str:
 
 
 def slurm_parameters(words: Sequence[str]) -> dict[str, Any]:
-    """What jobs ask the queue for.
-
-    Raises:
-        ConfigurationError: a word is not NAME=VALUE with a name of `PARAMETERS`, or its value is no positive number where it must be one.
-    """
+    """What jobs ask the queue for."""
     found: dict[str, Any] = {"mem_gb": 2.0, "timeout_min": 60, "cpus_per_task": 1, "name": "vehest"}
     for word in words:
         name, _, value = word.partition("=")

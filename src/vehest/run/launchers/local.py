@@ -21,12 +21,10 @@ from vehest.run.locks import Waiting
 from vehest.run.signals import StopSignals, TimeLimit
 from vehest.training.context import Progress
 
-Task = Callable[[Callable[[], bool], Callable[[Progress | Waiting], None]], Any]
-"""A function of (should_stop, on_progress), picklable."""
+Task = Callable[[Callable[[], bool], Callable[[Progress | Waiting], None]], Any]  # a function of (should_stop, on_progress), picklable
 Reporter = Callable[[int, Progress | Waiting | None], None]
 POLL_SECONDS = 0.2
-Files = MutableMapping[Path, Mapping[str, bytes]]
-"""Folder of an artefact -> its files."""
+Files = MutableMapping[Path, Mapping[str, bytes]]  # folder of an artefact -> its files
 
 
 @dataclass(frozen=True)

@@ -33,34 +33,22 @@ LEAST_GAP = 0.05  # s
 LONGEST_GAP = 1.0  # s that signals of a measurement may be missing
 MOST_STRAY = 0.002  # of the rows
 POSE_SECONDS = 0.15  # of the filter that differentiates poses
-CONTRADICTIONS = ("sign", "unit", "impossible")
-"""Checks that contradict a proposal."""
+CONTRADICTIONS = ("sign", "unit", "impossible")  # checks that contradict a proposal
 REMARKS = (*CONTRADICTIONS, "dropout", "stuck", "held")
 
 
 @dataclass(frozen=True, eq=False)
 class Draft:
-    """A data set with what its recordings show.
+    """A data set with what its recordings show."""
 
-    Args:
-        examined: the logs, delays among their proposals.
-        dataset: for conf/dataset.
-        late: channel -> its delay in the longest recording.
-        contents: of the recordings.
-        remarks: findings of the checks that concern the proposals.
-        ratio: estimated steering ratio and its uncertainty; None where it is given or not needed.
-        notes: further remarks.
-        durations: of the recordings [s].
-    """
-
-    examined: Examined
-    dataset: Mapping[str, Any]
-    late: Mapping[str, Late]
-    contents: list[RecordingSummary]
-    remarks: list[str]
-    ratio: tuple[float, float] | None
-    notes: list[str]
-    durations: list[float]
+    examined: Examined  # the logs, delays among their proposals
+    dataset: Mapping[str, Any]  # for conf/dataset
+    late: Mapping[str, Late]  # channel -> its delay in the longest recording
+    contents: list[RecordingSummary]  # of the recordings
+    remarks: list[str]  # findings of the checks that concern the proposals
+    ratio: tuple[float, float] | None  # estimated steering ratio and its uncertainty; None where it is given or not needed
+    notes: list[str]  # further remarks
+    durations: list[float]  # of the recordings [s]
 
     @property
     def seconds(self) -> float:
@@ -74,11 +62,7 @@ class Draft:
 
 
 def draft(examined: Examined) -> Draft:
-    """A data set by the proposals, read as an ingest reads it.
-
-    Raises:
-        VehestError: it cannot be read.
-    """
+    """A data set by the proposals, read as an ingest reads it."""
     proposals, vehicle = examined.proposals, examined.vehicle
     if not proposals.channels:
         raise ConfigurationError("no column is left that would be a channel")
@@ -139,7 +123,6 @@ def _remarks(longest: Recording, recordings: Sequence[Recording]) -> list[str]:
 
 
 def _dataset(examined: Examined) -> dict[str, Any]:
-    """The configuration of the source, without transforms."""
     log, name, proposals = examined.log, examined.name, examined.proposals
     dataset: dict[str, Any] = {"name": name, "title": f"Recordings of {name}", "kind": "real", "vehicle": name}
     dataset |= {"licence": "yours", "citation": "none", "source": log.source, **examined.place}
@@ -171,7 +154,6 @@ def _dataset(examined: Examined) -> dict[str, Any]:
 
 
 def _entry(one: Proposal, place: Mapping[str, Any]) -> dict[str, Any]:
-    """A channel's declaration."""
     sign = {"sign": one.sign} if one.sign != 1 else {}
     return {**place, "unit": one.unit} | sign | ({"factor": one.factor} if one.factor != 1.0 else {})
 

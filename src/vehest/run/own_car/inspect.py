@@ -46,25 +46,15 @@ VEHICLE = {
 
 @dataclass(frozen=True, eq=False)
 class Examined:
-    """Logs with their proposals.
+    """Logs with their proposals."""
 
-    Args:
-        name: of the data set.
-        files: in the order given.
-        logs: the longest first; its layout is that of all.
-        proposals: for all logs.
-        place: options ``path``, ``files`` and ``exclude`` of the data set.
-        rate_hz: sampling rate of logs without times; else None.
-        vehicle: values of `VEHICLE`, None where unknown.
-    """
-
-    name: str
-    files: tuple[Path, ...]
-    logs: tuple[Log, ...]
-    proposals: Proposals
-    place: dict[str, Any]
-    rate_hz: float | None
-    vehicle: Mapping[str, float | None]
+    name: str  # of the data set
+    files: tuple[Path, ...]  # in the order given
+    logs: tuple[Log, ...]  # the longest first; its layout is that of all
+    proposals: Proposals  # for all logs
+    place: dict[str, Any]  # options ``path``, ``files`` and ``exclude`` of the data set
+    rate_hz: float | None  # sampling rate of logs without times; else None
+    vehicle: Mapping[str, float | None]  # values of `VEHICLE`, None where unknown
 
     @property
     def log(self) -> Log:
@@ -81,19 +71,7 @@ class Examined:
 
 
 def inspect(name: str, files: Sequence[Path], vehicle: Mapping[str, float | None] | None = None, *, force: bool = False) -> Examined:
-    """Read logs and propose a channel, unit and sign for each column.
-
-    Args:
-        name: of the data set.
-        files: of one format and one set of columns, a recording each.
-        vehicle: known values of `VEHICLE`.
-        force: whether files of a data set of that name may exist.
-
-    Raises:
-        ConfigurationError: the name is taken or cannot be part of a file's name, or the files differ in format or folder.
-        MissingError: a file does not exist.
-        DataError: a file cannot be read, or differs in layout or columns.
-    """
+    """Read logs, of one format and one set of columns, and propose a channel, unit and sign for each column."""
     check_name(name, "data set")
     existing = [file for file in paths_of(name) if os.path.lexists(file)]
     if existing and not force:
@@ -120,7 +98,8 @@ def inspect(name: str, files: Sequence[Path], vehicle: Mapping[str, float | None
         names = counted([column.name for column in longest.columns])
         raise DataError(f"'{longest.file}': no column is recognised as a channel, by name or by motion, of {names}")
     proposals = replace(proposals, notes=(*proposals.notes, *_notes(longest, logs)))
-    place, rate = _place(files, longest.source), None if longest.has_clock else proposals.rate_hz
+    timed = longest.seconds is not None or any(column.stamps is not None for column in longest.columns)
+    place, rate = _place(files, longest.source), None if timed else proposals.rate_hz
     return Examined(name, tuple(files), (longest, *others), proposals, place, rate, dict.fromkeys(VEHICLE) | dict(vehicle or {}))
 
 
@@ -140,12 +119,6 @@ def rate_of(stamps: FloatArray) -> float:
 
 
 def _longest(logs: Sequence[Log]) -> Log:
-    """The longest log, with source and options for all.
-
-    Raises:
-        ConfigurationError: the logs differ in format.
-        DataError: they differ in layout.
-    """
     formats = {"text" if log.source in TABLES and not is_parquet(log) else log.source for log in logs}
     if len(formats) > 1:
         raise ConfigurationError(f"the files are of several formats ({', '.join(sorted(formats))}); make a data set of each")
@@ -185,11 +158,7 @@ def _notes(longest: Log, logs: Sequence[Log]) -> Iterator[str]:
 
 
 def _place(files: Sequence[Path], source: str) -> dict[str, Any]:
-    """Folder of the files, pattern that they match, and stems of further files that match.
-
-    Raises:
-        ConfigurationError: they lie in several folders, two have the same stem, or no pattern separates them from other files.
-    """
+    """Folder of the files, pattern that they match, and stems of further files that match."""
     folder, *further = sorted({file.resolve().parent for file in files})
     if further:
         listed = ", ".join(map(str, (folder, *further)))
@@ -230,7 +199,6 @@ def _evidence(log: Log) -> tuple[list[tuple[str, str, FloatArray]], float | None
 
 
 def _on_one_clock(log: Log, columns: Sequence[RawColumn]) -> tuple[FloatArray, float | None]:
-    """Samples of the columns, (C, T), and their rate [Hz]."""
     timed = [(column.values, column.stamps) for column in columns if column.stamps is not None]
     if timed:
         begin, end = (float(np.median([stamps[edge] for _, stamps in timed])) for edge in (0, -1))

@@ -24,23 +24,14 @@ LEAVE_OUT = "-"
 
 @dataclass(frozen=True)
 class Question:
-    """A question about logs or their car.
+    """A question about logs or their car."""
 
-    Args:
-        key: ``left_right``, ``rate``, ``time``, ``radius``, a column's name, or a value of the vehicle.
-        text: for people.
-        proposed: answer that Enter takes; empty where nothing is proposed.
-        candidates: other answers.
-        evidence: for the proposal.
-        hint: form of an answer.
-    """
-
-    key: str
-    text: str
-    proposed: str
-    candidates: tuple[str, ...] = ()
-    evidence: tuple[str, ...] = ()
-    hint: str = "a number"
+    key: str  # ``left_right``, ``rate``, ``time``, ``radius``, a column's name, or a value of the vehicle
+    text: str  # for people
+    proposed: str  # answer that Enter takes; empty where nothing is proposed
+    candidates: tuple[str, ...] = ()  # other answers
+    evidence: tuple[str, ...] = ()  # for the proposal
+    hint: str = "a number"  # form of an answer
 
     def as_plain(self) -> dict[str, Any]:
         """For JSON."""
@@ -49,19 +40,7 @@ class Question:
 
 
 def ask(examined: Examined, answers: Sequence[str] = (), *, interactive: bool) -> tuple[Examined, tuple[Question, ...]]:
-    """Answer the questions that logs leave open.
-
-    Args:
-        examined: the logs.
-        answers: given beforehand, as ``KEY=ANSWER``.
-        interactive: whether the other questions, and those of the vehicle, are asked at the terminal.
-
-    Returns:
-        The logs after the answers, and the questions left open.
-
-    Raises:
-        ConfigurationError: an answer makes no sense, or there is no terminal.
-    """
+    """Answer the questions that logs leave open, by ``KEY=ANSWER`` or at the terminal; returns the logs and the questions left open."""
     questions = list(questions_of(examined))
     keys = [question.key for question in questions]
     given: dict[str, str] = {}
@@ -135,11 +114,6 @@ def _ask_at_terminal(question: Question, examined: Examined) -> Examined:
 
 
 def _answered(examined: Examined, question: Question, answer: str) -> Examined:
-    """The logs after an answer; an empty one takes the proposal.
-
-    Raises:
-        ConfigurationError: the answer makes no sense.
-    """
     key, answer, proposals = question.key, answer.strip(), examined.proposals
     if answer in ("", question.proposed):
         return examined

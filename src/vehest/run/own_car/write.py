@@ -39,8 +39,7 @@ HEIGHT = 0.2  # of the centre of gravity over the wheelbase; assumed
 PRETRAINED = "training.start_from=pretrained"
 PRETRAINED_HZ = 20.0
 GIVEN = Trial(1, "given by --with")
-MINUTES = (0.5, 1.0, 2.0, 5.0)
-"""Of reference, parts of the pipeline where there are more."""
+MINUTES = (0.5, 1.0, 2.0, 5.0)  # of reference, parts of the pipeline where there are more
 DATASET_COMMENTS = {
     "time": "unit: s, ms, us or ns; null: no column of times",
     "clock": "strict | interpolate (bridges gaps and jitter) | uniform",
@@ -75,11 +74,7 @@ class Plan:
 
 
 def registered(word: str) -> str:
-    """The name of an estimator that is given by its name or as ``package.module:Class``.
-
-    Raises:
-        ConfigurationError: no installed package declares it, or it has no file in conf/estimator.
-    """
+    """The name of an estimator that is given by its name or as ``package.module:Class``."""
     name = next((point.name for point in entry_points(group=ENTRY_POINTS) if point.value == word), word)
     if name not in estimator_names():
         declared = f'NAME = "{word if ":" in word else "package.module:Class"}"'
@@ -96,21 +91,7 @@ def registered(word: str) -> str:
 def write(
     examined: Examined, left: Sequence[Question] = (), further: Sequence[str] = (), *, dry_run: bool = False
 ) -> tuple[dict[str, Any], list[str]]:
-    """Write data set, split and pipeline, all or none; the data set alone where nothing can be trained.
-
-    Args:
-        examined: logs after the answers.
-        left: questions without an answer.
-        further: estimators to compare beside those that every new car gets.
-        dry_run: whether to write nothing.
-
-    Returns:
-        The outcome for JSON and for a terminal.
-
-    Raises:
-        MissingError: the disk is full, or a folder cannot be written to.
-        VehestError: the data set cannot be read.
-    """
+    """Write data set, split and pipeline, all or none (only the data set where nothing can be trained); returns JSON and lines."""
     name = examined.name
     with use_limits(limits_from_config(compose_config("estimate")["limits"])):
         made = draft(examined)
@@ -143,12 +124,10 @@ def write(
 
 
 def _are_short(made: Draft) -> bool:
-    """Whether some recording is too short to be cut into blocks."""
     return 0.2 * min(made.durations) < LEAST_BLOCK
 
 
 def _is_too_short(made: Draft) -> bool:
-    """Whether there is too little to train, stop and test on."""
     return made.seconds < LEAST_SECONDS or (_are_short(made) and len(made.durations) < len(ROLES_OF_THREE))
 
 
@@ -250,7 +229,6 @@ def _plan_of(contents: Sequence[RecordingSummary], vehicle: Mapping[str, float |
 
 
 def _car(vehicle: Mapping[str, float | None]) -> dict[str, str]:
-    """Parameters of the car; with wheelbase and mass the others are assumed."""
     wheelbase, mass = vehicle["wheelbase"] or 0.0, vehicle["mass"] or 0.0
     half, stiffness = 0.5 * wheelbase, 0.5 * STIFFNESS * mass * GRAVITY
     values = {"mass": mass, "yaw_inertia": mass * half * half, "cg_height": HEIGHT * wheelbase}
@@ -260,7 +238,6 @@ def _car(vehicle: Mapping[str, float | None]) -> dict[str, str]:
 
 
 def _lack(name: str, words: Sequence[str], contents: Sequence[RecordingSummary]) -> str:
-    """Channels that an estimator lacks; empty if none."""
     first = [word if "[" in word else word.split(",")[0] for word in words if not word.startswith("seed=")]
     try:
         found = usability(name, compose_config("train", [f"estimator={name}", *first]), contents)
@@ -285,7 +262,6 @@ def _pipeline_of(name: str, plan: Plan, minutes: float) -> dict[str, Any]:
 
 
 def _limits(own: Draft) -> list[str]:
-    """Comparisons that the recordings do not allow."""
     made = {"vy_ref"} if "sideslip_ref" in own.channels else set()  # with vx
     missing = [name for name in SCORED if name not in own.channels | made]
     if not missing and _is_too_short(own):
@@ -337,11 +313,7 @@ def _pipeline_text(name: str, plan: Plan, minutes: float) -> str:
 
 
 def _yaml(content: Mapping[str, Any], head: Sequence[str], comments: Mapping[str, str] | None = None) -> str:
-    """YAML below a comment, with further comments behind some keys.
-
-    Raises:
-        ConfigurationError: a value would be read as a reference.
-    """
+    """YAML below a comment, with further comments behind some keys."""
     lines = yaml.safe_dump(dict(content), default_flow_style=None, allow_unicode=True, width=10_000, sort_keys=False).splitlines()
     for line in lines:
         if "${" in line:

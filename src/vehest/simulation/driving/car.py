@@ -19,22 +19,16 @@ from vehest.data.errors import ConfigurationError
 from vehest.simulation.plant.handling import ramp_steer
 from vehest.simulation.plant.multi_body import MultiBodyPlant
 
-TEST_SPEED = 25.0
-"""Of the measurement [m/s], or half of the top speed if that is less; assumed."""
-USEFUL_SHARE = 0.985
-"""Share of the largest lateral acceleration that counts as the grip: the last bit takes far more steering; assumed."""
-UNSTEADY = 0.5
-"""Difference between lateral acceleration and speed times yaw rate [m/s²] from which on a car spins; assumed."""
+TEST_SPEED = 25.0  # of the measurement [m/s], or half of the top speed if that is less; assumed
+USEFUL_SHARE = 0.985  # share of the largest lateral acceleration that counts as the grip: the last bit takes far more steering; assumed
+UNSTEADY = 0.5  # difference between lateral acceleration and speed times yaw rate [m/s²] from which on a car spins; assumed
 MARGIN = 0.85
 """Share of the lateral acceleration at which a car began to spin, or lifted a wheel, that a driver counts as all of the grip; assumed."""
-TRACTION_SHARE = 0.8
-"""Share of the driven axle's static grip that a driver uses for accelerating straight ahead; assumed."""
+TRACTION_SHARE = 0.8  # share of the driven axle's static grip that a driver uses for accelerating straight ahead; assumed
 DRAG_AREA = 0.25
 """Drag coefficient times frontal area, per square of the width; assumed: 0.7 m² for a car 1.7 m wide. ``driver: drag_area`` replaces it."""
-AIR_DENSITY = 1.2
-"""[kg/m³]"""
-POWER_SHARE = 0.9
-"""Share of the engine's power that a driver uses; assumed."""
+AIR_DENSITY = 1.2  # [kg/m³]
+POWER_SHARE = 0.9  # share of the engine's power that a driver uses; assumed
 
 
 @dataclass(frozen=True)
@@ -60,11 +54,6 @@ class Car:
         """Road-wheel angle [rad] of a steady turn; beyond the grip as much as at the grip.
 
         Friction scales forces and slip angles alike, because a tyre's cornering stiffness hardly depends on it.
-
-        Args:
-            curvature: positive to the left [1/m].
-            lateral_acceleration: that the tyres must give, positive to the left [m/s²].
-            friction: scale of the tyres' friction.
         """
         excess = self._at(self.excess_steer, lateral_acceleration, friction)
         return self.wheelbase * curvature + math.copysign(friction * excess, lateral_acceleration)
@@ -87,11 +76,7 @@ class Car:
 
 
 def car_of(plant: MultiBodyPlant) -> Car:
-    """The car as its driver knows it; measured once a process for each vehicle and step.
-
-    Raises:
-        ConfigurationError: the vehicle's ``driver`` values make no sense, or it cannot be driven around a corner.
-    """
+    """The car as its driver knows it; measured once a process for each vehicle and step."""
     own = dict(plant.vehicle.driver)
     key = json.dumps([plant.vehicle.name, plant.vehicle.parameter_set, plant.vehicle.overrides, own, plant.step], sort_keys=True)
     if key not in _KNOWN:
@@ -154,10 +139,7 @@ def _measure(plant: MultiBodyPlant, speed: float) -> tuple[tuple[float, ...], tu
     grip = (MARGIN if len(astray) and limit > 0.9 * end else 1.0) * float(steady[limit])
     if grip < 1.0:
         raise ConfigurationError(f"vehicle '{plant.vehicle.name}' cannot be driven around a corner at {speed:.3g} m/s: it does not follow")
-    ramp_values = (
-        ramp.steer - plant.wheelbase * ramp.yaw_rate / ramp.vx,
-        (float(plant.parameters.b) * ramp.yaw_rate - ramp.vy) / ramp.vx,
-    )
+    ramp_values = (ramp.steer - plant.wheelbase * ramp.yaw_rate / ramp.vx, (float(plant.parameters.b) * ramp.yaw_rate - ramp.vy) / ramp.vx)
     grid = np.append(np.arange(0.0, grip - 0.05, 0.25), grip)
     rising = np.maximum.accumulate(steady[: limit + 1])
     steers, slips = (np.interp(grid, rising, values[: limit + 1]).tolist() for values in ramp_values)

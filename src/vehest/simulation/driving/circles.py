@@ -139,5 +139,4 @@ class TurnBraker(LineDriver):
         return decision._replace(steering_velocity=0.0, lateral_error=math.nan) if self._held else decision
 
 
-BRAKE_BUILD_UP = 0.2
-"""Time in which brakes come on [s]; assumed."""
+BRAKE_BUILD_UP = 0.2  # time in which brakes come on [s]; assumed

@@ -10,7 +10,6 @@ import numpy as np
 
 from vehest.data.errors import ConfigurationError
 from vehest.simulation.driving.car import Car
-from vehest.simulation.driving.driver import Driver
 from vehest.simulation.driving.manoeuvre import (
     FASTEST_SHARE,
     SETTLING_TIME,
@@ -108,7 +107,6 @@ class Slalom(Manoeuvre):
 
 
 def _require_cone_values(manoeuvre: DoubleLaneChange | Slalom) -> None:
-    """Check the parameters of both."""
     require(manoeuvre, severity=(0.05, 1.3), half_width=(0.5, 50.0))
     require_one_of(manoeuvre, "side", SIDE_CHOICES)
     if manoeuvre.speed is not None:
@@ -119,27 +117,19 @@ def _between_cones(manoeuvre: DoubleLaneChange | Slalom, gates: tuple[Gate, ...]
     generator = generator_of(seed)
     severity, side = draw(manoeuvre.severity, generator), draw_side(manoeuvre.side, generator)
     own_speed = draw(manoeuvre.speed, generator) if manoeuvre.speed is not None else None
-    driver = _quick(draw_driver(seed))
+    usual = draw_driver(seed)  # who looks less far ahead and steers faster between cones
+    driver = replace(usual, preview_time=0.57 * usual.preview_time, steering_lag=0.5 * usual.steering_lag)
     shape = line_through(gates, car.width, 40.0, 60.0)
     grip = car.grip * OpenArea(surface, seed).mean
     speed = own_speed or min(math.sqrt(severity * grip / shape.largest_curvature), FASTEST_SHARE * car.top_speed)
     run_in = (SETTLING_TIME + 1.0) * speed
     line = _beginning_at(shape, run_in - 40.0) if run_in > 40.0 else shape
     if side < 0.0:
-        line = _mirrored(line)
+        line = Line(line.distance, line.x, -line.y, -line.heading, -line.curvature)
     plan = plan_along(line, speed, surface, seed)
     drawn = {"severity": severity if own_speed is None else None, "speed": speed, "side": SIDES[side], "driver": asdict(driver)}
     end = max(run_in, 40.0) + gates[-1].end - gates[0].begin + 40.0
     return LineDriver(plan, car, driver, drawn, end=end)
-
-
-def _quick(driver: Driver) -> Driver:
-    """The same person between cones: looks less far ahead and steers faster."""
-    return replace(driver, preview_time=0.57 * driver.preview_time, steering_lag=0.5 * driver.steering_lag)
-
-
-def _mirrored(line: Line) -> Line:
-    return Line(line.distance, line.x, -line.y, -line.heading, -line.curvature)
 
 
 def _beginning_at(line: Line, earlier: float) -> Line:

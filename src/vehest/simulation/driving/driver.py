@@ -20,14 +20,11 @@ from vehest.data.errors import ConfigurationError
 from vehest.simulation.driving.car import Car
 from vehest.simulation.road.course import Course
 
-DRIVER_RATE_HZ = 100.0
-"""Rate of a driver's decisions [Hz]."""
+DRIVER_RATE_HZ = 100.0  # rate of a driver's decisions [Hz]
 
-LOWEST_CORRECTION, HIGHEST_CORRECTION = 0.5, 2.0
-"""Frequencies between which a driver corrects [Hz]; assumed."""
+LOWEST_CORRECTION, HIGHEST_CORRECTION = 0.5, 2.0  # frequencies between which a driver corrects [Hz]; assumed
 
-WAVELENGTHS = (310.0, 470.0, 1130.0)
-"""Of the variations along a drive [m]; assumed, and none divides a lap."""
+WAVELENGTHS = (310.0, 470.0, 1130.0)  # of the variations along a drive [m]; assumed, and none divides a lap
 
 
 @dataclass(frozen=True)
@@ -284,7 +281,9 @@ class Follower:
         most = driver.saturation * grip / max(speed, 1.0) ** 2
         curvature = max(-most, min(most, meant - 2.0 * error_ahead / preview**2))
         lateral = curvature * speed**2 + GRAVITY * math.sin(bank)
-        steer = self._steer(meant, curvature - meant, speed, bank, friction)
+        # Back to the line with no more steering than at half of the grip: at the limit a car hardly answers, and more makes it weave.
+        held = car.steer_for(meant, meant * speed**2 + GRAVITY * math.sin(bank), friction)
+        steer = held + self._per_curvature(speed, friction) * (curvature - meant)
         steer -= driver.yaw_damping * (seen.yaw_rate - speed * curvature)
         sliding = sideslip - car.sideslip_for(curvature, lateral, friction)
         beyond = max(abs(sliding) - driver.slide, 0.0)
@@ -313,15 +312,6 @@ class Follower:
             grade=grade,
             heading=_between(self._heading, here, share),
         )
-
-    def _steer(self, meant: float, more: float, speed: float, bank: float, friction: float) -> float:
-        """Steering angle [rad] of the curvature that is meant, and of ``more`` [1/m] to get back to the line.
-
-        The latter takes no more steering than at half of the grip: at the limit a car hardly answers, and more steering makes it weave.
-        """
-        car = self.car
-        held = car.steer_for(meant, meant * speed**2 + GRAVITY * math.sin(bank), friction)
-        return held + self._per_curvature(speed, friction) * more
 
     def _per_curvature(self, speed: float, friction: float) -> float:
         """Steering angle per curvature [rad m] at half of the grip."""

@@ -15,16 +15,11 @@ from vehest.simulation.plant.planar import Inputs
 from vehest.simulation.plant.planar_car import PlanarCar
 from vehest.simulation.road.surface import Surface
 
-COMMAND_RATE_HZ = 100.0
-"""Rate at which the driver's hands reach the car."""
-SLOW = 0.9
-"""Speed below which the driver always gives gas [m/s]."""
-FAST = 1.0
-"""Speed over the wanted one at which the driver brakes [m/s]."""
-CALM = 0.12
-"""Sideslip angle below which the driver brakes, and has caught a slide [rad]."""
-COUNTERSTEER = 1.5
-"""Road-wheel angle over sideslip angle in a slide that is caught."""
+COMMAND_RATE_HZ = 100.0  # rate at which the driver's hands reach the car
+SLOW = 0.9  # speed below which the driver always gives gas [m/s]
+FAST = 1.0  # speed over the wanted one at which the driver brakes [m/s]
+CALM = 0.12  # sideslip angle below which the driver brakes, and has caught a slide [rad]
+COUNTERSTEER = 1.5  # road-wheel angle over sideslip angle in a slide that is caught
 
 
 @dataclass(frozen=True)

@@ -27,8 +27,7 @@ from vehest.simulation.road.course import Course, course_by_name
 from vehest.simulation.road.surface import Surface
 
 _TRAFFIC_STREAM = 5  # of a drive's seed; 0 to 4 are the style's, the sensors', the surface's, the manoeuvre's and the fleet's
-TRAFFIC_LENGTH = (50.0, 400.0)
-"""Of a stretch behind a slower car [m]; assumed."""
+TRAFFIC_LENGTH = (50.0, 400.0)  # of a stretch behind a slower car [m]; assumed
 
 
 @dataclass(frozen=True)
@@ -180,11 +179,7 @@ class FastLap(Manoeuvre):
         return 2.0 * course_by_name(self.course).length / self.mean_speed
 
     def controller(self, car: Car, surface: Surface, seed: int) -> Controller:
-        """A driver who uses as much of the grip as the mean speed takes.
-
-        Raises:
-            ConfigurationError: the car is too slow for the mean speed on this course.
-        """
+        """A driver who uses as much of the grip as the mean speed takes."""
         course, driver = _course(self.course, self.flat), draw_driver(seed)
         friction = course.friction * surface.along(course.arc_length, seed, course.length)
 
@@ -207,8 +202,7 @@ class FastLap(Manoeuvre):
         return LapDriver(plan(high), car, driver, course.length, 2.0 * course.length, {"severity": high, "driver": asdict(driver)})
 
 
-FASTEST_SEVERITY = 0.95
-"""Share of the grip that a fast lap may take."""
+FASTEST_SEVERITY = 0.95  # share of the grip that a fast lap may take
 
 
 class LapDriver(Follower):
@@ -251,13 +245,8 @@ class LapDriver(Follower):
         if self._stop is None:
             self._stop = (time, seen.speed)
         begin, speed = self._stop
-        return decision._replace(acceleration=even_stop(time - begin, speed, self._stop_time, seen.speed))
-
-
-def even_stop(since: float, speed_before: float, stop_time: float, speed: float) -> float:
-    """Acceleration [m/s²] of a driver who brakes evenly from a speed to the stand within a time."""
-    rate = speed_before / stop_time
-    return -rate + 3.0 * min(speed_before - rate * since - speed, 0.0)
+        rate = speed / self._stop_time
+        return decision._replace(acceleration=-rate + 3.0 * min(speed - rate * (time - begin) - seen.speed, 0.0))
 
 
 def _course(name: str, flat: bool) -> Course:

@@ -18,10 +18,8 @@ from vehest.simulation.road.surface import Surface
 
 Range = float | tuple[float, float]
 
-SETTLING_TIME = 2.0
-"""Driven before the first sample [s]."""
-OPEN_AREA_LAP = 2000.0
-"""Distance after which an open area's patches of friction come again [m]."""
+SETTLING_TIME = 2.0  # driven before the first sample [s]
+OPEN_AREA_LAP = 2000.0  # distance after which an open area's patches of friction come again [m]
 
 _STREAM = 3  # of a drive's seed; 0 is the style's, 1 the sensors', 2 the surface's
 
@@ -64,8 +62,7 @@ class Manoeuvre(ABC):
         return {"name": self.name, **asdict(self)}
 
 
-FASTEST_SHARE = 0.9
-"""Share of the top speed that a manoeuvre on an open area is driven at, at most."""
+FASTEST_SHARE = 0.9  # share of the top speed that a manoeuvre on an open area is driven at, at most
 
 
 class LineDriver(Follower):
@@ -109,29 +106,19 @@ class OpenArea:
         return float(self._friction[int(distance) % len(self._friction)])
 
 
-SIDES = {1.0: "left", -1.0: "right"}
-"""Names of the values of draw_side."""
-SIDE_CHOICES = ("left", "right", "either")
-"""Values of a manoeuvre's ``side``."""
+SIDES = {1.0: "left", -1.0: "right"}  # names of the values of draw_side
+SIDE_CHOICES = ("left", "right", "either")  # values of a manoeuvre's ``side``
 
 
 def require_one_of(manoeuvre: Any, key: str, choices: tuple[Any, ...]) -> None:
-    """Refuse a parameter that is none of its choices.
-
-    Raises:
-        ConfigurationError: it is not.
-    """
+    """Refuse a parameter that is none of its choices, by a `ConfigurationError`."""
     value = getattr(manoeuvre, key)
     if value not in choices:
         raise ConfigurationError(f"manoeuvre '{manoeuvre.name}': {key} '{value}' is not one of: {', '.join(map(str, choices))}")
 
 
 def require(manoeuvre: Any, **limits: tuple[float, float]) -> None:
-    """Refuse parameters outside their limits, both ends of a range included.
-
-    Raises:
-        ConfigurationError: one of them is.
-    """
+    """Refuse parameters outside their limits, both ends of a range included, by a `ConfigurationError`."""
     for key, (lowest, highest) in limits.items():
         value = getattr(manoeuvre, key)
         low, high = as_range(value)

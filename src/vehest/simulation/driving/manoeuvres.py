@@ -33,24 +33,12 @@ MANOEUVRES: Mapping[str, type[Manoeuvre]] = {
 
 
 def manoeuvre_from_config(configuration: Mapping[str, Any]) -> Manoeuvre:
-    """A manoeuvre of the multi-body plant from its ``name`` and any of its parameters.
-
-    Raises:
-        ConfigurationError: there is no such manoeuvre or parameter, or a value makes no sense.
-    """
+    """A manoeuvre of the multi-body plant from its ``name`` and any of its parameters."""
     return one_of(configuration, MANOEUVRES)
 
 
 def one_of(configuration: Mapping[str, Any], among: Mapping[str, type[Made]]) -> Made:
-    """A manoeuvre from its ``name`` and any of its parameters.
-
-    Args:
-        configuration: name and parameters.
-        among: the manoeuvres that the plant has, dataclasses by name.
-
-    Raises:
-        ConfigurationError: there is no such manoeuvre or parameter, or a value makes no sense.
-    """
+    """A manoeuvre from its ``name`` and any of its parameters, ``among`` those that the plant has; else `ConfigurationError`."""
     values = dict(configuration)
     name = values.pop("name", None)
     if not isinstance(name, str) or name not in among:

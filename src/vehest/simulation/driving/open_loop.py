@@ -150,8 +150,7 @@ class RandomSteer(Manoeuvre):
         return OpenLoop(car, area, speed, steer_at, self.duration, drawn)
 
 
-N_SINES = 24
-"""Of which random steering is made, evenly spread over the band."""
+N_SINES = 24  # of which random steering is made, evenly spread over the band
 
 
 class OpenLoop:

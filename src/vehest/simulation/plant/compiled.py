@@ -58,14 +58,10 @@ N_STATES = 29
 N_INPUTS = 5
 N_FORCES = 12
 
-ROLLED_OVER = 0.6
-"""Roll angle beyond which the car has rolled over [rad]: no shipped car stands at it."""
-STABLE_RATE = 2.785
-"""The Runge-Kutta method is stable for eigenvalues down to -STABLE_RATE/step."""
-AT_REST = 1e-9
-"""Lateral velocity [m/s] and yaw rate [rad/s] of a standing car that count as none."""
-OVERSPEED = 1.1
-"""Speed of the driven wheels over the car's top speed at which the engine gives no more torque; assumed."""
+ROLLED_OVER = 0.6  # roll angle beyond which the car has rolled over [rad]: no shipped car stands at it
+STABLE_RATE = 2.785  # the Runge-Kutta method is stable for eigenvalues down to -STABLE_RATE/step
+AT_REST = 1e-9  # lateral velocity [m/s] and yaw rate [rad/s] of a standing car that count as none
+OVERSPEED = 1.1  # speed of the driven wheels over the car's top speed at which the engine gives no more torque; assumed
 LARGEST_LOAD_FACTOR = 1.5
 """Wheel load over static load that sub-steps are stable for; assumed: at low speed, load transfer is that of braking."""
 

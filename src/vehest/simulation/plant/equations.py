@@ -46,8 +46,7 @@ from vehest.simulation.plant.regimes import (
 SMALLEST_WHEEL_VELOCITY = 0.5
 """Smallest divisor of slips [m/s]; below it a rolling wheel still has no slip, and slip stiffness stays finite."""
 
-SMALLEST_LOAD = 1.0
-"""Of a wheel, also in the air [N]: tyre formulas divide by the load."""
+SMALLEST_LOAD = 1.0  # of a wheel, also in the air [N]: tyre formulas divide by the load
 
 HEAVE_RATE = 12
 JOINT_FRONT, JOINT_REAR = 27, 28
@@ -130,7 +129,6 @@ def _tyre_forces(slip, angle, camber, load, tyre):  # type: ignore[no-untyped-de
 
 @_kernel
 def _axles(p):  # type: ignore[no-untyped-def]
-    """Front and rear axle."""
     both = 2.0 * (p.a + p.b)
     return (
         _Axle(

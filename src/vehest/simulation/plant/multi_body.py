@@ -56,8 +56,7 @@ STEADY_SHARE = 0.93
 The rest goes into the drag of the steered front wheels, its yaw moment, and the load that driving against it takes."""
 
 HEAVE_FRONT, HEAVE_REAR = 16, 21
-MIRRORED = (1, 0, 3, 2)
-"""The library's left front, right front, left rear and right rear wheel in the order of motion.WHEELS."""
+MIRRORED = (1, 0, 3, 2)  # the library's left front, right front, left rear and right rear wheel in the order of motion.WHEELS
 
 
 def _state(place: int, meaning: str) -> Any:
@@ -138,11 +137,7 @@ class MultiBodyPlant:
         return values
 
     def initial_state(self, x: float, y: float, yaw: float, vx: float) -> PlantState:
-        """In equilibrium, rolling straight ahead at the given place [m], heading [rad] and speed [m/s], or standing.
-
-        Raises:
-            ConfigurationError: the speed is negative.
-        """
+        """In equilibrium, rolling straight ahead at the given place [m], heading [rad] and speed [m/s], or standing."""
         if not vx >= 0:
             raise ConfigurationError(f"a car starts forwards or standing, not at {vx} m/s")
         values = self._at_rest.copy()
@@ -151,11 +146,7 @@ class MultiBodyPlant:
         return PlantState(values, Regime.SLOW if vx < SLOW_BELOW else Regime.ROLLING)
 
     def advance(self, state: PlantState, inputs: FloatArray, n_steps: int, friction: float = 1.0) -> PlantState:
-        """The state ``n_steps`` steps later, with inputs (5,) and the scale of friction held.
-
-        Raises:
-            SimulationError: the car rolled over, or a state is not finite.
-        """
+        """The state ``n_steps`` later, with inputs (5,) and friction held; `SimulationError` if the car rolls over or diverges."""
         inputs = _writable(inputs)
         values, regime, slid, held = compiled.advance(
             state.values, int(state.regime), inputs, self._vector, float(friction), self.step, int(n_steps), state.held
@@ -168,12 +159,7 @@ class MultiBodyPlant:
         return PlantState(values, Regime(regime), state.spun or slid, held)
 
     def evaluate(self, states: Sequence[PlantState], inputs: FloatArray, friction: ArrayLike = 1.0) -> tuple[FloatArray, FloatArray]:
-        """Derivatives of the states (T, 29), and tyre forces (T, 3, 4) along, across and up, for motion.WHEELS [N].
-
-        Args:
-            inputs: (T, 5).
-            friction: scale of friction, (T,) or one for all.
-        """
+        """Derivatives of the states (T, 29), and tyre forces (T, 3, 4) along, across and up, for motion.WHEELS [N]."""
         values = np.array([state.values for state in states]).reshape(-1, compiled.N_STATES)
         regimes = np.array([int(state.regime) for state in states], dtype=np.int64)
         inputs = _writable(inputs).reshape(-1, N_INPUTS)
@@ -195,8 +181,6 @@ class MultiBodyPlant:
         """States sampled at ``rate_hz``, each with the inputs that hold from then on, as motion in ISO 8855 axes.
 
         Args:
-            inputs: (T, 5).
-            rate_hz: [Hz].
             friction: scale of friction, (T,) or one for all.
             bank, grade: of the road, (T,) or one for all [rad]; kept with the motion, their gravity is in the inputs.
         """

@@ -26,8 +26,7 @@ from vehest.constants import FloatArray
 from vehest.data.errors import ConfigurationError
 
 LIBRARY = "commonroad-vehicle-models"
-LIBRARY_VERSION = metadata.version(LIBRARY)
-"""Of the package whose parameter files are read."""
+LIBRARY_VERSION = metadata.version(LIBRARY)  # of the package whose parameter files are read
 
 PUBLISHED_SETS: Mapping[int, str] = MappingProxyType({1: "Ford Escort", 2: "BMW 320i", 3: "VW Vanagon"})
 """Sets for which CommonRoad publishes all multi-body values (Althoff and Würsching 2020, appendix)."""
@@ -60,23 +59,15 @@ POSITIVE = ("m", "m_s", "m_uf", "m_ur", "a", "b", "I_z", "I_Phi_s", "I_y_s", "I_
 class Vehicle:
     """A car that the multi-body plant can drive.
 
-    Args:
-        name: in recordings.
-        parameter_set: number of the published set it starts from.
-        overrides: values that replace the published ones, by the library's names; a mapping inside it replaces
-            values of a group (``tire``, ``tire_rear``, ``steering``, ``longitudinal``).
-        driver: values of this car for its driver (car.py); the plant does not read them.
-        relaxation: way over which a tyre's lateral force follows its slip, front and rear [m]; zero for at once.
-
-    Raises:
-        ConfigurationError: no such set, no such parameter, or a value that is not a finite number.
+    ``overrides`` replace the published values, by the library's names; a mapping inside it replaces values of a group (``tire``,
+    ``tire_rear``, ``steering``, ``longitudinal``). `ConfigurationError` for an unknown set or parameter, or what is no finite number.
     """
 
-    name: str
-    parameter_set: int
+    name: str  # in recordings
+    parameter_set: int  # number of the published set it starts from
     overrides: Mapping[str, Any] = field(default_factory=dict)
-    driver: Mapping[str, float] = field(default_factory=dict)
-    relaxation: tuple[float, float] = (0.0, 0.0)
+    driver: Mapping[str, float] = field(default_factory=dict)  # values of this car for its driver (car.py); the plant does not read them
+    relaxation: tuple[float, float] = (0.0, 0.0)  # way over which tyres' lateral forces follow their slip, front and rear [m]; 0: at once
 
     def __post_init__(self) -> None:
         for name, mapping in (("overrides", self.overrides), ("driver", self.driver)):
@@ -96,11 +87,7 @@ class Vehicle:
 
 
 def vehicle_from_configuration(configuration: Mapping[str, Any]) -> Vehicle:
-    """A vehicle from the keys ``name``, ``parameter_set`` and (optional) ``overrides``, ``driver`` and ``relaxation`` (front, rear).
-
-    Raises:
-        ConfigurationError: a key is missing or unknown, or see Vehicle.
-    """
+    """A vehicle from the keys ``name``, ``parameter_set`` and (optional) ``overrides``, ``driver`` and ``relaxation`` (front, rear)."""
     known = {"name", "parameter_set", "overrides", "driver", "relaxation"}
     unknown = sorted(set(configuration) - known)
     missing = sorted({"name", "parameter_set"} - set(configuration))
@@ -122,9 +109,6 @@ def loaded(vehicle: Vehicle, mass: float, forward: float, up: float) -> Vehicle:
     Args:
         mass: of the payload [kg].
         forward, up: its place from the centre of gravity [m].
-
-    Raises:
-        ConfigurationError: the mass is negative, or an axle would carry nothing.
     """
     if mass == 0.0:
         return vehicle
@@ -198,7 +182,6 @@ def parameter_vector(parameters: Any) -> FloatArray:
 
 
 def _plain(value: Any) -> Any:
-    """Mappings as dictionaries, all else as it is."""
     return {name: _plain(inner) for name, inner in value.items()} if isinstance(value, Mapping) else value
 
 

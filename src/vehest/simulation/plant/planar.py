@@ -29,13 +29,10 @@ from vehest.simulation.errors import SimulationError
 from vehest.simulation.plant.motion import WHEELS, Motion
 from vehest.simulation.plant.planar_car import PARAMETERS, PlanarCar
 
-SLOWEST = 0.3
-"""Speed of a wheel below which its slips are divided by this one [m/s]: below it a tyre is a damper, not a spring."""
-STICTION_SPEED = 1.0
-"""Speed of the wheels over which the Coulomb friction of motor and gears builds up [rad/s]."""
+SLOWEST = 0.3  # speed of a wheel below which its slips are divided by this one [m/s]: below it a tyre is a damper, not a spring
+STICTION_SPEED = 1.0  # speed of the wheels over which the Coulomb friction of motor and gears builds up [rad/s]
 
-SHORTEST = 0.2
-"""Share of its length at small slip that a tyre's relaxation length keeps at least: shorter ones need a smaller step."""
+SHORTEST = 0.2  # share of its length at small slip that a tyre's relaxation length keeps at least: shorter ones need a smaller step
 
 X, Y, YAW, VX, VY, YAW_RATE = range(6)
 FIRST_WHEEL, FIRST_SLIP_X, FIRST_SLIP_Y = 6, 10, 14
@@ -140,14 +137,7 @@ class Inputs:
 
 
 class PlanarPlant:
-    """A car and its equations of motion.
-
-    Args:
-        step: of the integration [s].
-
-    Raises:
-        ConfigurationError: the step is not positive.
-    """
+    """A car and its equations of motion."""
 
     def __init__(self, car: PlanarCar, step: float = 1e-3) -> None:
         if not step > 0.0:

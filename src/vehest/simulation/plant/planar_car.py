@@ -69,8 +69,7 @@ class PlanarCar:
         return {name: float(getattr(self, name)) for name in PARAMETERS}
 
 
-PARAMETERS = tuple(entry.name for entry in fields(PlanarCar) if entry.name != "name")
-"""Names of the plant's parameters, in order."""
+PARAMETERS = tuple(entry.name for entry in fields(PlanarCar) if entry.name != "name")  # names of the plant's parameters, in order
 
 
 @dataclass(frozen=True)
@@ -83,21 +82,13 @@ class PlanarVehicle:
 
 
 def planar_car_from_configuration(configuration: Mapping[str, Any]) -> PlanarCar:
-    """A car from the keys ``name``, ``plant`` and ``parameters``.
-
-    Raises:
-        ConfigurationError: a key or a parameter is missing or unknown, or a value makes no sense.
-    """
+    """A car from the keys ``name``, ``plant`` and ``parameters``."""
     whole = validated(PlanarVehicle, dict(configuration), "planar vehicle", error=ConfigurationError)
     return _checked(whole.name, whole.parameters)
 
 
 def scaled_car(car: PlanarCar, factors: Mapping[str, float]) -> PlanarCar:
-    """The car with some of its parameters scaled.
-
-    Raises:
-        ConfigurationError: a name is no parameter, or the scaled value makes no sense.
-    """
+    """The car with some of its parameters scaled."""
     unknown = sorted(set(factors) - set(PARAMETERS))
     if unknown:
         raise ConfigurationError(f"vary: '{unknown[0]}' is no parameter of vehicle '{car.name}' that can be scaled")

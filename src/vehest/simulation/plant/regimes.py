@@ -33,30 +33,21 @@ class Regime(IntEnum):
 
 ROLLING, SLOW, SLIDING = (int(regime) for regime in Regime)
 
-SLOW_BELOW = 1.0
-"""Forward speed below which the car no longer slips [m/s]; assumed. The lateral dynamics are faster than 5 ms there."""
-ROLLING_ABOVE = 1.2
-"""Forward speed above which it slips again [m/s]; assumed, apart from SLOW_BELOW so that the regime does not flutter."""
-SLOW_TOLERANCE = 0.5
-"""How far lateral velocity [m/s] and yaw rate [rad/s] may be from rolling without slip for SLOW to follow; assumed."""
+SLOW_BELOW = 1.0  # forward speed below which the car no longer slips [m/s]; assumed. The lateral dynamics are faster than 5 ms there
+ROLLING_ABOVE = 1.2  # forward speed above which it slips again [m/s]; assumed, apart from SLOW_BELOW so that the regime does not flutter
+SLOW_TOLERANCE = 0.5  # how far lateral velocity [m/s] and yaw rate [rad/s] may be from rolling without slip for SLOW to follow; assumed
 SPUN_SIDESLIP = math.radians(60.0)
 """Sideslip beyond which the car counts as spun [rad]; assumed. Combined-slip formulas are fitted to far smaller angles."""
-STANDING = 0.02
-"""Speed [m/s] and yaw rate [rad/s] below which a slide has ended; assumed."""
-SLIDING_SMOOTHING = 0.05
-"""Speed over which Coulomb friction changes sign [m/s]; assumed."""
-RELAXATION = 0.05
-"""Time constant with which SLOW takes over the lateral motion that ROLLING left [s]; assumed."""
-WHEEL_RELAXATION = 0.02
-"""Time constant of wheels that start to roll freely, or lock [s]; assumed."""
-SLOW_ADHESION = 0.9
-"""Share of the tyres' longitudinal friction that SLOW makes use of; assumed."""
+STANDING = 0.02  # speed [m/s] and yaw rate [rad/s] below which a slide has ended; assumed
+SLIDING_SMOOTHING = 0.05  # speed over which Coulomb friction changes sign [m/s]; assumed
+RELAXATION = 0.05  # time constant with which SLOW takes over the lateral motion that ROLLING left [s]; assumed
+WHEEL_RELAXATION = 0.02  # time constant of wheels that start to roll freely, or lock [s]; assumed
+SLOW_ADHESION = 0.9  # share of the tyres' longitudinal friction that SLOW makes use of; assumed
 
 
 X, Y, STEER, VX, YAW, YAW_RATE, ROLL, ROLL_RATE, PITCH, PITCH_RATE, VY, HEAVE = range(12)
 VY_FRONT, VY_REAR = 15, 20
-FIRST_WHEEL = 23
-"""Places in the library's state vector; from FIRST_WHEEL on left front, right front, left rear, right rear by its names."""
+FIRST_WHEEL = 23  # places in the library's state vector; from FIRST_WHEEL on left front, right front, left rear, right rear by its names
 
 _kernel = numba.njit(error_model="numpy")
 
@@ -159,12 +150,7 @@ def _forces_needed(x, u, inputs, p):  # type: ignore[no-untyped-def]
     across = p.m * (vy_change + x[VX] * x[YAW_RATE] - inputs[4])
     moment, wheelbase = p.I_z * yaw_acceleration, p.a + p.b
     front_share = p.T_sb if along < 0.0 else p.T_se
-    return (
-        front_share * along,
-        (1.0 - front_share) * along,
-        (across * p.b + moment) / wheelbase,
-        (across * p.a - moment) / wheelbase,
-    )
+    return (front_share * along, (1.0 - front_share) * along, (across * p.b + moment) / wheelbase, (across * p.a - moment) / wheelbase)
 
 
 @_kernel

@@ -40,9 +40,5 @@ class Stint:
 
 
 def stint_from_config(values: Any) -> Stint:
-    """A stint from a drive's ``tyres``: ``{cold: 0.06, wear: 0.04}``.
-
-    Raises:
-        ConfigurationError: an unknown name, or see Stint.
-    """
+    """A stint from a drive's ``tyres``: ``{cold: 0.06, wear: 0.04}``."""
     return validated(Stint, values, "tyres", error=ConfigurationError)

@@ -12,14 +12,10 @@ from scipy.linalg import cho_solve_banded, cholesky_banded
 
 from vehest.constants import FloatArray
 
-SPACING = 0.5
-"""Of the samples of a line [m]."""
-CLEARANCE = 0.15
-"""Room between the car and a cone [m]; assumed."""
-_KNOTS = 1.5
-"""Spacing of the points that are sought for the smoothest line [m]."""
-_SMOOTH = 6.0
-"""Length [m] over which a change of curvature weighs as much as curvature itself; assumed, a fifth of a second at 30 m/s."""
+SPACING = 0.5  # of the samples of a line [m]
+CLEARANCE = 0.15  # room between the car and a cone [m]; assumed
+_KNOTS = 1.5  # spacing of the points that are sought for the smoothest line [m]
+_SMOOTH = 6.0  # length [m] over which a change of curvature weighs as much as curvature itself; assumed, a fifth of a second at 30 m/s
 
 
 @dataclass(frozen=True)
@@ -127,15 +123,7 @@ def _sampled(places: FloatArray, lateral: FloatArray, begin: float, end: float) 
 
 
 def circle(radius: float, side: float, run_in: float, length: float, transition: float) -> Line:
-    """A straight along the x axis, a clothoid, and a circle for the rest of ``length``.
-
-    Args:
-        radius: [m].
-        side: 1 for a circle to the left, -1 to the right.
-        run_in: length of the straight [m].
-        length: of the circle [m].
-        transition: length of the clothoid [m].
-    """
+    """A straight of ``run_in``, a clothoid of ``transition``, and a circle for the rest of ``length`` [m]; ``side`` 1: left, -1: right."""
     distance = np.arange(0.0, run_in + transition + length, SPACING)
     curvature = side / radius * np.clip((distance - run_in) / transition, 0.0, 1.0)
     beyond = np.clip(distance - run_in, 0.0, transition)

@@ -5,8 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-Piece = tuple[float, float, float]
-"""Length [m], then curvature [1/m] and bank [rad] at the end of a stretch along which both are linear."""
+Piece = tuple[float, float, float]  # length [m], then curvature [1/m] and bank [rad] at the end of a stretch along which both are linear
 
 
 @dataclass(frozen=True)

@@ -68,20 +68,12 @@ class Surface:
         return np.append(ends[inside], around), scales[: int(inside.sum()) + 1]
 
 
-SURFACES: dict[str, Surface] = {
-    "dry": Surface(),
-    "wet": Surface("wet", 0.7),
-    "patchy": Surface("patchy", 1.0, patches=0.5),
-}
+SURFACES: dict[str, Surface] = {"dry": Surface(), "wet": Surface("wet", 0.7), "patchy": Surface("patchy", 1.0, patches=0.5)}
 """Named surfaces; the scales are assumed: wet asphalt has about seven tenths of the dry road's friction, puddles or gravel half."""
 
 
 def surface_from_config(configuration: str | Mapping[str, Any] | None) -> Surface:
-    """A surface from its name, or from a mapping of Surface's arguments; none is the dry road.
-
-    Raises:
-        ConfigurationError: no such surface or argument, or see Surface.
-    """
+    """A surface from its name, or from a mapping of Surface's arguments; none is the dry road."""
     if configuration is None:
         return SURFACES["dry"]
     if isinstance(configuration, str):

@@ -7,18 +7,9 @@ from dataclasses import fields, is_dataclass, replace
 from typing import Any
 
 from vehest.data.errors import ConfigurationError
-from vehest.simulation.sensors.levels import (
-    NO_ERRORS,
-    PRESETS,
-    REFERENCES,
-    Reference,
-    SensorLevel,
-    SensorLevels,
-    without_errors,
-)
+from vehest.simulation.sensors.levels import NO_ERRORS, PRESETS, REFERENCES, Reference, SensorLevel, SensorLevels, without_errors
 
-OFF = "off"
-"""Switches errors off; YAML reads False, a command line the text."""
+OFF = "off"  # switches errors off; YAML reads False, a command line the text
 
 
 def switched_off(levels: SensorLevels, *names: str) -> SensorLevels:

@@ -11,8 +11,7 @@ from scipy import signal
 from vehest.constants import FloatArray
 from vehest.simulation.sensors.levels import SensorLevel
 
-STREAM = 1
-"""First spawn key of all sensor errors; 0 is the driver's."""
+STREAM = 1  # first spawn key of all sensor errors; 0 is the driver's
 
 
 def shown(true: FloatArray, level: SensorLevel, rate_hz: float, seed: int, name: str) -> FloatArray:

@@ -51,11 +51,7 @@ def _require_finite(levels: Any, *not_negative: str) -> None:
 
 @dataclass(frozen=True)
 class Mounting:
-    """Where the inertial unit sits and how it is turned against the body.
-
-    Raises:
-        ConfigurationError: a value is not finite, or the misalignment is negative.
-    """
+    """Where the inertial unit sits and how it is turned against the body."""
 
     lever_x: float = 0.0  # its place forward of the centre of gravity [m]
     lever_y: float = 0.0  # its place left of the centre of gravity [m]
@@ -71,11 +67,7 @@ class Mounting:
 
 @dataclass(frozen=True)
 class Tilt:
-    """Which angles the inertial unit is tilted by, so that gravity leaks into the accelerometers; the others count as zero.
-
-    Raises:
-        ConfigurationError: the share is not finite.
-    """
+    """Which angles the inertial unit is tilted by, so that gravity leaks into the accelerometers; the others count as zero."""
 
     roll: bool = True  # of the body against the road; also makes the gyros measure about the body's axes instead of the road's
     pitch: bool = True  # likewise
@@ -90,11 +82,7 @@ class Tilt:
 
 @dataclass(frozen=True)
 class Vibration:
-    """How the wheels' turning shakes the inertial unit: white noise whose standard deviation grows with their mean speed.
-
-    Raises:
-        ConfigurationError: a value is negative or not finite.
-    """
+    """How the wheels' turning shakes the inertial unit: white noise whose standard deviation grows with their mean speed."""
 
     yaw_rate: float = 0.0  # standard deviation of a sample per speed of the wheels [1]
     ax: float = 0.0  # the same [m/s² per rad/s]
@@ -230,8 +218,7 @@ class SensorLevels:
     speed_of_wheels: bool = False
 
 
-NO_ERRORS = ("kind", "drift_time")
-"""Fields that are no errors and stay when the others are switched off."""
+NO_ERRORS = ("kind", "drift_time")  # fields that are no errors and stay when the others are switched off
 
 
 def without_errors(level: Any) -> Any:

@@ -25,12 +25,7 @@ def measure(motion: Motion, levels: SensorLevels, seed: int) -> dict[str, FloatA
     speed = _speed_of_wheels(motion) if levels.speed_of_wheels else motion.vx
     true = {"vx": speed, "steer": motion.steer, **_inertial(motion, levels, seed)}
     sensor_of = {name: name for name in true}
-    for sensor, values in (
-        ("wheel_speed", motion.wheel_speed),
-        ("fx", motion.tyre_fx),
-        ("fy", motion.tyre_fy),
-        ("fz", motion.tyre_fz),
-    ):
+    for sensor, values in (("wheel_speed", motion.wheel_speed), ("fx", motion.tyre_fx), ("fy", motion.tyre_fy), ("fz", motion.tyre_fz)):
         for place, wheel in enumerate(WHEELS):
             true[f"{sensor}_{wheel}"] = values[:, place]
             sensor_of[f"{sensor}_{wheel}"] = sensor
@@ -51,8 +46,7 @@ def described(levels: SensorLevels, motion: Motion) -> dict[str, Any]:
     return {name: _without_idle(value) for name, value in asdict(levels).items() if name not in absent}
 
 
-_IDLE = {"gain": 0.0, "bias": 0.0, "roll_share": 1.0}
-"""Values without effect, left out."""
+_IDLE = {"gain": 0.0, "bias": 0.0, "roll_share": 1.0}  # values without effect, left out
 
 
 def _without_idle(value: Any) -> Any:
@@ -75,19 +69,11 @@ def specific_force(motion: Motion, tilt: Tilt | None = None) -> FloatArray:
 
     The road's axes follow from level ones by grade, then bank, the body's from the road's by pitch, then roll. Accelerations of the body
     along its vertical axis are left out.
-
-    Args:
-        motion: whose ax and ay are those in the road's plane.
-        tilt: which angles count; by default all.
     """
     tilt = tilt or Tilt()
     grade, bank = motion.grade * tilt.grade, motion.bank * tilt.bank
     road = np.stack(
-        [
-            motion.ax - GRAVITY * np.sin(grade),
-            motion.ay + GRAVITY * np.cos(grade) * np.sin(bank),
-            GRAVITY * np.cos(grade) * np.cos(bank),
-        ]
+        [motion.ax - GRAVITY * np.sin(grade), motion.ay + GRAVITY * np.cos(grade) * np.sin(bank), GRAVITY * np.cos(grade) * np.cos(bank)]
     )
     return _turned(road, motion.roll * (tilt.roll * tilt.roll_share), motion.pitch * tilt.pitch)
 
@@ -96,10 +82,6 @@ def body_rates(motion: Motion, tilt: Tilt | None = None) -> FloatArray:
     """Angular velocity about the body's forward, left and upward axes [rad/s], (3, T).
 
     ``motion`` has the rates of roll, pitch and yaw angle. In a steady turn a rolled body also turns about its own lateral axis.
-
-    Args:
-        motion: whose yaw rate is that about the road's normal.
-        tilt: which angles count, roll and pitch; by default all.
     """
     tilt = tilt or Tilt()
     roll, pitch = motion.roll * tilt.roll, motion.pitch * tilt.pitch

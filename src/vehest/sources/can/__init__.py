@@ -61,21 +61,12 @@ class CanSource(SignalSource):
         self.dbc = Path(self.options.dbc).expanduser()
 
     def inputs(self) -> dict[str, str | Path]:
-        """The logs and the DBC.
-
-        Raises:
-            MissingError: one of them is not there.
-        """
+        """The logs and the DBC."""
         require_files([self.dbc], self.name)
         return {**super().inputs(), self.dbc.name: self.dbc}
 
     def wanted(self) -> tuple[Database, dict[str, Wanted]]:
-        """The DBC, and the signal of each channel.
-
-        Raises:
-            MissingError: there is no DBC, or a package is not installed.
-            DataError: it cannot be used, or lacks a signal.
-        """
+        """The DBC, and the signal of each channel."""
         require_files([self.dbc], self.name)
         database = read_database(self.dbc, [declared.column for declared in self.channels.values()])
         found = {}
@@ -109,11 +100,7 @@ class CanSource(SignalSource):
 def decoded(
     frames: Frames, database: Database, wanted: Mapping[str, Wanted], bus: int | str | None = None
 ) -> Iterator[tuple[Any, dict[str, float]]]:
-    """Frames of a log that carry a wanted message, each with its values, channel -> value in the unit of the DBC; NaN: invalid.
-
-    Raises:
-        DataError: a frame is shorter than the DBC says.
-    """
+    """Frames of a log that carry a wanted message, each with its values, channel -> value in the unit of the DBC; NaN: invalid."""
     channels_of = channels_by_message(wanted)
     for frame in frames:
         message = database.messages.get((frame.arbitration_id, frame.is_extended_id))

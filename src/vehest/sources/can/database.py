@@ -37,11 +37,7 @@ class Message:
         return str(self.described.name)
 
     def decode(self, data: bytes | bytearray) -> dict[str, float]:
-        """Wanted signals that a frame carries, in the unit of the DBC; those that its multiplexer leaves out are not among them.
-
-        Raises:
-            DataError: it is shorter than the message.
-        """
+        """Wanted signals that a frame carries, in the unit of the DBC; those that its multiplexer leaves out are not among them."""
         length = self.described.length
         if len(data) < length:
             raise DataError(f"a frame of message '{self.name}' holds {len(data)} of the {length} bytes that the DBC says")
@@ -71,12 +67,7 @@ class Database:
 
 
 def read_dbc(file: Path) -> list[Any]:
-    """All messages of a DBC, as cantools holds them.
-
-    Raises:
-        MissingError: there is no such file, or cantools is not installed.
-        DataError: it is too long or damaged, or declares a message or signal of impossible length.
-    """
+    """All messages of a DBC, as cantools holds them."""
     size = regular_file(file).stat().st_size
     check_limit("text_bytes", size, f"'{file}' is {size} bytes long")
     require_package("cantools", "bus", "reading CAN")
@@ -95,15 +86,7 @@ def read_dbc(file: Path) -> list[Any]:
 
 
 def read_database(file: Path, wanted: Sequence[str]) -> Database:
-    """What a DBC says of wanted signals.
-
-    Args:
-        wanted: names, ``Message.Signal`` or ``Signal`` where only one message has it.
-
-    Raises:
-        MissingError: there is no such file, or cantools is not installed.
-        DataError: it is too long, damaged, or a signal is not there, ambiguous, or without a scale.
-    """
+    """What a DBC says of wanted signals."""
     described = read_dbc(file)
     known: dict[str, list[tuple[Any, str]]] = {}
     for message in described:
@@ -128,7 +111,6 @@ def _identifier(message: Any) -> tuple[int, bool]:
 
 
 def _only_one(known: Mapping[str, Sequence[tuple[Any, str]]], wanted: str, file: Path) -> tuple[Any, str]:
-    """The message and the signal that a name stands for."""
     found = known.get(wanted, ())
     if len(found) > 1:
         names = ", ".join(f"{message.name}.{signal}" for message, signal in found[:8])

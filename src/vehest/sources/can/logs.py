@@ -34,15 +34,7 @@ class Frames:
 
 
 def read_frames(file: Path, wanted: Collection[tuple[int, bool]] | None = None) -> Frames:
-    """Read a log.
-
-    Args:
-        wanted: identifiers of frames and whether they are extended; None for all.
-
-    Raises:
-        MissingError: there is no such file, or python-can is not installed.
-        DataError: it is of another format, damaged, truncated or more than the limits.
-    """
+    """Read the frames of a log whose (identifier, extended) is wanted; None for all."""
     if regular_file(file).suffix.lower() not in SUFFIXES:
         raise DataError(f"'{file}' is no log of a bus: its name ends in none of {', '.join(SUFFIXES)}")
     require_package("can", "bus", "reading CAN")

@@ -43,10 +43,6 @@ def read_topics(bag: Path, topics: Sequence[Topic], layouts: Mapping[str, str]) 
 
     Returns:
         ``TOPIC@received`` [ns of unix time], ``TOPIC@stamped`` [ns] where messages have headers, ``TOPIC.FIELD`` and the start of the bag.
-
-    Raises:
-        ConfigurationError: a layout cannot be read, or a type or field that does not exist.
-        DataError: the bag does not hold the topics, types and layouts that are wanted, or fewer messages than it says.
     """
     types = _types(layouts)
     with _opened(bag) as reader:
@@ -60,16 +56,7 @@ def read_topics(bag: Path, topics: Sequence[Topic], layouts: Mapping[str, str]) 
 
 
 def survey_topics(bag: Path, ignored: Sequence[str], most_fields: int) -> tuple[Arrays, dict[str, Any]]:
-    """All topics whose messages are of ROS's own types, with their plain numbers.
-
-    Args:
-        bag: a bag's folder, or one of its files.
-        ignored: last parts of names of topics that are passed by.
-        most_fields: of a message.
-
-    Returns:
-        arrays as `read_topics`, the topics, and a sentence for each that cannot be read.
-    """
+    """All topics whose messages are of ROS's own types, with their plain numbers."""
     types, arrays, found, skipped = _types({}), Arrays(), [], []
     with _opened(bag) as reader:
         topics = {connection.topic: connection.msgtype for connection in reader.connections if connection.msgcount}
@@ -142,7 +129,6 @@ def _part(message: Any, part: str) -> Any:
 
 
 def _getter(types: Any, topic: str, kind: str, path: str) -> Callable[[Any], Any]:
-    """What takes a number out of a message."""
     node, detail, parts = Nodetype.NAME, kind, path.split(".")
     for part in parts:
         inner: dict[str, Any] = {}

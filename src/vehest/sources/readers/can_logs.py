@@ -22,16 +22,9 @@ LATEST = 1e11  # s
 def read_frames(file: Path, wanted: Collection[Sequence[Any]] | None) -> tuple[Arrays, dict[str, Any]]:
     """Frames of a log in their order, without error frames and remote frames.
 
-    Args:
-        file: ``.asc``, ``.blf`` or ``.log`` of candump.
-        wanted: identifiers of frames and whether they are extended; None for all.
-
     Returns:
         ``time`` [s], ``identifier``, ``extended``, ``fd``, ``fast`` (bit rate switched), ``length`` [bytes] and ``bus`` (number in
         ``buses`` of the summary) of each frame, and ``data``, the bytes of all.
-
-    Raises:
-        DataError: it holds no frame, more than the limits, or a time that is none.
     """
     kept = None if wanted is None else {(int(identifier), bool(extended)) for identifier, extended in wanted}
     times, identifiers, buses, data = array("d"), array("L"), array("L"), bytearray()

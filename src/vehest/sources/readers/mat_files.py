@@ -25,9 +25,6 @@ def read_channels(file: Path, columns: Sequence[str], time: str) -> tuple[Arrays
 
     Returns:
         ``COLUMN.value`` and ``COLUMN.time``, and the name ``STRUCT.CHANNEL`` of each column.
-
-    Raises:
-        DataError: it is of another format, or a channel is not there, ambiguous, or no row or column of real numbers.
     """
     try:
         content = loadmat(file, simplify_cells=True)

@@ -44,16 +44,12 @@ def read(file: Path, wanted: Mapping[str, tuple[str, int | str | None]] | None) 
     """Signals with the times of their groups.
 
     Args:
-        file: the measurement.
         wanted: key -> name of a signal, and number or name of its group where the name occurs in several; None for every signal
             of numbers whose group has times.
 
     Returns:
         Arrays ``KEY`` (physical values, NaN where marked invalid) and ``stamps GROUP`` [s], shape (T,) each; and a summary with
         ``version``, ``start``, ``signals`` (key -> name, group, its title and the unit) and ``skipped`` (reasons).
-
-    Raises:
-        DataError: it is no MDF file, holds a formula or more than the limits, or a wanted signal cannot be read.
     """
     forbid_evaluation()
     with open(file, "rb") as stream:
@@ -92,15 +88,11 @@ def with_signals(
     """A measurement of version 4 with a group of signals more.
 
     Args:
-        file: the measurement.
         seconds: times of the new group [s].
         signals: name, values, unit, comment and, where values are codes, the text of each.
 
     Returns:
         ``content``: bytes of the new file.
-
-    Raises:
-        DataError: it is of another version.
     """
     forbid_evaluation()
     with open(file, "rb") as stream:
@@ -157,7 +149,6 @@ def _refuse_formulas(measurement: Any, file: Path) -> None:
 
 
 def _conversions(conversion: Any) -> Iterator[Any]:
-    """A conversion and those within it."""
     waiting, seen = [conversion], set()
     while waiting:
         found = waiting.pop()
@@ -308,7 +299,6 @@ def _group_name(measurement: Any, group: int) -> str:
 
 
 def _title(measurement: Any, group: int) -> str:
-    """Number and name of a group, for messages."""
     name = _group_name(measurement, group)
     return f"{group} '{_shown(name)}'" if name else str(group)
 

@@ -29,16 +29,12 @@ def read_csv(
     """Columns from the first row on in which all of them hold a value.
 
     Args:
-        file: official CSV file.
         columns: names of columns, the one of time first.
         gappy: columns that wait for nothing.
         preamble_lines: lines about the drive, above the names.
 
     Returns:
         Columns, shape (T,) in the units of the file; those units; and the provenance: lines about the drive, rows dropped at the head.
-
-    Raises:
-        DataError: it has other lines, lacks a column, a cell cannot be read, or a column begins after half of the rows.
     """
     time, head = columns[0], read_head(file).split(b"\n")[: preamble_lines + 2]
     lines = [_decoded(line).strip() for line in (*head, *[b""] * (preamble_lines + 2))]
@@ -68,9 +64,6 @@ def read_vehicle_parameters(file: Path) -> dict[str, dict[str, Any]]:
 
     A parameter with several values (a curve, such as road-wheel angles over the angle of the steering wheel) has a list of them.
     Cells below a column's last value are blank; text is kept as text.
-
-    Raises:
-        DataError: it is no such table.
     """
     text = _decoded(read_head(file))
     try:
@@ -90,7 +83,6 @@ def read_vehicle_parameters(file: Path) -> dict[str, dict[str, Any]]:
 
 
 def _value(cells: list[str], where: str) -> Any:
-    """A column's value, or its values."""
     while cells and not cells[-1]:
         cells.pop()
     if len(cells) == 1:
@@ -103,7 +95,6 @@ def _value(cells: list[str], where: str) -> Any:
 
 
 def _decoded(content: bytes) -> str:
-    """Text in UTF-8 or else Latin-1."""
     try:
         return content.decode("utf-8-sig")
     except UnicodeDecodeError:
@@ -111,7 +102,6 @@ def _decoded(content: bytes) -> str:
 
 
 def _number(text: str) -> float | None:
-    """A finite number; None of other text."""
     try:
         value = float(text)
     except ValueError:

@@ -43,9 +43,6 @@ def read_mat_columns(
 
     Returns:
         The clock, columns in the units of the file, shape (T,), and the rate that each was recorded at [Hz].
-
-    Raises:
-        DataError: the file or a column cannot be used as it is.
     """
     reading = read_limited(READER, regular_file(file), columns=columns, time=time.column)
     values: dict[str, FloatArray] = {}

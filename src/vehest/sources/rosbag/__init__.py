@@ -67,13 +67,7 @@ class RosbagSource(FileSource):
         return {file.name if file == bag else f"{bag.name}/{file.name}": file for bag in self._files() for file in bag_files(bag)}
 
     def read_raw_file(self, file: Path) -> Recording:
-        """Read a bag, a file or a folder, wherever it is.
-
-        Raises:
-            MissingError: there is no such bag, or rosbags is not installed.
-            ConfigurationError: a field or message type that does not exist.
-            DataError: the bag is damaged, or its topics cannot become a recording.
-        """
+        """Read a bag, a file or a folder, wherever it is."""
         wanted = [[topic.topic, topic.type, self.fields[name]] for name, topic in self.topics.items()]
         most_bytes, layouts = int(1e9 * self.options.unpacked_limit), self.options.messages or {}
         reading = read_bag(file, "read_topics", most_bytes, topics=wanted, layouts=layouts)
@@ -145,7 +139,6 @@ class RosbagSource(FileSource):
         return Series(topic, times - topic.delay, rate_hz, values, about)
 
     def _reference(self, pose: Pose, series: Series, grid: FloatArray, path: Path) -> dict[str, FloatArray]:
-        """Reference channels from the poses."""
         where = f"'{path}': topic '{series.topic.topic}'"
         values = np.stack([series.fields[f"{pose.field}.{part}"] for part in POSE_FIELDS], axis=1)
         plane, yaw = ground_plane(values[:, :3], values[:, 3:], pose.up, where)

@@ -27,11 +27,6 @@ def read_bag(path: Path, function: str, most_bytes: int = MOST_BYTES, **request:
         path: a bag's folder, one of its ``.db3`` or ``.mcap`` files, or a zip archive that holds one bag.
         function: ``read_topics`` or ``survey_topics`` of `vehest.sources.readers.bags`, which describe ``request`` and the result.
         most_bytes: limit of what is unpacked [bytes].
-
-    Raises:
-        MissingError: rosbags is not installed, or the bag is not there.
-        ConfigurationError: a layout cannot be read, or a type or a field that is not in the layouts.
-        DataError: the bag is damaged, or does not hold the topics, types and layouts that are wanted.
     """
     require_package("rosbags", "ros", "reading ROS 2 bags")
     bag_files(path)
@@ -43,11 +38,7 @@ def read_bag(path: Path, function: str, most_bytes: int = MOST_BYTES, **request:
 
 
 def bag_files(path: Path) -> list[Path]:
-    """The files that a bag is made of: the archive or file itself, or what its folder holds.
-
-    Raises:
-        MissingError: there is none, or the folder may not be read.
-    """
+    """The files that a bag is made of: the archive or file itself, or what its folder holds."""
     if not path.is_dir():
         return [regular_file(path)]
     try:

@@ -26,12 +26,7 @@ DEGREES = {"heading": "deg"}  # of a VBOX, which does not say so: a compass's, c
 
 
 def survey(path: Path) -> Log:
-    """Columns of one file, or of a bag's folder.
-
-    Raises:
-        MissingError: it is not there or empty, or a package is missing that its format needs.
-        DataError: it is of no format that is read, damaged, holds no numbers, or a time stamp is a stray one.
-    """
+    """Columns of one file, or of a bag's folder."""
     if not path.exists():
         raise MissingError(f"there is no file '{path}'")
     require_no_spreadsheet(path)
@@ -74,17 +69,14 @@ def _survey_vbo(file: Path) -> Log:
     except DataError as error:
         wanted = {name: samples for name, samples in log.columns.items() if not SLIP_AT_A_POINT.fullmatch(name)}
         skipped = (str(error),)
-    by_bus = any("CAN" in module for module in log.modules.values())
+    devices: dict[str, Literal["car", "reference"]] = {}
+    if any("CAN" in module for module in log.modules.values()):
+        devices = {name: "car" if "CAN" in log.modules.get(name, "") else "reference" for name in wanted}
     columns = tuple(
-        RawColumn(name, units.get(name, ""), samples, {"column": name}, None, _device(log.modules.get(name, "")) if by_bus else "")
-        for name, samples in wanted.items()
+        RawColumn(name, units.get(name, ""), samples, {"column": name}, None, devices.get(name, "")) for name, samples in wanted.items()
     )
     clock = Stamps("time", "s", "clock time of the format")
     return Log(file, "vbo", columns, {}, clock, log.seconds - log.seconds[0], (slice(0, len(log.seconds)),), skipped)
-
-
-def _device(module: str) -> Literal["car", "reference"]:
-    return "car" if "CAN" in module else "reference"
 
 
 def _begins_as_mdf(path: Path) -> bool:

@@ -24,12 +24,7 @@ UNITS = {  # of ROS's own types, REP 103
 
 
 def survey_bag(path: Path) -> Log:
-    """What a bag holds, as far as the types of its messages are ROS's own.
-
-    Raises:
-        MissingError: rosbags is not installed, or the bag is not there.
-        DataError: it is damaged, or none of its topics can be read.
-    """
+    """What a bag holds, as far as the types of its messages are ROS's own."""
     reading = read_bag(path, "survey_topics", ignored=IGNORED, most_fields=MOST_FIELDS)
     columns, skipped = [], reading.summary["skipped"]
     for topic, kind, fields in reading.summary["topics"]:

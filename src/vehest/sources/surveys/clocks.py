@@ -41,12 +41,7 @@ class Found:
 
 
 def find_clock(columns: Mapping[str, FloatArray], units: Mapping[str, str]) -> Found:
-    """The column that grows evenly, by name or unit before another.
-
-    Args:
-        columns: name -> values, (N,).
-        units: name -> unit as the header writes it.
-    """
+    """The column that grows evenly, by name or unit before another."""
     best, likely, step = None, -1, 0.0
     for name, values in columns.items():
         own = _step(values)

@@ -45,8 +45,3 @@ class Log:
     seconds: FloatArray | None = None  # times of the rows [s], (N,), from the clock; None where columns have their own or there is no clock
     runs: tuple[slice, ...] = ()  # rows of each uninterrupted run, the longest first; one of all where times never restart
     skipped: tuple[str, ...] = ()  # parts that were not read, with the reason
-
-    @property
-    def has_clock(self) -> bool:
-        """Whether its samples have times."""
-        return self.seconds is not None or any(column.stamps is not None for column in self.columns)

@@ -9,12 +9,7 @@ from vehest.sources.surveys.log import Log, RawColumn
 
 
 def survey_mdf(file: Path) -> Log:
-    """What a measurement holds: every signal of numbers whose group has times.
-
-    Raises:
-        MissingError: asammdf is not installed.
-        DataError: it is no such file, is damaged, holds a formula, or is more than the limits allow.
-    """
+    """What a measurement holds: every signal of numbers whose group has times."""
     signals, skipped, about = read_measurement(file, None)
     columns = []
     for key, signal in signals.items():

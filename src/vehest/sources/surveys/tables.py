@@ -118,11 +118,7 @@ def unit_in_name(name: str) -> str:
 
 
 def shape_of(file: Path) -> Shape:
-    """Layout of a table of text, by its beginning.
-
-    Raises:
-        DataError: it is no table of text, has one column only, or no line of names.
-    """
+    """Layout of a table of text, by its beginning."""
     head = read_head(file, HEAD)
     encoding, text = _decoded(head, file)
     lines = [line[:LONGEST_LINE] for line in re.split(r"\r\n|\n|\r", text)[: -1 if len(head) >= HEAD else None][:MOST_LINES]]
@@ -194,7 +190,6 @@ def _is_unit(text: str) -> bool:
 
 
 def _decoded(head: bytes, file: Path) -> tuple[str, str]:
-    """Encoding and text."""
     if head.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
         return "utf-16", head.decode("utf-16", errors="replace")
     if b"\0" in head or len(CONTROLS.findall(head)) > MOST_CONTROLS * len(head):

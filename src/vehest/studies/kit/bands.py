@@ -21,11 +21,7 @@ SHOWN = "coverage_90"
 def band_blocks(
     part: PartArtefacts, test_set: str, chosen: Mapping[Name, tuple[str, int]], lines: Mapping[Name, Line], file: str
 ) -> list[Block]:
-    """Table ``bands_FILE`` and figure ``reliability_FILE``; nothing where no estimator has bands.
-
-    Args:
-        chosen: (estimator, variant) -> title and seed, in the order of the rows.
-    """
+    """Table ``bands_FILE`` and figure ``reliability_FILE``; nothing where no estimator has bands."""
     values, lows, highs = (runs_of(part, column) for column in ("value", "low", "high"))
     rows, drawn = [], []
     for name, (title, seed) in chosen.items():

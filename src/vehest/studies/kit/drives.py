@@ -73,11 +73,7 @@ def floors_table(part: PartArtefacts, test_set: str, name: str) -> Table:
 
 
 def regime_table(part: PartArtefacts, test_set: str, chosen: Mapping[Name, tuple[str, int]], name: str) -> Table | None:
-    """RMSE(β) of candidates by regime; None where metrics have no regimes.
-
-    Args:
-        chosen: (estimator, variant) -> title and seed, in the order of the rows.
-    """
+    """RMSE(β) of candidates by regime; None where metrics have no regimes."""
     metrics = part.metrics
     own = metrics[(metrics["test_set"] == test_set) & metrics["subset"].isin(REGIMES) & (metrics["condition"] == "nominal")]
     seen = [regime for regime in REGIMES if regime in set(own["subset"])]

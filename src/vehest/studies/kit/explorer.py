@@ -41,7 +41,8 @@ def explorer_of(
     start, label, gap, zoom = axis
     spans = artefacts.split.tests[test_set]
     pieces = list(pieces_of(spans, lambda span: read_recording(artefacts.references[span.dataset, span.recording]), artefacts.protocol))
-    parts = [_scored_part(recording, piece, artefacts) for recording, piece in pieces]
+    skip = artefacts.protocol.skip_seconds
+    parts = [recording.cut(max(piece.start, recording.start_time) + skip, piece.stop) for recording, piece in pieces]
 
     def measured(name: str) -> FloatArray:
         return chained([part[name] if name in part else np.full(len(part), np.nan) for part in parts], gap)
@@ -101,10 +102,6 @@ def _health_of(health: HealthModel, recording: Recording, piece: Span, artefacts
     begin = recording.index_range(max(piece.start, recording.start_time) - artefacts.protocol.warm_up_seconds, piece.stop)[0]
     rows = np.ascontiguousarray(recording.stack(health.channels)[begin:end])
     return health_rows(health.packed(), rows, np.isfinite(rows), health.start()).status[first - begin :]
-
-
-def _scored_part(recording: Recording, piece: Span, artefacts: PartArtefacts) -> Recording:
-    return recording.cut(max(piece.start, recording.start_time) + artefacts.protocol.skip_seconds, piece.stop)
 
 
 def _signal(name: str, values: FloatArray) -> Signal:

@@ -237,13 +237,9 @@ def _figure(curve: Curve) -> MatplotlibFigure:
             axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
             axis.set_minor_formatter(NullFormatter())
         axes.set_xticks(sorted({round(point.minutes, 1) for point in curve.points}))
-        axes.set_yticks([tick for tick in (0.1, 0.2, 0.3, 0.5, 0.7, 1.0, 1.5, 2.0, 3.0, 5.0, 7.0, 10.0, 15.0, 20.0) if _within(tick, axes)])
+        low, high = axes.get_ylim()
+        axes.set_yticks([tick for tick in (0.1, 0.2, 0.3, 0.5, 0.7, 1.0, 1.5, 2.0, 3.0, 5.0, 7.0, 10.0, 15.0, 20.0) if low <= tick <= high])
         axes.set_xlabel("recording with a reference [min]")
         axes.set_ylabel("RMSE(β) [deg]")
         axes.legend(loc="center left", bbox_to_anchor=(1.01, 0.5), fontsize=6.5, frameon=False)
     return figure
-
-
-def _within(tick: float, axes: object) -> bool:
-    low, high = axes.get_ylim()  # type: ignore[attr-defined]
-    return bool(low <= tick <= high)

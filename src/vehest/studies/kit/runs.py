@@ -12,22 +12,13 @@ from vehest.data.errors import DataError
 from vehest.data.splits import VALIDATION
 from vehest.studies.artefacts import EvaluatedModel, PartArtefacts
 
-Name = tuple[str, str]
-"""Estimator and variant."""
+Name = tuple[str, str]  # estimator and variant
 
-Runs = dict[tuple[str, str, int, str], dict[str, float]]
-"""(estimator, variant, seed, test set) -> metric -> value."""
+Runs = dict[tuple[str, str, int, str], dict[str, float]]  # (estimator, variant, seed, test set) -> metric -> value
 
 
 def runs_of(artefacts: PartArtefacts, column: str = "value") -> Runs:
-    """The metrics of all samples under nominal conditions, by run and test set.
-
-    Args:
-        column: ``value``, or ``low`` or ``high`` for the ends of intervals.
-
-    Raises:
-        DataError: two different values for one metric of one run.
-    """
+    """The metrics (``column``: or an end of their intervals) of all samples under nominal conditions, by run and test set."""
     metrics = artefacts.metrics
     nominal = metrics[(metrics["subset"] == "all") & (metrics["condition"] == "nominal")]
     columns = (nominal[name].tolist() for name in ("estimator", "variant", "seed", "test_set", "metric", column))
@@ -57,11 +48,7 @@ def of_model(runs: Runs, name: Name, seed: int, metric: str) -> float:
 
 
 def chosen_seed(seeds: Sequence[int], name: Name, runs: Runs) -> int:
-    """The seed with the lowest RMSE(v) on the validation range, the lower one of equals: test data choose nothing.
-
-    Raises:
-        DataError: several seeds and no figures on the validation range.
-    """
+    """The seed with the lowest RMSE(v) on the validation range, the lower one of equals: test data choose nothing."""
     if len(seeds) > 1 and not any((*name, seed, VALIDATION) in runs for seed in seeds):
         raise DataError(
             f"{name[0]}/{name[1]} has {len(seeds)} seeds and no metrics on the validation range to choose one by; evaluate it there"

@@ -15,20 +15,8 @@ from vehest.studies.kit.runs import by_name
 BASELINE_TITLES = {"zero": "v = 0", "static_map": "the static map"}
 
 
-def ranking_of(
-    artefacts: PartArtefacts,
-    test_set: str,
-    asked: Sequence[tuple[Name, Name]] = (),
-) -> Ranking:
-    """Candidates of a comparison, ranked on a test set by RMSE(β) over all their seeds; those with errors that are not finite are left out.
-
-    Args:
-        test_set: to rank on.
-        asked: pairs to compare beside those that any ranking compares.
-
-    Raises:
-        DataError: errors by segment are missing or damaged.
-    """
+def ranking_of(artefacts: PartArtefacts, test_set: str, asked: Sequence[tuple[Name, Name]] = ()) -> Ranking:
+    """Candidates of a comparison, ranked on a test set by RMSE(β) over all their seeds; those with infinite errors are left out."""
     segments = {name: [model.segments(test_set) for model in own] for name, own in by_name(artefacts.models).items()}
     finite = {name: own for name, own in segments.items() if all(math.isfinite(float(part.squared_error_sideslip.sum())) for part in own)}
     return rank(finite, artefacts.protocol.rate_hz, asked=asked)

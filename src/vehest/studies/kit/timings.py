@@ -16,12 +16,7 @@ CAPTION = (
 
 
 def timings_of_study(parts: Sequence[tuple[str, pd.DataFrame, Mapping[tuple[str, str], str]]]) -> list[str | Table]:
-    """A section with what each estimator took; nothing where no times are known.
-
-    Args:
-        parts: of each its title, empty where there is only one; its times [s], with `vehest.studies.artefacts.METRIC_COLUMNS`; and
-            (estimator, variant) -> title.
-    """
+    """What each estimator took, by (title of a part, its times [s], (estimator, variant) -> title); nothing where it is not known."""
     rows = [row for part in parts for row in _rows(*part)]
     if not rows:
         return []
