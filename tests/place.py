@@ -1,5 +1,6 @@
 """A small data set with a configuration and a pipeline of its own, and the command line run on it."""
 
+import json
 import shutil
 import sys
 from functools import cache
@@ -138,28 +139,47 @@ class Place:
         """Exit code, standard output and standard error of a command."""
         return run_vehest(self._capsys, *arguments)
 
+    def done(self, *arguments):
+        """Standard output and error of a command that must succeed."""
+        code, out, err = self(*arguments)
+        assert code == 0, err
+        return out, err
+
+    def told(self, *arguments):
+        """What a command that must succeed says in JSON."""
+        return json.loads(self.done(*arguments, "--json")[0])
+
+    def change(self, name, **changes):
+        """Write a YAML file, or change keys of one that is there; what it holds then."""
+        file = self.folder / name
+        content = (yaml.safe_load(file.read_text(encoding="utf-8")) if file.is_file() else {}) | changes
+        file.write_text(yaml.safe_dump(content, allow_unicode=True, sort_keys=False), encoding="utf-8")
+        return content
+
     def once(self, *arguments):
-        """The same, of a command that a test needs the outcome of: it runs once, later places like this one get a copy of what it made."""
+        """Output and errors of a command that must succeed: it runs once, later places like this one get a copy of what it made."""
         files = [file for file in sorted(self.folder.rglob("*")) if file.is_file() and not file.is_symlink()]
         key = (*arguments, *((file.relative_to(self.folder), sha256(file.read_bytes()).digest()) for file in files))
         if key not in _DONE:
-            outcome, kept = self(*arguments), Path(_KEPT.name) / str(len(_DONE))
-            _DONE[key] = outcome, shutil.copytree(self.folder, kept)
+            said, kept = self.done(*arguments), Path(_KEPT.name) / str(len(_DONE))
+            _DONE[key] = said, shutil.copytree(self.folder, kept)
         else:
             shutil.copytree(_DONE[key][1], self.folder, dirs_exist_ok=True)
         return _DONE[key][0]
 
-    def refused(self, *arguments):
-        """Exit code and the one line of a command that must fail and leave nothing behind."""
+    def refused(self, *arguments, code=None, says=()):
+        """Exit code and the one line of a command that must fail and leave nothing behind; what is expected of them."""
         before = self.files()
-        code, _, err = self(*arguments)
-        assert code != 0
+        found, _, err = self(*arguments)
+        assert found != 0
         lines = [line for line in err.splitlines() if not line.startswith(("done", "skipped"))]
         assert len(lines) == 1, err
         assert lines[0].startswith("error: ")
         assert {name for name in self.files() - before if "/ingest/" not in name and "/downsample/" not in name} == set()
         assert not any(ASIDE_PREFIX in name for name in self.files())
-        return code, lines[0]
+        assert code in (None, found), lines[0]
+        assert [words for words in ([says] if isinstance(says, str) else says) if words not in lines[0]] == [], lines[0]
+        return found, lines[0]
 
     def files(self):
         """Every file in the output root but the locks, which stay where they are and are empty."""

@@ -62,9 +62,6 @@ def of_pages(found):
     return [pytest.param(file, item, id=f"{file.name}: {item}") for file in PAGES for item in found(file)]
 
 
-# Generated pages
-
-
 def generator():
     spec = importlib.util.spec_from_file_location("make_reference", ROOT / "docs" / "make_reference.py")
     assert spec is not None
@@ -95,9 +92,6 @@ def test_a_part_without_results_stays_as_it_is(tmp_path, monkeypatch):
     assert made.PART.sub(made._made, page("docs/results.md")) == page("docs/results.md")
 
 
-# Links
-
-
 def links(file):
     text = without_fences(file.read_text(encoding="utf-8"))
     found = re.findall(r"!?\[[^\]]*\]\(([^)\s]+)\)", text)
@@ -119,9 +113,6 @@ def test_relative_links_and_images_resolve(file, target):
     assert there.exists(), f"{file.name} links to {target}"
     if anchor:
         assert anchor in anchors(there), f"{file.name} links to {target}"
-
-
-# Examples of files
 
 
 @pytest.fixture
@@ -169,9 +160,6 @@ def test_python_examples_run(workplace, drive, monkeypatch, request):
     for block in blocks:
         exec(compile(block, "example", "exec", dont_inherit=True), {"__name__": "example"})
     assert (workplace / "out.parquet").is_file()
-
-
-# Commands
 
 
 @dataclass(frozen=True)
@@ -284,9 +272,6 @@ def test_wrong_command_lines_would_be_noticed(line):
         taken_apart(line)
 
 
-# What pages state
-
-
 def test_readme_names_the_patent_and_the_licence():
     assert "PCT/IT2023/050058" in page("README.md")
     assert "PCT/IT2023/050058" in page("docs/estimators/ksnn.md")
@@ -295,8 +280,7 @@ def test_readme_names_the_patent_and_the_licence():
 
 def test_citation_names_seven_papers():
     citation = yaml.safe_load(page("CITATION.cff"))
-    assert citation["cff-version"] == "1.2.0"
-    assert citation["version"] == vehest.__version__
+    assert (citation["cff-version"], citation["version"]) == ("1.2.0", vehest.__version__)
     papers = citation["references"]
     assert len({paper["title"] for paper in papers}) == 7
     assert all(paper["authors"] and paper["year"] for paper in papers)

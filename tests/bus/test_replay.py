@@ -196,13 +196,9 @@ FIGURES = Figures(frames_sent=30, frames_received=20, samples=10, samples_lost=1
 def test_the_view_shows_estimate_band_health_and_reason_in_words():
     values = {"vy": 0.5, "sideslip": math.radians(-1.25), "band_vy": 0.1, "band_sideslip": math.radians(0.5)}
     rows = dict(rows_of(FIGURES, {**values, "health": 2.0, "health_reason": 3e5}, 10.1, 20.0))
-    assert rows["time"] == "10.1 s"
-    assert rows["v"] == "+0.500 ± 0.100 m/s"
-    assert rows["β"] == "-1.25 ± 0.50 °"
-    assert rows["health"] == "invalid: there is no estimate"
-    assert rows["rate"] == "20.0 estimates/s"
-    assert rows["samples"] == "10, 1 lost"
-    assert dict(rows_of(Figures(), {}, 0.0, 0.0))["health"] == "-"
+    assert (rows["time"], rows["v"], rows["β"]) == ("10.1 s", "+0.500 ± 0.100 m/s", "-1.25 ± 0.50 °")
+    assert (rows["health"], rows["rate"]) == ("invalid: there is no estimate", "20.0 estimates/s")
+    assert (rows["samples"], dict(rows_of(Figures(), {}, 0.0, 0.0))["health"]) == ("10, 1 lost", "-")
 
 
 class Terminal(io.StringIO):

@@ -161,9 +161,6 @@ def _channels(recording):
     return {"time": recording.time, **{name: recording[name] for name in recording.channels}}
 
 
-# Sources
-
-
 def _tabular(folder):
     write_csv(folder / "lap.csv", 1, 5.0)
     return _channels(open_source(DATASET | {"path": str(folder)}).read("lap"))
@@ -235,9 +232,6 @@ SOURCES = {
     "text_log": _text_log,
     "vbo": _vbo,
 }
-
-
-# Stages
 
 
 def _downsampled(folder):

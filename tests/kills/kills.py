@@ -83,9 +83,6 @@ class Round:
     failed: list[str] = field(default_factory=list)
 
 
-# --- runs -----------------------------------------------------------------------------------------------------------
-
-
 def started(output, jobs, log):
     """Fork a run of the study into ``output``; returns its process, which leads a session of its own."""
     sys.stdout.flush()
@@ -158,9 +155,6 @@ def strays(leader, patience=20.0):
     return [f"process {process}" for process in found]
 
 
-# --- moments --------------------------------------------------------------------------------------------------------
-
-
 def names(folder, wanted):
     """Names in a folder, none where it is not there."""
     try:
@@ -220,9 +214,6 @@ def killed(output, stage, number, jobs, draw, log):
     left += [f"exit code {code} instead of {expected}"] if code != expected else []
     said = f"{moment} {count} + {delay * 1e3:.0f} ms"
     return Kill(stage, number, said, code, jobs, tuple(left))
-
-
-# --- checks ---------------------------------------------------------------------------------------------------------
 
 
 def artefacts(output):
@@ -302,9 +293,6 @@ def leftovers(output):
     found = [str(path.relative_to(output)) for path in output.rglob(".*") if path.name.startswith((".writing-", ".parts-"))]
     found += [f"checkpoints/{name}" for name in names(output / "checkpoints", lambda name: True)]
     return found + [f"lock {name}" for name in locks_held(output)]
-
-
-# --- rounds ---------------------------------------------------------------------------------------------------------
 
 
 def one_round(position, wanted, output, reference, draw):

@@ -61,8 +61,7 @@ def test_every_combination_of_units_is_told_apart_under_names_that_say_nothing(t
     found = proposed(write(tmp_path / "lap.csv", pd.DataFrame(columns)))
     assert (found["vx"].column, found["vx"].unit) == ("b", unit)
     assert (found["yaw_rate"].column, found["yaw_rate"].unit) == ("c", of_rate)
-    assert (found["ay"].column, found["ay"].unit) == ("d", of_ay)
-    assert found["ax"].column == "e"
+    assert ((found["ay"].column, found["ay"].unit), found["ax"].column) == (("d", of_ay), "e")
 
 
 def test_which_way_is_left_is_asked_unless_wheels_of_both_sides_tell(tmp_path):
@@ -184,8 +183,7 @@ def test_slow_signals_with_empty_cells_are_bridged(tmp_path):
 def test_a_log_without_reference_cannot_rank_anything(tmp_path):
     examined = inspect("my_car", [write(tmp_path / "lap.csv", usual(drive()).drop(columns="Beta"))])
     outcome, _ = write_files(examined, dry_run=True)
-    assert outcome["estimators"] == []
-    assert [Path(file).parts[0] for file in outcome["written"]] == ["conf"]
+    assert (outcome["estimators"], [Path(file).parts[0] for file in outcome["written"]]) == ([], ["conf"])
     assert outcome["next"][-1].startswith("vehest estimate ")
 
 
@@ -257,8 +255,7 @@ def test_a_row_of_units_a_preamble_and_quotes_are_seen_through(tmp_path):
 def test_a_column_that_counts_runs_makes_recordings_of_them(tmp_path):
     parts = [usual(drive(40.0, seed=seed)).assign(run=seed) for seed in (3, 4)]
     log = survey(write(tmp_path / "laps.csv", pd.concat(parts)))
-    assert log.options["runs"] == "run"
-    assert sorted((one.start, one.stop) for one in log.runs) == [(0, 2000), (2000, 4000)]
+    assert (log.options["runs"], sorted((one.start, one.stop) for one in log.runs)) == ("run", [(0, 2000), (2000, 4000)])
 
 
 def test_mirroring_turns_lateral_channels_alone():
@@ -481,9 +478,6 @@ def test_steering_and_yaw_rate_without_names_are_not_taken_for_yaw_rate_and_acce
     rate, wheelbase = 4.0 * d["r"], 3.6  # by which yaw_rate = steer·vx/wheelbase has the scale of km/h
     table = pd.DataFrame({"t": d["t"], "a": d["vx"], "b": wheelbase * rate / d["vx"], "c": rate})
     assert {"a", "b", "c"} <= set(asked(write(tmp_path / "lap.csv", table)))
-
-
-# The car's own signals, and what only looks like one
 
 
 def test_of_two_speeds_the_one_of_the_car_s_bus_is_its_own_whatever_their_noise(tmp_path):

@@ -48,8 +48,7 @@ def test_training_alone_calibrates_and_evaluation_takes_it(evaluated):
     assert found.inputs["model"] == read_artefact(model).digest
     assert read_artefact(evaluation).inputs["calibration"] == found.digest
     trust = trust_of(model, outputs)
-    assert trust.bands.vehicles == ("my car",)
-    assert trust.bands.calibrated_on == ("two (all)",)
+    assert (trust.bands.vehicles, trust.bands.calibrated_on) == (("my car",), ("two (all)",))
     assert trust.bands.scaled_on == ("one (all)",)
 
 
@@ -59,8 +58,7 @@ def test_a_model_by_its_path_has_its_calibration_whatever_the_output_root(evalua
     drive = planar_drive(20.0, 100.0).without_references()
     pd.DataFrame({"time": drive.time, **drive.channels}).to_csv(lap, index=False)
     for name, folder in (("here", place.folder / model), ("away", shutil.copytree(place.folder / model, tmp_path / "away"))):
-        code, said, err = place("estimate", str(folder), str(lap), "-o", str(out), f"output={tmp_path / 'other'}", "--json")
-        assert code == 0, err
+        said, _ = place.done("estimate", str(folder), str(lap), "-o", str(out), f"output={tmp_path / 'other'}", "--json")
         with open(out, encoding="utf-8") as stream:
             rows = list(csv.DictReader(stream))
         found = any(row.get("band_sideslip") for row in rows)
@@ -92,8 +90,7 @@ def test_metrics_say_coverage_width_and_scores_with_intervals_and_by_acceleratio
 
 
 def test_a_run_calibrates_each_model_once_and_shows_it(place):
-    code, _, err = place.once("run", "small", "tracking=none")
-    assert code == 0, err
+    _, err = place.once("run", "small", "tracking=none")
     assert [line.split()[0] for line in err.splitlines() if line.split()[1] == STAGE] == ["done"] * 4
     [report] = (place.folder / "outputs" / "report").iterdir()
     assert (report / "tables" / "bands_test.csv").is_file()
@@ -107,19 +104,15 @@ def test_a_calibration_that_is_gone_is_made_again_and_nothing_is_trained(evaluat
     found = calibration_of(model, place.folder / "outputs")
     (found.folder / "trust.yaml").unlink()
     before = (model / "manifest.json").stat().st_mtime_ns
-    code, out, err = place("eval", *TRAIN, "--json")
-    assert code == 0, err
-    assert json.loads(out) | {"skipped": True} == json.loads(out), "the same calibration leaves the evaluation up to date"
-    assert Path(json.loads(out)["folder"]) == evaluation
-    assert (model / "manifest.json").stat().st_mtime_ns == before
+    outcome = place.told("eval", *TRAIN)
+    assert outcome | {"skipped": True} == outcome, "the same calibration leaves the evaluation up to date"
+    assert (Path(outcome["folder"]), (model / "manifest.json").stat().st_mtime_ns) == (evaluation, before)
 
 
 def test_evaluation_of_a_named_model_on_another_split_takes_its_calibration_along(evaluated):
     place, model, _ = evaluated
     without_validation(place)
-    code, out, err = place("eval", "--model", str(model), "split=blind", "tracking=none", "--json")
-    assert code == 0, err
-    folder = Path(json.loads(out)["folder"])
+    folder = Path(place.told("eval", "--model", str(model), "split=blind", "tracking=none")["folder"])
     assert read_artefact(folder).inputs["calibration"] == calibration_of(model, place.folder / "outputs").digest
 
 
@@ -134,8 +127,7 @@ def test_without_a_validation_range_there_are_no_bands_and_a_note_says_so(place)
     without_validation(place)
     zero = ("estimator=zero", "split=blind", "tracking=none")
     assert place("train", *zero)[0] == 0
-    code, out, err = place("eval", *zero, "--json")
-    assert code == 0
+    out, err = place.done("eval", *zero, "--json")
     assert "note    calibrate  zero-zero-seed0 has no calibration, so its estimates have no bands" in err
     folder = Path(json.loads(out)["folder"])
     assert ("test", "all", "coverage_90") not in metrics_of(folder)
@@ -148,7 +140,7 @@ def test_a_model_that_learns_nothing_is_not_judged_by_a_calibration_that_may_hav
     split["tests"] = {"test": [{"recording": "two"}]}
     (place.folder / "conf" / "split" / "seen.yaml").write_text(yaml.safe_dump(split))
     without_validation(place)
-    model = json.loads(place("train", "estimator=zero", "split=seen", "tracking=none", "--json")[1])["model"]
+    model = place.told("train", "estimator=zero", "split=seen", "tracking=none")["model"]
     assert calibration_of(Path(model), place.folder / "outputs") is not None
     out = place("eval", "--model", model, "split=blind", "tracking=none", "--json")[1]
     assert "calibration" not in read_artefact(Path(json.loads(out)["folder"])).inputs

@@ -33,16 +33,13 @@ def _statuses(err):
 
 
 def test_pipeline_runs_then_skips_then_reruns_only_what_a_change_touches(place):
-    code, out, err = place.once("run", "small", "tracking=none")
-    assert code == 0, err
+    out, err = place.once("run", "small", "tracking=none")
     assert "KS-NN linear no bias, P = 2" in out
     assert [stage for status, stage in _statuses(err) if status == "done"].count("train") == 4
     made = place.files()
 
     code, again, err = place("run", "small", "tracking=none")
-    assert {status for status, _ in _statuses(err)} == {"skipped"}
-    assert again == out
-    assert place.files() == made
+    assert ({status for status, _ in _statuses(err)}, again, place.files()) == ({"skipped"}, out, made)
 
     (place.folder / "README.md").write_text("changed")
     dataset = {**DATASET, "citation": "somebody else", "licence": "another"}
@@ -58,8 +55,7 @@ def test_pipeline_runs_then_skips_then_reruns_only_what_a_change_touches(place):
 
 
 def test_dry_run_tells_and_makes_nothing(place):
-    code, _, err = place("run", "small", "--dry-run")
-    assert code == 0
+    _, err = place.done("run", "small", "--dry-run")
     assert ("would", "ingest") in _statuses(err)
     assert place.files() == set()
 
@@ -67,8 +63,7 @@ def test_dry_run_tells_and_makes_nothing(place):
 def test_two_processes_give_the_same_numbers_as_one(place):
     (place.folder / "pipelines" / "small.yaml").write_text(yaml.safe_dump({**PIPELINE, "sweeps": PIPELINE["sweeps"][1:]}))
     place("run", "small", "tracking=none", "output=one")
-    code, _, err = place("run", "small", "--jobs", "2", "tracking=none", "output=two")
-    assert code == 0, err
+    place.done("run", "small", "--jobs", "2", "tracking=none", "output=two")
     for model in (place.folder / "one" / "train").iterdir():
         other = place.folder / "two" / "train" / model.name
         assert (model / "model.safetensors").read_bytes() == (other / "model.safetensors").read_bytes()
@@ -83,23 +78,18 @@ def test_a_failed_job_is_reported_and_the_others_are_kept(place):
     assert "Traceback" not in err
     kept = {folder.name.split("-seed")[0] for folder in (place.folder / "outputs" / "train").iterdir()}
     assert kept == {"luenberger-luenberger"}
-    assert "Luenberger" in out
-    assert "left out: ksnn-linear_bias_p2 seed 0: training: the validation loss" in out
+    assert all(words in out for words in ("Luenberger", "left out: ksnn-linear_bias_p2 seed 0: training: the validation loss"))
     (report,) = (place.folder / "outputs").glob("report/*/report.md")
     assert "`ksnn-linear_bias_p2 seed 0` is left out: training: the validation loss" in report.read_text()
     assert not (place.folder / "results").exists()
 
 
 def test_a_report_is_drawn_of_what_is_there_and_says_what_is_not(place):
-    code, _, err = place.once("run", "small", "tracking=none")
-    assert code == 0, err
-    code, line = place.refused("report", "small", "tracking=none", "output=elsewhere")
-    assert code == 4
-    assert "run 'vehest run" in line
-    code, out, err = place("report", "small", "tracking=none", "--json")
-    assert code == 0, err
-    assert json.loads(out)["leaderboard"][0]["test_set"] == "test"
-    metrics = pd.read_csv(Path(json.loads(out)["report"]).parent / "metrics.csv")
+    place.once("run", "small", "tracking=none")
+    place.refused("report", "small", "tracking=none", "output=elsewhere", code=4, says="run 'vehest run")
+    outcome = place.told("report", "small", "tracking=none")
+    assert outcome["leaderboard"][0]["test_set"] == "test"
+    metrics = pd.read_csv(Path(outcome["report"]).parent / "metrics.csv")
     assert list(metrics.columns[:6]) == ["study", "estimator", "variant", "trained_on", "dataset", "kind"]
     assert set(metrics["kind"]) == {"simulated"}
     assert {"rmse_sideslip", "rmse_vy", "fvu", "n_parameters", "epochs"} <= set(metrics["metric"])
@@ -117,17 +107,11 @@ def test_a_report_is_drawn_of_what_is_there_and_says_what_is_not(place):
 
 def test_train_eval_estimate_report_one_by_one(place):
     arguments = ("estimator=ksnn", "split=mine", "training.max_epochs=2", "seed=3", "tracking=none")
-    code, out, err = place("train", *arguments, "--json")
-    assert code == 0, err
-    trained = json.loads(out)
-    assert trained["status"] == "complete"
-    assert trained["n_parameters"] == 28
-    assert json.loads(place("train", *arguments, "--json")[1])["skipped"] is True
-    assert json.loads(place("train", *arguments, "--json", "--force")[1])["skipped"] is False
+    trained = place.told("train", *arguments)
+    assert (trained["status"], trained["n_parameters"], place.told("train", *arguments)["skipped"]) == ("complete", 28, True)
+    assert place.told("train", *arguments, "--force")["skipped"] is False
 
-    code, out, err = place("eval", *arguments, "--json")
-    assert code == 0, err
-    by_overrides = json.loads(out)
+    by_overrides = place.told("eval", *arguments)
     name = Path(trained["model"]).name
     code, out, err = place("eval", "--model", name, "split=mine", "tracking=none", "--json")
     assert code == 0, err
@@ -141,9 +125,7 @@ def test_train_eval_estimate_report_one_by_one(place):
         )
     )
     for suffix in (".parquet", ".csv"):
-        code, out, err = place("estimate", name, "lap.csv", "dataset=lap", "-o", f"out{suffix}", "--json")
-        assert code == 0, err
-        assert json.loads(out)["estimated"] == 600 - 30
+        assert place.told("estimate", name, "lap.csv", "dataset=lap", "-o", f"out{suffix}")["estimated"] == 600 - 30
     frame, text = pq.read_table("out.parquet").to_pandas(), pd.read_csv("out.csv")
     assert list(frame.columns) == ["time", "vy", "sideslip", "band_vy", "band_sideslip", "health", "health_reason"]
     for column in ("vy", "sideslip", "band_vy", "band_sideslip", "health"):
@@ -157,28 +139,23 @@ def test_train_eval_estimate_report_one_by_one(place):
 
 
 def test_ingest_keeps_units_and_signs_and_downsample_the_rate(place):
-    code, out, err = place("ingest", "mine", "--json")
-    assert code == 0, err
-    recording = read_recording(Path(json.loads(out)["folder"]) / "one.parquet")
+    recording = read_recording(Path(place.told("ingest", "mine")["folder"]) / "one.parquet")
     truth = planar_drive(30.0, 100.0, seed=1, noise=0.02)
     for name in ("vx", "yaw_rate", "ay", "ax", "vy_ref"):
         assert np.allclose(recording[name], truth[name], rtol=0, atol=1e-9), name
-    code, out, err = place("downsample", "mine", "rate_hz=20", "--json")
-    assert code == 0, err
-    assert read_recording(Path(json.loads(out)["folder"]) / "one.parquet").rate_hz == 20.0
+    assert read_recording(Path(place.told("downsample", "mine", "rate_hz=20")["folder"]) / "one.parquet").rate_hz == 20.0
 
 
 def test_data_commands_list_show_and_check(place, monkeypatch):
     monkeypatch.setattr(inspect_data, "choices", lambda _: ["ferrari_250lm", "mine", "sim_quickstart"])
-    rows = json.loads(place("data", "list", "--json")[1])
+    rows = place.told("data", "list")
     assert [row["dataset"] for row in rows] == ["ferrari_250lm", "mine", "sim_quickstart"]
     assert next(row for row in rows if row["dataset"] == "mine")["here"] == "yes"
     assert "ferrari_250lm: Revs Vehicle Dynamics Database" in place("data", "list")[1]
-    shown = json.loads(place("data", "show", "mine", "--json")[1])
+    shown = place.told("data", "show", "mine")
     assert [recording["id"] for recording in shown["recordings"]] == ["one", "three", "two"]
     assert shown["recordings"][0]["rate_hz"] == 100.0
-    code, out, _ = place("data", "check", "mine")
-    assert code == 0
+    out, _ = place.done("data", "check", "mine")
     assert "follows ay - vx·yaw_rate" in out
     assert "yaw_rate" in place("data", "channels")[1]
     assert "one: simulated" in place("data", "show", "mine")[1]
@@ -190,10 +167,9 @@ def test_data_commands_list_show_and_check(place, monkeypatch):
 def test_doctor_names_what_an_absent_extra_is_for(place, monkeypatch):
     find = importlib.util.find_spec
     monkeypatch.setattr(importlib.util, "find_spec", lambda name, *rest: None if name == "optuna" else find(name, *rest) or find("vehest"))
-    code, out, _ = place("doctor", "--json")
-    assert code == 0
-    assert {item["name"]: item["level"] for item in json.loads(out)}["compiled recursions"] == "ok"
-    (extras,) = (item for item in json.loads(out) if item["name"] == "extras")
+    outcome = place.told("doctor")
+    assert {item["name"]: item["level"] for item in outcome}["compiled recursions"] == "ok"
+    (extras,) = (item for item in outcome if item["name"] == "extras")
     assert (extras["level"], extras["message"]) == (
         "warning",
         "noise levels tuned by Optuna need 'vehest[tuning]': pip install it where you need it",
@@ -202,15 +178,11 @@ def test_doctor_names_what_an_absent_extra_is_for(place, monkeypatch):
 
 def test_help_shows_choices_and_answers_quickly(place):
     _, out, _ = place("train", "--help")
-    assert "luenberger" in out
-    assert "ferrari_drive" in out
+    assert all(words in out for words in ("luenberger", "ferrari_drive"))
     code = "import sys; sys.argv = ['vehest', '--help']; import vehest.cli as c\ntry: c.main()\nexcept SystemExit: pass\n"
     code += "print(sorted({m.split('.')[0] for m in sys.modules} & {'torch', 'mlflow', 'hydra', 'pandas', 'numba', 'matplotlib'}))"
     result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert result.stdout.splitlines()[-1] == "[]", "--help must import nothing heavy"
-
-
-# --- input that cannot be used -------------------------------------------------------------------------------------
 
 
 def _rewrite(place, change):
@@ -253,10 +225,7 @@ def test_degrees_taken_as_radians_are_one_clear_line(place):
     content = yaml.safe_load((place.folder / "conf" / "dataset" / "mine.yaml").read_text())
     content["channels"]["yaw_rate"]["unit"] = "rad/s"
     (place.folder / "conf" / "dataset" / "mine.yaml").write_text(yaml.safe_dump(content, allow_unicode=True))
-    code, line = place.refused("ingest", "mine")
-    assert code == 3
-    assert "recording 'one': channel 'yaw_rate'" in line
-    assert "degrees" in line
+    place.refused("ingest", "mine", code=3, says=("recording 'one': channel 'yaw_rate'", "degrees"))
     assert place.files() == set()
     code, out, _ = place("data", "check", "mine")
     assert code == 3
@@ -270,16 +239,13 @@ def test_empty_and_truncated_files_are_one_clear_line(place):
     assert "one.csv' is empty" in place.refused("ingest", "mine")[1]
     whole = (place.folder / "raw" / "one.parquet").read_bytes()
     (place.folder / "raw" / "one.parquet").write_bytes(whole[: len(whole) // 2])
-    code, line = place.refused("ingest", "mine", "dataset.files=one.parquet")
-    assert code == 3
-    assert "one.parquet' is truncated or damaged" in line
-    assert "truncated" in line
+    place.refused("ingest", "mine", "dataset.files=one.parquet", code=3, says=("one.parquet' is truncated or damaged", "truncated"))
 
 
 def test_missing_root_missing_folder_and_unknown_words_are_one_clear_line(place, monkeypatch):
-    code, line = place.refused("ingest", "mine", "root=/no/such/folder")
-    assert code == 4
-    assert "there is no folder '/no/such/folder'; give root=FOLDER or set VEHEST_DATA" in line
+    place.refused(
+        "ingest", "mine", "root=/no/such/folder", code=4, says="there is no folder '/no/such/folder'; give root=FOLDER or set VEHEST_DATA"
+    )
     assert place.refused("ingest", "mine", "dataset.colour=red")[0] == 2
     assert "choices" in place.refused("train", "estimator=transformer")[1]
     assert "unknown option 'estimator.depth'" in place.refused("train", "estimator.depth=3")[1]
@@ -289,9 +255,7 @@ def test_missing_root_missing_folder_and_unknown_words_are_one_clear_line(place,
     overlapping = "split.tests.test=[{recording: one, start: 5, stop: 10}]"
     assert "share samples of recording 'one'" in place.refused("train", "split=mine", overlapping, "tracking=none")[1]
     monkeypatch.delenv("VEHEST_DATA")
-    code, line = place.refused("ingest", "mine")
-    assert code == 4
-    assert "no data root is set" in line
+    place.refused("ingest", "mine", code=4, says="no data root is set")
 
 
 def test_estimate_refuses_a_recording_it_cannot_use(place):
@@ -312,10 +276,8 @@ def test_truncated_artefact_is_made_again(place):
     weights = model / "model.safetensors"
     whole = weights.read_bytes()
     weights.write_bytes(whole[:50])
-    code, out, _ = place(*arguments)
-    assert code == 0
-    assert json.loads(out)["skipped"] is False
-    assert weights.read_bytes() == whole
+    out, _ = place.done(*arguments)
+    assert (json.loads(out)["skipped"], weights.read_bytes()) == (False, whole)
 
 
 def test_what_did_not_fit_into_the_minutes_is_named_and_the_same_command_goes_on(place, monkeypatch):
@@ -333,20 +295,22 @@ def test_what_did_not_fit_into_the_minutes_is_named_and_the_same_command_goes_on
     assert code == 0, err
     assert "Luenberger" in out
     assert "left out: gru-states_2-seed0: not done yet: no time was left, the same command goes on" in out
-    code, out, _ = place("run", "small", "tracking=none", "--minutes", "10")
-    assert code == 0
+    out, _ = place.done("run", "small", "tracking=none", "--minutes", "10")
     assert "not done yet" not in out
     assert "GRU" in out
 
 
 def test_a_time_in_which_nothing_can_be_done_is_said(place):
-    code, line = place.refused("run", "small", "tracking=none", "--minutes", "0.000001")
-    assert code == 3
-    assert "no estimator was done in this time; the same command goes on with: luenberger-luenberger-seed0" in line
+    place.refused(
+        "run",
+        "small",
+        "tracking=none",
+        "--minutes",
+        "0.000001",
+        code=3,
+        says="no estimator was done in this time; the same command goes on with: luenberger-luenberger-seed0",
+    )
     assert place.refused("run", "small", "--minutes", "0")[1] == "error: --minutes must be positive, not 0"
-
-
-# --- what must not happen by accident -----------------------------------------------------------------------------
 
 
 def test_only_the_study_as_it_is_written_is_published(place):
@@ -362,9 +326,7 @@ def test_only_the_study_as_it_is_written_is_published(place):
     assert str(place.folder) not in text + (results / "provenance.json").read_text()
     (results / "metrics.csv").unlink()
     (results / "provenance.json").unlink()
-    code, line = place.refused("run", "small", "tracking=none")
-    assert code == 2
-    assert "holds files that vehest did not publish" in line
+    place.refused("run", "small", "tracking=none", code=2, says="holds files that vehest did not publish")
 
 
 @pytest.mark.parametrize(
@@ -377,9 +339,7 @@ def test_only_the_study_as_it_is_written_is_published(place):
 )
 def test_pipelines_that_would_mix_or_lose_results_are_refused(place, change, message):
     (place.folder / "pipelines" / "small.yaml").write_text(yaml.safe_dump({**PIPELINE, **change}))
-    code, line = place.refused("run", "small", "tracking=none")
-    assert code == 2
-    assert message in line
+    place.refused("run", "small", "tracking=none", code=2, says=message)
 
 
 @pytest.mark.parametrize(
@@ -393,17 +353,13 @@ def test_pipelines_that_would_mix_or_lose_results_are_refused(place, change, mes
 def test_splits_that_would_mix_test_and_validation_are_refused(place, tests, message):
     file = place.folder / "conf" / "split" / "mine.yaml"
     file.write_text(yaml.safe_dump({**yaml.safe_load(file.read_text()), "tests": tests}))
-    code, line = place.refused("train", "split=mine", "tracking=none")
-    assert code == 2
-    assert message in line
+    place.refused("train", "split=mine", "tracking=none", code=2, says=message)
 
 
 def test_a_model_is_not_tested_on_what_it_learnt_from(place):
     model = json.loads(place.once("train", "split=mine", "training.max_epochs=1", "tracking=none", "--json")[1])["model"]
     swapped = ("split.train=[{recording: three}]", "split.tests.test=[{recording: one, start: 5, stop: 20}]")
-    code, line = place.refused("eval", "--model", model, "split=mine", *swapped, "tracking=none")
-    assert code == 2
-    assert "shares samples with the ranges" in line
+    place.refused("eval", "--model", model, "split=mine", *swapped, "tracking=none", code=2, says="shares samples with the ranges")
 
 
 def test_estimate_neither_replaces_folders_nor_its_own_recording(place):
@@ -420,11 +376,11 @@ def test_estimate_neither_replaces_folders_nor_its_own_recording(place):
 def test_a_model_remembers_how_its_recordings_were_prepared(place):
     arguments = ("split=mine", "training.max_epochs=1", "tracking=none")
     filtered = (*arguments, "downsample.transforms=[{name: low_pass, cutoff_hz: 0.3}]")
-    model = json.loads(place("train", *filtered, "--json")[1])["model"]
-    by_overrides = json.loads(place("eval", *filtered, "--json")[1])
-    by_name = json.loads(place("eval", "--model", model, *arguments, "--json")[1])
+    model = place.told("train", *filtered)["model"]
+    by_overrides = place.told("eval", *filtered)
+    by_name = place.told("eval", "--model", model, *arguments)
     assert by_name["folder"] == by_overrides["folder"]
-    unfiltered = json.loads(place("eval", "--model", model, *arguments, "downsample.transforms=[]", "--json")[1])
+    unfiltered = place.told("eval", "--model", model, *arguments, "downsample.transforms=[]")
     assert unfiltered["rmse_sideslip.test"] != by_name["rmse_sideslip.test"]
     references = {json.dumps(read_artefact(Path(outcome["folder"])).inputs["reference of mine/three"]) for outcome in (by_name, unfiltered)}
     assert len(references) == 1, "what is scored against is never filtered"
@@ -450,8 +406,6 @@ def test_odd_values_are_refused_in_one_line(place, arguments):
     assert "defect" not in line
     assert {path.name for path in place.folder.iterdir()} <= {"raw", "conf", "pipelines", "outputs"}
 
-
-# --- signals, kills and full disks -----------------------------------------------------------------------------------
 
 BUDGET = ("split=mine", "training.max_epochs=8", "training.patience=8", "training.checkpoint_seconds=0", "tracking=none", "--json")
 SAVES = (supervised, "save_checkpoint")  # once an epoch
@@ -514,9 +468,7 @@ def test_a_signal_or_kill_in_ingest_leaves_nothing_that_looks_finished(place, mo
         _killed(place, ingest, "write_recording", 2, "ingest", "mine")
         assert sum(name.endswith(".parquet") for name in place.files()) == 2, "it was in the middle"
     assert not list((place.folder / "outputs" / "ingest").glob("mine-*"))
-    code, out, err = place("ingest", "mine", "--json")
-    assert code == 0, err
-    assert len(json.loads(out)["recordings"]) == 3
+    assert len(place.told("ingest", "mine")["recordings"]) == 3
     assert not any(ASIDE_PREFIX in name for name in place.files()), "what the killed run left is cleared away"
 
 
@@ -529,8 +481,7 @@ def test_killed_pipeline_leaves_no_processes_and_the_next_run_finishes(place):
     assert children
     process.kill()
     wait_for(lambda: not any(map(is_alive, children)))
-    code, _, err = place("run", "small", "tracking=none")
-    assert code == 0, err
+    place.done("run", "small", "tracking=none")
 
 
 def test_a_really_full_disk_is_one_line_and_leaves_nothing(place):
@@ -540,9 +491,7 @@ def test_a_really_full_disk_is_one_line_and_leaves_nothing(place):
     if mounted.returncode:
         pytest.skip("a small file system cannot be mounted here (needs root)")
     try:
-        code, line = place.refused("ingest", "mine", f"output={disk}")
-        assert code == 4
-        assert "no room left to write" in line
+        place.refused("ingest", "mine", f"output={disk}", code=4, says="no room left to write")
         assert list(disk.rglob("*.parquet")) == []
     finally:
         subprocess.run(["umount", str(disk)], check=True)

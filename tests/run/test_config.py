@@ -34,8 +34,7 @@ def test_every_estimator_and_split_composes(elsewhere):
     for at in range(max(len(estimators), len(splits))):
         estimator, split = estimators[at % len(estimators)], splits[at % len(splits)]
         config = compose_config("eval", [f"estimator={estimator}", f"split={split}"])
-        assert config["estimator"]["name"] == estimator
-        assert config["split"]["name"] == split
+        assert (config["estimator"]["name"], config["split"]["name"]) == (estimator, split)
 
 
 def test_local_configuration_is_searched_first_and_adds_to_the_packaged_one(elsewhere):
@@ -72,8 +71,7 @@ def test_missing_choice_names_the_choices(elsewhere):
 
 def test_sweeps_expand_to_every_combination():
     jobs = expand(["estimator=ksnn", "estimator.n_local=2,3", "estimator.bias=true,false", "seed=range(3)"])
-    assert len(jobs) == 12
-    assert jobs[0] == ["estimator=ksnn", "estimator.n_local=2", "estimator.bias=True", "seed=0"]
+    assert (len(jobs), jobs[0]) == (12, ["estimator=ksnn", "estimator.n_local=2", "estimator.bias=True", "seed=0"])
     assert len({tuple(job) for job in jobs}) == 12
 
 

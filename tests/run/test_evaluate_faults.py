@@ -29,26 +29,19 @@ CONDITION = "frozen:yaw_rate:severe"
 
 def evaluated(place, *overrides):
     """Folder and figures of an evaluation."""
-    code, out, err = place("eval", *TRAINED, *overrides, "--json")
-    assert code == 0, err
-    figures = json.loads(out)
+    figures = place.told("eval", *TRAINED, *overrides)
     return Path(figures["folder"]), figures
 
 
 @pytest.fixture
 def trained(place):
     """A place with a model."""
-    code, _, err = place.once("train", *TRAINED)
-    assert code == 0, err
+    place.once("train", *TRAINED)
     return place
 
 
-# What configurations say
-
-
 def test_there_is_a_file_for_every_kind_and_none_is_the_default():
-    assert set(choices("fault")) == {*KINDS, "none"}
-    assert compose_config("eval")["fault"] == {"name": "none"}
+    assert (set(choices("fault")), compose_config("eval")["fault"]) == ({*KINDS, "none"}, {"name": "none"})
     assert faults_of(compose_config("eval")) == ()
 
 
@@ -66,8 +59,7 @@ def test_a_list_takes_what_it_does_not_say_from_the_kind_and_stands_before_the_c
     listed = "faults=[{kind:drift,channel:ay,severity:mild},{kind:bias,channel:ax,size:0.4,start:3}]"
     drift, bias, frozen = faults_of(compose_config("eval", [listed, "fault=frozen"]))
     assert (drift.condition, drift.duration) == ("drift:ay:mild", 20.0)
-    assert (bias.condition, bias.start, bias.duration) == ("bias:ax:0.4", 3.0, 10.0)
-    assert frozen.name == "frozen"
+    assert ((bias.condition, bias.start, bias.duration), frozen.name) == (("bias:ax:0.4", 3.0, 10.0), "frozen")
 
 
 def test_the_start_is_drawn_between_20_and_40_percent_of_the_range_and_another_in_each():
@@ -75,8 +67,7 @@ def test_the_start_is_drawn_between_20_and_40_percent_of_the_range_and_another_i
     onsets = np.array([fault.within(10.0, 100.0, position).onset for position in range(50)])
     assert 30.0 <= onsets.min() < 32.0
     assert 48.0 < onsets.max() <= 50.0
-    assert len(set(onsets)) == 50
-    assert fault.within(10.0, 100.0, 3) == fault.within(10.0, 100.0, 3)
+    assert (len(set(onsets)), fault.within(10.0, 100.0, 3)) == (50, fault.within(10.0, 100.0, 3))
     assert FaultSettings("bias", "ay", "mild", start=4.0).within(10.0, 100.0, 7).onset == 14.0
 
 
@@ -90,15 +81,18 @@ def test_the_start_is_drawn_between_20_and_40_percent_of_the_range_and_another_i
     ],
 )
 def test_a_fault_that_makes_no_sense_is_one_line(place, overrides, message):
-    code, line = place.refused("eval", *TRAINED, *overrides)
-    assert code == 2
-    assert message in line
+    place.refused("eval", *TRAINED, *overrides, code=2, says=message)
 
 
 def test_a_fault_in_a_channel_that_a_recording_lacks_is_one_line(trained):
-    code, line = trained.refused("eval", *TRAINED, "fault=bias", "fault.channel=steer")
-    assert code == 2
-    assert "recording 'two' of data set 'mine' has no channel 'steer' (it has ax, ay, vx, yaw_rate)" in line
+    trained.refused(
+        "eval",
+        *TRAINED,
+        "fault=bias",
+        "fault.channel=steer",
+        code=2,
+        says="recording 'two' of data set 'mine' has no channel 'steer' (it has ax, ay, vx, yaw_rate)",
+    )
 
 
 def test_two_faults_of_one_name_are_refused_and_the_same_one_twice_is_one():
@@ -107,9 +101,6 @@ def test_two_faults_of_one_name_are_refused_and_the_same_one_twice_is_one():
     with pytest.raises(ConfigurationError, match="two faults are both called bias:ay:mild"):
         all_of([[fault], [FaultSettings("bias", "ay", "mild", start=4.0)]])
     assert len(all_of([[fault], [FaultSettings("bias", "ay", "mild", start=4.0, seed=1)]])) == 2
-
-
-# The evaluation
 
 
 def test_an_evaluation_has_rows_of_its_fault_and_keeps_all_others(trained):
@@ -122,8 +113,7 @@ def test_an_evaluation_has_rows_of_its_fault_and_keeps_all_others(trained):
     assert shown == set(nominal)
     assert all(figures[name] == nominal[name] for name in shown - {"folder", "step_seconds.test", "train_seconds.test"})
     added = pd.DataFrame(csv.DictReader([before[0], *after[len(before) :]]))
-    assert set(added["condition"]) == {CONDITION}
-    assert set(added["subset"]) == {"faulted", "after"}
+    assert (set(added["condition"]), set(added["subset"])) == ({CONDITION}, {"faulted", "after"})
     assert set(added["test_set"]) == {"validation", "test"}
     metrics = {"rmse_sideslip", "rmse_vy", "max_error_sideslip"}
     flags = {"coverage_90", "coverage_90_unflagged", "detection_delay", "missed_detections", "max_error_sideslip_undetected"}
@@ -141,9 +131,7 @@ def test_errors_under_a_fault_are_those_of_an_estimate_made_by_hand(place):
     """v = 0 has the error v; what it is while the fault lasts follows from the reference alone."""
     overrides = ("split=mine", "estimator=zero", "tracking=none")
     assert place("train", *overrides)[0] == 0
-    code, out, err = place("eval", *overrides, *FROZEN, "--json")
-    assert code == 0, err
-    figures = json.loads(out)
+    figures = place.told("eval", *overrides, *FROZEN)
     recording = read_recording(next((place.folder / "outputs" / "downsample").glob("mine-20hz-*")) / "three.parquet")
     time = recording.time - recording.start_time
     for subset, inside in (("faulted", (time > 7.99) & (time < 13.99)), ("after", time > 16.99)):
@@ -175,21 +163,16 @@ def test_without_faults_the_key_holds_nothing_of_them(trained):
     assert set(manifest["outputs"]) == {"metrics.csv", "timings.csv", "blocks.csv", "validation/0.parquet", "test/0.parquet"}
 
 
-# Sweeps and pipelines
-
-
 def test_a_sweep_over_faults_trains_each_model_once(place):
     quick = ("split=mine", "estimator=gru", "estimator.n_states=2", "training.max_epochs=1", "tracking=none")
-    code, out, err = place("sweep", *quick, "fault=frozen,bias", "fault.channel=yaw_rate,ay", "seed=range(2)", "--json")
-    assert code == 0, err
+    out, err = place.done("sweep", *quick, "fault=frozen,bias", "fault.channel=yaw_rate,ay", "seed=range(2)", "--json")
     assert sum(line.startswith("done") and " train " in line for line in err.splitlines()) == 2
     assert sum(line.startswith("done") and " evaluate " in line for line in err.splitlines()) == 2
     outcome = json.loads(out)
     assert outcome["chosen"] is None, "faults are not chosen between"
     folder = Path(outcome["folder"])
     jobs = pd.read_csv(folder / "sweep.csv")
-    assert len(jobs) == 8
-    assert set(jobs["status"]) == {"done"}
+    assert (len(jobs), set(jobs["status"])) == (8, {"done"})
     for job in jobs.to_dict("records"):
         metrics = pd.read_csv(next((place.folder / "outputs" / "evaluate").glob(f"gru-*-seed{job['seed']}-*")) / "metrics.csv")
         condition = f"{job['fault']}:{job['fault.channel']}:medium"
@@ -202,11 +185,8 @@ def test_a_sweep_over_faults_trains_each_model_once(place):
 
 def test_settings_under_one_fault_are_still_chosen_on_validation(place):
     quick = ("split=mine", "estimator=kinematic,zero", "tracking=none")
-    code, out, err = place("sweep", *quick, *FROZEN, "--json")
-    assert code == 0, err
-    assert json.loads(out)["chosen"]["rmse_sideslip.validation"] == min(
-        row["rmse_sideslip.validation"] for row in json.loads(out)["summary"]
-    )
+    outcome = place.told("sweep", *quick, *FROZEN)
+    assert outcome["chosen"]["rmse_sideslip.validation"] == min(row["rmse_sideslip.validation"] for row in outcome["summary"])
 
 
 def test_a_fault_that_suits_no_channel_is_named_and_the_others_go_on(place):
@@ -226,20 +206,18 @@ def pipeline_with(place, sweeps, **keys):
 def test_a_pipeline_lists_faults_for_all_of_its_evaluations(place):
     faults = [{"kind": "frozen", "channel": "yaw_rate", "severity": "severe"}, {"kind": "nan", "channel": "ay", "severity": "mild"}]
     name = pipeline_with(place, [["estimator=zero,kinematic"]], evaluation={"faults": faults, "skip_seconds": 1})
-    code, out, err = place("run", name, "tracking=none", "--json")
-    assert code == 0, err
+    outcome = place.told("run", name, "tracking=none")
     files = list((place.folder / "outputs" / "evaluate").glob("*/metrics.csv"))
     assert len(files) == 2
     for file in files:
         assert {name for name in pd.read_csv(file)["condition"] if is_fault(name)} == {CONDITION, "nan:ay:mild"}
-    shown = json.loads(out)["leaderboard"]
+    shown = outcome["leaderboard"]
     assert len(shown) == 2, "the leaderboard is that without faults"
 
 
 def test_sweeps_of_a_pipeline_over_faults_fill_the_same_list(place):
     name = pipeline_with(place, [["estimator=kinematic", "fault=frozen,bias"], ["estimator=zero"]])
-    code, _, err = place("run", name, "tracking=none")
-    assert code == 0, err
+    _, err = place.done("run", name, "tracking=none")
     assert sum(line.startswith("done") and " train " in line for line in err.splitlines()) == 2
     for file in (place.folder / "outputs" / "evaluate").glob("*/metrics.csv"):
         assert {name for name in pd.read_csv(file)["condition"] if is_fault(name)} == {"frozen:yaw_rate:medium", "bias:yaw_rate:medium"}
@@ -258,9 +236,7 @@ def test_a_fault_can_be_added_to_any_study_on_the_command_line(place):
     ],
 )
 def test_faults_of_a_pipeline_that_make_no_sense_are_one_line(place, evaluation, message):
-    code, line = place.refused("run", pipeline_with(place, [["estimator=zero"]], evaluation=evaluation), "tracking=none")
-    assert code == 2
-    assert message in line
+    place.refused("run", pipeline_with(place, [["estimator=zero"]], evaluation=evaluation), "tracking=none", code=2, says=message)
 
 
 def test_a_plan_without_faults_is_that_of_the_evaluation(trained):

@@ -48,9 +48,6 @@ def trained(own, seconds, text="weights"):
     return make(own.plan, write)
 
 
-# How far a launch is
-
-
 def test_progress_counts_and_estimates_the_end():
     progress = LaunchProgress(10)
     progress.running.add(0)
@@ -60,8 +57,7 @@ def test_progress_counts_and_estimates_the_end():
     progress.ended(0, 10.0, failed=False)
     progress.ended(1, 20.0, failed=True)
     ended = {"done": "1", "running": "0", "waiting": "8", "failed": "1", "core hours": "0.008", "cores": "4", "left": "0:00:30"}
-    assert progress.row(4) == ended
-    assert LaunchProgress(1).row(4) == {}
+    assert (progress.row(4), LaunchProgress(1).row(4)) == (ended, {})
 
 
 def test_no_more_bars_are_drawn_than_fit_a_terminal(monkeypatch):
@@ -69,9 +65,6 @@ def test_no_more_bars_are_drawn_than_fit_a_terminal(monkeypatch):
         for number in range(console.MOST_BARS + 5):
             bars.fit(f"training {number}", None)
         assert len(bars.tasks) == console.MOST_BARS
-
-
-# Artefacts that travel
 
 
 def test_an_artefact_travels_with_its_digest_and_a_damaged_one_does_not_arrive(tmp_path):
@@ -95,8 +88,7 @@ def test_a_digest_that_is_a_path_removes_nothing(tmp_path):
     (made.folder / MANIFEST).write_text(json.dumps(manifest))
     with pytest.raises(DataError, match=r"outputs\.model\.safetensors\.sha256"):
         unpack({tmp_path / "there" / "train" / made.folder.name: pack({made.folder})[made.folder]})
-    assert find(job(tmp_path / "here").plan) is None
-    assert precious.read_text() == "precious"
+    assert (find(job(tmp_path / "here").plan), precious.read_text()) == (None, "precious")
 
 
 def test_a_machine_with_other_versions_says_so_and_does_nothing(tmp_path):
@@ -111,9 +103,6 @@ def test_a_machine_without_the_output_root_does_nothing_before_it_gets_copies(tm
     with pytest.raises(NotShared):
         run_task(spec, None, lambda: False)
     assert not list(tmp_path.iterdir())
-
-
-# Machines and choices
 
 
 def test_what_another_host_writes_is_left_alone_for_a_day(tmp_path, monkeypatch):
@@ -138,9 +127,7 @@ def test_options_of_a_cluster_are_refused_elsewhere(place):
 def test_without_ray_one_line_says_how_to_get_it(place, monkeypatch):
     real = importlib.util.find_spec
     monkeypatch.setattr(importlib.util, "find_spec", lambda name, *rest: None if name == "ray" else real(name, *rest))
-    code, line = place.refused("run", "small", "--launcher", "ray")
-    assert code == 4
-    assert "pip install 'vehest[ray]'" in line
+    place.refused("run", "small", "--launcher", "ray", code=4, says="pip install 'vehest[ray]'")
 
 
 def test_the_local_launcher_hands_back_failures_as_values(tmp_path):
@@ -149,9 +136,6 @@ def test_the_local_launcher_hands_back_failures_as_values(tmp_path):
     group = Group([job(tmp_path)], SPLIT)
     (done,) = launcher.launch([group], StopSignals(), lambda *_: None)
     assert isinstance(done.outcome, Failure)
-
-
-# Options of launchers
 
 
 @pytest.mark.parametrize(

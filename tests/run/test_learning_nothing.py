@@ -33,8 +33,7 @@ def figures_of(out):
 
 def test_whole_recording_is_a_test_without_training(steered):
     assert steered("train", *OWN_NOISE, "split=whole")[0] == 0
-    code, out, _ = steered("eval", *OWN_NOISE, "split=whole", "--json")
-    assert code == 0
+    out, _ = steered.done("eval", *OWN_NOISE, "split=whole", "--json")
     figures = figures_of(out)
     assert 0 < figures["rmse_sideslip.test"] < 5
     assert figures["n_parameters.test"] == 0
@@ -45,17 +44,15 @@ def test_whole_recording_is_a_test_without_training(steered):
 
 
 def test_model_that_learnt_nothing_is_the_same_for_every_split_and_may_be_tested_on_any(steered):
-    folders = [json.loads(steered("train", *OWN_NOISE, f"split={split}", "--json")[1])["model"] for split in ("whole", "cut")]
-    assert folders[0] == folders[1]
-    assert steered("eval", "--model", folders[0], "split=whole", "tracking=none")[0] == 0
-    other = json.loads(steered("train", *OWN_NOISE, "split=cut", "downsample.method=decimate", "--json")[1])["model"]
+    folders = [steered.told("train", *OWN_NOISE, f"split={split}")["model"] for split in ("whole", "cut")]
+    assert (folders[0], steered("eval", "--model", folders[0], "split=whole", "tracking=none")[0]) == (folders[1], 0)
+    other = steered.told("train", *OWN_NOISE, "split=cut", "downsample.method=decimate")["model"]
     assert other != folders[0], "how recordings are prepared is part of a model"
 
 
 def test_filter_with_levels_from_training_is_kept_from_testing_on_them(steered):
     arguments = ("estimator=kalman", "tracking=none", "--json")
-    code, out, err = steered("train", *arguments, "split=cut")
-    assert code == 0
+    out, err = steered.done("train", *arguments, "split=cut")
     assert json.loads(out)["n_parameters"] == 3
     assert "3 parameters" in err
     figures = figures_of(steered("eval", *arguments, "split=cut")[1])
@@ -73,10 +70,9 @@ def test_study_without_training_reports_and_says_where_estimates_start(steered):
     evaluation = {"initial_state": True, "warm_up_seconds": 0}
     pipeline = {"study": "given", "report": "drive", "split": "whole", "evaluation": evaluation, "sweeps": [[*OWN_NOISE[:2]]]}
     (Path("pipelines") / "given.yaml").write_text(yaml.safe_dump(pipeline))
-    code, out, _ = steered("run", "given", "tracking=none", "--json")
-    assert code == 0
-    (row,) = json.loads(out)["leaderboard"]
+    outcome = steered.told("run", "given", "tracking=none")
+    (row,) = outcome["leaderboard"]
     assert (row["estimator"], row["start"]) == ("kalman", "reference")
-    report = (Path(json.loads(out)["report"]).parent / "report.md").read_text(encoding="utf-8")
+    report = (Path(outcome["report"]).parent / "report.md").read_text(encoding="utf-8")
     assert "Estimates start at the reference state" in report
     assert 0 < row["rmse_sideslip"] < 5

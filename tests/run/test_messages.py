@@ -34,9 +34,6 @@ def _shows_only_text(text):
     return all(character == "\n" or is_printable(character) for character in text)
 
 
-# --- usage -----------------------------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
@@ -71,9 +68,6 @@ def test_help_version_and_completion_answer_as_before(place, monkeypatch):
     assert place()[1].split() == ["train"]
 
 
-# --- names from files ------------------------------------------------------------------------------------------------
-
-
 def test_hostile_names_reach_the_terminal_as_text(place):
     dataset = {**DATASET, "title": HOSTILE, "licence": HOSTILE, "citation": HOSTILE, "vehicle": HOSTILE}
     (place.folder / "conf" / "dataset" / "mine.yaml").write_text(yaml.safe_dump(dataset, allow_unicode=True))
@@ -93,8 +87,7 @@ def test_json_and_yaml_show_only_text_and_keep_every_value(place):
     hostile = HOSTILE + "\x7f\u2028\U000e0041β"
     override = f"output='{hostile}'"
     for arguments, read in ((("--json",), json.loads), ((), yaml.safe_load)):
-        code, out, _ = place("config", "train", override, *arguments)
-        assert code == 0
+        out, _ = place.done("config", "train", override, *arguments)
         assert _shows_only_text(out)
         assert read(out)["output"] == hostile
     assert "β" in as_yaml({"name": "β"})
@@ -129,9 +122,6 @@ def test_tables_read_no_markup_and_hold_no_escapes(place, capsys):
     assert ":car:" in out
 
 
-# --- names that are not UTF-8 ----------------------------------------------------------------------------------------
-
-
 def test_files_whose_names_are_not_utf_8_are_read_and_written(place):
     drive = planar_drive(20.0, 100.0).without_references()
     pd.DataFrame({"time": drive.time, **drive.channels}).to_csv("lap.csv", index=False)
@@ -145,9 +135,7 @@ def test_files_whose_names_are_not_utf_8_are_read_and_written(place):
     assert r"lap\udcff: real" in place("data", "show", lap)[1]
     assert place("train", "estimator=luenberger", "split=mine", "training.grid=1", "training.max_evaluations=5", "tracking=none")[0] == 0
     for name in (b"out\xfe.parquet", b"out\xfe.csv"):
-        code, out, err = place("estimate", "luenberger", lap, "-o", os.fsdecode(name), "--json")
-        assert code == 0, err
-        assert json.loads(out)["out"] == os.fsdecode(name)
+        assert place.told("estimate", "luenberger", lap, "-o", os.fsdecode(name))["out"] == os.fsdecode(name)
         assert name in os.listdir(b".")
     code, line = place.refused("data", "show", os.fsdecode(b"other\xff.csv"))
     assert (code, r"'other\udcff.csv' is neither" in line) == (2, True)
@@ -163,20 +151,13 @@ def test_a_data_set_whose_recordings_names_are_not_utf_8_makes_a_whole_study(pla
     pipeline = yaml.safe_load((place.folder / "pipelines" / "small.yaml").read_text()) | {"sweeps": sweeps}
     pipeline |= {"title": "T <script>alert(1)</script>", "about": "<img src=x onerror=alert(1)> [x](javascript:alert(1))"}
     (place.folder / "pipelines" / "small.yaml").write_text(yaml.safe_dump(pipeline))
-    code, out, err = place("run", "small", "tracking=none", "--json")
-    assert code == 0, err
-    report = Path(json.loads(out)["report"])
+    report = Path(place.told("run", "small", "tracking=none")["report"])
     assert r"recording one\\udcff" in report.with_suffix(".md").read_text(encoding="utf-8")
     for text in (report.read_text(encoding="utf-8"), report.with_suffix(".md").read_text(encoding="utf-8")):
         assert "T &lt;script" in text
-        assert "<script>alert" not in text
-        assert "<img src=x" not in text
-        assert 'href="javascript' not in text
+        assert not any(words in text for words in ("<script>alert", "<img src=x", 'href="javascript'))
     assert "[x](javascript" not in report.with_suffix(".md").read_text(encoding="utf-8")
     assert r"one\udcff" in (report.parent / "tables" / "ranges.csv").read_text(encoding="utf-8")
-
-
-# --- number of jobs, overrides ---------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -193,9 +174,7 @@ def test_a_data_set_whose_recordings_names_are_not_utf_8_makes_a_whole_study(pla
     ],
 )
 def test_a_sweep_is_counted_before_it_is_expanded(place, value, words):
-    code, line = place.refused("sweep", "split=mine", f"seed={value}", "--dry-run")
-    assert code == 2
-    assert words in line
+    place.refused("sweep", "split=mine", f"seed={value}", "--dry-run", code=2, says=words)
 
 
 def test_ranges_count_what_they_expand_to():
@@ -205,10 +184,15 @@ def test_ranges_count_what_they_expand_to():
 
 
 def test_the_limit_of_jobs_holds_for_products_and_is_raised_by_an_override(place):
-    code, line = place.refused("sweep", "split=mine", "seed=range(200)", "training.patience=range(1,100)", "--dry-run")
-    assert code == 2
-    assert "19800 jobs" in line
-    assert "limits.jobs=NUMBER" in line
+    place.refused(
+        "sweep",
+        "split=mine",
+        "seed=range(200)",
+        "training.patience=range(1,100)",
+        "--dry-run",
+        code=2,
+        says=("19800 jobs", "limits.jobs=NUMBER"),
+    )
     assert place.refused("sweep", "split=mine", "seed=range(6)", "limits.jobs=5", "--dry-run")[0] == 2
     assert place("sweep", "split=mine", "seed=range(6)", "limits.jobs=6", "--dry-run")[0] == 0
     assert limits_of(["limits.jobs=12345", "seed=3"]).jobs == 12345
@@ -239,9 +223,6 @@ def test_long_honest_overrides_are_read():
     ranges = ", ".join(f"{{recording: one, start: {k}.5, stop: {k + 1}}}" for k in range(300))
     assert len(compose_config("train", [f"split.train=[{ranges}]"])["split"]["train"]) == 300
     assert compose_config("train", ["output='[((a, {b'"])["output"] == "[((a, {b"
-
-
-# --- full disks, broken streams, odd surroundings --------------------------------------------------------------------
 
 
 @contextmanager
@@ -285,8 +266,7 @@ def test_a_full_disk_names_its_target_in_every_stage_and_leaves_nothing(place):
         assert code == 4, line
         assert line.startswith("error: no room left to write '"), line
         assert target in line
-        assert place.files() | set(os.listdir()) == before | {"outputs"}
-        assert place(*command)[0] == 0
+        assert (place.files() | set(os.listdir()), place(*command)[0]) == (before | {"outputs"}, 0)
 
 
 def _break_off(target, error):
@@ -309,8 +289,7 @@ def _break_off(target, error):
 def test_a_full_disk_is_known_whatever_a_library_calls_it(tmp_path, error):
     with pytest.raises(MissingError, match=f"no room left to write '{tmp_path / 'target'}'"):
         _break_off(tmp_path / "target", error)
-    assert list(tmp_path.iterdir()) == []
-    assert failure_of(error).exit_code == 4
+    assert (list(tmp_path.iterdir()), failure_of(error).exit_code) == ([], 4)
 
 
 def test_what_is_no_full_disk_is_none(tmp_path):
@@ -383,13 +362,11 @@ def test_no_home_no_terminal_and_no_utf_8_still_show_everything(place):
     plain = _shell(place, "vehest data channels --json", LC_ALL="C", PYTHONCOERCECLOCALE="0", PYTHONUTF8="0")
     assert (plain.returncode, plain.stderr) == (0, "")
     assert plain.stdout.isascii()
-    assert json.loads(plain.stdout) == json.loads(place("data", "channels", "--json")[1])
+    assert json.loads(plain.stdout) == place.told("data", "channels")
     table = _shell(place, "vehest data channels", LC_ALL="C", PYTHONCOERCECLOCALE="0", PYTHONUTF8="0")
     assert (table.returncode, table.stderr) == (0, "")
     assert "m/s²" in table.stdout
 
 
 def test_a_folder_that_cannot_be_written_is_one_line(place):
-    code, line = place.refused("ingest", "mine", "output=/proc/nothing")
-    assert code == 4
-    assert "cannot write '/proc/nothing" in line
+    place.refused("ingest", "mine", "output=/proc/nothing", code=4, says="cannot write '/proc/nothing")

@@ -30,15 +30,13 @@ def test_enter_takes_what_is_proposed_and_what_is_known_of_the_car_is_used(log):
     result = CliRunner().invoke(app, ["new", "my_car", "lap.csv"], input="\n2.7\n1500\n\n")
     assert result.exit_code == 0, result.output
     assert "yaw_rate: column Gyro, deg/s: ay and vx·yaw_rate agree" in result.output
-    assert "in a left turn, does column 'Gyro' count up?" in result.output
-    assert "vehest run my_car" in result.output
+    assert all(words in result.output for words in ("in a left turn, does column 'Gyro' count up?", "vehest run my_car"))
     dataset = yaml.safe_load(Path(FILES[0]).read_text(encoding="utf-8"))
     assert dataset["channels"]["ay"] == {"column": "LatAcc", "unit": "g"}
     assert [entry["name"] for entry in dataset["transforms"]] == ["velocity_from_sideslip", "steering_ratio"]
     pipeline = yaml.safe_load(Path(FILES[2]).read_text(encoding="utf-8"))
     sweeps = [" ".join(sweep) for sweep in pipeline["parts"]["all"]["sweeps"]]
-    assert sweeps[0] == "estimator=zero,static_map,kinematic"
-    assert sweeps[1] == "estimator=data_sheet estimator.wheelbase=2.7"
+    assert (sweeps[0], sweeps[1]) == ("estimator=zero,static_map,kinematic", "estimator=data_sheet estimator.wheelbase=2.7")
     assert any("estimator=kalman" in sweep and "estimator.car.mass=1500" in sweep for sweep in sweeps)
 
 
@@ -159,8 +157,7 @@ def test_files_beside_those_that_are_named_stay_out_of_the_data_set(tmp_path, ca
     write(tmp_path / "run_other.csv", usual(drive(seed=3)))
     assert run_vehest(capsys, "new", "my_car", "run_1.csv", "run_2.csv", "--yes")[0] == 0
     code, out, _ = run_vehest(capsys, "data", "show", "my_car", "--json")
-    assert code == 0
-    assert [one["id"] for one in json.loads(out)["recordings"]] == ["run_1", "run_2"]
+    assert (code, [one["id"] for one in json.loads(out)["recordings"]]) == (0, ["run_1", "run_2"])
 
 
 def test_without_a_speed_no_pipeline_is_written_that_could_not_run(tmp_path, capsys, log):
@@ -213,8 +210,7 @@ def test_a_stop_gives_in_json_what_was_found_and_a_dry_run_needs_no_force(capsys
     assert (code, err) == (2, f"error: {found['stopped']}\n")
     assert "vx" in [one["channel"] for one in found["channels"]]
     code, out, _ = run_vehest(capsys, "new", "my_car", "lap.csv", "--json", "--dry-run")
-    assert (code, json.loads(out)["dry_run"]) == (0, True)
-    assert [Path(file).read_text() for file in FILES] == before
+    assert ((code, json.loads(out)["dry_run"]), [Path(file).read_text() for file in FILES]) == ((0, True), before)
 
 
 def test_an_estimator_of_ones_own_is_compared_too(tmp_path, capsys, log, monkeypatch):

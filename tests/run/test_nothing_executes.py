@@ -57,9 +57,6 @@ def by_source(**dataset):
     return read
 
 
-# --- formats -----------------------------------------------------------------------------------------------------------------------
-
-
 def mdf(honest, hostile):
     import asammdf
 
@@ -217,9 +214,6 @@ CASES = {
     "table": Case(table, refused=frozenset({"cell0.csv", "pickle.csv"})),
     "model": Case(model_folder, refused=frozenset({"tag0", "tag1", "tag2", "name0", "name1", "name2", "name3", "name4", "pickle"})),
 }
-
-
-# --- watching ----------------------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("name", CASES)

@@ -58,15 +58,13 @@ def parts_place(place):
 
 def test_parts_run_as_one_study_and_the_next_run_skips_all(parts_place):
     place = parts_place
-    code, out, err = place("run", "both", "--json", "tracking=none")
-    assert code == 0, err
+    out, err = place.done("run", "both", "--json", "tracking=none")
     assert "goes on without part 'ferrari_drive'" in " ".join(err.split())
     overview = pd.DataFrame(json.loads(out)["overview"])
     assert list(overview["model"]) == [paper.LUENBERGER, paper.LSTM, paper.LINEAR, paper.NONLINEAR] * 2
     results = place.folder / "results" / "both"
     metrics = pd.read_csv(results / "metrics.csv")
-    assert set(metrics["trained_on"]) == {"mine/scheme_1", "mine/scheme_2"}
-    assert list(metrics.columns) == list(METRIC_COLUMNS)
+    assert (set(metrics["trained_on"]), list(metrics.columns)) == ({"mine/scheme_1", "mine/scheme_2"}, list(METRIC_COLUMNS))
     about = json.loads((results / "provenance.json").read_text())
     assert (about["parts"], about["absent"]) == (["scheme_1", "scheme_2"], ["ferrari_drive"])
     report = (results / "report.md").read_text(encoding="utf-8")
@@ -116,14 +114,12 @@ def test_a_run_without_a_part_does_not_replace_a_published_study_that_shows_it(p
         part["sweeps"] = [sweep for sweep in CANDIDATES if "estimator=ksnn" not in sweep]
     file.write_text(yaml.safe_dump(content))
     shutil.copytree(place.folder / "raw", place.folder / "raw" / "other")
-    code, _, err = place("run", "both", "tracking=none")
-    assert code == 0, err
+    place.done("run", "both", "tracking=none")
     published = (place.folder / "results" / "both" / "report.md").read_bytes()
     shutil.rmtree(place.folder / "raw" / "other")
     code, out, err = place("run", "both", "--json", "tracking=none")
     assert "not published: 'results/both' shows part 'ferrari_drive'" in " ".join(err.split())
-    assert json.loads(out)["published"] is None
-    assert (place.folder / "results" / "both" / "report.md").read_bytes() == published
+    assert (json.loads(out)["published"], (place.folder / "results" / "both" / "report.md").read_bytes()) == (None, published)
     assert place("report", "--check")[:2] == (0, "both: up to date: raw files not here, not compared: other\n")
 
 
@@ -137,8 +133,7 @@ def test_a_study_of_real_cars_is_nowhere_called_simulated(parts_place):
     content["parts"]["scheme_1"]["sweeps"] = content["parts"]["scheme_2"]["sweeps"] = quick
     content["parts"]["devbot_ferrari"] = content["parts"]["minutes_5_a"] = {"split": "back", "sweeps": CANDIDATES[::2]}
     file.write_text(yaml.safe_dump(content, sort_keys=False))
-    code, _, err = place("run", "both", "tracking=none")
-    assert code == 0, err
+    place.done("run", "both", "tracking=none")
     report = (place.folder / "results" / "both" / "report.md").read_text(encoding="utf-8")
     made_here = report.replace("a simulated DevBot", "").replace("samples, simulated, σ", "")  # a heading, and noise put into a made turn
     assert "simulated" not in made_here.lower()
@@ -151,9 +146,7 @@ def test_files_of_a_part_that_must_be_there_are_missed_in_one_line(parts_place):
     del content["parts"]["ferrari_drive"]["optional"]
     content["parts"] = {"ferrari_drive": content["parts"]["ferrari_drive"], **content["parts"]}
     file.write_text(yaml.safe_dump(content, sort_keys=False))
-    code, line = place.refused("run", "both", "tracking=none")
-    assert code == 4
-    assert "other" in line
+    place.refused("run", "both", "tracking=none", code=4, says="other")
 
 
 def test_a_pipeline_based_on_another_says_only_what_changes(parts_place):
@@ -183,8 +176,7 @@ def test_both_schemes_have_the_39_candidates_of_table_3_and_three_baselines():
     for scheme in schemes:
         names = [(new_estimator(config["estimator"]).name, new_estimator(config["estimator"]).variant) for config in configs[scheme]]
         candidates = [name for name in dict.fromkeys(names) if name[0] not in baselines]
-        assert {name[0] for name in names} - {name[0] for name in candidates} == set(baselines)
-        assert len(candidates) == 39
+        assert ({name[0] for name in names} - {name[0] for name in candidates}, len(candidates)) == (set(baselines), 39)
         categories = [category_of(*name) for name in candidates]
         assert {name: categories.count(name) for name in categories} == {name: row.variants for name, row in paper.TABLE_III.items()}
         assert all(names.count(name) in ((1,) if name[0] == "luenberger" else (5, 10)) for name in candidates)

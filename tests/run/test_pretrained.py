@@ -1,7 +1,6 @@
 """The model for cars that nobody has trained on, which comes with vehest."""
 
 import importlib.util
-import json
 import re
 import subprocess
 import sys
@@ -28,9 +27,7 @@ ROOT = Path(__file__).parents[2]
 def test_estimate_without_a_model_takes_the_one_that_comes_with_vehest_and_says_so(place):
     table = write_csv(place.folder / "lap.csv", 9).drop(columns="Vy")
     table.to_csv(place.folder / "lap.csv", index=False)
-    code, out, err = place("estimate", "lap.csv", "dataset=mine", "-o", "default.csv", "--json")
-    assert code == 0, err
-    said = json.loads(out)
+    said = place.told("estimate", "lap.csv", "dataset=mine", "-o", "default.csv")
     assert said["model"] == said["estimator"] == "self_calibrating"
     for what in ("simulated cars and not on this one", "results/unseen_car", "PCT/IT2023/050058"):
         assert what in said["note"]
@@ -56,8 +53,7 @@ def test_completion_of_the_first_word_offers_models_and_recordings(place):
     for name in ("lap.csv", "lap.parquet", "notes.txt"):
         (place.folder / name).touch()
     assert _complete_model_or_file("") == ["pretrained", "self_calibrating", "ksnn-a", "lap.csv", "lap.parquet"]
-    assert _complete_model_or_file("la") == ["lap.csv", "lap.parquet"]
-    assert _complete_model_or_file("raw/o") == ["raw/one.csv"]
+    assert (_complete_model_or_file("la"), _complete_model_or_file("raw/o")) == (["lap.csv", "lap.parquet"], ["raw/one.csv"])
     assert _complete_model_or_file("./la") == ["./lap.csv", "./lap.parquet"]
 
 
@@ -67,18 +63,15 @@ def test_a_named_model_is_used_and_a_folder_is_no_recording(place):
     observer.load_weights({"gain": np.array([5.0]), "threshold": np.array([0.05])})
     (place.folder / "own").mkdir()
     save_model(observer, place.folder / "own")
-    code, out, err = place("estimate", "own", "lap.csv", "dataset=mine", "--json")
-    assert code == 0, err
-    assert json.loads(out)["estimator"] == "luenberger"
-    assert "note" not in json.loads(out)
+    outcome = place.told("estimate", "own", "lap.csv", "dataset=mine")
+    assert outcome["estimator"] == "luenberger"
+    assert "note" not in outcome
     assert "comes after the model" in place.refused("estimate", "own")[1]
 
 
 def test_a_recording_whose_name_holds_an_equals_sign_is_no_override(place):
     write_csv(place.folder / "speed=30.csv", 9)
-    code, out, err = place("estimate", "pretrained", "speed=30.csv", "dataset=mine", "--json")
-    assert code == 0, err
-    assert json.loads(out)["recording"] == "speed=30"
+    assert place.told("estimate", "pretrained", "speed=30.csv", "dataset=mine")["recording"] == "speed=30"
 
 
 def test_pretrained_model_is_small_and_what_the_published_study_has_chosen():

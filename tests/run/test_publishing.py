@@ -73,9 +73,6 @@ def changed(file, **values):
     file.write_text(yaml.safe_dump({**yaml.safe_load(file.read_text()), **values}, allow_unicode=True))
 
 
-# What is published
-
-
 def test_numbers_are_published_with_six_digits_and_everything_else_as_it_is(tmp_path):
     file = tmp_path / "table.csv"
     cells = ["0.7459900813211685", "-1.2345678e-07", "1234567.0", "7", "0.10", "", '"0.0123456789, 2"', "nan", "1e-05"]
@@ -100,8 +97,7 @@ def test_times_are_in_no_published_file_but_beside_the_page_and_on_it(published)
     assert list(timings.columns) == list(metrics.columns)
     assert len(timings[(timings["estimator"] == "gru") & (timings["metric"] == "train_seconds")]) == 2
     page = (report / "report.html").read_text(encoding="utf-8")
-    assert "<h2>Times</h2>" in page
-    assert "online step [ms]" in page
+    assert all(words in page for words in ("<h2>Times</h2>", "online step [ms]"))
     texts = {
         name: content.decode(errors="replace")
         for name, content in contents(published / "results" / "small").items()
@@ -129,8 +125,7 @@ def test_a_rerun_leaves_the_work_tree_clean(published, monkeypatch, capsys):
     assert (report / TIMINGS).read_bytes() != timings, "it was trained again"
     assert contents(published / "results") == before
     status = subprocess.run(["git", "status", "--short", "--", "results"], capture_output=True, text=True, check=True)
-    assert status.stdout == ""
-    assert run_vehest(capsys, *CHECK)[:2] == (0, "small: up to date\n")
+    assert (status.stdout, run_vehest(capsys, *CHECK)[:2]) == ("", (0, "small: up to date\n"))
 
 
 def test_results_that_other_code_gives_alike_are_recorded_as_its_own(published, place, monkeypatch):
@@ -140,14 +135,10 @@ def test_results_that_other_code_gives_alike_are_recorded_as_its_own(published, 
     monkeypatch.chdir(place.folder)
     monkeypatch.setattr(study_keys, "code_of_ingest", lambda dataset: "other")
     before = contents(place.folder / "results" / "small")
-    assert place(*CHECK)[:2] == (3, "small: stale: code (ingest mine)\n")
-    assert place(*RUN)[0] == 0
+    assert (place(*CHECK)[:2], place(*RUN)[0]) == ((3, "small: stale: code (ingest mine)\n"), 0)
     after = contents(place.folder / "results" / "small")
     assert [name for name in before if after[name] != before[name]] == [PROVENANCE]
     assert place(*CHECK)[:2] == (0, "small: up to date\n")
-
-
-# What is checked
 
 
 def test_published_results_are_up_to_date_by_study_and_by_file(checked):
@@ -238,12 +229,7 @@ def test_what_cannot_be_checked_is_one_line(checked, words, code, message):
 
 
 def test_where_nothing_is_published_there_is_nothing_to_check(place):
-    code, line = place.refused(*CHECK)
-    assert code == 4
-    assert "no study is published in 'results'" in line
-
-
-# Published weights
+    place.refused(*CHECK, code=4, says="no study is published in 'results'")
 
 
 def models(folder):
@@ -254,24 +240,20 @@ def models(folder):
 
 def test_a_run_elsewhere_takes_the_published_weights_and_comes_to_the_same_results(published, checked):
     before = contents(checked.folder / "results")
-    code, _, said = checked(*RUN)
-    assert code == 0
+    _, said = checked.done(*RUN)
     assert "3 of 3 taken from results/small/weights.safetensors" in " ".join(said.split())
-    assert models(checked.folder) == models(published)
-    assert contents(checked.folder / "results") == before
+    assert (models(checked.folder), contents(checked.folder / "results")) == (models(published), before)
 
 
 def test_weights_of_another_key_are_not_taken(checked):
     changed(checked.folder / "pipelines" / "small.yaml", sweeps=[QUICK["sweeps"][0], [*QUICK["sweeps"][1][:-1], "training.max_epochs=1"]])
-    code, _, said = checked(*RUN)
-    assert code == 0
+    _, said = checked.done(*RUN)
     assert "1 of 3 taken from" in " ".join(said.split())
     assert said.count("1 epochs") == 2
 
 
 def test_trainings_are_repeated_on_demand(checked):
-    code, _, said = checked(*RUN, "--retrain")
-    assert code == 0
+    _, said = checked.done(*RUN, "--retrain")
     assert "taken from" not in said
     assert said.count("2 epochs") == 2
 
@@ -281,5 +263,4 @@ def test_damaged_weights_are_refused_in_one_line(checked):
     file.write_bytes(file.read_bytes()[:100])
     code, _, err = checked(*RUN)
     assert code == 3
-    assert "weights.safetensors' is damaged" in " ".join(err.split())
-    assert "--retrain" in " ".join(err.split())
+    assert all(words in " ".join(err.split()) for words in ("weights.safetensors' is damaged", "--retrain"))

@@ -1,6 +1,5 @@
 """A finished study is recognised by what it was made from, and prints what a run in full would print."""
 
-import json
 import os
 import subprocess
 import sys
@@ -40,8 +39,7 @@ def test_a_finished_study_prints_what_a_run_in_full_prints(study, options):
     assert cached()
     recognised = study("run", *WORDS, *options)
     forget(study)
-    assert study("run", *WORDS, *options) == recognised
-    assert recognised[0] == 0
+    assert (study("run", *WORDS, *options), recognised[0]) == (recognised, 0)
     assert ("skipped report" in recognised[2]) == (options != ("--quiet",))
 
 
@@ -60,14 +58,12 @@ def test_a_finished_study_imports_nothing_that_made_it(study):
 
 
 def test_a_finished_sweep_prints_what_a_run_in_full_prints(place):
-    code, first, err = place("sweep", *SWEEP)
-    assert code == 0, err
+    first, _ = place.done("sweep", *SWEEP)
     assert RunCache("sweep", "", SWEEP).load() is not None
     recognised = place("sweep", *SWEEP)
     assert recognised[1] == first
     forget(place)
-    assert place("sweep", *SWEEP) == recognised
-    assert json.loads(place("sweep", *SWEEP, "--json")[1])["skipped"] is True
+    assert (place("sweep", *SWEEP), place.told("sweep", *SWEEP)["skipped"]) == (recognised, True)
 
 
 def test_a_published_copy_that_is_gone_is_published_again(study):
@@ -78,8 +74,7 @@ def test_a_published_copy_that_is_gone_is_published_again(study):
     assert published.is_file()
     published.unlink()
     assert cached()
-    code, out, err = study("run", *WORDS)
-    assert code == 0, err
+    out, err = study.done("run", *WORDS)
     assert published.is_file()
     assert "published: results/small" in out
     assert "publish" in err
@@ -121,15 +116,12 @@ def test_a_study_on_raw_files_that_changed_is_made_anew(study):
     raw = study.folder / "raw" / "three.csv"
     lines = raw.read_text().splitlines()
     raw.write_text("\n".join([lines[0], *lines[1:-5]]) + "\n")
-    code, _, err = study("run", *WORDS)
-    assert code == 0, err
-    assert "done    ingest" in err
-    assert "done    report" in err
+    _, err = study.done("run", *WORDS)
+    assert all(words in err for words in ("done    ingest", "done    report"))
 
 
 def test_force_runs_what_is_there(study):
-    code, _, err = study("run", *WORDS, "--force")
-    assert code == 0, err
+    _, err = study.done("run", *WORDS, "--force")
     assert "skipped" not in err
     assert cached()
 

@@ -45,9 +45,6 @@ def changed(content, /, **changes):
     return {key: value for key, value in {**content, **changes}.items() if value is not ...}
 
 
-# ---------------------------------------------------------------------------------------------------------------- models
-
-
 @pytest.fixture
 def model(tmp_path):
     folder = tmp_path / "model"
@@ -67,8 +64,7 @@ def test_the_description_of_a_model_is_read_with_its_types(model):
     described = read_description(model)
     assert isinstance(described, Description)
     assert (described.estimator, described.about.seed, described.about.datasets) == ("ksnn", 3, ("d",))
-    assert preparation_of(model) == {"method": "decimate", "transforms": []}
-    assert load_model(model).name == "ksnn"
+    assert (preparation_of(model), load_model(model).name) == ({"method": "decimate", "transforms": []}, "ksnn")
 
 
 @pytest.mark.parametrize(
@@ -152,9 +148,6 @@ def test_a_header_that_lies_is_one_line(model, length, header):
         load_model(model)
 
 
-# ------------------------------------------------------------------------------------------------------------- manifests
-
-
 def plan(output, label="mine"):
     return StagePlan("stage", label, {"a": 1.0}, {"raw": "0"}, "code", output)
 
@@ -167,8 +160,7 @@ def test_a_manifest_states_its_format_and_one_without_is_read_too(tmp_path):
     artefact = made(tmp_path)
     path = artefact.folder / "manifest.json"
     content = json.loads(path.read_text())
-    assert content["format"] == 1
-    assert artefact.config == {"a": 1.0}
+    assert (content["format"], artefact.config) == (1, {"a": 1.0})
     path.write_text(json.dumps(changed(content, format=...)))
     assert read_artefact(artefact.folder).outputs == artefact.outputs
 
@@ -229,9 +221,6 @@ def test_labels_that_are_fine_name_the_folder_as_before(tmp_path):
     own = plan(tmp_path, "ksnn-linear_bias_p2-seed0-on-ferrari_drive")
     assert own.folder == tmp_path / "stage" / f"{own.label}-{own.key[:12]}"
     assert own.checkpoint_folder == tmp_path / "checkpoints" / f"{own.label}-{own.key[:12]}"
-
-
-# --------------------------------------------------------------------------------------------------------------- Parquet
 
 
 def recording(name="lap", n=20):
@@ -312,9 +301,6 @@ def test_columns_of_another_type_are_refused(tmp_path):
         read_recording(path)
 
 
-# ------------------------------------------------------------------------------------------- what stages read back
-
-
 def test_tables_that_are_damaged_are_one_line(tmp_path):
     path = tmp_path / "fit.csv"
     for text in ("metric\n1\n", "metric,value\nepochs,many\n", 'metric,value\n"open,1\n'):
@@ -343,8 +329,7 @@ def test_frames_have_the_columns_and_numbers_that_are_asked_for(tmp_path):
 def test_a_checkpoint_that_says_nonsense_counts_as_none(tmp_path):
     for values in ({"epoch": "three"}, {}, {"epoch": 3, "finished": "no"}):
         save_checkpoint(tmp_path, Checkpoint({"a": torch.zeros(2)}, values))
-        assert load_checkpoint(tmp_path) is None
-        assert resume_epoch(tmp_path) == 0
+        assert (load_checkpoint(tmp_path), resume_epoch(tmp_path)) == (None, 0)
     save_checkpoint(tmp_path, Checkpoint({"a": torch.zeros(2)}, {"epoch": 3, "finished": False, "losses": [1.0]}))
     assert resume_epoch(tmp_path) == 3
 
@@ -367,9 +352,6 @@ def test_nothing_is_published_through_a_link(tmp_path, monkeypatch, link):
     with pytest.raises(ConfigurationError, match="through a link"):
         publish_study(Publication("study", {}, {}), report, Messages(silent=True))
     assert not list((tmp_path / "elsewhere").iterdir())
-
-
-# --------------------------------------------------------------------------------------------------------- configuration
 
 
 PIPELINE = {"study": "mine", "report": "drive", "split": "quickstart", "sweeps": [["estimator=luenberger"]]}
@@ -514,9 +496,6 @@ def test_a_data_set_that_does_not_fit_names_data_set_and_key(changes, message):
         open_source(changed(TABULAR, **changes))
     assert message in str(caught.value)
     assert str(caught.value).startswith("data set")
-
-
-# ----------------------------------------------------------------------------------------------------------------- names
 
 
 def tree(folder):

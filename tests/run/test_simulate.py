@@ -35,9 +35,7 @@ def simulated(place, drives, **more):
 
 
 def made(place, *arguments):
-    code, out, err = place("simulate", "sim", *arguments, "--json")
-    assert code == 0, err
-    return json.loads(out)
+    return place.told("simulate", "sim", *arguments)
 
 
 def samples(folder):
@@ -69,8 +67,7 @@ def test_everything_it_makes_says_that_it_is_simulated(place):
     simulated(place, [{"id": "lap", "manoeuvre": LAP}])
     (file,) = Path(made(place)["folder"]).glob("*.parquet")
     recording = read_recording(file)
-    assert recording.kind == "simulated"
-    assert recording.provenance["flags"]["spun"] is False
+    assert (recording.kind, recording.provenance["flags"]["spun"]) == ("simulated", False)
     _, out, _ = place("data", "show", "sim")
     assert out.startswith("lap: simulated, bmw_320i_low, 50 Hz")
 
@@ -86,9 +83,7 @@ def test_drives_that_were_done_before_a_kill_are_not_made_again(place, monkeypat
         return read(self, recording_id)
 
     monkeypatch.setattr(SimulatedSource, "read", interrupted)
-    assert place("simulate", "sim")[0] == 130
-    assert made(place)["drives"] == 3
-    assert begun == ["lap_001", "lap_002", "lap_002", "lap_003"]
+    assert (place("simulate", "sim")[0], made(place)["drives"], begun) == (130, 3, ["lap_001", "lap_002", "lap_002", "lap_003"])
 
 
 def test_a_drive_that_spins_is_kept_flagged_and_counted(place):
@@ -100,9 +95,7 @@ def test_a_drive_that_spins_is_kept_flagged_and_counted(place):
         sensors="ideal",
     )
     outcome = made(place)
-    assert outcome["drives"] == 2
-    assert outcome["spun"] == ["wild"]
-    assert outcome["not_completed"] == ["wild"]
+    assert (outcome["drives"], outcome["spun"], outcome["not_completed"]) == (2, ["wild"], ["wild"])
     recording = read_recording(Path(outcome["folder"]) / "wild.parquet")
     assert np.isfinite(recording["vy_ref"]).all()
     assert np.abs(recording["sideslip_ref"]).max() > 1.0, "it did spin"
@@ -119,8 +112,7 @@ def test_a_spin_at_high_speed_is_no_impossible_recording(place):
     assert len(outcome["spun"]) >= 1
     sideways = [np.abs(read_recording(Path(outcome["folder"]) / f"{name}.parquet")["vy_ref"]).max() for name in outcome["spun"]]
     assert max(sideways) > 40.0, "beyond what the check of other recordings lets pass"
-    code, out, _ = place("data", "check", "sim")
-    assert code == 0
+    out, _ = place.done("data", "check", "sim")
     assert "the simulated car spun here" in out
 
 
@@ -136,9 +128,7 @@ def test_a_report_of_simulated_drives_never_says_real(place):
     study = {"study": "s", "title": "t", "report": "drive", "split": "sim"}
     study["sweeps"] = [["estimator=luenberger", "training.grid=1", "training.max_evaluations=5"]]
     (place.folder / "pipelines" / "sim.yaml").write_text(yaml.safe_dump(study))
-    code, out, err = place("run", "sim", "tracking=none", "--json")
-    assert code == 0, err
-    report = Path(json.loads(out)["report"]).with_name("report.md").read_text()
+    report = Path(place.told("run", "sim", "tracking=none")["report"]).with_name("report.md").read_text()
     assert "**Simulated data:** every number here comes from simulated recordings" in report
     assert "real data" not in report.lower()
     assert "| real |" not in report
@@ -148,15 +138,13 @@ def test_looking_at_a_simulated_data_set_reads_what_is_in_the_store(place, monke
     simulated(place, [{"id": "lap", "manoeuvre": LAP}])
     made(place)
     monkeypatch.setattr(compiled, "advance", None)  # nothing can be simulated any more
-    code, out, err = place("data", "check", "sim")
-    assert code == 0, err
+    out, _ = place.done("data", "check", "sim")
     assert "error" not in out
 
 
 def test_only_simulated_data_sets_are_simulated(place):
     code, line = place.refused("simulate", "mine")
-    assert code == 2
-    assert line == "error: data set 'mine' is not simulated but read from files; run 'vehest ingest mine'"
+    assert (code, line) == (2, "error: data set 'mine' is not simulated but read from files; run 'vehest ingest mine'")
 
 
 def test_a_bad_seed_is_one_line(place):
@@ -169,9 +157,7 @@ def test_a_bad_seed_is_one_line(place):
 
 def test_a_manoeuvre_that_is_misspelt_is_one_line(place):
     simulated(place, [{"id": "lap", "manoeuvre": {"name": "slalon"}}])
-    code, line = place.refused("simulate", "sim")
-    assert code == 2
-    assert "there is no manoeuvre 'slalon'; there are braking_in_turn, double_lane_change" in line
+    place.refused("simulate", "sim", code=2, says="there is no manoeuvre 'slalon'; there are braking_in_turn, double_lane_change")
 
 
 def test_options_of_the_data_set_are_offered(place):

@@ -21,8 +21,7 @@ pytestmark = pytest.mark.apart
 
 
 def test_runs_are_tracked_with_parameters_metrics_model_and_figures(place):
-    code, _, err = place("run", "small")
-    assert code == 0, err
+    place.done("run", "small")
     from mlflow import MlflowClient
 
     client = MlflowClient(f"sqlite:///{place.folder / 'outputs' / 'mlflow.db'}")
@@ -33,8 +32,7 @@ def test_runs_are_tracked_with_parameters_metrics_model_and_figures(place):
     assert {run.data.tags["mlflow.parentRunId"] for run in runs.values()} == {parent.info.run_id}
     trained = runs["ksnn-linear_no_bias_p2-seed0"]
     assert trained.data.tags["mlflow.source.name"].startswith("vehest run small")
-    assert trained.data.params["estimator.n_local"] == "2"
-    assert trained.data.params["training.learning_rate"] == "0.001"
+    assert (trained.data.params["estimator.n_local"], trained.data.params["training.learning_rate"]) == ("2", "0.001")
     assert len(client.get_metric_history(trained.info.run_id, "validation_loss")) == 2
     kept = {entry.path for entry in client.list_artifacts(trained.info.run_id)}
     assert {"model.safetensors", "model.yaml", "manifest.json", "figures"} <= kept
@@ -44,8 +42,7 @@ def test_runs_are_tracked_with_parameters_metrics_model_and_figures(place):
 
 
 def test_training_goes_on_when_the_tracking_server_is_away(place):
-    code, _, err = place("train", "split=mine", "training.max_epochs=1", "tracking.uri=http://127.0.0.1:9")
-    assert code == 0
+    _, err = place.done("train", "split=mine", "training.max_epochs=1", "tracking.uri=http://127.0.0.1:9")
     assert err.count("logging to MLflow") == 1
     assert "going on without tracking" in err
 
@@ -66,12 +63,10 @@ def _local(place, stage=""):
 def test_what_a_server_that_was_away_missed_is_logged_by_the_next_run(place, monkeypatch):
     with monkeypatch.context() as away:
         away.setattr(Tracker, "_log", _raising(ConnectionError("no answer")))
-        code, _, err = place("run", "small")
-        assert code == 0, err
+        _, err = place.done("run", "small")
         assert err.count("logging to MLflow") == 1
     assert not (place.folder / "outputs" / "finished").exists()
-    code, _, err = place("run", "small")
-    assert code == 0, err
+    _, err = place.done("run", "small")
     assert "done" not in err, "nothing is made again for it"
     assert sorted(run.info.status for run in _local(place)) == ["FINISHED"] * 12
 
@@ -83,8 +78,7 @@ def test_a_run_that_was_half_logged_is_completed(place, monkeypatch, step):
     with monkeypatch.context() as killed:
         killed.setattr(MlflowClient, step, _raising(KeyboardInterrupt()))
         assert place(*TRAIN)[0] == 130
-    assert [run.info.status for run in _local(place, "train")] == ["RUNNING"]
-    assert place(*TRAIN)[0] == 0
+    assert ([run.info.status for run in _local(place, "train")], place(*TRAIN)[0]) == (["RUNNING"], 0)
     [run] = _local(place, "train")
     assert run.info.status == "FINISHED"
     client = MlflowClient(f"sqlite:///{place.folder / 'outputs' / 'mlflow.db'}")
@@ -105,8 +99,7 @@ def test_an_unfinished_run_of_another_output_root_is_left_alone(place, monkeypat
 
 
 def test_the_same_training_made_again_is_the_same_run_and_another_outcome_is_another(place):
-    assert place(*TRAIN)[0] == 0
-    assert place(*TRAIN, "--force")[0] == 0
+    assert (place(*TRAIN)[0], place(*TRAIN, "--force")[0]) == (0, 0)
     [run] = _local(place, "train")
     tracker = Tracker({"name": "mlflow"}, place.folder / "outputs", pytest.fail)
     [folder] = (place.folder / "outputs" / "train").iterdir()
@@ -120,8 +113,7 @@ def test_the_same_training_made_again_is_the_same_run_and_another_outcome_is_ano
 def test_a_store_that_is_gone_is_filled_again(place):
     assert place(*TRAIN)[0] == 0
     (place.folder / "outputs" / "mlflow.db").unlink()
-    assert place(*TRAIN)[0] == 0
-    assert len(_local(place, "train")) == 1
+    assert (place(*TRAIN)[0], len(_local(place, "train"))) == (0, 1)
 
 
 def test_a_finished_and_tracked_study_is_recognised_without_mlflow(place):
@@ -142,8 +134,7 @@ def test_what_a_full_disk_kept_from_tracking_is_logged_by_the_next_run(place):
     assert full.returncode == 0, full.stderr
     assert full.stderr.count("going on without tracking") == 1
     assert not list((place.folder / "outputs").glob("*mlflow.db*")), "no half of a store stays"
-    code, _, err = place(*TRAIN)
-    assert code == 0, err
+    place.done(*TRAIN)
     assert [run.info.status for run in _local(place, "train")] == ["FINISHED"]
 
 
@@ -157,8 +148,7 @@ def test_a_disk_that_fills_up_while_runs_are_logged_loses_none(place):
     full = _in_process(FULL.replace("200_000", str(size)), "run", "small", "--jobs", "1")
     assert full.returncode == 0, full.stderr
     assert full.stderr.count("going on without tracking") == 1
-    code, _, err = place("run", "small")
-    assert code == 0, err
+    place.done("run", "small")
     assert [run.info.status for run in _local(place)] == ["FINISHED"] * 14
 
 
@@ -205,14 +195,12 @@ def test_a_server_receives_every_run_of_a_study_and_its_loss_half_way_stops_noth
 
     address, process = mlflow_server(place.folder / "server")
     client = MlflowClient(address)
-    code, _, err = place("run", "small", f"tracking.uri={address}")
-    assert code == 0, err
+    _, err = place.done("run", "small", f"tracking.uri={address}")
     assert "logging to MLflow" not in err
     runs = _runs(client)
     assert len(runs) == 13
     trained = runs["ksnn-linear_no_bias_p2-seed1"]
-    assert trained.info.status == "FINISHED"
-    assert len(client.get_metric_history(trained.info.run_id, "validation_loss")) == 2
+    assert (trained.info.status, len(client.get_metric_history(trained.info.run_id, "validation_loss"))) == ("FINISHED", 2)
     kept = {entry.path for entry in client.list_artifacts(trained.info.run_id)}
     assert {"model.safetensors", "model.yaml", "manifest.json", "figures"} <= kept
     assert not (place.folder / "outputs" / "mlflow.db").exists()
@@ -241,8 +229,7 @@ def test_a_server_that_hears_and_never_answers_is_given_up(place, monkeypatch):
         deaf.listen()
         uri = f"http://127.0.0.1:{deaf.getsockname()[1]}"
         code, _, err = place("train", "split=mine", "training.max_epochs=1", f"tracking.uri={uri}")
-    assert code == 0
-    assert err.count("logging to MLflow") == 1
+    assert (code, err.count("logging to MLflow")) == (0, 1)
 
 
 def test_every_parameter_is_tracked_however_many_there_are(tmp_path):

@@ -92,9 +92,6 @@ def models(place):
     return {folder.name.split("-")[0] for folder in (place.folder / "outputs" / "train").glob("[!.]*")}
 
 
-# What recordings have
-
-
 def test_description_in_the_store_tells_channels_gaps_and_rate_as_the_samples_do(tmp_path):
     vx = np.ones(40)
     vx[3] = np.nan
@@ -105,9 +102,6 @@ def test_description_in_the_store_tells_channels_gaps_and_rate_as_the_samples_do
         == summary_of(recording)
         == RecordingSummary("gap", 40.0, frozenset({"vx", "ay"}), frozenset({"vx"}))
     )
-
-
-# What estimators need
 
 
 IDENTIFIED = [f"training.identification.{setting}" for setting in ("method=data", "restarts=1", "generations=1")]
@@ -158,9 +152,6 @@ def test_estimator_of_another_package_says_itself_what_it_learns_from():
 def test_estimator_without_a_file_in_conf_is_told_by_its_defaults():
     found = usability("luenberger", {"estimator": {"name": "luenberger"}, "training": {}}, [summary_of(log(FULL))])
     assert (found.usable, found.rate_hz, found.own_rate_hz) == ("yes", 50.0, 100.0)
-
-
-# What could supply it
 
 
 LOGS = {
@@ -222,14 +213,12 @@ def test_wheelbase_is_a_missing_setting_and_giving_it_helps():
 
 def test_log_without_a_reference_will_do_for_models_from_elsewhere():
     found = rows(log(FULL - {"vy_ref"}))
-    assert found["ksnn"]["usable"] == "not to train"
-    assert found["ksnn"]["missing_to_train"] == ["vy_ref"]
+    assert (found["ksnn"]["usable"], found["ksnn"]["missing_to_train"]) == ("not to train", ["vy_ref"])
     assert (found["zero"]["usable"], found["kalman"]["usable"]) == ("yes", "yes"), "they learn nothing of a reference"
 
 
 def test_nothing_is_made_of_a_speed_with_gaps_or_of_channels_that_are_not_there():
-    assert derivation_of("ax", {"vx"}, {"vx"}, 50.0) is None
-    assert derivation_of("steer", {"vx", "yaw_rate"}, (), 50.0) is None
+    assert (derivation_of("ax", {"vx"}, {"vx"}, 50.0), derivation_of("steer", {"vx", "yaw_rate"}, (), 50.0)) == (None, None)
     assert derivation_of("vy_ref", {"sideslip_ref"}, (), 50.0) is None
     assert derivation_of("motor_current", set(UNITS), (), 50.0) is None
 
@@ -258,24 +247,16 @@ def test_every_transform_that_makes_a_channel_is_known():
         assert channel in transform_from_config({"name": name, **options})(lacking)
 
 
-# The table
-
-
 def test_table_names_all_estimators_and_json_says_the_same(place):
     add_logged(place, LOGS["wheels"])
     place("ingest", "logged")
-    code, out, _ = place("data", "usable", "logged", "--json")
-    assert code == 0
-    told = json.loads(out)
-    assert {row["estimator"] for row in told["estimators"]} == set(estimator_names())
-    assert told["rate_hz"] == 50.0
+    told = place.told("data", "usable", "logged")
+    assert ({row["estimator"] for row in told["estimators"]}, told["rate_hz"]) == (set(estimator_names()), 50.0)
     assert told["missing_to_score"] == ["vx", "vy_ref"]
     ksnn = next(row for row in told["estimators"] if row["estimator"] == "ksnn")
-    assert ksnn["missing_to_estimate"] == ["vx", "ax"]
-    assert ksnn["missing_to_train"] == ["vx", "ax", "vy_ref"]
+    assert (ksnn["missing_to_estimate"], ksnn["missing_to_train"]) == (["vx", "ax"], ["vx", "ax", "vy_ref"])
     assert ksnn["supplies"]["ax"] == [{"name": "speed_from_wheels", "wheel_radius": None}, {"name": "acceleration_from_speed"}]
-    code, out, _ = place("data", "usable", "logged")
-    assert code == 0
+    out, _ = place.done("data", "usable", "logged")
     words = " ".join(out.split())
     assert "luenberger no 50 Hz, not 100" in words
     assert "ax: transforms: [{name: speed_from_wheels, wheel_radius: …}, {name: acceleration_from_speed}]" in words
@@ -285,33 +266,31 @@ def test_bare_file_is_told_by_its_columns(place):
     lap = log({"vx", "yaw_rate", "ay"})
     table = pd.DataFrame({"time": lap.time, **lap.channels, "AccX": 0.0, "Steering": 0.0})
     table.to_csv("lap.csv", index=False)
-    code, out, _ = place("data", "usable", "lap.csv", "--json")
-    assert code == 0
-    assert json.loads(out)["unused_columns"] == ["AccX", "Steering"]
+    assert place.told("data", "usable", "lap.csv")["unused_columns"] == ["AccX", "Steering"]
     assert "columns that no channel uses: AccX, Steering" in place("data", "usable", "lap.csv")[1]
     assert place("data", "usable", "nowhere.csv")[0] == 2
 
 
-# Before anything is trained
-
-
 def test_training_on_a_log_that_lacks_a_channel_is_refused_with_the_remedy_which_works(place):
     add_logged(place, LOGS["speed and accelerations"])
-    code, line = place.refused("train", "estimator=luenberger", "split=logged", "tracking=none")
-    assert code == 3
-    assert (
-        "recording 'lap1' and 1 more lack what estimator 'luenberger' needs: ax (transforms: [{name: acceleration_from_speed}] of vx)"
-        in line
+    place.refused(
+        "train",
+        "estimator=luenberger",
+        "split=logged",
+        "tracking=none",
+        code=3,
+        says=(
+            "recording 'lap1' and 1 more lack what estimator 'luenberger' needs: ax (transforms: [{name: acceleration_from_speed}] of vx)",
+            "vy_ref (transforms: [{name: velocity_from_sideslip}] of sideslip_ref and vx)",
+            "'vehest data usable logged'",
+        ),
     )
-    assert "vy_ref (transforms: [{name: velocity_from_sideslip}] of sideslip_ref and vx)" in line
-    assert "'vehest data usable logged'" in line
     assert not list((place.folder / "outputs").glob("downsample/*")), "it is said before recordings are resampled"
     file = place.folder / "conf" / "dataset" / "logged.yaml"
     transforms = [{"name": "acceleration_from_speed"}, {"name": "velocity_from_sideslip"}]
     file.write_text(yaml.safe_dump(yaml.safe_load(file.read_text()) | {"transforms": transforms}, allow_unicode=True))
     few = ("training.grid=1", "training.max_evaluations=10")
-    code, _, err = place("train", "estimator=luenberger", "split=logged", "tracking=none", *few)
-    assert code == 0, err
+    place.done("train", "estimator=luenberger", "split=logged", "tracking=none", *few)
 
 
 def test_candidates_that_lack_something_are_told_at_once_and_the_others_are_shown(place):
@@ -372,14 +351,10 @@ def test_sweep_names_combinations_that_lack_something_and_finishes_the_others(pl
     assert err.index("steer (not in the log)") < err.index("static_map")
 
 
-# Rates
-
-
 def test_estimator_of_100_hz_runs_at_50_on_a_log_of_50_and_says_so(place):
     add_logged(place, FULL)
     few = ("estimator=luenberger", "split=logged", "tracking=none", "training.grid=1", "training.max_evaluations=10")
-    code, out, err = place("train", *few, "--json")
-    assert code == 0, err
+    out, err = place.done("train", *few, "--json")
     said = "luenberger runs at 50 Hz instead of its 100 Hz, since recording 'lap1' is sampled at 50 Hz"
     assert " ".join(err.split()).count(said) == 1
     folder = Path(json.loads(out)["model"])
@@ -387,15 +362,21 @@ def test_estimator_of_100_hz_runs_at_50_on_a_log_of_50_and_says_so(place):
     assert json.loads((folder / "manifest.json").read_text())["config"]["estimator"]["rate_hz"] == 50.0
     assert place("eval", *few, "--json")[0] == 0, "it finds the model by the same overrides"
     assert place("eval", "--model", str(folder), "split=logged", "tracking=none")[0] == 0
-    same = json.loads(place("train", *few, "estimator.rate_hz=50.0", "--json")[1])
+    same = place.told("train", *few, "estimator.rate_hz=50.0")
     assert (same["model"], same["skipped"]) == (str(folder), True), "the same training as if the rate had been given"
 
 
 def test_rate_that_an_override_asks_for_is_not_lowered(place):
     add_logged(place, FULL)
-    code, line = place.refused("train", "estimator=luenberger", "estimator.rate_hz=100", "split=logged", "tracking=none")
-    assert code == 3
-    assert "estimator.rate_hz asks for 100 Hz, and recording 'lap1' is sampled at 50 Hz; give estimator.rate_hz=50 or less" in line
+    place.refused(
+        "train",
+        "estimator=luenberger",
+        "estimator.rate_hz=100",
+        "split=logged",
+        "tracking=none",
+        code=3,
+        says="estimator.rate_hz asks for 100 Hz, and recording 'lap1' is sampled at 50 Hz; give estimator.rate_hz=50 or less",
+    )
 
 
 def test_one_candidate_at_a_rate_that_the_log_does_not_have_hides_no_other(place):
@@ -408,8 +389,7 @@ def test_one_candidate_at_a_rate_that_the_log_does_not_have_hides_no_other(place
     assert [name.split("-")[0] for name in told["failed"]] == ["static_map"]
     assert "kalman runs at 50 Hz instead of its 100 Hz" in " ".join(err.split())
     report = (Path(told["report"]).parent / "report.md").read_text(encoding="utf-8")
-    assert "kalman runs at 50 Hz instead of its 100 Hz" in report
-    assert "Recordings at 20 and 50 Hz" in report
+    assert all(words in report for words in ("kalman runs at 50 Hz instead of its 100 Hz", "Recordings at 20 and 50 Hz"))
 
 
 def test_study_whose_rates_were_lowered_is_recognised_when_it_is_finished(place):
@@ -425,8 +405,7 @@ def test_study_whose_rates_were_lowered_is_recognised_when_it_is_finished(place)
 def test_evaluation_grid_is_no_finer_than_a_log_of_10_hz(place):
     add_logged(place, FULL, rate_hz=10.0)
     add_study(place, ["estimator=static_map"], ["estimator=ksnn", "estimator.window=10", "training.max_epochs=2"])
-    code, out, err = place("run", "logged", "--json", "tracking=none")
-    assert code == 0, err
+    out, err = place.done("run", "logged", "--json", "tracking=none")
     words = " ".join(err.split())
     assert words.count("evaluation reads estimates at 10 Hz instead of 20 Hz") == 1
     assert "ksnn runs at 10 Hz instead of its 20 Hz" in words
@@ -445,8 +424,7 @@ def test_lowest_rate_of_all_data_sets_of_a_split_counts(place):
     split["tests"]["other"] = [{"dataset": "mine", "recording": "three"}]  # sampled at 100 Hz
     file.write_text(yaml.safe_dump(split))
     add_study(place, ["estimator=luenberger", "training.grid=1", "training.max_evaluations=10"])
-    code, out, err = place("run", "logged", "--json", "tracking=none")
-    assert code == 0, err
+    out, err = place.done("run", "logged", "--json", "tracking=none")
     assert "luenberger runs at 50 Hz instead of its 100 Hz" in " ".join(err.split())
     assert {row["test_set"] for row in json.loads(out)["leaderboard"]} >= {"test", "other"}
 

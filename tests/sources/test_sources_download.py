@@ -165,8 +165,7 @@ def test_a_server_without_ranges_starts_over(server, tmp_path, modified):
     server.ranges, server.etag, server.modified = False, None, modified
     server.breaks = [200_000]
     (outcome,) = fetch(download(server, tmp_path))
-    assert (outcome.resumed_at, server.sent) == (0, [200_000, SIZE])
-    assert (server.asked[1][1] is None) == (modified is None)
+    assert ((outcome.resumed_at, server.sent), server.asked[1][1] is None) == ((0, [200_000, SIZE]), modified is None)
     assert_only(tmp_path)
 
 
@@ -221,8 +220,7 @@ def test_a_refusal_of_the_server_is_one_line_and_not_tried_again_and_a_passing_o
     server.statuses = [503, 404]
     message = refused(download(server, tmp_path))
     assert message == f"cannot fetch {server.url}/a.csv: the server answers 404 Not Found; is the address right?"
-    assert len(server.asked) == 2
-    assert files(tmp_path) == {}
+    assert (len(server.asked), files(tmp_path)) == (2, {})
 
 
 def test_a_full_disk_is_one_line_and_the_next_run_goes_on(server, tmp_path):

@@ -70,8 +70,7 @@ def test_a_simulated_drive_is_the_same_every_time_and_another_with_another_seed(
 
 def test_count_makes_as_many_drives_with_seeds_of_their_own():
     source = SimulatedSource(simulated(drives=[drive("a", count=3)]))
-    assert source.ids() == ["a_001", "a_002", "a_003"]
-    assert len({source.seed_of(name) for name in source.ids()}) == 3
+    assert (source.ids(), len({source.seed_of(name) for name in source.ids()})) == (["a_001", "a_002", "a_003"], 3)
 
 
 def test_of_several_vehicles_each_drive_has_the_one_it_names():
@@ -98,8 +97,7 @@ def test_every_car_of_the_fleet_weighs_what_its_parts_weigh_and_differs_at_both_
 def test_nobody_can_call_a_simulation_real():
     with pytest.raises(ConfigurationError, match="simulated"):
         SimulatedSource(simulated(kind="real"))
-    assert kind_of({"source": "simulated"}) == "simulated"
-    assert kind_of({"source": "tabular"}) == "real"
+    assert (kind_of({"source": "simulated"}), kind_of({"source": "tabular"})) == ("simulated", "real")
 
 
 def test_sensors_of_a_fleet_differ_and_references_do_not():
@@ -107,8 +105,7 @@ def test_sensors_of_a_fleet_differ_and_references_do_not():
     variation = SensorVariation.from_config({"noise": [2.0, 3.0], "delay": [0.0, 0.0]})
     changed = variation.applied(levels, 3)
     assert 2.0 <= changed.yaw_rate.noise / levels.yaw_rate.noise <= 3.0
-    assert changed.yaw_rate.delay == 0.0
-    assert changed.yaw_rate.offset == levels.yaw_rate.offset
+    assert (changed.yaw_rate.delay, changed.yaw_rate.offset) == (0.0, levels.yaw_rate.offset)
     assert changed.reference == levels.reference
     assert changed.yaw_rate.noise / levels.yaw_rate.noise != changed.ay.noise / levels.ay.noise
 

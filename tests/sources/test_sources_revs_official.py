@@ -111,8 +111,7 @@ def test_provenance_tells_session_parameters_and_file(root, csv):
     write_vehicle_parameters(root / "revs" / "250lm.csv")
     assert set(source(root).inputs()) == {f"{NAME}.csv", "250lm.csv"}
     provenance = read(root).provenance
-    assert provenance["file"] == f"{NAME}.csv"
-    assert provenance["preamble"] == [line for line in PREAMBLE if line]
+    assert (provenance["file"], provenance["preamble"]) == (f"{NAME}.csv", [line for line in PREAMBLE if line])
     assert provenance["vehicle_parameters"]["mass"] == {"value": 982.0, "unit": "kg"}
     assert provenance["vehicle_parameters"]["handwheelAngle"] == {"value": [-90.0, 0.0, 90.0], "unit": "°"}
     (root / "revs" / "250lm.csv").unlink()

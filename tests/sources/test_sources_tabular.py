@@ -90,8 +90,7 @@ def test_recordings_are_the_stems_in_order(tmp_path):
     for name in ("b.csv", "a.csv", "a.txt"):
         written(tmp_path, HEADER + rows(3), name)
     found = source(tmp_path, files="*.csv")
-    assert found.ids() == ["a", "b"]
-    assert list(found.inputs()) == ["a.csv", "b.csv"]
+    assert (found.ids(), list(found.inputs())) == (["a", "b"], ["a.csv", "b.csv"])
     assert [recording.id for recording in found.recordings()] == ["a", "b"]
     assert "has no recording 'c' (it has a, b)" in refusal(lambda: found.read("c"), MissingError)
     assert "two files are called 'a'" in refusal(source(tmp_path).ids)
