@@ -178,6 +178,7 @@ class Place:
         assert {name for name in self.files() - before if "/ingest/" not in name and "/downsample/" not in name} == set()
         assert not any(ASIDE_PREFIX in name for name in self.files())
         assert code in (None, found), lines[0]
+        assert found == 1 or "defect" not in lines[0]
         assert [words for words in ([says] if isinstance(says, str) else says) if words not in lines[0]] == [], lines[0]
         return found, lines[0]
 
