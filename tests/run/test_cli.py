@@ -37,7 +37,7 @@ def test_pipeline_runs_then_skips_then_reruns_only_what_a_change_touches(place):
     assert [stage for status, stage in _statuses(err) if status == "done"].count("train") == 4
     made = place.files()
 
-    code, again, err = place("run", "small", "tracking=none")
+    again, err = place.done("run", "small", "tracking=none")
     assert ({status for status, _ in _statuses(err)}, again, place.files()) == ({"skipped"}, out, made)
 
     (place.folder / "README.md").write_text("changed")

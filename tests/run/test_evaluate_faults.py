@@ -40,26 +40,27 @@ def trained(place):
     return place
 
 
-def test_there_is_a_file_for_every_kind_and_none_is_the_default():
-    assert (set(choices("fault")), compose_config("eval")["fault"]) == ({*KINDS, "none"}, {"name": "none"})
-    assert faults_of(compose_config("eval")) == ()
-
-
 @pytest.mark.parametrize("kind", KINDS)
 def test_every_file_is_a_fault_with_every_key_and_a_word_on_each(kind):
     text = (packaged_conf() / "fault" / f"{kind}.yaml").read_text()
     assert set(yaml.safe_load(text)) == {"name", "channel", "severity", "size", "start", "duration", "seed"}
     assert all("#" in line for line in text.splitlines() if not line.startswith("name"))
     (fault,) = faults_of(compose_config("eval", [f"fault={kind}"]))
-    assert fault.name == kind
-    assert fault.condition.startswith(f"{kind}:")
+    assert (fault.name, fault.condition.partition(":")[0]) == (kind, kind)
+    assert (set(choices("fault")), compose_config("eval")["fault"]) == ({*KINDS, "none"}, {"name": "none"})
 
 
-def test_a_list_takes_what_it_does_not_say_from_the_kind_and_stands_before_the_choice():
+def test_a_list_takes_what_it_does_not_say_from_the_kind_stands_before_the_choice_and_holds_a_fault_once():
     listed = "faults=[{kind:drift,channel:ay,severity:mild},{kind:bias,channel:ax,size:0.4,start:3}]"
     drift, bias, frozen = faults_of(compose_config("eval", [listed, "fault=frozen"]))
-    assert (drift.condition, drift.duration) == ("drift:ay:mild", 20.0)
-    assert ((bias.condition, bias.start, bias.duration), frozen.name) == (("bias:ax:0.4", 3.0, 10.0), "frozen")
+    assert (drift.condition, drift.duration, frozen.name) == ("drift:ay:mild", 20.0, "frozen")
+    assert (bias.condition, bias.start, bias.duration) == ("bias:ax:0.4", 3.0, 10.0)
+    assert faults_of(compose_config("eval")) == ()
+    fault = FaultSettings("bias", "ay", "mild")
+    assert all_of([[fault], [fault]]) == (fault,)
+    with pytest.raises(ConfigurationError, match="two faults are both called bias:ay:mild"):
+        all_of([[fault], [replace(fault, start=4.0)]])
+    assert len(all_of([[fault], [replace(fault, start=4.0, seed=1)]])) == 2
 
 
 def test_the_start_is_drawn_between_20_and_40_percent_of_the_range_and_another_in_each():
@@ -71,36 +72,21 @@ def test_the_start_is_drawn_between_20_and_40_percent_of_the_range_and_another_i
     assert FaultSettings("bias", "ay", "mild", start=4.0).within(10.0, 100.0, 7).onset == 14.0
 
 
-@pytest.mark.parametrize(
-    ("overrides", "message"),
-    [
+def test_a_fault_that_makes_no_sense_is_one_line(trained):
+    for overrides, says in (
         (("fault=frozn",), "fault=frozn is not there; did you mean frozen?"),
         (("fault=frozen", "fault.channel=yawrate"), "fault.channel 'yawrate' is not there; did you mean yaw_rate?"),
         (("fault.channel=ay",), "unknown option 'fault.channel'"),
         (("faults=[{channel:ay}]",), "faults must be a list of faults, each with its kind"),
-    ],
-)
-def test_a_fault_that_makes_no_sense_is_one_line(place, overrides, message):
-    place.refused("eval", *TRAINED, *overrides, code=2, says=message)
-
-
-def test_a_fault_in_a_channel_that_a_recording_lacks_is_one_line(trained):
-    trained.refused(
-        "eval",
-        *TRAINED,
-        "fault=bias",
-        "fault.channel=steer",
-        code=2,
-        says="recording 'two' of data set 'mine' has no channel 'steer' (it has ax, ay, vx, yaw_rate)",
-    )
-
-
-def test_two_faults_of_one_name_are_refused_and_the_same_one_twice_is_one():
-    fault = FaultSettings("bias", "ay", "mild")
-    assert all_of([[fault], [fault]]) == (fault,)
-    with pytest.raises(ConfigurationError, match="two faults are both called bias:ay:mild"):
-        all_of([[fault], [FaultSettings("bias", "ay", "mild", start=4.0)]])
-    assert len(all_of([[fault], [FaultSettings("bias", "ay", "mild", start=4.0, seed=1)]])) == 2
+        (("fault=bias", "fault.channel=steer"), "recording 'two' of data set 'mine' has no channel 'steer' (it has ax, ay, vx, yaw_rate)"),
+    ):
+        trained.refused("eval", *TRAINED, *overrides, code=2, says=says)
+    for faults, says in (
+        ([{"kind": "bias", "channel": "nowhere", "severity": "mild"}], "fault.channel 'nowhere' is not there"),
+        ("bias", "faults must be a list of faults, each with its kind"),
+    ):
+        pipeline_with(trained, [["estimator=zero"]], evaluation={"faults": faults})
+        trained.refused("run", "faulted", "tracking=none", code=2, says=says)
 
 
 def test_an_evaluation_has_rows_of_its_fault_and_keeps_all_others(trained):
@@ -115,13 +101,9 @@ def test_an_evaluation_has_rows_of_its_fault_and_keeps_all_others(trained):
     added = pd.DataFrame(csv.DictReader([before[0], *after[len(before) :]]))
     assert (set(added["condition"]), set(added["subset"])) == ({CONDITION}, {"faulted", "after"})
     assert set(added["test_set"]) == {"validation", "test"}
-    metrics = {"rmse_sideslip", "rmse_vy", "max_error_sideslip"}
+    metrics = {f"{name}{nominal}" for name in ("rmse_sideslip", "rmse_vy", "max_error_sideslip") for nominal in ("", "_nominal")}
     flags = {"coverage_90", "coverage_90_unflagged", "detection_delay", "missed_detections", "max_error_sideslip_undetected"}
-    assert (
-        metrics | {f"{name}_nominal" for name in metrics}
-        <= set(added["metric"])
-        <= metrics | {f"{name}_nominal" for name in metrics} | flags
-    )
+    assert metrics <= set(added["metric"]) <= metrics | flags
     assert set(added.loc[added["metric"].isin(flags), "subset"]) <= {"faulted"}
     faulted, unharmed = (figures[f"{name}.test.{CONDITION}.faulted"] for name in ("rmse_sideslip", "rmse_sideslip_nominal"))
     assert faulted > unharmed, "what stands still is passed over, and the estimate fades"
@@ -148,16 +130,12 @@ def test_values_that_are_not_finite_leave_finite_errors(trained):
     assert None not in found, "JSON has null for what is not finite"
 
 
-def test_an_evaluation_under_a_fault_is_skipped_and_another_seed_is_another(trained):
+def test_an_evaluation_under_a_fault_is_skipped_another_seed_is_another_and_without_faults_the_key_holds_nothing_of_them(trained):
     first = evaluated(trained, "fault=noise")
     again = evaluated(trained, "fault=noise")
     assert again == (first[0], {**first[1], "skipped": True})
     assert evaluated(trained, "fault=noise", "fault.seed=1")[0] != first[0]
-
-
-def test_without_faults_the_key_holds_nothing_of_them(trained):
-    folder = evaluated(trained)[0]
-    manifest = json.loads((folder / "manifest.json").read_text())
+    manifest = json.loads((evaluated(trained)[0] / "manifest.json").read_text())
     assert set(manifest["config"]) == {"sets", "protocol", "kinds", "split"}
     assert manifest["code"] == code_of_evaluation("kinematic"), "and the code of faults does not count"
     assert set(manifest["outputs"]) == {"metrics.csv", "timings.csv", "blocks.csv", "validation/0.parquet", "test/0.parquet"}
@@ -183,24 +161,21 @@ def test_a_sweep_over_faults_trains_each_model_once(place):
     assert "Faults: frozen:yaw_rate:medium, frozen:ay:medium, bias:yaw_rate:medium, bias:ay:medium" in report
 
 
-def test_settings_under_one_fault_are_still_chosen_on_validation(place):
-    quick = ("split=mine", "estimator=kinematic,zero", "tracking=none")
-    outcome = place.told("sweep", *quick, *FROZEN)
-    assert outcome["chosen"]["rmse_sideslip.validation"] == min(row["rmse_sideslip.validation"] for row in outcome["summary"])
-
-
-def test_a_fault_that_suits_no_channel_is_named_and_the_others_go_on(place):
-    quick = ("split=mine", "estimator=kinematic", "tracking=none")
-    code, out, err = place("sweep", *quick, "fault=sign,bias", "fault.channel=vx,ay", "--json")
+def test_a_fault_that_suits_no_channel_is_named_the_others_go_on_and_under_one_fault_settings_are_chosen_on_validation(place):
+    quick = ("sweep", "split=mine", "tracking=none")
+    code, out, err = place(*quick, "estimator=kinematic", "fault=sign,bias", "fault.channel=vx,ay", "--json")
     assert code == 5
     assert "fault=sign, channel=vx seed 0: a fault 'sign' makes no sense for channel 'vx'" in err.splitlines()[-1]
     assert [row["n_seeds"] for row in json.loads(out)["summary"]] == [0, 1, 1, 1]
+    outcome = place.told(*quick, "estimator=kinematic,zero", *FROZEN)
+    best = min(row["rmse_sideslip.validation"] for row in outcome["summary"])
+    assert outcome["chosen"]["rmse_sideslip.validation"] == best
+    configs = jobs_of(read_study("small"), ["fault=held", "fault.channel=vx"])
+    assert {fault.condition for job in configs[""] for fault in faults_of(job.config)} == {"held:vx:medium"}
 
 
 def pipeline_with(place, sweeps, **keys):
-    pipeline = {"study": "faulted", "report": "drive", "split": "mine", "sweeps": sweeps, **keys}
-    (place.folder / "pipelines" / "faulted.yaml").write_text(yaml.safe_dump(pipeline))
-    return "faulted"
+    return place.change("pipelines/faulted.yaml", study="faulted", report="drive", split="mine", sweeps=sweeps, **keys)["study"]
 
 
 def test_a_pipeline_lists_faults_for_all_of_its_evaluations(place):
@@ -221,22 +196,6 @@ def test_sweeps_of_a_pipeline_over_faults_fill_the_same_list(place):
     assert sum(line.startswith("done") and " train " in line for line in err.splitlines()) == 2
     for file in (place.folder / "outputs" / "evaluate").glob("*/metrics.csv"):
         assert {name for name in pd.read_csv(file)["condition"] if is_fault(name)} == {"frozen:yaw_rate:medium", "bias:yaw_rate:medium"}
-
-
-def test_a_fault_can_be_added_to_any_study_on_the_command_line(place):
-    configs = jobs_of(read_study("small"), ["fault=held", "fault.channel=vx"])
-    assert {fault.condition for job in configs[""] for fault in faults_of(job.config)} == {"held:vx:medium"}
-
-
-@pytest.mark.parametrize(
-    ("evaluation", "message"),
-    [
-        ({"faults": [{"kind": "bias", "channel": "nowhere", "severity": "mild"}]}, "fault.channel 'nowhere' is not there"),
-        ({"faults": "bias"}, "faults must be a list of faults, each with its kind"),
-    ],
-)
-def test_faults_of_a_pipeline_that_make_no_sense_are_one_line(place, evaluation, message):
-    place.refused("run", pipeline_with(place, [["estimator=zero"]], evaluation=evaluation), "tracking=none", code=2, says=message)
 
 
 def test_a_plan_without_faults_is_that_of_the_evaluation(trained):

@@ -68,24 +68,19 @@ def with_values(entries):
 
 def add_logged(place, channels, rate_hz=50.0, **options):
     """A data set ``logged`` of three laps with these channels, and a split ``logged`` on it."""
-    folder = place.folder / "raw" / "logged"
-    folder.mkdir()
-    for seed, name in enumerate(("lap1", "lap2", "lap3"), 1):
+    (place.folder / "raw" / "logged").mkdir()
+    for seed in (1, 2, 3):
         lap = log(channels, rate_hz, seed)
-        pd.DataFrame({"t": lap.time, **lap.channels}).to_csv(folder / f"{name}.csv", index=False)
+        pd.DataFrame({"t": lap.time, **lap.channels}).to_csv(place.folder / "raw" / "logged" / f"lap{seed}.csv", index=False)
     declared = {name: {"column": name, "unit": UNITS[name]} for name in sorted(channels)}
-    dataset = DATASET | {"name": "logged", "path": "${root}/logged", "time": {"column": "t", "unit": "s"}, "channels": declared, **options}
-    split = yaml.safe_load((place.folder / "conf" / "split" / "mine.yaml").read_text()) | {"name": "logged", "dataset": "logged"}
-    for role, lap in (("train", "lap1"), ("validation", "lap2")):
-        split[role] = [{"recording": lap}]
-    split["tests"] = {"test": [{"recording": "lap3"}]}
-    for group, content in (("dataset", dataset), ("split", split)):
-        (place.folder / "conf" / group / "logged.yaml").write_text(yaml.safe_dump(content, allow_unicode=True))
+    own = {"name": "logged", "path": "${root}/logged", "time": {"column": "t", "unit": "s"}, "channels": declared}
+    place.change("conf/dataset/logged.yaml", **DATASET | own | options)
+    train, validation, test = ([{"recording": f"lap{number}"}] for number in (1, 2, 3))
+    place.change("conf/split/logged.yaml", name="logged", dataset="logged", train=train, validation=validation, tests={"test": test})
 
 
 def add_study(place, *sweeps, **options):
-    pipeline = {"study": "logged", "report": "drive", "split": "logged", "sweeps": list(sweeps), **options}
-    (place.folder / "pipelines" / "logged.yaml").write_text(yaml.safe_dump(pipeline))
+    place.change("pipelines/logged.yaml", study="logged", report="drive", split="logged", sweeps=list(sweeps), **options)
 
 
 def models(place):
@@ -93,15 +88,11 @@ def models(place):
 
 
 def test_description_in_the_store_tells_channels_gaps_and_rate_as_the_samples_do(tmp_path):
-    vx = np.ones(40)
-    vx[3] = np.nan
+    vx = np.where(np.arange(40) == 3, np.nan, 1.0)
     recording = Recording("gap", "car", 40.0, 0.0, {"vx": vx, "ay": np.ones(40)}, gappy=frozenset({"vx"}))
     write_recording(recording, tmp_path / "gap.parquet")
-    assert (
-        stored_summary(tmp_path / "gap.parquet")
-        == summary_of(recording)
-        == RecordingSummary("gap", 40.0, frozenset({"vx", "ay"}), frozenset({"vx"}))
-    )
+    told = RecordingSummary("gap", 40.0, frozenset({"vx", "ay"}), frozenset({"vx"}))
+    assert stored_summary(tmp_path / "gap.parquet") == summary_of(recording) == told
 
 
 IDENTIFIED = [f"training.identification.{setting}" for setting in ("method=data", "restarts=1", "generations=1")]
@@ -110,14 +101,11 @@ QUICK = {"cnn_ukf": IDENTIFIED, "ensemble_ukf": IDENTIFIED}
 
 @pytest.mark.parametrize("name", [name for name in estimator_names() if name != "data_sheet"])
 def test_fit_fails_for_each_channel_that_it_is_said_to_need(name):
-    """The table that stands beside the estimators against their own fits: without any one of the channels, no fit succeeds."""
     config = compose_config("train", [f"estimator={name}", *QUICK.get(name, ())])
     estimator = new_estimator(config["estimator"])
     training = settings_from_config(estimator.training_type, config["training"], "training")
     needed = lacking_to_train(estimator, training, ())
-    unread = {"learned_ukf": {"vx"}, "learned_ukf_variant": {"vx"}, "kalman": {"vx"}}.get(
-        name, set()
-    )  # their fits read other channels, their estimates this one
+    unread = {"vx"} if name in ("learned_ukf", "learned_ukf_variant", "kalman") else set()  # their estimates read it, their fits do not
     assert bool(needed) == estimator.learns
     generator = np.random.default_rng(0)
     channels = {channel: 10.0 + generator.normal(size=400) for channel in needed}
@@ -125,9 +113,8 @@ def test_fit_fails_for_each_channel_that_it_is_said_to_need(name):
     for channel in set(needed) - unread:
         held = {other: samples for other, samples in channels.items() if other != channel}
         lap = Recording("skidpad", "car", estimator.settings.rate_hz, 0.0, held, "simulated")
-        fresh = new_estimator(config["estimator"])
         with pytest.raises(DataError, match=f"'{channel}'|no {channel} "):
-            fresh.fit(FitData([lap], [lap]), training, FitContext(should_stop=lambda: stops))
+            new_estimator(config["estimator"]).fit(FitData([lap], [lap]), training, FitContext(should_stop=lambda: stops))
 
 
 def test_channels_of_a_settings_choice_and_references_of_outputs_count():
@@ -143,13 +130,10 @@ def test_channels_of_a_settings_choice_and_references_of_outputs_count():
     assert needed("estimator=zero") == set()
 
 
-def test_estimator_of_another_package_says_itself_what_it_learns_from():
+def test_estimators_of_another_package_or_without_a_file_in_conf_say_themselves_what_they_need():
     kind = estimator_class("static_map")
     other = type("Other", (kind,), {"learns_from": ("vx_ref", "vy_ref")})(kind.settings_type())
     assert set(lacking_to_train(other, None, ())) == {"vx", "yaw_rate", "vx_ref", "vy_ref"}
-
-
-def test_estimator_without_a_file_in_conf_is_told_by_its_defaults():
     found = usability("luenberger", {"estimator": {"name": "luenberger"}, "training": {}}, [summary_of(log(FULL))])
     assert (found.usable, found.rate_hz, found.own_rate_hz) == ("yes", 50.0, 100.0)
 
@@ -192,50 +176,36 @@ def test_with_all_promises_kept_estimators_of_a_plain_log_become_usable(channels
         assert {*after[name]["missing_to_estimate"], *after[name]["missing_to_train"]} == unsupplied
 
 
-@pytest.mark.parametrize("name", ["dugoff_ukf", "sideslip_ffnn", "cnn_ukf", "ensemble_ukf", "velocity_gru", "velocity_lstm"])
-def test_settings_that_are_offered_make_the_estimator_usable(name):
+NAMES = ("dugoff_ukf", "sideslip_ffnn", "cnn_ukf", "ensemble_ukf", "velocity_gru", "velocity_lstm", "data_sheet")
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_settings_that_are_offered_or_asked_for_make_the_estimator_usable(name):
     contents = [summary_of(log(FULL))]
-    config = compose_config("train", [f"estimator={name}"])
-    plain = usability(name, config, contents)
-    assert plain.usable == "no"
-    changed = compose_config("train", [f"estimator={name}", *plain.as_plain()["settings"]])
-    assert usability(name, changed, contents).usable == "yes"
+    plain = usability(name, compose_config("train", [f"estimator={name}"]), contents)
+    assert (plain.usable, "estimator.wheelbase=" in plain.to_give) == ("no", name == "data_sheet")
+    given = ["estimator.wheelbase=2.4"] if name == "data_sheet" else plain.as_plain()["settings"]
+    assert usability(name, compose_config("train", [f"estimator={name}", *given]), contents).usable == "yes"
 
 
-def test_wheelbase_is_a_missing_setting_and_giving_it_helps():
-    contents = [summary_of(log(FULL))]
-    row = usability("data_sheet", compose_config("train", ["estimator=data_sheet"]), contents)
-    assert row.usable == "no"
-    assert "estimator.wheelbase=" in row.to_give
-    given = compose_config("train", ["estimator=data_sheet", "estimator.wheelbase=2.4"])
-    assert usability("data_sheet", given, contents).usable == "yes"
-
-
-def test_log_without_a_reference_will_do_for_models_from_elsewhere():
+def test_lacking_references_gaps_and_channels_of_one_recording_alone_are_told_to_those_whom_they_concern():
     found = rows(log(FULL - {"vy_ref"}))
     assert (found["ksnn"]["usable"], found["ksnn"]["missing_to_train"]) == ("not to train", ["vy_ref"])
     assert (found["zero"]["usable"], found["kalman"]["usable"]) == ("yes", "yes"), "they learn nothing of a reference"
-
-
-def test_nothing_is_made_of_a_speed_with_gaps_or_of_channels_that_are_not_there():
-    assert (derivation_of("ax", {"vx"}, {"vx"}, 50.0), derivation_of("steer", {"vx", "yaw_rate"}, (), 50.0)) == (None, None)
-    assert derivation_of("vy_ref", {"sideslip_ref"}, (), 50.0) is None
-    assert derivation_of("motor_current", set(UNITS), (), 50.0) is None
-
-
-def test_gaps_are_told_to_estimators_that_cannot_skip_them():
     drive = log(FULL)
-    ay = drive["ay"].copy()
-    ay[10] = np.nan
+    ay = np.where(np.arange(len(drive)) == 10, np.nan, drive["ay"])
     found = rows(replace(drive, channels={**drive.channels, "ay": ay}, gappy=frozenset({"ay"})))
-    assert found["ksnn"]["gaps"] == ["ay"]
-    assert found["kalman"]["gaps"] == [], "it skips a sample of ay"
-
-
-def test_channels_count_that_every_recording_has():
-    one, other = summary_of(log(FULL)), summary_of(log(FULL - {"ax"}, name="other"))
+    assert (found["ksnn"]["gaps"], found["kalman"]["gaps"]) == (["ay"], []), "the filter skips a sample of ay"
+    one, other = summary_of(drive), summary_of(log(FULL - {"ax"}, name="other"))
     assert common_channels([one, other]) == FULL - {"ax"}
     assert usability("ksnn", compose_config("train", ["estimator=ksnn"]), [one, other]).usable == "no"
+    for channel, held, gappy in (
+        ("ax", {"vx"}, {"vx"}),
+        ("steer", {"vx", "yaw_rate"}, ()),
+        ("vy_ref", {"sideslip_ref"}, ()),
+        ("motor_current", set(UNITS), ()),
+    ):
+        assert derivation_of(channel, held, gappy, 50.0) is None
 
 
 def test_every_transform_that_makes_a_channel_is_known():
@@ -315,22 +285,18 @@ def test_candidates_that_lack_something_are_told_at_once_and_the_others_are_show
     assert (code, json.loads(again)["failed"].keys()) == (5, told["failed"].keys())
 
 
-def test_study_none_of_whose_candidates_will_do_trains_nothing(place):
-    add_logged(place, {"vx", "yaw_rate", "vy_ref"})
-    add_study(place, ["estimator=ksnn"], ["estimator=kalman"])
+@pytest.mark.parametrize(
+    ("channels", "sweeps", "says"),
+    [
+        ({"vx", "yaw_rate", "vy_ref"}, ("ksnn", "kalman"), "none of these estimators can be used with the recordings of split 'logged'"),
+        (FULL - {"vy_ref"}, ("zero", "kalman"), "vy_ref (not in the log)"),
+    ],
+)
+def test_study_none_of_whose_candidates_will_do_or_can_be_scored_trains_nothing(place, channels, sweeps, says):
+    add_logged(place, channels)
+    add_study(place, *([f"estimator={name}"] for name in sweeps))
     code, _, err = place("run", "logged", "tracking=none")
-    assert code == 3
-    assert "none of these estimators can be used with the recordings of split 'logged'" in err.splitlines()[-1]
-    assert not models(place)
-
-
-def test_recordings_without_the_reference_that_scores_are_refused_for_all(place):
-    add_logged(place, FULL - {"vy_ref"})
-    add_study(place, ["estimator=zero"], ["estimator=kalman"])
-    code, _, err = place("run", "logged", "tracking=none")
-    assert code == 3
-    assert "vy_ref (not in the log)" in err.splitlines()[-1]
-    assert not models(place)
+    assert (code, says in err.splitlines()[-1], models(place)) == (3, True, set())
 
 
 def test_channels_that_the_downsampling_makes_are_not_missing(place):
@@ -429,19 +395,15 @@ def test_lowest_rate_of_all_data_sets_of_a_split_counts(place):
     assert {row["test_set"] for row in json.loads(out)["leaderboard"]} >= {"test", "other"}
 
 
-def test_rates_that_recordings_have_are_left_alone():
-    config, limit = compose_config("eval", ["estimator=luenberger"]), RecordingSummary("lap", 100.0, frozenset())
+def test_rates_that_recordings_have_are_left_alone_and_what_a_lower_one_means_is_told():
+    def at(rate_hz):
+        return RecordingSummary("lap", rate_hz, frozenset())
+
+    config = compose_config("eval", ["estimator=luenberger"])
     for group in ("estimator", "evaluation"):
-        assert lower_rate(config, group, limit) == (config, [])
-
-
-def test_setting_that_makes_no_sense_at_the_lower_rate_is_told_with_it():
+        assert lower_rate(config, group, at(100.0)) == (config, [])
     config = compose_config("eval", ["estimator=factor_graph", "estimator.window=0.01"])
     with pytest.raises(DataError, match=r"'factor_graph' cannot run at 20 Hz, and recording 'lap' is sampled at 20 Hz: estimator.window"):
-        lower_rate(config, "estimator", RecordingSummary("lap", 20.0, frozenset()))
-
-
-def test_lengths_that_a_training_counts_in_samples_are_told():
-    config = compose_config("eval", ["estimator=velocity_gru"])
-    _, ((_, text),) = lower_rate(config, "estimator", RecordingSummary("lap", 50.0, frozenset()))
+        lower_rate(config, "estimator", at(20.0))
+    _, ((_, text),) = lower_rate(compose_config("eval", ["estimator=velocity_gru"]), "estimator", at(50.0))
     assert "training.sequence_steps of 300 samples lasts 6 s instead of 3 s" in text
