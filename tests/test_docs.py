@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-import importlib.util
+import importlib
 import re
 import shlex
 from dataclasses import dataclass, fields
 from pathlib import Path
 
+import make_reference
 import numpy as np
 import pytest
 import typer
@@ -62,17 +63,8 @@ def of_pages(found):
     return [pytest.param(file, item, id=f"{file.name}: {item}") for file in PAGES for item in found(file)]
 
 
-def generator():
-    spec = importlib.util.spec_from_file_location("make_reference", ROOT / "docs" / "make_reference.py")
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
-
-
 def test_generated_pages_are_up_to_date():
-    for path, text in generator().pages().items():
+    for path, text in make_reference.pages().items():
         assert path.read_text(encoding="utf-8") == text, f"{path.name} is not what the code says; run 'make docs'"
 
 
@@ -81,15 +73,14 @@ def test_leaderboard_on_the_page_of_results_follows_them(tmp_path):
     columns = "title,n_parameters,rmse_sideslip,interval,against_best,beats_zero,beats_static_map,fvu"
     rows = '"KS-NN, small",12,0.12345,0.100 … 0.200,lowest,yes,no,0.0123\nOther,2,0.5,0.400 … 0.600,not told apart,,,0.2\n'
     source.write_text(f"{columns}\n{rows}", encoding="utf-8")
-    (made,) = generator().leaderboard(str(source))
+    (made,) = make_reference.leaderboard(str(source))
     first = "| KS-NN, small | 12 | 0.123 | 0.100 … 0.200 | lowest | yes | no | 0.012 |"
     assert made.endswith(f"{first}\n| Other | 2 | 0.500 | 0.400 … 0.600 | not told apart | – | – | 0.200 |")
 
 
 def test_a_part_without_results_stays_as_it_is(tmp_path, monkeypatch):
-    made = generator()
-    monkeypatch.setattr(made, "RESULTS", tmp_path)
-    assert made.PART.sub(made._made, page("docs/results.md")) == page("docs/results.md")
+    monkeypatch.setattr(make_reference, "RESULTS", tmp_path)
+    assert make_reference.PART.sub(make_reference._made, page("docs/results.md")) == page("docs/results.md")
 
 
 def links(file):

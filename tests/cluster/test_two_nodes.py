@@ -59,6 +59,10 @@ def alone(folder):
 @pytest.fixture(scope="session")
 def cluster(folder):
     """One that outlives a test, since nothing happens to its nodes."""
+    yield from _nodes()
+
+
+def _nodes():
     nodes = TwoNodes()
     yield nodes
     nodes.shut_down()
@@ -67,9 +71,7 @@ def cluster(folder):
 @pytest.fixture
 def mortal():
     """One of which a node will be lost."""
-    nodes = TwoNodes()
-    yield nodes
-    nodes.shut_down()
+    yield from _nodes()
 
 
 def swept(cluster, folder, output, *words, alone=False):
