@@ -85,6 +85,34 @@ STEERED = {"vx": "m/s", "yaw_rate": "rad/s", "ay": "m/s²", "steer": "rad"}
 STEERED |= {"vx_ref": "m/s", "vy_ref": "m/s", "yaw_rate_ref": "rad/s"}
 
 
+SPLIT = {"name": "mine", "dataset": "mine", "train": [{"recording": "one"}], "validation": [{"recording": "two"}]}
+SPLIT |= {"tests": {"test": [{"recording": "three"}]}}
+
+
+def write_yaml(file, content):
+    file.parent.mkdir(parents=True, exist_ok=True)
+    file.write_text(yaml.safe_dump(content, allow_unicode=True, sort_keys=False), encoding="utf-8")
+
+
+def write_drives(folder):
+    """The tables of `DATASET`."""
+    (folder / "raw").mkdir(exist_ok=True)
+    for seed, name in enumerate(("one", "two", "three"), start=1):
+        write_csv(folder / "raw" / f"{name}.csv", seed)
+
+
+def write_steered(folder, names):
+    """A data set ``steered`` of a linear single track with a steering angle: drives of 30 s, name -> seed."""
+    (folder / "raw" / "steered").mkdir(parents=True)
+    for name, seed in names.items():
+        drive = linear_drive(30.0, seed=seed)[0]
+        table = pd.DataFrame({"t": drive.time, **{channel: drive[channel] for channel in STEERED}})
+        table.to_csv(folder / "raw" / "steered" / f"{name}.csv", index=False)
+    channels = {name: {"column": name, "unit": unit} for name, unit in STEERED.items()}
+    own = {"name": "steered", "path": "${root}/steered", "time": {"column": "t", "unit": "s"}, "channels": channels}
+    write_yaml(folder / "conf" / "dataset" / "steered.yaml", DATASET | own)
+
+
 def run_vehest(capsys, *arguments):
     """Exit code, standard output and standard error of a command."""
     former, code = sys.argv, 0
@@ -108,32 +136,14 @@ class Place:
 
     def __init__(self, folder, capsys):
         self.folder, self._capsys = folder, capsys
-        for name, seed in (("one", 1), ("two", 2), ("three", 3)):
-            (folder / "raw").mkdir(exist_ok=True)
-            write_csv(folder / "raw" / f"{name}.csv", seed)
-        split = {
-            "name": "mine",
-            "dataset": "mine",
-            "train": [{"recording": "one"}],
-            "validation": [{"recording": "two"}],
-            "tests": {"test": [{"recording": "three"}]},
-        }
-        for group, content in (("dataset", DATASET), ("split", split)):
-            (folder / "conf" / group).mkdir(parents=True, exist_ok=True)
-            (folder / "conf" / group / "mine.yaml").write_text(yaml.safe_dump(content, allow_unicode=True))
-        (folder / "pipelines").mkdir()
-        (folder / "pipelines" / "small.yaml").write_text(yaml.safe_dump(PIPELINE))
+        write_drives(folder)
+        self.change("conf/dataset/mine.yaml", **DATASET)
+        self.change("conf/split/mine.yaml", **SPLIT)
+        self.change("pipelines/small.yaml", **PIPELINE)
 
     def add_steered(self):
         """A data set ``steered``: drives of 30 s, ``first`` and ``second``, of a linear single track with a steering angle."""
-        (self.folder / "raw" / "steered").mkdir()
-        for name, seed in (("first", 1), ("second", 2)):
-            drive = linear_drive(30.0, seed=seed)[0]
-            table = pd.DataFrame({"t": drive.time, **{channel: drive[channel] for channel in STEERED}})
-            table.to_csv(self.folder / "raw" / "steered" / f"{name}.csv", index=False)
-        channels = {name: {"column": name, "unit": unit} for name, unit in STEERED.items()}
-        dataset = DATASET | {"name": "steered", "path": "${root}/steered", "time": {"column": "t", "unit": "s"}, "channels": channels}
-        (self.folder / "conf" / "dataset" / "steered.yaml").write_text(yaml.safe_dump(dataset, allow_unicode=True))
+        write_steered(self.folder, {"first": 1, "second": 2})
 
     def __call__(self, *arguments):
         """Exit code, standard output and standard error of a command."""
@@ -153,7 +163,7 @@ class Place:
         """Write a YAML file, or change keys of one that is there; what it holds then."""
         file = self.folder / name
         content = (yaml.safe_load(file.read_text(encoding="utf-8")) if file.is_file() else {}) | changes
-        file.write_text(yaml.safe_dump(content, allow_unicode=True, sort_keys=False), encoding="utf-8")
+        write_yaml(file, content)
         return content
 
     def once(self, *arguments):
