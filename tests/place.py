@@ -159,7 +159,7 @@ class Place:
         """What a command that must succeed says in JSON."""
         return json.loads(self.done(*arguments, "--json")[0])
 
-    def change(self, name, **changes):
+    def change(self, name, /, **changes):
         """Write a YAML file, or change keys of one that is there; what it holds then."""
         file = self.folder / name
         content = (yaml.safe_load(file.read_text(encoding="utf-8")) if file.is_file() else {}) | changes

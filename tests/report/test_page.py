@@ -61,19 +61,13 @@ def fill(driver, label, value):
 
 def views(driver):
     """First and last time that each trace shows [s]."""
-    return run(driver, f"{LIVE}.plots.map(plot => [plot.scales.x.min, plot.scales.x.max])")
+    plots = "document.querySelector('figure.live').explorer.plots"
+    return driver.execute_script(f"return {plots}.map(plot => [plot.scales.x.min, plot.scales.x.max])")
 
 
 def press(driver, text):
     (button,) = [own for own in driver.find_elements("css selector", ".views button, .filters button") if own.text == text]
     button.click()
-
-
-def run(driver, script):
-    return driver.execute_script(f"return {script}")
-
-
-LIVE = "document.querySelector('figure.live').explorer"
 
 
 def test_errors_over_all_rows_are_those_of_the_leaderboard(chromium, toy):

@@ -73,7 +73,10 @@ def test_units_and_signs_are_applied_and_misspelt_ones_refused():
     assert column_from_config({"column": "t", "unit": "ms"}, "here", "s") == Column("t", "ms")
     assert column_from_config({"column": 3, "unit": "s", "sign": -1}, "here", "s") == Column("3", "s", -1), "YAML reads it as a number"
     for act, said in (
-        (lambda: columns_from_config({"vz": {"column": "a", "unit": "m/s"}}, "mine"), "data set 'mine': channel 'vz' is not known"),
+        (
+            lambda: columns_from_config({"vz": {"column": "a", "unit": "m/s"}}, "mine"),
+            "data set 'mine': channel 'vz': channel 'vz' is not known",
+        ),
         (lambda: columns_from_config({"vx": {"column": "a", "unit": "deg"}}, "mine"), "unit 'deg' cannot be converted to 'm/s'"),
         (lambda: column_from_config({"column": "t", "unit": "km/h"}, "here", "s"), "here: unit 'km/h' cannot be converted to 's'"),
     ):
