@@ -3,6 +3,7 @@
 import json
 import shutil
 import subprocess
+from types import SimpleNamespace
 
 import numpy as np
 import pandas as pd
@@ -35,17 +36,10 @@ def published(tmp_path_factory):
         patch.setenv("VEHEST_DATA", str(folder / "raw"))
         patch.delenv("VEHEST_OUTPUT", raising=False)
         undrawn(patch)
-        place = Place(folder, _Silent())
+        place = Place(folder, SimpleNamespace(readouterr=lambda: ("", "")))
         (folder / "pipelines" / "small.yaml").write_text(yaml.safe_dump(QUICK))
         assert place(*RUN)[0] == 0
     return folder
-
-
-class _Silent:
-    """Stands for pytest's capsys, which serves single tests only."""
-
-    def readouterr(self):
-        return "", ""
 
 
 @pytest.fixture
@@ -168,15 +162,13 @@ def test_estimators_that_come_and_go_are_named(checked):
     assert {f"{stage} {name}" for stage in stages for name in ("zero added", "luenberger removed")} <= named
 
 
-def test_changed_code_and_data_are_told_apart(checked, monkeypatch):
+def test_changed_code_and_data_are_told_apart_and_raw_files_that_are_elsewhere_are_not_compared(checked, monkeypatch):
     with open(checked.folder / "raw" / "two.csv", "a") as stream:
         stream.write("\n")
     assert verdict(checked) == (3, "small: stale: data (ingest mine)")
-    monkeypatch.setattr(study_keys, "code_of_report", lambda study: "other")
-    assert verdict(checked) == (3, "small: stale: code (report), data (ingest mine)")
-
-
-def test_raw_files_that_are_elsewhere_are_not_compared_and_this_is_said(checked):
+    with monkeypatch.context() as patch:
+        patch.setattr(study_keys, "code_of_report", lambda study: "other")
+        assert verdict(checked) == (3, "small: stale: code (report), data (ingest mine)")
     shutil.rmtree(checked.folder / "raw")
     assert verdict(checked) == (0, "small: up to date: raw files not here, not compared: mine")
     checked.change("conf/dataset/mine.yaml", vehicle="another car")
@@ -226,22 +218,15 @@ def test_a_run_elsewhere_takes_the_published_weights_and_comes_to_the_same_resul
     assert contents(checked.folder / "results") == before
 
 
-def test_weights_of_another_key_are_not_taken(checked):
+def test_weights_of_another_key_are_not_taken_trainings_are_repeated_on_demand_and_damaged_weights_refused(checked):
+    pipeline = checked.change("pipelines/small.yaml")
     checked.change("pipelines/small.yaml", sweeps=[QUICK["sweeps"][0], [*QUICK["sweeps"][1][:-1], "training.max_epochs=1"]])
     _, said = checked.done(*RUN)
-    assert "1 of 3 taken from" in " ".join(said.split())
-    assert said.count("1 epochs") == 2
-
-
-def test_trainings_are_repeated_on_demand(checked):
-    _, said = checked.done(*RUN, "--retrain")
-    assert "taken from" not in said
-    assert said.count("2 epochs") == 2
-
-
-def test_damaged_weights_are_refused_in_one_line(checked):
+    assert ("1 of 3 taken from" in " ".join(said.split()), said.count("1 epochs")) == (True, 2)
+    checked.change("pipelines/small.yaml", **pipeline)
+    _, said = checked.done(*RUN, "--retrain", "output=again")
+    assert ("taken from" in said, said.count("2 epochs")) == (False, 2)
     file = checked.folder / "results" / "small" / "weights.safetensors"
     file.write_bytes(file.read_bytes()[:100])
-    code, _, err = checked(*RUN)
-    assert code == 3
-    assert all(words in " ".join(err.split()) for words in ("weights.safetensors' is damaged", "--retrain"))
+    code, _, err = checked(*RUN, "output=damaged")
+    assert (code, "weights.safetensors' is damaged" in " ".join(err.split()), "--retrain" in err) == (3, True, True)
