@@ -6,8 +6,8 @@ import signal
 
 import pytest
 from pretended_slurm import install, scancel, states
-from test_two_nodes import FORTY, LONGER, alone, folder  # noqa: F401
-from two_nodes import Driver, metrics, under_way, weights, with_recordings
+from test_two_nodes import FORTY, LONGER, Alone, alone, folder  # noqa: F401
+from two_nodes import Driver, manifests, metrics, under_way, weights, with_recordings
 
 pytestmark = [
     pytest.mark.cluster,
@@ -32,7 +32,8 @@ def test_processes_of_this_machine_give_the_bits_of_the_local_launcher(folder, a
     output = with_recordings(alone["forty"], tmp_path / "out")
     driver = Driver(folder, output, "sweep", *FORTY, "--launcher", "slurm", "--address", "local", "-j", "2")
     assert driver.ended() == 0, driver.said
-    assert (metrics(output), weights(output)) == (metrics(alone["forty"]), weights(alone["forty"]))
+    assert metrics(output) == metrics(alone["forty"])
+    assert weights(output) == weights(alone["forty"])
     assert not list(output.glob("clusters/*")), "what was handed over is forgotten"
 
 
@@ -44,7 +45,8 @@ def test_a_queue_gives_the_same_although_a_job_dies_and_another_is_put_back(fold
     put_back = driver.sees(lambda: with_a_checkpoint(output, but=lost))
     os.kill(put_back["pid"], signal.SIGUSR2)
     assert driver.ended() == 0, driver.said
-    assert (metrics(output), weights(output)) == (metrics(alone["longer"]), weights(alone["longer"]))
+    assert metrics(output) == metrics(alone["longer"])
+    assert weights(output) == weights(alone["longer"])
     assert "its job ended without an outcome" in driver.said
     assert set(states(queue).values()) <= {"COMPLETED", "FAILED"}
 
@@ -60,21 +62,31 @@ def test_ctrl_c_takes_jobs_back_and_the_next_call_goes_on(folder, alone, queue, 
     assert metrics(output) == metrics(alone["longer"])
 
 
-def test_a_queue_that_takes_no_jobs_or_no_more_ends_the_command_in_one_line_and_the_next_call_goes_on(folder, alone, queue, tmp_path):  # noqa: F811
+def test_a_queue_that_takes_no_jobs_is_an_error_of_one_line(folder, alone, queue, tmp_path):  # noqa: F811
+    output = with_recordings(alone["forty"], tmp_path / "out")
+    environment = install(queue)
+    (queue / "bin" / "sbatch").write_text("#!/bin/sh\necho 'sbatch: error: invalid partition specified: none' >&2\nexit 1\n")
+    driver = Driver(folder, output, "sweep", *FORTY, "--launcher", "slurm", "--slurm", "partition=none", **environment)
+    assert driver.ended() == 4, driver.said
+    assert "error: SLURM takes no jobs" in driver.said
+    assert "invalid partition" in driver.said
+    assert "Traceback" not in driver.said
+    assert not manifests(output)
+
+
+def test_a_queue_that_takes_no_more_jobs_ends_the_command_and_the_next_call_goes_on(folder, alone, queue, tmp_path):  # noqa: F811
     output, environment = with_recordings(alone["longer"], tmp_path / "out"), install(queue)
-    words, sbatch = ("sweep", *LONGER, "--launcher", "slurm"), queue / "bin" / "sbatch"
-    takes_jobs, takes_none = sbatch.read_text(), "#!/bin/sh\necho 'sbatch: error: the account is out of hours' >&2\nexit 1\n"
-    for at_once in (True, False):
-        sbatch.write_text(takes_none if at_once else takes_jobs)
-        driver = Driver(folder, output, *words, **environment)
-        if not at_once:
-            lost = driver.sees(lambda driver=driver: with_a_checkpoint(output))
-            sbatch.write_text(takes_none)
-            os.kill(lost["pid"], signal.SIGKILL)
-        assert driver.ended() == 4, driver.said
-        assert "error: SLURM takes no jobs" in driver.said.rstrip().splitlines()[-1]
-        assert ("out of hours" in driver.said, "Traceback" in driver.said) == (True, False)
+    sbatch = queue / "bin" / "sbatch"
+    takes_jobs = sbatch.read_text()
+    driver = Driver(folder, output, "sweep", *LONGER, "--launcher", "slurm", **environment)
+    lost = driver.sees(lambda: with_a_checkpoint(output))
+    sbatch.write_text("#!/bin/sh\necho 'sbatch: error: the account is out of hours' >&2\nexit 1\n")
+    os.kill(lost["pid"], signal.SIGKILL)
+    assert driver.ended() == 4, driver.said
+    assert "error: SLURM takes no jobs" in driver.said.rstrip().splitlines()[-1]
+    assert "out of hours" in driver.said
+    assert "Traceback" not in driver.said
     sbatch.write_text(takes_jobs)
-    again = Driver(folder, output, *words, **environment)
+    again = Driver(folder, output, "sweep", *LONGER, "--launcher", "slurm", **environment)
     assert again.ended() == 0, again.said
     assert metrics(output) == metrics(alone["longer"])
