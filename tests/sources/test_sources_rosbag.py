@@ -17,7 +17,6 @@ import yaml
 from numpy.typing import NDArray
 from refusals import refusal
 
-from vehest.alignment.checks import checks_of_recording
 from vehest.data.errors import ConfigurationError, DataError
 from vehest.data.limits import Limits, use_limits
 from vehest.sources.base import open_source
@@ -319,13 +318,6 @@ def test_a_misspelt_declaration_is_refused(bags):
 
 def real_configuration(root):
     return yaml.safe_load(CONFIGURATION.read_text(encoding="utf-8").replace("${root}", str(root)))
-
-
-def test_the_real_bag_has_no_errors_and_its_velocities_follow_its_imu(data_root):
-    (recording,) = open_source(real_configuration(data_root)).recordings()
-    findings = checks_of_recording(recording)
-    assert not [finding for finding in findings if finding.level == "error"]
-    assert [finding.channel for finding in findings if finding.check == "kinematics"] == ["vy_ref"]
 
 
 @pytest.mark.slow
