@@ -34,9 +34,9 @@ def without_validation(place):
 @pytest.fixture
 def evaluated(place):
     """A place, a model and its evaluation."""
-    _, out, err = place.once("train", *TRAIN, "--json")
+    out, err = place.once("train", *TRAIN, "--json")
     assert "calibrate  luenberger-luenberger-seed0-trust bands by" in err
-    return place, Path(json.loads(out)["model"]), Path(json.loads(place.once("eval", *TRAIN, "--json")[1])["folder"])
+    return place, Path(json.loads(out)["model"]), Path(json.loads(place.once("eval", *TRAIN, "--json")[0])["folder"])
 
 
 def test_training_alone_calibrates_and_evaluation_takes_it(evaluated):
