@@ -7,26 +7,14 @@ from importlib.resources import files
 import pytest
 
 WIDTHS = (1280, 390)
-FLAGS = (
-    "--headless",
-    "--no-sandbox",
-    "--disable-gpu",
-    "--disable-quic",
-    "--no-first-run",
-    "--disable-background-networking",
-    "--disable-component-update",
-    "--disable-sync",
-)
+FLAGS = ("--headless", "--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run", "--disable-background-networking")
+FLAGS += ("--disable-component-update", "--disable-sync")
 READY_SECONDS = 60.0
 
 
 @contextmanager
 def browser(profile):
-    """A browser with a profile of its own; the test is skipped where there is none.
-
-    Args:
-        profile: an empty folder.
-    """
+    """A browser with a profile of its own, in an empty folder; the test is skipped where there is none."""
     webdriver = pytest.importorskip("selenium.webdriver", reason="selenium is not installed: pip install 'vehest[dev]'")
     from selenium.webdriver.chrome.service import Service
 
@@ -46,14 +34,7 @@ def browser(profile):
 
 
 def opened(driver, path, *, width=1280, scheme="light"):
-    """Open a page and wait until all that it draws by itself is drawn.
-
-    Args:
-        driver: of `browser`.
-        path: of the page.
-        width: of the window [px]; a narrow one counts as a phone's.
-        scheme: ``light`` or ``dark``, as the system says.
-    """
+    """Open a page in a window so wide [px], a narrow one counts as a phone's, and wait until all that it draws by itself is drawn."""
     from selenium.webdriver.support.ui import WebDriverWait
 
     size = {"width": width, "height": 900, "deviceScaleFactor": 1, "mobile": width < 600}

@@ -1,5 +1,6 @@
 """A small data set with a configuration and a pipeline of its own, and the command line run on it."""
 
+import json
 import shutil
 import sys
 from functools import cache
@@ -84,6 +85,34 @@ STEERED = {"vx": "m/s", "yaw_rate": "rad/s", "ay": "m/s²", "steer": "rad"}
 STEERED |= {"vx_ref": "m/s", "vy_ref": "m/s", "yaw_rate_ref": "rad/s"}
 
 
+SPLIT = {"name": "mine", "dataset": "mine", "train": [{"recording": "one"}], "validation": [{"recording": "two"}]}
+SPLIT |= {"tests": {"test": [{"recording": "three"}]}}
+
+
+def write_yaml(file, content):
+    file.parent.mkdir(parents=True, exist_ok=True)
+    file.write_text(yaml.safe_dump(content, allow_unicode=True, sort_keys=False), encoding="utf-8")
+
+
+def write_drives(folder):
+    """The tables of `DATASET`."""
+    (folder / "raw").mkdir(exist_ok=True)
+    for seed, name in enumerate(("one", "two", "three"), start=1):
+        write_csv(folder / "raw" / f"{name}.csv", seed)
+
+
+def write_steered(folder, names):
+    """A data set ``steered`` of a linear single track with a steering angle: drives of 30 s, name -> seed."""
+    (folder / "raw" / "steered").mkdir(parents=True)
+    for name, seed in names.items():
+        drive = linear_drive(30.0, seed=seed)[0]
+        table = pd.DataFrame({"t": drive.time, **{channel: drive[channel] for channel in STEERED}})
+        table.to_csv(folder / "raw" / "steered" / f"{name}.csv", index=False)
+    channels = {name: {"column": name, "unit": unit} for name, unit in STEERED.items()}
+    own = {"name": "steered", "path": "${root}/steered", "time": {"column": "t", "unit": "s"}, "channels": channels}
+    write_yaml(folder / "conf" / "dataset" / "steered.yaml", DATASET | own)
+
+
 def run_vehest(capsys, *arguments):
     """Exit code, standard output and standard error of a command."""
     former, code = sys.argv, 0
@@ -107,59 +136,61 @@ class Place:
 
     def __init__(self, folder, capsys):
         self.folder, self._capsys = folder, capsys
-        for name, seed in (("one", 1), ("two", 2), ("three", 3)):
-            (folder / "raw").mkdir(exist_ok=True)
-            write_csv(folder / "raw" / f"{name}.csv", seed)
-        split = {
-            "name": "mine",
-            "dataset": "mine",
-            "train": [{"recording": "one"}],
-            "validation": [{"recording": "two"}],
-            "tests": {"test": [{"recording": "three"}]},
-        }
-        for group, content in (("dataset", DATASET), ("split", split)):
-            (folder / "conf" / group).mkdir(parents=True, exist_ok=True)
-            (folder / "conf" / group / "mine.yaml").write_text(yaml.safe_dump(content, allow_unicode=True))
-        (folder / "pipelines").mkdir()
-        (folder / "pipelines" / "small.yaml").write_text(yaml.safe_dump(PIPELINE))
+        write_drives(folder)
+        self.change("conf/dataset/mine.yaml", **DATASET)
+        self.change("conf/split/mine.yaml", **SPLIT)
+        self.change("pipelines/small.yaml", **PIPELINE)
 
     def add_steered(self):
         """A data set ``steered``: drives of 30 s, ``first`` and ``second``, of a linear single track with a steering angle."""
-        (self.folder / "raw" / "steered").mkdir()
-        for name, seed in (("first", 1), ("second", 2)):
-            drive = linear_drive(30.0, seed=seed)[0]
-            table = pd.DataFrame({"t": drive.time, **{channel: drive[channel] for channel in STEERED}})
-            table.to_csv(self.folder / "raw" / "steered" / f"{name}.csv", index=False)
-        channels = {name: {"column": name, "unit": unit} for name, unit in STEERED.items()}
-        dataset = DATASET | {"name": "steered", "path": "${root}/steered", "time": {"column": "t", "unit": "s"}, "channels": channels}
-        (self.folder / "conf" / "dataset" / "steered.yaml").write_text(yaml.safe_dump(dataset, allow_unicode=True))
+        write_steered(self.folder, {"first": 1, "second": 2})
 
     def __call__(self, *arguments):
         """Exit code, standard output and standard error of a command."""
         return run_vehest(self._capsys, *arguments)
 
+    def done(self, *arguments):
+        """Standard output and error of a command that must succeed."""
+        code, out, err = self(*arguments)
+        assert code == 0, err
+        return out, err
+
+    def told(self, *arguments):
+        """What a command that must succeed says in JSON."""
+        return json.loads(self.done(*arguments, "--json")[0])
+
+    def change(self, name, /, **changes):
+        """Write a YAML file, or change keys of one that is there; what it holds then."""
+        file = self.folder / name
+        content = (yaml.safe_load(file.read_text(encoding="utf-8")) if file.is_file() else {}) | changes
+        write_yaml(file, content)
+        return content
+
     def once(self, *arguments):
-        """The same, of a command that a test needs the outcome of: it runs once, later places like this one get a copy of what it made."""
+        """Output and errors of a command that must succeed: it runs once, later places like this one get a copy of what it made."""
         files = [file for file in sorted(self.folder.rglob("*")) if file.is_file() and not file.is_symlink()]
         key = (*arguments, *((file.relative_to(self.folder), sha256(file.read_bytes()).digest()) for file in files))
         if key not in _DONE:
-            outcome, kept = self(*arguments), Path(_KEPT.name) / str(len(_DONE))
-            _DONE[key] = outcome, shutil.copytree(self.folder, kept)
+            said, kept = self.done(*arguments), Path(_KEPT.name) / str(len(_DONE))
+            _DONE[key] = said, shutil.copytree(self.folder, kept)
         else:
             shutil.copytree(_DONE[key][1], self.folder, dirs_exist_ok=True)
         return _DONE[key][0]
 
-    def refused(self, *arguments):
-        """Exit code and the one line of a command that must fail and leave nothing behind."""
+    def refused(self, *arguments, code=None, says=()):
+        """Exit code and the one line of a command that must fail and leave nothing behind; what is expected of them."""
         before = self.files()
-        code, _, err = self(*arguments)
-        assert code != 0
+        found, _, err = self(*arguments)
+        assert found != 0
         lines = [line for line in err.splitlines() if not line.startswith(("done", "skipped"))]
         assert len(lines) == 1, err
         assert lines[0].startswith("error: ")
         assert {name for name in self.files() - before if "/ingest/" not in name and "/downsample/" not in name} == set()
         assert not any(ASIDE_PREFIX in name for name in self.files())
-        return code, lines[0]
+        assert code in (None, found), lines[0]
+        assert found == 1 or "defect" not in lines[0]
+        assert [words for words in ([says] if isinstance(says, str) else says) if words not in lines[0]] == [], lines[0]
+        return found, lines[0]
 
     def files(self):
         """Every file in the output root but the locks, which stay where they are and are empty."""

@@ -37,11 +37,7 @@ def end_all():
 
 
 def wait_for(event, process=None, said=None):
-    """Wait for an event and return what it says; a process that ends before it fails the test.
-
-    Args:
-        said: output of the process, by default what its pipes hold.
-    """
+    """Wait for an event and return what it says; a process that ends before it fails the test with what it ``said``."""
     limit = time.monotonic() + HANGS
     while not (found := event()):
         assert process is None or process.poll() is None, f"it ended before the event: {(said or process.communicate)()}"

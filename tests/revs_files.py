@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from itertools import zip_longest
 
 import numpy as np
 import pyarrow as pa
@@ -17,16 +18,8 @@ from vehest.constants import FloatArray
 
 CSV_RATE_HZ, INS_RATE_HZ, GPS_RATE_HZ = 1000, 100, 10
 PREAMBLE = (
-    "Event: 2014 Targa 66",
-    "Venue: Palm Beach International Raceway",
-    "Date: 2014-02-22",
-    "Time (UTC): 14:29:02",
-    "Driver: Participant 3",
-    "Vehicle: 1965 Ferrari 250 LM Berlinetta GT",
-    "Run: 01",
-    "Outing: 01",
-    "Remark: made for tests, 25 °C",
-    "",
+    *("Event: 2014 Targa 66", "Venue: Palm Beach International Raceway", "Date: 2014-02-22", "Time (UTC): 14:29:02"),
+    *("Driver: Participant 3", "Vehicle: 1965 Ferrari 250 LM Berlinetta GT", "Run: 01", "Outing: 01", "Remark: made for tests, 25 °C", ""),
 )
 PARAMETERS = {
     "mass": ("kg", [982.0]),
@@ -38,9 +31,7 @@ PARAMETERS = {
     "roadWheelAngleFR": ("°", [-6.9, 0.0, 6.7]),
 }
 
-_DRIVER = "driverData"
-_INS = "insData"
-_TYRE = "tireData"
+_DRIVER, _INS, _TYRE = "driverData", "insData", "tireData"
 
 
 def _columns():
@@ -72,84 +63,42 @@ assert len(COLUMNS) == 55
 
 @dataclass(frozen=True)
 class Drive:
-    """What the sensors delivered, in the units of the official files.
-
-    Args:
-        seconds: a whole number of tenths.
-        signals: column -> samples at the rate of its sensor (COLUMNS; roadWheelAngle… at 1 kHz).
-        start_time: of the first sample [s].
-    """
+    """What the sensors delivered over a whole number of tenths of a second: column -> samples at its rate, in the files' units."""
 
     seconds: float
     signals: Mapping[str, FloatArray]
     start_time: float = 0.0
 
     def rows(self):
-        """Rows of the CSV file."""
         return round(self.seconds * CSV_RATE_HZ)
 
 
 def smooth_drive(seconds, start_time=0.0, decimals=None):
-    """A drive that obeys planar kinematics exactly, and its channels in SI units at 1 kHz, with nothing held.
-
-    Args:
-        seconds: a whole number of tenths.
-        start_time: of the first sample [s].
-        decimals: of the file's values; None keeps every digit.
-    """
+    """A drive that obeys planar kinematics exactly, and its channels in SI units at 1 kHz, with nothing held and every digit kept."""
     time = np.arange(round(seconds * CSV_RATE_HZ)) / CSV_RATE_HZ
     yaw_rate = 0.35 * np.sin(0.5 * time + 0.3) + 0.15 * np.sin(1.3 * time + 1.1)
     yaw_rate_dot = 0.175 * np.cos(0.5 * time + 0.3) + 0.195 * np.cos(1.3 * time + 1.1)
     vx, vx_dot = 30.0 + 8.0 * np.sin(0.2 * time), 1.6 * np.cos(0.2 * time)
     vy = -2.2 * yaw_rate + 0.3 * np.sin(0.7 * time + 2.0)
     vy_dot = -2.2 * yaw_rate_dot + 0.21 * np.cos(0.7 * time + 2.0)
-    roll, pitch = 0.03 * np.sin(0.5 * time + 0.4), 0.01 * np.cos(0.9 * time)
-    truth = {
-        "vx": vx,
-        "yaw_rate": yaw_rate,
-        "ax": vx_dot - vy * yaw_rate,
-        "ay": vy_dot + vx * yaw_rate,
-        "handwheel": 1.2 * np.sin(0.5 * time + 0.5) + 0.01 * np.sin(40.0 * time),
-        "roll": roll,
-        "pitch": pitch,
-        "roll_rate": 0.015 * np.cos(0.5 * time + 0.4),
-        "pitch_rate": -0.009 * np.sin(0.9 * time),
-        "vx_ref": vx,
-        "vy_ref": vy,
-        "sideslip_ref": np.arctan2(vy, vx),
-    }
+    truth = {"vx": vx, "yaw_rate": yaw_rate, "ax": vx_dot - vy * yaw_rate, "ay": vy_dot + vx * yaw_rate}
+    truth |= {"roll": 0.03 * np.sin(0.5 * time + 0.4), "pitch": 0.01 * np.cos(0.9 * time)}
+    truth |= {"roll_rate": 0.015 * np.cos(0.5 * time + 0.4), "pitch_rate": -0.009 * np.sin(0.9 * time)}
+    truth |= {"vx_ref": vx, "vy_ref": vy, "sideslip_ref": np.arctan2(vy, vx)}
+    truth["handwheel"] = 1.2 * np.sin(0.5 * time + 0.5) + 0.01 * np.sin(40.0 * time)
     truth["steer"] = truth["handwheel"] / 13.3
-    signals = {
-        "handwheelAngle": np.rad2deg(truth["handwheel"]),
-        "roadWheelAngle": np.rad2deg(truth["steer"]),
-        "roadWheelAngleFL": np.rad2deg(truth["steer"]) * 1.01,
-        "roadWheelAngleFR": np.rad2deg(truth["steer"]) * 0.99,
-        **_ins_signals({name: samples[:: CSV_RATE_HZ // INS_RATE_HZ] for name, samples in truth.items()}),
-    }
+    signals = _ins_signals({name: samples[:: CSV_RATE_HZ // INS_RATE_HZ] for name, samples in truth.items()})
+    signals["handwheelAngle"] = np.rad2deg(truth["handwheel"])
+    signals |= {f"roadWheelAngle{side}": size * np.rad2deg(truth["steer"]) for side, size in (("", 1.0), ("FL", 1.01), ("FR", 0.99))}
     if decimals is not None:
         signals = {name: np.round(samples, decimals) for name, samples in signals.items()}
     return Drive(seconds, signals, start_time), truth
 
 
-def drive_of(recording):
-    """A recording at 100 Hz as the sensors of Revs would have delivered it; its road-wheel angle is held at 1 kHz."""
-    assert recording.rate_hz == INS_RATE_HZ
-    signals = _ins_signals(recording.channels)
-    if "steer" in recording:
-        signals["roadWheelAngle"] = np.repeat(np.rad2deg(recording["steer"]), CSV_RATE_HZ // INS_RATE_HZ)
-    return Drive(len(recording) / INS_RATE_HZ, signals, recording.start_time)
-
-
-def write_csv(path, drive, *, blank_rows=37, preamble=PREAMBLE, encoding="latin-1", newline="\r\n"):
+def write_csv(path, drive, *, blank_rows=37):
     """One official CSV file: lines about the drive, names, units, a row a millisecond; slower sensors' values are held.
 
-    Args:
-        path: of the file.
-        drive: what to write; columns that it lacks are filled with something.
-        blank_rows: blank rows at the head of every column slower than 1 kHz, or of the columns named.
-        preamble: lines above the names.
-        encoding: of preamble and units.
-        newline: of preamble, names and units.
+    Columns that the drive lacks are filled with something; every column slower than 1 kHz, or those named, begin with ``blank_rows``.
     """
     arrays = []
     for name, (_, rate, _) in COLUMNS.items():
@@ -157,37 +106,26 @@ def write_csv(path, drive, *, blank_rows=37, preamble=PREAMBLE, encoding="latin-
         blank = blank_rows.get(name, 0) if isinstance(blank_rows, Mapping) else (blank_rows if rate < CSV_RATE_HZ else 0)
         arrays.append(pa.array(values, mask=np.arange(drive.rows()) < blank if blank else None))
     with open(path, "wb") as stream:
-        header = [*preamble, ",".join(COLUMNS), ",".join(unit for unit, _, _ in COLUMNS.values())]
-        stream.write("".join(line + newline for line in header).encode(encoding))
+        header = [*PREAMBLE, ",".join(COLUMNS), ",".join(unit for unit, _, _ in COLUMNS.values()), ""]
+        stream.write("\r\n".join(header).encode("latin-1"))
         options = pc.WriteOptions(include_header=False, quoting_style="none")
         pc.write_csv(pa.table(arrays, names=list(COLUMNS)), stream, options)
 
 
-def write_mat(path, drive, *, compressed=True, late=None):
-    """One official MAT file: structs of channels, each a struct of value and time.
-
-    Args:
-        path: of the file.
-        drive: what to write; columns that it lacks are left out.
-        compressed: as MATLAB's -v7 does.
-        late: samples that a channel lacks at its head.
-    """
+def write_mat(path, drive, *, compressed=True):
+    """One official MAT file: structs of channels, each a struct of value and time, compressed as MATLAB's -v7 does."""
     structs = {_INS: {}, _TYRE: {}, _DRIVER: {}}
     for name, values in drive.signals.items():
         _, rate, struct = COLUMNS.get(name, ("°", CSV_RATE_HZ, _TYRE))
-        first = (late or {}).get(name, 0)
-        stamps = drive.start_time + np.arange(len(values)) / rate
-        structs[struct][name] = {"value": values[first:, None], "time": stamps[first:, None]}
+        structs[struct][name] = {"value": values[:, None], "time": (drive.start_time + np.arange(len(values)) / rate)[:, None]}
     parameters = {name: {"value": np.asarray(values)[:, None], "units": unit} for name, (unit, values) in PARAMETERS.items()}
     savemat(path, {**structs, "params": parameters}, do_compression=compressed, oned_as="column")
 
 
-def write_vehicle_parameters(path, parameters=PARAMETERS):
+def write_vehicle_parameters(path):
     """One table of vehicle parameters: names, units, values; short columns end in blanks."""
-    longest = max(len(values) for _, values in parameters.values())
-    lines = [",".join(parameters), ",".join(unit for unit, _ in parameters.values())]
-    for row in range(longest):
-        lines.append(",".join(str(values[row]) if row < len(values) else "" for _, values in parameters.values()))
+    columns = [[name, unit, *map(str, values)] for name, (unit, values) in PARAMETERS.items()]
+    lines = map(",".join, zip_longest(*columns, fillvalue=""))
     path.write_bytes(("\r\n".join(lines) + "\r\n").encode("latin-1"))
 
 

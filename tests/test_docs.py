@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import importlib.util
 import re
 import shlex
 from dataclasses import dataclass, fields
 from pathlib import Path
 
+import make_reference
 import numpy as np
 import pytest
 import typer
@@ -28,7 +28,7 @@ from vehest.evaluation.metrics import UNITS
 from vehest.run.config import compose_config, expand
 from vehest.run.config_files import GROUPS, choices
 from vehest.run.study import Part, PipelineFile, jobs_of, read_study
-from vehest.sources.base import COMMON_KEYS, open_source, source_names
+from vehest.sources.base import COMMON_KEYS, open_source, source_class, source_names
 from vehest.studies.artefacts import METRIC_COLUMNS
 
 pytestmark = pytest.mark.apart
@@ -62,20 +62,8 @@ def of_pages(found):
     return [pytest.param(file, item, id=f"{file.name}: {item}") for file in PAGES for item in found(file)]
 
 
-# Generated pages
-
-
-def generator():
-    spec = importlib.util.spec_from_file_location("make_reference", ROOT / "docs" / "make_reference.py")
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
-
-
 def test_generated_pages_are_up_to_date():
-    for path, text in generator().pages().items():
+    for path, text in make_reference.pages().items():
         assert path.read_text(encoding="utf-8") == text, f"{path.name} is not what the code says; run 'make docs'"
 
 
@@ -84,18 +72,14 @@ def test_leaderboard_on_the_page_of_results_follows_them(tmp_path):
     columns = "title,n_parameters,rmse_sideslip,interval,against_best,beats_zero,beats_static_map,fvu"
     rows = '"KS-NN, small",12,0.12345,0.100 … 0.200,lowest,yes,no,0.0123\nOther,2,0.5,0.400 … 0.600,not told apart,,,0.2\n'
     source.write_text(f"{columns}\n{rows}", encoding="utf-8")
-    (made,) = generator().leaderboard(str(source))
+    (made,) = make_reference.leaderboard(str(source))
     first = "| KS-NN, small | 12 | 0.123 | 0.100 … 0.200 | lowest | yes | no | 0.012 |"
     assert made.endswith(f"{first}\n| Other | 2 | 0.500 | 0.400 … 0.600 | not told apart | – | – | 0.200 |")
 
 
 def test_a_part_without_results_stays_as_it_is(tmp_path, monkeypatch):
-    made = generator()
-    monkeypatch.setattr(made, "RESULTS", tmp_path)
-    assert made.PART.sub(made._made, page("docs/results.md")) == page("docs/results.md")
-
-
-# Links
+    monkeypatch.setattr(make_reference, "RESULTS", tmp_path)
+    assert make_reference.PART.sub(make_reference._made, page("docs/results.md")) == page("docs/results.md")
 
 
 def links(file):
@@ -119,9 +103,6 @@ def test_relative_links_and_images_resolve(file, target):
     assert there.exists(), f"{file.name} links to {target}"
     if anchor:
         assert anchor in anchors(there), f"{file.name} links to {target}"
-
-
-# Examples of files
 
 
 @pytest.fixture
@@ -169,9 +150,6 @@ def test_python_examples_run(workplace, drive, monkeypatch, request):
     for block in blocks:
         exec(compile(block, "example", "exec", dont_inherit=True), {"__name__": "example"})
     assert (workplace / "out.parquet").is_file()
-
-
-# Commands
 
 
 @dataclass(frozen=True)
@@ -248,10 +226,6 @@ def overrides_of(given):
             yield given.command[0], given.overrides
 
 
-def test_command_lines_are_found():
-    assert len(of_pages(command_lines)) > 60
-
-
 @pytest.mark.parametrize(("file", "line"), of_pages(command_lines))
 def test_command_line_is_one_that_vehest_takes(file, line, workplace):
     given = taken_apart(line)
@@ -278,34 +252,23 @@ def test_make_targets_exist():
     assert {"run", "test", "ui"} <= named <= targets
 
 
-@pytest.mark.parametrize("line", ["vehest trian", "vehest train --fast", "vehest doctor now", "vehest data look", "vehest --quick"])
-def test_wrong_command_lines_would_be_noticed(line):
-    with pytest.raises(AssertionError):
-        taken_apart(line)
+def test_command_lines_are_found_and_wrong_ones_would_be_noticed():
+    assert len(of_pages(command_lines)) > 60
+    for line in ("vehest trian", "vehest train --fast", "vehest doctor now", "vehest data look", "vehest --quick"):
+        with pytest.raises(AssertionError):
+            taken_apart(line)
 
 
-# What pages state
-
-
-def test_readme_names_the_patent_and_the_licence():
-    assert "PCT/IT2023/050058" in page("README.md")
-    assert "PCT/IT2023/050058" in page("docs/estimators/ksnn.md")
+def test_readme_names_the_patent_and_the_licence_and_the_citation_seven_papers():
+    assert all("PCT/IT2023/050058" in page(name) for name in ("README.md", "docs/estimators/ksnn.md"))
     assert "(LICENSE)" in page("README.md")
-
-
-def test_citation_names_seven_papers():
     citation = yaml.safe_load(page("CITATION.cff"))
-    assert citation["cff-version"] == "1.2.0"
-    assert citation["version"] == vehest.__version__
+    assert (citation["cff-version"], citation["version"]) == ("1.2.0", vehest.__version__)
     papers = citation["references"]
     assert len({paper["title"] for paper in papers}) == 7
     assert all(paper["authors"] and paper["year"] for paper in papers)
-    assert {paper["doi"] for paper in papers if "doi" in paper} == {
-        "10.1109/TITS.2023.3303776",
-        "10.1109/ACCESS.2020.3012770",
-        "10.1109/TVT.2024.3389493",
-        "10.3390/s21165409",
-    }
+    known = {"10.1109/TITS.2023.3303776", "10.1109/ACCESS.2020.3012770", "10.1109/TVT.2024.3389493", "10.3390/s21165409"}
+    assert {paper["doi"] for paper in papers if "doi" in paper} == known
 
 
 def test_pages_know_every_name():
@@ -315,7 +278,7 @@ def test_pages_know_every_name():
     for source in source_names():
         own = page(f"docs/sources/{source}.md")
         assert f"(sources/{source}.md)" in data
-        for option in fields(class_of(source).options_type):
+        for option in fields(source_class({"source": source}).options_type):
             assert f"`{option.name}`" in own, f"docs/sources/{source}.md does not explain {option.name}"
     named_checks = {"read", "impossible", "unit", "sign", "kinematics", "nan", "stuck", "saturated", "offset", "dropout", "reverse"}
     for name in set(COMMON_KEYS) | set(TRANSFORMS) | named_checks:
@@ -333,10 +296,6 @@ def test_pages_know_every_name():
 def test_page_of_the_python_interface_has_every_public_name():
     documented = set(re.findall(r"^\.\. auto(?:function|class):: (\w+)$", page("docs/api.md"), re.MULTILINE))
     assert documented == set(vehest.__all__) - {"__version__"}
-
-
-def class_of(source):
-    return importlib.import_module(f"vehest.sources.{source}").SOURCE
 
 
 def test_exit_codes_are_those_of_the_errors():
@@ -367,15 +326,11 @@ def test_stated_limits_of_checks_are_those_of_the_code():
     assert f"correlation below {checks.SIGN_CORRELATION:g} between {low:g} and {high:g} Hz" in text
 
 
-@pytest.mark.parametrize("name", ["gru", "lstm"])
-def test_stated_parameter_counts_of_recurrent_networks(name):
-    counts = [estimator_class(name).from_config({"n_states": states}).n_parameters for states in range(2, 7)]
-    row = re.search(rf"^\| {name.upper()} \| [^|]+ \|(.*)\|$", page("docs/estimators/recurrent.md"), re.MULTILINE)
-    assert row is not None
-    assert [int(cell) for cell in row[1].split("|")] == counts
-
-
-def test_stated_parameter_counts_of_the_ksnn():
+def test_stated_parameter_counts_of_recurrent_networks_and_the_ksnn():
+    for name in ("gru", "lstm"):
+        counts = [estimator_class(name).from_config({"n_states": states}).n_parameters for states in range(2, 7)]
+        row = re.search(rf"^\| {name.upper()} \| [^|]+ \|(.*)\|$", page("docs/estimators/recurrent.md"), re.MULTILINE)
+        assert [int(cell) for cell in row[1].split("|")] == counts
     rows = re.findall(r"^\| (?:non)?linear[^|]*\| `([^`]+)` \|[^|]+\| (\d+)", page("docs/estimators/ksnn.md"), re.MULTILINE)
     assert len(rows) == 4
     for overrides, count in rows:

@@ -36,14 +36,9 @@ def examples(place, tmp_path_factory, monkeypatch):
     """A place to work in where the examples are installed."""
     install_examples(tmp_path_factory.mktemp("examples") / "site", monkeypatch)
     place.add_steered()
-    split = {
-        "name": "steered",
-        "dataset": "steered",
-        "train": [{"recording": "first"}],
-        "validation": [{"recording": "second", "stop": 12}],
-        "tests": {"test": [{"recording": "second", "start": 14, "stop": 20}]},
-    }
-    (place.folder / "conf" / "split" / "steered.yaml").write_text(yaml.safe_dump(split))
+    parts = {"train": [{"recording": "first"}], "validation": [{"recording": "second", "stop": 12}]}
+    tests = {"test": [{"recording": "second", "start": 14, "stop": 20}]}
+    place.change("conf/split/steered.yaml", name="steered", dataset="steered", **parts, tests=tests)
     yield place
     forget_examples()
 
@@ -55,26 +50,19 @@ def drive_for(name, seconds=8.0):
 
 
 def test_each_example_is_a_module_and_a_configuration_of_few_lines_on_the_page():
-    files = {f"{name}.{end}" for name in NAMES for end in ("py", "yaml")} | {"sliding_mode.c.j2"}
-    assert {file.name for file in EXAMPLES.iterdir() if file.is_file()} == files
-    page, lines = (
-        PAGE.read_text(encoding="utf-8"),
-        {file: len((EXAMPLES / file).read_text(encoding="utf-8").splitlines()) for file in files},
-    )
+    lines = {file.name: len(file.read_text(encoding="utf-8").splitlines()) for file in EXAMPLES.iterdir() if file.is_file()}
+    assert set(lines) == {f"{name}.{end}" for name in NAMES for end in ("py", "yaml")} | {"sliding_mode.c.j2"}
     assert lines["sliding_mode.c.j2"] <= 40
+    page = PAGE.read_text(encoding="utf-8")
     for name, most in {"window_transformer": 90, "sliding_mode": 60, "saturating_ekf": 100}.items():
         assert lines[f"{name}.py"] + lines[f"{name}.yaml"] <= most
-        assert f"(examples/{name}.py)" in page
-        assert f"(examples/{name}.yaml)" in page
+        assert all(f"(examples/{name}.{end})" in page for end in ("py", "yaml"))
 
 
-def test_entry_points_of_another_package_are_found_and_only_while_it_is_there(examples):
-    for name in NAMES:
-        assert name in estimator_names()
-        assert estimator_class(name).__module__ == name
-
-
-def test_without_the_package_examples_are_unknown():
+def test_entry_points_of_another_package_are_found_and_only_while_it_is_there(examples, monkeypatch):
+    assert set(NAMES) <= set(estimator_names())
+    assert [estimator_class(name).__module__ for name in NAMES] == list(NAMES)
+    monkeypatch.undo()
     forget_examples()
     with pytest.raises(ConfigurationError, match="estimator 'sliding_mode' is not one of"):
         estimator_class("sliding_mode")
@@ -83,10 +71,8 @@ def test_without_the_package_examples_are_unknown():
 @pytest.mark.parametrize("name", NAMES)
 def test_example_is_trained_evaluated_read_back_and_runs_online_as_in_batch(name, examples):
     split = [f"split={SPLITS[name]}", f"estimator={name}", *QUICK[name], "tracking=none"]
-    code, _, err = examples("train", *split)
-    assert code == 0, err
-    code, _, err = examples("eval", *split)
-    assert code == 0, err
+    examples.done("train", *split)
+    examples.done("eval", *split)
     (evaluation,) = (examples.folder / "outputs" / "evaluate").iterdir()
     table = pd.read_csv(evaluation / "metrics.csv")
     scored = table[(table["test_set"] == "test") & (table["subset"] == "all") & (table["metric"] == "rmse_vy")]
@@ -98,8 +84,7 @@ def test_example_is_trained_evaluated_read_back_and_runs_online_as_in_batch(name
     assert {"bands", "guard", "health"} <= {key for key, value in yaml.safe_load(trust.read_text()).items() if value}
     model, again = vehest.load_model(folder), vehest.load_model(folder)
     drive = drive_for(name)
-    (batch,) = (vehest.estimate(model, drive),)
-    assert np.array_equal(batch["vy"], vehest.estimate(again, drive)["vy"], equal_nan=True)
+    assert np.array_equal(vehest.estimate(model, drive)["vy"], vehest.estimate(again, drive)["vy"], equal_nan=True)
     at_rate = drive if model.settings.rate_hz == drive.rate_hz else planar_drive(8.0, model.settings.rate_hz, seed=7)
     (batch,) = model.estimate([at_rate.without_references()])
     stepper = model.online()
@@ -113,10 +98,7 @@ def test_example_is_trained_evaluated_read_back_and_runs_online_as_in_batch(name
 
 def test_example_that_was_trained_is_not_trained_again_unless_a_setting_changes(examples):
     words = ["train", "split=mine", "estimator=sliding_mode", *QUICK["sliding_mode"], "tracking=none"]
-    assert examples(*words)[0] == 0
-    assert "up to date" in examples(*words)[2]
-    assert len(list((examples.folder / "outputs" / "train").iterdir())) == 1
-    assert examples(*words, "estimator.injection=6.0")[0] == 0
+    assert [examples.told(*words, *more)["skipped"] for more in ((), (), ("estimator.injection=6.0",))] == [False, True, False]
     assert len(list((examples.folder / "outputs" / "train").iterdir())) == 2
 
 
@@ -158,21 +140,18 @@ def test_score_is_the_error_at_the_times_that_the_protocol_scores(examples):
     write_laps()
     lap = vehest.read_recording("lap3.csv")
     model = vehest.train("zero", [], [], ["estimator.rate_hz=100"])
-    metrics = vehest.score(model, [lap])
     scored = lap["vy_ref"][150::5]  # 20 Hz, from 1.5 s on
-    assert metrics["rmse_vy"] == pytest.approx(np.sqrt(np.mean(scored**2)), rel=1e-3)
-    with pytest.raises(DataError, match="has no channel 'vy_ref'"):
-        vehest.score(model, [lap.without_references()])
-    with pytest.raises(DataError, match="no channel 'vy_ref', which the fit of 'static_map' needs"):
-        vehest.train("static_map", [lap.without_references()], [lap])
-    with pytest.raises(ConfigurationError, match="n_hiden"):
-        vehest.train("ksnn", [lap], [lap], ["estimator.n_hiden=2"])
-
-
-def test_python_reads_references_of_a_declared_data_set_on_request(examples):
+    assert vehest.score(model, [lap])["rmse_vy"] == pytest.approx(np.sqrt(np.mean(scored**2)), rel=1e-3)
+    bare = lap.without_references()
+    for act, error, said in (
+        (lambda: vehest.score(model, [bare]), DataError, "has no channel 'vy_ref'"),
+        (lambda: vehest.train("static_map", [bare], [lap]), DataError, "no channel 'vy_ref', which the fit of 'static_map' needs"),
+        (lambda: vehest.train("ksnn", [lap], [lap], ["estimator.n_hiden=2"]), ConfigurationError, "n_hiden"),
+    ):
+        with pytest.raises(error, match=said):
+            act()
     file = examples.folder / "raw" / "one.csv"
-    assert "vy_ref" not in vehest.read_recording(file, ["dataset=mine"])
-    assert "vy_ref" in vehest.read_recording(file, ["dataset=mine"], references=True)
+    assert ["vy_ref" in vehest.read_recording(file, ["dataset=mine"], references=own) for own in (False, True)] == [False, True]
 
 
 def test_python_trains_what_the_command_trains(examples):

@@ -1,25 +1,16 @@
 """The documentation site: it builds without a warning, its links lead somewhere, and it reads well in a browser."""
 
-import importlib.util
 import subprocess
 import sys
 from pathlib import Path
 
 import pytest
+from check_site import broken_links
 
 from chromium import WIDTHS, axe_violations, browser, complaints, opened
 
 ROOT = Path(__file__).resolve().parents[1]
 SHOWN = ("docs/index.html", "docs/api.html", "docs/estimators.html", "docs/estimators/ksnn.html", "results/ferrari_drive/report.html")
-
-
-def broken_links(site):
-    spec = importlib.util.spec_from_file_location("check_site", ROOT / "docs" / "check_site.py")
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module.broken_links(site)
 
 
 @pytest.fixture(scope="module")

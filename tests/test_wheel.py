@@ -27,30 +27,22 @@ def installed(tmp_path_factory):
     return folder / "site"
 
 
-def _vehest(installed, cwd, *arguments):
+def _python(installed, cwd, *words):
     environment = {**os.environ, "PYTHONPATH": str(installed)}
     environment.pop("VEHEST_OUTPUT", None)
-    return subprocess.run([sys.executable, "-m", "vehest", *arguments], cwd=cwd, env=environment, capture_output=True, text=True)
+    result = subprocess.run([sys.executable, *words], cwd=cwd, env=environment, capture_output=True, text=True)
+    assert result.returncode == 0, result.stderr
+    return result
 
 
 def test_wheel_holds_configuration_pipelines_and_templates(installed):
     names = {file.relative_to(installed / "vehest").as_posix() for file in (installed / "vehest").rglob("*") if file.is_file()}
-    shipped = {
-        f"{folder}/{file.relative_to(ROOT / folder).as_posix()}"
-        for folder in ("conf", "pipelines")
-        for file in (ROOT / folder).rglob("*.yaml")
-    }
+    shipped = {file.relative_to(ROOT).as_posix() for folder in ("conf", "pipelines") for file in (ROOT / folder).rglob("*.yaml")}
     assert shipped <= names
-    assert {
-        "report/templates/page.css",
-        "py.typed",
-        "pretrained/model.safetensors",
-        "pretrained/model.yaml",
-        "pretrained/trust.yaml",
-        "pretrained_filter/model.safetensors",
-        "pretrained_filter/model.yaml",
-        "pretrained_filter/trust.yaml",
-    } <= names
+    models = {
+        f"{folder}/{name}" for folder in ("pretrained", "pretrained_filter") for name in ("model.safetensors", "model.yaml", "trust.yaml")
+    }
+    assert {"report/templates/page.css", "py.typed"} | models <= names
     splits = {file.name for file in (ROOT / "src" / "vehest_papers" / "conf" / "split").glob("*.yaml")}
     assert len(splits) > 20
     assert splits == {file.name for file in (installed / "vehest_papers" / "conf" / "split").glob("*.yaml")}
@@ -58,24 +50,19 @@ def test_wheel_holds_configuration_pipelines_and_templates(installed):
 
 
 def test_installed_wheel_runs_a_pipeline_from_an_empty_folder(installed, tmp_path):
-    assert "ksnn" in _vehest(installed, tmp_path, "train", "--help").stdout
-    assert "name: leave_av21" in _vehest(installed, tmp_path, "config", "train", "split=leave_av21").stdout
-    result = _vehest(installed, tmp_path, "config", "train", "--json")
-    assert json.loads(result.stdout)["estimator"]["name"] == "ksnn"
+    def vehest(*words):
+        return _python(installed, tmp_path, "-m", "vehest", *words)
+
+    assert "ksnn" in vehest("train", "--help").stdout
+    assert "name: leave_av21" in vehest("config", "train", "split=leave_av21").stdout
+    assert json.loads(vehest("config", "train", "--json").stdout)["estimator"]["name"] == "ksnn"
     lap = "manoeuvre: {name: laps, course: handling, duration: "
     drives = f"drives=[{{id: drive_1, {lap}20}}}}, {{id: drive_2, {lap}10}}}}, {{id: drive_3, {lap}10}}}}]"
-    result = _vehest(installed, tmp_path, "ingest", "sim_quickstart", f"dataset.{drives}", "--json")
-    assert result.returncode == 0, result.stderr
-    assert json.loads(result.stdout)["recordings"] == ["drive_1", "drive_2", "drive_3"]
-    result = _vehest(installed, tmp_path, "run", "quickstart", "--dry-run")
-    assert result.returncode == 0, result.stderr
-    assert "would" in result.stderr
+    ingested = json.loads(vehest("ingest", "sim_quickstart", f"dataset.{drives}", "--json").stdout)
+    assert ingested["recordings"] == ["drive_1", "drive_2", "drive_3"]
+    assert "would" in vehest("run", "quickstart", "--dry-run").stderr
     assert {path.name for path in tmp_path.iterdir()} == {"outputs"}
     (recording,) = (tmp_path / "outputs" / "ingest").glob("*/drive_3.parquet")
-    result = _vehest(installed, tmp_path, "estimate", str(recording), "--json")
-    assert result.returncode == 0, result.stderr
-    assert json.loads(result.stdout)["model"] == "self_calibrating"
-    code = "import vehest, pathlib; print(pathlib.Path(vehest.__file__).parent)"
-    environment = {**os.environ, "PYTHONPATH": str(installed)}
-    where = subprocess.run([sys.executable, "-c", code], cwd=tmp_path, env=environment, capture_output=True, text=True)
+    assert json.loads(vehest("estimate", str(recording), "--json").stdout)["model"] == "self_calibrating"
+    where = _python(installed, tmp_path, "-c", "import vehest, pathlib; print(pathlib.Path(vehest.__file__).parent)")
     assert where.stdout.strip() == str(installed / "vehest"), "the wheel was tested, not the checkout"

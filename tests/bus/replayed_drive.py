@@ -20,22 +20,15 @@ TOLD = ",".join(f"{name}={MINUS[entry.get('sign', 1)]}{entry['column']}:{entry['
 
 @dataclass(frozen=True)
 class Compared:
-    """Errors of one model on one drive, after both have settled.
-
-    Args:
-        online, offline: root mean square errors of v [m/s] and β [deg] against the reference.
-        at_sample: those online if estimates counted for the instant of their sample, as if filters took no time.
-        samples, lost: of the bus, and those at which a channel was missing.
-        latest_ms, missed: as fast as it goes, the longest step and how many took longer than a cycle.
-    """
+    """Errors of one model on one drive, after both have settled: root mean squares of v [m/s] and β [deg] against the reference."""
 
     online: tuple[float, float]
     offline: tuple[float, float]
-    at_sample: tuple[float, float]
+    at_sample: tuple[float, float]  # those online if estimates counted for the instant of their sample, as if filters took no time
     samples: int
-    lost: int
-    latest_ms: float
-    missed: int
+    lost: int  # samples at which a channel was missing
+    latest_ms: float  # the longest step, as fast as it goes
+    missed: int  # steps that took longer than a cycle
 
     @property
     def ratios(self):
@@ -49,14 +42,7 @@ def told_for(channels):
 
 
 def compare(model, drive, folder, output=None):
-    """Estimate a drive offline, and online from the frames of a bus with jitter and lost frames.
-
-    Args:
-        model: as ``vehest replay`` takes it.
-        drive: with references.
-        folder: for log and estimates.
-        output: root in which models are.
-    """
+    """Estimate a drive with references offline, and online from the frames of a bus with jitter and lost frames."""
     written = write_log(drive, folder, jitter=JITTER, lost=LOST, seed=1)
     fitted = load_model(model, output)
     offline = estimate(fitted, drive.without_references())

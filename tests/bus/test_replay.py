@@ -14,7 +14,6 @@ from vehest.bus.mapping import from_dataset, from_names
 from vehest.bus.view import Figures, View, rows_of
 from vehest.data.errors import ConfigurationError, DataError, MissingError, VehestError
 from vehest.run.replay import replay_log
-from vehest.trust.contract import GuardedStepper
 
 can = pytest.importorskip("can", reason="python-can is not installed: pip install 'vehest[bus]'")
 cantools = pytest.importorskip("cantools", reason="cantools is not installed: pip install 'vehest[bus]'")
@@ -50,7 +49,7 @@ def by_cantools(written):
     return found
 
 
-def test_estimates_are_those_of_the_model_stepped_on_the_decoded_values(tmp_path):
+def test_estimates_are_those_of_the_model_stepped_on_the_decoded_values_and_hold_for_their_sample_less_the_filters_delay(tmp_path):
     written = write_log(drive(), tmp_path, jitter=0.001)
     figures = replayed(written, out=tmp_path / "out.csv")
     table = pd.read_csv(tmp_path / "out.csv")
@@ -65,25 +64,18 @@ def test_estimates_are_those_of_the_model_stepped_on_the_decoded_values(tmp_path
     assert figures["samples_lost"] == 0
     assert figures["estimates"] == len(table) == len(expected)
     np.testing.assert_allclose(table[["vy", "sideslip", "health"]], np.array(expected), rtol=1e-7, atol=1e-9)
-
-
-def test_estimates_hold_for_their_sample_less_the_delay_of_the_filter_and_plus_the_horizon(tmp_path):
-    written = write_log(drive(), tmp_path)
-    replayed(written, out=tmp_path / "out.csv")
-    table = pd.read_csv(tmp_path / "out.csv")
-    stepper = vehest.online(vehest.load_model(), RATE)
-    ahead = stepper.horizon_steps / 20.0 - stepper.delay
+    replayed(write_log(drive(), tmp_path), out=tmp_path / "out.csv")
+    table, ahead = pd.read_csv(tmp_path / "out.csv"), stepper.horizon_steps / 20.0 - stepper.delay
     # frames come at whole cycles, 0 and 0.4 ms behind them; samples in the middle of the rest
     np.testing.assert_allclose(table["sampled"] % 0.01, 0.0052, atol=2e-5)
-    held = table["sampled"] + ahead - 0.0050
-    assert np.abs(table["time"] - held).max() < 3e-4
+    assert np.abs(table["time"] - (table["sampled"] + ahead - 0.0050)).max() < 3e-4
 
 
 def test_lost_frames_are_missing_samples(tmp_path):
     written = write_log(drive(30.0), tmp_path, jitter=0.001, lost=0.02)
-    figures = replayed(written)
-    assert figures["missing"] == {"vx": len(written.lost["Speed"]), **dict.fromkeys(("yaw_rate", "ay", "ax"), len(written.lost["IMU"]))}
-    assert figures["samples_lost"] == len(set(written.lost["IMU"]) | set(written.lost["Speed"]))
+    figures, lost = replayed(written), written.lost
+    assert figures["missing"] == {"vx": len(lost["Speed"]), **dict.fromkeys(("yaw_rate", "ay", "ax"), len(lost["IMU"]))}
+    assert figures["samples_lost"] == len({*lost["IMU"], *lost["Speed"]})
 
 
 def test_frames_of_estimates_say_what_the_table_says(tmp_path):
@@ -122,25 +114,18 @@ def test_what_was_written_before_a_stop_is_kept(tmp_path, speed):
     assert len(pd.read_csv(tmp_path / "out.csv")) == figures["estimates"]
 
 
-def test_signals_called_like_channels_need_no_map(tmp_path):
+def test_signals_called_like_channels_need_no_map_and_a_data_set_says_the_same_as_words_do(tmp_path):
     text = 'VERSION ""\n\nBO_ 5 A: 8 X\n SG_ vx : 0|16@1+ (0.01,0) [0|0] "m/s" X\n SG_ ay : 16|16@1- (0.01,0) [0|0] "g" X\n'
     (tmp_path / "own.dbc").write_text(text)
-    found = from_names(tmp_path / "own.dbc", ["vx", "ay"])
-    assert found.factors == {"vx": 1.0, "ay": pytest.approx(9.80665)}
+    assert from_names(tmp_path / "own.dbc", ["vx", "ay"]).factors == {"vx": 1.0, "ay": pytest.approx(9.80665)}
     with pytest.raises(ConfigurationError, match="the model reads channel 'ax'"):
         from_names(tmp_path / "own.dbc", ["vx", "ay", "ax"])
     assert set(from_names(tmp_path / "own.dbc", ["vx", "ay", "ax"], optional=["ax"]).wanted) == {"vx", "ay"}
-
-
-def test_a_data_set_says_the_same_as_words_do(tmp_path):
     written = write_log(drive(1.0), tmp_path)
     dataset = {"name": "mine", "source": "can", "dbc": str(written.dbc), "path": str(tmp_path), "rate_hz": 100, "channels": SIGNALS}
-    declared = from_dataset(dataset, CHANNELS)
-    named = from_names(written.dbc, CHANNELS, words=told_for(CHANNELS).split(","))
-    assert declared.factors == named.factors
-    assert {name: (one.message.name, one.signal) for name, one in declared.wanted.items()} == {
-        name: (one.message.name, one.signal) for name, one in named.wanted.items()
-    }
+    maps = from_dataset(dataset, CHANNELS), from_names(written.dbc, CHANNELS, words=told_for(CHANNELS).split(","))
+    declared, named = ((own.factors, {name: (one.message.name, one.signal) for name, one in own.wanted.items()}) for own in maps)
+    assert declared == named
 
 
 @pytest.mark.parametrize(
@@ -173,16 +158,12 @@ def test_words_that_make_no_sense_are_one_line(tmp_path, words, said):
     assert isinstance(caught.value, ConfigurationError | DataError | MissingError)
 
 
-def test_the_log_itself_is_never_written_over(tmp_path):
+def test_a_damaged_log_ends_a_replay_in_one_line_in_real_time_too_and_is_never_written_over(tmp_path):
     written = write_log(drive(2.0), tmp_path)
     before = written.log.read_bytes()
     with pytest.raises(ConfigurationError, match="is an input"):
         replayed(written, out=written.log)
     assert written.log.read_bytes() == before
-
-
-def test_a_damaged_log_ends_a_replay_in_one_line_in_real_time_too(tmp_path):
-    written = write_log(drive(2.0), tmp_path)
     lines = written.log.read_text().splitlines()
     written.log.write_text("\n".join([*lines[:300], lines[300].replace("Rx   d 8", "Rx   d zz")]))
     for speed in ("max", "10"):
@@ -196,13 +177,9 @@ FIGURES = Figures(frames_sent=30, frames_received=20, samples=10, samples_lost=1
 def test_the_view_shows_estimate_band_health_and_reason_in_words():
     values = {"vy": 0.5, "sideslip": math.radians(-1.25), "band_vy": 0.1, "band_sideslip": math.radians(0.5)}
     rows = dict(rows_of(FIGURES, {**values, "health": 2.0, "health_reason": 3e5}, 10.1, 20.0))
-    assert rows["time"] == "10.1 s"
-    assert rows["v"] == "+0.500 ± 0.100 m/s"
-    assert rows["β"] == "-1.25 ± 0.50 °"
-    assert rows["health"] == "invalid: there is no estimate"
-    assert rows["rate"] == "20.0 estimates/s"
-    assert rows["samples"] == "10, 1 lost"
-    assert dict(rows_of(Figures(), {}, 0.0, 0.0))["health"] == "-"
+    assert (rows["time"], rows["v"], rows["β"]) == ("10.1 s", "+0.500 ± 0.100 m/s", "-1.25 ± 0.50 °")
+    assert (rows["health"], rows["rate"]) == ("invalid: there is no estimate", "20.0 estimates/s")
+    assert (rows["samples"], dict(rows_of(Figures(), {}, 0.0, 0.0))["health"]) == ("10, 1 lost", "-")
 
 
 class Terminal(io.StringIO):
@@ -220,13 +197,6 @@ def test_a_terminal_gets_a_table_and_any_other_stream_plain_lines():
     assert plain.getvalue().count("\n") == 1
     assert "\x1b" not in plain.getvalue()
     assert "+0.500 m/s" in terminal.getvalue()
-
-
-def test_steppers_say_all_that_the_view_and_the_frames_need():
-    stepper = GuardedStepper(vehest.load_model(), None, RATE)
-    for k in range(300):
-        said = stepper.step({"vx": 20.0, "yaw_rate": 0.1 * math.sin(0.05 * k), "ay": 2.0 * math.sin(0.05 * k), "ax": 0.0})
-    assert {"vy", "sideslip", "health", "health_reason"} <= set(said)
 
 
 def test_a_replay_of_the_real_ferrari_errs_as_the_model_does_offline(data_root, tmp_path):

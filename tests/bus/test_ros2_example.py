@@ -1,8 +1,9 @@
 """The ROS 2 node of the documentation, without ROS: messages of a bag go through it and come back as they were."""
 
-import importlib.util
 import math
+import runpy
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -22,12 +23,7 @@ START = 1_700_000_000  # s
 
 @pytest.fixture(scope="module")
 def node():
-    spec = importlib.util.spec_from_file_location("sideslip_node", EXAMPLE / "sideslip_node.py")
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
+    return SimpleNamespace(**runpy.run_path(str(EXAMPLE / "sideslip_node.py"), run_name="sideslip_node"))
 
 
 @pytest.fixture(scope="module")

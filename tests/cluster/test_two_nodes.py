@@ -59,6 +59,10 @@ def alone(folder):
 @pytest.fixture(scope="session")
 def cluster(folder):
     """One that outlives a test, since nothing happens to its nodes."""
+    yield from _nodes()
+
+
+def _nodes():
     nodes = TwoNodes()
     yield nodes
     nodes.shut_down()
@@ -67,9 +71,7 @@ def cluster(folder):
 @pytest.fixture
 def mortal():
     """One of which a node will be lost."""
-    nodes = TwoNodes()
-    yield nodes
-    nodes.shut_down()
+    yield from _nodes()
 
 
 def swept(cluster, folder, output, *words, alone=False):
@@ -81,9 +83,7 @@ def test_a_sweep_of_forty_trainings_has_the_bits_of_the_local_launcher(cluster, 
     driver = swept(cluster, folder, output, *FORTY)
     assert driver.ended() == 0, driver.said
     assert "2 machines, 2 cores" in driver.said
-    assert len(metrics(output)) == 40
-    assert metrics(output) == metrics(alone["forty"])
-    assert weights(output) == weights(alone["forty"])
+    assert (len(metrics(output)), metrics(output), weights(output)) == (40, metrics(alone["forty"]), weights(alone["forty"]))
     assert sweep_of(output).equals(sweep_of(alone["forty"]))
     before = manifests(output)
     assert len(before) == 40
@@ -99,9 +99,7 @@ def test_the_quickstart_has_the_bits_of_the_local_launcher(cluster, tmp_path):
     output = with_recordings(alone.output, tmp_path / "out")
     driver = Driver(tmp_path, output, *words, "--launcher", "ray", "--address", cluster.address)
     assert driver.ended() == 0, driver.said
-    assert len(metrics(output)) == 13
-    assert metrics(output) == metrics(alone.output)
-    assert weights(output) == weights(alone.output)
+    assert (len(metrics(output)), metrics(output), weights(output)) == (13, metrics(alone.output), weights(alone.output))
     (page,), (page_alone,) = (list(root.glob("report/*/metrics.csv")) for root in (output, alone.output))
     assert page.read_bytes() == page_alone.read_bytes()
 
@@ -113,8 +111,7 @@ def test_a_killed_worker_is_replaced_and_the_bits_are_the_same(cluster, folder, 
     before = manifests(output)
     os.kill(lost["pid"], signal.SIGKILL)
     assert driver.ended() == 0, driver.said
-    assert metrics(output) == metrics(alone["longer"])
-    assert weights(output) == weights(alone["longer"])
+    assert (metrics(output), weights(output)) == (metrics(alone["longer"]), weights(alone["longer"]))
     assert "again   ray        A worker died" in driver.said
     assert before.items() <= manifests(output).items(), "nothing that had finished was trained again"
     assert not list(output.glob("checkpoints/*"))
@@ -127,8 +124,7 @@ def test_a_lost_node_takes_nothing_that_was_finished(mortal, folder, alone, tmp_
     before = manifests(output)
     mortal.lose(mortal.nodes[1])
     assert driver.ended() == 0, driver.said
-    assert metrics(output) == metrics(alone["longer"])
-    assert weights(output) == weights(alone["longer"])
+    assert (metrics(output), weights(output)) == (metrics(alone["longer"]), weights(alone["longer"]))
     assert before.items() <= manifests(output).items()
 
 
@@ -143,8 +139,7 @@ def test_ctrl_c_loses_nothing_and_the_next_call_goes_on(cluster, folder, alone, 
     before = {name: text for name, text in manifests(output).items() if b'"status": "complete"' in text}
     again = swept(cluster, folder, output, *LONGER)
     assert again.ended() == 0, again.said
-    assert metrics(output) == metrics(alone["longer"])
-    assert weights(output) == weights(alone["longer"])
+    assert (metrics(output), weights(output)) == (metrics(alone["longer"]), weights(alone["longer"]))
     assert before.items() <= manifests(output).items()
 
 
@@ -156,8 +151,7 @@ def test_nodes_that_do_not_share_the_output_root_get_copies_and_send_artefacts_b
     mortal.lose(mortal.nodes[1])
     assert driver.ended() == 0, driver.said
     assert "does not share the output root" in driver.said
-    assert metrics(output) == metrics(alone["longer"])
-    assert weights(output) == weights(alone["longer"])
+    assert (metrics(output), weights(output)) == (metrics(alone["longer"]), weights(alone["longer"]))
 
 
 def test_a_group_that_ends_every_worker_fails_alone_and_the_others_are_kept(cluster, folder, alone, tmp_path):
@@ -209,8 +203,7 @@ def test_two_hundred_trainings_survive_twenty_kills_at_random_moments(cluster, f
         deaths[entry["name"].partition("-seed")[0]] += 1
         os.kill(entry["pid"], signal.SIGKILL)
     assert driver.ended() == 0, driver.said
-    assert metrics(output) == metrics(alone.output)
-    assert weights(output) == weights(alone.output)
+    assert (metrics(output), weights(output)) == (metrics(alone.output), weights(alone.output))
 
 
 def victim(output, moment, killed, deaths, draw):

@@ -36,7 +36,8 @@ class TwoNodes:
     def lose(self, node):
         """End a node's daemons by SIGKILL, as a power cut does; its workers end when they notice."""
         for pid in _children(_raylet(node)):
-            _kill(pid)
+            with suppress(ProcessLookupError):
+                os.kill(pid, signal.SIGKILL)
         self._cluster.remove_node(node, allow_graceful=False)
 
     def shut_down(self):
@@ -47,22 +48,13 @@ def _raylet(node):
     return int(node.all_processes["raylet"][0].process.pid)
 
 
-def _children(pid):
+def _children(parent):
     found = []
-    for folder in Path("/proc").iterdir():
-        if folder.name.isdigit():
-            try:
-                parent = int((folder / "stat").read_text().rpartition(")")[2].split()[1])
-            except OSError:
-                continue
-            if parent == pid:
-                found.append(int(folder.name))
+    for file in Path("/proc").glob("[0-9]*/stat"):
+        with suppress(OSError):
+            if int(file.read_text().rpartition(")")[2].split()[1]) == parent:
+                found.append(int(file.parent.name))
     return found
-
-
-def _kill(pid):
-    with suppress(ProcessLookupError):
-        os.kill(pid, signal.SIGKILL)
 
 
 class Driver:

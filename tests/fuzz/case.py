@@ -24,42 +24,25 @@ _DEPTH = ("up", "up", "up", "place")
 
 @dataclass(frozen=True)
 class Command:
-    """A command line to try.
-
-    Args:
-        argv: words after ``vehest``, as the operating system would hand them over (bytes where they are no UTF-8).
-        targets: files and folders, beside the output root, that the command may write, relative to the place.
-        environment: variables to set.
-        stdout: where standard output goes to instead of a file, for example ``/dev/full``.
-        unprivileged: whether it runs as a user without rights, so that permissions matter.
-    """
+    """A command line to try: words after ``vehest``, and files and folders, beside the output root, that it may write."""
 
     argv: tuple[str | bytes, ...]
     targets: tuple[str, ...] = ("out.csv",)
     environment: Mapping[str, str] = field(default_factory=dict)
-    stdout: str | None = None
-    unprivileged: bool = False
+    stdout: str | None = None  # where it goes to instead of a file
+    unprivileged: bool = False  # runs as a user without rights, so that permissions matter
 
 
 @dataclass(frozen=True)
 class Case:
-    """One input to make.
-
-    Args:
-        folder: the case's own; nothing above it may be touched.
-        templates: honest files made once, by the name of their template; to be copied.
-        rng: of everything that is drawn.
-        honest: whether the input is to be left as it should be, so that the command must succeed.
-        visit: how often its generator has been called before, to go through a list of ideas.
-        seconds: that its command may take.
-    """
+    """One input to make, in a folder of its own; nothing above it may be touched."""
 
     folder: Path
-    templates: Path
-    rng: random.Random
-    honest: bool
-    visit: int
-    seconds: float = 20.0
+    templates: Path  # honest files made once, by the name of their template; to be copied
+    rng: random.Random  # of everything that is drawn
+    honest: bool  # the input is left as it should be, so that the command must succeed
+    visit: int  # how often its generator has been called before, to go through a list of ideas
+    seconds: float = 20.0  # that its command may take
 
     @property
     def place(self):
@@ -98,21 +81,13 @@ Build = Callable[[Case], Command]
 
 @dataclass(frozen=True)
 class Generator:
-    """A way to make inputs.
-
-    Args:
-        family: module it stands in.
-        name: of the function.
-        build: writes the files of a case and returns the command.
-        needs: names of templates.
-        weight: how often it is taken in a round.
-    """
+    """A way to make inputs: a function of a family's module that writes the files of a case and returns the command."""
 
     family: str
     name: str
     build: Build
-    needs: tuple[str, ...]
-    weight: int
+    needs: tuple[str, ...]  # names of templates
+    weight: int  # how often it is taken in a round
 
 
 GENERATORS = []

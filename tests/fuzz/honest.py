@@ -2,7 +2,6 @@
 
 import encodings
 import importlib
-import os
 import pkgutil
 import sys
 from contextlib import suppress
@@ -10,43 +9,22 @@ from pathlib import Path
 
 import numpy as np
 import pandas as pd
-import yaml
+import pytest
 
+import place
 from conftest import planar_drive
 from fuzz.case import template
-from place import DATASET, STEERED, write_csv
-from single_track_drive import linear_drive
+from place import DATASET, SPLIT, write_drives, write_steered, write_yaml
 from vehest.cli import main
 
 SECONDS, RATE_HZ = 30.0, 50.0
-SPLIT = {
-    "name": "mine",
-    "dataset": "mine",
-    "train": [{"recording": "one"}],
-    "validation": [{"recording": "two"}],
-    "tests": {"test": [{"recording": "three"}]},
-}
-PIPELINE = {
-    "study": "small",
-    "title": "A small study",
-    "report": "drive",
-    "split": "mine",
-    "sweeps": [
-        ["estimator=luenberger", "estimator.rate_hz=20", "training.grid=1", "training.max_evaluations=5"],
-        ["estimator=ksnn", "estimator.n_hidden=0", "training.max_epochs=1"],
-    ],
-    "evaluation": {"rate_hz": 20},
-}
+SWEEPS = [
+    ["estimator=luenberger", "estimator.rate_hz=20", "training.grid=1", "training.max_evaluations=5"],
+    ["estimator=ksnn", "estimator.n_hidden=0", "training.max_epochs=1"],
+]
+PIPELINE = place.PIPELINE | {"sweeps": SWEEPS, "evaluation": {"rate_hz": 20}}
 KSNN = ("estimator=ksnn", "estimator.n_hidden=0", "split=mine", "training.max_epochs=1", "tracking=none")
-LUENBERGER = (
-    "estimator=luenberger",
-    "estimator.rate_hz=20",
-    "training.grid=1",
-    "training.max_evaluations=5",
-    "split=mine",
-    "tracking=none",
-)
-STEERED_SPLIT = SPLIT | {"name": "steered", "dataset": "steered"}
+LUENBERGER = (*SWEEPS[0], "split=mine", "tracking=none")
 KALMAN = ("estimator=kalman", "estimator.rate_hz=50", "split=steered", "tracking=none")
 
 
@@ -58,35 +36,22 @@ def lap(seed=9, seconds=SECONDS, rate_hz=RATE_HZ):
 
 def run(*words):
     """A command of vehest, which must succeed, in the current folder."""
-    former, code = (sys.argv, dict(os.environ)), 0
-    os.environ |= {"VEHEST_DATA": str(Path.cwd() / "raw")}
-    for name in ("VEHEST_OUTPUT", "MLFLOW_TRACKING_URI"):
-        os.environ.pop(name, None)
-    sys.argv = ["vehest", *words]
-    try:
-        main()
-    except SystemExit as leave:
-        code = int(leave.code or 0)
-    finally:
-        sys.argv = former[0]
-        os.environ.clear()
-        os.environ.update(former[1])
-    if code:
-        raise RuntimeError(f"'vehest {' '.join(words)}' leaves with {code}")
-
-
-def write_yaml(path, content):
-    """An honest YAML file."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_text(yaml.safe_dump(content, allow_unicode=True, sort_keys=False), encoding="utf-8")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("VEHEST_DATA", str(Path.cwd() / "raw"))
+        for name in ("VEHEST_OUTPUT", "MLFLOW_TRACKING_URI"):
+            patch.delenv(name, raising=False)
+        patch.setattr(sys, "argv", ["vehest", *words])
+        try:
+            main()
+        except SystemExit as leave:
+            if leave.code:
+                raise RuntimeError(f"'vehest {' '.join(words)}' leaves with {leave.code}") from leave
 
 
 @template
 def drives(folder):
     """Three tables of a car, with its data set, split and pipeline; a lap with columns called like channels."""
-    (folder / "raw").mkdir()
-    for seed, name in enumerate(("one", "two", "three"), start=1):
-        write_csv(folder / "raw" / f"{name}.csv", seed, SECONDS)
+    write_drives(folder)
     lap().to_csv(folder / "lap.csv", index=False)
     write_yaml(folder / "conf" / "dataset" / "mine.yaml", DATASET)
     write_yaml(folder / "conf" / "split" / "mine.yaml", SPLIT)
@@ -96,15 +61,8 @@ def drives(folder):
 @template
 def steered(folder):
     """Three tables with a steering angle, for filters that know a car; and the Kalman filter of their split."""
-    (folder / "raw" / "steered").mkdir(parents=True)
-    for seed, name in enumerate(("one", "two", "three"), start=1):
-        drive = linear_drive(SECONDS, seed=seed)[0]
-        content = pd.DataFrame({"t": drive.time, **{channel: drive[channel] for channel in STEERED}})
-        content.to_csv(folder / "raw" / "steered" / f"{name}.csv", index=False)
-    channels = {name: {"column": name, "unit": unit} for name, unit in STEERED.items()}
-    dataset = DATASET | {"name": "steered", "path": "${root}/steered", "time": {"column": "t", "unit": "s"}, "channels": channels}
-    write_yaml(folder / "conf" / "dataset" / "steered.yaml", dataset)
-    write_yaml(folder / "conf" / "split" / "steered.yaml", STEERED_SPLIT)
+    write_steered(folder, {"one": 1, "two": 2, "three": 3})
+    write_yaml(folder / "conf" / "split" / "steered.yaml", SPLIT | {"name": "steered", "dataset": "steered"})
 
 
 @template
@@ -130,30 +88,11 @@ def warm_up(folder):
     run("data", "channels")
 
 
-def models_in(case):
-    """Model folders of the copied study."""
-    return sorted((case.place / "outputs" / "train").iterdir())
-
-
 # Libraries that are imported piece by piece while they work, and what they import then.
 PIECES = (
-    "asammdf",
-    "asammdf.blocks",
-    "rosbags.rosbag2",
-    "rosbags.typesys",
-    "mlflow",
-    "optuna",
-    "can.interfaces.virtual",
-    "can.io.asc",
-    "can.io.blf",
-    "can.io.canutils",
-    "cantools.database",
-    "torch",
-    "pooch",
-    "requests",
-    "netrc",
-    "pydantic._internal._serializers",
-)
+    "asammdf", "asammdf.blocks", "rosbags.rosbag2", "rosbags.typesys", "mlflow", "optuna", "can.interfaces.virtual", "can.io.asc",
+    "can.io.blf", "can.io.canutils", "cantools.database", "torch", "pooch", "requests", "netrc", "pydantic._internal._serializers",
+)  # fmt: skip
 PACKAGES = ("typer", "rich")
 
 

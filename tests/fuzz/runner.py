@@ -49,15 +49,7 @@ class Row:
 
 
 class Fuzzer:
-    """Everything that is imported and made once.
-
-    Args:
-        folder: to work in; templates and cases go there.
-        seed: of all inputs.
-        families: names of those to use; all but the planted ones if there are none.
-        keep: whether the cases' folders stay.
-        seconds: that a command may take.
-    """
+    """Everything that is imported and made once; all families but the planted ones, if none is named."""
 
     def __init__(self, folder, seed, families=(), *, keep=False, seconds=20.0):
         self.folder, self.seed, self.keep, self.seconds = folder.resolve(), seed, keep, seconds
@@ -148,7 +140,8 @@ class Fuzzer:
 def _watch(case, command):
     """Run a command in a forked child and see what it does."""
     if command.unprivileged and os.getuid() == 0:
-        _hand_over(case.folder)
+        for path in (case.folder, *case.folder.rglob("*")):
+            os.chown(path, 65534, 65534, follow_symlinks=False)
     pipe = case.folder / "log" / "reader"
     os.mkfifo(pipe)
     pipe.chmod(0o666)
@@ -159,7 +152,7 @@ def _watch(case, command):
         become(case, command)
     process, events = os.pidfd_open(child), os.open(pipe, os.O_RDWR | os.O_NONBLOCK)
     readers = _Readers(child)
-    while not _ends(process, POLL_SECONDS):
+    while not select.select([process], [], [], POLL_SECONDS)[0]:
         readers.look()
         if _seconds(child, started) - readers.waited > case.seconds or time.monotonic() - started > MOST_WALL_SECONDS:
             os.killpg(child, signal.SIGKILL)
@@ -190,25 +183,17 @@ def _watch(case, command):
 
 
 class _Readers:
-    """What a command and the reading processes that it starts take, as far as repeated looks at them tell.
-
-    Args:
-        command: number of the command's process.
-
-    Attributes:
-        command_kb: most memory of the command [kB].
-        peaks_kb: reading process -> most memory [kB].
-        waited: seconds that reading processes waited for a core.
-    """
+    """What a command and the reading processes that it starts take, as far as repeated looks at them tell."""
 
     def __init__(self, command):
         self._command = command
-        self.command_kb = 0
-        self.peaks_kb: dict[str, int] = {}
+        self.command_kb = 0  # most memory of the command
+        self.peaks_kb: dict[str, int] = {}  # of each reading process
         self._waits: dict[str, float] = {}
 
     @property
     def waited(self):
+        """Seconds that reading processes waited for a core."""
         return sum(self._waits.values())
 
     def look(self):
@@ -227,13 +212,6 @@ def _peak_kb(process):
         return next(int(line.split()[1]) for line in stream if line.startswith("VmHWM:"))
 
 
-def _ends(process, seconds):
-    """Whether a process ends within some seconds."""
-    poll = select.poll()
-    poll.register(process, select.POLLIN)
-    return bool(poll.poll(seconds * 1000))
-
-
 def _seconds(child, started):
     """Wall clock since the start, less what the child has waited for a core on a machine that has others to serve."""
     try:
@@ -241,11 +219,6 @@ def _seconds(child, started):
     except (OSError, IndexError):
         waited = 0.0
     return time.monotonic() - started - waited
-
-
-def _hand_over(folder):
-    for path in (folder, *folder.rglob("*")):
-        os.chown(path, 65534, 65534, follow_symlinks=False)
 
 
 def _remove(folder):

@@ -31,34 +31,20 @@ EXIT_CODES = frozenset({0, 2, 3, 4, 5, 130, 141, 143})
 PROGRESS = ("done ", "skipped ", "would ", "once ", "failed ", "stopped ", "warning")
 _CONTROL = re.compile("[\x00-\x08\x0b-\x1f\x7f\x80-\x9f]")
 
-Snapshot = dict[str, tuple[object, ...]]
-
 
 @dataclass(frozen=True)
 class Outcome:
-    """How a child ended.
+    """How a child ended."""
 
-    Args:
-        exit_code: of the process; negative for a signal.
-        seconds: of wall clock, less those spent waiting for a core.
-        cpu_seconds: of processor time.
-        peak_mb: most memory above that of the imports.
-        stdout: as it was written.
-        stderr: as it was written.
-        events: of the audit hook: verdict and what happened.
-        changed: paths in the case's folder that are new, gone or different.
-        stack: where it was when its time was up.
-    """
-
-    exit_code: int
-    seconds: float
+    exit_code: int  # negative for a signal
+    seconds: float  # of wall clock, less those spent waiting for a core
     cpu_seconds: float
-    peak_mb: float
+    peak_mb: float  # most memory above that of the imports
     stdout: str
     stderr: str
-    events: tuple[tuple[str, str], ...]
-    changed: tuple[str, ...]
-    stack: str
+    events: tuple[tuple[str, str], ...]  # of the audit hook: verdict and what happened
+    changed: tuple[str, ...]  # paths in the case's folder that are new, gone or different
+    stack: str  # where it was when its time was up
 
 
 def judge(case, command, outcome):

@@ -16,25 +16,11 @@ ADDRESS_SPACE = 4 * 2**30
 FILE_SIZE = 2**30
 
 # What runs, and what asks for code to be run. Each is noted; a program that would start is stopped.
-PROGRAMS = frozenset(
-    {"os.system", "os.exec", "os.posix_spawn", "os.spawn", "os.startfile", "os.fork", "os.forkpty", "pty.spawn", "subprocess.Popen"}
-)
+PROGRAMS = {"os.system", "os.exec", "os.posix_spawn", "os.spawn", "os.startfile", "os.fork", "os.forkpty", "pty.spawn", "subprocess.Popen"}
 CODE = frozenset({"exec", "compile", "import", "ctypes.dlopen", "pickle.find_class", "marshal.loads"})
 # Position of the path that each of these writes to.
-WRITES = {
-    "os.mkdir": (0,),
-    "os.rename": (0, 1),
-    "os.remove": (0,),
-    "os.rmdir": (0,),
-    "os.link": (1,),
-    "os.symlink": (1,),
-    "os.truncate": (0,),
-    "os.chmod": (0,),
-    "os.chown": (0,),
-    "os.utime": (0,),
-    "os.mkfifo": (0,),
-    "shutil.rmtree": (0,),
-}
+WRITES = {f"os.{name}": (0,) for name in ("mkdir", "remove", "rmdir", "truncate", "chmod", "chown", "utime", "mkfifo")}
+WRITES |= {"shutil.rmtree": (0,), "os.rename": (0, 1), "os.link": (1,), "os.symlink": (1,)}
 DEVICES = ("/dev/null", "/dev/full", "/dev/zero", "/dev/tty", "/dev/shm/")
 NO_PLACES = ("/dev/null/", "/dev/full/", "/proc/")  # where nothing can be made, though a user may ask for it
 
@@ -42,18 +28,8 @@ NO_PLACES = ("/dev/null/", "/dev/full/", "/proc/")  # where nothing can be made,
 # own functions, which inspect and typing evaluate for Typer; SQLAlchemy, which makes constructors of its own classes where MLflow migrates
 # a store; and rosbags, which makes dataclasses and readers of message layouts whose names its grammar has let through. Whatever a payload
 # would do is noticed as well: the file that it makes, or the program.
-MAKERS = (
-    "dataclasses",
-    "collections",
-    "inspect",
-    "typing",
-    "numba.",
-    "llvmlite.",
-    "rosbags.typesys.store",
-    "rosbags.serde.",
-    "sqlalchemy.util.langhelpers",
-    "ast",
-)
+MAKERS = ("dataclasses", "collections", "inspect", "typing", "numba.", "llvmlite.", "ast")
+MAKERS += ("rosbags.typesys.store", "rosbags.serde.", "sqlalchemy.util.langhelpers")
 PAGES = str(Path(vehest.__file__).parent / "report" / "templates")
 READER = "vehest.sources.limited"
 """The module that a command may run in a process of its own, to read one file."""
@@ -61,12 +37,9 @@ IMPORTERS = ("importlib._bootstrap", "importlib._bootstrap_external", "_frozen_i
 
 
 class Watch:
-    """Notes what a command does that no input should make it do.
+    """Notes, a line of JSON each, what a command does that no input should make it do: it may write inside the case's folder alone.
 
-    Args:
-        inside: the case's folder, the only one that may be written to.
-        report: file descriptor that each event is written to, a line of JSON.
-        reads: whether this is a reading process, which imports what it needs and runs nothing but code of installed files.
+    A reading process imports what it needs and runs nothing but code of installed files.
     """
 
     def __init__(self, inside, report, *, reads=False):
@@ -254,13 +227,8 @@ def _prepare(case, command):
         os.setuid(65534)
     os.write(report, (json.dumps(["rss", _status("VmRSS")]) + "\n").encode())
     size = _status("VmSize") * 1024 + ADDRESS_SPACE
-    for limit, value in (
-        (resource.RLIMIT_AS, size),
-        (resource.RLIMIT_CPU, 90),
-        (resource.RLIMIT_FSIZE, FILE_SIZE),
-        (resource.RLIMIT_CORE, 0),
-    ):
-        resource.setrlimit(limit, (value, value))
+    for limit, value in {"AS": size, "CPU": 90, "FSIZE": FILE_SIZE, "CORE": 0}.items():
+        resource.setrlimit(getattr(resource, f"RLIMIT_{limit}"), (value, value))
     return report
 
 

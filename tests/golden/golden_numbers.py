@@ -23,7 +23,7 @@ import yaml
 
 from conftest import planar_drive
 from every_estimator import drive_for, fitted
-from place import DATASET, write_csv
+from place import DATASET, Place, write_csv
 from vehest.estimators.registry import estimator_class, estimator_names
 from vehest.run import calibrate, downsample, evaluate, evaluate_faults
 from vehest.sources.base import open_source, source_class
@@ -41,17 +41,11 @@ Arrays = dict[str, np.ndarray[Any, Any]]
 
 @dataclass(frozen=True)
 class Subject:
-    """Something with versions whose numbers are recorded.
+    """Something with versions whose numbers are recorded."""
 
-    Args:
-        versions: what to raise when numbers move, for example ``Ksnn.version``, and its value.
-        tolerance: of values elsewhere than on the machine that recorded.
-        numbers: makes them: ``weights`` and ``estimates`` of an estimator, else one part.
-    """
-
-    versions: Mapping[str, str]
-    tolerance: float
-    numbers: Callable[[], Mapping[str, Arrays]]
+    versions: Mapping[str, str]  # what to raise when numbers move, for example ``Ksnn.version``, and its value
+    tolerance: float  # of values elsewhere than on the machine that recorded
+    numbers: Callable[[], Mapping[str, Arrays]]  # makes them: ``weights`` and ``estimates`` of an estimator, else one part
 
     def record(self):
         """What digests.json holds of it."""
@@ -70,7 +64,7 @@ def subjects():
         tolerance = SIMULATED if name == "simulated" else FIXED
         told = source_class({"source": name})
         found[f"source {name}"] = Subject({f"{told.__name__}.version": told.version}, tolerance, partial(_in_folder, make))
-    for stage, numbers in {downsample: _downsampled, calibrate: _calibrated, evaluate: _evaluated, evaluate_faults: _faulted}.items():
+    for stage, numbers in STAGES.items():
         what, tolerance = f"VERSION of {stage.__name__}", FIXED
         if stage is not downsample:
             what, tolerance = f"{what}, unless numbers of {MODEL} moved too,", LEARNT
@@ -86,14 +80,7 @@ def this_machine():
 
 
 def moved(name, recorded, now, tolerance):
-    """What to do about numbers that are not those recorded; empty where they are.
-
-    Args:
-        name: of the subject.
-        recorded: of it in digests.json.
-        now: its `Subject.record`.
-        tolerance: of values, of an array's largest; none to compare digests.
-    """
+    """What to do about numbers that are not those recorded; empty where they are. Digests are compared where there is no tolerance."""
     if recorded["versions"] != now["versions"]:
         return f"a version of {name} was raised: record its numbers with `make golden`"
     if tolerance is None:
@@ -161,9 +148,6 @@ def _channels(recording):
     return {"time": recording.time, **{name: recording[name] for name in recording.channels}}
 
 
-# Sources
-
-
 def _tabular(folder):
     write_csv(folder / "lap.csv", 1, 5.0)
     return _channels(open_source(DATASET | {"path": str(folder)}).read("lap"))
@@ -225,19 +209,8 @@ def _simulated(folder):
     return _channels(open_source(dataset).read("a"))
 
 
-SOURCES = {
-    "can": _can,
-    "mdf": _mdf,
-    "revs": _revs,
-    "rosbag": _rosbag,
-    "simulated": _simulated,
-    "tabular": _tabular,
-    "text_log": _text_log,
-    "vbo": _vbo,
-}
-
-
-# Stages
+SOURCES = {"can": _can, "mdf": _mdf, "revs": _revs, "rosbag": _rosbag, "simulated": _simulated}
+SOURCES |= {"tabular": _tabular, "text_log": _text_log, "vbo": _vbo}
 
 
 def _downsampled(folder):
@@ -247,22 +220,17 @@ def _downsampled(folder):
     return _channels(recording)
 
 
+def _made(pattern):
+    (file,) = (Path(_study().name) / "outputs").glob(pattern)
+    return file
+
+
 def _calibrated(folder):
-    (trust,) = _outputs().glob("calibrate/*/trust.yaml")
-    return dict(_leaves("", yaml.safe_load(trust.read_text(encoding="utf-8"))))
-
-
-def _evaluated(folder):
-    return _metrics(lambda condition: not is_fault(condition))
-
-
-def _faulted(folder):
-    return _metrics(is_fault)
+    return dict(_leaves("", yaml.safe_load(_made("calibrate/*/trust.yaml").read_text(encoding="utf-8"))))
 
 
 def _metrics(chosen):
-    (file,) = _outputs().glob("evaluate/*/metrics.csv")
-    with file.open(newline="", encoding="utf-8") as stream:
+    with _made("evaluate/*/metrics.csv").open(newline="", encoding="utf-8") as stream:
         rows = [row for row in csv.DictReader(stream) if chosen(row["condition"])]
     metrics = {}
     for row in rows:
@@ -275,22 +243,12 @@ def _study():
     """A folder with a small study: one model, calibrated, evaluated without faults and under one."""
     made = tempfile.TemporaryDirectory()
     folder = Path(made.name)
-    (folder / "raw").mkdir()
-    for seed, name in enumerate(("one", "two", "three"), start=1):
-        write_csv(folder / "raw" / f"{name}.csv", seed)
-    spans = {"train": [{"recording": "one"}], "validation": [{"recording": "two"}], "tests": {"test": [{"recording": "three"}]}}
-    for group, content in {"dataset": DATASET, "split": {"name": "mine", "dataset": "mine", **spans}}.items():
-        (folder / "conf" / group).mkdir(parents=True)
-        (folder / "conf" / group / "mine.yaml").write_text(yaml.safe_dump(content, allow_unicode=True), encoding="utf-8")
+    Place(folder, None)
     environment = os.environ | {"VEHEST_DATA": str(folder / "raw"), "VEHEST_OUTPUT": str(folder / "outputs")}
     for words in (("train", *TRAINED), ("eval", *TRAINED, "fault=noise")):
         command = [sys.executable, "-c", "from vehest.cli import main; main()", *words]
         subprocess.run(command, cwd=folder, env=environment, check=True, capture_output=True)
     return made
-
-
-def _outputs():
-    return Path(_study().name) / "outputs"
 
 
 def _leaves(path, content):
@@ -300,6 +258,14 @@ def _leaves(path, content):
             yield from _leaves(f"{path}.{name}".lstrip("."), value)
     elif isinstance(content, int | float | list) and np.issubdtype(np.array(content).dtype, np.number):
         yield path, np.array(content)
+
+
+STAGES = {
+    downsample: _downsampled,
+    calibrate: _calibrated,
+    evaluate: lambda _: _metrics(lambda condition: not is_fault(condition)),
+    evaluate_faults: lambda _: _metrics(is_fault),
+}
 
 
 def main():

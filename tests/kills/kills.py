@@ -11,8 +11,6 @@ This process imports everything once, and every run is a fork of it that calls t
 their time on imports. In every fourth round jobs run side by side, in processes that a run starts itself.
 """
 
-from __future__ import annotations
-
 import argparse
 import csv
 import ctypes
@@ -28,12 +26,14 @@ import sqlite3
 import sys
 import tempfile
 import time
+import traceback
 from collections import Counter
 from dataclasses import dataclass, field
 from pathlib import Path
 
 STAGES = ("ingest", "downsample", "train", "evaluate", "report")
-SIGNALS = (signal.SIGKILL, signal.SIGTERM, signal.SIGINT)
+EXIT_CODES = {signal.SIGKILL: -9, signal.SIGTERM: 143, signal.SIGINT: 130}
+SIGNALS = tuple(EXIT_CODES)
 STUDY = ("run", "quickstart", "training.max_epochs=3", "training.checkpoint_seconds=0")
 MOMENTS = {
     "ingest": ("begun", "part", "made"),
@@ -45,30 +45,22 @@ MOMENTS = {
 PR_SET_PDEATHSIG = 1  # of Linux's prctl: a run ends with this process
 MAX_DELAY = 0.06  # s
 COUNTS = 3  # a moment is one of the first so many of its kind
-RUN_SECONDS = 1800.0  # after which a run hangs
-LOOK_SECONDS = 0.002
+RUN_SECONDS, LOOK_SECONDS = 1800.0, 0.002  # after the first a run hangs
 HEADER = ("number", "round", "jobs", "signal", "stage", "moment", "exit_code", "resumed_runs", "metrics_equal", "tracking_complete")
 HEADER += ("leftovers", "outcome")
-HEAVY = (
-    "mlflow",
-    "matplotlib.pyplot",
-    "vehest.run.study_run",
-    "vehest.studies.drive",
-    "vehest.report.document",
-    "vehest.report.run_figures",
-)
+HEAVY = ("mlflow", "matplotlib.pyplot", "vehest.run.study_run", "vehest.studies.drive", "vehest.report.document")
+HEAVY += ("vehest.report.run_figures",)
 
 
 @dataclass(frozen=True)
 class Kill:
-    """One kill: when, by what, and how the run ended."""
+    """When a run was killed, by what, how it ended, and what was wrong at once."""
 
     stage: str
     number: signal.Signals
     moment: str
     exit_code: int
-    jobs: int
-    at_once: tuple[str, ...] = ()
+    at_once: tuple[str, ...]
 
 
 @dataclass
@@ -82,8 +74,9 @@ class Round:
     leftovers: list[str] = field(default_factory=list)
     failed: list[str] = field(default_factory=list)
 
-
-# --- runs -----------------------------------------------------------------------------------------------------------
+    @property
+    def jobs(self):
+        return 2 if self.position % 4 == 3 else 1
 
 
 def started(output, jobs, log):
@@ -97,20 +90,15 @@ def started(output, jobs, log):
         os.setsid()
         ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGKILL)
         out = os.open(log, os.O_WRONLY | os.O_CREAT | os.O_APPEND)
-        for stream in (1, 2):
-            os.dup2(out, stream)
-        os.dup2(os.open(os.devnull, os.O_RDONLY), 0)
+        for number, stream in ((out, 1), (out, 2), (os.open(os.devnull, os.O_RDONLY), 0)):
+            os.dup2(number, stream)
         signal.signal(signal.SIGINT, signal.default_int_handler)
         sys.argv = ["vehest", *STUDY, f"output={output}", "--jobs", str(jobs)]
-        from vehest.cli import main
-
-        main()
+        importlib.import_module("vehest.cli").main()
         code = 0
     except SystemExit as leave:
         code = int(leave.code or 0)
     except BaseException:
-        import traceback
-
         traceback.print_exc()
     finally:
         sys.stdout.flush()
@@ -123,10 +111,8 @@ def ended(process, *, at_once=False):
     end = time.monotonic() + RUN_SECONDS
     while True:
         found, status = os.waitpid(process, os.WNOHANG)
-        if found:
-            return os.waitstatus_to_exitcode(status)
-        if at_once:
-            return None
+        if found or at_once:
+            return os.waitstatus_to_exitcode(status) if found else None
         if time.monotonic() > end:
             os.killpg(process, signal.SIGKILL)
             raise SystemExit(f"a run hangs: process {process}")
@@ -136,60 +122,48 @@ def ended(process, *, at_once=False):
 def session(leader):
     """Living processes that a run started, itself included."""
     alive = []
-    for entry in os.scandir("/proc"):
-        if entry.name.isdigit():
-            try:
-                fields = Path(entry.path, "stat").read_text().rpartition(")")[2].split()
-            except OSError:
-                continue
-            if int(fields[3]) == leader and fields[0] not in "ZX":
-                alive.append(int(entry.name))
+    for entry in Path("/proc").glob("[0-9]*/stat"):
+        try:
+            fields = entry.read_text().rpartition(")")[2].split()
+        except OSError:
+            continue
+        if int(fields[3]) == leader and fields[0] not in "ZX":
+            alive.append(int(entry.parent.name))
     return alive
 
 
 def strays(leader, patience=20.0):
     """Processes of a run that outlive it for more than ``patience`` seconds; they are ended here."""
     end = time.monotonic() + patience
-    while session(leader) and time.monotonic() < end:
+    while (found := session(leader)) and time.monotonic() < end:
         time.sleep(LOOK_SECONDS)
-    found = session(leader)
     for process in found:
         os.kill(process, signal.SIGKILL)
     return [f"process {process}" for process in found]
 
 
-# --- moments --------------------------------------------------------------------------------------------------------
-
-
-def names(folder, wanted):
-    """Names in a folder, none where it is not there."""
+def names(folder, start="", hidden=True):
+    """Names in a folder that begin so; none where it is not there."""
     try:
-        return {entry.name for entry in os.scandir(folder) if wanted(entry.name)}
+        return {name for name in os.listdir(folder) if name.startswith(start) and (hidden or not name.startswith("."))}
     except OSError:
         return set()
 
 
 def seen(output, stage, moment):
     """What there is of a kind of event; one more of them is the event."""
-    if moment == "begun":
-        return names(output / stage, lambda name: name.startswith(".writing-"))
-    if moment == "made":
-        return names(output / stage, lambda name: not name.startswith("."))
-    if moment == "part":
-        parts = names(output / stage, lambda name: name.startswith(".parts-"))
-        return {file for folder in parts for file in names(output / stage / folder, lambda name: not name.startswith("."))}
-    if moment == "file":
-        asides = names(output / stage, lambda name: name.startswith(".writing-"))
-        return {file for folder in asides for file in names(output / stage / folder, lambda name: True)}
-    if moment == "locked":
-        return names(output / "locks", lambda name: name.startswith(f"{stage}-"))
-    if moment == "checkpoint":
-        return {
-            name for name in names(output / "checkpoints", lambda name: True) if names(output / "checkpoints" / name, lambda file: True)
-        }
-    if moment == "store":
-        return names(output, lambda name: name.endswith("mlflow.db"))
-    return names(output / "mlartifacts", lambda name: True)
+    own = output / stage
+    found = {
+        "begun": lambda: names(own, ".writing-"),
+        "made": lambda: names(own, hidden=False),
+        "part": lambda: {file for folder in names(own, ".parts-") for file in names(own / folder, hidden=False)},
+        "file": lambda: {file for folder in names(own, ".writing-") for file in names(own / folder)},
+        "locked": lambda: names(output / "locks", f"{stage}-"),
+        "checkpoint": lambda: {name for name in names(output / "checkpoints") if names(output / "checkpoints" / name)},
+        "store": lambda: {name for name in names(output) if name.endswith("mlflow.db")},
+        "tracking": lambda: names(output / "mlartifacts"),
+    }
+    return found[moment]()
 
 
 def killed(output, stage, number, jobs, draw, log):
@@ -210,25 +184,17 @@ def killed(output, stage, number, jobs, draw, log):
         time.sleep(LOOK_SECONDS)
     time.sleep(delay)
     os.kill(process, number)
-    code = ended(process)
-    assert code is not None
-    left = strays(process)
+    code, left = ended(process), strays(process)
     if code == 0:
         return None
-    left += [f"lock {name}" for name in locks_held(output)] + broken(output)
-    expected = {signal.SIGKILL: -9, signal.SIGTERM: 143, signal.SIGINT: 130}[number]
-    left += [f"exit code {code} instead of {expected}"] if code != expected else []
-    said = f"{moment} {count} + {delay * 1e3:.0f} ms"
-    return Kill(stage, number, said, code, jobs, tuple(left))
-
-
-# --- checks ---------------------------------------------------------------------------------------------------------
+    left += locks_held(output) + broken(output)
+    left += [f"exit code {code} instead of {EXIT_CODES[number]}"] if code != EXIT_CODES[number] else []
+    return Kill(stage, number, f"{moment} {count} + {delay * 1e3:.0f} ms", code, tuple(left))
 
 
 def artefacts(output):
     """Folders of all stages."""
-    for stage in STAGES:
-        yield from (output / stage / name for name in sorted(names(output / stage, lambda name: not name.startswith("."))))
+    return [output / stage / name for stage in STAGES for name in sorted(names(output / stage, hidden=False))]
 
 
 def broken(output):
@@ -248,12 +214,12 @@ def broken(output):
 def locks_held(output):
     """Locks that somebody holds."""
     held = []
-    for name in names(output / "locks", lambda name: name.endswith(".lock")):
-        with open(output / "locks" / name, "rb") as stream:
+    for file in (output / "locks").glob("*.lock"):
+        with open(file, "rb") as stream:
             try:
                 fcntl.flock(stream, fcntl.LOCK_EX | fcntl.LOCK_NB)
             except OSError:
-                held.append(name)
+                held.append(f"lock {file.name}")
     return held
 
 
@@ -266,11 +232,10 @@ def content(output):
     for folder in artefacts(output):
         artefact = read_artefact(folder)
         own = f"{artefact.stage}/{folder.name} {artefact.status}"
+        found[own] = artefact.digest
         if artefact.stage == "report":
             with open(folder / "metrics.csv", newline="", encoding="utf-8") as stream:
                 found[own] = json.dumps([row for row in csv.DictReader(stream) if row["metric"] not in TIMES])
-        else:
-            found[own] = artefact.digest
     return found
 
 
@@ -281,18 +246,22 @@ def differences(found, wanted):
 
 def tracked(output):
     """Finished run -> its artefact and what was logged of it, times aside; runs that are neither finished nor killed by that name."""
+    found = {}
     with sqlite3.connect(f"file:{output / 'mlflow.db'}?mode=ro", uri=True) as store:
-        runs = store.execute("select run_uuid, name, status from runs where lifecycle_stage = 'active'").fetchall()
-        found = {}
-        for run, name, status in runs:
+        for run, name, status in store.execute("select run_uuid, name, status from runs where lifecycle_stage = 'active'").fetchall():
             if status == "KILLED":  # of an interrupted training, by which it is told from the finished one
                 continue
-            keys = store.execute("select value from tags where run_uuid = ? and key = 'vehest.key'", [run]).fetchall()
-            points = store.execute("select key, step, value from metrics where run_uuid = ? order by key, step, value", [run]).fetchall()
-            parameters = store.execute("select key, value from params where run_uuid = ? order by key", [run]).fetchall()
+            keys, points, parameters = (
+                store.execute(f"select {what} where run_uuid = ? {rest}", [run]).fetchall()
+                for what, rest in (
+                    ("value from tags", "and key = 'vehest.key'"),
+                    ("key, step, value from metrics", "order by key, step, value"),
+                    ("key, value from params", "order by key"),
+                )
+            )
             files = sorted(str(file.relative_to(output / "mlartifacts" / run)) for file in (output / "mlartifacts" / run).rglob("*.*"))
-            logged = [[point for point in points if "_seconds" not in point[0]], parameters, files]
             own = f"{name} {status} {keys[0][0] if keys else ''}"
+            logged = [[point for point in points if "_seconds" not in point[0]], parameters, files]
             found[own + (f" again {run}" if own in found else "")] = json.dumps(logged)
     return found
 
@@ -300,24 +269,16 @@ def tracked(output):
 def leftovers(output):
     """What killed runs left and nobody needs: half-written things, parts, checkpoints, locks."""
     found = [str(path.relative_to(output)) for path in output.rglob(".*") if path.name.startswith((".writing-", ".parts-"))]
-    found += [f"checkpoints/{name}" for name in names(output / "checkpoints", lambda name: True)]
-    return found + [f"lock {name}" for name in locks_held(output)]
-
-
-# --- rounds ---------------------------------------------------------------------------------------------------------
+    return [*found, *(f"checkpoints/{name}" for name in names(output / "checkpoints")), *locks_held(output)]
 
 
 def one_round(position, wanted, output, reference, draw):
     """Kill runs in one output root, let the last one end, and look at what there is."""
-    own, jobs = Round(position), 2 if position % 4 == 3 else 1
-    log = output.with_suffix(".log")
-    for stage, number in wanted:
-        kill = killed(output, stage, number, jobs, draw, log)
-        if kill is not None:
-            own.kills.append(kill)
-    last = started(output, jobs, log)
-    code = ended(last)
-    own.leftovers = strays(last)
+    own, log = Round(position), output.with_suffix(".log")
+    made = (killed(output, stage, number, own.jobs, draw, log) for stage, number in wanted)
+    own.kills = [kill for kill in made if kill is not None]
+    last = started(output, own.jobs, log)
+    code, own.leftovers = ended(last), strays(last)
     if code != 0:
         own.failed = [f"the last run left with {code}, see '{log}'"]
         return own
@@ -330,27 +291,49 @@ def one_round(position, wanted, output, reference, draw):
 def rows_of(own, first):
     """A row a kill."""
     for position, kill in enumerate(own.kills):
-        faults = [*own.failed, *own.metrics, *own.tracking, *own.leftovers, *kill.at_once]
         equal, complete = ("yes" if not (own.failed or found) else "no" for found in (own.metrics, own.tracking))
-        left = "; ".join([*own.leftovers, *kill.at_once]) or "none"
-        outcome = "good" if not faults else "bad: " + "; ".join([*own.failed, *own.metrics, *own.tracking] or [left])
-        resumed = len(own.kills) - position
-        head = [first + position, own.position, kill.jobs, kill.number.name, kill.stage, kill.moment, kill.exit_code, resumed]
-        yield [*head, equal, complete, left, outcome]
+        left = "; ".join([*own.leftovers, *kill.at_once])
+        faults = "; ".join([*own.failed, *own.metrics, *own.tracking]) or left
+        head = [first + position, own.position, own.jobs, kill.number.name, kill.stage, kill.moment, kill.exit_code]
+        yield [*head, len(own.kills) - position, equal, complete, left or "none", f"bad: {faults}" if faults else "good"]
 
 
 def still_wanted(missing):
     """For the next round: of each stage a kill that is missing most."""
-    chosen = []
-    for stage in STAGES:
-        number = max(SIGNALS, key=lambda number: (missing[stage, number], -SIGNALS.index(number)))
-        if missing[stage, number] > 0:
-            chosen.append((stage, number))
-    return chosen
+    chosen = [(stage, max(SIGNALS, key=lambda one, stage=stage: (missing[stage, one], -SIGNALS.index(one)))) for stage in STAGES]
+    return [wanted for wanted in chosen if missing[wanted] > 0]
+
+
+def rounds(missing, draw, scratch, out):
+    """Run rounds until every kill was made; how many were bad."""
+    os.chdir(scratch)  # runs find the configuration that came with the package
+    begun, reference = time.monotonic(), scratch / "reference"
+    if ended(started(reference, 1, reference.with_suffix(".log"))) != 0:
+        raise SystemExit(f"the study does not run by itself:\n{reference.with_suffix('.log').read_text()}")
+    print(f"reference: {time.monotonic() - begun:.0f} s", flush=True)
+    position, bad, number, limit = 0, 0, 1, 3 * missing.total()
+    with open(out, "w", newline="", encoding="utf-8") as stream:
+        writer = csv.writer(stream, lineterminator="\n")
+        writer.writerow(HEADER)
+        while missing.total() > 0:
+            if position > limit:
+                raise SystemExit("moments are missed again and again")
+            own = one_round(position, still_wanted(missing), scratch / f"round{position}", reference, draw)
+            missing -= Counter((kill.stage, kill.number) for kill in own.kills)
+            rows = list(rows_of(own, number))
+            writer.writerows(rows)
+            stream.flush()
+            worse = sum(row[-1] != "good" for row in rows)
+            bad, number = bad + worse, number + len(rows)
+            print(f"round {position}: {len(rows)} kills, {bad} bad so far, {time.monotonic() - begun:.0f} s", flush=True)
+            if not worse:
+                shutil.rmtree(scratch / f"round{position}")
+            position += 1
+    return bad
 
 
 def main():
-    """Run rounds until every kill was made; exit code 1 if any row is bad."""
+    """Exit code 1 if any row is bad."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--kills", type=int, default=100, help="how many, spread evenly over five stages and three signals")
     parser.add_argument("--seed", type=int, default=0, help="of signals, moments and delays")
@@ -361,44 +344,13 @@ def main():
     for module in HEAVY:
         importlib.import_module(module)
     gc.freeze()
-    draw = random.Random(given.seed)
     out = given.out.resolve()
     out.parent.mkdir(parents=True, exist_ok=True)
     missing = Counter((STAGES[k % len(STAGES)], SIGNALS[k // len(STAGES) % len(SIGNALS)]) for k in range(given.kills))
     with tempfile.TemporaryDirectory(prefix="kills-") as scratch:
-        bad = _rounds(missing, draw, Path(scratch), out)
+        bad = rounds(missing, random.Random(given.seed), Path(scratch), out)
     print(f"{given.kills} kills, {bad} of them bad: {out}")
     sys.exit(1 if bad else 0)
-
-
-def _rounds(missing, draw, scratch, out):
-    os.chdir(scratch)  # runs find the configuration that came with the package
-    begun = time.monotonic()
-    reference = scratch / "reference"
-    code = ended(started(reference, 1, reference.with_suffix(".log")))
-    if code != 0:
-        raise SystemExit(f"the study does not run by itself:\n{reference.with_suffix('.log').read_text()}")
-    print(f"reference: {time.monotonic() - begun:.0f} s", flush=True)
-    position, bad, limit = 0, 0, 3 * missing.total()
-    with open(out, "w", newline="", encoding="utf-8") as stream:
-        writer = csv.writer(stream, lineterminator="\n")
-        writer.writerow(HEADER)
-        number = 1
-        while missing.total() > 0:
-            if position > limit:
-                raise SystemExit("moments are missed again and again")
-            own = one_round(position, still_wanted(missing), scratch / f"round{position}", reference, draw)
-            missing -= Counter((kill.stage, kill.number) for kill in own.kills)
-            rows = list(rows_of(own, number))
-            writer.writerows(rows)
-            stream.flush()
-            bad += sum(row[-1] != "good" for row in rows)
-            number += len(rows)
-            print(f"round {position}: {len(rows)} kills, {bad} bad so far, {time.monotonic() - begun:.0f} s", flush=True)
-            if all(row[-1] == "good" for row in rows):
-                shutil.rmtree(scratch / f"round{position}")
-            position += 1
-    return bad
 
 
 if __name__ == "__main__":

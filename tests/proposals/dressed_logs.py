@@ -46,13 +46,10 @@ def later(t, samples, delay):
 
 def nuisances(t, seed):
     """What a logger writes besides: a temperature that rises, a gear, a voltage, a level that stays."""
-    random = np.random.default_rng(seed)
-    return {
-        "temperature": 80.0 + 10.0 * (1.0 - np.exp(-t / 60.0)) + 0.05 * random.standard_normal(len(t)),
-        "gear": np.repeat(random.integers(2, 5, len(t) // 200 + 1), 200)[: len(t)].astype(float),
-        "voltage": 13.8 + 0.02 * random.standard_normal(len(t)),
-        "level": np.full(len(t), 42.0),
-    }
+    random, n = np.random.default_rng(seed), len(t)
+    temperature = 80.0 + 10.0 * (1.0 - np.exp(-t / 60.0)) + 0.05 * random.standard_normal(n)
+    gear = np.repeat(random.integers(2, 5, n // 200 + 1), 200)[:n].astype(float)
+    return {"temperature": temperature, "gear": gear, "voltage": 13.8 + 0.02 * random.standard_normal(n), "level": np.full(n, 42.0)}
 
 
 def write(file, columns, digits=4, **options):
@@ -178,23 +175,13 @@ def mdf(data, folder):
     def signal(d, name, samples, unit=""):
         return asammdf.Signal(np.round(samples, 5), d["t"], name=name, unit=unit)
 
-    groups = [
-        [
-            signal(fast, "YawRt", -np.degrees(fast["r"]), "deg/s"),
-            signal(fast, "LatAcc", fast["ay"] / G, "g"),
-            signal(fast, "LongAcc", fast["ax"] / G),
-            signal(fast, "ADMA_VelLat", fast["vy"]),
-        ],
-        [
-            signal(slow, "VehSpd", 3.6 * slow["vx"], "km/h"),
-            signal(slow, "StWhlAng", np.degrees(RATIO * slow["delta"])),
-            signal(slow, "EngTemp", more["temperature"], "°C"),
-            signal(slow, "GearAct", more["gear"]),
-            signal(slow, "UBatt", more["voltage"], "V"),
-        ],
-    ]
+    first = [signal(fast, "YawRt", -np.degrees(fast["r"]), "deg/s"), signal(fast, "LatAcc", fast["ay"] / G, "g")]
+    first += [signal(fast, "LongAcc", fast["ax"] / G), signal(fast, "ADMA_VelLat", fast["vy"])]
+    second = [signal(slow, "VehSpd", 3.6 * slow["vx"], "km/h"), signal(slow, "StWhlAng", np.degrees(RATIO * slow["delta"]))]
+    second += [signal(slow, "EngTemp", more["temperature"], "°C"), signal(slow, "GearAct", more["gear"])]
+    second.append(signal(slow, "UBatt", more["voltage"], "V"))
     with asammdf.MDF(version="4.10") as measurement:
-        for group in groups:
+        for group in (first, second):
             measurement.append(group, common_timebase=True)
         measurement.save(folder / "drive.mf4", overwrite=True)
 
@@ -222,33 +209,26 @@ def bag(data, folder):
     still = made["geometry_msgs/msg/Quaternion"](0.0, 0.0, 0.0, 1.0)
     origin = made["geometry_msgs/msg/Pose"](made["geometry_msgs/msg/Point"](0.0, 0.0, 0.0), still)
     none, flat = np.zeros(9), np.zeros(36)
+    pose = made["geometry_msgs/msg/PoseWithCovariance"](origin, flat)
+
+    def imu(k):
+        return header(k), still, none, vector(0.0, 0.0, d["r"][k]), none, vector(-d["ax"][k], -d["ay"][k], G), none
+
+    def odometry(k):
+        seen = twist(d["vx"][k], d["vy"][k], d["r_ref"][k])
+        return header(k), "base", pose, made["geometry_msgs/msg/TwistWithCovariance"](seen, flat)
+
     messages = {
-        "/imu/data": (
-            "sensor_msgs/msg/Imu",
-            lambda k: made["sensor_msgs/msg/Imu"](
-                header(k), still, none, vector(0.0, 0.0, d["r"][k]), none, vector(-d["ax"][k], -d["ay"][k], G), none
-            ),
-        ),
-        "/wheel/twist": (
-            "geometry_msgs/msg/TwistStamped",
-            lambda k: made["geometry_msgs/msg/TwistStamped"](header(k), twist(d["v"][k], 0.0, 0.0)),
-        ),
-        "/servo": ("std_msgs/msg/Float64", lambda k: made["std_msgs/msg/Float64"](float(0.5 - d["delta"][k] / 1.5171428571))),
-        "/mocap/odom": (
-            "nav_msgs/msg/Odometry",
-            lambda k: made["nav_msgs/msg/Odometry"](
-                header(k),
-                "base",
-                made["geometry_msgs/msg/PoseWithCovariance"](origin, flat),
-                made["geometry_msgs/msg/TwistWithCovariance"](twist(d["vx"][k], d["vy"][k], d["r_ref"][k]), flat),
-            ),
-        ),
+        "/imu/data": ("sensor_msgs/msg/Imu", imu),
+        "/wheel/twist": ("geometry_msgs/msg/TwistStamped", lambda k: (header(k), twist(d["v"][k], 0.0, 0.0))),
+        "/servo": ("std_msgs/msg/Float64", lambda k: (float(0.5 - d["delta"][k] / 1.5171428571),)),
+        "/mocap/odom": ("nav_msgs/msg/Odometry", odometry),
     }
     with Writer(folder / "drive_bag", version=9, storage_plugin=StoragePlugin.SQLITE3) as writer:
         connections = {topic: writer.add_connection(topic, kind, typestore=types) for topic, (kind, _) in messages.items()}
         for k, t in enumerate(d["t"]):
-            for topic, (kind, message) in messages.items():
-                writer.write(connections[topic], start + round(t * 1e9), bytes(types.serialize_cdr(message(k), kind)))
+            for topic, (kind, fields) in messages.items():
+                writer.write(connections[topic], start + round(t * 1e9), bytes(types.serialize_cdr(made[kind](*fields(k)), kind)))
 
 
 def vbo(data, folder):
@@ -297,34 +277,14 @@ def no_reference(data, folder):
     write(folder / "no_reference.csv", columns, 5)
 
 
-LOGS = {
-    "units": (units, "units.csv"),
-    "german": (german, "german.csv"),
-    "numbered": (numbered, "numbered.txt"),
-    "unix": (unix, "unix.csv"),
-    "flipped": (flipped, "flipped.csv"),
-    "wheels": (wheels, "wheels.csv"),
-    "sideslip": (sideslip, "sideslip.csv"),
-    "mdf": (mdf, "drive.mf4"),
-    "bag": (bag, "drive_bag"),
-    "vbo": (vbo, "lap.vbo"),
-    "two_runs": (two_runs, "run_*.csv"),
-    "no_reference": (no_reference, "no_reference.csv"),
-}
+MADE = (units, german, numbered, unix, flipped, wheels, sideslip, mdf, bag, vbo, two_runs, no_reference)
+FILES = {"numbered": "numbered.txt", "mdf": "drive.mf4", "bag": "drive_bag", "vbo": "lap.vbo", "two_runs": "run_*.csv"}
+LOGS = {make.__name__: (make, FILES.get(make.__name__, f"{make.__name__}.csv")) for make in MADE}
 """Log -> what writes it, and its files."""
 
 
 def write_log(name, data, folder):
-    """Write one log into a folder of its own.
-
-    Args:
-        name: in `LOGS`.
-        data: folder of the real recordings.
-        folder: that the log's folder is made in.
-
-    Returns:
-        Its files.
-    """
+    """Write one log into a folder of its own; returns its files."""
     make, pattern = LOGS[name]
     own = folder / name
     own.mkdir(parents=True)

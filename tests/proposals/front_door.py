@@ -16,9 +16,7 @@ EXPECTED = Path(__file__).parent / "front_door.yaml"
 
 def vehest(folder, *words):
     """Exit code, standard output and error of a command in a folder."""
-    ran = subprocess.run(
-        [sys.executable, "-m", "vehest", *words], cwd=folder, capture_output=True, text=True, check=False, env=dict(os.environ)
-    )
+    ran = subprocess.run([sys.executable, "-m", "vehest", *words], cwd=folder, capture_output=True, text=True, check=False)
     return ran.returncode, ran.stdout, ran.stderr
 
 
@@ -27,14 +25,12 @@ def differences(told, code, plain, words):
     if code:
         return [] if told["end"] == "stop" else [f"exit {code}: {words.strip().splitlines()[-1]}"]
     found = {one["channel"]: one["column"] for one in plain["channels"]}
-    asked = {question["key"] for question in plain["open"]}
-    wrong = [
-        f"{channel} is {found.get(channel)}, not {column}" for channel, column in told["channels"].items() if found.get(channel) != column
+    wrong = [f"{channel} is {found.get(channel)}, not {own}" for channel, own in told["channels"].items() if found.get(channel) != own]
+    wrong += [
+        f"nothing is asked about {own}" for own in told.get("asked", ()) if own not in {question["key"] for question in plain["open"]}
     ]
-    wrong += [f"nothing is asked about {column}" for column in told.get("asked", ()) if column not in asked]
-    said = " ".join(
-        [words, *plain["notes"], *plain["limits"], *plain["findings"], *(text for one in plain["channels"] for text in one["evidence"])]
-    )
+    evidence = [text for one in plain["channels"] for text in one["evidence"]]
+    said = " ".join([words, *plain["notes"], *plain["limits"], *plain["findings"], *evidence])
     return wrong + ([f"'{told['note']}' is not said"] if told.get("note", "") not in said else [])
 
 

@@ -114,18 +114,8 @@ def no_reference(data, folder):
     write(folder / "no_reference.csv", columns)
 
 
-LOGS = {
-    "six_seconds": six_seconds,
-    "standstill_first": standstill_first,
-    "two_speeds": two_speeds,
-    "misnamed_lateral": misnamed_lateral,
-    "two_yaw_rates": two_yaw_rates,
-    "fast_speedometer": fast_speedometer,
-    "wheels_in_kmh": wheels_in_kmh,
-    "vbox": vbox,
-    "twenty_seconds": twenty_seconds,
-    "no_reference": no_reference,
-}
+MADE = (six_seconds, standstill_first, two_speeds, misnamed_lateral, two_yaw_rates, fast_speedometer, wheels_in_kmh, vbox)
+LOGS = {make.__name__: make for make in (*MADE, twenty_seconds, no_reference)}
 
 
 def write_log(name, data, folder):

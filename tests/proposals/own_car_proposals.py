@@ -31,8 +31,8 @@ Row = dict[str, str]
 
 def proposed_for(files, folder):
     """What `vehest new --json` says of files, run in an empty folder."""
-    command = [sys.executable, "-m", "vehest", "new", "my_car", *(str(file) for file in files), "--json", "--dry-run"]
-    ran = subprocess.run(command, cwd=folder, capture_output=True, text=True, check=False, env=dict(os.environ))
+    command = [sys.executable, "-m", "vehest", "new", "my_car", *map(str, files), "--json", "--dry-run"]
+    ran = subprocess.run(command, cwd=folder, capture_output=True, text=True, check=False)
     if ran.returncode:
         raise SystemExit(f"{files[0]}: {ran.stderr.strip()}")
     return dict(json.loads(ran.stdout))
@@ -47,10 +47,8 @@ def rows_of(log, answers, proposed):
     for name in (*columns, *proposed["unused"]):
         if name not in answers["columns"]:
             one = columns.get(name)
-            shown = f"{one['channel']}, {one['unit']}" if one else "no channel"
-            rows.append(
-                _line(log, name, "no channel", shown, one["evidence"] if one else [], name in asked, one is None and name not in asked)
-            )
+            shown, evidence = (f"{one['channel']}, {one['unit']}", one["evidence"]) if one else ("no channel", [])
+            rows.append(_line(log, name, "no channel", shown, evidence, name in asked, one is None and name not in asked))
     if "time" in answers:
         rows.append(_clock(log, answers["time"], proposed))
     for key in WHOLE:

@@ -26,18 +26,12 @@ def test_packed_values_come_back_within_half_a_step_of_their_range_and_gaps_stay
     assert np.isnan(back["nothing"]).all()
 
 
-def test_course_of_a_steady_turn_is_a_circle_of_speed_over_yaw_rate():
+def test_course_of_a_steady_turn_is_a_circle_of_speed_over_yaw_rate_and_starts_anew_after_a_gap():
     n, step = 4_001, 0.05
-    vx, vy, yaw_rate = np.full(n, 20.0), np.full(n, -1.0), np.full(n, 0.2)
-    x, y = reckoned_course(vx, vy, yaw_rate, step)
-    speed = np.hypot(20.0, 1.0)
-    angle = 0.2 * step * np.arange(n)
-    heading = np.arctan2(-1.0, 20.0)
-    assert x == pytest.approx(speed / 0.2 * (np.sin(angle + heading) - np.sin(heading)), abs=0.01)
-    assert y == pytest.approx(-speed / 0.2 * (np.cos(angle + heading) - np.cos(heading)), abs=0.01)
-
-
-def test_course_starts_anew_after_a_gap():
+    x, y = reckoned_course(np.full(n, 20.0), np.full(n, -1.0), np.full(n, 0.2), step)
+    radius, angle, heading = np.hypot(20.0, 1.0) / 0.2, 0.2 * step * np.arange(n), np.arctan2(-1.0, 20.0)
+    assert x == pytest.approx(radius * (np.sin(angle + heading) - np.sin(heading)), abs=0.01)
+    assert y == pytest.approx(-radius * (np.cos(angle + heading) - np.cos(heading)), abs=0.01)
     vx = np.array([1.0, 1.0, np.nan, 1.0, 1.0, 1.0])
     x, y = reckoned_course(vx, 0.0 * vx, 0.0 * vx, 1.0)
     assert x.tolist()[:2] + x.tolist()[3:] == [0.0, 1.0, 0.0, 1.0, 2.0]
@@ -47,9 +41,6 @@ def test_course_starts_anew_after_a_gap():
 def test_bars_share_an_axis_from_zero_and_one_far_beyond_is_cut():
     one, two, far, none = bars_of([0.2, 0.4, 50.0, np.nan], [0.1, 0.3, 40.0, np.nan], [0.4, 0.5, 60.0, np.nan])
     assert none is None
-    assert one is not None
-    assert two is not None
-    assert far is not None
     assert one["at"] > 0
     assert two["at"] == pytest.approx(2 * one["at"], abs=0.1)
     assert one["low"] < one["at"] < one["high"]

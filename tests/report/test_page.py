@@ -61,9 +61,8 @@ def fill(driver, label, value):
 
 def views(driver):
     """First and last time that each trace shows [s]."""
-    return driver.execute_script(
-        "return document.querySelector('figure.live').explorer.plots.map(plot => [plot.scales.x.min, plot.scales.x.max])"
-    )
+    plots = "document.querySelector('figure.live').explorer.plots"
+    return driver.execute_script(f"return {plots}.map(plot => [plot.scales.x.min, plot.scales.x.max])")
 
 
 def press(driver, text):
@@ -122,10 +121,8 @@ def test_dragging_over_one_trace_zooms_all(chromium, hour):
 
     opened(chromium, hour)
     over = chromium.find_elements("css selector", ".u-over")[1]
-    wide = over.size["width"]
-    ActionChains(chromium).move_to_element_with_offset(over, -wide // 4, 0).click_and_hold().move_by_offset(
-        wide // 4, 0
-    ).release().perform()
+    quarter = over.size["width"] // 4
+    ActionChains(chromium).move_to_element_with_offset(over, -quarter, 0).click_and_hold().move_by_offset(quarter, 0).release().perform()
     for start, stop in views(chromium):
         assert start == pytest.approx(900.0, abs=30.0)
         assert stop == pytest.approx(1800.0, abs=30.0)
@@ -188,10 +185,10 @@ CUT = """return [...document.querySelectorAll("main *")].filter(
 def test_page_of_an_own_car_opens_with_verdict_bars_and_traces_the_rest_folded(chromium, tmp_path):
     """Two test ranges: nothing is cut at 1280 px, folded or not, the page does not scroll sideways at 390, traces break between ranges."""
     tests = {"test": (Span("toy", "lap", 60.0, 72.0), Span("toy", "lap", 74.0, 85.0))}
-    document = documents(
-        StudyArtefacts("toy", "A toy study", "", "vehest run toy", {"": ""}, {"": study(tmp_path / "study", tests)}, [], [], [])
+    part = study(tmp_path / "study", tests)
+    write_document(
+        documents(StudyArtefacts("toy", "A toy study", "", "vehest run toy", {"": ""}, {"": part}, [], [], []))["report"], tmp_path
     )
-    write_document(document["report"], tmp_path)
     opened(chromium, tmp_path / "report.html", width=390)
     assert chromium.execute_script("return document.documentElement.scrollWidth <= innerWidth")
     opened(chromium, tmp_path / "report.html", width=1280)

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import re
-from html.parser import HTMLParser
 
 import pandas as pd
 import pytest
 from markdown_it import MarkdownIt
+from test_report import Page
 
 from vehest.report.document import Column, Document, Table, as_code, as_text, write_document
 
@@ -26,24 +26,6 @@ HOSTILE = (
     "a\u202eb\x1b[31m\x9b",
     "</title></style><script>x</script>",
 )
-
-
-class _Seen(HTMLParser):
-    """Elements, attributes and text of a page."""
-
-    def __init__(self, page):
-        super().__init__()
-        self.elements: list[str] = []
-        self.attributes: list[tuple[str, str | None]] = []
-        self.text = ""
-        self.feed(page)
-
-    def handle_starttag(self, tag, attrs):
-        self.elements.append(tag)
-        self.attributes += attrs
-
-    def handle_data(self, data):
-        self.text += data
 
 
 def _document(name):
@@ -65,10 +47,10 @@ def test_a_hostile_name_ends_as_text_in_both_forms_of_a_report(tmp_path, name):
     write_document(_document("plain"), tmp_path / "plain")
     write_document(_document(name), tmp_path / "hostile")
     for calm, shown in zip(_rendered(tmp_path / "plain"), _rendered(tmp_path / "hostile"), strict=True):
-        expected, seen = _Seen(calm), _Seen(shown)
-        assert seen.elements.count("script") == expected.elements.count("script")
-        assert seen.elements.count("img") == expected.elements.count("img") == 0
-        assert seen.elements.count("td") == expected.elements.count("td"), "a cell stays one cell"
+        expected, seen = Page(calm), Page(shown)
+        assert seen.tags.count("script") == expected.tags.count("script")
+        assert seen.tags.count("img") == expected.tags.count("img") == 0
+        assert seen.tags.count("td") == expected.tags.count("td"), "a cell stays one cell"
         assert not any(key.startswith("on") for key, _ in seen.attributes)
         assert not any(key in ("href", "src") and re.match(r"\s*javascript:", value or "", re.I) for key, value in seen.attributes)
 
@@ -78,9 +60,9 @@ def test_a_name_as_text_reads_as_it_is_written(name):
     lenient = MarkdownIt("commonmark", {"html": True})
     line = " ".join(name.split()).replace("\u202e", r"\u202e").replace("\x1b", r"\x1b").replace("\x9b", r"\x9b")
     for form in (as_text, as_code):
-        seen = _Seen(lenient.render(f"Name: {form(name)}"))
+        seen = Page(lenient.render(f"Name: {form(name)}"))
         assert seen.text.strip() == f"Name: {line}"
-        assert set(seen.elements) <= {"p", "code"}
+        assert set(seen.tags) <= {"p", "code"}
 
 
 def test_honest_markdown_stays_as_it_is(tmp_path):

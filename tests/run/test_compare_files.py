@@ -9,6 +9,7 @@ import pytest
 
 from conftest import planar_drive
 from vehest.data.errors import DataError
+from vehest.data.estimate import Estimate
 from vehest.data.recording import Recording
 from vehest.run.compare_files import compare_estimates, read_estimate_table
 
@@ -62,28 +63,18 @@ def test_the_static_map_knows_no_sample_that_it_is_judged_by(drive):
     """With lateral velocity turned in the second half, a map of the other half is wrong in both."""
     turned = np.where(drive.time < drive.start_time + 60.0, drive["vy_ref"], -drive["vy_ref"])
     other = Recording(drive.id, drive.vehicle, drive.rate_hz, drive.start_time, {**drive.channels, "vy_ref": turned})
-    estimate = read_back(other)
+    estimate = Estimate(other.id, "true", other.rate_hz, other.start_time, {"vy": turned, "sideslip": np.zeros(len(other))})
     rows = {row["estimate"]: row["rmse_vy"] for row in compare_estimates(other, {"true": estimate}).rows}
     assert rows["static_map"] > rows["zero"] > rows["true"]
 
 
-def read_back(drive):
-    from vehest.data.estimate import Estimate
-
-    return Estimate(drive.id, "true", drive.rate_hz, drive.start_time, {"vy": drive["vy_ref"], "sideslip": np.zeros(len(drive))})
-
-
-def test_other_clocks_and_gaps_are_refused_with_the_file_that_has_them(drive, tmp_path):
+def test_other_clocks_and_columns_are_refused_with_the_file_that_has_them(drive, tmp_path):
     late = written(tmp_path, "late", drive, 0.1, time=drive.time + 1.7e9)
     with pytest.raises(DataError, match=r"'late' goes from .* are the clocks the same"):
         compare_estimates(drive, {"late": read_estimate_table(late, drive)})
+    pd.read_csv(late)[["time"]].assign(other=1.0).to_csv(late, index=False)
     with pytest.raises(DataError, match=r"has no column vy \[m/s\]"):
-        read_estimate_table(written(tmp_path, "none", drive, 0.1).rename(tmp_path / "x.csv") and _without(tmp_path / "x.csv"), drive)
-
-
-def _without(file):
-    pd.read_csv(file)[["time"]].assign(other=1.0).to_csv(file, index=False)
-    return file
+        read_estimate_table(late, drive)
 
 
 def test_the_command_prints_a_row_an_estimate_and_says_where_a_model_learnt(place, tmp_path):
@@ -91,14 +82,12 @@ def test_the_command_prints_a_row_an_estimate_and_says_where_a_model_learnt(plac
     pd.DataFrame({"time": table["Time"], "vy": table["Vy"] + 0.1}).to_csv(tmp_path / "mine.csv", index=False)
     assert place("train", "estimator=luenberger", "split=mine", "training.grid=1", "tracking=none")[0] == 0
     raw = str(place.folder / "raw")
-    code, out, err = place(
+    out, err = place.done(
         "compare", f"{raw}/three.csv", str(tmp_path / "mine.csv"), "dataset=mine", "-m", "luenberger", "-m", "pretrained", "--json"
     )
-    assert code == 0, err
     rows = {row["estimate"] for row in json.loads(out)["rows"]}
     assert rows == {"mine", "luenberger", "pretrained", "zero", "static_map"}
     assert "learnt on this recording" not in err
-    code, out, err = place("compare", f"{raw}/one.csv", "dataset=mine", "-m", "luenberger")
-    assert code == 0
+    _, err = place.done("compare", f"{raw}/one.csv", "dataset=mine", "-m", "luenberger")
     assert "warning: 'luenberger' learnt on this recording: its row is no test" in err
     assert place.refused("compare", f"{raw}/one.csv", "dataset=mine")[1] == "error: name at least one estimate to compare"

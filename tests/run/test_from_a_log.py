@@ -49,8 +49,7 @@ def test_a_log_of_twenty_seconds_gets_a_leaderboard_and_no_winner(logged):
     assert (code, err) == (0, "")
     (said,) = re.findall(r"\$ vehest data check my_log\n(warning .*)\n", page)
     assert said in out.splitlines()
-    code, out, _ = logged("data", "usable", "my_log")
-    assert code == 0
+    out, _ = logged.done("data", "usable", "my_log")
     for line in ("ax: transforms: [{name: acceleration_from_speed}] of vx", "vy_ref: transforms: [{name: velocity_from_sideslip}]"):
         assert line in page
         assert line in out
@@ -59,15 +58,12 @@ def test_a_log_of_twenty_seconds_gets_a_leaderboard_and_no_winner(logged):
     file.write_text(
         file.read_text(encoding="utf-8").replace("{column: AccY, unit: m/s²}", "{column: AccY, unit: m/s², sign: -1}") + transforms
     )
-    code, out, err = logged("data", "check", "my_log")
-    assert code == 0
+    out, _ = logged.done("data", "check", "my_log")
     assert "ay points the other way" not in out
-    code, out, err = logged("run", "my_log", "tracking=none")
-    assert code == 0, err
+    out, err = logged.done("run", "my_log", "tracking=none")
     assert "luenberger runs at 50 Hz instead of its 100 Hz" in err
     assert "test set 'test' is too short to tell estimators apart: no interval, no winner" in out
     report = next((logged.folder / "outputs" / "report").glob("my_log-*")) / "report.md"
     text = report.read_text(encoding="utf-8")
-    assert "but the test is too short to tell estimators apart" in text
-    assert "from 14 s after its start" in text
+    assert all(words in text for words in ("but the test is too short to tell estimators apart", "from 14 s after its start"))
     assert "1.393e+09" not in text

@@ -19,5 +19,4 @@ def test_a_study_that_is_killed_ends_in_the_same_numbers_and_leaves_nothing_behi
     assert done.returncode == 0, done.stdout + done.stderr
     with open(table, newline="", encoding="utf-8") as stream:
         rows = list(csv.DictReader(stream))
-    assert [row["stage"] for row in rows] == ["ingest", "downsample", "train"]
-    assert {row["outcome"] for row in rows} == {"good"}
+    assert ([row["stage"] for row in rows], {row["outcome"] for row in rows}) == (["ingest", "downsample", "train"], {"good"})

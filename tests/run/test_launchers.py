@@ -27,55 +27,33 @@ FINE = Messages(silent=True)
 SPLIT = Split("any", (), (), {"test": (Span("any", "one", 0.0, 1.0),)})
 
 
-def job(output, seed=0, *, variant="small", epochs=10, **training):
-    config = {
-        "estimator": {"name": "net", "kind": variant},
-        "training": {"max_epochs": epochs},
-        "seed": seed,
-        "train": [],
-        "validation": [],
-    }
-    plan = StagePlan("train", f"net-{variant}-seed{seed}", config, {}, "code", output)
-    return TrainJob(plan, config["estimator"], {**config["training"], **training}, SPLIT, seed, {})
+def job(output, seed=0):
+    training = {"max_epochs": 10}
+    config = {"estimator": {"name": "net", "kind": "small"}, "training": training, "seed": seed, "train": [], "validation": []}
+    return TrainJob(StagePlan("train", f"net-seed{seed}", config, {}, "code", output), config["estimator"], training, SPLIT, seed, {})
 
 
-def trained(own, seconds, text="weights"):
-    def write(folder):
-        (folder / "model.safetensors").write_text(text)
-        (folder / "fit.csv").write_text("metric,value\nepochs,3\n")
-        (folder / "timings.csv").write_text(f"metric,value\ntrain_seconds,{seconds}\n")
-
-    return make(own.plan, write)
+def made_in(output):
+    return make(job(output).plan, lambda folder: (folder / "model.safetensors").write_text("weights") and None)
 
 
-# How far a launch is
-
-
-def test_progress_counts_and_estimates_the_end():
+def test_progress_counts_and_estimates_the_end_in_no_more_bars_than_fit_a_terminal():
     progress = LaunchProgress(10)
-    progress.running.add(0)
-    progress.running.add(1)
+    progress.running |= {0, 1}
     begun = {"done": "0", "running": "2", "waiting": "8", "failed": "0", "core hours": "0.000", "cores": "2", "left": ""}
     assert progress.row(2) == begun
     progress.ended(0, 10.0, failed=False)
     progress.ended(1, 20.0, failed=True)
     ended = {"done": "1", "running": "0", "waiting": "8", "failed": "1", "core hours": "0.008", "cores": "4", "left": "0:00:30"}
-    assert progress.row(4) == ended
-    assert LaunchProgress(1).row(4) == {}
-
-
-def test_no_more_bars_are_drawn_than_fit_a_terminal(monkeypatch):
+    assert (progress.row(4), LaunchProgress(1).row(4)) == (ended, {})
     with FINE.bars() as bars:
         for number in range(console.MOST_BARS + 5):
             bars.fit(f"training {number}", None)
         assert len(bars.tasks) == console.MOST_BARS
 
 
-# Artefacts that travel
-
-
 def test_an_artefact_travels_with_its_digest_and_a_damaged_one_does_not_arrive(tmp_path):
-    made = trained(job(tmp_path / "here"), 1.0)
+    made = made_in(tmp_path / "here")
     there = tmp_path / "there" / "train" / made.folder.name
     files = pack({made.folder})[made.folder]
     unpack({there: files})
@@ -89,31 +67,23 @@ def test_a_digest_that_is_a_path_removes_nothing(tmp_path):
     precious = tmp_path / "home" / "precious.txt"
     precious.parent.mkdir()
     precious.write_text("precious")
-    made = trained(job(tmp_path / "here"), 1.0)
+    made = made_in(tmp_path / "here")
     manifest = json.loads((made.folder / MANIFEST).read_text())
     manifest["outputs"]["model.safetensors"]["sha256"] = "../home/precious.txt"
     (made.folder / MANIFEST).write_text(json.dumps(manifest))
     with pytest.raises(DataError, match=r"outputs\.model\.safetensors\.sha256"):
         unpack({tmp_path / "there" / "train" / made.folder.name: pack({made.folder})[made.folder]})
-    assert find(job(tmp_path / "here").plan) is None
-    assert precious.read_text() == "precious"
+    assert (find(job(tmp_path / "here").plan), precious.read_text()) == (None, "precious")
 
 
-def test_a_machine_with_other_versions_says_so_and_does_nothing(tmp_path):
+def test_a_machine_with_other_versions_or_without_the_output_root_does_nothing(tmp_path):
     spec = replace(task_of(0, Group([job(tmp_path)], SPLIT), tmp_path, tmp_path), versions={**versions_here(), "torch": "1.0"})
     with pytest.raises(MissingError, match=r"torch .* instead of 1\.0; install the same versions"):
         run_task(spec, {}, lambda: False)
-    assert not list(tmp_path.iterdir())
-
-
-def test_a_machine_without_the_output_root_does_nothing_before_it_gets_copies(tmp_path):
     spec = task_of(0, Group([job(tmp_path / "out")], SPLIT), tmp_path / "out", tmp_path / "out" / "clusters" / "run-0")
     with pytest.raises(NotShared):
         run_task(spec, None, lambda: False)
     assert not list(tmp_path.iterdir())
-
-
-# Machines and choices
 
 
 def test_what_another_host_writes_is_left_alone_for_a_day(tmp_path, monkeypatch):
@@ -130,28 +100,16 @@ def test_what_another_host_writes_is_left_alone_for_a_day(tmp_path, monkeypatch)
     assert not old.exists()
 
 
-def test_options_of_a_cluster_are_refused_elsewhere(place):
-    assert "--slurm is for --launcher slurm, not for local" in place.refused("run", "small", "--slurm", "minutes=5")[1]
-    assert "--launcher must be one of local, ray, slurm" in place.refused("sweep", "split=mine", "--launcher", "dask")[1]
-
-
-def test_without_ray_one_line_says_how_to_get_it(place, monkeypatch):
+def test_without_ray_one_line_says_how_to_get_it_and_the_local_launcher_hands_back_failures_as_values(place, monkeypatch):
+    place.refused("run", "small", "--slurm", "minutes=5", says="--slurm is for --launcher slurm, not for local")
+    place.refused("sweep", "split=mine", "--launcher", "dask", says="--launcher must be one of local, ray, slurm")
+    launcher = chosen_launcher(LauncherOptions(), 1, place.folder, FINE)
+    assert isinstance(launcher, LocalLauncher)
+    (done,) = launcher.launch([Group([job(place.folder)], SPLIT)], StopSignals(), lambda *_: None)
+    assert isinstance(done.outcome, Failure)
     real = importlib.util.find_spec
     monkeypatch.setattr(importlib.util, "find_spec", lambda name, *rest: None if name == "ray" else real(name, *rest))
-    code, line = place.refused("run", "small", "--launcher", "ray")
-    assert code == 4
-    assert "pip install 'vehest[ray]'" in line
-
-
-def test_the_local_launcher_hands_back_failures_as_values(tmp_path):
-    launcher = chosen_launcher(LauncherOptions(), 1, tmp_path, FINE)
-    assert isinstance(launcher, LocalLauncher)
-    group = Group([job(tmp_path)], SPLIT)
-    (done,) = launcher.launch([group], StopSignals(), lambda *_: None)
-    assert isinstance(done.outcome, Failure)
-
-
-# Options of launchers
+    place.refused("run", "small", "--launcher", "ray", code=4, says="pip install 'vehest[ray]'")
 
 
 @pytest.mark.parametrize(
@@ -171,12 +129,9 @@ def test_options_that_a_launcher_does_not_take_are_refused(where, says, tmp_path
     assert not list(tmp_path.iterdir())
 
 
-def test_what_jobs_ask_of_slurm_has_the_names_of_submitit():
+def test_what_jobs_ask_of_slurm_has_the_names_of_submitit_and_without_slurm_a_line_says_where_to_run(tmp_path, monkeypatch):
     asked = slurm_parameters(["partition=long", "minutes=90.4", "memory_gb=1.5"])
     assert asked == {"slurm_partition": "long", "timeout_min": 90, "mem_gb": 1.5, "cpus_per_task": 1, "name": "vehest"}
-
-
-def test_without_slurm_a_line_says_where_to_run(tmp_path, monkeypatch):
     pytest.importorskip("submitit")
     monkeypatch.setenv("PATH", str(tmp_path))
     with pytest.raises(MissingError, match="there is no SLURM here"):

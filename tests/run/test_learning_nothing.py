@@ -1,12 +1,11 @@
 """Estimators that learn nothing: no training range is needed, recorded, or held against a test."""
 
-import csv
 import json
 import math
 from pathlib import Path
 
+import pandas as pd
 import pytest
-import yaml
 
 OWN_NOISE = ("estimator=kalman", "estimator.noise.read_from=recording", "tracking=none")
 
@@ -15,68 +14,43 @@ OWN_NOISE = ("estimator=kalman", "estimator.noise.read_from=recording", "trackin
 def steered(place):
     """Two drives with a steering angle, a split with a test only, and one that trains on the other drive."""
     place.add_steered()
-    whole = {"name": "whole", "dataset": "steered", "train": [], "validation": [], "tests": {"test": [{"recording": "second"}]}}
-    cut = whole | {
-        "name": "cut",
-        "train": [{"recording": "first"}],
-        "validation": [{"recording": "second", "stop": 10}],
-        "tests": {"test": [{"recording": "second", "start": 10}]},
-    }
-    for split in (whole, cut):
-        (Path("conf") / "split" / f"{split['name']}.yaml").write_text(yaml.safe_dump(split))
+    tests = {"test": [{"recording": "second"}]}
+    place.change("conf/split/whole.yaml", name="whole", dataset="steered", train=[], validation=[], tests=tests)
+    parts = {"train": [{"recording": "first"}], "validation": [{"recording": "second", "stop": 10}]}
+    place.change("conf/split/cut.yaml", name="cut", dataset="steered", **parts, tests={"test": [{"recording": "second", "start": 10}]})
     return place
 
 
-def figures_of(out):
-    return {name: value for name, value in json.loads(out).items() if name.endswith(".test")}
-
-
-def test_whole_recording_is_a_test_without_training(steered):
-    assert steered("train", *OWN_NOISE, "split=whole")[0] == 0
-    code, out, _ = steered("eval", *OWN_NOISE, "split=whole", "--json")
-    assert code == 0
-    figures = figures_of(out)
+def test_whole_recording_is_a_test_without_training_and_the_model_is_the_same_for_every_split(steered):
+    folders = [steered.told("train", *OWN_NOISE, f"split={split}")["model"] for split in ("whole", "cut")]
+    assert (folders[0], steered("eval", "--model", folders[0], "split=whole", "tracking=none")[0]) == (folders[1], 0)
+    other = steered.told("train", *OWN_NOISE, "split=cut", "downsample.method=decimate")["model"]
+    assert other != folders[0], "how recordings are prepared is part of a model"
+    figures = steered.told("eval", *OWN_NOISE, "split=whole")
     assert 0 < figures["rmse_sideslip.test"] < 5
     assert figures["n_parameters.test"] == 0
     assert "step_seconds.test" not in figures, "offline: there is no online step to time"
-    with open(Path(json.loads(out)["folder"]) / "metrics.csv", encoding="utf-8") as stream:
-        rows = list(csv.DictReader(stream))
-    assert {(row["trained_on"], row["mode"], row["test_set"]) for row in rows} == {("", "offline", "test")}
-
-
-def test_model_that_learnt_nothing_is_the_same_for_every_split_and_may_be_tested_on_any(steered):
-    folders = [json.loads(steered("train", *OWN_NOISE, f"split={split}", "--json")[1])["model"] for split in ("whole", "cut")]
-    assert folders[0] == folders[1]
-    assert steered("eval", "--model", folders[0], "split=whole", "tracking=none")[0] == 0
-    other = json.loads(steered("train", *OWN_NOISE, "split=cut", "downsample.method=decimate", "--json")[1])["model"]
-    assert other != folders[0], "how recordings are prepared is part of a model"
+    rows = pd.read_csv(Path(figures["folder"]) / "metrics.csv", keep_default_na=False)
+    assert set(zip(rows["trained_on"], rows["mode"], rows["test_set"], strict=True)) == {("", "offline", "test")}
 
 
 def test_filter_with_levels_from_training_is_kept_from_testing_on_them(steered):
-    arguments = ("estimator=kalman", "tracking=none", "--json")
-    code, out, err = steered("train", *arguments, "split=cut")
-    assert code == 0
-    assert json.loads(out)["n_parameters"] == 3
-    assert "3 parameters" in err
-    figures = figures_of(steered("eval", *arguments, "split=cut")[1])
-    assert math.isfinite(figures["step_seconds.test"])
-    folder = json.loads(out)["model"]
-    assert "shares samples with" in steered.refused("eval", "--model", folder, "split=whole", "tracking=none")[1]
-
-
-def test_estimator_that_learns_is_refused_where_there_is_nothing_to_learn_from(steered):
-    line = steered.refused("train", "estimator=ksnn", "split=whole", "tracking=none")[1]
-    assert "split 'whole' has nothing to train on, and estimator 'ksnn' learns" in line
+    arguments = ("estimator=kalman", "tracking=none", "split=cut")
+    out, err = steered.done("train", *arguments, "--json")
+    assert (json.loads(out)["n_parameters"], "3 parameters" in err) == (3, True)
+    assert math.isfinite(steered.told("eval", *arguments)["step_seconds.test"])
+    steered.refused("eval", "--model", json.loads(out)["model"], "split=whole", "tracking=none", says="shares samples with")
+    said = "split 'whole' has nothing to train on, and estimator 'ksnn' learns"
+    steered.refused("train", "estimator=ksnn", "split=whole", "tracking=none", says=said)
 
 
 def test_study_without_training_reports_and_says_where_estimates_start(steered):
     evaluation = {"initial_state": True, "warm_up_seconds": 0}
-    pipeline = {"study": "given", "report": "drive", "split": "whole", "evaluation": evaluation, "sweeps": [[*OWN_NOISE[:2]]]}
-    (Path("pipelines") / "given.yaml").write_text(yaml.safe_dump(pipeline))
-    code, out, _ = steered("run", "given", "tracking=none", "--json")
-    assert code == 0
-    (row,) = json.loads(out)["leaderboard"]
+    own = {"study": "given", "report": "drive", "split": "whole", "sweeps": [[*OWN_NOISE[:2]]]}
+    steered.change("pipelines/given.yaml", **own, evaluation=evaluation)
+    outcome = steered.told("run", "given", "tracking=none")
+    (row,) = outcome["leaderboard"]
     assert (row["estimator"], row["start"]) == ("kalman", "reference")
-    report = (Path(json.loads(out)["report"]).parent / "report.md").read_text(encoding="utf-8")
+    report = (Path(outcome["report"]).parent / "report.md").read_text(encoding="utf-8")
     assert "Estimates start at the reference state" in report
     assert 0 < row["rmse_sideslip"] < 5

@@ -1,25 +1,18 @@
 """Rows of errors with the best lever arm in a study's metrics: where the reference's point is unknown, and nowhere else."""
 
-import json
-
 import numpy as np
 import pandas as pd
 import pytest
-import yaml
 
-from place import DATASET
 from vehest.data.store import read_recording
 
 
 def run(place, point):
-    declared = DATASET if point is None else {**DATASET, "reference_point": point}
-    (place.folder / "conf" / "dataset" / "mine.yaml").write_text(yaml.safe_dump(declared))
-    pipeline = {"study": "levers", "report": "drive", "split": "mine", "sweeps": [["estimator=zero"]]}
-    (place.folder / "pipelines" / "levers.yaml").write_text(yaml.safe_dump(pipeline))
-    code, out, err = place("run", "levers", "tracking=none", "output=out", "--json")
-    assert code == 0, err
+    place.change("conf/dataset/mine.yaml", **({} if point is None else {"reference_point": point}))
+    place.change("pipelines/levers.yaml", study="levers", report="drive", split="mine", sweeps=[["estimator=zero"]])
+    outcome = place.told("run", "levers", "tracking=none", "output=out")
     metrics = next((place.folder / "out" / "evaluate").glob("zero-*")) / "metrics.csv"
-    return pd.read_csv(metrics), json.loads(out)
+    return pd.read_csv(metrics), outcome
 
 
 def test_where_the_point_is_unknown_errors_are_given_with_the_best_lever_arm_too(place):

@@ -1,6 +1,5 @@
 """Two runs in one output root: each artefact and each MLflow run once, the same numbers as alone, nobody waits for ever."""
 
-import json
 import os
 import signal
 import subprocess
@@ -41,25 +40,19 @@ def held_elsewhere(output, stage, name):
         process.communicate()
 
 
-def test_a_lock_ends_with_the_process_that_holds_it(tmp_path):
-    lock = Lock(tmp_path, "train", "a model")
+def test_a_lock_ends_with_the_process_that_holds_it_and_waiting_says_once_for_whom_and_ends_when_asked(tmp_path):
+    lock, said = Lock(tmp_path, "train", "a model"), []
+    asked = iter([False, False, True])
     with held_elsewhere(tmp_path, "train", "a model") as holder:
         assert not lock.take()
         assert lock.holder.startswith(f"process {holder.pid} on ")
+        with held(Lock(tmp_path, "train", "a model"), lambda: next(asked), said.append) as mine:
+            assert not mine
+        assert [(waiting.stage, waiting.label, str(holder.pid) in waiting.holder) for waiting in said] == [("train", "a model", True)]
         os.kill(holder.pid, signal.SIGKILL)
         holder.wait()
         assert lock.take()
     lock.release()
-
-
-def test_waiting_says_once_for_whom_and_ends_when_asked(tmp_path):
-    said = []
-    asked = iter([False, False, True])
-    with held_elsewhere(tmp_path, "train", "a model") as holder:
-        with held(Lock(tmp_path, "train", "a model"), lambda: next(asked), said.append) as mine:
-            assert not mine
-        assert [(waiting.stage, waiting.label) for waiting in said] == [("train", "a model")]
-        assert str(holder.pid) in said[0].holder
 
 
 def test_names_that_suit_no_file_are_locks_of_their_own(tmp_path):
@@ -73,7 +66,8 @@ def test_names_that_suit_no_file_are_locks_of_their_own(tmp_path):
 
 
 def test_a_group_begins_with_what_nobody_trains_and_waits_for_the_rest_with_empty_hands(tmp_path):
-    jobs = [_job(tmp_path, seed) for seed in range(3)]
+    plans = [StagePlan("train", f"model-seed{seed}", {"seed": seed}, {}, "code", tmp_path) for seed in range(3)]
+    jobs = [TrainJob(plan, {}, {}, None, seed, {}) for seed, plan in enumerate(plans)]
     first, second = jobs[0].plan.lock, jobs[1].plan.lock
     assert first.take()
     with _held(jobs, lambda: False, pytest.fail) as free:
@@ -93,11 +87,6 @@ def test_a_group_begins_with_what_nobody_trains_and_waits_for_the_rest_with_empt
     with _held(jobs[1:2], lambda: True, said.append) as free:
         assert free == [], "who is asked to stop waits no longer"
     second.release()
-
-
-def _job(output, seed):
-    plan = StagePlan("train", f"model-seed{seed}", {"seed": seed}, {}, "code", output)
-    return TrainJob(plan, {}, {}, None, seed, {})
 
 
 COMMAND = [sys.executable, "-m", "vehest"]
@@ -184,31 +173,24 @@ def test_three_runs_at_once_make_each_artefact_and_each_mlflow_run_once_with_the
     found = client.search_runs([client.get_experiment_by_name("vehest").experiment_id])
     runs = [run for run in found if run.data.tags["vehest.stage"] != "study"]
     assert len(found) == len(runs) + 1, "and one above them"
-    assert sorted(run.data.tags["vehest.key"] for run in runs) == sorted(
-        artefact.key for folder in _folders(together) if (artefact := read_artefact(folder)).stage in {"train", "calibrate", "evaluate"}
-    )
+    tracked = _artefacts(together, ("train", "calibrate", "evaluate"))
+    assert sorted(run.data.tags["vehest.key"] for run in runs) == sorted(artefact.key for artefact in tracked)
     assert {run.info.status for run in runs} == {"FINISHED"}
     assert not list((together / "checkpoints").rglob("*"))
 
 
 def test_a_training_made_again_leaves_its_evaluation_up_to_date(place):
-    arguments = ("split=mine", "training.max_epochs=1", "tracking=none", "--json")
-    assert place("train", *arguments)[0] == 0
-    assert json.loads(place("eval", *arguments)[1])["skipped"] is False
-    assert json.loads(place("train", *arguments, "--force")[1])["skipped"] is False
-    evaluated = json.loads(place("eval", *arguments)[1])
+    arguments = ("split=mine", "training.max_epochs=1", "tracking=none")
+    place.told("train", *arguments)
+    assert [place.told(*words)["skipped"] for words in (("eval", *arguments), ("train", *arguments, "--force"))] == [False, False]
+    evaluated = place.told("eval", *arguments)
     assert evaluated["skipped"] is True
-    assert evaluated["train_seconds.test"] > 0
-    assert evaluated["step_seconds.test"] > 0
+    assert min(evaluated["train_seconds.test"], evaluated["step_seconds.test"]) > 0
 
 
-def _folders(output):
-    return [
-        folder
-        for stage in ("ingest", "downsample", "train", "calibrate", "evaluate", "report")
-        for folder in sorted((output / stage).iterdir())
-    ]
+def _artefacts(output, stages):
+    return [read_artefact(folder) for stage in stages for folder in sorted((output / stage).iterdir())]
 
 
 def _contents(output):
-    return {folder.name: read_artefact(folder).digest for folder in _folders(output) if folder.parent.name != "report"}
+    return {own.folder.name: own.digest for own in _artefacts(output, ("ingest", "downsample", "train", "calibrate", "evaluate"))}

@@ -7,9 +7,8 @@ import shutil
 
 import pandas as pd
 import pytest
-import yaml
 
-from place import write_csv
+from place import DATASET, write_csv
 from vehest.report.document import Document
 from vehest.run.study import jobs_of, read_study
 from vehest.run.train import new_estimator
@@ -17,6 +16,7 @@ from vehest.studies.artefacts import METRIC_COLUMNS
 from vehest_papers.ksnn import paper
 from vehest_papers.ksnn.candidates import category_of
 
+BOTH = "pipelines/both.yaml"
 CANDIDATES = [
     ["estimator=luenberger", "training.grid=1", "training.max_evaluations=20"],
     ["estimator=ksnn", "estimator.n_hidden=0,2", "seed=0,1", "training.max_epochs=2"],
@@ -29,44 +29,38 @@ def parts_place(place):
     """A place whose data set serves two schemes, and a part whose raw files are elsewhere."""
     for seed, name in enumerate(("one", "two", "three"), 1):
         write_csv(place.folder / "raw" / f"{name}.csv", seed, 80.0)
-    conf, pipelines = place.folder / "conf", place.folder / "pipelines"
-    split = yaml.safe_load((conf / "split" / "mine.yaml").read_text())
+    split = place.change("conf/split/mine.yaml")
     tests = {"c2": [{"recording": "three", "stop": 40}], "f2": [{"recording": "three", "start": 40}]}
     for name, train, validation in (("forth", "one", "two"), ("back", "two", "one")):
-        own = {**split, "name": name, "train": [{"recording": train}], "validation": [{"recording": validation}], "tests": tests}
-        (conf / "split" / f"{name}.yaml").write_text(yaml.safe_dump(own))
-    dataset = yaml.safe_load((conf / "dataset" / "mine.yaml").read_text())
-    (conf / "dataset" / "other.yaml").write_text(yaml.safe_dump({**dataset, "name": "other", "path": "${root}/other"}, allow_unicode=True))
-    (conf / "split" / "other.yaml").write_text(yaml.safe_dump({**split, "name": "other", "dataset": "other"}))
-    pipeline = {
-        "study": "both",
-        "title": "Both ways",
-        "report": "ksnn",
-        "publish": True,
-        "parts": {
-            "scheme_1": {"title": "There", "split": "forth", "sweeps": CANDIDATES},
-            "scheme_2": {"title": "Back", "split": "back", "sweeps": CANDIDATES},
-            "ferrari_drive": {"title": "Elsewhere", "split": "other", "sweeps": CANDIDATES, "optional": True},
-        },
+        own = {"name": name, "train": [{"recording": train}], "validation": [{"recording": validation}], "tests": tests}
+        place.change(f"conf/split/{name}.yaml", **split | own)
+    place.change("conf/dataset/other.yaml", **DATASET | {"name": "other", "path": "${root}/other"})
+    place.change("conf/split/other.yaml", **split | {"name": "other", "dataset": "other"})
+    parts = {
+        "scheme_1": {"title": "There", "split": "forth", "sweeps": CANDIDATES},
+        "scheme_2": {"title": "Back", "split": "back", "sweeps": CANDIDATES},
+        "ferrari_drive": {"title": "Elsewhere", "split": "other", "sweeps": CANDIDATES, "optional": True},
     }
-    (pipelines / "both.yaml").write_text(yaml.safe_dump(pipeline, sort_keys=False))
-    (pipelines / "turned.yaml").write_text(
-        yaml.safe_dump({"based_on": "both", "study": "turned", "publish": False, "parts": {"scheme_1": {"split": "back"}}})
-    )
+    place.change("pipelines/both.yaml", study="both", title="Both ways", report="ksnn", publish=True, parts=parts)
+    place.change("pipelines/turned.yaml", based_on="both", study="turned", publish=False, parts={"scheme_1": {"split": "back"}})
     return place
+
+
+def change_parts(place, change):
+    """Write the pipeline anew with what ``change`` makes of its parts."""
+    parts = place.change(BOTH)["parts"]
+    place.change(BOTH, parts=change(parts) or parts)
 
 
 def test_parts_run_as_one_study_and_the_next_run_skips_all(parts_place):
     place = parts_place
-    code, out, err = place("run", "both", "--json", "tracking=none")
-    assert code == 0, err
+    out, err = place.done("run", "both", "--json", "tracking=none")
     assert "goes on without part 'ferrari_drive'" in " ".join(err.split())
     overview = pd.DataFrame(json.loads(out)["overview"])
     assert list(overview["model"]) == [paper.LUENBERGER, paper.LSTM, paper.LINEAR, paper.NONLINEAR] * 2
     results = place.folder / "results" / "both"
     metrics = pd.read_csv(results / "metrics.csv")
-    assert set(metrics["trained_on"]) == {"mine/scheme_1", "mine/scheme_2"}
-    assert list(metrics.columns) == list(METRIC_COLUMNS)
+    assert (set(metrics["trained_on"]), list(metrics.columns)) == ({"mine/scheme_1", "mine/scheme_2"}, list(METRIC_COLUMNS))
     about = json.loads((results / "provenance.json").read_text())
     assert (about["parts"], about["absent"]) == (["scheme_1", "scheme_2"], ["ferrari_drive"])
     report = (results / "report.md").read_text(encoding="utf-8")
@@ -77,7 +71,7 @@ def test_parts_run_as_one_study_and_the_next_run_skips_all(parts_place):
 
     assert place("report", "both", "tracking=none")[0] == 0
     made = place.files()
-    code, again, err = place("run", "both", "--json", "tracking=none")
+    again, err = place.done("run", "both", "--json", "tracking=none")
     assert json.loads(again)["overview"] == json.loads(out)["overview"]
     assert {line.split()[0] for line in err.splitlines() if line.split()[1] in {"train", "evaluate", "report"}} == {"skipped"}
     assert place.files() == made
@@ -89,71 +83,45 @@ def test_parts_run_as_one_study_and_the_next_run_skips_all(parts_place):
     shutil.copytree(place.folder / "raw", place.folder / "raw" / "other")
     assert place("report", "--check")[:2] == (3, "both: stale: data (ferrari_drive, which was not here)\n")
     shutil.rmtree(place.folder / "raw" / "other")
-    file = place.folder / "pipelines" / "both.yaml"
-    content = yaml.safe_load(file.read_text())
-    content["parts"]["scheme_2"]["sweeps"] = [*CANDIDATES[:2], ["estimator=lstm", "estimator.n_states=3", "training.max_epochs=2"]]
-    file.write_text(yaml.safe_dump(content, sort_keys=False))
+    sweeps = [*CANDIDATES[:2], ["estimator=lstm", "estimator.n_states=3", "training.max_epochs=2"]]
+    change_parts(place, lambda parts: parts["scheme_2"].update(sweeps=sweeps))
     assert place("report", "--check")[:2] == (3, "both: stale: configuration (scheme_2: train lstm)\n")
 
 
 def test_a_study_module_without_an_overview_is_told_so(parts_place, monkeypatch):
     monkeypatch.setattr("vehest_papers.ksnn.documents", lambda artefacts: {"report": Document(artefacts.title, ["no tables"])})
-    file = parts_place.folder / "pipelines" / "both.yaml"
-    content = yaml.safe_load(file.read_text())
-    content["parts"] = {"scheme_1": {"split": "forth", "sweeps": CANDIDATES[:1]}}
-    file.write_text(yaml.safe_dump(content))
+    parts_place.change(BOTH, parts={"scheme_1": {"split": "forth", "sweeps": CANDIDATES[:1]}})
     code, _, err = parts_place("run", "both", "tracking=none")
-    assert code == 2
-    assert "gives no table 'overview'" in " ".join(err.split())
+    assert (code, "gives no table 'overview'" in " ".join(err.split())) == (2, True)
     assert not list((parts_place.folder / "outputs" / "report").glob("both-*"))
 
 
 def test_a_run_without_a_part_does_not_replace_a_published_study_that_shows_it(parts_place):
     place = parts_place
-    file = place.folder / "pipelines" / "both.yaml"
-    content = yaml.safe_load(file.read_text())
-    for part in content["parts"].values():
-        part["sweeps"] = [sweep for sweep in CANDIDATES if "estimator=ksnn" not in sweep]
-    file.write_text(yaml.safe_dump(content))
+    change_parts(place, lambda parts: [part.update(sweeps=CANDIDATES[::2]) for part in parts.values()] and None)
     shutil.copytree(place.folder / "raw", place.folder / "raw" / "other")
-    code, _, err = place("run", "both", "tracking=none")
-    assert code == 0, err
+    place.done("run", "both", "tracking=none")
     published = (place.folder / "results" / "both" / "report.md").read_bytes()
     shutil.rmtree(place.folder / "raw" / "other")
-    code, out, err = place("run", "both", "--json", "tracking=none")
+    _, out, err = place("run", "both", "--json", "tracking=none")
     assert "not published: 'results/both' shows part 'ferrari_drive'" in " ".join(err.split())
     assert json.loads(out)["published"] is None
     assert (place.folder / "results" / "both" / "report.md").read_bytes() == published
     assert place("report", "--check")[:2] == (0, "both: up to date: raw files not here, not compared: other\n")
+    change_parts(place, lambda parts: parts["ferrari_drive"].pop("optional") and None)
+    place.refused("run", "both", "tracking=none", code=4, says="other")
 
 
 def test_a_study_of_real_cars_is_nowhere_called_simulated(parts_place):
-    place = parts_place
-    for file in (place.folder / "conf" / "dataset").glob("*.yaml"):
-        file.write_text(yaml.safe_dump({**yaml.safe_load(file.read_text()), "kind": "real"}, allow_unicode=True))
-    file = place.folder / "pipelines" / "both.yaml"
-    content = yaml.safe_load(file.read_text())
+    for name in ("mine", "other"):
+        parts_place.change(f"conf/dataset/{name}.yaml", kind="real")
     quick = [CANDIDATES[0], [*CANDIDATES[1][:2], "training.max_epochs=1"], CANDIDATES[2]]
-    content["parts"]["scheme_1"]["sweeps"] = content["parts"]["scheme_2"]["sweeps"] = quick
-    content["parts"]["devbot_ferrari"] = content["parts"]["minutes_5_a"] = {"split": "back", "sweeps": CANDIDATES[::2]}
-    file.write_text(yaml.safe_dump(content, sort_keys=False))
-    code, _, err = place("run", "both", "tracking=none")
-    assert code == 0, err
-    report = (place.folder / "results" / "both" / "report.md").read_text(encoding="utf-8")
+    further = {name: {"split": "back", "sweeps": CANDIDATES[::2]} for name in ("devbot_ferrari", "minutes_5_a")}
+    change_parts(parts_place, lambda parts: {name: part | {"sweeps": quick} for name, part in parts.items()} | further)
+    parts_place.done("run", "both", "tracking=none")
+    report = (parts_place.folder / "results" / "both" / "report.md").read_text(encoding="utf-8")
     made_here = report.replace("a simulated DevBot", "").replace("samples, simulated, σ", "")  # a heading, and noise put into a made turn
     assert "simulated" not in made_here.lower()
-
-
-def test_files_of_a_part_that_must_be_there_are_missed_in_one_line(parts_place):
-    place = parts_place
-    file = place.folder / "pipelines" / "both.yaml"
-    content = yaml.safe_load(file.read_text())
-    del content["parts"]["ferrari_drive"]["optional"]
-    content["parts"] = {"ferrari_drive": content["parts"]["ferrari_drive"], **content["parts"]}
-    file.write_text(yaml.safe_dump(content, sort_keys=False))
-    code, line = place.refused("run", "both", "tracking=none")
-    assert code == 4
-    assert "other" in line
 
 
 def test_a_pipeline_based_on_another_says_only_what_changes(parts_place):
@@ -167,12 +135,13 @@ def test_a_pipeline_based_on_another_says_only_what_changes(parts_place):
 def test_the_study_of_the_paper_differs_from_that_on_its_own_recordings_in_splits_and_what_is_simulated_alone():
     simulated, official = read_study("ksnn"), read_study("ksnn_revs")
     shared = [part for name, part in simulated.parts.items() if not name.startswith("same_")]
-    changed = {part.split: other.split for part, other in zip(shared, official.parts.values(), strict=True) if part != other}
+    pairs = list(zip(shared, official.parts.values(), strict=True))
+    changed = {part.split: other.split for part, other in pairs if part != other}
     assert changed == {"cross_vehicle_1_sim": "cross_vehicle_1", "cross_vehicle_2_sim": "cross_vehicle_2", "one_vehicle_sim": "one_vehicle"}
-    assert all(
-        dataclasses.replace(part, split="") == dataclasses.replace(other, split="")
-        for part, other in zip(official.parts.values(), shared, strict=True)
-    )
+    assert all(dataclasses.replace(part, split="") == dataclasses.replace(other, split="") for part, other in pairs)
+    for name, part in simulated.parts.items():
+        estimators = {own for sweep in part.sweeps for own in sweep[0].removeprefix("estimator=").split(",")}
+        assert {"zero", "static_map"} <= estimators or name == "ferrari_whole", name
 
 
 def test_both_schemes_have_the_39_candidates_of_table_3_and_three_baselines():
@@ -183,47 +152,33 @@ def test_both_schemes_have_the_39_candidates_of_table_3_and_three_baselines():
     for scheme in schemes:
         names = [(new_estimator(config["estimator"]).name, new_estimator(config["estimator"]).variant) for config in configs[scheme]]
         candidates = [name for name in dict.fromkeys(names) if name[0] not in baselines]
-        assert {name[0] for name in names} - {name[0] for name in candidates} == set(baselines)
-        assert len(candidates) == 39
+        assert ({name[0] for name in names} - {name[0] for name in candidates}, len(candidates)) == (set(baselines), 39)
         categories = [category_of(*name) for name in candidates]
         assert {name: categories.count(name) for name in categories} == {name: row.variants for name, row in paper.TABLE_III.items()}
         assert all(names.count(name) in ((1,) if name[0] == "luenberger" else (5, 10)) for name in candidates)
 
 
-def test_every_part_of_the_study_in_which_a_car_is_tested_has_zero_and_the_static_map_beside_it():
-    for name, part in read_study("ksnn").parts.items():
-        estimators = {own for sweep in part.sweeps for own in sweep[0].removeprefix("estimator=").split(",")}
-        assert {"zero", "static_map"} <= estimators or name == "ferrari_whole", name
-
-
 @pytest.mark.parametrize(
-    ("change", "message"),
+    ("file", "content", "says"),
     [
-        ({"split": "forth", "sweeps": CANDIDATES}, "it needs study, report and one of"),
-        ({"parts": {}}, "it needs study, report and one of"),
-        ({"parts": {"one": {"split": "forth"}}}, "part 'one' needs split and sweeps"),
-        ({"parts": {"../one": {"split": "forth", "sweeps": CANDIDATES}}}, "part"),
-        ({"report": "drive"}, "the study module 'drive' draws its report from split and sweeps"),
-        ({"parts": {"scheme_1": {"split": "forth", "sweeps": CANDIDATES}}}, "needs part 'scheme_2'"),
+        (BOTH, {"split": "forth", "sweeps": CANDIDATES}, "it needs study, report and one of"),
+        (BOTH, {"parts": {}}, "it needs study, report and one of"),
+        (BOTH, {"parts": {"one": {"split": "forth"}}}, "part 'one' needs split and sweeps"),
+        (BOTH, {"parts": {"../one": {"split": "forth", "sweeps": CANDIDATES}}}, "part"),
+        (BOTH, {"report": "drive"}, "the study module 'drive' draws its report from split and sweeps"),
+        (BOTH, {"parts": {"scheme_1": {"split": "forth", "sweeps": CANDIDATES}}}, "needs part 'scheme_2'"),
+        ("pipelines/x.yaml", {"based_on": "turned", "study": "x"}, "is based on another pipeline itself"),
+        ("pipelines/x.yaml", {"based_on": "no_such", "study": "x"}, "there is no pipeline 'no_such'"),
+        (
+            "pipelines/x.yaml",
+            {"based_on": "both", "study": "x", "parts": {"scheme_3": {"split": "back"}}},
+            "part 'scheme_3' needs split and",
+        ),
     ],
 )
-def test_parts_that_make_no_sense_are_refused(parts_place, change, message):
-    file = parts_place.folder / "pipelines" / "both.yaml"
-    file.write_text(yaml.safe_dump({**yaml.safe_load(file.read_text()), **change}))
-    code, _, err = parts_place("run", "both", "tracking=none", "--quiet")
+def test_parts_and_bases_that_make_no_sense_are_refused(parts_place, file, content, says):
+    parts_place.change(file, **content)
+    code, _, err = parts_place("run", file, "tracking=none", "--quiet")
     assert code != 0
-    assert message in " ".join(err.split())
+    assert says in " ".join(err.split())
     assert "Traceback" not in err
-
-
-@pytest.mark.parametrize(
-    ("content", "message"),
-    [
-        ({"based_on": "turned", "study": "x"}, "is based on another pipeline itself"),
-        ({"based_on": "no_such", "study": "x"}, "there is no pipeline 'no_such'"),
-        ({"based_on": "both", "study": "x", "parts": {"scheme_3": {"split": "back"}}}, "part 'scheme_3' needs split and sweeps"),
-    ],
-)
-def test_wrong_bases_of_pipelines_are_one_line(parts_place, content, message):
-    (parts_place.folder / "pipelines" / "mine.yaml").write_text(yaml.safe_dump(content))
-    assert message in parts_place.refused("run", "mine")[1]

@@ -1,12 +1,11 @@
 """The model for cars that nobody has trained on, which comes with vehest."""
 
-import importlib.util
-import json
 import re
 import subprocess
 import sys
 from pathlib import Path
 
+import make_pretrained
 import numpy as np
 import pandas as pd
 import yaml
@@ -28,9 +27,7 @@ ROOT = Path(__file__).parents[2]
 def test_estimate_without_a_model_takes_the_one_that_comes_with_vehest_and_says_so(place):
     table = write_csv(place.folder / "lap.csv", 9).drop(columns="Vy")
     table.to_csv(place.folder / "lap.csv", index=False)
-    code, out, err = place("estimate", "lap.csv", "dataset=mine", "-o", "default.csv", "--json")
-    assert code == 0, err
-    said = json.loads(out)
+    said = place.told("estimate", "lap.csv", "dataset=mine", "-o", "default.csv")
     assert said["model"] == said["estimator"] == "self_calibrating"
     for what in ("simulated cars and not on this one", "results/unseen_car", "PCT/IT2023/050058"):
         assert what in said["note"]
@@ -56,52 +53,31 @@ def test_completion_of_the_first_word_offers_models_and_recordings(place):
     for name in ("lap.csv", "lap.parquet", "notes.txt"):
         (place.folder / name).touch()
     assert _complete_model_or_file("") == ["pretrained", "self_calibrating", "ksnn-a", "lap.csv", "lap.parquet"]
-    assert _complete_model_or_file("la") == ["lap.csv", "lap.parquet"]
-    assert _complete_model_or_file("raw/o") == ["raw/one.csv"]
+    assert (_complete_model_or_file("la"), _complete_model_or_file("raw/o")) == (["lap.csv", "lap.parquet"], ["raw/one.csv"])
     assert _complete_model_or_file("./la") == ["./lap.csv", "./lap.parquet"]
 
 
-def test_a_named_model_is_used_and_a_folder_is_no_recording(place):
-    write_csv(place.folder / "lap.csv", 9)
+def test_a_named_model_is_used_a_folder_is_no_recording_and_a_name_with_an_equals_sign_is_no_override(place):
+    write_csv(place.folder / "speed=30.csv", 9)
     observer = estimator_class("luenberger").from_config({"rate_hz": 20})
     observer.load_weights({"gain": np.array([5.0]), "threshold": np.array([0.05])})
     (place.folder / "own").mkdir()
     save_model(observer, place.folder / "own")
-    code, out, err = place("estimate", "own", "lap.csv", "dataset=mine", "--json")
-    assert code == 0, err
-    assert json.loads(out)["estimator"] == "luenberger"
-    assert "note" not in json.loads(out)
-    assert "comes after the model" in place.refused("estimate", "own")[1]
-
-
-def test_a_recording_whose_name_holds_an_equals_sign_is_no_override(place):
-    write_csv(place.folder / "speed=30.csv", 9)
-    code, out, err = place("estimate", "pretrained", "speed=30.csv", "dataset=mine", "--json")
-    assert code == 0, err
-    assert json.loads(out)["recording"] == "speed=30"
+    outcome = place.told("estimate", "own", "speed=30.csv", "dataset=mine")
+    assert (outcome["estimator"], outcome["recording"], "note" in outcome) == ("luenberger", "speed=30", False)
+    place.refused("estimate", "own", says="comes after the model")
 
 
 def test_pretrained_model_is_small_and_what_the_published_study_has_chosen():
     folder = pretrained_folder()
     assert sum(file.stat().st_size for file in folder.iterdir()) < 30_000
-    spec = importlib.util.spec_from_file_location("make_pretrained", ROOT / "docs" / "make_pretrained.py")
-    assert spec is not None
-    assert spec.loader is not None
-    maker = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(maker)
-    row, about = maker.chosen_step(), yaml.safe_load((folder / "model.yaml").read_text(encoding="utf-8"))["about"]
-    assert about["note"] == maker.note_of(row, load_model(folder)), "make pretrained"
+    row, about = make_pretrained.chosen_step(), yaml.safe_load((folder / "model.yaml").read_text(encoding="utf-8"))["about"]
+    assert about["note"] == make_pretrained.note_of(row, load_model(folder)), "make pretrained"
     assert (about["seed"], about["step"]) == (row["model_seed"], row["part"])
-    assert all(kind_of(compose_config("ingest", [f"dataset={name}"])["dataset"]) == "simulated" for name in about["datasets"])
-
-
-def test_what_is_known_of_the_pretrained_model_was_learnt_on_other_cars_than_the_yardstick():
-    trust = read_trust(pretrained_folder())
-    assert trust.about.note == ""
-    assert trust.bands is not None
-    assert trust.guard is None, "simulated sensors say nothing of the range and resolution of real ones"
-    assert trust.health is not None
-    assert all(kind_of(compose_config("ingest", [f"dataset={name}"])["dataset"]) == "simulated" for name in trust.bands.datasets)
+    trust = read_trust(folder)  # learnt on other cars than the yardstick; simulated sensors say nothing of the range of real ones
+    assert (trust.about.note, trust.guard, trust.bands is None, trust.health is None) == ("", None, False, False)
+    for name in (*about["datasets"], *trust.bands.datasets):
+        assert kind_of(compose_config("ingest", [f"dataset={name}"])["dataset"]) == "simulated"
     assert trust.bands.n_blocks >= 34
     assert "ferrari_250_lm" not in trust.bands.vehicles
 

@@ -2,6 +2,7 @@
 
 import json
 import os
+import shutil
 import subprocess
 import sys
 
@@ -48,20 +49,12 @@ def name_of(artefact):
     return f"{artefact.stage}/{artefact.folder.name}"
 
 
-def a_dead_process():
-    ended = subprocess.Popen([sys.executable, "-c", ""])
-    ended.wait()
-    return ended.pid
-
-
-def test_what_todays_code_has_made_stays(root):
+def test_what_todays_code_has_made_stays_and_models_of_estimators_that_are_not_installed(root):
     assert root.found() == {}
-
-
-def test_a_report_of_calibrated_models_stays(root):
     inputs = {artefact.folder.name: artefact.digest for artefact in (root.model, root.trusted, root.scored)}
     root.add("report", "mine", {"module": "drive"}, inputs, report.code_of_report("drive"))
     root.add("evaluate", "faulted", {"faults": []}, {}, f"{root.scored.code} faults=1")
+    root.add("train", "theirs", {"estimator": {"name": "somebody_elses"}}, {}, "train=1 somebody_elses=1 training=1")
     assert root.found() == {}
 
 
@@ -71,34 +64,20 @@ def test_what_other_code_has_made_is_found(root):
     assert root.found() == {name_of(older): OUTDATED, name_of(old): OUTDATED}
 
 
-def test_a_model_of_an_estimator_that_is_not_installed_stays(root):
-    root.add("train", "theirs", {"estimator": {"name": "somebody_elses"}}, {}, "train=1 somebody_elses=1 training=1")
-    assert root.found() == {}
-
-
-def test_what_was_made_of_a_model_that_is_gone_is_found_but_not_a_model_without_its_recordings(root):
-    for file in [*root.model.folder.iterdir()]:
-        file.unlink()
-    root.model.folder.rmdir()
+def test_what_was_made_of_a_model_or_a_calibration_that_is_gone_is_found_but_not_a_model_without_its_recordings(root):
+    shutil.rmtree(root.trusted.folder)
+    assert root.found() == {name_of(root.scored): ORPHANED}
+    root.trusted = root.add("calibrate", "one-trust", {}, {"model": root.model.digest}, root.trusted.code)
+    shutil.rmtree(root.model.folder)
     assert root.found() == {name_of(root.trusted): ORPHANED, name_of(root.scored): ORPHANED}
 
 
-def test_an_evaluation_without_its_calibration_is_found(root):
-    for file in [*root.trusted.folder.iterdir()]:
-        file.unlink()
-    root.trusted.folder.rmdir()
-    assert root.found() == {name_of(root.scored): ORPHANED}
-
-
-def test_recordings_of_outdated_code_keep_what_was_made_from_them(root):
+def test_recordings_of_outdated_code_keep_what_was_made_from_them_and_damaged_ones_are_found(root):
     manifest = root.ingested.folder / "manifest.json"
     manifest.write_text(manifest.read_text().replace(root.ingested.code, "0" * 16))
     assert root.found() == {name_of(root.ingested): OUTDATED}
-
-
-def test_a_damaged_artefact_is_found(root):
     (root.rated.folder / "content").unlink()
-    assert root.found() == {name_of(root.rated): DAMAGED}
+    assert root.found() == {name_of(root.ingested): OUTDATED, name_of(root.rated): DAMAGED}
 
 
 def test_checkpoints_of_finished_models_are_found_and_others_are_not(root):
@@ -109,7 +88,9 @@ def test_checkpoints_of_finished_models_are_found_and_others_are_not(root):
 
 
 def test_what_a_killed_process_left_is_found_and_what_a_living_one_writes_is_not(root):
-    dead = root.output / "train" / f"{ASIDE_PREFIX}{a_dead_process()}-1-one"
+    ended = subprocess.Popen([sys.executable, "-c", ""])
+    ended.wait()
+    dead = root.output / "train" / f"{ASIDE_PREFIX}{ended.pid}-1-one"
     living = root.output / "train" / f"{ASIDE_PREFIX}{os.getpid()}-1-one"
     for folder in (dead, living):
         folder.mkdir()
@@ -140,29 +121,16 @@ def outdated(root, monkeypatch, tmp_path):
     return root.add("train", "one", {"estimator": {"name": "luenberger"}}, {}, "0" * 16).folder
 
 
-def test_a_dry_run_lists_and_removes_nothing(outdated, capsys):
+def test_a_dry_run_or_no_answer_removes_nothing_and_yes_removes_what_was_listed_and_nothing_else(outdated, root, capsys):
     code, out, err = run_vehest(capsys, "prune", "--dry-run")
-    assert code == 0, err
-    assert OUTDATED in out
-    assert "1 to remove" in out
-    assert outdated.is_dir()
-
-
-def test_where_nobody_can_be_asked_nothing_is_removed(outdated, capsys):
+    assert (code, OUTDATED in out, "1 to remove" in out) == (0, True, True), err
     for options in ((), ("--json",)):
         code, _, err = run_vehest(capsys, "prune", *options)
-        assert code == 2
-        assert "--yes" in err
-    assert outdated.is_dir()
-
-
-def test_yes_removes_what_was_listed_and_nothing_else(outdated, root, capsys):
+        assert (code, "--yes" in err, outdated.is_dir()) == (2, True, True)
     code, out, err = run_vehest(capsys, "prune", "--yes", "--json")
     assert code == 0, err
     outcome = json.loads(out)
     assert outcome["removed"] == [row["path"] for row in outcome["found"]]
     assert outcome["bytes"] > 0
-    assert not outdated.exists()
-    assert root.model.folder.is_dir()
     assert {path.name for path in outdated.parent.iterdir()} == {root.model.folder.name}
     assert run_vehest(capsys, "prune")[1] == "nothing to remove\n"

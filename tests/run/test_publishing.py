@@ -3,6 +3,7 @@
 import json
 import shutil
 import subprocess
+from types import SimpleNamespace
 
 import numpy as np
 import pandas as pd
@@ -35,17 +36,10 @@ def published(tmp_path_factory):
         patch.setenv("VEHEST_DATA", str(folder / "raw"))
         patch.delenv("VEHEST_OUTPUT", raising=False)
         undrawn(patch)
-        place = Place(folder, _Silent())
+        place = Place(folder, SimpleNamespace(readouterr=lambda: ("", "")))
         (folder / "pipelines" / "small.yaml").write_text(yaml.safe_dump(QUICK))
         assert place(*RUN)[0] == 0
     return folder
-
-
-class _Silent:
-    """Stands for pytest's capsys, which serves single tests only."""
-
-    def readouterr(self):
-        return "", ""
 
 
 @pytest.fixture
@@ -67,13 +61,6 @@ def verdict(place, *words):
     assert not (place.folder / "outputs").exists()
     assert err == ""
     return code, out.strip()
-
-
-def changed(file, **values):
-    file.write_text(yaml.safe_dump({**yaml.safe_load(file.read_text()), **values}, allow_unicode=True))
-
-
-# What is published
 
 
 def test_numbers_are_published_with_six_digits_and_everything_else_as_it_is(tmp_path):
@@ -100,8 +87,7 @@ def test_times_are_in_no_published_file_but_beside_the_page_and_on_it(published)
     assert list(timings.columns) == list(metrics.columns)
     assert len(timings[(timings["estimator"] == "gru") & (timings["metric"] == "train_seconds")]) == 2
     page = (report / "report.html").read_text(encoding="utf-8")
-    assert "<h2>Times</h2>" in page
-    assert "online step [ms]" in page
+    assert all(words in page for words in ("<h2>Times</h2>", "online step [ms]"))
     texts = {
         name: content.decode(errors="replace")
         for name, content in contents(published / "results" / "small").items()
@@ -129,8 +115,7 @@ def test_a_rerun_leaves_the_work_tree_clean(published, monkeypatch, capsys):
     assert (report / TIMINGS).read_bytes() != timings, "it was trained again"
     assert contents(published / "results") == before
     status = subprocess.run(["git", "status", "--short", "--", "results"], capture_output=True, text=True, check=True)
-    assert status.stdout == ""
-    assert run_vehest(capsys, *CHECK)[:2] == (0, "small: up to date\n")
+    assert (status.stdout, run_vehest(capsys, *CHECK)[:2]) == ("", (0, "small: up to date\n"))
 
 
 def test_results_that_other_code_gives_alike_are_recorded_as_its_own(published, place, monkeypatch):
@@ -140,38 +125,34 @@ def test_results_that_other_code_gives_alike_are_recorded_as_its_own(published, 
     monkeypatch.chdir(place.folder)
     monkeypatch.setattr(study_keys, "code_of_ingest", lambda dataset: "other")
     before = contents(place.folder / "results" / "small")
-    assert place(*CHECK)[:2] == (3, "small: stale: code (ingest mine)\n")
-    assert place(*RUN)[0] == 0
+    assert (place(*CHECK)[:2], place(*RUN)[0]) == ((3, "small: stale: code (ingest mine)\n"), 0)
     after = contents(place.folder / "results" / "small")
     assert [name for name in before if after[name] != before[name]] == [PROVENANCE]
     assert place(*CHECK)[:2] == (0, "small: up to date\n")
 
 
-# What is checked
-
-
-def test_published_results_are_up_to_date_by_study_and_by_file(checked):
+def test_published_results_are_up_to_date_by_study_and_by_file_and_after_what_trains_nothing_new(checked):
     for words in ([], ["small"], ["pipelines/small.yaml"], ["small", f"root={checked.folder / 'raw'}"]):
         assert verdict(checked, *words) == (0, "small: up to date")
+    checked.change("pipelines/small.yaml", sweeps=[QUICK["sweeps"][0], [*QUICK["sweeps"][1], "training.checkpoint_seconds=1"]])
+    checked.change("conf/dataset/mine.yaml", citation="somebody else")
+    assert verdict(checked) == (0, "small: up to date")
+    checked.change("conf/split/mine.yaml", tests={"test": [{"recording": "three", "stop": 20}]})
+    assert verdict(checked) == (3, "small: stale: configuration (split)")
+    checked.change("conf/dataset/mine.yaml", title="Another title")
+    assert verdict(checked) == (3, "small: stale: configuration (split, report)")
 
 
 def test_a_changed_setting_of_one_estimator_makes_the_study_stale_and_is_named(checked):
-    changed(checked.folder / "pipelines" / "small.yaml", sweeps=[QUICK["sweeps"][0], [*QUICK["sweeps"][1], "training.learning_rate=0.002"]])
+    checked.change("pipelines/small.yaml", sweeps=[QUICK["sweeps"][0], [*QUICK["sweeps"][1], "training.learning_rate=0.002"]])
     assert verdict(checked) == (3, "small: stale: configuration (train gru, report)")
     code, out = verdict(checked, "--json")
     changes = [{"what": what, "cause": "configuration"} for what in ("train gru", "report")]
     assert (code, json.loads(out)) == (3, [{"study": "small", "state": "stale", "changes": changes, "note": ""}])
 
 
-def test_what_trains_nothing_new_leaves_a_study_up_to_date(checked):
-    sweeps = [[*sweep, "training.checkpoint_seconds=1"] if "estimator=gru" in sweep else sweep for sweep in QUICK["sweeps"]]
-    changed(checked.folder / "pipelines" / "small.yaml", sweeps=sweeps)
-    changed(checked.folder / "conf" / "dataset" / "mine.yaml", citation="somebody else")
-    assert verdict(checked) == (0, "small: up to date")
-
-
 def test_estimators_that_come_and_go_are_named(checked):
-    changed(checked.folder / "pipelines" / "small.yaml", sweeps=[QUICK["sweeps"][1], ["estimator=zero"]])
+    checked.change("pipelines/small.yaml", sweeps=[QUICK["sweeps"][1], ["estimator=zero"]])
     code, line = verdict(checked)
     assert code == 3
     assert "train zero added" in line
@@ -181,25 +162,16 @@ def test_estimators_that_come_and_go_are_named(checked):
     assert {f"{stage} {name}" for stage in stages for name in ("zero added", "luenberger removed")} <= named
 
 
-def test_changed_split_and_title_are_named(checked):
-    changed(checked.folder / "conf" / "split" / "mine.yaml", tests={"test": [{"recording": "three", "stop": 20}]})
-    assert verdict(checked) == (3, "small: stale: configuration (split)")
-    changed(checked.folder / "conf" / "dataset" / "mine.yaml", title="Another title")
-    assert verdict(checked) == (3, "small: stale: configuration (split, report)")
-
-
-def test_changed_code_and_data_are_told_apart(checked, monkeypatch):
+def test_changed_code_and_data_are_told_apart_and_raw_files_that_are_elsewhere_are_not_compared(checked, monkeypatch):
     with open(checked.folder / "raw" / "two.csv", "a") as stream:
         stream.write("\n")
     assert verdict(checked) == (3, "small: stale: data (ingest mine)")
-    monkeypatch.setattr(study_keys, "code_of_report", lambda study: "other")
-    assert verdict(checked) == (3, "small: stale: code (report), data (ingest mine)")
-
-
-def test_raw_files_that_are_elsewhere_are_not_compared_and_this_is_said(checked):
+    with monkeypatch.context() as patch:
+        patch.setattr(study_keys, "code_of_report", lambda study: "other")
+        assert verdict(checked) == (3, "small: stale: code (report), data (ingest mine)")
     shutil.rmtree(checked.folder / "raw")
     assert verdict(checked) == (0, "small: up to date: raw files not here, not compared: mine")
-    changed(checked.folder / "conf" / "dataset" / "mine.yaml", vehicle="another car")
+    checked.change("conf/dataset/mine.yaml", vehicle="another car")
     assert verdict(checked) == (3, "small: stale: configuration (ingest mine); raw files not here, not compared: mine")
 
 
@@ -217,33 +189,19 @@ def test_nothing_is_known_without_keys_without_a_pipeline_and_without_results(ch
     assert verdict(checked, "quickstart")[1] == "quickstart: not known: there is nothing in 'results/quickstart' that vehest published"
 
 
-def test_a_pipeline_that_cannot_be_run_any_more_is_stale(checked):
-    changed(checked.folder / "pipelines" / "small.yaml", sweeps=[["estimator=luenberger", "training.nothing=1"]])
-    code, line = verdict(checked)
-    assert code == 3
-    assert line.startswith("small: stale: configuration (pipeline); today it cannot be run (unknown option 'training.nothing'")
-
-
-@pytest.mark.parametrize(
-    ("words", "code", "message"),
-    [
+def test_what_cannot_be_checked_is_one_line_and_a_pipeline_that_cannot_be_run_any_more_is_stale(checked):
+    for words, code, says in (
         (("report",), 2, "no pipeline is named; there are:"),
         ((*CHECK, "smal"), 4, "there is no pipeline 'smal'; did you mean pipelines/small.yaml?"),
         ((*CHECK, "small", "seed=7"), 2, "'seed=7' changes the results"),
-    ],
-)
-def test_what_cannot_be_checked_is_one_line(checked, words, code, message):
-    ended, line = checked.refused(*words)
-    assert (ended, message in line) == (code, True), line
-
-
-def test_where_nothing_is_published_there_is_nothing_to_check(place):
-    code, line = place.refused(*CHECK)
-    assert code == 4
-    assert "no study is published in 'results'" in line
-
-
-# Published weights
+    ):
+        checked.refused(*words, code=code, says=says)
+    checked.change("pipelines/small.yaml", sweeps=[["estimator=luenberger", "training.nothing=1"]])
+    code, line = verdict(checked)
+    said = "small: stale: configuration (pipeline); today it cannot be run (unknown option 'training.nothing'"
+    assert (code, line.startswith(said)) == (3, True)
+    shutil.rmtree(checked.folder / "results")
+    checked.refused(*CHECK, code=4, says="no study is published in 'results'")
 
 
 def models(folder):
@@ -254,32 +212,21 @@ def models(folder):
 
 def test_a_run_elsewhere_takes_the_published_weights_and_comes_to_the_same_results(published, checked):
     before = contents(checked.folder / "results")
-    code, _, said = checked(*RUN)
-    assert code == 0
+    _, said = checked.done(*RUN)
     assert "3 of 3 taken from results/small/weights.safetensors" in " ".join(said.split())
     assert models(checked.folder) == models(published)
     assert contents(checked.folder / "results") == before
 
 
-def test_weights_of_another_key_are_not_taken(checked):
-    changed(checked.folder / "pipelines" / "small.yaml", sweeps=[QUICK["sweeps"][0], [*QUICK["sweeps"][1][:-1], "training.max_epochs=1"]])
-    code, _, said = checked(*RUN)
-    assert code == 0
-    assert "1 of 3 taken from" in " ".join(said.split())
-    assert said.count("1 epochs") == 2
-
-
-def test_trainings_are_repeated_on_demand(checked):
-    code, _, said = checked(*RUN, "--retrain")
-    assert code == 0
-    assert "taken from" not in said
-    assert said.count("2 epochs") == 2
-
-
-def test_damaged_weights_are_refused_in_one_line(checked):
+def test_weights_of_another_key_are_not_taken_trainings_are_repeated_on_demand_and_damaged_weights_refused(checked):
+    pipeline = checked.change("pipelines/small.yaml")
+    checked.change("pipelines/small.yaml", sweeps=[QUICK["sweeps"][0], [*QUICK["sweeps"][1][:-1], "training.max_epochs=1"]])
+    _, said = checked.done(*RUN)
+    assert ("1 of 3 taken from" in " ".join(said.split()), said.count("1 epochs")) == (True, 2)
+    checked.change("pipelines/small.yaml", **pipeline)
+    _, said = checked.done(*RUN, "--retrain", "output=again")
+    assert ("taken from" in said, said.count("2 epochs")) == (False, 2)
     file = checked.folder / "results" / "small" / "weights.safetensors"
     file.write_bytes(file.read_bytes()[:100])
-    code, _, err = checked(*RUN)
-    assert code == 3
-    assert "weights.safetensors' is damaged" in " ".join(err.split())
-    assert "--retrain" in " ".join(err.split())
+    code, _, err = checked(*RUN, "output=damaged")
+    assert (code, "weights.safetensors' is damaged" in " ".join(err.split()), "--retrain" in err) == (3, True, True)

@@ -1,11 +1,9 @@
 """`vehest simulate`: seeds, interruption, drives that go wrong, and what it refuses."""
 
-import json
 from pathlib import Path
 
 import numpy as np
 import pytest
-import yaml
 
 from vehest.data.store import read_recording
 from vehest.run.config_files import complete_override
@@ -18,26 +16,9 @@ MANY_TURNS = {"name": "j_turn", "speed": 30.0, "severity": 1.4, "steer_time": 0.
 
 def simulated(place, drives, **more):
     """Write conf/dataset/sim.yaml."""
-    content = {
-        "defaults": [{"/vehicle@vehicle": "bmw_320i_low"}, "_self_"],
-        "name": "sim",
-        "title": "A few drives",
-        "kind": "simulated",
-        "licence": "none",
-        "citation": "none",
-        "source": "simulated",
-        "seed": 0,
-        "rate_hz": 50,
-        "drives": drives,
-        **more,
-    }
-    (place.folder / "conf" / "dataset" / "sim.yaml").write_text(yaml.safe_dump(content))
-
-
-def made(place, *arguments):
-    code, out, err = place("simulate", "sim", *arguments, "--json")
-    assert code == 0, err
-    return json.loads(out)
+    content = {"defaults": [{"/vehicle@vehicle": "bmw_320i_low"}, "_self_"], "name": "sim", "title": "A few drives"}
+    content |= {"licence": "none", "citation": "none", "source": "simulated", "seed": 0, "rate_hz": 50, "drives": drives}
+    place.change("conf/dataset/sim.yaml", **content | more)
 
 
 def samples(folder):
@@ -46,33 +27,30 @@ def samples(folder):
 
 def test_a_seed_gives_the_same_samples_however_many_processes_make_them(place):
     simulated(place, [{"id": "lap", "count": 3, "manoeuvre": LAP}])
-    alone = samples(made(place, "seed=1")["folder"])
-    together = samples(made(place, "seed=1", "--jobs", "2", "--force")["folder"])
+    alone = samples(place.told("simulate", "sim", "seed=1")["folder"])
+    together = samples(place.told("simulate", "sim", "seed=1", "--jobs", "2", "--force")["folder"])
     assert list(alone) == ["lap_001", "lap_002", "lap_003"]
     for name, values in alone.items():
         np.testing.assert_array_equal(values, together[name])
-    other = samples(made(place, "seed=2")["folder"])
+    other = samples(place.told("simulate", "sim", "seed=2")["folder"])
     assert not any(np.array_equal(values, other[name]) for name, values in alone.items())
 
 
-def test_seed_is_short_for_the_data_sets_seed(place):
+def test_seed_is_short_for_the_data_sets_seed_and_the_ordinary_ingest_makes_the_same(place):
     simulated(place, [{"id": "lap", "manoeuvre": LAP}])
-    folder = made(place, "seed=1")["folder"]
-    again = made(place, "dataset.seed=1")
-    assert again["folder"] == folder
-    assert again["skipped"]
-    code, out, _ = place("ingest", "sim", "dataset.seed=1", "--json")
-    assert (code, json.loads(out)["folder"]) == (0, folder), "the ordinary ingest"
+    folder = place.told("simulate", "sim", "seed=1")["folder"]
+    again = place.told("simulate", "sim", "dataset.seed=1")
+    assert (again["folder"], again["skipped"], place.told("ingest", "sim", "dataset.seed=1")["folder"]) == (folder, True, folder)
 
 
-def test_everything_it_makes_says_that_it_is_simulated(place):
+def test_everything_it_makes_says_that_it_is_simulated_and_looking_at_it_simulates_nothing(place, monkeypatch):
     simulated(place, [{"id": "lap", "manoeuvre": LAP}])
-    (file,) = Path(made(place)["folder"]).glob("*.parquet")
+    (file,) = Path(place.told("simulate", "sim")["folder"]).glob("*.parquet")
     recording = read_recording(file)
-    assert recording.kind == "simulated"
-    assert recording.provenance["flags"]["spun"] is False
-    _, out, _ = place("data", "show", "sim")
-    assert out.startswith("lap: simulated, bmw_320i_low, 50 Hz")
+    assert (recording.kind, recording.provenance["flags"]["spun"]) == ("simulated", False)
+    monkeypatch.setattr(compiled, "advance", None)  # nothing can be simulated any more
+    assert place("data", "show", "sim")[1].startswith("lap: simulated, bmw_320i_low, 50 Hz")
+    assert "error" not in place.done("data", "check", "sim")[0]
 
 
 def test_drives_that_were_done_before_a_kill_are_not_made_again(place, monkeypatch):
@@ -86,9 +64,11 @@ def test_drives_that_were_done_before_a_kill_are_not_made_again(place, monkeypat
         return read(self, recording_id)
 
     monkeypatch.setattr(SimulatedSource, "read", interrupted)
-    assert place("simulate", "sim")[0] == 130
-    assert made(place)["drives"] == 3
-    assert begun == ["lap_001", "lap_002", "lap_002", "lap_003"]
+    assert (place("simulate", "sim")[0], place.told("simulate", "sim")["drives"], begun) == (
+        130,
+        3,
+        ["lap_001", "lap_002", "lap_002", "lap_003"],
+    )
 
 
 def test_a_drive_that_spins_is_kept_flagged_and_counted(place):
@@ -99,10 +79,8 @@ def test_a_drive_that_spins_is_kept_flagged_and_counted(place):
         vehicle={"overrides": tail_happy},
         sensors="ideal",
     )
-    outcome = made(place)
-    assert outcome["drives"] == 2
-    assert outcome["spun"] == ["wild"]
-    assert outcome["not_completed"] == ["wild"]
+    outcome = place.told("simulate", "sim")
+    assert (outcome["drives"], outcome["spun"], outcome["not_completed"]) == (2, ["wild"], ["wild"])
     recording = read_recording(Path(outcome["folder"]) / "wild.parquet")
     assert np.isfinite(recording["vy_ref"]).all()
     assert np.abs(recording["sideslip_ref"]).max() > 1.0, "it did spin"
@@ -114,66 +92,32 @@ def test_a_drive_that_spins_is_kept_flagged_and_counted(place):
 def test_a_spin_at_high_speed_is_no_impossible_recording(place):
     wild = {"name": "random_steer", "speed": [45.0, 60.0], "severity": [1.4, 1.8], "duration": 8.0}
     simulated(place, [{"id": "fast", "count": 4, "manoeuvre": wild}], defaults=[{"/vehicle@vehicle": "bmw_545i"}, "_self_"])
-    outcome = made(place)
+    outcome = place.told("simulate", "sim")
     assert outcome["drives"] == 4
     assert len(outcome["spun"]) >= 1
     sideways = [np.abs(read_recording(Path(outcome["folder"]) / f"{name}.parquet")["vy_ref"]).max() for name in outcome["spun"]]
     assert max(sideways) > 40.0, "beyond what the check of other recordings lets pass"
-    code, out, _ = place("data", "check", "sim")
-    assert code == 0
+    out, _ = place.done("data", "check", "sim")
     assert "the simulated car spun here" in out
 
 
 def test_a_report_of_simulated_drives_never_says_real(place):
     simulated(place, [{"id": name, "manoeuvre": {**LAP, "duration": 12.0}} for name in "abc"], rate_hz=100)
-    file = place.folder / "conf" / "dataset" / "sim.yaml"
-    content = yaml.safe_load(file.read_text())
-    del content["kind"]
-    file.write_text(yaml.safe_dump(content))
-    split = {"name": "sim", "dataset": "sim", "train": [{"recording": "a"}], "validation": [{"recording": "b"}]}
-    split["tests"] = {"test": [{"recording": "c"}]}
-    (place.folder / "conf" / "split" / "sim.yaml").write_text(yaml.safe_dump(split))
-    study = {"study": "s", "title": "t", "report": "drive", "split": "sim"}
-    study["sweeps"] = [["estimator=luenberger", "training.grid=1", "training.max_evaluations=5"]]
-    (place.folder / "pipelines" / "sim.yaml").write_text(yaml.safe_dump(study))
-    code, out, err = place("run", "sim", "tracking=none", "--json")
-    assert code == 0, err
-    report = Path(json.loads(out)["report"]).with_name("report.md").read_text()
+    train, validation, test = ([{"recording": name}] for name in "abc")
+    place.change("conf/split/sim.yaml", name="sim", dataset="sim", train=train, validation=validation, tests={"test": test})
+    sweeps = [["estimator=luenberger", "training.grid=1", "training.max_evaluations=5"]]
+    place.change("pipelines/sim.yaml", study="s", title="t", report="drive", split="sim", sweeps=sweeps)
+    report = Path(place.told("run", "sim", "tracking=none")["report"]).with_name("report.md").read_text()
     assert "**Simulated data:** every number here comes from simulated recordings" in report
     assert "real data" not in report.lower()
     assert "| real |" not in report
 
 
-def test_looking_at_a_simulated_data_set_reads_what_is_in_the_store(place, monkeypatch):
+def test_what_cannot_be_simulated_is_one_line_and_options_of_the_data_set_are_offered(place):
+    place.refused("simulate", "mine", code=2, says="data set 'mine' is not simulated but read from files; run 'vehest ingest mine'")
     simulated(place, [{"id": "lap", "manoeuvre": LAP}])
-    made(place)
-    monkeypatch.setattr(compiled, "advance", None)  # nothing can be simulated any more
-    code, out, err = place("data", "check", "sim")
-    assert code == 0, err
-    assert "error" not in out
-
-
-def test_only_simulated_data_sets_are_simulated(place):
-    code, line = place.refused("simulate", "mine")
-    assert code == 2
-    assert line == "error: data set 'mine' is not simulated but read from files; run 'vehest ingest mine'"
-
-
-def test_a_bad_seed_is_one_line(place):
-    simulated(place, [{"id": "lap", "manoeuvre": LAP}])
-    assert place.refused("simulate", "sim", "seed=one") == (
-        2,
-        "error: data set 'sim': dataset.seed must be a whole number, zero or positive, not 'one'",
-    )
-
-
-def test_a_manoeuvre_that_is_misspelt_is_one_line(place):
+    place.refused("simulate", "sim", "seed=one", code=2, says="dataset.seed must be a whole number, zero or positive, not 'one'")
     simulated(place, [{"id": "lap", "manoeuvre": {"name": "slalon"}}])
-    code, line = place.refused("simulate", "sim")
-    assert code == 2
-    assert "there is no manoeuvre 'slalon'; there are braking_in_turn, double_lane_change" in line
-
-
-def test_options_of_the_data_set_are_offered(place):
+    place.refused("simulate", "sim", code=2, says="there is no manoeuvre 'slalon'; there are braking_in_turn, double_lane_change")
     offered = [text for text, _ in complete_override("ingest", ["dataset=sim_small"], "dataset.")]
     assert {"dataset.seed=0", "dataset.rate_hz=100"} <= set(offered)

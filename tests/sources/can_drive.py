@@ -47,32 +47,16 @@ ORIGIN = 1.7e9  # s, of the writers that take no other time; an .asc counts from
 
 @dataclass(frozen=True)
 class Written:
-    """What was written.
-
-    Args:
-        dbc: what describes the bus.
-        log: the frames.
-        lost: message -> numbers of the samples whose frames were lost.
-        origin: time of the recording at which the log's clock stands at 0 [s].
-    """
-
     dbc: Path
     log: Path
-    lost: dict[str, np.ndarray[Any, Any]]
-    origin: float
+    lost: dict[str, np.ndarray[Any, Any]]  # message -> numbers of the samples whose frames were lost
+    origin: float  # time of the recording at which the log's clock stands at 0 [s]
 
 
 def write_log(recording, folder, suffix=".asc", *, jitter=0.0, lost=0.0, seed=0, repeats=1):
-    """Write a recording as the frames of a bus.
+    """Write a recording as the frames of a bus, one of each message a sample, the drive ``repeats`` times.
 
-    Args:
-        recording: with vx, yaw_rate, ax, ay, and perhaps steer; a frame of each message a sample.
-        folder: where the log and the DBC go.
-        suffix: of the log: .asc, .blf or .log.
-        jitter: stamps are late by up to twice this, evenly distributed [s].
-        lost: share of frames that are lost.
-        seed: of jitter and losses.
-        repeats: how often the drive is written, one after the other.
+    Stamps are late by up to twice ``jitter`` [s], evenly distributed; a share of frames is ``lost``.
     """
     import can
 

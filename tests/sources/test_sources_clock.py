@@ -47,57 +47,40 @@ def test_the_rate_survives_strong_jitter_and_gaps(rate, share):
     assert clock.n_samples == pytest.approx(1000, abs=1)
 
 
-def test_jitter_beyond_a_hundredth_of_an_interval_needs_interpolation():
+def test_jitter_beyond_a_hundredth_of_an_interval_and_gaps_need_interpolation():
     even, noise = np.arange(1000) / 100.0, np.random.default_rng(0).uniform(-1, 1, 1000)
     assert uniform_clock(even + 4e-5 * noise, "'file'").rate_hz == 100.0
-    with pytest.raises(DataError, match="set clock: interpolate"):
-        uniform_clock(even + 2e-3 * noise, "'file'")
+    assert "set clock: interpolate" in refusal(lambda: uniform_clock(even + 2e-3 * noise, "'file'"))
     assert uniform_clock(even + 2e-3 * noise, "'file'", "interpolate").rate_hz == 100.0
-
-
-def test_interpolation_bridges_a_gap_linearly():
-    stamps = np.delete(np.arange(300) / 100.0, np.s_[100:200])
-    with pytest.raises(DataError, match="cut the range out or set clock: interpolate"):
-        uniform_clock(stamps, "'file'")
+    stamps = np.delete(even[:300], np.s_[100:200])
+    assert "cut the range out or set clock: interpolate" in refusal(lambda: uniform_clock(stamps, "'file'"))
     clock = uniform_clock(stamps, "'file'", "interpolate")
     assert (clock.rate_hz, clock.n_samples) == (100.0, 300)
-    np.testing.assert_allclose(clock.align(5.0 * stamps), 5.0 * np.arange(300) / 100.0, atol=1e-12)
-
-
-def test_interpolation_keeps_every_measured_sample_of_a_slow_channel():
-    stamps = np.arange(200) / 100.0 + 1e-3 * np.random.default_rng(0).uniform(-1, 1, 200)
+    np.testing.assert_allclose(clock.align(5.0 * stamps), 5.0 * even[:300], atol=1e-12)
+    stamps = even[:200] + 1e-3 * noise[:200]
     slow = np.where(np.arange(200) % 5 == 0, np.arange(200.0), np.nan)
     aligned = uniform_clock(stamps, "'file'", "interpolate").align(slow, gappy=True)
     measured = ~np.isnan(aligned)
-    assert aligned[measured].tolist() == slow[::5].tolist()
+    assert aligned[measured].tolist() == slow[::5].tolist(), "every measured sample of a slow channel is kept"
     assert np.abs(np.flatnonzero(measured) - aligned[measured]).max() <= 1
 
 
-def test_units_and_signs_are_applied():
+def test_units_and_signs_are_applied_and_misspelt_ones_refused():
     values = np.array([1.0, -2.0, 0.5])
     np.testing.assert_allclose(Column("a", "g", -1).to_si(values, "m/s²"), -9.80665 * values)
     np.testing.assert_allclose(Column("a", "deg/s").to_si(values, "rad/s"), np.deg2rad(values))
     np.testing.assert_array_equal(Column("a", "m/s").to_si(values, "m/s"), values)
-
-
-@pytest.mark.parametrize(
-    ("entries", "what"),
-    [
-        ({"vz": {"column": "a", "unit": "m/s"}}, "channel 'vz' is not known"),
-        ({"vx": {"column": "a", "unit": "deg"}}, "unit 'deg' cannot be converted to 'm/s'"),
-    ],
-)
-def test_a_misspelt_map_of_columns_is_refused_in_one_line(entries, what):
-    message = refusal(lambda: columns_from_config(entries, "mine"), ConfigurationError)
-    assert message.startswith("data set 'mine'")
-    assert what in message
-
-
-def test_a_time_column_has_a_unit_of_time():
     assert column_from_config({"column": "t", "unit": "ms"}, "here", "s") == Column("t", "ms")
-    with pytest.raises(ConfigurationError, match="here: unit 'km/h' cannot be converted to 's'"):
-        column_from_config({"column": "t", "unit": "km/h"}, "here", "s")
     assert column_from_config({"column": 3, "unit": "s", "sign": -1}, "here", "s") == Column("3", "s", -1), "YAML reads it as a number"
+    for act, said in (
+        (
+            lambda: columns_from_config({"vz": {"column": "a", "unit": "m/s"}}, "mine"),
+            "data set 'mine': channel 'vz': channel 'vz' is not known",
+        ),
+        (lambda: columns_from_config({"vx": {"column": "a", "unit": "deg"}}, "mine"), "unit 'deg' cannot be converted to 'm/s'"),
+        (lambda: column_from_config({"column": "t", "unit": "km/h"}, "here", "s"), "here: unit 'km/h' cannot be converted to 's'"),
+    ):
+        assert said in refusal(act, ConfigurationError)
 
 
 EVEN = np.arange(1000) / 100.0
@@ -123,29 +106,34 @@ def test_time_stamps_of_no_drive_are_refused_in_one_line_whatever_the_policy(pol
     assert said in message
 
 
-def test_every_recording_of_a_source_keeps_the_rule(tmp_path):
-    (tmp_path / "lap.csv").write_text("vx\n" + "1.0\n" * 100, encoding="utf-8")
+def test_every_recording_of_a_source_keeps_the_rule_and_surveys_name_a_stray_time_stamp(tmp_path):
+    file = tmp_path / "lap.csv"
+    file.write_text("vx\n" + "1.0\n" * 100, encoding="utf-8")
     declared = {"name": "mine", "source": "tabular", "path": str(tmp_path), "channels": {"vx": {"column": "vx", "unit": "m/s"}}}
     assert open_source({**declared, "rate_hz": 9e4}).read("lap").rate_hz == 9e4
-    for read in (lambda source: source.read("lap"), lambda source: source.read_file(tmp_path / "lap.csv")):
-        with pytest.raises(DataError, match="recording 'lap': the sampling rate must lie between 1e-06 and 100000 Hz, not at 200000 Hz"):
-            read(open_source({**declared, "rate_hz": 2e5}))
+    for read in (lambda source: source.read("lap"), lambda source: source.read_file(file)):
+        said = refusal(lambda read=read: read(open_source({**declared, "rate_hz": 2e5})))
+        assert "recording 'lap': the sampling rate must lie between 1e-06 and 100000 Hz, not at 200000 Hz" in said
+    for rows in (1000, 400):
+        stamps = np.where(np.arange(1000) == rows - 1, 1e9, EVEN)
+        np.savetxt(file, np.stack([stamps, EVEN], axis=1), delimiter=",", header="time,vx", comments="", fmt="%.3f")
+        with pytest.raises(DataError, match=rf"lap\.csv': time spans .* between sample {rows - 2} .* and {rows - 1} \(1000000000 s\)"):
+            survey(file)
 
 
-@pytest.mark.parametrize("rows", [1000, 400])
-def test_a_survey_names_a_stray_time_stamp(tmp_path, rows):
-    stamps = np.where(np.arange(1000) == rows - 1, 1e9, EVEN)
-    np.savetxt(tmp_path / "lap.csv", np.stack([stamps, EVEN], axis=1), delimiter=",", header="time,vx", comments="", fmt="%.3f")
-    with pytest.raises(DataError, match=rf"lap\.csv': time spans .* between sample {rows - 2} .* and {rows - 1} \(1000000000 s\)"):
-        survey(tmp_path / "lap.csv")
-
-
-def test_an_even_clock_over_a_gap_stays_within_the_limit_of_samples():
+def test_an_even_clock_over_a_gap_stays_within_the_limit_of_samples_and_withstands_a_stall():
     stamps = np.append(EVEN, 3e5)
-    with pytest.raises(DataError, match=r"over 1001 rows would hold 30000001 samples, more than the limit .*: limits\.samples=NUMBER"):
-        uniform_clock(stamps, "'lap.csv'", "interpolate")
+    said = refusal(lambda: uniform_clock(stamps, "'lap.csv'", "interpolate"))
+    assert "over 1001 rows would hold 30000001 samples, more than the limit" in said
+    assert "limits.samples=NUMBER" in said
     with use_limits(Limits(samples=30_000_001)):
         assert uniform_clock(stamps, "'lap.csv'", "interpolate").n_samples == 30_000_001
+    times = np.arange(2000) / 100 * 1.00003
+    stamps = times.copy()
+    stamps[700:715] = stamps[715]  # 150 ms nothing, then all at once
+    found, rate_hz, _ = uniform_times(stamps, 100.0, "topic")
+    np.testing.assert_allclose(found, times, rtol=0, atol=1e-9)
+    assert rate_hz == pytest.approx(100.0 / 1.00003, rel=1e-12)
 
 
 @pytest.mark.parametrize(
@@ -159,15 +147,6 @@ def test_an_even_clock_over_a_gap_stays_within_the_limit_of_samples():
 )
 def test_gaps_jitter_and_drift_are_found_with_their_size(stamps, found):
     assert unevenness(stamps).startswith(found)
-
-
-def test_an_even_clock_withstands_a_stall():
-    times = np.arange(2000) / 100 * 1.00003
-    stamps = times.copy()
-    stamps[700:715] = stamps[715]  # 150 ms nothing, then all at once
-    found, rate_hz, _ = uniform_times(stamps, 100.0, "topic")
-    np.testing.assert_allclose(found, times, rtol=0, atol=1e-9)
-    assert rate_hz == pytest.approx(100.0 / 1.00003, rel=1e-12)
 
 
 @pytest.mark.parametrize(

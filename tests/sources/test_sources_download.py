@@ -112,16 +112,12 @@ def server(monkeypatch):
     made.server_close()
 
 
-def download(server, folder, *names, known=None):
-    return Download(folder, server.url, names or ("a.csv",), known or {})
-
-
-def fetch(what):
-    return list(what.fetch())
+def download(server, folder, known=None):
+    return Download(folder, server.url, ("a.csv",), known or {})
 
 
 def refused(what, kind=MissingError):
-    return refusal(lambda: fetch(what), kind)
+    return refusal(lambda: list(what.fetch()), kind)
 
 
 def files(folder):
@@ -133,7 +129,7 @@ def assert_only(folder, content=BYTES):
 
 
 def test_a_file_arrives_byte_for_byte_and_is_recorded(server, tmp_path):
-    (outcome,) = fetch(download(server, tmp_path / "new" / "folder"))
+    (outcome,) = download(server, tmp_path / "new" / "folder").fetch()
     assert outcome == Outcome("a.csv", "fetched", sha256(BYTES), SIZE)
     assert_only(tmp_path / "new" / "folder")
     assert server.asked == [("/a.csv", None, None)]
@@ -141,7 +137,7 @@ def test_a_file_arrives_byte_for_byte_and_is_recorded(server, tmp_path):
 
 def test_a_server_that_breaks_off_again_and_again_is_asked_for_the_rest_as_long_as_bytes_come(server, tmp_path):
     server.breaks = [CHUNK + 7] * (ATTEMPTS + 2)
-    (outcome,) = fetch(download(server, tmp_path))
+    (outcome,) = download(server, tmp_path).fetch()
     assert_only(tmp_path)
     assert [asked[1:] for asked in server.asked[1:]] == [(f"bytes={k * CHUNK}-", '"one"') for k in range(1, ATTEMPTS + 3)]
     assert outcome.resumed_at == (ATTEMPTS + 2) * CHUNK
@@ -155,7 +151,7 @@ def test_a_server_that_brings_nothing_new_is_given_up_and_the_next_run_goes_on(s
     assert files(tmp_path)[f"{UNDER_WAY}/a.csv.part"] == BYTES[: 4 * CHUNK]
     assert not (tmp_path / CHECKSUMS).exists()
     server.breaks = []
-    (outcome,) = fetch(download(server, tmp_path))
+    (outcome,) = download(server, tmp_path).fetch()
     assert outcome.resumed_at == 4 * CHUNK
     assert_only(tmp_path)
 
@@ -164,9 +160,8 @@ def test_a_server_that_brings_nothing_new_is_given_up_and_the_next_run_goes_on(s
 def test_a_server_without_ranges_starts_over(server, tmp_path, modified):
     server.ranges, server.etag, server.modified = False, None, modified
     server.breaks = [200_000]
-    (outcome,) = fetch(download(server, tmp_path))
-    assert (outcome.resumed_at, server.sent) == (0, [200_000, SIZE])
-    assert (server.asked[1][1] is None) == (modified is None)
+    (outcome,) = download(server, tmp_path).fetch()
+    assert (outcome.resumed_at, server.sent, server.asked[1][1] is None) == (0, [200_000, SIZE], modified is None)
     assert_only(tmp_path)
 
 
@@ -174,7 +169,7 @@ def test_a_server_without_ranges_starts_over(server, tmp_path, modified):
 def test_a_file_that_changes_between_attempts_is_never_mixed(server, tmp_path, size, careless):
     other = BYTES[::-1][:size]
     server.breaks, server.changed, server.careless = [200_000], (other, '"two"'), careless
-    fetch(download(server, tmp_path))
+    list(download(server, tmp_path).fetch())
     assert_only(tmp_path, other)
     assert server.asked[1][2] == '"one"'
 
@@ -184,7 +179,7 @@ def test_two_processes_do_not_fetch_into_one_folder(server, tmp_path):
     fcntl.flock(descriptor, fcntl.LOCK_EX)
     assert "another process is fetching into" in refused(download(server, tmp_path))
     os.close(descriptor)
-    fetch(download(server, tmp_path))
+    list(download(server, tmp_path).fetch())
     assert_only(tmp_path)
 
 
@@ -192,7 +187,7 @@ def test_other_bytes_than_recorded_or_declared_are_refused_and_leave_nothing(ser
     message = refused(download(server, tmp_path, known={"a.csv": sha256(b"other")}), DataError)
     assert all(part in message for part in (f"{server.url}/a.csv", sha256(b"other"), sha256(BYTES), "known by download.sha256"))
     assert files(tmp_path) == {}
-    fetch(download(server, tmp_path, known={"a.csv": sha256(BYTES)}))
+    list(download(server, tmp_path, known={"a.csv": sha256(BYTES)}).fetch())
     (tmp_path / "a.csv").write_bytes(b"changed")
     message = refused(download(server, tmp_path), DataError)
     assert all(part in message for part in (sha256(b"changed"), sha256(BYTES), "remove the file to fetch it again"))
@@ -203,26 +198,18 @@ def test_other_bytes_than_recorded_or_declared_are_refused_and_leave_nothing(ser
     assert files(tmp_path) == {CHECKSUMS: f"a.csv {sha256(BYTES)}\n".encode()}
 
 
-def test_a_damaged_record_is_refused(server, tmp_path):
-    (tmp_path / CHECKSUMS).write_bytes(b"a.csv")
-    assert CHECKSUMS in refused(download(server, tmp_path), DataError)
-    assert server.asked == []
-
-
-def test_a_web_page_and_an_answer_without_a_length_are_not_taken_for_data(server, tmp_path):
+def test_web_pages_answers_without_a_length_refusals_and_damaged_records_are_one_line(server, tmp_path):
     server.headers = {"Content-Type": "text/html; charset=utf-8"}
     assert "a.csv is a web page, not a file" in refused(download(server, tmp_path))
     server.headers, server.length = {}, False
     assert "does not state its length" in refused(download(server, tmp_path))
-    assert files(tmp_path) == {}
-
-
-def test_a_refusal_of_the_server_is_one_line_and_not_tried_again_and_a_passing_one_is(server, tmp_path):
-    server.statuses = [503, 404]
+    server.asked, server.statuses = [], [503, 404]  # the first passes
     message = refused(download(server, tmp_path))
     assert message == f"cannot fetch {server.url}/a.csv: the server answers 404 Not Found; is the address right?"
+    assert (len(server.asked), files(tmp_path)) == (2, {})
+    (tmp_path / CHECKSUMS).write_bytes(b"a.csv")
+    assert CHECKSUMS in refused(download(server, tmp_path), DataError)
     assert len(server.asked) == 2
-    assert files(tmp_path) == {}
 
 
 def test_a_full_disk_is_one_line_and_the_next_run_goes_on(server, tmp_path):
@@ -233,32 +220,26 @@ def test_a_full_disk_is_one_line_and_the_next_run_goes_on(server, tmp_path):
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
     assert files(tmp_path)[f"{UNDER_WAY}/a.csv.part"] == BYTES[:200_000]
-    (outcome,) = fetch(download(server, tmp_path))
+    (outcome,) = download(server, tmp_path).fetch()
     assert outcome.resumed_at == 200_000
     assert_only(tmp_path)
 
 
 TABULAR = {"name": "mine", "source": "tabular", "path": "there", "rate_hz": 10, "time": None}
-ENTRY = {"url": "https://example.org/folder", "files": ["a.csv"]}
 
 
-def test_an_entry_says_address_files_and_checksums():
+def test_an_entry_says_address_files_and_checksums_or_is_refused_in_one_line():
     entry = {"url": "https://example.org/folder/", "files": ["a.csv", "b 1.csv"], "sha256": {"a.csv": "AB" * 32}}
     what = download_of(open_source({**TABULAR, "download": entry}))
     assert (what.folder, what.files, what.sha256) == (Path("there"), ("a.csv", "b 1.csv"), {"a.csv": "ab" * 32})
     assert what.address("b 1.csv") == "https://example.org/folder/b%201.csv"
-
-
-@pytest.mark.parametrize(
-    ("entry", "said"),
-    [
-        ({**ENTRY, "url": "file:///etc/passwd"}, "dataset.download.url: string should match pattern"),
-        ({**ENTRY, "files": ["a.csv", "a.csv"]}, "each once, not ['a.csv', 'a.csv']"),
-        *(({**ENTRY, "files": [name]}, "is not the name of a file in one folder") for name in ("../a.csv", CHECKSUMS, "a\n.csv")),
-    ],
-)
-def test_an_entry_that_makes_no_sense_is_refused_in_one_line(entry, said):
-    assert said in refusal(lambda: download_of(open_source({**TABULAR, "download": entry})), ConfigurationError)
+    for changes, said in (
+        ({"url": "file:///etc/passwd"}, "dataset.download.url: string should match pattern"),
+        ({"files": ["a.csv", "a.csv"]}, "each once, not ['a.csv', 'a.csv']"),
+        *(({"files": [name]}, "is not the name of a file in one folder") for name in ("../a.csv", CHECKSUMS, "a\n.csv")),
+    ):
+        wrong = TABULAR | {"download": {"url": "https://example.org/folder", "files": ["a.csv"]} | changes}
+        assert said in refusal(lambda wrong=wrong: download_of(open_source(wrong)), ConfigurationError)
 
 
 DRIVE = "time,vx,yaw_rate,ay,ax\n" + "".join(

@@ -134,34 +134,23 @@ def test_a_chain_that_leads_back_ends_in_one_line(tmp_path, block, link, monkeyp
 
 def test_a_packed_block_of_a_gigabyte_ends_in_one_line(tmp_path):
     file = written(tmp_path / "a.mf4", compression=1)
-    content = bytearray(file.read_bytes())
-    at = content.index(b"##DZ")
+    content = file.read_bytes()
     packer = zlib.compressobj(9)
     packed = b"".join(packer.compress(bytes(2**20)) for _ in range(2000)) + packer.flush()
-    length = 48 + len(packed)
     content += bytes(-len(content) % 8)
-    moved = len(content)
-    content += struct.pack("<4sIQQ2sBBIQQ", b"##DZ", 0, length, 0, b"DT", 0, 0, 0, 2000 * 2**20, len(packed)) + packed
-    content = bytearray(bytes(content).replace(struct.pack("<Q", at), struct.pack("<Q", moved)))
-    file.write_bytes(content)
-    record = 24
-    overwritten(file, b"##CG", 0, 56, "<Q", 2000 * 2**20 // record)
-    assert refused(file)
+    moved = content.replace(struct.pack("<Q", content.index(b"##DZ")), struct.pack("<Q", len(content)))
+    head = struct.pack("<4sIQQ2sBBIQQ", b"##DZ", 0, 48 + len(packed), 0, b"DT", 0, 0, 0, 2000 * 2**20, len(packed))
+    file.write_bytes(moved + head + packed)
+    assert refused(overwritten(file, b"##CG", 0, 56, "<Q", 2000 * 2**20 // 24))  # bytes a record
 
 
-@pytest.mark.parametrize("samples", [10**7, 2**64 - 1])
-def test_samples_that_are_not_there_are_not_made(tmp_path, samples):
-    message = refused(overwritten(written(tmp_path / "a.mf4"), b"##CG", 0, 56, "<Q", samples))
-    assert "its header says" in message or "limits.samples" in message
-
-
-def test_more_samples_than_the_limit_are_refused(tmp_path):
+def test_samples_that_are_not_there_or_beyond_the_limit_are_not_made_and_a_pipe_is_not_waited_for(tmp_path):
     file = written(tmp_path / "a.mf4")
     with use_limits(Limits(samples=2000)):
         assert "raise it: limits.samples=NUMBER" in refused(file)
-
-
-def test_a_pipe_is_not_waited_for(tmp_path):
+    for samples in (10**7, 2**64 - 1):
+        message = refused(overwritten(file, b"##CG", 0, 56, "<Q", samples))
+        assert "its header says" in message or "limits.samples" in message
     os.mkfifo(tmp_path / "pipe.mf4")
     assert "is a pipe, not a file" in refusal(lambda: read_measurement(tmp_path / "pipe.mf4", {}))
 

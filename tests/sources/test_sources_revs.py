@@ -1,18 +1,15 @@
 """The Revs database as re-laid text: a file a channel, a number a line."""
 
-from pathlib import Path
-
 import numpy as np
 import pytest
-import yaml
 from refusals import refusal
 
+from real_drives import real_drive
 from vehest.alignment.checks import checks_of_recording
 from vehest.data.errors import DataError, MissingError
 from vehest.sources.base import open_source
 from vehest.sources.revs import RevsSource
 
-CONFIGURATION = Path(__file__).parents[2] / "conf" / "dataset" / "ferrari_250lm.yaml"
 N = 300
 
 
@@ -57,35 +54,24 @@ def test_a_folder_of_text_files_is_a_recording(folder):
     assert dict(recording.provenance) == {"dataset": "mine", "source": "revs", "layout": "text"}
 
 
-def test_a_missing_or_empty_channel_file_is_named(folder):
-    (folder / "lap" / "vx.txt").unlink()
-    assert "vx.txt" in refused(folder, MissingError)
-    (folder / "lap" / "vx.txt").touch()
-    assert "vx.txt' is empty" in refused(folder, MissingError)
-    (folder / "lap" / "vx.txt").write_text("\n\n")
-    assert "vx.txt' has no rows" in refused(folder)
-
-
-def test_an_incomplete_copy_is_refused_with_both_counts(folder):
-    np.savetxt(folder / "lap" / "vx.txt", np.zeros(N - 3))
+def test_missing_empty_and_incomplete_channel_files_are_named(folder):
+    file = folder / "lap" / "vx.txt"
+    np.savetxt(file, np.zeros(N - 3))
     assert f"holds {N - 3} samples, the time file {N}" in refused(folder)
-    (folder / "lap" / "vx.txt").write_text("1\n" * 41 + "spam\n")
-    assert "vx.txt': column 'number' holds the text 'spam' in data row 42" in refused(folder)
+    for text, kind, said in (
+        ("1\n" * 41 + "spam\n", DataError, "vx.txt': column 'number' holds the text 'spam' in data row 42"),
+        ("", MissingError, "vx.txt' is empty"),
+        ("\n\n", DataError, "vx.txt' has no rows"),
+    ):
+        file.write_text(text)
+        assert said in refused(folder, kind)
+    file.unlink()
+    assert "vx.txt" in refused(folder, MissingError)
 
 
-@pytest.fixture(scope="module")
-def ferrari(data_root):
-    config = yaml.safe_load(CONFIGURATION.read_text(encoding="utf-8").replace("${root}", str(data_root)))
-    source = open_source(config)
-    (recording,) = source.recordings()
-    return recording
-
-
-def test_the_ferraris_bias_of_ay_is_that_of_the_paper(ferrari):
+def test_the_ferrari_passes_every_check_and_its_bias_of_ay_is_that_of_the_paper(data_root):
+    ferrari = real_drive(data_root)
+    assert [finding for finding in checks_of_recording(ferrari) if finding.level != "note"] == []
     derived = (ferrari["vy_ref"][2:] - ferrari["vy_ref"][:-2]) * 50.0
     residual = derived - (ferrari["ay"] - ferrari["yaw_rate"] * ferrari["vx"])[1:-1]
     assert residual.mean() == pytest.approx(-0.028, abs=5e-4)  # -0.03 in Table I of Da Lio et al. 2023
-
-
-def test_the_ferrari_passes_every_check(ferrari):
-    assert [finding for finding in checks_of_recording(ferrari) if finding.level != "note"] == []

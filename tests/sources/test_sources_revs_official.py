@@ -111,8 +111,7 @@ def test_provenance_tells_session_parameters_and_file(root, csv):
     write_vehicle_parameters(root / "revs" / "250lm.csv")
     assert set(source(root).inputs()) == {f"{NAME}.csv", "250lm.csv"}
     provenance = read(root).provenance
-    assert provenance["file"] == f"{NAME}.csv"
-    assert provenance["preamble"] == [line for line in PREAMBLE if line]
+    assert (provenance["file"], provenance["preamble"]) == (f"{NAME}.csv", [line for line in PREAMBLE if line])
     assert provenance["vehicle_parameters"]["mass"] == {"value": 982.0, "unit": "kg"}
     assert provenance["vehicle_parameters"]["handwheelAngle"] == {"value": [-90.0, 0.0, 90.0], "unit": "°"}
     (root / "revs" / "250lm.csv").unlink()
@@ -162,8 +161,7 @@ def test_a_malformed_csv_is_one_line(root, csv, one_second, case):
     change, said = MALFORMED[case]
     csv.write_bytes(change(one_second))
     message = refused(root)
-    assert csv.name in message
-    assert re.search(said, message), message
+    assert (csv.name in message, bool(re.search(said, message))) == (True, True), message
 
 
 def test_the_files_own_row_of_units_must_not_contradict_the_declared_ones(root, csv, one_second):
@@ -177,34 +175,28 @@ def signal(values, rate=100.0, start=0.0):
 
 
 STEADY = np.linspace(1, 2, 100)
-ODD_MAT = {
-    "no time": ({"insData": {"vxCG": {"value": STEADY}}}, "has no channel 'vxCG' with a field 'time' (it has insData.vxCG)"),
-    "twice": ({name: {"vxCG": signal(STEADY)} for name in ("a", "b")}, "more than once (a.vxCG, b.vxCG); name its struct too"),
-    "text": ({"insData": {"vxCG": {"value": "fast", "time": STEADY}}}, "'insData.vxCG.value' is no row or column of real numbers"),
-    "gap": ({"insData": {"vxCG": {"value": STEADY, "time": np.r_[0:50, 90:140] / 100}}}, "'insData.vxCG': 1 gaps"),
-}
 
 
-@pytest.mark.parametrize("case", ODD_MAT)
-def test_an_odd_mat_file_is_one_line(root, mat, case):
-    content, said = ODD_MAT[case]
-    savemat(mat, dict(content), oned_as="column")
-    message = refused(root, layout="mat", channels={"vx": {"column": "vxCG", "unit": "m/s"}}, extra_channels={})
-    assert mat.name in message
-    assert said in message
+def test_an_odd_mat_file_is_one_line(root, mat):
+    channels, gap = {"vx": {"column": "vxCG", "unit": "m/s"}}, np.r_[0:50, 90:140] / 100
+    for content, said in (
+        ({"insData": {"vxCG": {"value": STEADY}}}, "has no channel 'vxCG' with a field 'time' (it has insData.vxCG)"),
+        ({name: {"vxCG": signal(STEADY)} for name in ("a", "b")}, "more than once (a.vxCG, b.vxCG); name its struct too"),
+        ({"insData": {"vxCG": {"value": "fast", "time": STEADY}}}, "'insData.vxCG.value' is no row or column of real numbers"),
+        ({"insData": {"vxCG": {"value": STEADY, "time": gap}}}, "'insData.vxCG': 1 gaps"),
+    ):
+        savemat(mat, content, oned_as="column")
+        message = refused(root, layout="mat", channels=channels, extra_channels={})
+        assert all(words in message for words in (mat.name, said))
 
 
-@pytest.mark.parametrize(
-    ("content", "said"),
-    [
+def test_a_malformed_table_of_vehicle_parameters_is_one_line(root, csv, one_second):
+    csv.write_bytes(one_second)
+    for content, said in (
         ("mass,,b\nkg,m,m\n1,2,3\n", "column 2 is called ''"),
         ("mass\nkg\n1\nabc\n", "parameter 'mass' holds 'abc' in line 4"),
         ("mass\nkg\n1\0\n", "is no table of vehicle parameters"),
-    ],
-)
-def test_a_malformed_table_of_vehicle_parameters_is_one_line(root, csv, one_second, content, said):
-    csv.write_bytes(one_second)
-    (root / "revs" / "250lm.csv").write_text(content)
-    message = refused(root)
-    assert "250lm.csv" in message
-    assert said in message
+    ):
+        (root / "revs" / "250lm.csv").write_text(content)
+        message = refused(root)
+        assert all(words in message for words in ("250lm.csv", said))

@@ -22,15 +22,7 @@ def clock(seconds):
 
 
 def write_log(file, first=38870.45, *, swapped=False, units=UNITS, end=""):
-    """Write a log.
-
-    Args:
-        file: where to.
-        first: clock time of the first row [s].
-        swapped: whether slip is computed with offsets whose lateral and longitudinal part have changed places.
-        units: under [channel units].
-        end: what stands after the last row.
-    """
+    """Write a log from a clock time on [s]; ``swapped``: lateral and longitudinal offsets of slip change places; ``end`` comes last."""
     d = drive()
     n = len(d["vx"])
     slip = []

@@ -6,10 +6,12 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import pytest
+from make_models import drive_name
 
 from place import run_vehest
 from vehest.data.store import read_estimate, read_recording
 from vehest.estimators.model_files import load_model
+from vehest.estimators.registry import estimator_class, estimator_names
 from vehest.run.estimate import estimate_recording, open_model
 from vehest.trust.health import INVALID, TOO_WIDE
 from vehest.trust.verdict import WIDEST
@@ -19,15 +21,10 @@ MODELS = sorted(folder.name for folder in (HERE / "models").iterdir())
 TOLERANCE = 1e-6
 
 
-def drive_file(channels, rate_hz):
-    kind = "small_car" if "motor_current" in channels else "steered" if "steer" in channels else "planar"
-    return HERE / "drives" / f"{kind}_{rate_hz:g}hz.parquet"
-
-
 @pytest.mark.parametrize("name", MODELS)
 def test_a_model_of_yesterday_estimates_as_it_did(name):
     folder, model, trust = open_model(str(HERE / "models" / name), HERE, print)
-    drive = read_recording(drive_file(tuple(model.channels), model.settings.rate_hz))
+    drive = read_recording(HERE / "drives" / drive_name(model))
     then = read_estimate(folder / "estimate.parquet")
     now = estimate_recording(model, drive, trust)
     assert set(now.channels) == set(then.channels)
@@ -42,7 +39,7 @@ def test_a_model_of_yesterday_estimates_as_it_did(name):
 def test_the_command_gives_the_same(tmp_path, monkeypatch, capsys):
     folder = HERE / "models" / "ksnn"
     model = load_model(folder)
-    drive = read_recording(drive_file(tuple(model.channels), model.settings.rate_hz))
+    drive = read_recording(HERE / "drives" / drive_name(model))
     monkeypatch.chdir(tmp_path)
     pd.DataFrame({"time": drive.time, **drive.channels}).to_csv("lap.csv", index=False)
     code, out, err = run_vehest(capsys, "estimate", str(folder), "lap.csv", "-o", "out.csv", "--json")
@@ -55,7 +52,4 @@ def test_the_command_gives_the_same(tmp_path, monkeypatch, capsys):
 
 
 def test_every_family_has_a_model_of_yesterday():
-    from vehest.estimators.registry import estimator_class, estimator_names
-
-    own = [name for name in estimator_names() if estimator_class(name).__module__.startswith("vehest.")]
-    assert sorted(own) == MODELS
+    assert sorted(name for name in estimator_names() if estimator_class(name).__module__.startswith("vehest.")) == MODELS

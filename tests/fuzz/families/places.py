@@ -12,17 +12,8 @@ NAMES = (
     b"lap.csv.csv", b"lap.", b"lap", b"lap.csv ", b"$(touch EXECUTED).csv", b"a;touch EXECUTED.csv", b"<b>.csv", b"[red]a[blue].csv",
     b"null.csv", b"${root}.csv",
 )  # fmt: skip
-LINKS = (
-    "/dev/zero",
-    "/dev/null",
-    "/dev/full",
-    "/dev/stdin",
-    "/dev/urandom",
-    "/proc/self/mem",
-    "/proc/self/environ",
-    "gone.csv",
-    "special.csv",
-)
+LINKS = (*(f"/dev/{name}" for name in ("zero", "null", "full", "stdin", "urandom")), "/proc/self/mem", "/proc/self/environ")
+LINKS += ("gone.csv", "special.csv")
 TARGETS = (
     "/dev/full", "/dev/null", "/dev/stdout", "out", "out.txt", "out.csv/", "raw", "raw/one.csv/x.csv", "", ".", "..", "/",
     "x" * 300 + ".csv", "loop.csv", "pipe.csv", "zero.csv", "full.csv", "full.parquet", "lap.csv", "./lap.csv", "link.csv",

@@ -14,13 +14,11 @@ from fuzz.honest import write_yaml
 from fuzz.mutations import CALL, NAMES, spoil_bytes, spoil_yaml, yaml_of
 
 STATEMENTS = (
-    "DROP TABLE messages",
-    "DELETE FROM messages",
+    *("DROP TABLE messages", "DELETE FROM messages"),
     "UPDATE topics SET type = '../../../evil'",
     "UPDATE topics SET name = char(27) || '[2J' || name",
     "UPDATE topics SET serialization_format = 'pickle'",
-    "UPDATE topics SET id = 1",
-    "UPDATE messages SET timestamp = -timestamp",
+    *("UPDATE topics SET id = 1", "UPDATE messages SET timestamp = -timestamp"),
     "UPDATE messages SET timestamp = 9223372036854775807",
     "UPDATE messages SET timestamp = timestamp + 1000000000000000000 WHERE id % 97 = 0",
     "UPDATE messages SET data = zeroblob(100000000) WHERE id = 5",
