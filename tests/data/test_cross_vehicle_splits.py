@@ -4,7 +4,6 @@ import pytest
 
 from vehest.data.split_files import split_from_config
 from vehest.run.config import compose_config
-from vehest.sources.base import open_source
 
 SETS = {  # Table I
     "C-1": ("20130222_01_01_03", "20130222_01_02_03", "20130222_02_01_03"),
@@ -43,16 +42,6 @@ def test_without_cross_vehicle_regularisation_two_files_teach_and_the_third_stop
     assert (sets_of(found.train), sets_of(found.validation)) == (["F-1"] * 2, ["F-1"])
     third = {"j1": ["J-1"] * 2} if name.endswith("_sim") else {}
     assert {name: sets_of(spans) for name, spans in found.tests.items()} == {"c2": ["C-2"] * 2, "f2": ["F-2"] * 2, **third}
-
-
-@pytest.mark.parametrize("name", [*SCHEMES, "one_vehicle"])
-def test_every_recording_is_one_of_its_data_set(name, tmp_path):
-    for place in ("", "_sim"):
-        found = split(name + place)
-        spans = [*found.train, *found.validation, *(span for spans in found.tests.values() for span in spans)]
-        for dataset in found.datasets:
-            ids = open_source(compose_config("ingest", [f"dataset={dataset}", f"root={tmp_path}"])["dataset"]).ids()
-            assert {span.recording for span in spans if span.dataset == dataset} <= set(ids)
 
 
 @pytest.mark.parametrize("dataset", ["sim_two_cars", "sim_race_cars", "sim_race_cars_same_sensors"])

@@ -16,7 +16,7 @@ from vehest.data.laps import laps_of
 from vehest.data.recording import Recording
 from vehest.data.split_files import dataset_names, split_from_config
 from vehest.data.splits import Span, Split
-from vehest.data.windows import window_starts, windows_of
+from vehest.data.windows import windows_of
 from vehest.run.config import compose_config
 from vehest.sources.base import open_source
 
@@ -30,6 +30,18 @@ bounds = st.sampled_from([-math.inf, math.inf, 0.0, 1.0, 1.005, 1.01, 2.0, 3.5])
 def spans(draw):
     start, stop = sorted(draw(st.lists(bounds, min_size=2, max_size=2, unique=True)))
     return Span("set", draw(st.sampled_from(["lap1", "lap2"])), start, stop)
+
+
+BASE = {"name": "s", "dataset": "d", "train": [{"recording": "a"}], "validation": [{"recording": "b"}], "tests": {}}
+
+
+def refusal(config, catalogue=None):
+    """The one line with which a split is refused."""
+    with pytest.raises(ConfigurationError) as error:
+        split_from_config(config, catalogue)
+    assert "split 's'" in str(error.value)
+    assert "\n" not in str(error.value)
+    return str(error.value)
 
 
 def samples_of(span, rate_hz):
@@ -72,19 +84,8 @@ def test_overlap_goes_both_ways_and_is_that_of_the_times(one, other):
     assert one.overlaps(other) is common
 
 
-def test_neighbouring_ranges_share_nothing():
-    parts = Split("s", (Span("d", "r", 150, 450),), (Span("d", "r", 450, 550),), {"test": (Span("d", "r", 550, 700),)})
-    assert len(parts.all_spans) == 3
-    recording = Recording("r", "car", 100.0, 149.99, {"ay": np.zeros(55_001)})
-    ranges = [recording.index_range(span.start, span.stop) for span in parts.all_spans]
-    assert ranges == [(1, 30_001), (30_001, 40_001), (40_001, 55_001)]
-
-
-def test_equal_ranges_of_other_recordings_or_data_sets_share_nothing():
+def test_equal_ranges_elsewhere_and_test_sets_that_overlap_share_nothing():
     Split("s", (Span("d", "r1"),), (Span("d", "r2"),), {"test": (Span("e", "r1"),)})
-
-
-def test_two_test_sets_may_look_at_the_same_samples():
     Split("s", (Span("d", "r", 0, 1),), (Span("d", "r", 1, 2),), {"all": (Span("d", "r", 2, 4),), "fast": (Span("d", "r", 3, 4),)})
 
 
@@ -100,24 +101,15 @@ def test_a_stretch_must_run_forward(start, stop):
         Span("d", "r", start, stop)
 
 
-def test_plain_values_make_a_split():
+def test_plain_values_make_a_split_of_which_tests_alone_will_do():
     entry = {"recording": "lap", "start": 1, "stop": 2}
-    config = {
-        "name": "s",
-        "dataset": "d",
-        "train": [entry],
-        "validation": [{"recording": "v", "dataset": "e"}],
-        "tests": {"t": [{"recording": "x"}]},
-    }
-    split = split_from_config(config)
+    tests = {"t": [{"recording": "x"}]}
+    split = split_from_config(BASE | {"train": [entry], "validation": [{"recording": "v", "dataset": "e"}], "tests": tests})
     assert split.train == (Span("d", "lap", 1.0, 2.0),)
     assert split.validation == (Span("e", "v", -math.inf, math.inf),)
     assert split.tests == {"t": (Span("d", "x"),)}
     assert split.datasets == ("d", "e")
-
-
-def test_a_split_may_have_tests_only_but_not_nothing():
-    config = {"name": "s", "dataset": "d", "train": [], "validation": [], "tests": {"t": [{"recording": "x"}]}}
+    config = BASE | {"train": [], "validation": [], "tests": tests}
     split = split_from_config(config)
     assert (split.train, split.validation, split.datasets) == ((), (), ("d",))
     with pytest.raises(ConfigurationError, match="split 's' has no ranges at all"):
@@ -130,21 +122,13 @@ def test_a_split_may_have_tests_only_but_not_nothing():
         ({"train": []}, "nothing to train on"),
         ({"validation": []}, "nothing to validate on"),
         ({"train": [{"start": 3}]}, "needs a recording"),
-        (
-            {"train": [{"recording": "a", "start": "three"}]},
-            "start and stop are a number of seconds or a percentage such as \"60 %\", not 'three'",
-        ),
+        ({"train": [{"recording": "a", "start": "three"}]}, "are a number of seconds or a percentage such as \"60 %\", not 'three'"),
         ({"train": "a"}, 'train must be a list of ranges, a percentage such as "60 %" or laps such as "last lap"'),
         ({"dataset": None}, "each range needs a dataset"),
     ],
 )
 def test_a_misspelt_split_is_refused_in_one_line(changes, what):
-    config = {"name": "s", "dataset": "d", "train": [{"recording": "a"}], "validation": [{"recording": "b"}], "tests": {}}
-    with pytest.raises(ConfigurationError) as error:
-        split_from_config(config | changes)
-    assert what in str(error.value)
-    assert "split 's'" in str(error.value)
-    assert "\n" not in str(error.value)
+    assert what in refusal(BASE | changes)
 
 
 @pytest.mark.parametrize("file", CONFIGURATIONS, ids=lambda file: file.stem)
@@ -174,9 +158,6 @@ def test_every_split_that_is_shipped_is_one(file):
     split = split_from_config(config, cruising)
     assert split.name == file.stem + ("_fold_1" if "folds" in config else "")
     assert set(dataset_names(config)) == set(split.datasets)
-
-
-# --- patterns and conditions
 
 
 def drives(ay, vx=None, start_time=0.0):
@@ -253,14 +234,11 @@ def test_what_a_condition_keeps_is_what_a_plain_loop_over_the_samples_keeps(piec
     assert all(one[1] < other[0] for one, other in pairwise(ranges))
 
 
-def test_all_channels_of_a_condition_must_meet_it():
+def test_all_channels_of_a_condition_must_meet_it_within_the_range():
     ay, vx = [0.0] * 50 + [9.0] * 50 + [0.0] * 100, [10.0] * 150 + [4.0] * 50
     keep = {"magnitude": {"ay": {"at_most": 7.0}, "vx": {"at_least": 5.0}}}
     spans = kept_of(keep, drives({"train_1": ay}, vx=vx)).train
     assert [(span.start, span.stop) for span in spans] == [(-math.inf, 0.5), (1.0, 1.5)]
-
-
-def test_a_condition_looks_at_no_more_than_the_range():
     keep = {"magnitude": {"ay": {"at_most": 7.0}}}
     spans = kept_of(keep, drives({"train_1": [0.0] * 100 + [9.0] * 100 + [0.0] * 100}), start=0.5, stop=2.5).train
     assert [(span.start, span.stop) for span in spans] == [(0.5, 1.0), (2.0, 2.5)]
@@ -284,27 +262,17 @@ CONDITION = {"magnitude": {"ay": {"at_most": 7.0}}}
 )
 def test_a_pattern_or_condition_that_makes_no_sense_is_refused_in_one_line(entry, what):
     named = {} if "recording" in entry else {"recordings": "train_*"}
-    config = {"name": "s", "dataset": "d", "train": [{**named, **entry}], "validation": [{"recording": "v"}]}
-    with pytest.raises(ConfigurationError) as error:
-        split_from_config(config, drives({"train_1": [0.0] * 200}))
-    assert what in str(error.value)
-    assert "split 's'" in str(error.value)
-    assert "\n" not in str(error.value)
+    assert what in refusal(BASE | {"train": [{**named, **entry}]}, drives({"train_1": [0.0] * 200}))
 
 
 @pytest.mark.parametrize("entry", [{"recordings": "train_*"}, {"recording": "train_1", "keep": CONDITION}])
 def test_patterns_and_conditions_without_recordings_say_what_they_need(entry):
-    config = {"name": "s", "dataset": "d", "train": [entry], "validation": [{"recording": "v"}]}
-    with pytest.raises(ConfigurationError, match="its patterns and the like need the recordings of data set 'd'"):
-        split_from_config(config)
+    assert "its patterns and the like need the recordings of data set 'd'" in refusal(BASE | {"train": [entry]})
 
 
 def test_a_condition_on_a_channel_that_a_recording_lacks_names_both():
     with pytest.raises(DataError, match="recording 'train_1' has no channel 'yaw_rate'"):
         kept_of({"magnitude": {"yaw_rate": {"at_most": 1.0}}}, drives({"train_1": [0.0] * 10}))
-
-
-# --- windows
 
 
 def recorded(name, length, offset):
@@ -332,12 +300,6 @@ def test_windows_are_those_of_a_plain_loop_over_each_recording(lengths, n_window
         assert target == after
 
 
-@PROPERTY
-@given(st.integers(0, 50), st.integers(1, 50))
-def test_window_starts_count_those_with_a_sample_after_them(n_samples, n_window):
-    assert window_starts(n_samples, n_window).tolist() == [k for k in range(n_samples) if k + n_window < n_samples]
-
-
 def test_windows_share_memory_instead_of_being_copied():
     windows = windows_of([recorded("r", 1000, 0.0)], ["vx", "ay"], "vy_ref", 30)
     assert windows.series.nbytes == 1000 * 2 * 8
@@ -349,9 +311,6 @@ def test_windows_over_gaps_are_refused_by_name():
     with pytest.raises(DataError, match="recording 'lap': channel 'ay' has gaps"):
         windows_of([recording], ["vx", "ay"], "vy_ref", 3)
     assert len(windows_of([recording], ["vx"], "vy_ref", 3)) == 6
-
-
-# --- percentages, laps and folds
 
 
 def circuit(name="lap", laps=4.3, start_time=1600000000.0, rate_hz=20.0):
@@ -379,7 +338,7 @@ def catalogue_of(*recordings):
     return lambda dataset: {recording.id: reader(recording) for recording in recordings}
 
 
-def test_laps_last_as_long_as_the_course_is_driven_round_once():
+def test_laps_last_as_long_as_the_course_is_driven_round_once_and_are_named_from_either_end():
     recording, length = circuit()
     laps = laps_of(recording)
     assert len(laps) == 4
@@ -387,9 +346,15 @@ def test_laps_last_as_long_as_the_course_is_driven_round_once():
     driven = [np.interp(stop, recording.time, distance) - np.interp(start, recording.time, distance) for start, stop in laps]
     np.testing.assert_allclose(driven, length, rtol=0.01)
     assert all(one[1] == other[0] for one, other in pairwise(laps))
+    entry = {"recording": "lap"}
+    config = {"name": "s", "dataset": "d", "train": [{**entry, "laps": "first 2"}], "validation": [{**entry, "laps": "3"}]}
+    split = split_from_config(config | {"tests": {"end": "last lap"}}, catalogue_of(recording))
+    assert split.train == (Span("d", "lap", laps[0][0], laps[1][1]),)
+    assert split.validation == (Span("d", "lap", *laps[2]),)
+    assert split.tests["end"] == (Span("d", "lap", *laps[3]),)
 
 
-def test_half_a_turn_of_an_oval_is_no_lap_and_a_circle_has_one_a_turn():
+def test_half_a_turn_of_an_oval_is_no_lap_a_circle_has_one_a_turn_and_a_road_none():
     time = np.arange(6000) / 50.0
     speed = np.full(6000, 10.0)
     bend = np.mod(10.0 * time, 100.0 + 10.0 * np.pi * 2.0) >= 100.0  # two equal halves: a straight, and half a turn of 20 m
@@ -398,9 +363,6 @@ def test_half_a_turn_of_an_oval_is_no_lap_and_a_circle_has_one_a_turn():
     np.testing.assert_allclose(durations, 2.0 * (100.0 + 20.0 * np.pi) / 10.0, rtol=0.02)
     circle = Recording("circle", "car", 50.0, 0.0, {"vx": speed, "yaw_rate": np.full(6000, -0.4)})
     np.testing.assert_allclose([stop - start for start, stop in laps_of(circle)], 2.0 * np.pi / 0.4, atol=0.03)
-
-
-def test_a_drive_that_never_repeats_has_no_laps():
     generator = np.random.default_rng(1)
     yaw_rate = np.convolve(generator.standard_normal(6000), np.full(200, 0.01), mode="same")
     assert laps_of(Recording("road", "car", 50.0, 0.0, {"vx": np.full(6000, 20.0), "yaw_rate": yaw_rate})) == []
@@ -416,17 +378,6 @@ def test_percentages_follow_one_another_over_every_recording():
     assert split.validation == (Span("d", "a", 110.0, 125.0), Span("d", "b", 12.0, 15.0))
     assert split.tests["wet"] == (Span("d", "a", 125.0, 145.0), Span("d", "b", 15.0, 19.0))
     assert split.tests["dry"] == (Span("d", "a", 145.0, math.inf), Span("d", "b", 19.0, math.inf))
-
-
-def test_laps_are_named_from_either_end():
-    recording, _ = circuit()
-    laps = laps_of(recording)
-    entry = {"recording": "lap"}
-    config = {"name": "s", "dataset": "d", "train": [{**entry, "laps": "first 2"}], "validation": [{**entry, "laps": "3"}]}
-    split = split_from_config(config | {"tests": {"end": "last lap"}}, catalogue_of(recording))
-    assert split.train == (Span("d", "lap", laps[0][0], laps[1][1]),)
-    assert split.validation == (Span("d", "lap", *laps[2]),)
-    assert split.tests["end"] == (Span("d", "lap", *laps[3]),)
 
 
 def test_every_fold_is_tested_once_and_none_learns_from_its_test():
@@ -475,12 +426,7 @@ def test_folds_of_recordings_and_of_seconds_leave_nothing_out(of):
     ids=str,
 )
 def test_portions_that_make_no_sense_are_refused_in_one_line(changes, what):
-    config = {"name": "s", "dataset": "d", "train": [{"recording": "lap"}], "validation": [{"recording": "b"}], "tests": {}}
-    with pytest.raises(ConfigurationError) as error:
-        split_from_config(config | changes, catalogue_of(circuit()[0]))
-    assert what in str(error.value)
-    assert "split 's'" in str(error.value)
-    assert "\n" not in str(error.value)
+    assert what in refusal(BASE | {"train": [{"recording": "lap"}]} | changes, catalogue_of(circuit()[0]))
 
 
 def test_no_fold_is_a_scrap_and_gaps_are_kept_whole():

@@ -133,7 +133,7 @@ def test_json_that_is_none_is_one_line(text):
         parse_json(text, "'f'")
 
 
-def test_only_regular_files_are_read(tmp_path):
+def test_only_regular_files_of_utf8_and_bounded_length_are_read(tmp_path):
     os.mkfifo(tmp_path / "pipe")
     for path, message in ((tmp_path / "pipe", "a pipe"), (Path("/dev/zero"), "a device"), (tmp_path, "a folder")):
         with pytest.raises(DataError, match=message):
@@ -143,9 +143,6 @@ def test_only_regular_files_are_read(tmp_path):
             regular_file(path)
     with pytest.raises(DataError):
         regular_file(Path("a" * 5000))
-
-
-def test_text_is_utf8_and_of_bounded_length(tmp_path):
     (tmp_path / "latin").write_bytes("ä".encode("latin-1"))
     (tmp_path / "long").write_text("x" * 100)
     with pytest.raises(DataError, match="is not UTF-8 text"):
@@ -171,8 +168,10 @@ def test_limits_come_from_a_configuration_and_end_with_their_block():
             limits_from_config(wrong)
 
 
-def test_the_configuration_names_every_limit_with_its_default():
+def test_the_configuration_names_every_limit_and_an_hour_at_1_khz_stays_below():
     assert limits_from_config(compose_config("ingest", ["dataset=tabular"])["limits"]) == Limits()
+    assert Limits().samples > 3600 * 1000
+    assert Limits().memory > 8 * 3600 * 1000 * 55
 
 
 def test_a_file_may_not_unpack_to_more_than_the_limit_and_ten_times_its_size():
@@ -180,11 +179,6 @@ def test_a_file_may_not_unpack_to_more_than_the_limit_and_ten_times_its_size():
         check_unpacked("f", 200, 3000)
         with pytest.raises(DataError, match=r"'f' unpacks to 3001 bytes, 1001 beyond ten times its size, .*limits\.memory=NUMBER"):
             check_unpacked("f", 200, 3001)
-
-
-def test_an_hour_at_1_khz_stays_below_the_limits():
-    assert Limits().samples > 3600 * 1000
-    assert Limits().memory > 8 * 3600 * 1000 * 55
 
 
 @given(st.text(max_size=300))

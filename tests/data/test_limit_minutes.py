@@ -26,11 +26,8 @@ def test_as_much_is_kept_as_was_asked_for_from_any_place(seconds, at):
         assert not any(one.overlaps(other) for other in kept[position + 1 :])
 
 
-def test_the_stretch_begins_where_it_is_said_and_goes_on_at_the_start():
+def test_the_stretch_begins_where_it_is_said_goes_on_at_the_start_and_leaves_out_a_second():
     assert limit_minutes(SPANS, 60.0, 0.5) == (Span("d", "one", 10.0, 25.0), Span("d", "two", 115.0, 160.0))
-
-
-def test_an_end_of_a_second_is_left_out():
     assert limit_minutes(SPANS, 31.0, 0.0) == (Span("d", "one", 10.0, 40.0),)
 
 
