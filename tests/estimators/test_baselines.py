@@ -58,7 +58,7 @@ def test_data_sheet_is_exact_on_a_car_with_the_stiffness_it_assumes():
     np.testing.assert_allclose(estimate["vy"], drive["vy_ref"], atol=1e-12)
 
 
-def test_kinematic_integration_is_the_solution_of_its_equation():
+def test_kinematic_integration_is_the_solution_of_its_equation_whose_time_constant_it_finds():
     drive = planar_drive(20.0)
     estimator = new("kinematic")
     estimator.values = {"time_constant": 2.5}
@@ -73,9 +73,6 @@ def test_kinematic_integration_is_the_solution_of_its_equation():
     for begin, end in itertools.pairwise(times):
         solved.append(solve_ivp(derivative, (begin, end - 1e-12), [solved[-1]], rtol=1e-10, atol=1e-12).y[0, -1])
     np.testing.assert_allclose(estimate["vy"], solved, atol=1e-8)
-
-
-def test_kinematic_integration_finds_the_time_constant_that_made_the_data():
     truth = new("kinematic")
     truth.values = {"time_constant": 1.7}
     drive = planar_drive(60.0)

@@ -101,10 +101,14 @@ def test_online_agrees_with_batch_through_gaps_and_standstill(inputs):
     np.testing.assert_allclose(batch["yaw_rate"][rolling[1:]], (drive["vx"] * drive["steer"])[rolling[1:] - 1] / 2.88, rtol=1e-12)
 
 
-def test_a_state_handed_over_is_where_the_estimate_starts():
+def test_errors_alike_count_as_fewer_measurements_and_states_handed_over_are_believed():
     drive = dugoff_drive(2.0, 7).without_references()
     first = given().estimate([drive], {"vy": -1.0, "yaw_rate": 0.2})[0]
     assert first["vy"][0] == pytest.approx(-1.0, abs=1e-6)
+    white, alike = (given(correlated_samples=own) for own in (1.0, 10.0))
+    (process, once), (same, tenfold) = (own.noise_covariances(own.levels) for own in (white, alike))
+    np.testing.assert_array_equal(process, same)
+    np.testing.assert_allclose(tenfold, 10.0 * once)
 
 
 def test_forces_are_trusted_with_a_hysteresis():
@@ -116,7 +120,7 @@ def test_forces_are_trusted_with_a_hysteresis():
     assert in_nonlinear_range(ay[3:4], 4.0, 3.0, before=True)[0]
 
 
-def test_process_noise_is_tuned_by_the_house_search():
+def test_process_noise_is_tuned_by_the_house_search_below_its_limit():
     estimator = DugoffUkf.from_config({"tyres": TYRES, "noise": FORCES})
     drives = [dugoff_drive(4.0, seed) for seed in (1, 2)]
     record = estimator.fit(FitData(drives, drives), IdentificationSettings(method="nelder_mead", grid=1, max_evaluations=12))
@@ -124,6 +128,10 @@ def test_process_noise_is_tuned_by_the_house_search():
     before = untuned.fit(FitData(drives, drives), IdentificationSettings(method="data"))
     assert record.metrics["best_validation_loss"] < before.metrics["best_validation_loss"]
     assert record.metrics["evaluations"] == 12
+    estimator = DugoffUkf.from_config({"tyres": TYRES, "noise": FORCES | {"ay": 0.06, "yaw_rate": 0.002}})
+    data = FitData([dugoff_drive(6.0)], [dugoff_drive(4.0, seed=2)])
+    estimator.fit(data, IdentificationSettings(trials=6, most_process_yaw_rate=2e-5, error="recordings"))
+    assert 1e-5 <= estimator.levels["process_yaw_rate"] <= 2e-5
 
 
 def test_sensors_levels_are_read_where_the_car_moves_and_tyres_where_loads_are_known():
@@ -201,17 +209,3 @@ def test_what_makes_no_sense_is_refused():
         DugoffUkf.from_config({"car": {"cg_height": -1.0}})
     with pytest.raises(DataError, match=r"no training recording is called '\*skidpad\*'"):
         DugoffUkf.from_config({}).fit(FitData([dugoff_drive(2.0)], []), IdentificationSettings(method="data"))
-
-
-def test_errors_that_are_alike_over_samples_count_as_fewer_measurements():
-    white, alike = (given(correlated_samples=own) for own in (1.0, 10.0))
-    (process, once), (same, tenfold) = (own.noise_covariances(own.levels) for own in (white, alike))
-    np.testing.assert_array_equal(process, same)
-    np.testing.assert_allclose(tenfold, 10.0 * once)
-
-
-def test_the_search_for_the_yaw_rates_noise_stays_below_its_limit():
-    estimator = DugoffUkf.from_config({"tyres": TYRES, "noise": FORCES | {"ay": 0.06, "yaw_rate": 0.002}})
-    data = FitData([dugoff_drive(6.0)], [dugoff_drive(4.0, seed=2)])
-    estimator.fit(data, IdentificationSettings(trials=6, most_process_yaw_rate=2e-5, error="recordings"))
-    assert 1e-5 <= estimator.levels["process_yaw_rate"] <= 2e-5

@@ -96,15 +96,12 @@ def test_model_read_back_estimates_the_same(tmp_path, name):
 
 @pytest.mark.parametrize("size", [0, 40, -8])
 def test_truncated_weights_are_one_clear_error(tmp_path, size):
+    with pytest.raises(MissingError, match="holds no model"):
+        load_model(tmp_path)
     save_model(known("ksnn", "float64"), tmp_path)
     weights = tmp_path / "model.safetensors"
     weights.write_bytes(weights.read_bytes()[:size])
     with pytest.raises(DataError, match="truncated or damaged"):
-        load_model(tmp_path)
-
-
-def test_folder_without_model_is_one_clear_error(tmp_path):
-    with pytest.raises(MissingError, match="holds no model"):
         load_model(tmp_path)
 
 
@@ -141,12 +138,7 @@ def test_a_number_that_is_given_is_not_fitted(drive):
     assert estimator.threshold >= 0.0
 
 
-def test_sideslip_is_atan2_of_estimated_vy_and_measured_vx(drive):
-    estimate = known("gru", "float64").estimate([drive.without_references()])[0]
-    assert np.array_equal(estimate["sideslip"], np.arctan2(estimate["vy"], drive["vx"]), equal_nan=True)
-
-
-def test_luenberger_starts_from_a_state_that_is_handed_over():
+def test_recordings_start_from_their_own_states_or_all_from_one_and_forget_them(monkeypatch, drive):
     estimator = fitted("luenberger")
     estimator.threshold = 0.0
     drive = drive_for(estimator)
@@ -154,9 +146,6 @@ def test_luenberger_starts_from_a_state_that_is_handed_over():
     started = estimator.estimate([drive], {"vy": 2.0})[0]["vy"]
     assert abs(started[0] - free[0]) > 1.0
     assert abs(started[-1] - free[-1]) < 0.05, "the observer forgets where it started"
-
-
-def test_each_recording_starts_from_its_own_state_or_all_from_one(monkeypatch):
     estimator = known("luenberger", "float64")
     drive = drive_for(estimator)
     states = [{"vy": 2.0}, {"vy": -1.0, "vx": 20.0}]
@@ -169,9 +158,6 @@ def test_each_recording_starts_from_its_own_state_or_all_from_one(monkeypatch):
         estimator.estimate([drive], states)
     monkeypatch.setattr(type(estimator), "ignores_initial_state", True)
     assert np.array_equal(estimator.estimate([drive], states[0])[0]["vy"], estimator.estimate([drive])[0]["vy"])
-
-
-def test_window_network_has_no_state_to_start_from(drive):
     with pytest.raises(ConfigurationError, match="no state to start from"):
         known("ksnn", "float64").estimate([drive], {"vy": 1.0})
 

@@ -94,14 +94,11 @@ def test_a_short_window_is_dense_least_squares_over_it():
     assert np.abs(states_of(estimator.estimate([drive])[0]) - expected).max() < 1e-9
 
 
-def test_online_skips_gaps_as_batch_does():
+def test_online_skips_gaps_as_batch_does_and_believes_a_state_handed_over():
     estimator, drive = factor_graph(window=0.1), drive_with_gaps()
     stepper = estimator.online()
     online = np.array([stepper.step({name: drive[name][k] for name in estimator.channels})["vy"] for k in range(len(drive))])
     assert np.abs(online - estimator.estimate([drive])[0]["vy"]).max() < 1e-9
-
-
-def test_a_state_that_is_handed_over_is_believed():
     drive = linear_drive(1.0)[0]
     for window in (None, 0.05):
         estimate = factor_graph(window=window).estimate([drive], {"vy": 2.0, "yaw_rate": -0.3})[0]
@@ -109,23 +106,17 @@ def test_a_state_that_is_handed_over_is_believed():
         assert estimate["yaw_rate"][0] == pytest.approx(-0.3, abs=1e-6)
 
 
-def test_batch_cannot_run_along_with_a_drive():
-    with pytest.raises(ConfigurationError, match=r"cannot run along with a drive; set estimator\.window"):
-        factor_graph().online()
-
-
-def test_it_learns_nothing():
+def test_variants_say_how_they_are_solved_and_learn_nothing():
     estimator = factor_graph()
     record = estimator.fit(FitData([], []), NoTraining())
     assert record.metrics["epochs"] == 0
     assert (estimator.learns, estimator.n_parameters, estimator.weights()) == (False, 0, {})
     with pytest.raises(DataError, match="must be none"):
         estimator.load_weights({"gain": np.ones(1)})
-
-
-def test_variants_say_how_it_is_solved():
     assert (factor_graph().variant, factor_graph().causal) == ("factor_graph_batch", False)
     assert (factor_graph(window=0.05).variant, factor_graph(window=0.05).causal) == ("factor_graph_lag_0.05s", True)
+    with pytest.raises(ConfigurationError, match=r"cannot run along with a drive; set estimator\.window"):
+        factor_graph().online()
 
 
 @pytest.mark.parametrize(
@@ -133,6 +124,7 @@ def test_variants_say_how_it_is_solved():
     [
         ({"window": 0}, "window must be null or at least one sampling interval, 0.01 s, not 0.0 s"),
         ({"noise": {"measured_ay": 0}}, r"estimator\.noise\.measured_ay must be positive"),
+        ({"gate": 5.0}, r"estimator\.gate needs estimator\.window"),
     ],
 )
 def test_settings_that_make_no_sense_are_refused(config, message):
@@ -152,8 +144,3 @@ def test_with_a_long_window_its_gate_is_that_of_the_kalman_filter():
     assert not expected.measured[80:130, 0].any(), "shut for half a second"
     assert expected.measured[130, 0], "and open then"
     assert np.abs(states_of(estimator.estimate([drive])[0]) - expected.filtered.mean).max() < 1e-9
-
-
-def test_a_gate_without_a_window_is_refused():
-    with pytest.raises(ConfigurationError, match=r"estimator\.gate needs estimator\.window"):
-        factor_graph(gate=5.0)

@@ -49,11 +49,14 @@ def test_levels_are_those_of_the_high_passed_training_signals():
     assert (estimator.n_parameters, estimator.learns, estimator.causal, estimator.variant) == (3, True, True, "kalman")
 
 
-def test_a_level_that_is_given_is_not_read():
+def test_levels_that_are_given_are_not_read_and_need_no_training():
     estimator = kalman(noise={"ay": 0.7})
     estimator.fit(FitData([linear_drive(60.0)[0]], []), NoTraining())
     assert estimator.values["ay"] == 0.7
     assert estimator.n_parameters == 2
+    estimator = kalman(**GIVEN)
+    assert (estimator.learns, estimator.causal, estimator.variant) == (False, True, "kalman_given_noise")
+    assert np.isfinite(estimator.online().step({"vx": 20.0, "yaw_rate": 0.1, "ay": 2.0, "steer": 0.01})["vy"])
 
 
 def test_levels_of_the_recording_itself_make_the_estimate_offline():
@@ -66,19 +69,6 @@ def test_levels_of_the_recording_itself_make_the_estimate_offline():
     assert (own.learns, own.n_parameters, own.variant) == (False, 0, "kalman_own_noise")
     with pytest.raises(ConfigurationError, match="cannot run along with a drive"):
         own.online()
-
-
-def test_levels_that_are_all_given_need_no_training():
-    estimator = kalman(**GIVEN)
-    assert (estimator.learns, estimator.causal, estimator.variant) == (False, True, "kalman_given_noise")
-    assert np.isfinite(estimator.online().step({"vx": 20.0, "yaw_rate": 0.1, "ay": 2.0, "steer": 0.01})["vy"])
-
-
-def test_references_are_not_looked_at():
-    drive = linear_drive(30.0, seed=4)[0]
-    estimator = kalman()
-    estimator.fit(FitData([drive.without_references()], []), NoTraining())
-    assert np.isfinite(estimator.estimate([drive.without_references()])[0]["vy"]).all()
 
 
 def test_samples_that_are_missing_are_skipped():
@@ -107,15 +97,12 @@ def test_speed_and_steering_may_not_be_missing():
         kalman(**GIVEN).online().step({"vx": 1.0, "yaw_rate": 0.0, "ay": 0.0})
 
 
-def test_a_car_that_stands_or_reverses_has_an_estimate():
+def test_a_car_that_stands_has_an_estimate_and_a_state_handed_over_is_believed():
     drive = linear_drive(20.0, seed=6)[0]
     slow = {**drive.channels, "vx": np.linspace(20.0, -1.0, len(drive))}
     estimate = kalman(**GIVEN).estimate([type(drive)(drive.id, drive.vehicle, 100.0, 0.0, slow, drive.kind)])[0]
     assert np.isfinite(estimate["vy"]).all()
     assert np.isfinite(estimate.covariance).all()
-
-
-def test_a_state_that_is_handed_over_is_believed():
     drive = linear_drive(2.0)[0]
     estimate = kalman(**GIVEN).estimate([drive], {"vy": 2.0, "yaw_rate": -0.3})[0]
     assert estimate["vy"][0] == pytest.approx(2.0, abs=1e-3)
@@ -143,6 +130,7 @@ def test_levels_that_cannot_be_read_are_one_clear_error(name, samples, message):
         ({"noise": {"cutoff": 1.5}}, "cutoff must lie between"),
         ({"car": {**asdict(FERRARI_250LM), "mass": -3}}, r"estimator\.car: mass must be positive, not -3"),
         ({"minimum_speed": 0}, "minimum_speed must be positive"),
+        ({"offsets": {"ay": 0.0}}, r"estimator\.offsets\.ay must be positive"),
     ],
 )
 def test_settings_that_make_no_sense_are_refused(config, message):
@@ -187,7 +175,7 @@ def augmented(drive, ay, steer, seconds):
 OFFSETS = {"ay": 0.6, "steer": 0.01, "seconds": 100.0}
 
 
-def test_offsets_are_the_states_of_an_augmented_filter():
+def test_offsets_are_the_states_of_an_augmented_filter_online_too():
     drive, _ = with_planted_offsets(3, 0.6, 0.01)
     means, covariances = augmented(drive, **OFFSETS)
     estimator = kalman(**GIVEN, offsets=OFFSETS)
@@ -196,6 +184,12 @@ def test_offsets_are_the_states_of_an_augmented_filter():
     assert found.mean == pytest.approx(means, abs=1e-8)
     assert found.covariance == pytest.approx(covariances[:, :2, :2], abs=1e-8)
     assert estimator.estimate([drive])[0]["yaw_rate"] == pytest.approx(means[:, 1], abs=1e-8)
+    estimator = kalman(**GIVEN, offsets=OFFSETS, gate=5.0)
+    assert estimator.variant == "kalman_given_noise_ay_offset_steer_offset_gate5"
+    drive, _ = with_planted_offsets(1, 0.6, 0.01)
+    stepper, batch = estimator.online(), estimator.estimate([drive])[0]
+    online = [stepper.step({name: drive[name][k] for name in estimator.channels})["vy"] for k in range(len(drive))]
+    assert np.abs(np.array(online) - batch["vy"]).max() < 1e-9
 
 
 @pytest.mark.parametrize(("offsets", "honest"), [(OFFSETS, True), ({}, False)])
@@ -211,17 +205,3 @@ def test_with_offsets_errors_that_last_are_as_large_as_the_covariance_says(offse
         nees.append(error @ np.linalg.solve(found.covariance[-1, :2, :2], error))
     bounds = chi2.ppf([0.0005, 0.9995], 2 * drives) / drives
     assert bool(bounds[0] < np.mean(nees) < bounds[1]) is honest
-
-
-def test_online_is_batch_with_offsets_and_a_variant_is_called_so():
-    estimator = kalman(**GIVEN, offsets=OFFSETS, gate=5.0)
-    assert estimator.variant == "kalman_given_noise_ay_offset_steer_offset_gate5"
-    drive, _ = with_planted_offsets(1, 0.6, 0.01)
-    stepper, batch = estimator.online(), estimator.estimate([drive])[0]
-    online = [stepper.step({name: drive[name][k] for name in estimator.channels})["vy"] for k in range(len(drive))]
-    assert np.abs(np.array(online) - batch["vy"]).max() < 1e-9
-
-
-def test_an_offset_of_nothing_is_refused():
-    with pytest.raises(ConfigurationError, match=r"estimator\.offsets\.ay must be positive"):
-        kalman(**GIVEN, offsets={"ay": 0.0})

@@ -126,21 +126,14 @@ def test_online_with_a_gate_is_batch_with_a_gate(name):
 
 
 @EVERY
-def test_a_variant_with_a_gate_is_called_another(name):
+def test_a_variant_with_a_gate_is_called_another_and_a_gate_of_nothing_refused(name):
     assert estimator(name, 5.0).variant.replace("_gate5", "") == estimator(name).variant != estimator(name, 5.0).variant
     assert "gated at 5 sigma" in estimator(name, 5.0).full_title
-
-
-@EVERY
-def test_a_gate_of_nothing_is_refused(name):
     with pytest.raises(ConfigurationError, match=r"estimator\.gate must be positive"):
         estimator(name, 0.0)
 
 
-def test_a_gate_of_the_unscented_filter_on_rational_tyres_is_refused():
+def test_learned_filters_share_their_training_with_gates_and_unscented_ones_have_none():
     with pytest.raises(ConfigurationError, match=r"estimator\.gate is there for estimator\.filter=extended only"):
         estimator_class("rational_ekf").from_config({**CONFIGS["rational_ekf"], "filter": "unscented", "gate": 5.0})
-
-
-def test_a_learned_filter_is_trained_once_for_use_with_a_gate_and_without():
     assert estimator("learned_ukf", 5.0).batch_key == estimator("learned_ukf").batch_key

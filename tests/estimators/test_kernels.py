@@ -3,7 +3,6 @@
 import threading
 from types import SimpleNamespace
 
-import numba
 import numpy as np
 import pytest
 import torch
@@ -127,7 +126,7 @@ def test_gradient_of_the_ksnn_equals_finite_differences():
     )
 
 
-def test_gru_equals_the_library_gru():
+def test_gru_and_lstm_equal_those_of_the_library():
     states = 5
     network = Gru(Gru.settings_type(n_states=states)).new_network().double()
     network.reset(torch.Generator().manual_seed(3))
@@ -141,9 +140,6 @@ def test_gru_equals_the_library_gru():
         library.bias_hh_l0.zero_()
     windows = torch.randn(11, 30, 4, generator=torch.Generator().manual_seed(5), dtype=torch.float64)
     assert torch.allclose(network.last_state(windows), library(windows)[1][0], rtol=0, atol=1e-12)
-
-
-def test_lstm_equals_the_library_lstm():
     states = 6
     network = Lstm(Lstm.settings_type(n_states=states)).new_network().double()
     network.reset(torch.Generator().manual_seed(3))
@@ -160,13 +156,10 @@ def test_lstm_equals_the_library_lstm():
     assert torch.allclose(network.last_state(windows), library(windows)[1][0][0], rtol=0, atol=1e-12)
 
 
-def test_rational_tanh_is_within_2e_7_of_tanh():
+def test_activations_in_single_precision_are_within_rounding_of_the_exact_ones():
     x = np.linspace(-12.0, 12.0, 20001).astype(np.float32)
     assert np.abs(np.array([rational_tanh(value) for value in x]) - np.tanh(x.astype(np.float64))).max() < 2e-7
 
-
-def test_softplus_and_arctan_in_single_precision_are_within_rounding_of_the_exact_ones():
-    @numba.njit(error_model="numpy")
     def apply(x, above, angle):
         for i in range(x.size):
             above[i], angle[i] = softplus(x[i]), arctan(x[i])
@@ -179,7 +172,7 @@ def test_softplus_and_arctan_in_single_precision_are_within_rounding_of_the_exac
     assert np.allclose(angle, np.arctan(exact), rtol=3e-7, atol=0)
 
 
-def test_compiled_observer_equals_the_readable_one():
+def test_compiled_observer_equals_the_readable_one_and_resets_below_the_threshold():
     drive = planar_drive(20.0, 100.0, noise=0.02)
     measurements = drive.stack(("yaw_rate", "vx", "ay", "ax"))
     vy, vx = np.empty(len(drive)), np.empty(len(drive))
@@ -187,6 +180,10 @@ def test_compiled_observer_equals_the_readable_one():
     compiled_vy, compiled_vx = observe(measurements, 6.0, 0.1, 0.01)
     assert np.array_equal(vy, compiled_vy)
     assert np.array_equal(vx, compiled_vx)
+    measurements = np.tile([0.05, 20.0, 3.0, 0.0], (10, 1))
+    vy, vx = observe(measurements, 5.0, 0.1, 0.01)
+    assert (vy == 0.0).all()
+    assert (vx == 20.0).all()
 
 
 def test_observer_has_the_transfer_functions_of_appendix_b():
@@ -206,13 +203,6 @@ def test_observer_has_the_transfer_functions_of_appendix_b():
             padded[k + 2] = (forced - denominator[1] * padded[k + 1] - denominator[2] * padded[k]) / denominator[0]
         expected = padded[2:]
         assert np.allclose(vy, expected, rtol=0, atol=1e-12)
-
-
-def test_observer_resets_below_the_threshold():
-    measurements = np.tile([0.05, 20.0, 3.0, 0.0], (10, 1))
-    vy, vx = observe(measurements, 5.0, 0.1, 0.01)
-    assert (vy == 0.0).all()
-    assert (vx == 20.0).all()
 
 
 def test_a_group_of_jobs_keeps_matrix_products_on_one_thread(monkeypatch):

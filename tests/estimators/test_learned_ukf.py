@@ -73,9 +73,6 @@ def online(made, recording):
     return {name: np.array([row[name] for row in rows]) for name in rows[0]}
 
 
-# Candidates
-
-
 def test_variants_are_called_as_in_the_paper():
     cases = {
         "pc": {"dynamics": "pacejka", "noise": "constant", "through_filter": False},
@@ -118,9 +115,6 @@ def test_after_a_moment_of_training_it_estimates_a_drive_that_it_has_not_seen():
         assert np.sqrt(np.mean(error**2)) < (0.5 * recording["vy_ref"].std() if name == "vy" else 0.3), name
 
 
-# Online and batch
-
-
 @pytest.mark.parametrize(("dtype", "tolerance"), [("float64", 1e-9), ("float32", 1e-4)])
 def test_online_agrees_with_batch_also_where_sensors_fail(dtype, tolerance):
     recording = with_gaps(drive(seconds=2.0), {"ay": slice(40, 60), "steer": slice(50, 55), "motor_speed": slice(100, 120)})
@@ -128,17 +122,6 @@ def test_online_agrees_with_batch_also_where_sensors_fail(dtype, tolerance):
     step_by_step = online(trained(dtype), recording)
     for name in ("vx", "vy", "yaw_rate", "rim_speed", "friction"):
         assert np.abs(step_by_step[name] - batch[name]).max() <= tolerance, name
-
-
-def test_recordings_together_are_what_they_are_alone():
-    drives = [drive(3, 2.0), drive(4, 1.0), drive(5, 2.0)]
-    together = trained().estimate(drives)
-    for one, own in zip(drives, together, strict=True):
-        assert np.abs(trained().estimate([one])[0]["vy"] - own["vy"]).max() < 1e-12
-        assert own.recording_id == one.id
-
-
-# Starts
 
 
 def test_it_starts_from_a_state_that_is_handed_over_and_forgets_it():
@@ -173,9 +156,6 @@ def test_seeds_differ_and_a_seed_gives_the_same_numbers_again():
     vy = [one.estimate([drive(seconds=1.0)])[0]["vy"] for one in made]
     assert np.array_equal(vy[0], vy[1])
     assert not np.array_equal(vy[0], vy[2])
-
-
-# Sensors that fail
 
 
 @pytest.mark.parametrize("sensor", SENSORS)
@@ -236,15 +216,9 @@ def test_real_drives_with_dropouts_of_every_sensor_stay_finite(data_root):
         assert_finite_and_possible(made.estimate([everything])[0])
 
 
-# What is refused
-
-
-def test_weights_of_another_width_are_refused():
+def test_weights_and_drives_that_do_not_fit_are_one_clear_error():
     with pytest.raises(DataError, match=r"do not fit its settings: 'dynamics\.network\.0\.bias'"):
         estimator(width=8).load_weights(trained().weights())
-
-
-def test_a_drive_without_what_it_learns_from_is_one_clear_error():
     missing = small_car_drive(1.2, 0).without_references()
     with pytest.raises(DataError, match="has no channel 'vx_ref', which estimator 'learned_ukf' learns from"):
         estimator().fit(FitData([missing], [missing]), quick())
@@ -273,9 +247,6 @@ def test_it_is_registered_and_counts_its_parameters():
     network = 9 * 64 + 64 + 64 * 64 + 64 + 64 * 4 + 4
     assert made.n_parameters == network + 9 + (15 + 15 * 6) + (10 + 10 * 6) + 15
     assert torch.get_default_dtype() == torch.float32
-
-
-# Diagonal noise and curvature
 
 
 def variant_of(seed=0, **config):

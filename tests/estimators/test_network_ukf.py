@@ -109,13 +109,10 @@ def test_a_word_counts_as_much_as_its_variance_says():
     np.testing.assert_allclose(filtered(1e6), alone, atol=1e-6)
 
 
-def test_the_ensembles_variance_is_scaled_by_the_papers_formula():
+def test_the_ensembles_variance_is_that_of_its_networks_scaled_by_the_papers_formula():
     variance = np.array([1e-6, 4e-4])
     np.testing.assert_allclose(scaled_variance(variance, np.array([0.0, 1.0])), variance + LEAST_VARIANCE)
     np.testing.assert_allclose(scaled_variance(variance, np.array([-4.269, 0.7901])), 10**-4.269 * variance**0.7901 + LEAST_VARIANCE)
-
-
-def test_the_ensemble_says_the_mean_and_the_variance_of_its_networks():
     inputs = DATA.validation[0].stack(estimator_of("ensemble_ukf").network_inputs)
     told = {}
     for kind in ("models", "mixture"):
@@ -198,7 +195,7 @@ def test_gradients_end_to_end_are_those_of_automatic_differentiation():
     assert found.item() > (batch.sideslip - said.sideslip).square().mean().item()  # the filter's error comes on top of the network's
 
 
-def test_a_sequence_that_is_lost_teaches_nothing_and_the_others_go_on():
+def test_lost_sequences_and_gradients_teach_nothing_and_too_many_stop_the_training():
     estimator, training = end_to_end()
     batch = next(iter(training.batches(torch.Generator().manual_seed(2))))
     rest = type(batch)(*(part[1:] if part.dim() and len(part) == 4 else part for part in batch))
@@ -209,9 +206,6 @@ def test_a_sequence_that_is_lost_teaches_nothing_and_the_others_go_on():
     for own, other in zip(*(gradients_of(estimator, loss) for loss in losses), strict=True):
         torch.testing.assert_close(own, other, rtol=1e-9, atol=1e-15)
     assert training.lost == 1
-
-
-def test_a_gradient_that_is_not_finite_is_left_out_of_its_sequence_alone():
     _, training = end_to_end()
     batch = next(iter(training.batches(torch.Generator().manual_seed(2))))
     gradient = torch.ones(4, 30, 4)
@@ -219,9 +213,6 @@ def test_a_gradient_that_is_not_finite_is_left_out_of_its_sequence_alone():
     cleaned = training._cleaned(gradient, batch, torch.tensor([True, False, False, False]))
     assert cleaned.sum((1, 2)).tolist() == [0.0, 120.0, 0.0, 120.0]
     assert training.lost == 1
-
-
-def test_too_many_lost_sequences_stop_the_training_and_name_manoeuvre_and_step():
     _, training = end_to_end()
     firsts = torch.tensor([30, 830, 60, 100])
     batch = training.cut(firsts, torch.tensor([5]))

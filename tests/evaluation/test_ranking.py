@@ -99,11 +99,8 @@ def test_intervals_of_an_rmse_cover_it_at_about_the_nominal_rate(memory):
     assert 0.90 <= np.mean(covered) <= 0.99
 
 
-def test_holm_is_the_textbook_example():
+def test_holm_and_effective_blocks_are_the_textbooks():
     assert holm([0.01, 0.04, 0.03, 0.005]) == pytest.approx([0.03, 0.06, 0.06, 0.02])
-
-
-def test_effective_blocks_count_what_carries_the_error():
     assert effective_blocks(np.ones(20)) == pytest.approx(20.0)
     assert effective_blocks(np.array([1.0, *[0.0] * 19])) == pytest.approx(1.0)
 

@@ -32,14 +32,11 @@ def estimate_with(recording, error):
     return Estimate(recording.id, "test", RATE, 0.0, {"vy": vy, "sideslip": np.arctan2(vy, recording["vx"])})
 
 
-def test_each_sample_lies_in_one_band_one_of_straight_or_turning_and_one_of_transient_or_steady():
+def test_regimes_are_where_the_drive_was_made_to_have_them_one_of_each_kind():
     masks = regimes_of(stepped_drive(), Span("d", "steps"), ALL)
     assert tuple(masks) == REGIMES
     for group in (("straight", "turning"), tuple(AY_BANDS), ("transient", "steady")):
         assert (np.sum([masks[name] for name in group], axis=0) == 1).all()
-
-
-def test_regimes_are_where_the_drive_was_made_to_have_them():
     masks = regimes_of(stepped_drive(), Span("d", "steps"), ALL)
     time = stepped_drive().time
     assert masks["straight"][time < 10].all()
@@ -80,15 +77,12 @@ def test_errors_of_regimes_make_up_the_error_of_all_samples():
             assert together == pytest.approx(whole[metric] ** 2)
 
 
-def test_regime_of_less_than_two_seconds_has_no_errors():
+def test_short_regimes_and_missing_channels_have_no_errors():
     drive = stepped_drive()
     part = score(estimate_with(drive, np.full(600, 0.1)), drive, Span("d", "steps"), ALL)
     masks = regimes_of(drive, Span("d", "steps"), ALL)
     assert 0 < masks["ay_4_6"].sum() < 2 * RATE
     assert set(errors_by_regime([part], [masks], RATE)) == set(REGIMES) - {"ay_4_6"}
-
-
-def test_drive_without_lateral_acceleration_has_no_bands_and_one_without_yaw_rate_is_not_told_straight():
     drive = stepped_drive()
     without_ay = regimes_of(drive.select(["vx", "yaw_rate", "vy_ref"]), Span("d", "steps"), ALL)
     assert set(without_ay) == {"straight", "turning", "transient", "steady"}

@@ -12,15 +12,12 @@ from vehest_papers.kit.spectra import decibels, lateral_velocity_rate, mean_bias
 RATE = 20.0
 
 
-def test_density_of_white_noise_is_its_variance_over_the_band():
+def test_density_of_white_noise_is_its_variance_over_the_band_and_power_that_of_any_colour():
     """σ² spread evenly over 0 to 10 Hz; the mean of 255 lines over n segments scatters by about 1/sqrt(255 n)."""
     noise = 0.3 * np.random.default_rng(0).standard_normal(40_000)
     own = periodogram([noise], RATE)
     assert own.density[1:-1].mean() == pytest.approx(0.3**2 / (RATE / 2), rel=4 / np.sqrt(255 * own.n_segments))
-
-
-def test_power_over_all_lines_is_the_variance():
-    """Parseval: for noise of any colour, up to what the segments' ends weigh."""
+    # Parseval: for noise of any colour, up to what the segments' ends weigh.
     noise = np.random.default_rng(1).standard_normal(80_000)
     coloured = np.convolve(noise, np.ones(6) / 6, mode="valid")
     assert periodogram([coloured], RATE).power == pytest.approx(coloured.var(), rel=0.03)

@@ -95,7 +95,7 @@ def test_scan_is_the_unscented_filter_in_values_and_gradients(name):
         assert a.abs().sum() > 0, field
 
 
-def test_missing_measurements_are_skipped_as_by_the_filter():
+def test_missing_measurements_and_bounds_of_states_are_as_by_the_filter():
     measurements, inputs, first = measured_pendulum(30, 3)
     measurements[0, 3, 0] = measurements[1, 5] = measurements[2, 10:20, 1] = torch.nan
     (filtered, gradients), (scanned, own) = both_ways(RULES["symmetric"], measurements, inputs, first)
@@ -103,9 +103,6 @@ def test_missing_measurements_are_skipped_as_by_the_filter():
     for a, b in zip(gradients, own, strict=True):
         assert torch.isfinite(b).all()
         assert torch.allclose(a, b, rtol=0, atol=1e-10 * float(a.abs().max()))
-
-
-def test_states_stay_within_their_bounds_as_by_the_filter():
     lower = [-1e9, -1e9, 0.25]
     (filtered, gradients), (scanned, own) = both_ways(RULES["scaled"], *measured_pendulum(30, 4), lower=lower)
     assert (scanned.steps.filtered.mean[..., 2] == 0.25).any(), "the bound is met"

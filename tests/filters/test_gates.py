@@ -37,9 +37,11 @@ def by_the_filter(u, first, rule, y):
     return unscented_filter(pendulum_with_radar(), y, u, first, rule).steps
 
 
-def test_the_limit_is_that_of_the_chi_square_distribution():
+def test_gates_have_the_limit_of_the_chi_square_distribution_and_patience_in_samples():
     limit = Gate(3.0, PATIENCE).deviations ** 2
     assert chi2.sf(limit, 1) == pytest.approx(2.0 * norm.sf(3.0))
+    assert Gate.of(None, 100.0) is None
+    assert Gate.of(5.0, 100.0) == Gate(5.0, 50)
 
 
 def test_a_consistent_filter_refuses_as_often_as_the_normal_distribution_says():
@@ -162,25 +164,6 @@ def test_sample_by_sample_the_gate_is_that_of_the_whole_sequence():
         assert stepper.step(y[0, k].numpy(), u[0, k].numpy(), process, observation) == pytest.approx(whole[k], abs=1e-12), k
 
 
-def test_every_sequence_has_its_own_gate_however_they_are_shared_out():
-    y, u, first = outliers(30, 4)
-    together = pendulum(y, u, first, Gate(4.0, PATIENCE)).steps
-    for row in range(4):
-        alone = pendulum(y[row : row + 1], u[row : row + 1], first, Gate(4.0, PATIENCE)).steps
-        assert torch.equal(alone.measured[0], together.measured[row])
-    model = pendulum_with_radar()
-    noises = [noise(NOTHING, NOTHING) for noise in (model.process_noise, model.observation_noise)]
-    points = TorchModel(model.transition, model.observation)
-
-    def halves(work, count):
-        work(0, count // 2)
-        work(count // 2, count)
-
-    shared = unscented_scan(points, y, u, first, *noises, RULES["symmetric"], gate=Gate(4.0, PATIENCE), share=halves).steps
-    assert torch.equal(shared.measured, together.measured)
-    assert torch.equal(shared.filtered.mean, together.filtered.mean)
-
-
 def test_the_gate_of_the_kalman_filter_judges_by_its_innovations():
     model, measurements, first = example(60, seed=5, missing=0.1)
     measurements[20, 0], measurements[40:, 1] = 1e3, 1e3
@@ -190,8 +173,3 @@ def test_the_gate_of_the_kalman_filter_judges_by_its_innovations():
     assert np.array_equal(judged.measured, compiled.measured)
     assert not compiled.measured.all()
     assert judged.filtered.mean.numpy() == pytest.approx(compiled.filtered.mean, abs=1e-9)
-
-
-def test_half_a_second_of_patience_is_counted_in_samples():
-    assert Gate.of(None, 100.0) is None
-    assert Gate.of(5.0, 100.0) == Gate(5.0, 50)

@@ -90,7 +90,7 @@ def test_at_the_length_it_was_trained_on_a_window_gives_the_networks_own_estimat
     assert errors.value("5", "rmse_vy") != errors.value("30", "rmse_vy")
 
 
-def test_at_little_yaw_rate_v_0_errs_by_v(tmp_path):
+def test_at_little_yaw_rate_v_0_errs_by_v_and_thresholds_beyond_tell_nothing(tmp_path):
     own = scheme(tmp_path)
     errors, share = behaviour.at_low_yaw_rate(own, 0.1, [paper.ZERO, paper.LINEAR], "c2")
     drive = planar_drive(SECONDS, seed=1)
@@ -98,9 +98,6 @@ def test_at_little_yaw_rate_v_0_errs_by_v(tmp_path):
     low = scored & (np.abs(drive["yaw_rate"]) < 0.1)
     assert share == pytest.approx(low.sum() / scored.sum())
     assert errors.value(paper.ZERO, "rmse_vy") == pytest.approx(math.sqrt(np.mean(drive["vy_ref"][low] ** 2)), rel=1e-6)
-
-
-def test_a_threshold_that_is_never_or_always_reached_tells_nothing(tmp_path):
     own = scheme(tmp_path)
     for threshold in (0.0, 100.0):
         assert paper.ZERO not in behaviour.at_low_yaw_rate(own, threshold, [paper.ZERO], "c2")[0]

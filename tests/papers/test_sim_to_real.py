@@ -38,9 +38,6 @@ def courses(name):
     return {drive.manoeuvre["course"] for drive in open_source(dataset(name)).drives.values() if "course" in drive.manoeuvre}
 
 
-# What is learnt on, and what is chosen by
-
-
 @pytest.mark.parametrize("name", SPLITS)
 def test_nothing_is_learnt_or_stopped_on_that_is_not_simulated(name):
     split = compose_config("train", [f"split={name}"])["split"]
@@ -81,8 +78,6 @@ def test_cars_of_the_fleets_differ_as_widely_as_stated():
         assert max(car.m for car in cars) / min(car.m for car in cars) > 1.6
         assert max(car.a + car.b for car in cars) / min(car.a + car.b for car in cars) > 1.2
 
-
-# The study
 
 ERRORS = {  # part -> (on validation, on race cars, on another simulation's car, on the real car) of every seed
     "one": [(0.30, 0.20, 0.0, 0.10), (0.31, 0.21, 0.0, 0.11)],

@@ -175,17 +175,16 @@ def test_the_published_page_for_a_busy_engineer_is_short():
     assert len(text[: text.index("## Appendix")].split()) <= 2500
 
 
-def test_candidates_have_the_papers_names(part):
+def test_candidates_have_the_papers_names_and_lines(part):
     assert set(map(candidate_of, part.models)) == {*paper.OF_FOUR, paper.SMOOTH, paper.ZERO}
     away = replace(part.models[-2], estimator="cnn_ukf", variant="full_no_adaptive_process")
     assert candidate_of(away) == "process noise constant"
     twice = replace(part, models=[part.models[0], part.models[0]])
     with pytest.raises(DataError, match="Model-based was trained twice with one seed"):
         runs_of(twice, Prepared(twice))
-
-
-def test_a_hybrid_that_is_its_own_filter_is_drawn_as_the_hybrid():
     assert line_of(paper.CNN + OWN) == line_of(paper.CNN)
+    with pytest.raises(DataError, match="'GRU' is none of the paper's methods"):
+        candidate_of(EvaluatedModel("gru", "states_5", "GRU", 0, Path(), Path()))
 
 
 def made_run(candidate, errors, seed=0, validation=None, ay=5.0):
@@ -253,11 +252,19 @@ def test_validation_chooses_the_seed_and_no_single_manoeuvre_does():
     assert chosen([quiet, wild]).model.seed == 0
 
 
-def test_a_drive_is_scored_until_it_slides_beyond_twelve_degrees():
+def test_a_drive_is_scored_until_it_slides_and_the_report_counts_those_that_are_cut():
     angle = np.array([0.1, 0.2, 0.22, 0.1])
     part = Scored(np.arange(4.0), angle, angle, angle, angle, angle)
     assert len(until(part, 0.21).time) == 2
     assert len(until(part, 0.3).time) == 4
+
+    def driven(*largest):
+        test = {f"drive {k}": [SimpleNamespace(sideslip_ref=np.radians([0.0, -angle]))] for k, angle in enumerate(largest)}
+        return SimpleNamespace(runs={"any": [SimpleNamespace(test=test)]})
+
+    assert document._cut_in_words(driven(3.0, 43.0, 11.9, 180.0)) == "2 of 4 drives, with up to 180° and 43°, are"
+    assert document._cut_in_words(driven(3.0, 13.0)) == "1 of 2 drives, with up to 13°, is"
+    assert document._cut_in_words(driven(3.0)) == "no drive is"
 
 
 def test_what_networks_say_is_held_against_the_reference_of_the_same_time(part, runs, monkeypatch):
@@ -356,19 +363,20 @@ def test_the_search_compares_validation_with_the_papers_widths(everything, runs)
     assert search.search_table(parts, {**runs, paper.DATA: [wild]}, "D").frame["validation"].tolist() == table.frame["validation"].tolist()
 
 
-def test_a_report_without_its_main_part_is_refused(part):
+def test_manoeuvres_in_two_ranges_and_reports_without_a_main_part_are_refused(part):
+    spans = (*SPLIT.tests["test"], Span("car", "test_lap_1", 4.0))
+    twice = replace(part, split=Split("made", SPLIT.train, SPLIT.validation, {"test": spans}))
+    with pytest.raises(DataError, match="has several ranges, but a manoeuvre is one"):
+        runs_of(twice, Prepared(twice))
     with pytest.raises(DataError, match="needs part 'full'"):
         documents(StudyArtefacts("cnn_ukf", "t", "a", "c", {"limited": "l"}, {"limited": part}, []))
 
 
-def test_the_study_prepares_references_as_the_pipeline_prepares_recordings():
+def test_recordings_are_prepared_as_the_pipeline_prepares_them(part):
     content = yaml.safe_load((ROOT / "pipelines" / "cnn_ukf.yaml").read_text())
     offline = {override for part in content["parts"].values() for sweep in part["sweeps"] for override in sweep}
     (told,) = {override for override in offline if override.startswith("downsample.transforms=")}
     assert tuple(transform_from_config(entry) for entry in yaml.safe_load(told.partition("=")[2])) == OFFLINE
-
-
-def test_references_and_accelerations_are_low_passed_before_they_are_scored(part):
     prepared = Prepared(part)
     noisy = part.references["car", "test_lap_1"]
     assert np.std(np.diff(prepared.recording("car", "test_lap_1")["ay"], 2)) < 0.1 * np.std(np.diff(loaded_ay(noisy), 2))
@@ -392,25 +400,3 @@ def test_the_manoeuvre_drawn_is_the_one_with_the_largest_angle_whose_car_did_not
     assert traces.manoeuvre_of(more, Prepared(more), "J-turn").recording == "test_j_turn_2"
     with pytest.raises(DataError, match="no test manoeuvre is a skidpad"):
         traces.manoeuvre_of(part, Prepared(part), "skidpad")
-
-
-def test_manoeuvres_in_two_ranges_are_refused(part):
-    spans = (*SPLIT.tests["test"], Span("car", "test_lap_1", 4.0))
-    twice = replace(part, split=Split("made", SPLIT.train, SPLIT.validation, {"test": spans}))
-    with pytest.raises(DataError, match="has several ranges, but a manoeuvre is one"):
-        runs_of(twice, Prepared(twice))
-
-
-def test_a_method_that_the_paper_does_not_have_is_refused():
-    with pytest.raises(DataError, match="'GRU' is none of the paper's methods"):
-        candidate_of(EvaluatedModel("gru", "states_5", "GRU", 0, Path(), Path()))
-
-
-def test_the_report_counts_the_drives_that_are_cut_and_tells_how_far_they_slide():
-    def driven(*largest):
-        test = {f"drive {k}": [SimpleNamespace(sideslip_ref=np.radians([0.0, -angle]))] for k, angle in enumerate(largest)}
-        return SimpleNamespace(runs={"any": [SimpleNamespace(test=test)]})
-
-    assert document._cut_in_words(driven(3.0, 43.0, 11.9, 180.0)) == "2 of 4 drives, with up to 180° and 43°, are"
-    assert document._cut_in_words(driven(3.0, 13.0)) == "1 of 2 drives, with up to 13°, is"
-    assert document._cut_in_words(driven(3.0)) == "no drive is"

@@ -81,9 +81,6 @@ def made(study):
     return documents(study)
 
 
-# Statistics
-
-
 def test_statistics_of_many_recordings_are_those_of_all_samples_together():
     drives = [_drive(f"d{seed}", seed, 20.0 + seed) for seed in range(5)]
     tally = Tally()
@@ -138,19 +135,6 @@ def test_slow_samples_count_in_the_duration_and_not_in_distributions():
     assert tally.counts["sideslip"].sum() == len(drive)
 
 
-def test_memory_does_not_grow_with_the_number_of_recordings():
-    tally, points = Tally(), HandlingPoints(2.4)
-    sizes = []
-    for seed in range(3):
-        tally.add(_drive(seed=seed))
-        points.add(_drive(seed=seed))
-        sizes.append(sum(counts.nbytes for counts in tally.counts.values()) + points.everything.nbytes + points.steady.nbytes)
-    assert len(set(sizes)) == 1
-
-
-# Handling
-
-
 def test_medians_find_the_steering_that_was_added_to_the_curvature():
     points = HandlingPoints(2.4)
     points.add(_drive(seconds=600.0, steered=np.radians(1.03)))
@@ -176,9 +160,6 @@ def test_ramp_of_the_plant_starts_with_the_slope_of_the_linear_single_track():
     assert wet.ay.max() == pytest.approx(0.7 * own.ay.max(), rel=0.05)
 
 
-# What is shown
-
-
 def test_spectrum_of_white_noise_is_flat_at_its_density():
     noise = np.random.default_rng(0).standard_normal(60_000)
     drive = replace(_drive(seconds=600.0, rate_hz=100.0), channels=dict.fromkeys(CHANNELS, 0.3 * noise))
@@ -188,19 +169,19 @@ def test_spectrum_of_white_noise_is_flat_at_its_density():
     assert own.frequency[-1] > 40.0
 
 
-def test_busiest_stretch_is_the_one_with_the_most_lateral_acceleration():
+def test_pages_sets_and_stretches_are_those_of_the_names_and_the_busiest_drive():
     drive = _drive(seconds=60.0)
     ay = np.zeros(len(drive))
     ay[400:500] = 5.0
     stretch = busiest_stretch(replace(drive, channels={**drive.channels, "ay": ay}), 5.0)
     assert (stretch.time[0], len(stretch.time)) == (20.0, 100)
-
-
-def test_variants_share_a_page_and_counters_a_set():
     assert page_of("heavy_truck_worn") == page_of("heavy_truck") == "heavy_truck"
     assert page_of("bmw_320i_low") == "bmw_320i_low"
     assert set_of("train_j_turn_off_012") == "train_j_turn_off"
     assert set_of("nominal_fast") == "nominal_fast"
+    edges = np.array([-30.0, -20.0, 0.0, 20.0, 30.0])
+    distributions = [Distribution("simulated", edges, np.array([1, 50, 45, 4])), Distribution("real", edges, np.array([0, 60, 40, 0]))]
+    assert beyond(distributions, 20.0) == pytest.approx(2.5)
 
 
 def test_table_i_is_what_the_paper_prints():
@@ -251,9 +232,6 @@ def test_without_the_real_recording_the_page_says_how_to_get_it(study):
     assert "somebody's licence" in text
     assert "vehest data check ferrari_250lm" in text
     assert not any(getattr(block, "name", "").endswith("_spectra") for block in made["ferrari_250_lm"].blocks)
-
-
-# Pipelines of data sets alone
 
 
 @pytest.fixture
@@ -354,15 +332,6 @@ def test_a_signal_while_pages_are_drawn_leaves_nothing_and_the_next_run_goes_on(
     assert not (place.folder / "results").exists()
     code, _, err = place("run", "ground", "--dry-run")
     assert _statuses(err) == [("skipped", "ingest"), ("would", "report")]
-
-
-def test_samples_beyond_the_drawn_range_are_counted():
-    edges = np.array([-30.0, -20.0, 0.0, 20.0, 30.0])
-    distributions = [Distribution("simulated", edges, np.array([1, 50, 45, 4])), Distribution("real", edges, np.array([0, 60, 40, 0]))]
-    assert beyond(distributions, 20.0) == pytest.approx(2.5)
-
-
-# Gates
 
 
 def _set(name, seed, seconds=60.0):

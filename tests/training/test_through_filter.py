@@ -62,9 +62,6 @@ def numbered(*lengths):
     return made
 
 
-# What is learnt from
-
-
 def test_drives_are_cut_from_their_start_and_remainders_are_left_out():
     cut = sequences_of(numbered(25, 9, 10), 10)
     assert cut.states[:, 0].tolist() == [[0.0, 0.0], [10.0, 0.0], [0.0, 2.0]]
@@ -133,10 +130,7 @@ def test_a_share_of_sequences_is_seen_in_a_mirror():
         assert seen == allowed
 
 
-# Truncation
-
-
-def test_truncated_training_has_the_same_estimates_and_other_gradients():
+def test_truncated_training_has_the_same_estimates_and_gradients_that_end_at_its_starts():
     made = estimator()
     sequences = drives(made)
     results = {}
@@ -150,9 +144,6 @@ def test_truncated_training_has_the_same_estimates_and_other_gradients():
     assert torch.equal(results[40][1], results[None][1]), "as long as the sequence: nothing is cut"
     off = float((results[15][1] - results[None][1]).norm() / results[None][1].norm())
     assert 1e-4 < off < 2.0
-
-
-def test_truncated_gradients_do_not_reach_the_start():
     made = estimator()
     sequences = drives(made)
     start = sequences.states[:, 0].clone().requires_grad_()
@@ -162,29 +153,12 @@ def test_truncated_gradients_do_not_reach_the_start():
     assert start.grad.abs().max() > 0
 
 
-# Noise
-
-
 def test_surprise_is_the_log_density_of_errors_under_the_covariance():
     generator = np.random.default_rng(0)
     errors, factors = generator.standard_normal((7, 3)), generator.standard_normal((7, 3, 3))
     covariances = factors @ factors.swapaxes(1, 2) + 0.1 * np.eye(3)
     expected = -np.mean([stats.multivariate_normal(cov=own).logpdf(error) for error, own in zip(errors, covariances, strict=True)])
     assert float(gaussian_surprise(torch.from_numpy(errors), torch.from_numpy(covariances))) == pytest.approx(expected, rel=1e-9)
-
-
-def test_likelihood_teaches_the_filter_how_sure_to_be():
-    """With the term the filter's own variances come nearer to its squared errors in training; without it they are left where they are."""
-    ratios = {}
-    for weight in (0.0, 0.05):
-        made = estimator(noise="constant")
-        made.fit(DATA, settings(through=PhaseSettings(learning_rate=5e-3, max_epochs=15), likelihood=weight))
-        own = sequences_of([made.drive(recording, torch.float64) for recording in DATA.train], 40)
-        with torch.no_grad():
-            mean, covariance = made.filter.estimate_with_covariance(own, own.states[:, 0], None)
-        error = (mean - own.states)[..., :3]
-        ratios[weight] = float(gaussian_surprise(error, covariance[..., :3, :3]))
-    assert ratios[0.05] < ratios[0.0] - 0.1
 
 
 def test_noise_starts_where_the_models_residuals_say():
@@ -212,9 +186,6 @@ def test_noise_given_is_not_started_from_residuals():
     other = estimator()
     other.fit(DATA, settings(through=PhaseSettings(max_epochs=1, learning_rate=1e-12)))
     assert (other.weights()["process_noise.unit"] != 1.0).all()
-
-
-# Phases
 
 
 def test_noise_alone_leaves_the_dynamics_as_the_one_step_training_left_them():
@@ -268,9 +239,6 @@ def test_killed_training_goes_on_to_the_same_weights(tmp_path, stop):
     again = resumed.fit(DATA, settings(checkpoint_seconds=0.0), FitContext([tmp_path]))
     assert np.array_equal(weights_of(resumed), weights_of(whole))
     assert again.history == record.history
-
-
-# What is refused
 
 
 @pytest.mark.parametrize(

@@ -92,13 +92,6 @@ def test_early_stopping_keeps_the_best_weights_on_validation():
     assert np.mean(error**2) == pytest.approx(losses[best], rel=1e-9)
 
 
-def test_gamma_1_stays_in_its_range():
-    (member,), _ = _fit("ksnn", {"n_hidden": 0}, [0], SupervisedSettings(max_epochs=10, learning_rate=5e-2))
-    gamma = member.weights()["gamma"][:, 0]
-    assert (gamma > 0).all()
-    assert (gamma <= 1).all()
-
-
 class _StopAfter:
     """Asks to stop after so many batches."""
 
@@ -171,7 +164,7 @@ def test_ksnn_learns_exact_kinematics_better_than_a_zero_estimate():
     assert np.var(error) < 0.3 * np.var(test["vy_ref"][known])
 
 
-def test_direct_search_finds_the_minimum_that_a_fine_grid_finds():
+def test_direct_search_finds_the_minimum_of_a_fine_grid_within_its_box():
     def cost(p):
         return float((p[0] - 7.0) ** 2 + 30 * abs(p[1] - 0.11) + 5 * np.sin(3 * p[0]) ** 2)
 
@@ -179,9 +172,6 @@ def test_direct_search_finds_the_minimum_that_a_fine_grid_finds():
     grid = optimize.brute(cost, ((0, 50), (0, 0.5)), Ns=401, finish=optimize.fmin)
     assert record.cost <= cost(grid) + 1e-6
     assert len(record.starts) == 16
-
-
-def test_direct_search_stays_in_its_box():
     record = nelder_mead_over_grid(
         lambda p: float(-p.sum()), [(0, 2), (0, 1)], [(0.5, 1), (0.1, 0.5)], DirectSearchSettings(), FitContext()
     )
@@ -252,15 +242,6 @@ def test_averaging_never_reaches_the_optimiser():
     (_,), (averaged,) = _fit("ksnn", {}, [0], SupervisedSettings(max_epochs=5, averaging=0.99))
     assert averaged.history["train_loss"] == plain.history["train_loss"]
     assert averaged.history["validation_loss"] != plain.history["validation_loss"]
-
-
-def test_validation_loss_of_averaged_weights_jumps_less():
-    def jumps(averaging):
-        settings = SupervisedSettings(max_epochs=30, patience=30, learning_rate=1e-2, averaging=averaging)
-        _, (record,) = _fit("gru", {"n_states": 3}, [1], settings)
-        return np.abs(np.diff(record.history["validation_loss"][10:], n=2)).mean()
-
-    assert jumps(0.98) < 0.5 * jumps(0.0)
 
 
 @pytest.mark.parametrize(("name", "config"), SHAPES)

@@ -157,9 +157,13 @@ def test_best_validation_is_kept_and_the_start_is_a_candidate():
     assert torch.equal(_flat(network), start)
 
 
-def test_validation_every_third_epoch_and_after_the_last():
+def test_validation_comes_every_third_epoch_and_progress_counts_over_all_phases():
     (record,) = train_phases([_phase(_network(), validate_every=3, max_epochs=8)], 0, FitContext())
     assert [math.isfinite(loss) for loss in record.validation_loss] == [False, False, True, False, False, True, False, True]
+    told = []
+    train_phases(_two_phases(_network()), 3, FitContext(on_progress=told.append))
+    assert [progress.epoch for progress in told] == list(range(1, len(told) + 1))
+    assert told[0].max_epochs == 19
 
 
 def test_gradients_are_clipped_element_by_element():
@@ -200,14 +204,11 @@ def test_step_that_is_not_finite_is_skipped_and_counted(where):
     assert math.isfinite(record.train_loss[0])
 
 
-def test_twenty_steps_in_a_row_that_are_not_finite_are_an_error():
+def test_bad_steps_end_nothing_between_good_ones_and_training_twenty_in_a_row():
     network = _network()
     phase = _phase(network, "through the filter", loss=lambda batch: network(batch[0]).sum() * math.inf)
     with pytest.raises(DataError, match=r"phase 'through the filter', epoch 7, step 2: .* 20 times in a row; lower its learning_rate"):
         train_phases([phase], 0, FitContext())
-
-
-def test_bad_steps_with_good_ones_between_them_end_nothing():
     network, calls = _network(), 0
 
     def loss(batch):
@@ -217,9 +218,6 @@ def test_bad_steps_with_good_ones_between_them_end_nothing():
 
     (record,) = train_phases([_phase(network, loss=loss)], 0, FitContext())
     assert record.skipped_steps == 24, "two of three in twelve epochs"
-
-
-def test_phase_without_a_finite_validation_is_an_error():
     with pytest.raises(DataError, match="no finite validation loss in 12 epochs"):
         train_phases([_phase(_network(), validation=lambda: math.nan)], 0, FitContext())
 
@@ -248,13 +246,6 @@ def test_stop_leaves_the_best_so_far_and_says_so(tmp_path):
     assert checkpoint is not None
     assert torch.equal(_flat(network)[:8], checkpoint.tensors["best.0.0.weight"].reshape(-1))
     assert math.isclose(records[-1].best_loss, float((network(X) - Y).square().mean().detach()), rel_tol=1e-6)
-
-
-def test_progress_counts_epochs_over_all_phases():
-    told = []
-    train_phases(_two_phases(_network()), 3, FitContext(on_progress=told.append))
-    assert [progress.epoch for progress in told] == list(range(1, len(told) + 1))
-    assert told[0].max_epochs == 19
 
 
 def test_phases_that_make_no_sense_are_refused():

@@ -125,15 +125,12 @@ def test_a_slide_does_not_accuse_the_longitudinal_acceleration_where_ay_tells_of
     assert bool((statistics[:, at] > np.array(model.limits)[at]).any()) is accused
 
 
-def test_a_channel_that_is_lost_degrades_at_once_and_invalidates_after_half_a_second():
+def test_noise_jumps_and_lost_channels_are_told():
     drive = measured_drive(3)
     found = judged(model_of(), drive, ay=after(drive["ay"], math.nan))
     assert found.status[ONSET] == DEGRADED
     assert found.status[ONSET + round(0.6 * RATE)] == INVALID
     assert reason_in_words(found.reason[ONSET]) == "ay is not measured"
-
-
-def test_noise_is_flagged_as_noise_and_a_spike_as_a_jump():
     drive, generator = measured_drive(3), np.random.default_rng(0)
     noisy = judged(model_of(), drive, ax=after(drive["ax"], lambda part: part + 1.0 * generator.standard_normal(len(part))))
     assert reason_in_words(noisy.reason[ONSET + round(RATE)]) in {

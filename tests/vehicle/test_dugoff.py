@@ -44,14 +44,10 @@ def test_tyres_are_those_of_the_paper():
 
 
 @BOTH
-def test_the_gradient_at_a_slip_of_zero_is_the_cornering_stiffness(tyres):
+def test_gradients_of_tyres_are_finite_differences_and_the_stiffness_at_zero(tyres):
     slip = torch.tensor([0.0, 1e-12, -1e-12, 1e-4], dtype=torch.float64, requires_grad=True)
     (slope,) = torch.autograd.grad(force(slip, tyres).sum(), slip)
     torch.testing.assert_close(slope, torch.full_like(slope, FRONT.cornering_stiffness))
-
-
-@BOTH
-def test_the_gradient_is_that_of_finite_differences(tyres):
     slip = torch.linspace(-0.3, 0.3, 61, dtype=torch.float64, requires_grad=True)
     (slope,) = torch.autograd.grad(force(slip, tyres).sum(), slip)
     with torch.no_grad():

@@ -69,7 +69,7 @@ def test_local_models_have_the_activations_and_feedback_of_the_network(structure
     np.testing.assert_allclose(models.activations(values).sum(axis=-1), 1.0, atol=1e-14)
 
 
-def test_gains_are_those_of_a_local_model_at_its_centre_and_of_the_last_beyond():
+def test_gains_are_those_of_the_nearest_models_and_linearisation_the_tangent():
     model = LocalModels.of(ksnn_with_weights(3, 0, True)).linearised()
     for position, centre in enumerate(model.centres.tolist()):
         own = model.gains(-centre)
@@ -77,9 +77,6 @@ def test_gains_are_those_of_a_local_model_at_its_centre_and_of_the_last_beyond()
             np.testing.assert_allclose(found, table[position], rtol=1e-12)
     np.testing.assert_allclose(model.gains(0.5 * model.centres[1]).gamma, model.gamma[:2].mean(axis=0), rtol=1e-12)
     np.testing.assert_array_equal(model.gains(2.0).beta, model.beta[-1])
-
-
-def test_linearisation_is_the_tangent_of_nonlinear_feedback():
     models, tiny = LocalModels.of(ksnn_with_weights(2, 2, True)), 1e-6
     for at in (0.0, -0.4):
         rise = (models.feedback(np.array(at + tiny)) - models.feedback(np.array(at - tiny))) / (2 * tiny)

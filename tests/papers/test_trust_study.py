@@ -38,14 +38,11 @@ def alarmed(*edges):
     return np.searchsorted(edges, np.arange(36_000), side="right") % 2 == 1
 
 
-def test_alarms_in_a_row_are_one_and_their_interval_is_poissons():
+def test_alarms_in_a_row_are_one_and_their_intervals_poissons():
     found = false_alarms_per_hour([alarmed(10, 20, 500, 501), alarmed(0, 5)], 10.0)
     assert (found.alarms, found.hours) == (3, 2.0)
     assert stats.poisson.sf(2, found.low * 2.0) == pytest.approx(0.025)
     assert stats.poisson.cdf(3, found.high * 2.0) == pytest.approx(0.025)
-
-
-def test_no_alarm_in_an_hour_and_a_half_bounds_the_rate_at_two_and_a_half_an_hour():
     found = false_alarms_per_hour([np.zeros(54_000, bool)], 10.0)
     assert (found.low, found.high) == (0.0, pytest.approx(-math.log(0.025) / 1.5))
 

@@ -35,10 +35,12 @@ def test_learnt_noises_stay_definite_and_give_gradients_wherever_they_go():
         assert all(parameter.grad is not None and parameter.grad.abs().sum() > 0 for parameter in noise.parameters())
 
 
-def test_a_factor_of_zero_leaves_the_floor():
+def test_factors_of_zero_leave_the_floor_and_numbers_of_parameters_are_those_of_factors():
     noise = ConstantNoise([1.0, 1.0])
     torch.nn.init.zeros_(noise.factor)
     assert torch.equal(noise(STATE, INPUTS)[0], FLOOR * torch.eye(2))
+    assert sum(parameter.numel() for parameter in ConstantNoise(START).parameters()) == 15
+    assert sum(parameter.numel() for parameter in StateDependentNoise(START, 5).parameters()) == 15 + 15 * 6
 
 
 def test_state_dependent_noise_is_the_formula_written_out():
@@ -48,19 +50,11 @@ def test_state_dependent_noise_is_the_formula_written_out():
     assert torch.allclose(noise(STATE, INPUTS)[2], torch.diag(torch.tensor([0.2, 0.3])) + 0.01 * lower @ lower.mT, atol=1e-6)
 
 
-def test_noises_have_as_many_parameters_as_their_factors():
-    assert sum(parameter.numel() for parameter in ConstantNoise(START).parameters()) == 15
-    assert sum(parameter.numel() for parameter in StateDependentNoise(START, 5).parameters()) == 15 + 15 * 6
-
-
-def test_entropy_is_that_of_an_independent_library():
+def test_entropy_is_that_of_a_library_and_is_raised_to_its_floor():
     root = torch.randn(4, 3, 3, generator=torch.Generator().manual_seed(4), dtype=torch.float64)
     covariance = root @ root.mT + 0.1 * torch.eye(3, dtype=torch.float64)
     for own, value in zip(covariance, entropy(covariance), strict=True):
         assert float(value) == pytest.approx(multivariate_normal(cov=own.numpy()).entropy())
-
-
-def test_entropy_below_the_floor_is_raised_to_it_and_above_is_left():
     small, large = 1e-4 * torch.eye(5, dtype=torch.float64), 10.0 * torch.eye(5, dtype=torch.float64)
     small[0, 1] = small[1, 0] = 5e-5
     raised = with_entropy(torch.stack([small, large]), -9.0)

@@ -126,16 +126,13 @@ def test_everything_together_is_a_document_that_can_be_written(tmp_path):
     assert {file.stem for file in (tmp_path / "figures").glob("*.png")} == {"learned_gains", "sub_models", "feedback_1", "feedback_2"}
 
 
-def test_parts_of_what_there_is_are_shown():
+def test_what_cannot_be_interpreted_is_refused_and_parts_of_what_there_is_shown():
     drive = planar_drive(noise=0.1)
     only_nonlinear = interpretation([], [_trained(2)], drive, (5.0, 20.0), "a made-up drive")
     assert [block.name for block in only_nonlinear if isinstance(block, Figure)] == ["sub_models", "feedback"]
     only_linear = interpretation([_trained()], [], drive, (5.0, 20.0), "a made-up drive")
     assert [block.name for block in only_linear if isinstance(block, Figure)] == ["learned_gains", "sub_models"]
     assert interpretation([], [], drive, (5.0, 20.0), "a made-up drive") == []
-
-
-def test_what_cannot_be_interpreted_is_refused():
     with pytest.raises(ConfigurationError, match="is nonlinear"):
         gain_curves([_trained(2)])
     with pytest.raises(ConfigurationError, match="is linear"):
