@@ -32,24 +32,10 @@ from vehest.simulation.sensors.levels import SensorLevel, ideal_sensors
 from vehest.simulation.sensors.recording import measure, specific_force
 
 IMU = ("lever_arm", "mounting", "delay", "offsets")
-PLANTED = {
-    "lever_x": 1.0,
-    "lever_y": 0.3,
-    "yaw": math.radians(3.0),
-    "delay": 0.040,
-    "offset_ax": 0.15,
-    "offset_ay": -0.10,
-    "offset_yaw_rate": 0.010,
-}
-TOLERANCE = {
-    "lever_x": 0.1,
-    "lever_y": 0.1,
-    "yaw": math.radians(0.3),
-    "delay": 0.003,
-    "offset_ax": 0.03,
-    "offset_ay": 0.03,
-    "offset_yaw_rate": 0.002,
-}
+PLANTED = {"lever_x": 1.0, "lever_y": 0.3, "yaw": math.radians(3.0), "delay": 0.040}
+PLANTED |= {"offset_ax": 0.15, "offset_ay": -0.10, "offset_yaw_rate": 0.010}
+TOLERANCE = {"lever_x": 0.1, "lever_y": 0.1, "yaw": math.radians(0.3), "delay": 0.003}
+TOLERANCE |= {"offset_ax": 0.03, "offset_ay": 0.03, "offset_yaw_rate": 0.002}
 """The stated standard uncertainties on this drive are 0.04 m, 0.01 m, 0.04°, 0.05 to 3.7 ms, 0.010 and 0.02 m/s² and 0.0008 rad/s: the
 tolerances are at least 1.5 times those, except for the delay without a reference yaw rate, which is known less well than that."""
 LARGEST_UNCERTAINTY = TOLERANCE | {"delay": 0.004}
