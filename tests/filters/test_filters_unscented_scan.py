@@ -112,25 +112,6 @@ def test_missing_measurements_and_bounds_of_states_are_as_by_the_filter():
         assert torch.allclose(a, b, rtol=0, atol=1e-10 * float(a.abs().max()))
 
 
-def test_gradients_are_those_of_finite_differences():
-    measurements, inputs, first = measured_pendulum(12, 2)
-    weights = torch.randn(2, 12, 3, generator=torch.Generator().manual_seed(3), dtype=torch.float64)
-    start = learnt(first)
-    directions = [torch.randn(part.shape, generator=torch.Generator().manual_seed(k), dtype=torch.float64) for k, part in enumerate(start)]
-    directions = [direction if direction.dim() < 2 else 1e-3 * (direction + direction.mT) for direction in directions]
-
-    def loss(shift):
-        moved_there = Learnt(*(part.detach() + shift * way for part, way in zip(start, directions, strict=True)))
-        own = Learnt(*(part.requires_grad_() for part in moved_there))
-        filtered = by_the_scan(own, RULES["symmetric"], measurements, inputs, torch.tensor(FREE), None)
-        return (filtered.steps.filtered.mean * weights).sum(), own
-
-    value, at = loss(0.0)
-    slope = sum(float((g * way).sum()) for g, way in zip(torch.autograd.grad(value, at), directions, strict=True))
-    numeric = float((loss(1e-5)[0] - loss(-1e-5)[0]).detach()) / 2e-5
-    assert slope == pytest.approx(numeric, rel=1e-7)
-
-
 def spread(*sizes):
     """Sequences of `sharp` that are more or less spread to begin with."""
     covariances = torch.tensor(sizes, dtype=torch.float64)[:, None, None] * torch.eye(5, dtype=torch.float64)
