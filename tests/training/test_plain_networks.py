@@ -167,14 +167,6 @@ def test_global_random_state_neither_matters_nor_changes(name):
         assert np.array_equal(flat(one), flat(other))
 
 
-def test_dropout_counts_in_training_and_not_in_estimates():
-    with_dropout, without = known("dropout"), known("perceptron")
-    assert not np.allclose(flat(with_dropout), flat(without))
-    drive = planar_drive(10.0, seed=3).without_references()
-    one, other = (with_dropout.estimate([drive])[0]["vy"] for _ in range(2))
-    assert np.array_equal(one, other, equal_nan=True)
-
-
 @pytest.mark.parametrize("name", ["perceptron", "dropout", "lstm"])
 def test_interrupted_training_goes_on_to_the_same_result(tmp_path, name):
     whole, _ = fit(NETWORKS[name], [0, 1])
@@ -185,15 +177,6 @@ def test_interrupted_training_goes_on_to_the_same_result(tmp_path, name):
     resumed, _ = fit(NETWORKS[name], [0, 1], FitContext(folders))
     for one, other in zip(whole, resumed, strict=True):
         assert np.array_equal(flat(one), flat(other))
-
-
-@pytest.mark.parametrize("name", NETWORKS)
-def test_weights_read_back_estimate_the_same(name):
-    member = known(name, "float32")
-    other = estimator_of(NETWORKS[name])
-    other.load_weights(member.weights())
-    drive = planar_drive(5.0, seed=3).without_references()
-    assert np.array_equal(member.estimate([drive])[0]["vy"], other.estimate([drive])[0]["vy"], equal_nan=True)
 
 
 class Frozen(Perceptron):

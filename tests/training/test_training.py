@@ -53,33 +53,6 @@ def test_members_equal_training_each_alone_over_the_whole_training_in_float64(na
         assert np.allclose(own.history["validation_loss"], record.history["validation_loss"], rtol=0, atol=1e-8)
 
 
-@pytest.mark.parametrize(("name", "config"), SHAPES)
-def test_members_equal_training_each_alone_over_first_epochs_in_float32(name, config):
-    settings = SupervisedSettings(max_epochs=3)
-    together, _ = _fit(name, config, [0, 1, 2], settings)
-    for seed, member in enumerate(together):
-        (alone,), _ = _fit(name, config, [seed], settings)
-        assert np.allclose(_weights(alone), _weights(member), rtol=0, atol=1e-5)
-
-
-def test_compiled_training_equals_plain_training():
-    plain = SupervisedSettings(dtype="float64", max_epochs=2, compiled=False)
-    compiled = SupervisedSettings(dtype="float64", max_epochs=2)
-    for name, config in SHAPES:
-        (one,), _ = _fit(name, config, [5], plain)
-        (other,), _ = _fit(name, config, [5], compiled)
-        assert np.allclose(_weights(one), _weights(other), rtol=0, atol=1e-9)
-
-
-def test_same_seed_gives_the_same_numbers_and_another_seed_others():
-    settings = SupervisedSettings(max_epochs=3)
-    (first,), _ = _fit("ksnn", {}, [7], settings)
-    (again,), _ = _fit("ksnn", {}, [7], settings)
-    (other,), _ = _fit("ksnn", {}, [8], settings)
-    assert np.array_equal(_weights(first), _weights(again))
-    assert not np.allclose(_weights(first), _weights(other))
-
-
 def test_early_stopping_keeps_the_best_weights_on_validation():
     settings = SupervisedSettings(dtype="float64", max_epochs=40, patience=4, learning_rate=3e-2)
     (member,), (record,) = _fit("ksnn", {"n_hidden": 2, "bias": True}, [0], settings)
@@ -127,7 +100,7 @@ def test_interrupted_training_goes_on_to_the_same_result(tmp_path, name, config)
         assert record.history == resumed_record.history
 
 
-def test_member_goes_on_alone_from_a_checkpoint_it_shared(tmp_path):
+def test_a_member_goes_on_alone_and_a_damaged_checkpoint_starts_anew(tmp_path):
     settings = SupervisedSettings(max_epochs=10, patience=10)
     (whole,), _ = _fit("ksnn", {}, [1], settings)
     folders = [tmp_path / str(seed) for seed in range(3)]
@@ -135,9 +108,6 @@ def test_member_goes_on_alone_from_a_checkpoint_it_shared(tmp_path):
     assert resume_epoch(folders[1]) > 0
     (resumed,), _ = _fit("ksnn", {}, [1], settings, FitContext([folders[1]]))
     assert np.array_equal(_weights(whole), _weights(resumed))
-
-
-def test_damaged_checkpoint_starts_anew(tmp_path):
     settings = SupervisedSettings(max_epochs=4)
     _fit("ksnn", {}, [0], settings, FitContext([tmp_path], should_stop=_StopAfter(20)))
     file = tmp_path / "checkpoint.safetensors"
@@ -151,17 +121,6 @@ def test_damaged_checkpoint_starts_anew(tmp_path):
 def test_diverging_training_is_one_clear_error():
     with pytest.raises(DataError, match=r"lower training\.learning_rate"):
         _fit("ksnn", {"n_hidden": 0, "bias": True}, [0], SupervisedSettings(max_epochs=200, learning_rate=1e3))
-
-
-def test_ksnn_learns_exact_kinematics_better_than_a_zero_estimate():
-    settings = SupervisedSettings(max_epochs=25)
-    data = FitData([planar_drive(120.0, seed=1)], [planar_drive(40.0, seed=2)])
-    (member,), _ = _fit("ksnn", {"n_hidden": 0}, [0], settings, data=data)
-    test = planar_drive(40.0, seed=3)
-    estimate = member.estimate([test.without_references()])[0]
-    known = ~np.isnan(estimate["vy"])
-    error = (estimate["vy"] - test["vy_ref"])[known]
-    assert np.var(error) < 0.3 * np.var(test["vy_ref"][known])
 
 
 def test_direct_search_finds_the_minimum_of_a_fine_grid_within_its_box():
@@ -242,17 +201,6 @@ def test_averaging_never_reaches_the_optimiser():
     (_,), (averaged,) = _fit("ksnn", {}, [0], SupervisedSettings(max_epochs=5, averaging=0.99))
     assert averaged.history["train_loss"] == plain.history["train_loss"]
     assert averaged.history["validation_loss"] != plain.history["validation_loss"]
-
-
-@pytest.mark.parametrize(("name", "config"), SHAPES)
-def test_members_with_averaged_weights_equal_training_each_alone(name, config):
-    settings = SupervisedSettings(dtype="float64", max_epochs=30, patience=3, learning_rate=1e-2, averaging=0.9)
-    together, records = _fit(name, config, [0, 1, 2, 3], settings)
-    assert len({record.metrics["epochs"] for record in records}) > 1, "members must stop at different times for this to mean anything"
-    for seed, member, record in zip(range(4), together, records, strict=True):
-        (alone,), (own,) = _fit(name, config, [seed], settings)
-        assert own.metrics["epochs"] == record.metrics["epochs"]
-        assert np.allclose(_weights(alone), _weights(member), rtol=0, atol=1e-8)
 
 
 @pytest.mark.parametrize("batches", [2, 25])
