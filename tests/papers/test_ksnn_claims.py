@@ -12,8 +12,8 @@ from scipy import stats
 from vehest.evaluation.blocks import Segments, segments_of
 from vehest.evaluation.metrics import Scored
 from vehest_papers.kit.statements import Change, Compared, Statement, counted, decided, outcomes
-from vehest_papers.ksnn import claims, cost, paper, tables
-from vehest_papers.ksnn.causes import CAUSES, causes_in_words, causes_table, headline, orders
+from vehest_papers.ksnn import claims, cost, paper
+from vehest_papers.ksnn.causes import headline
 from vehest_papers.ksnn.comparing import SegmentErrors, masked_segments
 from vehest_papers.ksnn.schemes import Scheme
 
@@ -63,7 +63,7 @@ def test_the_papers_own_figures_give_the_papers_verdicts(tmp_path):
     assert found[next(claim for claim in found if claim.startswith("a third car"))] == "not testable on this data"
 
 
-def test_turned_figures_turn_the_verdicts(tmp_path):
+def test_turned_figures_turn_verdicts_and_the_headline(tmp_path):
     found = verdicts(schemes(tmp_path, turned))
     for claim in (
         "nonlinear no bias: RMSE(v) on the other car below Luenberger's",
@@ -71,9 +71,6 @@ def test_turned_figures_turn_the_verdicts(tmp_path):
         "the same by FVU, GRU, LSTM",
     ):
         assert found[claim] == "not reproduced", claim
-
-
-def test_headline_says_whether_the_order_of_families_is_the_papers(tmp_path):
     assert "comes out in both schemes" in headline(schemes(tmp_path / "as"), {})
     words = headline(schemes(tmp_path / "turned", turned), {})
     assert words.startswith("**The paper's order of families does not come out** (scheme 1 and scheme 2)")
@@ -84,44 +81,6 @@ def test_headline_says_whether_the_order_of_families_is_the_papers(tmp_path):
     assert "is not decided here" in level
 
 
-def test_the_cause_without_which_the_order_is_lost_is_named(tmp_path):
-    made = schemes(tmp_path / "main")
-    ablations = {
-        cause: [
-            Scheme(f"{cause}_{own.name[-1]}", cause, own.part, own.own, own.other)
-            for own in schemes(tmp_path / cause, turned if cause == "same_sensors" else None)
-        ]
-        for cause in CAUSES
-    }
-    words = causes_in_words(made, orders(made), ablations)
-    assert words.count("It needs that the cars do not have the same sensors.") == 2
-    table = causes_table(made, ablations)
-    assert table.frame.iloc[-1]["S1 as it is"] == "comes out"
-    assert table.frame.iloc[-1]["S2 same sensors"] == "does not come out"
-    assert {paper.ZERO, paper.STATIC_MAP} <= set(table.frame["model"])
-    whole = causes_in_words(made, orders(made), {cause: own for cause, own in ablations.items() if cause != "same_sensors"})
-    assert whole.count("survives without each of them") == 2
-    other = causes_in_words(
-        schemes(tmp_path / "t", turned),
-        dict.fromkeys(("scheme_1", "scheme_2"), "does not come out"),
-        {"same_tyres": ablations["same_tyres"]},
-    )
-    assert "difference that the same tyres take away" in other
-
-
-def test_a_third_car_counts_where_it_is_there(tmp_path):
-    def with_third(table):
-        return {name: {**own, "j1": own["c2"]} for name, own in of_the_paper(table).items()}
-
-    made = schemes(tmp_path, with_third, tests=("c2", "f2", "j1"))
-    found = verdicts(made)
-    assert found[next(claim for claim in found if claim.startswith("a third car"))] in ("reproduced", "not reproduced")
-    table = tables.across_cars(made, "overview", "caption")
-    assert "fvu_third_shown" in table.columns
-    assert table.frame["model"].tolist()[:2] == [paper.ZERO, paper.STATIC_MAP]
-    assert table.frame.set_index(["scheme", "model"]).loc[("Scheme 1", paper.LINEAR), "fvu_other"] == pytest.approx(0.152, rel=0.05)
-
-
 def test_regularisation_is_compared_on_the_same_structures(tmp_path):
     with_it = schemes(tmp_path / "with")[1]
     table = {paper.LSTM: {"c2": 0.84, "f2": 0.042}, paper.NONLINEAR: {"c2": 0.197, "f2": 0.059}}
@@ -129,16 +88,6 @@ def test_regularisation_is_compared_on_the_same_structures(tmp_path):
     found = decided(claims.on_regularisation(with_it, without))
     assert [claim.verdict for claim in found] == ["reproduced"] * 3
     assert "−57 %" in found[0].ours
-
-
-def test_an_order_is_not_read_where_a_candidate_failed_on_its_own_car(tmp_path):
-    made = schemes(tmp_path)[0]
-    assert "the paper's order of families" in tables.whether_an_order_means_anything(made)
-    failing = of_the_paper(paper.TABLE_IV) | {paper.GRU: {"c2": 1.3, "f2": 0.9}}
-    scheme = Scheme("x_1", "Pair", planted_part(tmp_path / "failing", failing, train="c"), "c2", "f2")
-    words = tables.whether_an_order_means_anything(scheme)
-    assert "on the car that they learnt on themselves GRU do no better than the baselines" in words
-    assert "order of families." not in words.split("No order")[1]
 
 
 def test_figures_are_those_of_the_samples_and_infinite_errors_left_out():
@@ -174,14 +123,6 @@ def _of_pieces(squares):
     zeros = np.zeros_like(squares)
     n = np.arange(len(squares), dtype=float)
     return Segments(n, zeros, np.ones_like(squares), squares, squares, zeros, zeros, np.ones_like(squares))
-
-
-def test_the_same_networks_under_two_conditions_are_compared_seed_by_seed():
-    parts = {name: [planted_segments(level * fvu, "c2", 3) for fvu in (0.1, 0.2, 0.4)] for name, level in (("a", 0.9), ("b", 1.0))}
-    together = SegmentErrors(parts, "c2", same_models=True).change("a", "b", "fvu")
-    apart = SegmentErrors(parts, "c2").change("a", "b", "fvu")
-    assert together.ends() == pytest.approx((0.9, 0.9), rel=1e-6)
-    assert apart.ends()[0] < 0.5
 
 
 def test_masked_segments_without_a_mask_are_the_evaluations_own():

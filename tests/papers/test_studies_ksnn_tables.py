@@ -102,15 +102,6 @@ def test_sideslip_table_has_a_column_a_kind_of_data():
     assert tables.sideslip(runs, drive, None, "real").columns["scheme_2"].header == "ours: REAL F-2, scheme 2 [deg]"
 
 
-def test_regularisation_compares_the_same_structure():
-    figures = {("lstm", "states_2", 0): (0.2, 0.4, 0.1), ("lstm", "states_5", 0): (0.1, 0.3, 0.1)}
-    without = {("lstm", "states_2", 0): (0.2, 0.8, 0.05)}
-    table = tables.regularisation(runs_of(part(figures)), runs_of(part(without))).frame
-    assert table["model"].tolist() == ["LSTM, 2 states"] * 2
-    assert table["fvu_c2"].tolist() == [0.4, 0.8]
-    assert table["paper_fvu_c2"].tolist() == [0.483, 0.840]
-
-
 def test_stopping_and_candidates_count_what_was_trained():
     table = tables.stopping({"scheme_1": runs_of(part())}, {"scheme_1": "Scheme 1"}).frame.set_index("model")
     assert paper.LUENBERGER not in table.index

@@ -33,14 +33,12 @@ from vehest_papers.learned_ukf.additions import (
     samples_seen,
 )
 from vehest_papers.learned_ukf.candidates import candidate_of, chosen, models_by_candidate, runs_of, scored_of
-from vehest_papers.learned_ukf.departures import departures, settings_table
 from vehest_papers.learned_ukf.errors import Losses
 from vehest_papers.learned_ukf.filtering import drives_of, filtered, loaded, lost_sequences, one_step_squares, swapped
 from vehest_papers.learned_ukf.lengths import lengths
 from vehest_papers.learned_ukf.order import APART, AS_IN_THE_PAPER, LEVEL, TURNED, UNDECIDED, differences, order_in_words
 from vehest_papers.learned_ukf.slips import rear_slip
 from vehest_papers.learned_ukf.traces import hardest
-from vehest_papers.learned_ukf.trials import trials_table
 
 PROTOCOL = Protocol(rate_hz=100.0, warm_up_seconds=0.0, skip_seconds=0.2, sequence_seconds=1.0, initial_state=True)
 SPANS = {name: Span("car", name) for name in ("learnt", "judged", "a", "d")}
@@ -341,18 +339,6 @@ def test_friction_settles_after_the_last_sample_outside_and_slip_is_that_of_a_ha
     assert hardest([[np.array([1.0]), np.array([5.0])], [np.array([9.0]), np.array([2.0])]]) == 0
 
 
-def test_friction_starts_where_it_is_told_and_with_the_deviation_it_is_told(part):
-    estimator = loaded(model(part, "NNTF_UH"))
-    drives = drives_of(part, estimator, "tyre_d")
-    low, high = (friction.tracks_of([estimator], drives, start) for start in (0.3, 0.9))
-    assert low.mean.shape == (1, 3, 100)
-    assert float(low.mean[..., 0].mean()) < float(high.mean[..., 0].mean())
-    assert not low.apart(low).any()
-    assert (low.apart(high) > 0.0).all()
-    sure = filtered(estimator, drives, friction=0.3, deviation=1e-4).steps.filtered.mean[..., 0, -1]
-    np.testing.assert_allclose(sure.numpy(), 0.3, atol=1e-3)
-
-
 def test_baselines_take_their_other_velocities_from_what_is_measured(part, tmp_path):
     own = model(part, "GRU")
     for test in ("tyre_a",):
@@ -366,18 +352,6 @@ def test_baselines_take_their_other_velocities_from_what_is_measured(part, tmp_p
     expected = reference["yaw_rate"][20:100] - reference["yaw_rate_ref"][20:100]
     np.testing.assert_allclose(scored[0].errors["yaw_rate"], expected, atol=1e-12)
     assert not scored[0].errors["vx"].any(), "the measured speed of the test is the true one"
-
-
-def test_trials_show_what_validation_chose_and_what_the_tables_use_instead(part):
-    def trial(size, validation):
-        own = replace(model(part, "NNTF_UH"), training={"through": {"learning_rate": size}})
-        metrics = part.metrics.copy()
-        metrics.loc[(metrics["test_set"] == "validation") & (metrics["metric"] == "mse_weighted"), "value"] = validation
-        return replace(part, models=[own], metrics=metrics)
-
-    table, other = trials_table({"trial_1": trial(1e-3, 0.2), "trial_2": trial(2e-3, 0.1)}, {"NNTF_UH": 1e-3})
-    assert table.frame["chosen"].tolist() == ["", "chosen"]
-    assert other == ["NNTF_UH"]
 
 
 def test_differences_that_are_planted_are_told_from_those_that_are_not_or_level():
@@ -408,23 +382,6 @@ def test_differences_that_are_planted_are_told_from_those_that_are_not_or_level(
     assert (verdicts["A", "B"], verdicts["B", "C"], verdicts["C", "D"]) == (APART, LEVEL, AS_IN_THE_PAPER)
     assert {tuple(row) for row in pairs[pairs["neighbours"]][["first", "second"]].to_numpy()} == {("A", "D"), ("B", "D"), ("C", "D")}
     assert "Level in the paper: A and B; A and C; B and C; told apart here: A and B; A and C." in order_in_words(pairs, {}, "x")
-
-
-def test_only_what_departs_from_the_paper_is_said(part):
-    assert [line.split(":")[0] for line in departures({"real": part})] == [
-        "Data",
-        "Hidden layers of some candidates are 4 wide (paper",
-        "Not part of this run",
-        "GRU and LSTM",
-    ]
-    training = {**AS_THE_PAPER, "batch_size": 6, "through": {**PHASE, "max_epochs": 300, "schedule": "cosine"}, "mirrored": 0.5}
-    changed = [EvaluatedModel(**{**vars(own), "training": training}) for own in part.models if own.estimator == "learned_ukf"]
-    text = "\n".join(departures({"real": replace(part, models=changed)}))
-    assert "Batches of 6 sequences" in text
-    assert "300 epochs (paper: 1000, of one batch each); a step size of 0.0005 that falls to zero along a cosine" in text
-    assert "mirror" in text
-    table = settings_table({"real": replace(part, models=changed)})
-    assert table[(table["candidate"] == "NNT") & (table["setting"] == "through.max_epochs")]["value"].tolist() == [300]
 
 
 def test_lengths_and_samples_are_those_of_trainings_through_the_filter(part):
@@ -480,16 +437,6 @@ def test_added_claims_on_two_tyres_need_both_and_shared_seeds_are_paired(level, 
     assert table["difference"].tolist() == pytest.approx(
         [one.squared(test).mean() - other.squared(test).mean() for test in ("tyre_a", "tyre_d")]
     )
-
-
-def test_added_intervals_widen_with_their_number_and_those_without_claims_count():
-    one, other = planted(tyre_a=0.9), planted(tyre_a=1.0)
-    alone = Comparison(one, other, "c", "p", ("tyre_a",), shared=False)
-    silent = Comparison(other, one, "", "", ("tyre_a",), shared=False)
-    first = corrected([alone])[0, "tyre_a"]
-    together = corrected([alone, silent])[0, "tyre_a"]
-    assert together[2] - together[1] > first[2] - first[1]
-    assert len(comparison_claims([alone, silent], corrected([alone, silent]), "real")) == 1
 
 
 @pytest.mark.parametrize(

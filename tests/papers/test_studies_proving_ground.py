@@ -1,9 +1,7 @@
 """The study of the simulated cars: its statistics against plain ones, its pages, and pipelines of data sets alone."""
 
 import json
-import os
 import re
-import signal
 from dataclasses import replace
 from pathlib import Path
 
@@ -15,9 +13,7 @@ from test_cli import _statuses
 
 from conftest import planar_drive
 from place import DATASET
-from vehest.data.files import ASIDE_PREFIX
 from vehest.data.store import write_recording
-from vehest.report.document import write_document
 from vehest.simulation.plant.parameters import Vehicle
 from vehest.studies.artefacts import AbsentDataset, StoredDataset, StudyArtefacts
 from vehest_papers.proving_ground import documents, gates
@@ -99,7 +95,7 @@ def test_statistics_of_many_recordings_are_those_of_all_samples_together():
     np.testing.assert_allclose(values["sideslip_abs_q50"], np.degrees(np.quantile(np.abs(together["sideslip_ref"]), 0.5)), **tight)
 
 
-def test_two_tallies_merged_are_one_tally_of_both():
+def test_tallies_merge_count_slow_samples_in_the_duration_alone_and_have_the_papers_bins():
     first, second, both = Tally(), Tally(), Tally()
     one, two = _simulated(_drive("a", 1), spun=True), _drive("b", 2)
     first.add(one)
@@ -109,9 +105,6 @@ def test_two_tallies_merged_are_one_tally_of_both():
     first.merge(second)
     assert first.values() == both.values()
     assert first.flags["spun"] == 1
-
-
-def test_histogram_has_the_bins_of_the_paper_and_loses_no_sample():
     drive = _drive(seconds=30.0)
     tally = Tally()
     tally.add(drive)
@@ -123,9 +116,6 @@ def test_histogram_has_the_bins_of_the_paper_and_loses_no_sample():
     assert np.array_equal(Grid(2.0, 1.0).count(np.array([-9.0, -1.0, 0.0, 0.5, 9.0])), [1, 1, 2, 1]), "beyond the limit: outermost bins"
     with pytest.raises(ValueError, match="do not fit"):
         tally.histogram("ay", 0.03)
-
-
-def test_slow_samples_count_in_the_duration_and_not_in_distributions():
     drive = _drive(seconds=10.0)
     stopped = {**drive.channels, "vx": np.zeros(len(drive)), "vy_ref": np.zeros(len(drive)), "sideslip_ref": np.full(len(drive), 3.0)}
     tally = Tally()
@@ -293,47 +283,6 @@ def test_overrides_reach_the_data_sets_that_have_their_key(survey_place):
     assert "run 'vehest run" in place.refused("report", "ground")[1]
 
 
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        ({"split": "mine"}, "one of: split and sweeps; parts"),
-        ({"datasets": ["other"]}, "datasets, each once"),
-        ({"report": "drive"}, "'drive' draws its report from split and sweeps"),
-    ],
-)
-def test_pipelines_of_data_sets_that_make_no_sense_are_refused(survey_place, change, message):
-    file = survey_place.folder / "pipelines" / "ground.yaml"
-    file.write_text(yaml.safe_dump({**yaml.safe_load(file.read_text()), **change}))
-    code, line = survey_place.refused("run", "ground")
-    assert code == 2
-    assert message in line
-
-
-def test_needed_recordings_that_are_missing_are_one_clear_line(survey_place):
-    file = survey_place.folder / "pipelines" / "ground.yaml"
-    file.write_text(yaml.safe_dump({"study": "ground", "report": "proving_ground", "datasets": ["other"]}))
-    code, line = survey_place.refused("run", "ground")
-    assert code == 4
-    assert "no data root is set" in line
-
-
-def test_a_signal_while_pages_are_drawn_leaves_nothing_and_the_next_run_goes_on(survey_place, monkeypatch):
-    place, reports = survey_place, survey_place.folder / "outputs" / "report"
-
-    def interrupted(made, folder, **_):
-        write_document(made["report"], folder)
-        assert any(reports.glob(f"{ASIDE_PREFIX}*/report.md"))
-        os.kill(os.getpid(), signal.SIGTERM)
-
-    monkeypatch.setattr("vehest.report.document.write_documents", interrupted)
-    code, _, err = place("run", "ground", "--jobs", "1")
-    assert code == 143, err
-    assert not list(reports.iterdir())
-    assert not (place.folder / "results").exists()
-    code, _, err = place("run", "ground", "--dry-run")
-    assert _statuses(err) == [("skipped", "ingest"), ("would", "report")]
-
-
 def _set(name, seed, seconds=60.0):
     return replace(_simulated(_drive(f"{name}_001", seed, seconds)), vehicle=f"car {name[0]}")
 
@@ -373,14 +322,3 @@ def test_the_gate_on_the_spectrum_is_zero_against_itself_and_in_decibels():
     assert all(abs(gate.values[gates.AFTER]) < 1e-9 for gate in found)
     doubled = [gate for gate in gates.gates({gates.AFTER: {"f1": [twice]}}, [own]) if "process noise" in gate.quantity]
     np.testing.assert_allclose([gate.values[gates.AFTER] for gate in doubled], 20.0 * np.log10(2.0), atol=0.1)
-
-
-def test_the_first_cars_stand_in_the_gates_only(tmp_path):
-    stored = [
-        _stored(tmp_path, name, "simulated", [replace(_set(letter, seed), vehicle=vehicle)])
-        for name, letter, seed, vehicle in ((gates.AFTER, "f1", 4, "ferrari_250_lm"), (gates.BEFORE, "c1", 5, "corvette_grand_sport"))
-    ]
-    made = documents(StudyArtefacts("proving_ground", "Proving ground", "About it.", "vehest run x.yaml", datasets=stored))
-    assert "corvette_grand_sport" not in made
-    assert "ferrari_250_lm" in made
-    assert any(getattr(block, "name", "") == "excitation" for block in made["report"].blocks)
