@@ -5,23 +5,21 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from cars import plant_of
 from scipy.integrate import solve_ivp
 from scipy.signal import welch
 from test_simulation_sensors import motion_of, only
-from test_simulation_vehicles import plant_of
 
 from vehest.constants import GRAVITY
 from vehest.data.errors import ConfigurationError
 from vehest.run.config import compose_config
-from vehest.simulation.drive import drive, simulate_drive
-from vehest.simulation.driving.car import car_of
+from vehest.simulation.drive import drive
 from vehest.simulation.driving.driver import HIGHEST_CORRECTION, LOWEST_CORRECTION, Hands
 from vehest.simulation.driving.laps import Laps
 from vehest.simulation.fleet import SensorVariation, variations_from_config
 from vehest.simulation.plant.multi_body import MultiBodyPlant
 from vehest.simulation.plant.parameters import loaded
 from vehest.simulation.plant.wear import Stint, stint_from_config
-from vehest.simulation.road.surface import SURFACES
 from vehest.simulation.sensors.levels import SensorLevel, SensorLevels, Tilt
 from vehest.simulation.sensors.recording import measure
 from vehest.sources.base import open_source
@@ -67,7 +65,7 @@ def test_lateral_forces_follow_the_slip_over_the_relaxation_length():
         np.testing.assert_allclose(ours, held, atol=0.01 * np.abs(held).max())
 
 
-def test_a_short_relaxation_length_is_none_but_for_the_step():
+def test_a_short_relaxation_length_is_none_but_for_the_step_and_a_negative_one_refused():
     def off(step):
         ends = []
         for length in (1e-4, 0.0):
@@ -81,9 +79,6 @@ def test_a_short_relaxation_length_is_none_but_for_the_step():
 
     assert off(1e-3) < 5e-3
     assert off(2.5e-4) < 0.4 * off(1e-3)  # first order in the step
-
-
-def test_relaxation_is_refused_where_it_makes_no_sense():
     with pytest.raises(ConfigurationError, match=r"relaxation rear must be zero or positive, not -0\.1 m"):
         _lagging((0.1, -0.1))
 
@@ -131,32 +126,11 @@ def test_corrections_have_their_size_and_their_band():
     assert hands.at(1.0, 0.0) == pytest.approx(hands.at(1.0, 1.0) / 3.0)
 
 
-def test_traffic_slows_the_car_down_where_it_is_met():
-    car = car_of(plant_of("ferrari_250_lm"))
-    free = Laps(course="palm_beach_like", duration=200.0, severity=0.8)
-    held = replace(free, traffic=2.0, traffic_speed=(7.0, 12.0))
-    plans = [laps.controller(car, SURFACES["dry"], 7).plan for laps in (free, held)]
-    alone, behind = (plan.speed[: min(len(plan.speed) for plan in plans)] for plan in plans)
-    assert (behind <= alone + 1e-9).all()
-    assert 6.9 < behind.min() < 12.1
-    assert behind.min() < 0.8 * alone.min()
-
-
-def test_gain_and_bias_are_the_same_in_every_drive():
+def test_installations_have_a_gain_a_bias_and_a_speed_of_wheels():
     motion = motion_of(50, ay=3.0)
     levels = only(ay=SensorLevel(gain=0.02, bias=-0.1))
     for seed in (1, 2):
         np.testing.assert_allclose(measure(motion, levels, seed)["ay"], 3.0 * 1.02 - 0.1)
-
-
-@pytest.mark.parametrize("share", [1.0, 0.4, -0.5])
-def test_roll_leaks_by_its_share_and_sign(share):
-    motion = motion_of(10, roll=0.03)
-    shown = measure(motion, only(tilt=Tilt(roll_share=share)), 0)["ay"]
-    np.testing.assert_allclose(shown, GRAVITY * math.sin(0.03 * share), rtol=1e-9)
-
-
-def test_a_speed_of_wheels_is_right_on_the_straight_and_errs_with_slip():
     steer = np.concatenate([np.zeros(80), np.full(20, 0.1)])
     wheels = np.full((100, 4), 30.0 / 0.32)
     wheels[90:] *= 0.8  # locking
@@ -165,25 +139,11 @@ def test_a_speed_of_wheels_is_right_on_the_straight_and_errs_with_slip():
     np.testing.assert_allclose(shown[90:], 24.0)
 
 
-def test_idle_values_are_not_spoken_of_and_others_are():
-    laps = Laps(course="palm_beach_like", duration=1.0)
-    about = simulate_drive(id="d", vehicle=plant_of("ferrari_250_lm").vehicle, manoeuvre=laps, seed=1).provenance
-    assert not {"gain", "bias"} & set(about["sensors"]["ay"])
-    assert "roll_share" not in about["sensors"]["tilt"]
-    assert not {"tyres", "relaxation"} & set(about)
-    own = SensorLevels(ay=SensorLevel(gain=0.01), speed_of_wheels=True)
-    car = replace(plant_of("ferrari_250_lm").vehicle, relaxation=LENGTHS)
-    about = simulate_drive(id="d", vehicle=car, manoeuvre=laps, seed=1, sensors=own, stint=Stint(wear=0.1)).provenance
-    assert (about["sensors"]["ay"]["gain"], about["sensors"]["speed_of_wheels"]) == (0.01, True)
-    assert (about["tyres"]["wear"], about["relaxation"]) == (0.1, list(LENGTHS))
-
-
-def test_each_race_car_has_an_installation_of_its_own():
-    source = open_source(compose_config("ingest", ["dataset=sim_race_cars"])["dataset"])
-    installed = {name: str(source.drives[f"{name}_001"].sensors) for name in ("c1", "f1", "j1")}
-    assert len(set(installed.values())) == 3
-    same = open_source(compose_config("ingest", ["dataset=sim_race_cars_same_sensors"])["dataset"])
-    assert str(same.drives["c1_001"].sensors) == str(same.drives["f1_001"].sensors)
+@pytest.mark.parametrize("share", [1.0, 0.4, -0.5])
+def test_roll_leaks_by_its_share_and_sign(share):
+    motion = motion_of(10, roll=0.03)
+    shown = measure(motion, only(tilt=Tilt(roll_share=share)), 0)["ay"]
+    np.testing.assert_allclose(shown, GRAVITY * math.sin(0.03 * share), rtol=1e-9)
 
 
 @pytest.mark.parametrize(

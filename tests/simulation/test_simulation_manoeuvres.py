@@ -3,11 +3,11 @@
 import math
 from dataclasses import fields, replace
 from functools import cache
-from pathlib import Path
 
 import numpy as np
 import pytest
-import yaml
+from cars import ALL as CARS
+from cars import shipped
 
 from vehest.data.errors import ConfigurationError
 from vehest.simulation.drive import drive, simulate_drive
@@ -17,14 +17,10 @@ from vehest.simulation.driving.laps import Laps
 from vehest.simulation.driving.manoeuvre import Manoeuvre
 from vehest.simulation.driving.manoeuvres import MANOEUVRES, manoeuvre_from_config
 from vehest.simulation.plant.multi_body import MultiBodyPlant
-from vehest.simulation.plant.parameters import PUBLISHED_SETS, Vehicle, vehicle_from_configuration
+from vehest.simulation.plant.parameters import PUBLISHED_SETS, Vehicle
 from vehest.simulation.road.course import course_by_name
 from vehest.simulation.road.surface import surface_from_config
 
-VEHICLES = Path(__file__).parents[2] / "conf" / "vehicle"
-CARS = sorted(
-    path.stem for path in VEHICLES.glob("*.yaml") if "plant" not in yaml.safe_load(path.read_text(encoding="utf-8"))
-)  # multi-body
 MODERATE = {
     "lane change": {"name": "double_lane_change", "severity": 0.55},
     "obstacle": {"name": "double_lane_change", "layout": "iso_3888_2", "severity": 0.5},
@@ -45,11 +41,8 @@ MODERATE_LAPS = {  # whole laps, seconds each
 PUBLISHED = {name: Vehicle(name, number) for number, name in PUBLISHED_SETS.items()}
 
 
-@cache
 def vehicle(name):
-    if name in PUBLISHED:
-        return PUBLISHED[name]
-    return vehicle_from_configuration(yaml.safe_load((VEHICLES / f"{name}.yaml").read_text(encoding="utf-8")))
+    return PUBLISHED[name] if name in PUBLISHED else shipped(name)
 
 
 @cache
@@ -71,8 +64,11 @@ def times(trip):
     return np.arange(len(trip.motion)) / trip.motion.rate_hz
 
 
-def test_every_manoeuvre_is_among_the_moderate_ones():
+def test_every_manoeuvre_is_among_the_moderate_ones_and_seeds_take_both_sides():
     assert {configuration["name"] for configuration in (MODERATE | MODERATE_LAPS).values()} == set(MANOEUVRES)
+    car, surface = car_of(MultiBodyPlant(vehicle("bmw_545i"))), surface_from_config("dry")
+    sides = {manoeuvre_from_config({"name": "slalom"}).controller(car, surface, seed).drawn["side"] for seed in range(12)}
+    assert sides == {"left", "right"}
 
 
 @pytest.mark.parametrize("car", [*CARS, *(pytest.param(name, marks=pytest.mark.slow) for name in PUBLISHED)])
@@ -106,12 +102,6 @@ def test_seed_decides_every_sample_and_nothing_else_does(name):
     assert first.drawn == again.drawn
     n_common = min(len(first.motion), len(other.motion))
     assert np.abs(first.motion.yaw_rate[:n_common] - other.motion.yaw_rate[:n_common]).max() > 0.02
-
-
-def test_seeds_take_both_sides():
-    car, surface = car_of(MultiBodyPlant(vehicle("bmw_545i"))), surface_from_config("dry")
-    sides = {manoeuvre_from_config({"name": "slalom"}).controller(car, surface, seed).drawn["side"] for seed in range(12)}
-    assert sides == {"left", "right"}
 
 
 @pytest.mark.parametrize("car", CARS)

@@ -1,6 +1,7 @@
 """The planar plant, its car and its driver: closed forms, energy, standstill and spins, and what the simulated tyre sets hold."""
 
 import math
+import re
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
@@ -18,7 +19,7 @@ from vehest.simulation.driving.manoeuvres import one_of
 from vehest.simulation.errors import SimulationError
 from vehest.simulation.planar_drive import CHANNELS, PLANAR_MANOEUVRES, drive_freely, simulate_planar_drive
 from vehest.simulation.plant.planar import FIRST_WHEEL, LOAD_AX, LOAD_AY, STEER, VX, VY, YAW_RATE, Inputs, PlanarPlant
-from vehest.simulation.plant.planar_car import planar_car_from_configuration
+from vehest.simulation.plant.planar_car import PARAMETERS, planar_car_from_configuration
 from vehest.simulation.road.surface import SURFACES
 from vehest.simulation.sensors.levels import PRESETS
 from vehest.sources.base import open_source
@@ -167,14 +168,11 @@ def test_right_is_the_mirror_image_of_left():
     assert left[YAW_RATE] > 1.0  # a left turn is positive
 
 
-def test_fixed_step_agrees_with_solve_ivp():
+def test_fixed_step_agrees_with_solve_ivp_and_states_that_are_not_finite_are_errors():
     plant, inputs = PlanarPlant(CAR), Inputs(steer=0.45, current=45.0)
     start = plant.initial_state(2.0)
     reference = solve_ivp(lambda _, state: plant.derivative(state, inputs)[0], (0.0, 0.5), start, rtol=1e-9, atol=1e-10, max_step=0.005)
     np.testing.assert_allclose(plant.advance(start, inputs, 500), reference.y[:, -1], rtol=1e-3, atol=2e-4)
-
-
-def test_state_that_is_not_finite_is_an_error():
     plant = PlanarPlant(CAR, step=0.1)
     with pytest.raises(SimulationError, match=r"smaller step than 0\.1 s"):
         plant.advance(plant.initial_state(3.0), Inputs(0.4, 60.0), 10_000)
@@ -239,29 +237,29 @@ def test_tyre_sets_are_as_long_as_stated_and_slide_and_grip_as_the_recordings_do
     assert grip["test_d"] / grip["test_a"] == pytest.approx(0.45 / 0.65, rel=0.1)
 
 
-@pytest.mark.parametrize(
-    ("changes", "complaint"),
-    [
-        ({"parameters": {**CONFIGURATION["parameters"], "height": 1.0}}, "unknown key 'height'"),
-        ({"parameters": {**CONFIGURATION["parameters"], "mass": -1.0}}, "mass: .* greater than 0, not -1"),
-    ],
-)
-def test_vehicle_that_makes_no_sense_names_the_value(changes, complaint):
-    with pytest.raises(ConfigurationError, match=complaint):
-        planar_car_from_configuration({**CONFIGURATION, **changes})
+def test_every_value_says_where_it_comes_from_or_that_it_is_assumed():
+    lines = (CONF / "vehicle" / "f1tenth.yaml").read_text(encoding="utf-8").partition("parameters:\n")[2].splitlines()
+    assert len(lines) == len(PARAMETERS)
+    assert all(re.search(r"#.*(assumed|\] \[\d\]|see \w+)", line) for line in lines)
+
+
+def car_with(**changes):
+    return planar_car_from_configuration({**CONFIGURATION, "parameters": {**CONFIGURATION["parameters"], **changes}})
 
 
 @pytest.mark.parametrize(
-    ("configuration", "complaint"),
+    ("make", "complaint"),
     [
-        ({"name": "slalom"}, "there is no manoeuvre 'slalom'; there are freestyle"),
-        ({"name": "freestyle", "brakes": 2.0}, "brakes must lie between 0 and 1"),
-        ({"name": "freestyle", "brakes": 0.6, "kicks": 0.6}, "shares of one"),
+        (lambda: car_with(height=1.0), "unknown key 'height'"),
+        (lambda: car_with(mass=-1.0), "mass: .* greater than 0, not -1"),
+        (lambda: one_of({"name": "slalom"}, PLANAR_MANOEUVRES), "there is no manoeuvre 'slalom'; there are freestyle"),
+        (lambda: one_of({"name": "freestyle", "brakes": 2.0}, PLANAR_MANOEUVRES), "brakes must lie between 0 and 1"),
+        (lambda: one_of({"name": "freestyle", "brakes": 0.6, "kicks": 0.6}, PLANAR_MANOEUVRES), "shares of one"),
     ],
 )
-def test_freestyle_that_makes_no_sense_is_refused(configuration, complaint):
+def test_cars_and_manoeuvres_that_make_no_sense_are_refused(make, complaint):
     with pytest.raises(ConfigurationError, match=complaint):
-        one_of(configuration, PLANAR_MANOEUVRES)
+        make()
 
 
 def data_set(**changes):

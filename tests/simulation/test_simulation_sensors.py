@@ -113,7 +113,7 @@ def test_ideal_and_switched_off_sensors_show_the_motion_itself_without_angles_of
     assert different(measure(motion, nothing, 0), measure(motion, ideal_sensors(), 1)) == set()
 
 
-def test_a_car_without_an_electric_motor_shows_none_and_its_recording_speaks_of_none():
+def test_a_single_sample_is_measured_and_cars_without_an_electric_motor_show_none():
     electric = weaving(1.0)
     motion = replace(electric, motor_speed=None, motor_current=None)
     with_motor, without = measure(electric, SensorLevels(), 0), measure(motion, SensorLevels(), 0)
@@ -122,6 +122,8 @@ def test_a_car_without_an_electric_motor_shows_none_and_its_recording_speaks_of_
     assert set(described(SensorLevels(), electric)) - set(described(SensorLevels(), motion)) == {"motor_speed", "motor_current"}
     assert "vibration" not in described(SensorLevels(), electric)
     assert "vibration" in described(PRESETS["small_car"], electric)
+    levels = replace(SensorLevels(), imu=Mounting(lever_x=0.5), reference=PRESETS["race"].reference)
+    assert all(np.isfinite(samples).all() and samples.shape == (1,) for samples in measure(motion_of(1, vx=20.0), levels, 0).values())
 
 
 def test_vibration_grows_with_the_wheels_speed_and_moves_nothing_else():
@@ -134,11 +136,6 @@ def test_vibration_grows_with_the_wheels_speed_and_moves_nothing_else():
             assert shaken[name][part].std() == pytest.approx(expected, rel=0.06), name
     louder = measure(motion, only(vibration=Vibration(ax=0.1)), seed=3)
     np.testing.assert_array_equal(louder["ax"], shaken["ax"])
-
-
-def test_a_single_sample_is_measured_too():
-    levels = replace(SensorLevels(), imu=Mounting(lever_x=0.5), reference=PRESETS["race"].reference)
-    assert all(np.isfinite(samples).all() and samples.shape == (1,) for samples in measure(motion_of(1, vx=20.0), levels, 0).values())
 
 
 @pytest.mark.parametrize("rate_hz", [20.0, 100.0, 1000.0])
@@ -218,16 +215,13 @@ def test_gravity_leaks_in_at_rest_with_the_left_side_up_or_the_nose_down(angle, 
     np.testing.assert_allclose(shown["ay"], ay * G * math.sin(0.05), rtol=1e-12, atol=1e-12)
 
 
-def test_specific_force_is_the_acceleration_less_gravity_in_turned_axes():
+def test_specific_force_and_gyros_are_those_of_turned_axes():
     motion = weaving()
     force = specific_force(motion)
     for k in (0, 333, 1999):
         road, body = _rotation(motion.bank[k], motion.grade[k]), _rotation(motion.roll[k], motion.pitch[k])
         level = road @ np.array([motion.ax[k], motion.ay[k], 0.0]) - np.array([0.0, 0.0, -G])
         np.testing.assert_allclose(force[:, k], (road @ body).T @ level, atol=1e-12)
-
-
-def test_gyros_of_a_rolled_body_feel_the_yaw_rate():
     # A turntable: the body's axes in the road's are R(t) = Rz(ψ)Ry(θ)Rx(φ), its angular velocity the skew matrix RᵀdR/dt.
     motion = weaving()
     shown = body_rates(motion)
@@ -238,6 +232,13 @@ def test_gyros_of_a_rolled_body_feel_the_yaw_rate():
     skew = at(t).T @ (at(t + h) - at(t - h)) / (2.0 * h)
     np.testing.assert_allclose(shown[:, k], [skew[2, 1], skew[0, 2], skew[1, 0]], atol=1e-8)
     assert measure(motion_of(1, roll=0.05, yaw_rate=0.6), only(tilt=Tilt()), 0)["pitch_rate"][0] == pytest.approx(0.6 * math.sin(0.05))
+    motion = weaving()
+    straight = measure(motion, only(tilt=Tilt()), seed=0)
+    turned = measure(motion, only(tilt=Tilt(), imu=Mounting(roll=0.1, pitch=-0.05, yaw=0.2)), seed=0)
+    axes = _turn_z(0.2) @ _rotation(0.1, -0.05)
+    for names, third in ((("roll_rate", "pitch_rate", "yaw_rate"), None), (("ax", "ay"), specific_force(motion)[2])):
+        vector = np.stack([straight[name] for name in names] + ([third] if third is not None else []))
+        np.testing.assert_allclose(np.stack([turned[name] for name in names]), (axes.T @ vector)[: len(names)], atol=1e-12)
 
 
 def test_accelerometer_away_from_the_axis_feels_turning_and_swinging():
@@ -260,20 +261,19 @@ def test_accelerometer_away_from_the_axis_feels_turning_and_swinging():
         np.testing.assert_allclose([shown["ax"][k] - bare["ax"][k], shown["ay"][k] - bare["ay"][k]], expected[:2], atol=1e-3)
 
 
-def test_turned_unit_shows_the_same_vectors_along_other_axes():
-    motion = weaving()
-    straight = measure(motion, only(tilt=Tilt()), seed=0)
-    turned = measure(motion, only(tilt=Tilt(), imu=Mounting(roll=0.1, pitch=-0.05, yaw=0.2)), seed=0)
-    axes = _turn_z(0.2) @ _rotation(0.1, -0.05)
-    for names, third in ((("roll_rate", "pitch_rate", "yaw_rate"), None), (("ax", "ay"), specific_force(motion)[2])):
-        vector = np.stack([straight[name] for name in names] + ([third] if third is not None else []))
-        np.testing.assert_allclose(np.stack([turned[name] for name in names]), (axes.T @ vector)[: len(names)], atol=1e-12)
-
-
-def test_misalignment_lets_gravity_in_by_its_level():
+def test_misalignment_lever_and_heading_errors_have_their_size():
     shown = [measure(motion_of(1), only(imu=Mounting(misalignment=0.01)), seed) for seed in range(400)]
     for name in ("ax", "ay"):
         assert np.std([drive[name][0] for drive in shown]) == pytest.approx(G * 0.01, rel=0.14)  # 400 draws
+    motion = motion_of(10, vx=20.0, yaw_rate=0.5)
+    errors = [measure(motion, only(reference=Reference("gnss", lever_error=0.02)), seed)["vy_ref"][0] for seed in range(400)]
+    assert np.std(errors) == pytest.approx(0.5 * 0.02, rel=0.14)
+    motion, levels = weaving(1.0), only(reference=Reference("gnss", heading=SensorLevel(offset=0.01)))
+    drives = [measure(motion, levels, seed) for seed in range(400)]
+    errors = np.array([drive["sideslip_ref"] - motion.sideslip for drive in drives])
+    assert np.ptp(errors, axis=1).max() < 1e-12
+    assert np.std(errors[:, 0]) == pytest.approx(0.01, rel=0.14)  # 400 draws
+    np.testing.assert_allclose(np.hypot(drives[0]["vx_ref"], drives[0]["vy_ref"]), np.hypot(motion.vx, motion.vy))
 
 
 def test_reference_in_the_bumper_is_moved_and_rolls_below_the_centre_of_gravity():
@@ -284,18 +284,6 @@ def test_reference_in_the_bumper_is_moved_and_rolls_below_the_centre_of_gravity(
     shown = measure(motion_of(5, vx=20.0, roll_rate=0.2, pitch_rate=0.1), only(reference=Reference("optical", lever_z=-0.3)), seed=0)
     np.testing.assert_allclose(shown["vy_ref"], 0.2 * 0.3)  # left side going up: what is below goes left
     np.testing.assert_allclose(shown["vx_ref"], 20.0 - 0.1 * 0.3)  # nose going down: what is below goes back
-
-
-def test_lever_and_heading_errors_of_the_reference_have_their_size():
-    motion = motion_of(10, vx=20.0, yaw_rate=0.5)
-    errors = [measure(motion, only(reference=Reference("gnss", lever_error=0.02)), seed)["vy_ref"][0] for seed in range(400)]
-    assert np.std(errors) == pytest.approx(0.5 * 0.02, rel=0.14)
-    motion, levels = weaving(1.0), only(reference=Reference("gnss", heading=SensorLevel(offset=0.01)))
-    drives = [measure(motion, levels, seed) for seed in range(400)]
-    errors = np.array([drive["sideslip_ref"] - motion.sideslip for drive in drives])
-    assert np.ptp(errors, axis=1).max() < 1e-12
-    assert np.std(errors[:, 0]) == pytest.approx(0.01, rel=0.14)  # 400 draws
-    np.testing.assert_allclose(np.hypot(drives[0]["vx_ref"], drives[0]["vy_ref"]), np.hypot(motion.vx, motion.vy))
 
 
 def test_reference_and_car_err_apart():
@@ -324,15 +312,12 @@ def test_switching_off_an_error_leaves_all_else_bit_by_bit(sensor):
     assert different(all_on, measure(motion, silent, seed=7)) == channels_of(sensor)
 
 
-def test_errors_of_one_sensor_do_not_disturb_each_other():
+def test_errors_of_sensors_have_streams_of_their_own_and_do_not_disturb_each_other():
     motion = motion_of(500, ay=3.0)
     ay = {kind: measure(motion, only(ay=level), seed=7)["ay"] - 3.0 for kind, level in _alone(LOUD).items()}
     together = measure(motion, only(ay=replace(LOUD, quantisation=0.0)), seed=7)["ay"] - 3.0
     np.testing.assert_allclose(ay["noise"] + ay["offset"] + ay["drift"] + ay["scale"], together, atol=1e-12)
     assert ay["scale"][0] / (LOUD.scale * 3.0) != pytest.approx(ay["offset"][0] / LOUD.offset)
-
-
-def test_streams_of_all_errors_differ():
     levels = {name: SensorLevel(offset=1.0, drift=1.0, noise=1.0, scale=1.0) for name in SENSORS}
     first = []
     for kind in ("offset", "drift", "noise"):
