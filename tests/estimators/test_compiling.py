@@ -36,6 +36,7 @@ def test_slow_kernels_are_entries_that_are_there(where):
     assert hasattr(getattr(importlib.import_module(module), name), "stats")
 
 
+@pytest.mark.apart
 @pytest.mark.parametrize("kernels", ["networks", pytest.param("cars", marks=pytest.mark.slow)])
 def test_the_process_that_compiles_has_the_digits_of_those_that_read_the_cache(tmp_path, kernels):
     here = Path(__file__).parent

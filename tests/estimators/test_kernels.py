@@ -53,13 +53,12 @@ def _problem(estimator, dtype, members=3, batch=70):
 
 
 @pytest.mark.parametrize("estimator", STRUCTURES, ids=lambda e: f"{e.name}-{e.variant}")
-@pytest.mark.parametrize(("dtype", "tolerance"), [(torch.float64, 1e-12), (torch.float32, 2e-5)])
-def test_compiled_recursion_equals_plain_one_in_value_and_gradient(estimator, dtype, tolerance):
-    value_and_gradient = _problem(estimator, dtype)
+def test_compiled_recursion_equals_plain_one_in_single_precision(estimator):
+    value_and_gradient = _problem(estimator, torch.float32)  # in double precision: test_twins
     (value, gradient), (plain_value, plain_gradient) = value_and_gradient(True), value_and_gradient(False)
     scale, gradient_scale = plain_value.abs().max(), plain_gradient.abs().max()
-    assert (value - plain_value).abs().max() <= tolerance * scale
-    assert (gradient - plain_gradient).abs().max() <= tolerance * gradient_scale
+    assert (value - plain_value).abs().max() <= 2e-5 * scale
+    assert (gradient - plain_gradient).abs().max() <= 2e-5 * gradient_scale
 
 
 @pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
@@ -110,20 +109,6 @@ def test_ksnn_beyond_its_last_centre_and_at_its_centres_equals_the_plain_one():
         gradients.append(torch.autograd.grad(values[-1].sum(), flat)[0])
     assert torch.allclose(*values, rtol=0, atol=1e-12)
     assert (gradients[0] - gradients[1]).abs().max() <= 1e-12 * gradients[1].abs().max()
-
-
-def test_gradient_of_the_ksnn_equals_finite_differences():
-    estimator = Ksnn(Ksnn.settings_type(n_local=3, n_hidden=1, bias=True))
-    drive = planar_drive(10.0)
-    network = estimator.network_for([drive]).double()
-    network.reset(torch.Generator().manual_seed(1))
-    layout = FlatParameters(network)
-    windows = windows_of([drive], estimator.channels, "vy_ref", 30)
-    series, starts = torch.as_tensor(windows.series), torch.as_tensor(windows.starts[:8]).unsqueeze(0)
-    flat = layout.pack([network]).requires_grad_()
-    assert torch.autograd.gradcheck(
-        lambda rows: predict_members(network, layout.views(rows), series, starts, 30, compiled=True), (flat,), eps=1e-6, atol=1e-6
-    )
 
 
 def test_gru_and_lstm_equal_those_of_the_library():
@@ -184,25 +169,6 @@ def test_compiled_observer_equals_the_readable_one_and_resets_below_the_threshol
     vy, vx = observe(measurements, 5.0, 0.1, 0.01)
     assert (vy == 0.0).all()
     assert (vx == 20.0).all()
-
-
-def test_observer_has_the_transfer_functions_of_appendix_b():
-    """At constant yaw rate the response to a_y and a_x is that of Eqs. 18 and 19 of Da Lio et al. 2023."""
-    omega, alpha, step, n = 0.4, 5.0, 0.01, 400
-    denominator = [alpha**2 * omega**2 * step**2 + 2 * omega * alpha * step + 1, -2 * omega * alpha * step - 2, 1.0]
-    for column, numerator in ((2, [(2 * omega * alpha * step + 1) * step, -step, 0.0]), (3, [-(alpha**2) * omega * step**2, 0.0, 0.0])):
-        measurements = np.zeros((n, 4))
-        measurements[:, 0] = omega
-        measurements[0, column] = 1.0
-        vy, _ = observe(measurements, alpha, 0.0, step, 0.0, 0.0)
-        expected, padded = np.zeros(n), np.zeros(n + 2)
-        impulse = np.zeros(n + 2)
-        impulse[2] = 1.0
-        for k in range(n):
-            forced = sum(b * impulse[k + 2 - i] for i, b in enumerate(numerator))
-            padded[k + 2] = (forced - denominator[1] * padded[k + 1] - denominator[2] * padded[k]) / denominator[0]
-        expected = padded[2:]
-        assert np.allclose(vy, expected, rtol=0, atol=1e-12)
 
 
 def test_a_group_of_jobs_keeps_matrix_products_on_one_thread(monkeypatch):
