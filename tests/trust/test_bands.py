@@ -114,20 +114,6 @@ def test_coverage_of_a_further_block_averages_the_level():
         assert level - 3.0 * error <= own.mean() <= level + 0.02  # with all weight of K at infinity it would be up to 1/13 more
 
 
-def test_coverage_on_further_ranges_of_the_whole_calibration():
-    """Scale, blocks and factors together: 60 calibrations on 32 turns, each judged on 100 s more."""
-    rng, covered = np.random.default_rng(5), []
-    for _ in range(60):
-        bands = calibrated([piece_of(rng, 3000)], [piece_of(rng, 4000)], CHANNELS, **ORIGIN)
-        further = piece_of(rng, 2000)
-        shown = bands.half_widths(further.rows, further.vy, further.variance)[:, :, None]
-        half = shown * np.stack([own.beside(SHOWN_LEVEL) for own in (bands.vy, bands.sideslip)])
-        covered.append((np.abs(further.errors)[:, :, None] <= half).mean(axis=0))
-    mean, error = np.mean(covered, axis=0), np.std(covered, axis=0) / math.sqrt(60)
-    assert np.all(mean[:, :3] >= np.array(LEVELS)[:3] - 3.0 * error[:, :3])
-    assert np.all(mean[:, :3] <= np.array(LEVELS)[:3] + 0.09)
-
-
 def by_numpy(bands, rows, vy, variance, *, elsewhere):
     """Half widths at the level that is shown, (T, 2), by the formulas of `vehest.trust.bands`."""
     terms = terms_of(rows, vy, variance, bands.packed().columns)

@@ -105,13 +105,3 @@ def test_the_oracle_sees_larger_faults_sooner_and_what_is_not_finite_at_once(ora
     lost = np.array(drive["yaw_rate"])
     lost[2010:2020] = np.nan
     assert oracle.sees(drive, {**drive, "yaw_rate": lost}, 2000).delay == pytest.approx(11 / RATE)
-
-
-def test_random_noise_is_seen_by_its_size_and_not_by_its_draws(oracle):
-    drive = {name: np.array(measured_drive(3)[name]) for name in CHANNELS}
-    added = np.random.default_rng(0).standard_normal(len(drive["ay"])) * (np.arange(len(drive["ay"])) >= 2000)
-    loud, faint = (oracle.sees(drive, {**drive, "ay": drive["ay"] + size * added}, 2000, drawn=True) for size in (1.0, 0.01))
-    assert loud.visible
-    assert not faint.visible
-    known = oracle.sees(drive, {**drive, "ay": drive["ay"] + 1.0 * added}, 2000)
-    assert known.delay <= loud.delay
