@@ -1,8 +1,8 @@
-"""Splits and windows: no sample serves two purposes, no window crosses from one recording into another."""
+"""Splits, windows, runs and minutes: no sample serves two purposes, no window crosses recordings, and splits of papers are theirs."""
 
 import math
 import re
-from itertools import combinations, pairwise
+from itertools import combinations, groupby, pairwise
 from pathlib import Path
 
 import numpy as np
@@ -14,13 +14,14 @@ from hypothesis import strategies as st
 from vehest.data.errors import ConfigurationError, DataError
 from vehest.data.laps import laps_of
 from vehest.data.recording import Recording
-from vehest.data.split_files import dataset_names, split_from_config
+from vehest.data.runs import equal_runs, true_runs
+from vehest.data.split_files import dataset_names, limit_minutes, split_from_config
 from vehest.data.splits import Span, Split
 from vehest.data.windows import windows_of
 from vehest.run.config import compose_config
 from vehest.sources.base import open_source
 
-PROPERTY = settings(max_examples=150, deadline=None, derandomize=True, database=None)
+PROPERTY = settings(max_examples=80, deadline=None, derandomize=True, database=None)
 CONFIGURATIONS = sorted((Path(__file__).parents[2] / "conf" / "split").glob("*.yaml"))
 
 bounds = st.sampled_from([-math.inf, math.inf, 0.0, 1.0, 1.005, 1.01, 2.0, 3.5]) | st.floats(0.0, 4.0)
@@ -178,13 +179,10 @@ def kept_of(keep, catalogue, **entry):
     return split_from_config({"name": "s", "dataset": "d", "train": [train], "validation": [{"recording": "v"}]}, catalogue)
 
 
-def test_a_pattern_names_recordings_in_the_order_of_their_ids():
+def test_patterns_name_recordings_in_order_and_ask_for_a_data_set_once():
     catalogue = drives({name: [0.0] * 10 for name in ("train_b", "test_a", "train_a", "Train_c")})
     config = {"name": "s", "dataset": "d", "train": [{"recordings": "train_*", "start": 1}], "validation": [{"recording": "v"}]}
     assert split_from_config(config, catalogue).train == (Span("d", "train_a", 1.0), Span("d", "train_b", 1.0))
-
-
-def test_a_data_set_is_asked_for_once_and_only_where_a_pattern_or_condition_needs_it():
     asked = []
 
     def catalogue(dataset):
@@ -270,7 +268,14 @@ def test_patterns_and_conditions_without_recordings_say_what_they_need(entry):
     assert "its patterns and the like need the recordings of data set 'd'" in refusal(BASE | {"train": [entry]})
 
 
-def test_a_condition_on_a_channel_that_a_recording_lacks_names_both():
+def test_windows_share_memory_and_gaps_and_missing_channels_are_refused_by_name():
+    windows = windows_of([recorded("r", 1000, 0.0)], ["vx", "ay"], "vy_ref", 30)
+    assert windows.series.nbytes == 1000 * 2 * 8
+    channels = {"vx": np.zeros(9), "ay": np.where(np.arange(9) == 4, np.nan, 0.0), "vy_ref": np.zeros(9)}
+    recording = Recording("lap", "car", 20.0, 0.0, channels, gappy=frozenset({"ay"}))
+    with pytest.raises(DataError, match="recording 'lap': channel 'ay' has gaps"):
+        windows_of([recording], ["vx", "ay"], "vy_ref", 3)
+    assert len(windows_of([recording], ["vx"], "vy_ref", 3)) == 6
     with pytest.raises(DataError, match="recording 'train_1' has no channel 'yaw_rate'"):
         kept_of({"magnitude": {"yaw_rate": {"at_most": 1.0}}}, drives({"train_1": [0.0] * 10}))
 
@@ -298,19 +303,6 @@ def test_windows_are_those_of_a_plain_loop_over_each_recording(lengths, n_window
     for start, target, (past, after) in zip(windows.starts, windows.targets, expected, strict=True):
         assert windows.series[start : start + n_window].tolist() == past
         assert target == after
-
-
-def test_windows_share_memory_instead_of_being_copied():
-    windows = windows_of([recorded("r", 1000, 0.0)], ["vx", "ay"], "vy_ref", 30)
-    assert windows.series.nbytes == 1000 * 2 * 8
-
-
-def test_windows_over_gaps_are_refused_by_name():
-    channels = {"vx": np.zeros(9), "ay": np.where(np.arange(9) == 4, np.nan, 0.0), "vy_ref": np.zeros(9)}
-    recording = Recording("lap", "car", 20.0, 0.0, channels, gappy=frozenset({"ay"}))
-    with pytest.raises(DataError, match="recording 'lap': channel 'ay' has gaps"):
-        windows_of([recording], ["vx", "ay"], "vy_ref", 3)
-    assert len(windows_of([recording], ["vx"], "vy_ref", 3)) == 6
 
 
 def circuit(name="lap", laps=4.3, start_time=1600000000.0, rate_hz=20.0):
@@ -449,3 +441,108 @@ def test_laps_end_where_the_course_begins_again_wherever_the_recording_stops(lap
     found = laps_of(Recording("lap", "car", 20.0, 0.0, {"vx": np.full(len(time), 20.0), "yaw_rate": yaw_rate}))
     assert len(found) == int(laps)
     np.testing.assert_allclose([stop for _, stop in found], 60.0 * np.arange(1, int(laps) + 1), atol=0.3)
+
+
+SPANS = (Span("d", "one", 10.0, 40.0), Span("d", "two", 100.0, 160.0))
+
+
+def total(spans):
+    return sum(span.stop - span.start for span in spans)
+
+
+@pytest.mark.parametrize("at", [0.0, 0.2, 0.5, 0.9])
+@pytest.mark.parametrize("seconds", [5.0, 45.0, 86.0])
+def test_as_much_is_kept_as_was_asked_for_from_any_place(seconds, at):
+    kept = limit_minutes(SPANS, seconds, at)
+    assert total(kept) == pytest.approx(seconds)
+    assert all(any(own.start >= span.start and own.stop <= span.stop for span in SPANS if span.recording == own.recording) for own in kept)
+    for position, one in enumerate(kept):
+        assert not any(one.overlaps(other) for other in kept[position + 1 :])
+
+
+def test_minutes_begin_where_they_are_said_and_leave_tests_alone():
+    assert limit_minutes(SPANS, 60.0, 0.5) == (Span("d", "one", 10.0, 25.0), Span("d", "two", 115.0, 160.0))
+    assert limit_minutes(SPANS, 31.0, 0.0) == (Span("d", "one", 10.0, 40.0),)
+    assert split_of(minutes=4.0).train == (Span("d", "lap", 0.0, 180.0),)
+    assert split_of(minutes=9.0).train == (Span("d", "lap", -math.inf, 360.0),)
+    split = split_of(minutes=2.0)
+    assert split.name == "mine_2min"
+    assert total(split.train) == pytest.approx(90.0, abs=0.2)
+    assert total(split.validation) == pytest.approx(30.0, abs=0.2)
+    assert split.tests["test"][0].start == pytest.approx(480.0, abs=0.2)
+
+
+def split_of(**changed):
+    drive = Recording("lap", "car", 10.0, 0.0, {"vx": [1.0] * 6000})
+    shares = {"train": "60 %", "validation": "20 %", "tests": {"test": "20 %"}}
+    return split_from_config({"name": "mine", "dataset": "d", **shares, **changed}, lambda _: {"lap": lambda channels: drive})
+
+
+@pytest.mark.parametrize(
+    ("changed", "message"),
+    [
+        ({"minutes": 0.0}, "split.minutes: input should be greater than 0"),
+        ({"minutes_at": 1.0}, "split.minutes_at: input should be less than 1"),
+    ],
+)
+def test_no_time_and_no_place_are_refused(changed, message):
+    with pytest.raises(ConfigurationError, match=message):
+        split_of(**changed)
+
+
+SETS = {  # Table I
+    "C-1": ("20130222_01_01_03", "20130222_01_02_03", "20130222_02_01_03"),
+    "C-2": ("20130223_01_01_03", "20130223_01_02_03"),
+    "F-1": ("20140221_03_02_03", "20140221_03_03_03", "20140221_04_01_03"),
+    "F-2": ("20140222_01_01_03", "20140222_02_01_03"),
+}
+SCHEMES = {"cross_vehicle_1": ("C-1", "F-1"), "cross_vehicle_2": ("F-1", "C-1")}  # Table II: learn, stop
+
+
+def split(name):
+    return split_from_config(compose_config("train", [f"split={name}"])["split"])
+
+
+def sets_of(spans):
+    """Which of Table I's sets the recordings are, in alphabetical order of their names."""
+    names = sorted(span.recording for span in spans)
+    simulated = [f"{name[0].upper()}-{name[1]}" for name in names if name[2] == "_"]
+    return simulated or [key for name in names for key, files in SETS.items() if name.rsplit("_", 1)[0] in files]
+
+
+@pytest.mark.parametrize("place", ["", "_sim"])
+@pytest.mark.parametrize("scheme", SCHEMES)
+def test_schemes_learn_on_one_car_stop_on_the_other_and_test_on_both(scheme, place):
+    found = split(scheme + place)
+    learnt, stopped = SCHEMES[scheme]
+    assert sets_of(found.train) == [learnt] * 3
+    assert sets_of(found.validation) == [stopped] * 3
+    third = {"j1": ["J-1"] * 2} if place else {}
+    assert {name: sets_of(spans) for name, spans in found.tests.items()} == {"c2": ["C-2"] * 2, "f2": ["F-2"] * 2, **third}
+
+
+@pytest.mark.parametrize("name", ["one_vehicle", "one_vehicle_sim"])
+def test_without_cross_vehicle_regularisation_two_files_teach_and_the_third_stops(name):
+    found = split(name)
+    assert (sets_of(found.train), sets_of(found.validation)) == (["F-1"] * 2, ["F-1"])
+    third = {"j1": ["J-1"] * 2} if name.endswith("_sim") else {}
+    assert {name: sets_of(spans) for name, spans in found.tests.items()} == {"c2": ["C-2"] * 2, "f2": ["F-2"] * 2, **third}
+
+
+@pytest.mark.parametrize("dataset", ["sim_two_cars", "sim_race_cars", "sim_race_cars_same_sensors"])
+def test_simulated_sets_last_as_long_as_the_papers(dataset):
+    drives = compose_config("ingest", [f"dataset={dataset}"])["dataset"]["drives"]
+    minutes = {entry["id"]: entry["count"] * entry["manoeuvre"]["duration"] / 60.0 for entry in drives if entry["id"] != "j1"}
+    assert minutes == pytest.approx({"c1": 19.0, "c2": 12.6, "f1": 25.7, "f2": 18.1}, abs=0.05)
+
+
+@pytest.mark.parametrize("length", [0, 1, 2, 50])
+@pytest.mark.parametrize("seed", range(3))
+def test_runs_are_those_of_a_count_sample_by_sample(length, seed):
+    samples = np.random.default_rng(seed).integers(0, 2, length)
+    counted, place = [], 0
+    for value, group in groupby(samples.tolist()):
+        begin, place = place, place + len(list(group))
+        counted.append((value, [begin, place]))
+    assert equal_runs(samples).tolist() == [run for _, run in counted]
+    assert true_runs(samples == 1).tolist() == [run for value, run in counted if value == 1]

@@ -19,7 +19,7 @@ from vehest.data.estimate import QUANTITIES, Estimate
 from vehest.data.recording import Recording
 from vehest.data.store import is_stored_recording, read_estimate, read_recording, write_estimate, write_recording
 
-PROPERTY = settings(max_examples=40, deadline=None, derandomize=True, database=None)
+PROPERTY = settings(max_examples=25, deadline=None, derandomize=True, database=None)
 
 finite = st.floats(allow_nan=False, allow_infinity=False, width=64)  # -0.0 and denormals included
 not_measured = st.integers(1, 2**51 - 1).map(lambda payload: np.array([0x7FF8 << 48 | payload], dtype=np.uint64).view(np.float64)[0])

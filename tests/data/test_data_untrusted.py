@@ -38,8 +38,15 @@ class Outer:
 GOOD = {"name": "a", "inner": {"gain": 1}, "many": {"x": {"gain": 0.5, "steps": 4.0}}, "bounds": [0, 1.5]}
 
 
-def test_plain_values_become_dataclasses():
+def test_plain_values_become_dataclasses_that_may_take_further_keys():
     assert validated(Outer, GOOD, "'f'") == Outer("a", Inner(1.0), {"x": Inner(0.5, 4)}, (0.0, 1.5))
+
+    @dataclass(frozen=True)
+    class Loose:
+        __pydantic_config__ = FURTHER_KEYS
+        name: str
+
+    assert validated(Loose, {"name": "a", "more": 1}, "") == Loose("a")
 
 
 @pytest.mark.parametrize(
@@ -86,15 +93,6 @@ def test_a_refusal_says_what_the_type_of_the_key_takes(content, message):
     with pytest.raises(ConfigurationError) as caught:
         validated(Kinds, content, "", error=ConfigurationError, group="it")
     assert str(caught.value) == message
-
-
-def test_a_schema_may_take_further_keys():
-    @dataclass(frozen=True)
-    class Loose:
-        __pydantic_config__ = FURTHER_KEYS
-        name: str
-
-    assert validated(Loose, {"name": "a", "more": 1}, "") == Loose("a")
 
 
 def test_yaml_that_explodes_by_aliases_is_refused_at_once(tmp_path):
@@ -195,11 +193,8 @@ def test_different_names_stay_different(one, other):
     assert (file_name(one) == file_name(other)) == (one == other)
 
 
-def test_plain_names_stay_as_they_are():
+def test_plain_names_stay_and_escapes_for_the_terminal_are_shown():
     assert file_name("ksnn-linear_bias_p2-seed0", ".csv") == "ksnn-linear_bias_p2-seed0.csv"
-
-
-def test_escapes_for_the_terminal_are_shown_not_obeyed():
     assert printable("a\x1b[31mb\r\n\u202e") == "a\\x1b[31mb\\r\\n\\u202e"
     assert printable("größe β °") == "größe β °"
     assert printable("\udcff") == "\\udcff"

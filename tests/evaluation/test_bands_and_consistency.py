@@ -131,13 +131,10 @@ def flags(length, *spans):
     return found
 
 
-def test_delay_counts_from_the_first_faulty_sample_to_the_end_of_the_flagged_one():
+def test_delays_and_errors_of_detections_count_from_the_fault_to_the_flag():
     assert detection_delay(flags(100, (5, 8), (30, 40)), 20, 100, 10.0) == pytest.approx(1.1)
     assert detection_delay(flags(100, (5, 8)), 20, 100, 10.0) == math.inf
     assert missed_detections([0.2, 1.1, math.inf, 0.4], [0.5, 1.0, 5.0, 0.5]) == 0.5
-
-
-def test_error_counts_until_the_first_flag():
     error = np.array([9.0, 9.0, 3.0, -4.0, 9.0, 9.0])
     assert error_while_undetected(error, flags(6, (4, 6)), 2, 6) == (pytest.approx(math.sqrt(12.5)), 4.0)
     assert error_while_undetected(error, flags(6, (2, 6)), 2, 6) == (0.0, 0.0)

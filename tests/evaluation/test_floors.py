@@ -75,11 +75,6 @@ def test_white_noise_on_a_reference_is_measured_to_a_few_per_cent(sigma):
     assert floor.vy == pytest.approx(sigma, rel=0.04)
 
 
-def test_noise_of_the_accelerometer_is_not_taken_for_that_of_the_reference():
-    floor = reference_floor([drive_of(noisy_reference(0.01, ay_noise=0.5), Span("d", "drive"), PROTOCOL)])
-    assert floor.vy == pytest.approx(0.01, rel=0.06)
-
-
 def test_perfect_estimate_scores_the_floor_of_a_noisy_reference():
     """In sideslip too: the truth itself, held against the reference."""
     noisy, drive = noisy_reference(0.05), planar_drive(400.0)

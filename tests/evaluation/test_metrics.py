@@ -93,7 +93,7 @@ def test_faster_estimates_are_held_never_interpolated_from_the_future(drive):
     assert (held.vy <= held.time + 1e-9).all()
 
 
-def test_standstill_has_no_sideslip(drive):
+def test_standstill_has_no_sideslip_and_holes_no_better_score(drive):
     """Half a second at 0.0003 m/s: 0.1 m/s of v would be a sideslip of 90 degrees there."""
     vx, vy = drive["vx"].copy(), drive["vy_ref"].copy()
     vx[500:510], vy[500:510] = 0.0003, 0.0
@@ -103,9 +103,6 @@ def test_standstill_has_no_sideslip(drive):
         accuracy([score(estimate, own, Span("d", "drive"), Protocol(least_speed=least))])["max_error_sideslip"] for least in (0.0, 0.1)
     )
     assert (counted > 80.0, without) == (True, 0.0)
-
-
-def test_estimate_with_holes_is_an_error_not_a_better_score(drive):
     vy = drive["vy_ref"].copy()
     vy[500] = np.nan
     with pytest.raises(DataError, match="has no estimate for 1 of"):
@@ -213,16 +210,13 @@ def test_errors_are_means_over_samples_and_largest_ones_over_manoeuvres():
     assert np.isnan(kpis({"calm": [CALM]}).max_error_nonlinear)
 
 
-def test_ranges_of_one_recording_are_one_manoeuvre():
+def test_manoeuvres_are_recordings_grouped_by_their_names():
     spans = [Span("bmw", "test_lap_off_001", 0.0, 1.0), Span("bmw", "test_lap_off_001", 2.0, 3.0)]
     together = manoeuvres_of(spans, [CALM, HARD])
     assert kpis(together).manoeuvres == 1
     assert kpis(together).max_error == pytest.approx(4.0)
     with pytest.raises(DataError, match="1 scored parts do not belong to 2 ranges"):
         manoeuvres_of(spans, [CALM])
-
-
-def test_groups_are_told_by_the_names_of_recordings():
     assert group_of("test_lane_change_2_off_001") == "lane change"
     assert group_of("20140222_01") == "other"
     groups = kpis_by_group(SET | {"train_slalom_30_off_003": [HARD]})

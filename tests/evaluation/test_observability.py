@@ -38,15 +38,6 @@ def test_singular_values_of_a_linear_model_in_closed_form_with_units_and_blindne
     np.testing.assert_allclose(scaled.deviation, plain.deviation / 4.0)
 
 
-def test_a_gain_can_be_seen_only_where_its_signal_is():
-    # state (s, g), measured g·s and s: ∂/∂g = s
-    states = np.array([[0.0, 1.0], [0.5, 1.0], [2.0, 1.0]])
-    seen = along(lambda x, u: torch.stack([x[1] * x[0], x[0]]), transition=lambda x, u: x, states=states, noise=(1.0, 1.0), steps=1)
-    assert seen.smallest[0] == 0.0
-    assert seen.smallest[0] < seen.smallest[1] < seen.smallest[2]
-    np.testing.assert_allclose(seen.deviation[1:, 1], np.sqrt(1.0 + 1.0) / states[1:, 0])
-
-
 def test_windows_that_do_not_fit_are_refused():
     with pytest.raises(ValueError, match="take 1 to 3"):
         observability_matrices(np.zeros((3, 2, 2)), np.zeros((3, 1, 2)), 4)

@@ -6,9 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import yaml
 
-from place import DATASET
 from vehest.data.estimate import Estimate
 from vehest.data.recording import Recording
 from vehest.data.splits import Span
@@ -104,23 +102,3 @@ def test_evaluation_writes_regimes_as_subsets_and_prints_figures_of_all_samples_
     assert set(by_subset["turning"]) == {"rmse_vy", "rmse_sideslip", "share"}
     assert {"floor_reference", "floor_cramer_rao"} <= set(by_subset["all"])
     assert "share" not in by_subset["all"]
-
-
-def test_car_without_lateral_acceleration_goes_from_file_to_report(place):
-    """Estimators that need none are compared; the report has no axes of it, the metrics no bands."""
-    channels = {name: column for name, column in DATASET["channels"].items() if name != "ay"}
-    (Path("conf") / "dataset" / "mine.yaml").write_text(yaml.safe_dump(DATASET | {"channels": channels}, allow_unicode=True))
-    pipeline = {"study": "flat", "report": "drive", "split": "mine", "sweeps": [["estimator=zero,static_map"]]}
-    (Path("pipelines") / "flat.yaml").write_text(yaml.safe_dump(pipeline))
-    code, out, err = place("run", "flat", "tracking=none", "--json")
-    assert code == 0, err
-    folder = Path(json.loads(out)["report"]).parent
-    text = (folder / "report.md").read_text(encoding="utf-8")
-    assert "errors_over_ay" not in text
-    assert "and the measured lateral acceleration" not in text
-    with open(folder / "metrics.csv", encoding="utf-8") as stream:
-        rows = list(csv.DictReader(stream))
-    assert {row["subset"] for row in rows} == {"all", "turning", "transient", "steady"}
-    nonlinear = [row["value"] for row in rows if row["metric"] == "mse_sideslip_nonlinear"]
-    assert nonlinear
-    assert set(nonlinear) <= {"", "nan"}
