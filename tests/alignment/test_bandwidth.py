@@ -52,27 +52,18 @@ def test_a_yaw_rate_that_only_steering_can_judge_is_judged_by_what_cars_can_do()
     assert "more than the 0.3 s that cars take" in found["yaw_rate"].message
 
 
-# --- held channels -----------------------------------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("step", [2, 5, 10, 33])
 def test_a_held_channel_changes_at_its_own_rate(step):
     samples = np.repeat(np.random.default_rng(0).standard_normal(4000 // step + 1), step)[:4000]
     assert held_rate(samples, 100.0) == pytest.approx(100.0 / step)
 
 
-def test_a_sensor_on_a_clock_of_its_own_is_held_for_two_or_three_rows():
+def test_held_rates_are_those_of_a_sensors_own_clock_and_none_of_noise_or_slow_steps():
     newest = (np.arange(4000) * 0.4).astype(int)
     assert held_rate(np.random.default_rng(0).standard_normal(2000)[newest], 100.0) == pytest.approx(45.0, abs=6.0)
-
-
-def test_a_quantised_channel_that_moves_slowly_is_not_held():
     time = np.arange(6000) / 100.0
     for resolution in (0.05, 0.2):
         assert held_rate(np.round(np.sin(0.3 * time) / resolution) * resolution, 100.0) is None
-
-
-def test_noise_and_constants_are_not_held():
     assert held_rate(np.random.default_rng(0).standard_normal(1000), 100.0) is None
     assert held_rate(np.ones(1000), 100.0) is None
     assert held_rate(np.full(1000, np.nan), 100.0) is None
@@ -94,9 +85,6 @@ def test_channels_held_together_are_told_of_together_by_what_it_delays():
     )
     (fast,) = found_by("held", held(2)).values()
     assert (fast.level, fast.channel) == ("note", "ax")
-
-
-# --- real cars ---------------------------------------------------------------------------------------------------------------------
 
 
 def recordings_of(name, data_root):

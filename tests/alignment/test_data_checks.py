@@ -66,39 +66,21 @@ def test_a_clean_drive_gets_no_complaint_at_any_rate_and_length(rate, seconds):
     assert complaints(recording) == []
 
 
-def test_a_clean_drive_is_noted_to_follow_the_kinematics():
+def test_a_clean_drive_is_noted_to_follow_the_kinematics_and_a_bias_is_the_accelerometers():
     notes = [finding for finding in checks_of_recording(clean_drive()) if finding.level == "note"]
     assert [(note.check, note.channel) for note in notes] == [("kinematics", "vy_ref")]
-
-
-def test_the_noted_bias_is_that_of_the_accelerometer():
     note = checks_of_recording(changed(clean_drive(noise=0.0), ay=lambda ay: ay + 0.25))[0]
     assert "mean bias -0.250 m/s²" in note.message
 
 
-# --- impossible values and units ---------------------------------------------------------------------------------------------------
-
-
-def test_an_impossible_value_is_found_with_its_time():
+def test_an_impossible_value_is_found_with_its_time_and_degrees_are_hinted_at():
     found = only_complaint(changed(clean_drive(), ay=stuck(500.0, 1234, 1235)))
     assert (found.level, found.check, found.channel) == ("error", "impossible", "ay")
     assert "1 samples" in found.message
     assert "500 m/s² at 22.34 s" in found.message
-
-
-def test_large_angular_rates_in_degrees_are_impossible_and_the_hint_says_degrees():
     found = checks_of_recording(changed(clean_drive(), yaw_rate=np.rad2deg))
     assert (found[0].level, found[0].check, found[0].channel) == ("error", "impossible", "yaw_rate")
     assert "degrees" in found[0].message
-
-
-def test_steering_wheel_degrees_are_impossible_road_wheel_angles():
-    found = only_complaint(changed(clean_drive(), steer=lambda steer: np.rad2deg(15 * steer)))
-    assert (found.check, found.channel) == ("impossible", "steer")
-    assert "degrees" in found.message
-
-
-# --- signs -------------------------------------------------------------------------------------------------------------------------
 
 
 def test_ay_and_yaw_rate_turned_together_leave_two_explanations():
@@ -107,12 +89,9 @@ def test_ay_and_yaw_rate_turned_together_leave_two_explanations():
     assert "either ay and yaw_rate together or sideslip_ref, steer and vy_ref together point the other way" in found.message
 
 
-def test_a_reference_that_does_not_follow_the_kinematics_is_reported():
+def test_kinematics_are_judged_on_moving_cars_alone():
     found = only_complaint(changed(clean_drive(), vy_ref=lambda vy: np.roll(vy, round(0.9 * RATE))))
     assert (found.level, found.check, found.channel) == ("warning", "kinematics", "vy_ref")
-
-
-def test_kinematics_are_not_judged_on_a_parked_car():
     generator = np.random.default_rng(0)
     parked = {"vx": 0.01, "yaw_rate": 0.002, "ax": 0.05, "ay": 0.05, "vy_ref": 0.01}
     channels = {name: level * generator.standard_normal(LENGTH) for name, level in parked.items()}
@@ -128,30 +107,15 @@ def test_channels_with_gaps_are_noted_and_keep_the_checks_that_need_all_samples_
     assert "80.0 %" in found[0].message
 
 
-# --- stuck channels and standstill -------------------------------------------------------------------------------------------------
-
-
-def test_a_stuck_channel_is_found_with_value_time_and_duration():
+def test_a_stuck_channel_is_found_with_value_time_and_duration_and_short_or_held_ones_are_not():
     found = only_complaint(changed(clean_drive(), ay=stuck(1.5, 2000, 2250)))
     assert (found.level, found.check, found.channel) == ("warning", "stuck", "ay")
     assert "stays at 1.5 m/s² for 2.5 s from 30 s" in found.message
-
-
-def test_a_channel_that_never_changes_is_found():
     found = only_complaint(changed(clean_drive(), steer=lambda steer: np.full_like(steer, 0.02)))
     assert (found.check, found.channel) == ("stuck", "steer")
     assert "never changes: 0.02 rad" in found.message
-
-
-def test_a_gap_of_half_a_second_is_not_stuck():
     assert complaints(changed(clean_drive(), ay=stuck(1.5, 2000, 2050))) == []
-
-
-def test_a_slow_channel_held_between_its_samples_is_not_stuck():
     assert complaints(changed(clean_drive(), steer=lambda steer: np.repeat(steer[::10], 10))) == [("warning", "held", "steer")]
-
-
-def test_a_stuck_channel_with_gaps_is_found():
     recording = clean_drive()
     slow = np.where(np.arange(LENGTH) % 5 == 0, recording["steer"], np.nan)
     slow[2000:2500:5] = 0.03
@@ -165,19 +129,13 @@ def test_a_car_at_standstill_may_rest_its_steering_wheel_at_any_angle(steer):
     assert complaints(with_standstill(clean_drive(), 20.0, 35.0, steer=steer)) == []
 
 
-def test_a_speed_that_reads_zero_while_the_car_turns_is_stuck():
+def test_stuck_channels_are_told_from_standstill():
     found = [one for one in checks_of_recording(changed(clean_drive(), vx=stuck(0.0, 2000, 3000))) if one.check == "stuck"]
     assert [finding.channel for finding in found] == ["vx"]
     assert "stays at 0 m/s for 10 s from 30 s" in found[0].message
-
-
-def test_a_standstill_does_not_hide_a_channel_that_is_stuck_later():
     found = only_complaint(changed(with_standstill(clean_drive(), 20.0, 35.0), steer=stuck(0.03, 4000, 4200)))
     assert (found.check, found.channel) == ("stuck", "steer")
     assert "0.03 rad for 2 s from 50 s" in found.message
-
-
-# --- saturation --------------------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(("low", "high", "sides"), [(-4.0, 4.0, 2), (-100.0, 4.0, 1), (-2.5, 100.0, 1), (-100.0, 2.0, 1), (-0.8, 0.8, 2)])
@@ -190,25 +148,16 @@ def test_a_saturated_channel_is_found_on_the_side_where_it_is(low, high, sides):
             assert ("highest" in one.message) == (f", {high:g} m/s²" in one.message)
 
 
-def test_a_quantised_channel_is_not_saturated():
+def test_quantised_resting_and_stepped_channels_are_not_saturated():
     for step in (0.05, 0.5):
         assert complaints(changed(clean_drive(), ay=lambda ay, step=step: np.round(ay / step) * step)) == []
     time = np.arange(LENGTH) / RATE
     sine = np.round(8.0 * np.sin(2 * np.pi * 0.71 * time), 1)
     assert complaints(Recording("r", "car", RATE, 0.0, {"ay": sine})) == []
-
-
-def test_a_quantised_and_saturated_channel_is_saturated():
     found = checks_of_recording(changed(clean_drive(), ay=lambda ay: (np.round(ay / 0.05) * 0.05).clip(-4, 4)))
     assert sum(one.check == "saturated" for one in found) == 2
-
-
-def test_resting_values_are_not_saturated():
     recording = with_standstill(clean_drive(), 20.0, 35.0)
     assert complaints(changed(recording, vx=lambda vx: vx.clip(0.0, None))) == []
-
-
-def test_a_manoeuvre_of_one_exact_step_is_not_saturated():
     steer = np.where(np.arange(400) < 350, 0.01 * np.sin(np.arange(400)), 0.1)
     assert complaints(Recording("step", "car", RATE, 0.0, {"steer": steer})) == []
 
@@ -246,16 +195,13 @@ def reversing(recording):
     return [finding for finding in checks_of_recording(recording) if finding.check == "reverse"]
 
 
-def test_driving_backwards_is_noted_with_its_longest_stretch_and_its_lowest_speed():
+def test_driving_backwards_is_noted_with_its_longest_stretch_and_lowest_speed():
     (found,) = reversing(backwards(clean_drive(), (1000, 1150), (3000, 3250)))
     assert (found.level, found.channel) == ("note", "vx")
     assert "goes backwards 2 times" in found.message
     assert "the longest for 2.5 s from 40 s, lowest -2 m/s" in found.message
     assert "start and stop of a split" in found.message
     assert "sign: -1" in found.message
-
-
-def test_a_drive_with_the_other_sign_of_vx_goes_backwards_throughout():
     (found,) = reversing(changed(clean_drive(), vx=np.negative))
     assert "goes backwards 1 times" in found.message
     assert "for 60 s from 10 s" in found.message

@@ -55,24 +55,13 @@ def test_a_delay_is_measured_between_samples(late):
     assert delay.low < late < delay.high
 
 
-def test_an_inertial_unit_that_is_late_as_a_whole_is_not_taken_for_a_reference_that_is_early():
-    late = broadband_drive(late=dict.fromkeys(("ax", "ay", "yaw_rate"), 0.05))
-    assert set(reported(late)) == {"ax", "ay", "yaw_rate"}
-
-
-def test_without_yaw_rate_ref_three_accelerations_still_tell_who_is_late():
+def test_without_references_of_their_own_accelerations_and_angles_still_tell_who_is_late():
     for channel in ("ay", "yaw_rate", "vy_ref"):
         drive = without(broadband_drive(late={channel: 0.04}), "yaw_rate_ref", "sideslip_ref")
         assert set(reported(drive)) == {channel}
-
-
-def test_a_sideslip_angle_serves_where_there_is_no_lateral_velocity():
     assert set(reported(without(broadband_drive(late={"sideslip_ref": 0.06}), "vy_ref"))) == {"sideslip_ref"}
     assert set(reported(without(broadband_drive(late={"ay": 0.06}), "vy_ref"))) == {"ay"}
-
-
-def test_ay_against_turning_alone_tells_no_delay():
-    """d(vy)/dt follows the yaw acceleration, as a delay does."""
+    # d(vy)/dt follows the yaw acceleration, as a delay does.
     assert not reported(without(broadband_drive(late={"ay": 0.06}), "vy_ref", "sideslip_ref"))
 
 
@@ -88,14 +77,6 @@ def test_a_delay_is_found_in_channels_of_the_wrong_sign_and_unit():
     spoilt = replace(late, channels={**late.channels, "ay": -late["ay"], "vy_ref": 3.6 * late["vy_ref"]})
     found = checks_of_recording(spoilt)
     assert {(one.check, one.channel) for one in found if one.level == "warning"} == {("sign", "ay"), ("unit", "vy_ref"), ("delay", "ay")}
-
-
-@pytest.mark.parametrize("time_constant", [0.005, 0.01])
-def test_a_channel_low_passed_by_a_sample_or_two_is_as_late_as_the_filter(time_constant):
-    """The phase of 1/(1 + iωT) is -ωT as long as ωT is small."""
-    plain = broadband_drive()
-    slow = replace(plain, channels={**plain.channels, "yaw_rate": broadband_drive(slow_yaw_rate=time_constant)["yaw_rate"]})
-    assert between(slow, "yaw_rate", "yaw_rate_ref").delay.value == pytest.approx(time_constant, abs=1e-3)
 
 
 def test_the_delay_is_that_of_the_peak_of_the_cross_correlation():
@@ -128,15 +109,12 @@ def test_intervals_hold_the_truth_as_often_as_they_promise():
     assert inside >= 52
 
 
-def test_wheels_that_slip_lead_and_are_not_reported():
+def test_slipping_wheels_are_not_reported_and_late_ones_once():
     """Slip in proportion to the acceleration: r·ω = v + 0.1 s · dv/dt."""
     drive = broadband_drive()
     slipping = drive["vx_ref"] + 0.1 * np.gradient(drive["vx_ref"]) * drive.rate_hz
     assert between(replace(drive, channels={**drive.channels, "vx": slipping}), "vx", "vx_ref").delay.low < -0.015
     assert not reported(replace(drive, channels={**drive.channels, "vx": slipping}))
-
-
-def test_late_wheels_are_reported_once():
     drive = broadband_drive(noise=0.0)
     late = np.interp(drive.time - 0.06, drive.time, drive["vx_ref"]) / 0.3
     wheels = {f"wheel_speed_{wheel}": late for wheel in ("fl", "fr", "rl", "rr")}

@@ -37,13 +37,10 @@ def test_nothing_stands_at_the_place_before_the_end(tmp_path):
     assert path.read_text() == "new"
 
 
-def test_a_failure_leaves_nothing(tmp_path):
+def test_a_failure_leaves_nothing_and_keeps_an_old_file(tmp_path):
     with pytest.raises(InterruptedHereError):
         write_half(tmp_path / "file")
     assert list(tmp_path.iterdir()) == []
-
-
-def test_a_failure_keeps_the_old_file(tmp_path):
     (tmp_path / "file").write_text("old")
     with pytest.raises(InterruptedHereError):
         write_half(tmp_path / "file")
@@ -104,11 +101,8 @@ def test_a_killed_writer_leaves_only_what_is_swept(tmp_path):
     assert [path.name for path in tmp_path.iterdir()] == ["file"]
 
 
-def test_the_digest_is_that_of_the_bytes(tmp_path):
+def test_the_digest_is_that_of_the_bytes_of_a_file_that_can_be_read(tmp_path):
     (tmp_path / "file").write_bytes(b"abc")
     assert sha256_of(tmp_path / "file") == hashlib.sha256(b"abc").hexdigest()
-
-
-def test_a_file_that_cannot_be_read_has_no_digest(tmp_path):
     with pytest.raises(DataError, match="cannot read"):
         sha256_of(tmp_path / "none")

@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from hypothesis.extra.numpy import arrays
 from scipy import signal
 
 from vehest.data.errors import ConfigurationError, DataError
@@ -17,7 +16,6 @@ from vehest.data.transforms import Resample, windowed_sinc
 RATIOS = [(100.0, 20.0), (125.0, 20.0), (125.0, 100.0), (1000.0, 20.0), (20.0, 100.0), (50.0, 30.0), (1000.0 / 3.0, 20.0), (400.0, 100.0)]
 PROPERTY = settings(max_examples=60, deadline=None, derandomize=True, database=None)
 SMALL = st.floats(-1e3, 1e3)
-LENGTHS = st.integers(1, 120)
 every_ratio = pytest.mark.parametrize(("rate", "new_rate"), RATIOS)
 
 
@@ -27,12 +25,6 @@ def recorded(samples, rate_hz, start_time=0.0):
 
 def resampled(samples, rate, new_rate):
     return Resample(new_rate)(recorded(samples, rate))["ay"]
-
-
-@PROPERTY
-@given(st.sampled_from(RATIOS), LENGTHS, SMALL)
-def test_a_constant_stays_that_constant(ratio, length, value):
-    np.testing.assert_allclose(resampled(np.full(length, value), *ratio), value, rtol=1e-12, atol=1e-12)
 
 
 @PROPERTY
@@ -83,16 +75,6 @@ def test_what_lies_above_the_new_nyquist_frequency_is_attenuated_by_60_db(rate, 
         assert np.abs(out["ay"][inside]).max() < 1e-3, frequency
 
 
-def test_going_up_adds_no_images_of_the_signal():
-    time = np.arange(400) / 20
-    out = resampled(np.sin(2 * np.pi * 6.0 * time), 20.0, 100.0)[200:-200]
-    window = np.hanning(len(out))
-    spectrum = np.abs(np.fft.rfft(out * window)) / window.sum() * 2
-    frequency = np.fft.rfftfreq(len(out), 1 / 100)
-    assert spectrum[np.abs(frequency - 6.0) < 0.2].max() == pytest.approx(1.0, abs=0.02)
-    assert spectrum[frequency > 10.0].max() < 1e-3
-
-
 @every_ratio
 @pytest.mark.parametrize("length", [1, 2, 3, 50, 101])
 def test_the_first_sample_keeps_its_time_and_the_last_lies_in_the_recording(rate, new_rate, length):
@@ -119,33 +101,6 @@ def test_the_same_rate_changes_nothing():
         assert Resample(100.0, method=method)(recording) is recording
 
 
-@PROPERTY
-@given(st.sampled_from(RATIOS), st.integers(1, 60), st.data(), st.floats(-5, 5))
-def test_resampling_is_linear(ratio, length, data, factor):
-    one = data.draw(arrays(np.float64, length, elements=SMALL))
-    other = data.draw(arrays(np.float64, length, elements=SMALL))
-    together = resampled(one + factor * other, *ratio)
-    np.testing.assert_allclose(together, resampled(one, *ratio) + factor * resampled(other, *ratio), rtol=1e-9, atol=1e-7)
-
-
-@PROPERTY
-@given(st.sampled_from([(100.0, 20.0), (125.0, 100.0), (1000.0, 20.0), (50.0, 30.0)]), st.integers(1, 12), st.data())
-def test_resampling_backwards_is_the_same_backwards(ratio, periods, data):
-    rate, new_rate = ratio
-    step = (Fraction(rate) / Fraction(new_rate)).numerator
-    length = periods * step + 1  # both ends lie on the new grid, so that it is the same grid from both sides
-    samples = data.draw(arrays(np.float64, length, elements=SMALL))
-    np.testing.assert_allclose(resampled(samples[::-1], *ratio), resampled(samples, *ratio)[::-1], rtol=1e-9, atol=1e-8)
-
-
-def test_there_and_back_keeps_a_slow_signal():
-    time = np.arange(600) / 20
-    slow = np.sin(2 * np.pi * 0.7 * time) + 0.3 * np.cos(2 * np.pi * 2.9 * time)
-    back = resampled(resampled(slow, 20.0, 125.0), 125.0, 20.0)
-    assert len(back) == len(slow)
-    np.testing.assert_allclose(back[40:-40], slow[40:-40], atol=1e-3)
-
-
 def test_channels_with_gaps_are_refused_by_the_filter_and_kept_by_decimation():
     samples = np.where(np.arange(20) % 4 == 0, 1.0, np.nan)
     recording = Recording("lap", "car", 100.0, 0.0, {"ay": samples, "ax": np.zeros(20)}, gappy=frozenset({"ay"}))
@@ -155,16 +110,13 @@ def test_channels_with_gaps_are_refused_by_the_filter_and_kept_by_decimation():
     np.testing.assert_array_equal(Resample(20.0, method="decimate")(recording)["ay"], samples[::5])
 
 
-def test_a_ratio_that_is_not_of_whole_numbers_is_refused():
+def test_ratios_that_a_method_cannot_make_are_refused():
     with pytest.raises(DataError, match="not a ratio of whole numbers"):
         Resample(100.0 / math.pi)(recorded(np.zeros(10), 100.0))
     with pytest.raises(DataError, match="not a ratio of whole numbers"):
         Resample(20.0)(recorded(np.zeros(10), 99.997))
     with pytest.raises(DataError, match="not a ratio of whole numbers"):
         Resample(1e-9)(recorded(np.zeros(10), 100.0))
-
-
-def test_plain_decimation_by_a_broken_ratio_points_at_the_filter():
     with pytest.raises(ConfigurationError, match="method=polyphase"):
         Resample(30.0, method="decimate")(recorded(np.zeros(10), 50.0))
 

@@ -1,8 +1,8 @@
-"""Splits and windows: no sample serves two purposes, no window crosses from one recording into another."""
+"""Splits, windows, runs and minutes: no sample serves two purposes, no window crosses recordings, and splits of papers are theirs."""
 
 import math
 import re
-from itertools import combinations, pairwise
+from itertools import combinations, groupby, pairwise
 from pathlib import Path
 
 import numpy as np
@@ -14,13 +14,14 @@ from hypothesis import strategies as st
 from vehest.data.errors import ConfigurationError, DataError
 from vehest.data.laps import laps_of
 from vehest.data.recording import Recording
-from vehest.data.split_files import dataset_names, split_from_config
+from vehest.data.runs import equal_runs, true_runs
+from vehest.data.split_files import dataset_names, limit_minutes, split_from_config
 from vehest.data.splits import Span, Split
-from vehest.data.windows import window_starts, windows_of
+from vehest.data.windows import windows_of
 from vehest.run.config import compose_config
 from vehest.sources.base import open_source
 
-PROPERTY = settings(max_examples=150, deadline=None, derandomize=True, database=None)
+PROPERTY = settings(max_examples=80, deadline=None, derandomize=True, database=None)
 CONFIGURATIONS = sorted((Path(__file__).parents[2] / "conf" / "split").glob("*.yaml"))
 
 bounds = st.sampled_from([-math.inf, math.inf, 0.0, 1.0, 1.005, 1.01, 2.0, 3.5]) | st.floats(0.0, 4.0)
@@ -30,6 +31,18 @@ bounds = st.sampled_from([-math.inf, math.inf, 0.0, 1.0, 1.005, 1.01, 2.0, 3.5])
 def spans(draw):
     start, stop = sorted(draw(st.lists(bounds, min_size=2, max_size=2, unique=True)))
     return Span("set", draw(st.sampled_from(["lap1", "lap2"])), start, stop)
+
+
+BASE = {"name": "s", "dataset": "d", "train": [{"recording": "a"}], "validation": [{"recording": "b"}], "tests": {}}
+
+
+def refusal(config, catalogue=None):
+    """The one line with which a split is refused."""
+    with pytest.raises(ConfigurationError) as error:
+        split_from_config(config, catalogue)
+    assert "split 's'" in str(error.value)
+    assert "\n" not in str(error.value)
+    return str(error.value)
 
 
 def samples_of(span, rate_hz):
@@ -72,19 +85,8 @@ def test_overlap_goes_both_ways_and_is_that_of_the_times(one, other):
     assert one.overlaps(other) is common
 
 
-def test_neighbouring_ranges_share_nothing():
-    parts = Split("s", (Span("d", "r", 150, 450),), (Span("d", "r", 450, 550),), {"test": (Span("d", "r", 550, 700),)})
-    assert len(parts.all_spans) == 3
-    recording = Recording("r", "car", 100.0, 149.99, {"ay": np.zeros(55_001)})
-    ranges = [recording.index_range(span.start, span.stop) for span in parts.all_spans]
-    assert ranges == [(1, 30_001), (30_001, 40_001), (40_001, 55_001)]
-
-
-def test_equal_ranges_of_other_recordings_or_data_sets_share_nothing():
+def test_equal_ranges_elsewhere_and_test_sets_that_overlap_share_nothing():
     Split("s", (Span("d", "r1"),), (Span("d", "r2"),), {"test": (Span("e", "r1"),)})
-
-
-def test_two_test_sets_may_look_at_the_same_samples():
     Split("s", (Span("d", "r", 0, 1),), (Span("d", "r", 1, 2),), {"all": (Span("d", "r", 2, 4),), "fast": (Span("d", "r", 3, 4),)})
 
 
@@ -100,24 +102,15 @@ def test_a_stretch_must_run_forward(start, stop):
         Span("d", "r", start, stop)
 
 
-def test_plain_values_make_a_split():
+def test_plain_values_make_a_split_of_which_tests_alone_will_do():
     entry = {"recording": "lap", "start": 1, "stop": 2}
-    config = {
-        "name": "s",
-        "dataset": "d",
-        "train": [entry],
-        "validation": [{"recording": "v", "dataset": "e"}],
-        "tests": {"t": [{"recording": "x"}]},
-    }
-    split = split_from_config(config)
+    tests = {"t": [{"recording": "x"}]}
+    split = split_from_config(BASE | {"train": [entry], "validation": [{"recording": "v", "dataset": "e"}], "tests": tests})
     assert split.train == (Span("d", "lap", 1.0, 2.0),)
     assert split.validation == (Span("e", "v", -math.inf, math.inf),)
     assert split.tests == {"t": (Span("d", "x"),)}
     assert split.datasets == ("d", "e")
-
-
-def test_a_split_may_have_tests_only_but_not_nothing():
-    config = {"name": "s", "dataset": "d", "train": [], "validation": [], "tests": {"t": [{"recording": "x"}]}}
+    config = BASE | {"train": [], "validation": [], "tests": tests}
     split = split_from_config(config)
     assert (split.train, split.validation, split.datasets) == ((), (), ("d",))
     with pytest.raises(ConfigurationError, match="split 's' has no ranges at all"):
@@ -130,21 +123,13 @@ def test_a_split_may_have_tests_only_but_not_nothing():
         ({"train": []}, "nothing to train on"),
         ({"validation": []}, "nothing to validate on"),
         ({"train": [{"start": 3}]}, "needs a recording"),
-        (
-            {"train": [{"recording": "a", "start": "three"}]},
-            "start and stop are a number of seconds or a percentage such as \"60 %\", not 'three'",
-        ),
+        ({"train": [{"recording": "a", "start": "three"}]}, "are a number of seconds or a percentage such as \"60 %\", not 'three'"),
         ({"train": "a"}, 'train must be a list of ranges, a percentage such as "60 %" or laps such as "last lap"'),
         ({"dataset": None}, "each range needs a dataset"),
     ],
 )
 def test_a_misspelt_split_is_refused_in_one_line(changes, what):
-    config = {"name": "s", "dataset": "d", "train": [{"recording": "a"}], "validation": [{"recording": "b"}], "tests": {}}
-    with pytest.raises(ConfigurationError) as error:
-        split_from_config(config | changes)
-    assert what in str(error.value)
-    assert "split 's'" in str(error.value)
-    assert "\n" not in str(error.value)
+    assert what in refusal(BASE | changes)
 
 
 @pytest.mark.parametrize("file", CONFIGURATIONS, ids=lambda file: file.stem)
@@ -176,9 +161,6 @@ def test_every_split_that_is_shipped_is_one(file):
     assert set(dataset_names(config)) == set(split.datasets)
 
 
-# --- patterns and conditions
-
-
 def drives(ay, vx=None, start_time=0.0):
     """A catalogue of data set ``d``, or of any, with drives at 100 Hz of a given ay."""
 
@@ -197,13 +179,10 @@ def kept_of(keep, catalogue, **entry):
     return split_from_config({"name": "s", "dataset": "d", "train": [train], "validation": [{"recording": "v"}]}, catalogue)
 
 
-def test_a_pattern_names_recordings_in_the_order_of_their_ids():
+def test_patterns_name_recordings_in_order_and_ask_for_a_data_set_once():
     catalogue = drives({name: [0.0] * 10 for name in ("train_b", "test_a", "train_a", "Train_c")})
     config = {"name": "s", "dataset": "d", "train": [{"recordings": "train_*", "start": 1}], "validation": [{"recording": "v"}]}
     assert split_from_config(config, catalogue).train == (Span("d", "train_a", 1.0), Span("d", "train_b", 1.0))
-
-
-def test_a_data_set_is_asked_for_once_and_only_where_a_pattern_or_condition_needs_it():
     asked = []
 
     def catalogue(dataset):
@@ -253,14 +232,11 @@ def test_what_a_condition_keeps_is_what_a_plain_loop_over_the_samples_keeps(piec
     assert all(one[1] < other[0] for one, other in pairwise(ranges))
 
 
-def test_all_channels_of_a_condition_must_meet_it():
+def test_all_channels_of_a_condition_must_meet_it_within_the_range():
     ay, vx = [0.0] * 50 + [9.0] * 50 + [0.0] * 100, [10.0] * 150 + [4.0] * 50
     keep = {"magnitude": {"ay": {"at_most": 7.0}, "vx": {"at_least": 5.0}}}
     spans = kept_of(keep, drives({"train_1": ay}, vx=vx)).train
     assert [(span.start, span.stop) for span in spans] == [(-math.inf, 0.5), (1.0, 1.5)]
-
-
-def test_a_condition_looks_at_no_more_than_the_range():
     keep = {"magnitude": {"ay": {"at_most": 7.0}}}
     spans = kept_of(keep, drives({"train_1": [0.0] * 100 + [9.0] * 100 + [0.0] * 100}), start=0.5, stop=2.5).train
     assert [(span.start, span.stop) for span in spans] == [(0.5, 1.0), (2.0, 2.5)]
@@ -284,27 +260,24 @@ CONDITION = {"magnitude": {"ay": {"at_most": 7.0}}}
 )
 def test_a_pattern_or_condition_that_makes_no_sense_is_refused_in_one_line(entry, what):
     named = {} if "recording" in entry else {"recordings": "train_*"}
-    config = {"name": "s", "dataset": "d", "train": [{**named, **entry}], "validation": [{"recording": "v"}]}
-    with pytest.raises(ConfigurationError) as error:
-        split_from_config(config, drives({"train_1": [0.0] * 200}))
-    assert what in str(error.value)
-    assert "split 's'" in str(error.value)
-    assert "\n" not in str(error.value)
+    assert what in refusal(BASE | {"train": [{**named, **entry}]}, drives({"train_1": [0.0] * 200}))
 
 
 @pytest.mark.parametrize("entry", [{"recordings": "train_*"}, {"recording": "train_1", "keep": CONDITION}])
 def test_patterns_and_conditions_without_recordings_say_what_they_need(entry):
-    config = {"name": "s", "dataset": "d", "train": [entry], "validation": [{"recording": "v"}]}
-    with pytest.raises(ConfigurationError, match="its patterns and the like need the recordings of data set 'd'"):
-        split_from_config(config)
+    assert "its patterns and the like need the recordings of data set 'd'" in refusal(BASE | {"train": [entry]})
 
 
-def test_a_condition_on_a_channel_that_a_recording_lacks_names_both():
+def test_windows_share_memory_and_gaps_and_missing_channels_are_refused_by_name():
+    windows = windows_of([recorded("r", 1000, 0.0)], ["vx", "ay"], "vy_ref", 30)
+    assert windows.series.nbytes == 1000 * 2 * 8
+    channels = {"vx": np.zeros(9), "ay": np.where(np.arange(9) == 4, np.nan, 0.0), "vy_ref": np.zeros(9)}
+    recording = Recording("lap", "car", 20.0, 0.0, channels, gappy=frozenset({"ay"}))
+    with pytest.raises(DataError, match="recording 'lap': channel 'ay' has gaps"):
+        windows_of([recording], ["vx", "ay"], "vy_ref", 3)
+    assert len(windows_of([recording], ["vx"], "vy_ref", 3)) == 6
     with pytest.raises(DataError, match="recording 'train_1' has no channel 'yaw_rate'"):
         kept_of({"magnitude": {"yaw_rate": {"at_most": 1.0}}}, drives({"train_1": [0.0] * 10}))
-
-
-# --- windows
 
 
 def recorded(name, length, offset):
@@ -332,28 +305,6 @@ def test_windows_are_those_of_a_plain_loop_over_each_recording(lengths, n_window
         assert target == after
 
 
-@PROPERTY
-@given(st.integers(0, 50), st.integers(1, 50))
-def test_window_starts_count_those_with_a_sample_after_them(n_samples, n_window):
-    assert window_starts(n_samples, n_window).tolist() == [k for k in range(n_samples) if k + n_window < n_samples]
-
-
-def test_windows_share_memory_instead_of_being_copied():
-    windows = windows_of([recorded("r", 1000, 0.0)], ["vx", "ay"], "vy_ref", 30)
-    assert windows.series.nbytes == 1000 * 2 * 8
-
-
-def test_windows_over_gaps_are_refused_by_name():
-    channels = {"vx": np.zeros(9), "ay": np.where(np.arange(9) == 4, np.nan, 0.0), "vy_ref": np.zeros(9)}
-    recording = Recording("lap", "car", 20.0, 0.0, channels, gappy=frozenset({"ay"}))
-    with pytest.raises(DataError, match="recording 'lap': channel 'ay' has gaps"):
-        windows_of([recording], ["vx", "ay"], "vy_ref", 3)
-    assert len(windows_of([recording], ["vx"], "vy_ref", 3)) == 6
-
-
-# --- percentages, laps and folds
-
-
 def circuit(name="lap", laps=4.3, start_time=1600000000.0, rate_hz=20.0):
     """A course of two straights and two unlike bends, driven at a speed of its own every lap; and the distance of a lap [m]."""
     straight, radii = 200.0, (60.0, 30.0)
@@ -379,7 +330,7 @@ def catalogue_of(*recordings):
     return lambda dataset: {recording.id: reader(recording) for recording in recordings}
 
 
-def test_laps_last_as_long_as_the_course_is_driven_round_once():
+def test_laps_last_as_long_as_the_course_is_driven_round_once_and_are_named_from_either_end():
     recording, length = circuit()
     laps = laps_of(recording)
     assert len(laps) == 4
@@ -387,9 +338,15 @@ def test_laps_last_as_long_as_the_course_is_driven_round_once():
     driven = [np.interp(stop, recording.time, distance) - np.interp(start, recording.time, distance) for start, stop in laps]
     np.testing.assert_allclose(driven, length, rtol=0.01)
     assert all(one[1] == other[0] for one, other in pairwise(laps))
+    entry = {"recording": "lap"}
+    config = {"name": "s", "dataset": "d", "train": [{**entry, "laps": "first 2"}], "validation": [{**entry, "laps": "3"}]}
+    split = split_from_config(config | {"tests": {"end": "last lap"}}, catalogue_of(recording))
+    assert split.train == (Span("d", "lap", laps[0][0], laps[1][1]),)
+    assert split.validation == (Span("d", "lap", *laps[2]),)
+    assert split.tests["end"] == (Span("d", "lap", *laps[3]),)
 
 
-def test_half_a_turn_of_an_oval_is_no_lap_and_a_circle_has_one_a_turn():
+def test_half_a_turn_of_an_oval_is_no_lap_a_circle_has_one_a_turn_and_a_road_none():
     time = np.arange(6000) / 50.0
     speed = np.full(6000, 10.0)
     bend = np.mod(10.0 * time, 100.0 + 10.0 * np.pi * 2.0) >= 100.0  # two equal halves: a straight, and half a turn of 20 m
@@ -398,9 +355,6 @@ def test_half_a_turn_of_an_oval_is_no_lap_and_a_circle_has_one_a_turn():
     np.testing.assert_allclose(durations, 2.0 * (100.0 + 20.0 * np.pi) / 10.0, rtol=0.02)
     circle = Recording("circle", "car", 50.0, 0.0, {"vx": speed, "yaw_rate": np.full(6000, -0.4)})
     np.testing.assert_allclose([stop - start for start, stop in laps_of(circle)], 2.0 * np.pi / 0.4, atol=0.03)
-
-
-def test_a_drive_that_never_repeats_has_no_laps():
     generator = np.random.default_rng(1)
     yaw_rate = np.convolve(generator.standard_normal(6000), np.full(200, 0.01), mode="same")
     assert laps_of(Recording("road", "car", 50.0, 0.0, {"vx": np.full(6000, 20.0), "yaw_rate": yaw_rate})) == []
@@ -416,17 +370,6 @@ def test_percentages_follow_one_another_over_every_recording():
     assert split.validation == (Span("d", "a", 110.0, 125.0), Span("d", "b", 12.0, 15.0))
     assert split.tests["wet"] == (Span("d", "a", 125.0, 145.0), Span("d", "b", 15.0, 19.0))
     assert split.tests["dry"] == (Span("d", "a", 145.0, math.inf), Span("d", "b", 19.0, math.inf))
-
-
-def test_laps_are_named_from_either_end():
-    recording, _ = circuit()
-    laps = laps_of(recording)
-    entry = {"recording": "lap"}
-    config = {"name": "s", "dataset": "d", "train": [{**entry, "laps": "first 2"}], "validation": [{**entry, "laps": "3"}]}
-    split = split_from_config(config | {"tests": {"end": "last lap"}}, catalogue_of(recording))
-    assert split.train == (Span("d", "lap", laps[0][0], laps[1][1]),)
-    assert split.validation == (Span("d", "lap", *laps[2]),)
-    assert split.tests["end"] == (Span("d", "lap", *laps[3]),)
 
 
 def test_every_fold_is_tested_once_and_none_learns_from_its_test():
@@ -475,12 +418,7 @@ def test_folds_of_recordings_and_of_seconds_leave_nothing_out(of):
     ids=str,
 )
 def test_portions_that_make_no_sense_are_refused_in_one_line(changes, what):
-    config = {"name": "s", "dataset": "d", "train": [{"recording": "lap"}], "validation": [{"recording": "b"}], "tests": {}}
-    with pytest.raises(ConfigurationError) as error:
-        split_from_config(config | changes, catalogue_of(circuit()[0]))
-    assert what in str(error.value)
-    assert "split 's'" in str(error.value)
-    assert "\n" not in str(error.value)
+    assert what in refusal(BASE | {"train": [{"recording": "lap"}]} | changes, catalogue_of(circuit()[0]))
 
 
 def test_no_fold_is_a_scrap_and_gaps_are_kept_whole():
@@ -503,3 +441,108 @@ def test_laps_end_where_the_course_begins_again_wherever_the_recording_stops(lap
     found = laps_of(Recording("lap", "car", 20.0, 0.0, {"vx": np.full(len(time), 20.0), "yaw_rate": yaw_rate}))
     assert len(found) == int(laps)
     np.testing.assert_allclose([stop for _, stop in found], 60.0 * np.arange(1, int(laps) + 1), atol=0.3)
+
+
+SPANS = (Span("d", "one", 10.0, 40.0), Span("d", "two", 100.0, 160.0))
+
+
+def total(spans):
+    return sum(span.stop - span.start for span in spans)
+
+
+@pytest.mark.parametrize("at", [0.0, 0.2, 0.5, 0.9])
+@pytest.mark.parametrize("seconds", [5.0, 45.0, 86.0])
+def test_as_much_is_kept_as_was_asked_for_from_any_place(seconds, at):
+    kept = limit_minutes(SPANS, seconds, at)
+    assert total(kept) == pytest.approx(seconds)
+    assert all(any(own.start >= span.start and own.stop <= span.stop for span in SPANS if span.recording == own.recording) for own in kept)
+    for position, one in enumerate(kept):
+        assert not any(one.overlaps(other) for other in kept[position + 1 :])
+
+
+def test_minutes_begin_where_they_are_said_and_leave_tests_alone():
+    assert limit_minutes(SPANS, 60.0, 0.5) == (Span("d", "one", 10.0, 25.0), Span("d", "two", 115.0, 160.0))
+    assert limit_minutes(SPANS, 31.0, 0.0) == (Span("d", "one", 10.0, 40.0),)
+    assert split_of(minutes=4.0).train == (Span("d", "lap", 0.0, 180.0),)
+    assert split_of(minutes=9.0).train == (Span("d", "lap", -math.inf, 360.0),)
+    split = split_of(minutes=2.0)
+    assert split.name == "mine_2min"
+    assert total(split.train) == pytest.approx(90.0, abs=0.2)
+    assert total(split.validation) == pytest.approx(30.0, abs=0.2)
+    assert split.tests["test"][0].start == pytest.approx(480.0, abs=0.2)
+
+
+def split_of(**changed):
+    drive = Recording("lap", "car", 10.0, 0.0, {"vx": [1.0] * 6000})
+    shares = {"train": "60 %", "validation": "20 %", "tests": {"test": "20 %"}}
+    return split_from_config({"name": "mine", "dataset": "d", **shares, **changed}, lambda _: {"lap": lambda channels: drive})
+
+
+@pytest.mark.parametrize(
+    ("changed", "message"),
+    [
+        ({"minutes": 0.0}, "split.minutes: input should be greater than 0"),
+        ({"minutes_at": 1.0}, "split.minutes_at: input should be less than 1"),
+    ],
+)
+def test_no_time_and_no_place_are_refused(changed, message):
+    with pytest.raises(ConfigurationError, match=message):
+        split_of(**changed)
+
+
+SETS = {  # Table I
+    "C-1": ("20130222_01_01_03", "20130222_01_02_03", "20130222_02_01_03"),
+    "C-2": ("20130223_01_01_03", "20130223_01_02_03"),
+    "F-1": ("20140221_03_02_03", "20140221_03_03_03", "20140221_04_01_03"),
+    "F-2": ("20140222_01_01_03", "20140222_02_01_03"),
+}
+SCHEMES = {"cross_vehicle_1": ("C-1", "F-1"), "cross_vehicle_2": ("F-1", "C-1")}  # Table II: learn, stop
+
+
+def split(name):
+    return split_from_config(compose_config("train", [f"split={name}"])["split"])
+
+
+def sets_of(spans):
+    """Which of Table I's sets the recordings are, in alphabetical order of their names."""
+    names = sorted(span.recording for span in spans)
+    simulated = [f"{name[0].upper()}-{name[1]}" for name in names if name[2] == "_"]
+    return simulated or [key for name in names for key, files in SETS.items() if name.rsplit("_", 1)[0] in files]
+
+
+@pytest.mark.parametrize("place", ["", "_sim"])
+@pytest.mark.parametrize("scheme", SCHEMES)
+def test_schemes_learn_on_one_car_stop_on_the_other_and_test_on_both(scheme, place):
+    found = split(scheme + place)
+    learnt, stopped = SCHEMES[scheme]
+    assert sets_of(found.train) == [learnt] * 3
+    assert sets_of(found.validation) == [stopped] * 3
+    third = {"j1": ["J-1"] * 2} if place else {}
+    assert {name: sets_of(spans) for name, spans in found.tests.items()} == {"c2": ["C-2"] * 2, "f2": ["F-2"] * 2, **third}
+
+
+@pytest.mark.parametrize("name", ["one_vehicle", "one_vehicle_sim"])
+def test_without_cross_vehicle_regularisation_two_files_teach_and_the_third_stops(name):
+    found = split(name)
+    assert (sets_of(found.train), sets_of(found.validation)) == (["F-1"] * 2, ["F-1"])
+    third = {"j1": ["J-1"] * 2} if name.endswith("_sim") else {}
+    assert {name: sets_of(spans) for name, spans in found.tests.items()} == {"c2": ["C-2"] * 2, "f2": ["F-2"] * 2, **third}
+
+
+@pytest.mark.parametrize("dataset", ["sim_two_cars", "sim_race_cars", "sim_race_cars_same_sensors"])
+def test_simulated_sets_last_as_long_as_the_papers(dataset):
+    drives = compose_config("ingest", [f"dataset={dataset}"])["dataset"]["drives"]
+    minutes = {entry["id"]: entry["count"] * entry["manoeuvre"]["duration"] / 60.0 for entry in drives if entry["id"] != "j1"}
+    assert minutes == pytest.approx({"c1": 19.0, "c2": 12.6, "f1": 25.7, "f2": 18.1}, abs=0.05)
+
+
+@pytest.mark.parametrize("length", [0, 1, 2, 50])
+@pytest.mark.parametrize("seed", range(3))
+def test_runs_are_those_of_a_count_sample_by_sample(length, seed):
+    samples = np.random.default_rng(seed).integers(0, 2, length)
+    counted, place = [], 0
+    for value, group in groupby(samples.tolist()):
+        begin, place = place, place + len(list(group))
+        counted.append((value, [begin, place]))
+    assert equal_runs(samples).tolist() == [run for _, run in counted]
+    assert true_runs(samples == 1).tolist() == [run for value, run in counted if value == 1]

@@ -38,8 +38,15 @@ class Outer:
 GOOD = {"name": "a", "inner": {"gain": 1}, "many": {"x": {"gain": 0.5, "steps": 4.0}}, "bounds": [0, 1.5]}
 
 
-def test_plain_values_become_dataclasses():
+def test_plain_values_become_dataclasses_that_may_take_further_keys():
     assert validated(Outer, GOOD, "'f'") == Outer("a", Inner(1.0), {"x": Inner(0.5, 4)}, (0.0, 1.5))
+
+    @dataclass(frozen=True)
+    class Loose:
+        __pydantic_config__ = FURTHER_KEYS
+        name: str
+
+    assert validated(Loose, {"name": "a", "more": 1}, "") == Loose("a")
 
 
 @pytest.mark.parametrize(
@@ -88,15 +95,6 @@ def test_a_refusal_says_what_the_type_of_the_key_takes(content, message):
     assert str(caught.value) == message
 
 
-def test_a_schema_may_take_further_keys():
-    @dataclass(frozen=True)
-    class Loose:
-        __pydantic_config__ = FURTHER_KEYS
-        name: str
-
-    assert validated(Loose, {"name": "a", "more": 1}, "") == Loose("a")
-
-
 def test_yaml_that_explodes_by_aliases_is_refused_at_once(tmp_path):
     lines = ["a0: &a0 [x, x, x, x, x, x, x, x, x, x]"]
     lines += [f"a{k}: &a{k} [{', '.join([f'*a{k - 1}'] * 10)}]" for k in range(1, 12)]
@@ -133,7 +131,7 @@ def test_json_that_is_none_is_one_line(text):
         parse_json(text, "'f'")
 
 
-def test_only_regular_files_are_read(tmp_path):
+def test_only_regular_files_of_utf8_and_bounded_length_are_read(tmp_path):
     os.mkfifo(tmp_path / "pipe")
     for path, message in ((tmp_path / "pipe", "a pipe"), (Path("/dev/zero"), "a device"), (tmp_path, "a folder")):
         with pytest.raises(DataError, match=message):
@@ -143,9 +141,6 @@ def test_only_regular_files_are_read(tmp_path):
             regular_file(path)
     with pytest.raises(DataError):
         regular_file(Path("a" * 5000))
-
-
-def test_text_is_utf8_and_of_bounded_length(tmp_path):
     (tmp_path / "latin").write_bytes("ä".encode("latin-1"))
     (tmp_path / "long").write_text("x" * 100)
     with pytest.raises(DataError, match="is not UTF-8 text"):
@@ -171,8 +166,10 @@ def test_limits_come_from_a_configuration_and_end_with_their_block():
             limits_from_config(wrong)
 
 
-def test_the_configuration_names_every_limit_with_its_default():
+def test_the_configuration_names_every_limit_and_an_hour_at_1_khz_stays_below():
     assert limits_from_config(compose_config("ingest", ["dataset=tabular"])["limits"]) == Limits()
+    assert Limits().samples > 3600 * 1000
+    assert Limits().memory > 8 * 3600 * 1000 * 55
 
 
 def test_a_file_may_not_unpack_to_more_than_the_limit_and_ten_times_its_size():
@@ -180,11 +177,6 @@ def test_a_file_may_not_unpack_to_more_than_the_limit_and_ten_times_its_size():
         check_unpacked("f", 200, 3000)
         with pytest.raises(DataError, match=r"'f' unpacks to 3001 bytes, 1001 beyond ten times its size, .*limits\.memory=NUMBER"):
             check_unpacked("f", 200, 3001)
-
-
-def test_an_hour_at_1_khz_stays_below_the_limits():
-    assert Limits().samples > 3600 * 1000
-    assert Limits().memory > 8 * 3600 * 1000 * 55
 
 
 @given(st.text(max_size=300))
@@ -201,11 +193,8 @@ def test_different_names_stay_different(one, other):
     assert (file_name(one) == file_name(other)) == (one == other)
 
 
-def test_plain_names_stay_as_they_are():
+def test_plain_names_stay_and_escapes_for_the_terminal_are_shown():
     assert file_name("ksnn-linear_bias_p2-seed0", ".csv") == "ksnn-linear_bias_p2-seed0.csv"
-
-
-def test_escapes_for_the_terminal_are_shown_not_obeyed():
     assert printable("a\x1b[31mb\r\n\u202e") == "a\\x1b[31mb\\r\\n\\u202e"
     assert printable("größe β °") == "größe β °"
     assert printable("\udcff") == "\\udcff"

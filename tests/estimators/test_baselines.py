@@ -58,7 +58,7 @@ def test_data_sheet_is_exact_on_a_car_with_the_stiffness_it_assumes():
     np.testing.assert_allclose(estimate["vy"], drive["vy_ref"], atol=1e-12)
 
 
-def test_kinematic_integration_is_the_solution_of_its_equation():
+def test_kinematic_integration_is_the_solution_of_its_equation_whose_time_constant_it_finds():
     drive = planar_drive(20.0)
     estimator = new("kinematic")
     estimator.values = {"time_constant": 2.5}
@@ -73,9 +73,6 @@ def test_kinematic_integration_is_the_solution_of_its_equation():
     for begin, end in itertools.pairwise(times):
         solved.append(solve_ivp(derivative, (begin, end - 1e-12), [solved[-1]], rtol=1e-10, atol=1e-12).y[0, -1])
     np.testing.assert_allclose(estimate["vy"], solved, atol=1e-8)
-
-
-def test_kinematic_integration_finds_the_time_constant_that_made_the_data():
     truth = new("kinematic")
     truth.values = {"time_constant": 1.7}
     drive = planar_drive(60.0)
@@ -86,10 +83,12 @@ def test_kinematic_integration_finds_the_time_constant_that_made_the_data():
     assert record.metrics["best_validation_loss"] < 1e-8
 
 
-def test_zero_is_zero(drive):
+def test_zero_is_zero_and_what_is_not_fitted_does_not_run(drive):
     (estimate,) = new("zero").estimate([drive.without_references()])
     assert not estimate["vy"].any()
     assert not estimate["sideslip"].any()
+    with pytest.raises(ConfigurationError, match="has not been fitted"):
+        new("static_map").online()
 
 
 def test_what_does_not_determine_a_static_map_is_refused(drive):
@@ -98,21 +97,3 @@ def test_what_does_not_determine_a_static_map_is_refused(drive):
     for recording in (straight, one_speed):
         with pytest.raises(DataError, match="do not determine a static map"):
             fitted("static_map", recording)
-
-
-@pytest.mark.parametrize(
-    ("settings", "message"),
-    [
-        ({}, "needs your car's wheelbase"),
-        ({"wheelbase": -1}, "wheelbase must be positive"),
-        ({"wheelbase": 2.4, "cg_to_rear_axle": 3.0}, "between 0 and the wheelbase"),
-    ],
-)
-def test_a_data_sheet_that_makes_no_sense_is_refused(settings, message):
-    with pytest.raises(ConfigurationError, match=message):
-        estimator_class("data_sheet").from_config({"rate_hz": 20.0, **settings})
-
-
-def test_nothing_runs_online_before_it_is_fitted():
-    with pytest.raises(ConfigurationError, match="has not been fitted"):
-        new("static_map").online()

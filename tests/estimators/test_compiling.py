@@ -17,7 +17,7 @@ from vehest.estimators.registry import estimator_class, estimator_names
 from vehest.trust.health import SLOW_KERNEL
 
 
-def test_a_learned_filter_has_to_compile_until_its_code_is_kept(tmp_path, monkeypatch):
+def test_a_learned_filter_has_to_compile_until_its_code_is_kept_and_never_without_compilation(tmp_path, monkeypatch):
     monkeypatch.setattr(planar_car, "_transition", SimpleNamespace(stats=SimpleNamespace(cache_path=str(tmp_path))))
     assert has_to_compile(estimator_class("learned_ukf").slow_kernel)
     assert not has_to_compile(estimator_class("luenberger").slow_kernel)
@@ -25,6 +25,8 @@ def test_a_learned_filter_has_to_compile_until_its_code_is_kept(tmp_path, monkey
     os.utime(tmp_path / "planar_car._transition-1.py311.nbi", (0.0, 0.0))
     assert has_to_compile(estimator_class("learned_ukf").slow_kernel)  # of an earlier installation
     (tmp_path / "planar_car._transition-1.py311.nbi").touch()
+    assert not has_to_compile(estimator_class("learned_ukf").slow_kernel)
+    monkeypatch.setattr(planar_car, "_transition", lambda: None)
     assert not has_to_compile(estimator_class("learned_ukf").slow_kernel)
 
 
@@ -34,11 +36,7 @@ def test_slow_kernels_are_entries_that_are_there(where):
     assert hasattr(getattr(importlib.import_module(module), name), "stats")
 
 
-def test_nothing_has_to_compile_where_compilation_is_off(monkeypatch):
-    monkeypatch.setattr(planar_car, "_transition", lambda: None)
-    assert not has_to_compile(estimator_class("learned_ukf").slow_kernel)
-
-
+@pytest.mark.apart
 @pytest.mark.parametrize("kernels", ["networks", pytest.param("cars", marks=pytest.mark.slow)])
 def test_the_process_that_compiles_has_the_digits_of_those_that_read_the_cache(tmp_path, kernels):
     here = Path(__file__).parent

@@ -12,7 +12,6 @@ from vehest.estimators.base import FitData
 from vehest.estimators.cnn_ukf import CnnUkf, EndToEndSettings
 from vehest.estimators.dugoff_ukf import DugoffUkf
 from vehest.estimators.filtering.track_filter import groups_of, in_nonlinear_range
-from vehest.filters.noise_levels import quiet_level
 from vehest.training.context import FitContext
 from vehest.training.identification import IdentificationSettings
 from vehest.training.search import optuna_search
@@ -38,7 +37,7 @@ def error_of(estimator, drive):
     return float(np.sqrt(np.mean((estimate["sideslip"] - drive["sideslip_ref"])[100:] ** 2)))
 
 
-def test_the_fit_finds_tyres_and_sensors_noise():
+def test_the_fit_finds_tyres_and_noise_with_measured_forces_and_without():
     drives = [dugoff_drive(30.0, seed, straight=5.0) for seed in (1, 2)]
     estimator = DugoffUkf.from_config({})
     record = estimator.fit(FitData(drives, [dugoff_drive(10.0, 3)]), QUICK)
@@ -49,9 +48,6 @@ def test_the_fit_finds_tyres_and_sensors_noise():
     assert record.metrics["noise_fy_front"] == pytest.approx(NOISE["fy"] * np.sqrt(2.0), rel=0.2)
     assert record.metrics["best_validation_loss"] < np.radians(0.3) ** 2
     assert estimator.n_parameters == 6 + 7
-
-
-def test_tyres_are_found_without_measured_forces():
     drives = [dugoff_drive(25.0, seed) for seed in (1, 2)]
     estimator = DugoffUkf.from_config({"inputs": "imu"})
     estimator.fit(FitData([drive.select([n for n in drive.channels if not n.startswith("fy")]) for drive in drives], []), QUICK)
@@ -101,10 +97,14 @@ def test_online_agrees_with_batch_through_gaps_and_standstill(inputs):
     np.testing.assert_allclose(batch["yaw_rate"][rolling[1:]], (drive["vx"] * drive["steer"])[rolling[1:] - 1] / 2.88, rtol=1e-12)
 
 
-def test_a_state_handed_over_is_where_the_estimate_starts():
+def test_errors_alike_count_as_fewer_measurements_and_states_handed_over_are_believed():
     drive = dugoff_drive(2.0, 7).without_references()
     first = given().estimate([drive], {"vy": -1.0, "yaw_rate": 0.2})[0]
     assert first["vy"][0] == pytest.approx(-1.0, abs=1e-6)
+    white, alike = (given(correlated_samples=own) for own in (1.0, 10.0))
+    (process, once), (same, tenfold) = (own.noise_covariances(own.levels) for own in (white, alike))
+    np.testing.assert_array_equal(process, same)
+    np.testing.assert_allclose(tenfold, 10.0 * once)
 
 
 def test_forces_are_trusted_with_a_hysteresis():
@@ -116,7 +116,7 @@ def test_forces_are_trusted_with_a_hysteresis():
     assert in_nonlinear_range(ay[3:4], 4.0, 3.0, before=True)[0]
 
 
-def test_process_noise_is_tuned_by_the_house_search():
+def test_process_noise_is_tuned_by_the_house_search_below_its_limit():
     estimator = DugoffUkf.from_config({"tyres": TYRES, "noise": FORCES})
     drives = [dugoff_drive(4.0, seed) for seed in (1, 2)]
     record = estimator.fit(FitData(drives, drives), IdentificationSettings(method="nelder_mead", grid=1, max_evaluations=12))
@@ -124,9 +124,13 @@ def test_process_noise_is_tuned_by_the_house_search():
     before = untuned.fit(FitData(drives, drives), IdentificationSettings(method="data"))
     assert record.metrics["best_validation_loss"] < before.metrics["best_validation_loss"]
     assert record.metrics["evaluations"] == 12
+    estimator = DugoffUkf.from_config({"tyres": TYRES, "noise": FORCES | {"ay": 0.06, "yaw_rate": 0.002}})
+    data = FitData([dugoff_drive(6.0)], [dugoff_drive(4.0, seed=2)])
+    estimator.fit(data, IdentificationSettings(trials=6, most_process_yaw_rate=2e-5, error="recordings"))
+    assert 1e-5 <= estimator.levels["process_yaw_rate"] <= 2e-5
 
 
-def test_sensors_levels_are_read_where_the_car_moves_and_tyres_where_loads_are_known():
+def test_levels_are_read_where_the_car_moves_and_tuned_on_the_reference_that_is_scored():
     drive, still = dugoff_drive(12.0, straight=4.0), np.arange(1200) >= 700
     quiet = {
         "ay": np.where(still, 0.0, drive["ay"]),
@@ -138,9 +142,6 @@ def test_sensors_levels_are_read_where_the_car_moves_and_tyres_where_loads_are_k
     gap = changed(drive, {"ax": np.where(still, np.nan, drive["ax"])}, ("ax",))
     with pytest.raises(DataError, match="recording 'drive': channel 'ax' has gaps"):
         DugoffUkf.from_config({}).fit(FitData([gap], []), QUICK)
-
-
-def test_levels_are_tuned_on_the_reference_that_is_scored():
     drive, data = dugoff_drive(3.0), IdentificationSettings(method="data")
     other = changed(drive, {"sideslip_ref": drive["sideslip_ref"] + 0.1})
     losses = [given().fit(FitData([], [own]), data).metrics["best_validation_loss"] for own in (drive, other)]
@@ -174,44 +175,12 @@ def test_stages_search_wide_bounds_and_then_close_to_the_best():
     assert search.cost == search.starts[:, -1].min()
 
 
-def test_without_optuna_an_error_names_the_way_out(monkeypatch):
+def test_what_makes_no_sense_or_is_not_installed_is_refused(monkeypatch):
     monkeypatch.setitem(sys.modules, "optuna", None)
     drives = [dugoff_drive(2.0)]
     with pytest.raises(MissingError, match="set method=nelder_mead in its settings"):
         DugoffUkf.from_config({"tyres": TYRES}).fit(FitData(drives, drives), IdentificationSettings())
-
-
-def test_noise_is_read_where_little_happens():
-    generator = np.random.default_rng(0)
-    lively = np.concatenate([np.zeros(2000), np.sin(np.arange(2000) / 5.0)])
-    shown = [0.1 * np.arange(4000) + 3.0 * lively + 0.5 * generator.standard_normal(4000)]
-    assert quiet_level(shown, [lively], 50) == pytest.approx(0.5, rel=0.1)
-    with pytest.raises(ValueError, match="without a gap"):
-        quiet_level([np.full(100, np.nan)], [np.zeros(100)], 50)
-
-
-def test_what_makes_no_sense_is_refused():
-    with pytest.raises(ConfigurationError, match="linear_below must lie between"):
-        DugoffUkf.from_config({"linear_below": 5.0})
-    with pytest.raises(ConfigurationError, match=r"estimator\.tyres: give all"):
-        DugoffUkf.from_config({"tyres": {"friction_front": 1.0}})
     with pytest.raises(ConfigurationError, match="has no tyres yet"):
         DugoffUkf.from_config({}).online()
-    with pytest.raises(ConfigurationError, match="cg_height must be positive"):
-        DugoffUkf.from_config({"car": {"cg_height": -1.0}})
     with pytest.raises(DataError, match=r"no training recording is called '\*skidpad\*'"):
         DugoffUkf.from_config({}).fit(FitData([dugoff_drive(2.0)], []), IdentificationSettings(method="data"))
-
-
-def test_errors_that_are_alike_over_samples_count_as_fewer_measurements():
-    white, alike = (given(correlated_samples=own) for own in (1.0, 10.0))
-    (process, once), (same, tenfold) = (own.noise_covariances(own.levels) for own in (white, alike))
-    np.testing.assert_array_equal(process, same)
-    np.testing.assert_allclose(tenfold, 10.0 * once)
-
-
-def test_the_search_for_the_yaw_rates_noise_stays_below_its_limit():
-    estimator = DugoffUkf.from_config({"tyres": TYRES, "noise": FORCES | {"ay": 0.06, "yaw_rate": 0.002}})
-    data = FitData([dugoff_drive(6.0)], [dugoff_drive(4.0, seed=2)])
-    estimator.fit(data, IdentificationSettings(trials=6, most_process_yaw_rate=2e-5, error="recordings"))
-    assert 1e-5 <= estimator.levels["process_yaw_rate"] <= 2e-5

@@ -1,4 +1,4 @@
-"""Estimators: counts of the paper, one interface, online as in batch, files that execute nothing."""
+"""Estimators: counts of the paper, one interface, online as in batch, files that execute nothing, trainings that start from others."""
 
 import math
 from dataclasses import fields
@@ -7,14 +7,18 @@ from functools import cache
 import numpy as np
 import pytest
 
+import vehest
+from conftest import planar_drive
 from every_estimator import drive_for, fitted
 from vehest.data.errors import ConfigurationError, DataError, MissingError
 from vehest.data.transforms import Resample
 from vehest.estimators.base import FitData
 from vehest.estimators.model_files import load_model, save_model
+from vehest.estimators.networks.windowed import WindowedEstimator
 from vehest.estimators.registry import estimator_class, estimator_names
 from vehest.run.config import compose_config
 from vehest.training.search import DirectSearchSettings
+from vehest.vehicle.parameters import FERRARI_250LM
 
 known = cache(fitted)
 """The same estimator for several tests, which leave it as it is."""
@@ -96,15 +100,12 @@ def test_model_read_back_estimates_the_same(tmp_path, name):
 
 @pytest.mark.parametrize("size", [0, 40, -8])
 def test_truncated_weights_are_one_clear_error(tmp_path, size):
+    with pytest.raises(MissingError, match="holds no model"):
+        load_model(tmp_path)
     save_model(known("ksnn", "float64"), tmp_path)
     weights = tmp_path / "model.safetensors"
     weights.write_bytes(weights.read_bytes()[:size])
     with pytest.raises(DataError, match="truncated or damaged"):
-        load_model(tmp_path)
-
-
-def test_folder_without_model_is_one_clear_error(tmp_path):
-    with pytest.raises(MissingError, match="holds no model"):
         load_model(tmp_path)
 
 
@@ -141,24 +142,16 @@ def test_a_number_that_is_given_is_not_fitted(drive):
     assert estimator.threshold >= 0.0
 
 
-def test_sideslip_is_atan2_of_estimated_vy_and_measured_vx(drive):
-    estimate = known("gru", "float64").estimate([drive.without_references()])[0]
-    assert np.array_equal(estimate["sideslip"], np.arctan2(estimate["vy"], drive["vx"]), equal_nan=True)
-
-
-def test_luenberger_starts_from_a_state_that_is_handed_over():
+def test_recordings_start_from_their_own_states_or_all_from_one_and_forget_them(monkeypatch, drive):
+    with pytest.raises(ConfigurationError, match="no state to start from"):
+        known("ksnn", "float64").estimate([drive], {"vy": 1.0})
     estimator = fitted("luenberger")
-    estimator.threshold = 0.0
-    drive = drive_for(estimator)
+    estimator.threshold, drive = 0.0, drive_for(estimator)
     free = estimator.estimate([drive])[0]["vy"]
     started = estimator.estimate([drive], {"vy": 2.0})[0]["vy"]
     assert abs(started[0] - free[0]) > 1.0
     assert abs(started[-1] - free[-1]) < 0.05, "the observer forgets where it started"
-
-
-def test_each_recording_starts_from_its_own_state_or_all_from_one(monkeypatch):
     estimator = known("luenberger", "float64")
-    drive = drive_for(estimator)
     states = [{"vy": 2.0}, {"vy": -1.0, "vx": 20.0}]
     both = estimator.estimate([drive, drive], states)
     for state, own in zip(states, both, strict=True):
@@ -169,11 +162,6 @@ def test_each_recording_starts_from_its_own_state_or_all_from_one(monkeypatch):
         estimator.estimate([drive], states)
     monkeypatch.setattr(type(estimator), "ignores_initial_state", True)
     assert np.array_equal(estimator.estimate([drive], states[0])[0]["vy"], estimator.estimate([drive])[0]["vy"])
-
-
-def test_window_network_has_no_state_to_start_from(drive):
-    with pytest.raises(ConfigurationError, match="no state to start from"):
-        known("ksnn", "float64").estimate([drive], {"vy": 1.0})
 
 
 def test_registry_knows_names():
@@ -193,6 +181,44 @@ def test_registry_knows_names():
         ("ksnn", {"n_local": 0}, "n_local must be at least 1"),
         ("gru", {"n_states": 2.5}, "n_states must be a whole number"),
         ("luenberger", {"gains": 3}, "gains is not an option"),
+        ("kalman", {"noise": {"ay": -1}}, r"estimator\.noise\.ay must be positive"),
+        ("kalman", {"noise": {"cutoff": 1.5}}, "cutoff must lie between"),
+        ("kalman", {"car": {**vars(FERRARI_250LM), "mass": -3}}, r"estimator\.car: mass must be positive, not -3"),
+        ("kalman", {"minimum_speed": 0}, "minimum_speed must be positive"),
+        ("kalman", {"offsets": {"ay": 0.0}}, r"estimator\.offsets\.ay must be positive"),
+        ("factor_graph", {"window": 0}, "window must be null or at least one sampling interval, 0.01 s, not 0.0 s"),
+        ("factor_graph", {"noise": {"measured_ay": 0}}, r"estimator\.noise\.measured_ay must be positive"),
+        ("factor_graph", {"gate": 5.0}, r"estimator\.gate needs estimator\.window"),
+        ("rational_ekf", {"tyres": "square"}, "tyres 'square' is not one of: linear, rational"),
+        ("rational_ekf", {"bound": 1.0}, "bound must be more than 1"),
+        ("rational_ekf", {"largest_sideslip": 1.6}, r"largest_sideslip must lie between 0 and 1\.5 rad, not at 1\.6"),
+        ("rational_ekf", {"noise": {"yaw_rate": 0.1}}, "estimator.noise: give all of yaw_rate, ay, steer, or none"),
+        ("rational_ekf", {"curves": {"c1_front": 0.1}}, "estimator.curves: give all of c1_front, c2_front, c1_rear, c2_rear, or none"),
+        ("velocity_gru", {"inputs": ["ax", "ax"]}, "list of different channels"),
+        ("velocity_gru", {"inputs": ["warp"]}, "channel 'warp' is not known"),
+        ("velocity_gru", {"inputs": ["vy_ref"]}, "'vy_ref' comes from a reference sensor"),
+        ("velocity_gru", {"outputs": ["vx"]}, "vy among them, not vx"),
+        ("velocity_gru", {"dropout": 1.0}, "dropout must lie between 0 and 1"),
+        ("velocity_gru", {"negative_slope": 0.0}, "negative_slope must lie between 0 and 1"),
+        ("learned_ukf", {"dynamics": "magic"}, "dynamics 'magic' is not one of: pacejka, residual"),
+        ("learned_ukf", {"start_friction": 0.01}, "start_friction must lie above least_friction"),
+        ("learned_ukf", {"car": {"cg_to_rear_axle": 0.4}}, "less than the wheelbase"),
+        ("data_sheet", {}, "needs your car's wheelbase"),
+        ("data_sheet", {"wheelbase": -1}, "wheelbase must be positive"),
+        ("data_sheet", {"wheelbase": 2.4, "cg_to_rear_axle": 3.0}, "between 0 and the wheelbase"),
+        ("dugoff_ukf", {"linear_below": 5.0}, "linear_below must lie between"),
+        ("dugoff_ukf", {"tyres": {"friction_front": 1.0}}, r"estimator\.tyres: give all"),
+        ("dugoff_ukf", {"car": {"cg_height": -1.0}}, "cg_height must be positive"),
+        ("ensemble_ukf", {"members": 1}, "estimator"),
+        ("ensemble_ukf", {"variance": "all"}, "estimator"),
+        ("cnn_ukf", {"hidden": [0, 3]}, "estimator"),
+        ("sideslip_ffnn", {"inputs": "all"}, "estimator"),
+        ("sideslip_ffnn", {"hidden": [5]}, "estimator"),
+        ("sideslip_ffnn", {"hidden": "ab"}, "estimator"),
+        ("sideslip_ffnn", {"dropout": 1.0}, "estimator"),
+        ("sideslip_ffnn", {"normalisation": "rank"}, "estimator"),
+        ("self_calibrating", {"wheelbase": 2.7, "cg_to_rear_axle": 3.0}, "cg_to_rear_axle must lie between 0 and the wheelbase"),
+        ("self_calibrating", {"grips": [9.0, -1.0]}, "grips must be positive"),
     ],
 )
 def test_settings_that_make_no_sense_are_refused(name, config, message):
@@ -213,3 +239,39 @@ def test_activations_partition_unity_and_end_with_the_last_model():
     assert torch.allclose(phi[1], torch.tensor([0.5, 0.5, 0.0]))
     assert torch.allclose(phi[2], torch.tensor([0.0, 1.0, 0.0]), atol=1e-6)
     assert torch.allclose(phi[4], torch.tensor([0.0, 0.0, 1.0]))
+
+
+OF_SHIPPED = ["estimator.n_local=2", "estimator.n_hidden=2", "estimator.bias=false"]
+STANDING = ["training.max_epochs=1", "training.learning_rate=1e-12"]
+
+
+@pytest.fixture(scope="module")
+def drives():
+    return [planar_drive(30.0, 20.0, seed=seed) for seed in (1, 2)]
+
+
+def weights(model):
+    assert isinstance(model, WindowedEstimator)
+    return np.concatenate([values.ravel() for values in model.weights().values()])
+
+
+def test_a_training_that_does_not_move_ends_where_it_started_and_other_settings_are_refused(drives):
+    from vehest.run.estimate import pretrained_folder
+
+    started = vehest.train("ksnn", drives[:1], drives[1:], [*OF_SHIPPED, *STANDING, f"training.start_from={pretrained_folder()}"])
+    assert weights(started) == pytest.approx(weights(vehest.load_model()), abs=1e-6)
+    scratch = vehest.train("ksnn", drives[:1], drives[1:], [*OF_SHIPPED, *STANDING])
+    assert np.abs(weights(scratch) - weights(started)).max() > 0.01
+    from vehest.run.estimate import pretrained_folder
+
+    with pytest.raises(ConfigurationError, match=r"training\.start_from: 'pretrained' is KS-NN .*'n_hidden': 2.*'n_hidden': 0"):
+        vehest.train("ksnn", drives[:1], drives[1:], ["estimator.n_hidden=0", f"training.start_from={pretrained_folder()}"])
+
+
+def test_the_model_counts_as_an_input_and_is_found_by_name(place):
+    common = ("estimator=ksnn", "split=mine", "training.max_epochs=1", "tracking=none", *OF_SHIPPED)
+    assert place("train", *common)[0] == 0
+    code, out, _ = place("train", *common, "training.start_from=pretrained")
+    assert code == 0
+    assert "skipped: False" in out or "up to date" not in out
+    assert place.refused("train", *common, "training.start_from=nobody")[1].startswith("error: there is no model 'nobody'")

@@ -1,18 +1,21 @@
-"""Every filter with a gate: one spike does no harm, a jump of the truth is followed, online is batch, and nothing changes without it."""
+"""Filters with a gate: a spike does no harm, a jump is followed, online is batch; a step that raises leaves any stepper as it was."""
 
+import math
 from dataclasses import replace
 from functools import cache
+from itertools import product
 
 import numpy as np
 import pytest
 import torch
 
 from dugoff_drive import TYRES, dugoff_drive
+from every_estimator import fitted
 from rational_drive import CURVES, rational_drive
 from single_track_drive import NOISE, linear_drive
 from small_car_drive import small_car_drive
-from vehest.data.errors import ConfigurationError
-from vehest.estimators.registry import estimator_class
+from vehest.data.errors import ConfigurationError, DataError
+from vehest.estimators.registry import estimator_class, estimator_names
 
 SPIKE, JUMP = 6.0, 8.0  # s
 DUGOFF = {"inputs": "imu", "tyres": TYRES, "noise": {"ay": 0.06, "yaw_rate": 0.002, "process_vy": 0.002, "process_yaw_rate": 0.002}}
@@ -126,21 +129,79 @@ def test_online_with_a_gate_is_batch_with_a_gate(name):
 
 
 @EVERY
-def test_a_variant_with_a_gate_is_called_another(name):
+def test_a_variant_with_a_gate_is_called_another_and_a_gate_of_nothing_refused(name):
     assert estimator(name, 5.0).variant.replace("_gate5", "") == estimator(name).variant != estimator(name, 5.0).variant
     assert "gated at 5 sigma" in estimator(name, 5.0).full_title
-
-
-@EVERY
-def test_a_gate_of_nothing_is_refused(name):
     with pytest.raises(ConfigurationError, match=r"estimator\.gate must be positive"):
         estimator(name, 0.0)
 
 
-def test_a_gate_of_the_unscented_filter_on_rational_tyres_is_refused():
+def test_learned_filters_share_their_training_with_gates_and_unscented_ones_have_none():
     with pytest.raises(ConfigurationError, match=r"estimator\.gate is there for estimator\.filter=extended only"):
         estimator_class("rational_ekf").from_config({**CONFIGS["rational_ekf"], "filter": "unscented", "gate": 5.0})
-
-
-def test_a_learned_filter_is_trained_once_for_use_with_a_gate_and_without():
     assert estimator("learned_ukf", 5.0).batch_key == estimator("learned_ukf").batch_key
+
+
+SETTINGS = {
+    "data_sheet": {"wheelbase": 2.7},
+    "ksnn": {"window": 5},
+    "gru": {"window": 5},
+    "lstm": {"window": 5},
+    "velocity_gru": {"inputs": ["vx", "yaw_rate", "ay", "ax"], "outputs": ["vx", "vy"], "n_states": 4},
+    "velocity_lstm": {"inputs": ["vx", "yaw_rate", "ay", "ax"], "outputs": ["vx", "vy"], "n_states": 4},
+    "sideslip_ffnn": {"inputs": "imu", "hidden": [8, 4]},
+}
+FILTERS = ("kalman", "factor_graph", "rational_ekf", "dugoff_ukf", "cnn_ukf", "learned_ukf", "learned_ukf_variant")
+FITTED = ("kinematic", "static_map", "luenberger")  # in a moment
+OTHERS = [name for name in estimator_names() if name not in (*FILTERS, "ensemble_ukf")]  # whose stepper is that of cnn_ukf
+
+
+known = cache(fitted)
+
+
+def ready(name):
+    """As it starts to learn, where that runs already."""
+    if name in FITTED:
+        return known(name)
+    made = estimator(name, 5.0) if name in FILTERS else estimator_class(name).from_config(SETTINGS.get(name, {}))
+    made.seed(0)
+    return made
+
+
+def rows(name):
+    recording = small_car_drive(2.0) if name.startswith("learned_ukf") else linear_drive(2.0)[0]
+    return [{channel: float(recording[channel][k]) for channel in recording.channels} for k in range(60)]
+
+
+def missing(row):
+    """Without what every method reads, or fails without."""
+    return {name: value for name, value in row.items() if name not in ("ay", "vx", "steer")}
+
+
+def infinite(row):
+    return {**row, "ay": math.inf}
+
+
+def none(row):
+    return {**row, "yaw_rate": None, "vx": None}
+
+
+def motion(steps):
+    return np.array([step["vy"] for step in steps])
+
+
+@pytest.mark.parametrize(
+    ("name", "wrong"),
+    [*product((*FILTERS, *OTHERS), (missing, none)), *product(FILTERS, (infinite,))],  # others take an infinite value
+)
+def test_who_goes_on_after_a_step_that_raised_gets_what_he_would_have_got(name, wrong):
+    made, samples = ready(name), rows(name)
+    calm, disturbed = made.online(), made.online()
+    expected = motion([calm.step(row) for row in samples])
+    found = []
+    for k, row in enumerate(samples):
+        if k in (0, 1, 20, 21, 40):
+            with pytest.raises((DataError, TypeError)):
+                disturbed.step(wrong(row))
+        found.append(disturbed.step(row))
+    assert np.array_equal(motion(found), expected, equal_nan=True)

@@ -3,7 +3,6 @@
 import threading
 from types import SimpleNamespace
 
-import numba
 import numpy as np
 import pytest
 import torch
@@ -54,13 +53,12 @@ def _problem(estimator, dtype, members=3, batch=70):
 
 
 @pytest.mark.parametrize("estimator", STRUCTURES, ids=lambda e: f"{e.name}-{e.variant}")
-@pytest.mark.parametrize(("dtype", "tolerance"), [(torch.float64, 1e-12), (torch.float32, 2e-5)])
-def test_compiled_recursion_equals_plain_one_in_value_and_gradient(estimator, dtype, tolerance):
-    value_and_gradient = _problem(estimator, dtype)
+def test_compiled_recursion_equals_plain_one_in_single_precision(estimator):
+    value_and_gradient = _problem(estimator, torch.float32)  # in double precision: test_twins
     (value, gradient), (plain_value, plain_gradient) = value_and_gradient(True), value_and_gradient(False)
     scale, gradient_scale = plain_value.abs().max(), plain_gradient.abs().max()
-    assert (value - plain_value).abs().max() <= tolerance * scale
-    assert (gradient - plain_gradient).abs().max() <= tolerance * gradient_scale
+    assert (value - plain_value).abs().max() <= 2e-5 * scale
+    assert (gradient - plain_gradient).abs().max() <= 2e-5 * gradient_scale
 
 
 @pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
@@ -113,21 +111,7 @@ def test_ksnn_beyond_its_last_centre_and_at_its_centres_equals_the_plain_one():
     assert (gradients[0] - gradients[1]).abs().max() <= 1e-12 * gradients[1].abs().max()
 
 
-def test_gradient_of_the_ksnn_equals_finite_differences():
-    estimator = Ksnn(Ksnn.settings_type(n_local=3, n_hidden=1, bias=True))
-    drive = planar_drive(10.0)
-    network = estimator.network_for([drive]).double()
-    network.reset(torch.Generator().manual_seed(1))
-    layout = FlatParameters(network)
-    windows = windows_of([drive], estimator.channels, "vy_ref", 30)
-    series, starts = torch.as_tensor(windows.series), torch.as_tensor(windows.starts[:8]).unsqueeze(0)
-    flat = layout.pack([network]).requires_grad_()
-    assert torch.autograd.gradcheck(
-        lambda rows: predict_members(network, layout.views(rows), series, starts, 30, compiled=True), (flat,), eps=1e-6, atol=1e-6
-    )
-
-
-def test_gru_equals_the_library_gru():
+def test_gru_and_lstm_equal_those_of_the_library():
     states = 5
     network = Gru(Gru.settings_type(n_states=states)).new_network().double()
     network.reset(torch.Generator().manual_seed(3))
@@ -141,9 +125,6 @@ def test_gru_equals_the_library_gru():
         library.bias_hh_l0.zero_()
     windows = torch.randn(11, 30, 4, generator=torch.Generator().manual_seed(5), dtype=torch.float64)
     assert torch.allclose(network.last_state(windows), library(windows)[1][0], rtol=0, atol=1e-12)
-
-
-def test_lstm_equals_the_library_lstm():
     states = 6
     network = Lstm(Lstm.settings_type(n_states=states)).new_network().double()
     network.reset(torch.Generator().manual_seed(3))
@@ -160,13 +141,10 @@ def test_lstm_equals_the_library_lstm():
     assert torch.allclose(network.last_state(windows), library(windows)[1][0][0], rtol=0, atol=1e-12)
 
 
-def test_rational_tanh_is_within_2e_7_of_tanh():
+def test_activations_in_single_precision_are_within_rounding_of_the_exact_ones():
     x = np.linspace(-12.0, 12.0, 20001).astype(np.float32)
     assert np.abs(np.array([rational_tanh(value) for value in x]) - np.tanh(x.astype(np.float64))).max() < 2e-7
 
-
-def test_softplus_and_arctan_in_single_precision_are_within_rounding_of_the_exact_ones():
-    @numba.njit(error_model="numpy")
     def apply(x, above, angle):
         for i in range(x.size):
             above[i], angle[i] = softplus(x[i]), arctan(x[i])
@@ -179,7 +157,7 @@ def test_softplus_and_arctan_in_single_precision_are_within_rounding_of_the_exac
     assert np.allclose(angle, np.arctan(exact), rtol=3e-7, atol=0)
 
 
-def test_compiled_observer_equals_the_readable_one():
+def test_compiled_observer_equals_the_readable_one_and_resets_below_the_threshold():
     drive = planar_drive(20.0, 100.0, noise=0.02)
     measurements = drive.stack(("yaw_rate", "vx", "ay", "ax"))
     vy, vx = np.empty(len(drive)), np.empty(len(drive))
@@ -187,28 +165,6 @@ def test_compiled_observer_equals_the_readable_one():
     compiled_vy, compiled_vx = observe(measurements, 6.0, 0.1, 0.01)
     assert np.array_equal(vy, compiled_vy)
     assert np.array_equal(vx, compiled_vx)
-
-
-def test_observer_has_the_transfer_functions_of_appendix_b():
-    """At constant yaw rate the response to a_y and a_x is that of Eqs. 18 and 19 of Da Lio et al. 2023."""
-    omega, alpha, step, n = 0.4, 5.0, 0.01, 400
-    denominator = [alpha**2 * omega**2 * step**2 + 2 * omega * alpha * step + 1, -2 * omega * alpha * step - 2, 1.0]
-    for column, numerator in ((2, [(2 * omega * alpha * step + 1) * step, -step, 0.0]), (3, [-(alpha**2) * omega * step**2, 0.0, 0.0])):
-        measurements = np.zeros((n, 4))
-        measurements[:, 0] = omega
-        measurements[0, column] = 1.0
-        vy, _ = observe(measurements, alpha, 0.0, step, 0.0, 0.0)
-        expected, padded = np.zeros(n), np.zeros(n + 2)
-        impulse = np.zeros(n + 2)
-        impulse[2] = 1.0
-        for k in range(n):
-            forced = sum(b * impulse[k + 2 - i] for i, b in enumerate(numerator))
-            padded[k + 2] = (forced - denominator[1] * padded[k + 1] - denominator[2] * padded[k]) / denominator[0]
-        expected = padded[2:]
-        assert np.allclose(vy, expected, rtol=0, atol=1e-12)
-
-
-def test_observer_resets_below_the_threshold():
     measurements = np.tile([0.05, 20.0, 3.0, 0.0], (10, 1))
     vy, vx = observe(measurements, 5.0, 0.1, 0.01)
     assert (vy == 0.0).all()

@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from dugoff_drive import dugoff_drive
-from vehest.data.errors import ConfigurationError, DataError
+from vehest.data.errors import DataError
 from vehest.data.recording import Recording
 from vehest.estimators.base import FitData
 from vehest.estimators.kernels.sample_network import gaussian_likelihood, kept, losses_of, outputs_of, squared_error
@@ -113,14 +113,6 @@ def test_masks_hide_their_share_and_follow_from_the_seed():
         assert (mask == other).mean() == pytest.approx(0.8**2 + 0.2**2, abs=0.01)
 
 
-def test_inputs_of_training_lie_between_zero_and_one_and_constant_ones_say_nothing():
-    made = SampleNetwork(2, (4, 3), 1).double()
-    made.scale(np.array([[-2.0, 5.0], [6.0, 5.0]]), np.array([0.3, -0.4]))
-    seen = made.scaled(torch.tensor([[-2.0, 5.0], [6.0, 5.0], [10.0, 7.0]], dtype=torch.float64))
-    torch.testing.assert_close(seen, torch.tensor([[0.0, 0.0], [1.0, 0.0], [1.5, 0.0]], dtype=torch.float64))
-    assert float(made.unit) == pytest.approx(np.sqrt(0.125))
-
-
 def fitted(training=QUICK, **config):
     estimator = estimator_class("sideslip_ffnn").from_config({"hidden": [24, 12], "dropout": 0.05} | config)
     estimator.seed(1)
@@ -160,9 +152,6 @@ def test_what_is_missing_or_makes_no_sense_is_said():
     drive = dugoff_drive(2.0)
     with pytest.raises(DataError, match=r"'fx_fl', which estimator 'sideslip_ffnn' learns from; set estimator.inputs=imu"):
         estimator_class("sideslip_ffnn").from_config({}).fit(FitData([drive], [drive]), QUICK)
-    for config in ({"inputs": "all"}, {"hidden": [5]}, {"hidden": "ab"}, {"dropout": 1.0}, {"normalisation": "rank"}):
-        with pytest.raises(ConfigurationError, match="estimator"):
-            estimator_class("sideslip_ffnn").from_config(config)
 
 
 def test_inputs_are_scaled_by_their_range_or_to_z_scores():
@@ -174,4 +163,6 @@ def test_inputs_are_scaled_by_their_range_or_to_z_scores():
     network.scale(inputs, np.ones(50), "standard")
     scaled = network.scaled(torch.as_tensor(inputs)).numpy()
     np.testing.assert_allclose([scaled[:, 0].mean(), scaled[:, 0].std(), *scaled[:, 1]], [0.0, 1.0, *np.zeros(50)], atol=1e-12)
+    network.scale(np.array([[-2.0, 5.0], [6.0, 5.0]]), np.array([0.3, -0.4]))
+    assert float(network.unit) == pytest.approx(np.sqrt(0.125))
     assert estimator_class("sideslip_ffnn").from_config({"normalisation": "standard"}).variant == "full_standard"

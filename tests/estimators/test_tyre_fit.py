@@ -69,11 +69,6 @@ def test_intervals_hold_the_truth_about_as_often_as_they_say():
     assert 0.7 < np.mean(inside) <= 1.0
 
 
-def test_wider_intervals_where_tyres_stay_in_their_linear_range():
-    gentle, hard = fit_tyres([drive(size=0.3)], TRUCK), fit_tyres([drive()], TRUCK)
-    assert (gentle.interval[:, 0] > 5.0 * hard.interval[:, 0]).all()  # c1, which bends the curve
-
-
 def test_where_drives_say_nothing_of_the_bend_what_is_known_of_road_tyres_stands():
     """c1 stays where tyres peak at 9 degrees and as uncertain as that is, while c2 is what the drive says."""
     fit = fit_tyres([drive(size=0.05)], TRUCK)
@@ -83,19 +78,13 @@ def test_where_drives_say_nothing_of_the_bend_what_is_known_of_road_tyres_stands
     np.testing.assert_allclose([fit.front[1], fit.rear[1]], CURVES["rational"][:, 1], rtol=0.08)
 
 
-def test_forces_that_were_measured_are_taken_as_they_are():
+def test_measured_forces_and_several_drives_count_and_slow_samples_do_not():
     own = drive(noise=0.0)
     wheels = {f"fy_{wheel}": np.full(len(own), value) for wheel, value in (("fl", 1.0), ("fr", 2.0), ("rl", 10.0), ("rr", 20.0))}
     motion = axle_motion([replace(own, channels={**own.channels, **wheels})], TRUCK, measured_forces=True)
     np.testing.assert_allclose(motion.force, np.repeat([[3.0], [30.0]], motion.force.shape[1], axis=1))
-
-
-def test_several_drives_count_together():
     both = fit_tyres([drive(seed=1), drive(seed=2)], TRUCK)
     assert both.slip.shape[1] == 2 * fit_tyres([drive(seed=1)], TRUCK).slip.shape[1]
-
-
-def test_slow_and_missing_samples_are_left_out():
     own = drive()
     slow, unknown = np.array(own["vx"]), np.array(own["ay"])
     slow[:500], unknown[1000:1100] = 1.0, np.nan

@@ -69,18 +69,10 @@ def markov(generator, n, deviation, time_constant):
     return values
 
 
-# Noise of the reference
-
-
 @pytest.mark.parametrize("sigma", [0.003, 0.02, 0.1])
 def test_white_noise_on_a_reference_is_measured_to_a_few_per_cent(sigma):
     floor = reference_floor([drive_of(noisy_reference(sigma), Span("d", "drive"), PROTOCOL)])
     assert floor.vy == pytest.approx(sigma, rel=0.04)
-
-
-def test_noise_of_the_accelerometer_is_not_taken_for_that_of_the_reference():
-    floor = reference_floor([drive_of(noisy_reference(0.01, ay_noise=0.5), Span("d", "drive"), PROTOCOL)])
-    assert floor.vy == pytest.approx(0.01, rel=0.06)
 
 
 def test_perfect_estimate_scores_the_floor_of_a_noisy_reference():
@@ -103,29 +95,20 @@ def test_manoeuvres_that_the_inertial_signals_explain_are_no_noise():
     assert reference_floor([drive]).vy == pytest.approx(0.005, rel=0.1)
 
 
-def test_reference_in_coarse_steps_errs_by_at_least_its_step_over_root_twelve():
+def test_coarse_or_few_samples_bound_the_floor_and_smoothing_hides_noise():
     drive = planar_drive(200.0)
     coarse = Recording("d", "car", RATE, 0.0, {**drive.channels, "vy_ref": 0.1 * np.round(drive["vy_ref"] / 0.1)})
     assert quantisation_step(coarse["vy_ref"]) == pytest.approx(0.1)
     assert quantisation_step(drive["vy_ref"]) == 0.0
     assert reference_floor([drive_of(coarse, Span("d", "d"), PROTOCOL)]).vy >= 0.1 / math.sqrt(12) - 1e-9
-
-
-def test_smoothing_hides_noise_so_that_the_floor_is_a_lower_bound():
     noisy = noisy_reference(0.05)
     smooth = np.convolve(noisy["vy_ref"], np.full(5, 0.2), "same")
     hidden = Recording("d", "car", RATE, 0.0, {**noisy.channels, "vy_ref": smooth})
     left = np.std((smooth - planar_drive(400.0)["vy_ref"])[10:-10])
     assert reference_floor([drive_of(hidden, Span("d", "d"), PROTOCOL)]).vy < left
-
-
-def test_drive_of_few_samples_has_no_floor():
     drive = drive_of(planar_drive(2.0), Span("d", "drive"), PROTOCOL)
     assert reference_floor([drive]) is None
     assert cramer_rao_floor([drive], SETS[1]) is None
-
-
-# The bound: its recursion
 
 
 def random_model(steps, n=4, m=2, seed=1):
@@ -136,7 +119,7 @@ def random_model(steps, n=4, m=2, seed=1):
     return LinearModel(A, np.zeros(n), Q, generator.standard_normal((steps, m, n)), np.zeros(m), R), P
 
 
-def test_bound_is_the_inverse_of_the_information_of_tichavsky_and_others():
+def test_bound_is_that_of_tichavsky_and_others_and_of_another_librarys_filter():
     """J(k+1) = D22 - D21 (J(k) + D11)⁻¹ D12 (their Eq. 21) with D11 = AᵀQ⁻¹A, D12 = -AᵀQ⁻¹, D22 = Q⁻¹ + CᵀR⁻¹C."""
     model, prior = random_model(200)
     bound = posterior_bound(model, prior)
@@ -149,9 +132,6 @@ def test_bound_is_the_inverse_of_the_information_of_tichavsky_and_others():
             A = model.transition[k]
             D11, D12 = A.T @ inverse_Q @ A, -A.T @ inverse_Q
             information = inverse_Q + told[k + 1] - D12.T @ np.linalg.solve(information + D11, D12)
-
-
-def test_bound_is_the_covariance_of_another_librarys_kalman_filter():
     model, prior = random_model(50)
     other = KalmanFilter(dim_x=4, dim_z=2)
     other.P, other.Q, other.R = prior.copy(), model.process_noise, model.observation_noise
@@ -169,10 +149,7 @@ def test_long_drives_are_bounded_in_chunks_of_the_same_outcome(monkeypatch):
     assert (chunks.vy, chunks.sideslip) == (pytest.approx(whole.vy, rel=1e-9), pytest.approx(whole.sideslip, rel=1e-9))
 
 
-# The bound: its levels
-
-
-def test_white_and_slow_noise_are_told_apart():
+def test_white_and_slow_noise_are_told_apart_and_their_times_found():
     """40 minutes of known noise: white of 0.3 at 20 Hz, a density of 0.0045, and a slow part of 0.2 that lasts 8 s."""
     generator = np.random.default_rng(4)
     n = 48_000
@@ -180,20 +157,11 @@ def test_white_and_slow_noise_are_told_apart():
     assert found.density == pytest.approx(0.3**2 / RATE, rel=0.15)
     assert found.deviation == pytest.approx(0.2, rel=0.1)
     assert found.time_constant == pytest.approx(8.0, rel=0.35)
-
-
-def test_white_noise_alone_has_no_slow_part_to_speak_of():
     found = split_noise([0.3 * np.random.default_rng(5).standard_normal(48_000)], RATE)
     assert found.density == pytest.approx(0.3**2 / RATE, rel=0.15)
     assert found.deviation < 0.02
-
-
-def test_spread_and_correlation_time_of_a_process_are_found():
     found = gauss_markov([markov(np.random.default_rng(6), 48_000, 0.7, 2.5)], RATE)
     assert found == Noise(0.0, pytest.approx(0.7, rel=0.1), pytest.approx(2.5, rel=0.2))
-
-
-# The bound: of drives
 
 
 def test_more_inputs_never_raise_the_bound_and_none_exceeds_the_spread_of_the_reference():
@@ -211,12 +179,9 @@ def test_more_inputs_never_raise_the_bound_and_none_exceeds_the_spread_of_the_re
             assert found[frozenset({"vx", "yaw_rate"})].vy < 0.5 * spread.vy
 
 
-def test_kinematics_alone_tells_nothing_without_accelerations():
+def test_kinematics_tell_v_by_accelerations_in_bends_alone():
     drives = [drive_of(single_track_drive(), Span("d", "track"), Protocol(RATE, 0.0, 0.0))]
     assert cramer_rao_floor(drives, SETS[0], car=False).vy == pytest.approx(reference_spread(drives).vy, rel=1e-6)
-
-
-def test_longitudinal_acceleration_tells_v_in_bends_and_not_straight_ahead():
     bends = single_track_drive()
     straight = Recording("s", "car", RATE, 0.0, {**bends.channels, "yaw_rate": np.zeros(len(bends))})
     for recording, helps in ((bends, True), (straight, False)):
@@ -246,13 +211,6 @@ def test_a_filter_that_knows_the_model_reaches_the_bound_of_a_drive():
     assert cramer_rao_floor(drives, SETS[1], car=False).vy == pytest.approx(np.sqrt(np.mean(np.square(errors))), rel=0.1)
 
 
-def test_state_that_is_handed_over_lowers_the_bound_of_short_sequences():
-    cold, told = (
-        [drive_of(single_track_drive(12.0), Span("d", "track"), Protocol(RATE, 0.0, 0.0, initial_state=given))] for given in (False, True)
-    )
-    assert cramer_rao_floor(told, SETS[1], car=False).vy < cramer_rao_floor(cold, SETS[1], car=False).vy
-
-
 def test_gaps_and_standstill_leave_the_bound_finite():
     drive = single_track_drive(60.0)
     vx, ay = drive["vx"].copy(), drive["ay"].copy()
@@ -275,29 +233,17 @@ def test_drives_without_noise_or_without_motion_leave_every_bound_finite(scale):
                 assert 0 <= cramer_rao_floor(drives, inputs, car=car).vy <= spread.vy + 1e-8
 
 
-# Which bound is whose
-
-
-def test_inputs_of_an_estimator_decide_its_bound():
+def test_inputs_of_an_estimator_decide_which_bound_it_has_if_any():
     assert inputs_of(("yaw_rate", "vx", "ay", "ax")) == {"yaw_rate", "vx", "ay", "ax"}
     assert inputs_of(("motor_speed", "motor_current", "yaw_rate", "steer")) == {"vx", "yaw_rate", "steer"}
     assert inputs_of(("wheel_speed_fl", "yaw_rate", "handwheel")) == {"vx", "yaw_rate", "steer"}
-
-
-def test_no_bound_suits_an_estimator_without_yaw_rate_or_with_measured_tyre_forces():
     assert inputs_of(("vx",)) is None
     assert inputs_of(("vx", "yaw_rate", "ay", "fy_front_left")) is None
-
-
-def test_bound_of_inputs_that_a_drive_lacks_is_none_and_of_unknown_ones_refused():
     drives = [drive_of(single_track_drive(30.0).select(["vx", "yaw_rate", "vy_ref"]), Span("d", "track"), PROTOCOL)]
     assert cramer_rao_floor(drives, SETS[0]) is not None
     assert cramer_rao_floor(drives, SETS[1]) is None
     with pytest.raises(ValueError, match="inputs of a bound are vx, yaw_rate and some of"):
         cramer_rao_floor(drives, ("vx", "ay"))
-
-
-# A real drive
 
 
 @pytest.mark.skipif(not FERRARI.is_dir(), reason="VEHEST_DATA holds no revs/20140222_01_01_03_250lm")

@@ -1,25 +1,28 @@
-"""Metrics against their definitions on series whose errors are known."""
+"""Metrics, best lever arms and indicators over manoeuvres against their definitions on series whose errors are known."""
 
 import math
 from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy import optimize
 
 from conftest import planar_drive
 from vehest.data.errors import DataError
 from vehest.data.estimate import Estimate
+from vehest.data.recording import Recording
 from vehest.data.splits import Span
 from vehest.evaluation.blocks import segments_of
+from vehest.evaluation.lever_arm import LONGEST, best_lever_arm, lever_arm_figures
 from vehest.evaluation.metrics import UNITS, Protocol, Scored, accuracy, score, weighted_squared_errors
-from vehest_papers.cnn_ukf.manoeuvres import kpis
+from vehest_papers.cnn_ukf.manoeuvres import error_distribution, group_of, kpis, kpis_by_group, manoeuvres_of
 
 
 def _estimate(times, vy, rate_hz, start):
     return Estimate("drive", "test", rate_hz, start, {"vy": vy, "sideslip": np.zeros(len(vy))})
 
 
-def test_accuracy_has_the_values_of_a_hand_calculation():
+def test_accuracy_has_the_values_of_a_hand_calculation_and_wraps_angles():
     vy_ref = np.array([1.0, -1.0, 2.0, -2.0])
     vy = vy_ref + np.array([0.1, 0.1, 0.3, 0.3])
     part = Scored(np.arange(4.0), vy, vy_ref, np.radians([1.0, 2.0, 3.0, 4.0]), np.zeros(4), np.array([1.0, 5.0, -6.0, 0.0]))
@@ -34,28 +37,28 @@ def test_accuracy_has_the_values_of_a_hand_calculation():
     assert figures["max_error_sideslip_nonlinear"] == pytest.approx(3.0)
     assert figures["p99_sideslip"] == pytest.approx(np.quantile([1, 2, 3, 4], 0.99))
     assert set(figures) <= set(UNITS)
-
-
-def test_sideslip_errors_are_never_more_than_half_a_turn():
     part = Scored(np.arange(2.0), np.ones(2), np.array([1.0, 2.0]), np.radians([179.0, -170.0]), np.radians([-178.0, 170.0]), np.zeros(2))
     figures = accuracy([part])
     assert figures["max_error_sideslip"] == pytest.approx(20.0)
     assert figures["rmse_sideslip"] == pytest.approx(math.sqrt((3.0**2 + 20.0**2) / 2))
 
 
-def test_a_constant_offset_does_not_count_in_fvu_but_does_in_rmse(drive):
+def test_what_is_scored_begins_late_by_measured_speed_and_without_offset(drive):
     part = Scored(drive.time, drive["vy_ref"] + 0.5, drive["vy_ref"], drive["sideslip_ref"], drive["sideslip_ref"], drive["ay"])
     figures = accuracy([part])
     assert figures["fvu"] == pytest.approx(0.0, abs=1e-12)
     assert figures["rmse_vy"] == pytest.approx(0.5)
+    vy = np.where(drive.time < 11.5 - 1e-9, 1e6, drive["vy_ref"])
+    scored = score(_estimate(drive.time, vy, 20.0, 0.0), drive, Span("d", "drive", 10.0, 30.0), Protocol())
+    assert accuracy([scored])["rmse_vy"] == 0.0
+    drive = planar_drive(noise=0.3)
+    scored = score(_estimate(drive.time, drive["vy_ref"] + 1.0, 20.0, 0.0), drive, Span("d", "drive"), Protocol())
+    vx = drive["vx"][30:]
+    assert np.allclose(scored.sideslip_ref, np.arctan2(drive["vy_ref"][30:], vx))
+    assert np.allclose(scored.sideslip, np.arctan2(drive["vy_ref"][30:] + 1.0, vx))
 
 
-def test_without_nonlinear_samples_nonlinear_metrics_are_nan():
-    part = Scored(np.arange(3.0), np.ones(3), np.arange(3.0), np.zeros(3), np.zeros(3), np.zeros(3))
-    assert math.isnan(accuracy([part])["mse_sideslip_nonlinear"])
-
-
-def test_weighted_metrics_have_the_values_of_a_hand_calculation():
+def test_weighted_metrics_have_the_values_of_a_hand_calculation_where_all_parts_have_their_states():
     zero = np.zeros(2)
     others = {"vx": (np.array([1.0, 0.0]), zero), "yaw_rate": (np.array([0.0, -2.0]), zero)}
     part = Scored(np.arange(2.0), np.array([0.0, 3.0]), zero, zero, zero, zero, others)
@@ -66,9 +69,6 @@ def test_weighted_metrics_have_the_values_of_a_hand_calculation():
     assert figures["ae99_weighted"] == pytest.approx(np.quantile(absolute, 0.99))
     assert (figures["rmse_vx"], figures["rmse_yaw_rate"]) == (pytest.approx(math.sqrt(0.5)), pytest.approx(math.sqrt(2.0)))
     assert set(figures) <= set(UNITS)
-
-
-def test_metrics_of_states_that_one_part_lacks_are_absent():
     zero = np.zeros(2)
     with_vx = Scored(zero, zero, zero, zero, zero, zero, {"vx": (zero, zero)})
     without = Scored(zero, zero, zero, zero, zero, zero)
@@ -93,21 +93,7 @@ def test_faster_estimates_are_held_never_interpolated_from_the_future(drive):
     assert (held.vy <= held.time + 1e-9).all()
 
 
-def test_the_first_second_and_a_half_is_not_scored(drive):
-    vy = np.where(drive.time < 11.5 - 1e-9, 1e6, drive["vy_ref"])
-    scored = score(_estimate(drive.time, vy, 20.0, 0.0), drive, Span("d", "drive", 10.0, 30.0), Protocol())
-    assert accuracy([scored])["rmse_vy"] == 0.0
-
-
-def test_sideslip_uses_the_measured_forward_velocity():
-    drive = planar_drive(noise=0.3)
-    scored = score(_estimate(drive.time, drive["vy_ref"] + 1.0, 20.0, 0.0), drive, Span("d", "drive"), Protocol())
-    vx = drive["vx"][30:]
-    assert np.allclose(scored.sideslip_ref, np.arctan2(drive["vy_ref"][30:], vx))
-    assert np.allclose(scored.sideslip, np.arctan2(drive["vy_ref"][30:] + 1.0, vx))
-
-
-def test_standstill_has_no_sideslip(drive):
+def test_standstill_has_no_sideslip_and_holes_no_better_score(drive):
     """Half a second at 0.0003 m/s: 0.1 m/s of v would be a sideslip of 90 degrees there."""
     vx, vy = drive["vx"].copy(), drive["vy_ref"].copy()
     vx[500:510], vy[500:510] = 0.0003, 0.0
@@ -117,16 +103,13 @@ def test_standstill_has_no_sideslip(drive):
         accuracy([score(estimate, own, Span("d", "drive"), Protocol(least_speed=least))])["max_error_sideslip"] for least in (0.0, 0.1)
     )
     assert (counted > 80.0, without) == (True, 0.0)
-
-
-def test_estimate_with_holes_is_an_error_not_a_better_score(drive):
     vy = drive["vy_ref"].copy()
     vy[500] = np.nan
     with pytest.raises(DataError, match="has no estimate for 1 of"):
         score(_estimate(drive.time, vy, 20.0, 0.0), drive, Span("d", "drive"), Protocol())
 
 
-def test_recording_without_lateral_acceleration_is_scored_all_but_the_nonlinear_range(drive):
+def test_without_lateral_acceleration_all_but_the_nonlinear_range_is_scored(drive):
     without = drive.select([name for name in drive.channels if name != "ay"])
     estimate = _estimate(drive.time, drive["vy_ref"] + 0.1 * np.sin(drive.time), 20.0, 0.0)
     figures, known = (accuracy([score(estimate, own, Span("d", "drive", 10.0, 30.0), Protocol())]) for own in (without, drive))
@@ -135,12 +118,118 @@ def test_recording_without_lateral_acceleration_is_scored_all_but_the_nonlinear_
     assert {name: value for name, value in figures.items() if name not in blank} == {
         name: value for name, value in known.items() if name not in blank
     }
-
-
-def test_manoeuvres_without_lateral_acceleration_have_no_nonlinear_indicators(drive):
     without = drive.select([name for name in drive.channels if name != "ay"])
     part = score(_estimate(drive.time, drive["vy_ref"] + 0.1, 20.0, 0.0), without, Span("d", "drive"), Protocol())
     indicators = kpis({"slalom": [part]})
     assert indicators.mse > 0
     assert math.isnan(indicators.mse_nonlinear)
     assert segments_of([part], 20.0).squared_error_vy.sum() == pytest.approx(0.01 * len(part.time))
+
+
+RATE, N = 20.0, 400
+PROTOCOL = Protocol(rate_hz=RATE, skip_seconds=1.5)
+
+
+def drive(point="unknown"):
+    time = np.arange(N) / RATE
+    yaw_rate = 0.8 * np.sin(0.9 * time) + 0.1
+    channels = {"vx": 12.0 + np.sin(0.3 * time), "yaw_rate": yaw_rate, "vy_ref": 0.4 * np.cos(0.7 * time) - 0.3 * yaw_rate}
+    derived = {} if point is None else {"derived": {"reference_point": point}}
+    return Recording("drive", "car", RATE, 0.0, channels, provenance=derived)
+
+
+def scored(recording, vy):
+    cut = recording.cut(PROTOCOL.skip_seconds, recording.end_time)
+    vy = vy[-len(cut) :]
+    sideslip, reference = np.arctan2(vy, cut["vx"]), np.arctan2(cut["vy_ref"], cut["vx"])
+    return Scored(cut.time, vy, cut["vy_ref"], sideslip, reference, np.full(len(cut), np.nan))
+
+
+def figures(recording, vy):
+    span = Span("mine", "drive")
+    return lever_arm_figures([scored(recording, vy)], [(recording, span)], PROTOCOL)
+
+
+@pytest.mark.parametrize("x", [-0.4, 0.0, 0.27])
+def test_a_planted_lever_arm_is_found_and_leaves_no_error(x):
+    recording = drive()
+    found = figures(recording, recording["vy_ref"] + x * recording["yaw_rate"])
+    assert found["lever_arm"] == pytest.approx(x, abs=1e-12)
+    assert [found[name] for name in ("rmse_vy", "rmse_sideslip", "fvu")] == pytest.approx([0.0, 0.0, 0.0], abs=1e-9)
+
+
+def test_no_other_lever_arm_leaves_less_of_a_noisy_estimate():
+    recording = drive()
+    vy = recording["vy_ref"] + 0.2 * recording["yaw_rate"] + np.random.default_rng(0).normal(0.0, 0.1, N)
+    part = scored(recording, vy)
+    yaw_rate = recording["yaw_rate"][-len(part.vy) :]
+    searched = optimize.minimize_scalar(
+        lambda x: np.mean((part.vy - part.vy_ref - x * yaw_rate) ** 2), bounds=(-0.5, 0.5), method="bounded"
+    )
+    found = figures(recording, vy)
+    assert found["lever_arm"] == pytest.approx(searched.x, abs=1e-4)
+    assert found["rmse_vy"] ** 2 == pytest.approx(searched.fun, rel=1e-6)
+    assert found["rmse_vy"] < accuracy([part])["rmse_vy"]
+
+
+def test_lever_arms_end_at_half_a_metre_and_need_a_turn():
+    recording = drive()
+    found = figures(recording, recording["vy_ref"] - 1.3 * recording["yaw_rate"])
+    assert found["lever_arm"] == -LONGEST
+    yaw_rate = recording["yaw_rate"][-round((N / RATE - 1.5) * RATE) :]
+    assert found["rmse_vy"] == pytest.approx(0.8 * np.sqrt(np.mean(yaw_rate**2)), rel=1e-9)
+    recording = drive()
+    part = scored(recording, recording["vy_ref"] + 0.1)
+    best = best_lever_arm([part], [np.zeros(len(part.vy))], [np.ones(len(part.vy))])
+    assert best.x == 0.0
+    np.testing.assert_array_equal(best.parts[0].vy, part.vy)
+
+
+@pytest.mark.parametrize("point", [None, {"x": 0.0, "y": 0.0}])
+def test_where_the_point_is_known_or_undeclared_nothing_is_given(point):
+    recording = drive(point)
+    assert figures(recording, recording["vy_ref"]) == {}
+
+
+def driven_by(errors_deg, ay):
+    zero, error = np.zeros(len(ay)), np.radians(errors_deg)
+    return Scored(np.arange(len(ay)) * 0.01, 20.0 * np.tan(error), zero, error, zero, np.array(ay))
+
+
+CALM = driven_by([1.0, -0.5, 0.5, 0.5], [0.0, 1.0, -2.0, 3.0])
+HARD = driven_by([0.0, -4.0, 2.0, 0.0], [0.0, -8.0, 4.0, 3.9])
+SET = {"test_slalom_18_on_001": [CALM], "test_j_turn_off_002": [HARD]}
+
+
+def test_errors_are_means_over_samples_and_largest_ones_over_manoeuvres():
+    figures = accuracy([CALM, HARD])
+    assert kpis(SET).mse == pytest.approx(figures["mse_sideslip"]) == pytest.approx((1.75 + 20.0) / 8)
+    assert kpis(SET).mse_nonlinear == pytest.approx(figures["mse_sideslip_nonlinear"]) == pytest.approx(10.0)
+    assert kpis(SET).max_error == pytest.approx(0.5 * (1.0 + 4.0))
+    assert kpis(SET).max_error_nonlinear == pytest.approx(4.0)  # the calm one has no such sample
+    assert np.isnan(kpis({"calm": [CALM]}).max_error_nonlinear)
+
+
+def test_manoeuvres_are_recordings_grouped_by_their_names():
+    spans = [Span("bmw", "test_lap_off_001", 0.0, 1.0), Span("bmw", "test_lap_off_001", 2.0, 3.0)]
+    together = manoeuvres_of(spans, [CALM, HARD])
+    assert kpis(together).manoeuvres == 1
+    assert kpis(together).max_error == pytest.approx(4.0)
+    with pytest.raises(DataError, match="1 scored parts do not belong to 2 ranges"):
+        manoeuvres_of(spans, [CALM])
+    assert group_of("test_lane_change_2_off_001") == "lane change"
+    assert group_of("20140222_01") == "other"
+    groups = kpis_by_group(SET | {"train_slalom_30_off_003": [HARD]})
+    assert list(groups) == ["J-turn", "slalom"]
+    assert groups["slalom"].manoeuvres == 2
+    assert groups["slalom"].max_error == pytest.approx(2.5)
+
+
+def test_distribution_counts_errors_in_bins_of_a_quarter_of_a_degree():
+    found = error_distribution([driven_by([0.6, -0.6, 0.1, 0.7], [0.0, 5.0, -6.0, 1.0])], nonlinear_only=False)
+    np.testing.assert_allclose(found.edges, [-0.75, -0.5, -0.25, 0.0, 0.25, 0.5, 0.75])
+    np.testing.assert_array_equal(found.counts, [1, 0, 0, 1, 0, 2])
+    hard = error_distribution([CALM, HARD])
+    assert (hard.counts.sum(), hard.mean, hard.deviation) == (2, pytest.approx(-1.0), pytest.approx(3.0))
+    with pytest.raises(DataError, match="no sample has a lateral acceleration"):
+        error_distribution([CALM])

@@ -21,36 +21,21 @@ def along(observation, *, transition=moved, states=None, sizes=(1.0, 1.0), noise
     )
 
 
-def test_smallest_singular_value_of_a_linear_model_in_closed_form():
+def test_singular_values_of_a_linear_model_in_closed_form_with_units_and_blindness():
     # OᵀO = [[2, τ], [τ, τ²]]
     root = np.sqrt((2 - STEP**2) ** 2 + 4 * STEP**2)
     seen = along(lambda x, u: x[:1])
     np.testing.assert_allclose(seen.smallest, np.sqrt((2 + STEP**2 - root) / 2), rtol=1e-12)
     # two positions with noise 1: the first is known to 1, their difference over τ to √2/τ
     np.testing.assert_allclose(seen.deviation, np.tile([1.0, np.sqrt(2) / STEP], (4, 1)), rtol=1e-12)
-
-
-def test_position_cannot_be_seen_from_speed():
     blind = along(lambda x, u: x[1:])
     assert (blind.smallest == 0.0).all()
     assert (blind.rank == 1).all()
     assert np.isinf(blind.deviation[:, 0]).all()
     np.testing.assert_allclose(blind.deviation[:, 1], np.sqrt(0.5))
-
-
-def test_units_of_states_and_noise_of_measurements_count():
     plain, scaled = along(lambda x, u: x[:1]), along(lambda x, u: x[:1], sizes=(2.0, 2.0), noise=(0.5,))
     np.testing.assert_allclose(scaled.smallest, 4.0 * plain.smallest)
     np.testing.assert_allclose(scaled.deviation, plain.deviation / 4.0)
-
-
-def test_a_gain_can_be_seen_only_where_its_signal_is():
-    # state (s, g), measured g·s and s: ∂/∂g = s
-    states = np.array([[0.0, 1.0], [0.5, 1.0], [2.0, 1.0]])
-    seen = along(lambda x, u: torch.stack([x[1] * x[0], x[0]]), transition=lambda x, u: x, states=states, noise=(1.0, 1.0), steps=1)
-    assert seen.smallest[0] == 0.0
-    assert seen.smallest[0] < seen.smallest[1] < seen.smallest[2]
-    np.testing.assert_allclose(seen.deviation[1:, 1], np.sqrt(1.0 + 1.0) / states[1:, 0])
 
 
 def test_windows_that_do_not_fit_are_refused():

@@ -99,11 +99,8 @@ def test_intervals_of_an_rmse_cover_it_at_about_the_nominal_rate(memory):
     assert 0.90 <= np.mean(covered) <= 0.99
 
 
-def test_holm_is_the_textbook_example():
+def test_holm_and_effective_blocks_are_the_textbooks():
     assert holm([0.01, 0.04, 0.03, 0.005]) == pytest.approx([0.03, 0.06, 0.06, 0.02])
-
-
-def test_effective_blocks_count_what_carries_the_error():
     assert effective_blocks(np.ones(20)) == pytest.approx(20.0)
     assert effective_blocks(np.array([1.0, *[0.0] * 19])) == pytest.approx(1.0)
 
@@ -117,7 +114,7 @@ def candidates(generator, **levels):
     }
 
 
-def test_a_clear_winner_is_named():
+def test_winners_are_named_where_they_are_clear_and_beat_the_baselines():
     found = rank(candidates(np.random.default_rng(3), good=0.1, other=0.3, zero=2.0, static_map=1.0), RATE)
     assert found.winner == ("good", "good")
     assert found.order[0] == ("good", "good")
@@ -125,27 +122,18 @@ def test_a_clear_winner_is_named():
     assert found.against_best[("other", "other")].high < 0.0
     low, high = found.intervals[("good", "good")]
     assert low < found.rmse[("good", "good")] < high
-
-
-def test_equals_are_not_told_apart_and_no_winner_is_named():
     wrongly = 0
     generator = np.random.default_rng(4)
     for _ in range(10):
         found = rank(candidates(generator, a=0.2, b=0.2, c=0.2, zero=2.0, static_map=1.0), RATE)
         wrongly += found.winner is not None
     assert wrongly <= 1
-
-
-def test_whoever_does_not_beat_the_static_map_is_no_winner():
     found = rank(candidates(np.random.default_rng(5), a=1.0, b=3.0, zero=5.0, static_map=1.0), RATE)
     assert found.winner is None
     assert found.beats(("b", "b"), "static_map") is False
     without = rank(candidates(np.random.default_rng(5), a=0.1, b=3.0, zero=5.0), RATE)
     assert without.winner is None
     assert without.missing_baselines == ["static_map"]
-
-
-def test_too_few_blocks_give_no_verdict():
     short = {name: [segments_of([scored(0.1 * np.ones(40))], RATE)] for name in (("a", "a"), ("zero", "zero"))}
     found = rank(short, RATE)
     assert found.n_blocks < 3

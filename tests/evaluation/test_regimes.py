@@ -6,9 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import yaml
 
-from place import DATASET
 from vehest.data.estimate import Estimate
 from vehest.data.recording import Recording
 from vehest.data.splits import Span
@@ -32,14 +30,11 @@ def estimate_with(recording, error):
     return Estimate(recording.id, "test", RATE, 0.0, {"vy": vy, "sideslip": np.arctan2(vy, recording["vx"])})
 
 
-def test_each_sample_lies_in_one_band_one_of_straight_or_turning_and_one_of_transient_or_steady():
+def test_regimes_are_where_the_drive_was_made_to_have_them_one_of_each_kind():
     masks = regimes_of(stepped_drive(), Span("d", "steps"), ALL)
     assert tuple(masks) == REGIMES
     for group in (("straight", "turning"), tuple(AY_BANDS), ("transient", "steady")):
         assert (np.sum([masks[name] for name in group], axis=0) == 1).all()
-
-
-def test_regimes_are_where_the_drive_was_made_to_have_them():
     masks = regimes_of(stepped_drive(), Span("d", "steps"), ALL)
     time = stepped_drive().time
     assert masks["straight"][time < 10].all()
@@ -80,15 +75,12 @@ def test_errors_of_regimes_make_up_the_error_of_all_samples():
             assert together == pytest.approx(whole[metric] ** 2)
 
 
-def test_regime_of_less_than_two_seconds_has_no_errors():
+def test_short_regimes_and_missing_channels_have_no_errors():
     drive = stepped_drive()
     part = score(estimate_with(drive, np.full(600, 0.1)), drive, Span("d", "steps"), ALL)
     masks = regimes_of(drive, Span("d", "steps"), ALL)
     assert 0 < masks["ay_4_6"].sum() < 2 * RATE
     assert set(errors_by_regime([part], [masks], RATE)) == set(REGIMES) - {"ay_4_6"}
-
-
-def test_drive_without_lateral_acceleration_has_no_bands_and_one_without_yaw_rate_is_not_told_straight():
     drive = stepped_drive()
     without_ay = regimes_of(drive.select(["vx", "yaw_rate", "vy_ref"]), Span("d", "steps"), ALL)
     assert set(without_ay) == {"straight", "turning", "transient", "steady"}
@@ -110,23 +102,3 @@ def test_evaluation_writes_regimes_as_subsets_and_prints_figures_of_all_samples_
     assert set(by_subset["turning"]) == {"rmse_vy", "rmse_sideslip", "share"}
     assert {"floor_reference", "floor_cramer_rao"} <= set(by_subset["all"])
     assert "share" not in by_subset["all"]
-
-
-def test_car_without_lateral_acceleration_goes_from_file_to_report(place):
-    """Estimators that need none are compared; the report has no axes of it, the metrics no bands."""
-    channels = {name: column for name, column in DATASET["channels"].items() if name != "ay"}
-    (Path("conf") / "dataset" / "mine.yaml").write_text(yaml.safe_dump(DATASET | {"channels": channels}, allow_unicode=True))
-    pipeline = {"study": "flat", "report": "drive", "split": "mine", "sweeps": [["estimator=zero,static_map"]]}
-    (Path("pipelines") / "flat.yaml").write_text(yaml.safe_dump(pipeline))
-    code, out, err = place("run", "flat", "tracking=none", "--json")
-    assert code == 0, err
-    folder = Path(json.loads(out)["report"]).parent
-    text = (folder / "report.md").read_text(encoding="utf-8")
-    assert "errors_over_ay" not in text
-    assert "and the measured lateral acceleration" not in text
-    with open(folder / "metrics.csv", encoding="utf-8") as stream:
-        rows = list(csv.DictReader(stream))
-    assert {row["subset"] for row in rows} == {"all", "turning", "transient", "steady"}
-    nonlinear = [row["value"] for row in rows if row["metric"] == "mse_sideslip_nonlinear"]
-    assert nonlinear
-    assert set(nonlinear) <= {"", "nan"}

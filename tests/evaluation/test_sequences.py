@@ -56,14 +56,6 @@ def test_a_protocol_that_makes_no_sense_is_refused(changes, message):
         protocol_from_config({**PAPER, **changes})
 
 
-def test_reports_say_how_estimates_start():
-    assert Protocol().start_in_words == ""
-    words = protocol_from_config(PAPER).start_in_words
-    assert "sequences of 10 s" in words
-    assert "start at the reference state" in words
-    assert protocol_from_config(PAPER).piece == "sequence"
-
-
 @pytest.fixture
 def steered(place):
     """A split with tests only: one range of 30 s and one of 13 s."""

@@ -40,19 +40,6 @@ def test_intervals_of_equal_estimators_cover_zero_at_about_the_nominal_rate(n_se
     assert 0.91 <= median <= 0.99
 
 
-def test_noise_of_each_seed_alone_makes_intervals_wide_not_narrow():
-    generator = np.random.default_rng(5)
-    trials = [compared(*(losses(generator, 3, own_noise=True) for _ in range(2)), n_resamples=200) for _ in range(100)]
-    assert np.mean([trial.mean.low <= 0.0 <= trial.mean.high for trial in trials]) >= 0.95
-
-
-def test_blocks_that_are_shorter_than_the_correlation_are_too_sure():
-    generator = np.random.default_rng(1)
-    pairs = [(losses(generator, 1), losses(generator, 1)) for _ in range(50)]
-    covered = [result.mean.low <= 0.0 <= result.mean.high for result in (compared(*pair, 0.01, 100) for pair in pairs)]
-    assert np.mean(covered) < 0.6
-
-
 def test_a_shift_is_found_although_sequences_differ_much_more():
     generator = np.random.default_rng(2)
     hard = np.repeat(20.0 * generator.random(N_SEQUENCES), LENGTH)

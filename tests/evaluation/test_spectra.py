@@ -12,29 +12,23 @@ from vehest_papers.kit.spectra import decibels, lateral_velocity_rate, mean_bias
 RATE = 20.0
 
 
-def test_density_of_white_noise_is_its_variance_over_the_band():
+def test_density_of_white_noise_is_its_variance_over_the_band_and_power_that_of_any_colour():
     """σ² spread evenly over 0 to 10 Hz; the mean of 255 lines over n segments scatters by about 1/sqrt(255 n)."""
     noise = 0.3 * np.random.default_rng(0).standard_normal(40_000)
     own = periodogram([noise], RATE)
     assert own.density[1:-1].mean() == pytest.approx(0.3**2 / (RATE / 2), rel=4 / np.sqrt(255 * own.n_segments))
-
-
-def test_power_over_all_lines_is_the_variance():
-    """Parseval: for noise of any colour, up to what the segments' ends weigh."""
+    # Parseval: for noise of any colour, up to what the segments' ends weigh.
     noise = np.random.default_rng(1).standard_normal(80_000)
     coloured = np.convolve(noise, np.ones(6) / 6, mode="valid")
     assert periodogram([coloured], RATE).power == pytest.approx(coloured.var(), rel=0.03)
 
 
-def test_sinusoid_stands_in_its_bin_with_its_power():
+def test_sinusoids_stand_in_their_bin_and_recordings_count_by_segments():
     hz = 30 / 25.6
     own = periodogram([1.5 * np.sin(2 * np.pi * hz * np.arange(4096) / RATE)], RATE)
     assert own.frequency[np.argmax(own.density)] == pytest.approx(hz)
     assert own.power == pytest.approx(1.5**2 / 2, rel=1e-6)
     assert own.density[np.abs(own.frequency - hz) > 2.5 / 25.6].max() < 1e-6 * own.density.max()
-
-
-def test_recordings_count_by_their_number_of_segments():
     generator = np.random.default_rng(2)
     long, short = generator.standard_normal(512 * 4), 3.0 * generator.standard_normal(512)
     apart = [periodogram([samples], RATE) for samples in (long, short)]
@@ -52,24 +46,18 @@ def test_series_that_cannot_be_read_are_refused():
         periodogram([], RATE)
 
 
-def test_rate_of_a_sinusoidal_velocity_shrinks_as_documented(drive):
+def test_planted_biases_and_noise_are_the_process_noise_of_the_documented_rate(drive):
     hz, time = 1.0, drive.time
     waving = replace(drive, channels={**drive.channels, "vy_ref": np.sin(2 * np.pi * hz * time)})
     shrunk = np.sin(2 * np.pi * hz / RATE) / (2 * np.pi * hz / RATE)
     np.testing.assert_allclose(lateral_velocity_rate(waving), shrunk * 2 * np.pi * hz * np.cos(2 * np.pi * hz * time[1:-1]), atol=1e-9)
     assert shrunk == pytest.approx(0.98, abs=0.005)
-
-
-def test_exact_kinematics_have_almost_no_process_noise_and_a_planted_bias_is_found():
-    """The central difference of a drive that obeys the kinematics errs by a sixth of the third derivative, 3e-4 m/s² here."""
+    # The central difference of a drive that obeys the kinematics errs by a sixth of the third derivative, 3e-4 m/s² here.
     drive = planar_drive()
     assert np.abs(process_noise(drive)).max() < 1e-3
     tilted = replace(drive, channels={**drive.channels, "ay": drive["ay"] - 0.1})
     assert mean_bias([tilted]) == pytest.approx(0.1, abs=2e-4)
     assert mean_bias([tilted, drive]) == pytest.approx(0.05, abs=2e-4)
-
-
-def test_noise_planted_in_ay_is_the_process_noise():
     drive = planar_drive(seconds=600.0)
     noise = 0.4 * np.random.default_rng(3).standard_normal(len(drive))
     noisy = replace(drive, channels={**drive.channels, "ay": drive["ay"] + noise})

@@ -67,20 +67,8 @@ def trust(name):
     estimator = model(name)
     drives, rate = [drive(estimator, seed) for seed in (1, 2)], estimator.settings.rate_hz
     own = Quantity(WEIGHTS, 0.02, (0.5, 1.0, 1.8, 2.5), (False,) * 4, 10.0)
-    bands = Bands(
-        ("car",),
-        ("set",),
-        ("a",),
-        ("b",),
-        "range",
-        10,
-        100.0,
-        estimator.channels,
-        estimator.horizon_steps,
-        LARGEST,
-        own,
-        replace(own, floor=0.001),
-    )
+    about = (("car",), ("set",), ("a",), ("b",), "range", 10, 100.0)
+    bands = Bands(*about, estimator.channels, estimator.horizon_steps, LARGEST, own, replace(own, floor=0.001))
     health = learn_health(drives[:1], drives[1:], estimator.channels, rate)
     return Trust(About(name), bands, learn_limits(drives, estimator.channels, rate), health)
 
@@ -146,9 +134,8 @@ class Export:
     def compared(self):
         """The largest difference of vy, sideslip and both bands, and how many rows have another health or, in double, reason."""
         own, wanted = (np.genfromtxt(self.folder / name, delimiter=",", skip_header=1) for name in ("out.csv", "expected.csv"))
-        judged = slice(
-            4, None if self.precision == "double" else 5
-        )  # an offset and a scale of one lone channel are the same to the last digits
+        # an offset and a scale of one lone channel are the same to the last digits
+        judged = slice(4, None if self.precision == "double" else 5)
         same = (own[:, judged] == wanted[:, judged]).all(1)
         assert (np.isnan(own[same]) == np.isnan(wanted[same])).all()
         return np.nanmax(np.abs(own - wanted)[same][:, :4], axis=0, initial=0.0), int((~same).sum())

@@ -33,14 +33,8 @@ def found(home):
     rules = Counter()
     others = []
     for folder in sorted(home.iterdir()):
-        words = [
-            "cppcheck",
-            "--std=c99",
-            "--enable=warning,portability",
-            "--addon=misra",
-            "--quiet",
-            "--template={id} {file}:{line} {message}",
-        ]
+        words = ["cppcheck", "--std=c99", "--enable=warning,portability", "--addon=misra", "--quiet"]
+        words += ["--template={id} {file}:{line} {message}"]
         words += ["--suppress=missingIncludeSystem", f"-I{home / 'kinematic'}", *(str(path) for path in sorted(folder.glob("vehest_*.c")))]
         said = subprocess.run(words, capture_output=True, text=True, check=True, timeout=600.0).stderr
         for line in said.splitlines():

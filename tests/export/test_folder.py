@@ -57,15 +57,12 @@ def test_what_cannot_be_exported_is_said_and_leaves_nothing(tmp_path, options, w
     assert not list(tmp_path.iterdir())
 
 
-def test_a_channel_that_was_computed_from_another_is_not_for_float(tmp_path):
+def test_families_and_channels_that_c_cannot_have_are_refused_and_leave_nothing(tmp_path):
     own = trust("kalman")
     health = replace(own.health, deviation=(*own.health.deviation[:-1], 1e-9))
     with pytest.raises(ConfigurationError, match=r"'steer' follows the others to .* which float cannot resolve"):
         export_model(model("kalman"), replace(own, health=health), tmp_path / "c", "float")
     assert not list(tmp_path.iterdir())
-
-
-def test_the_factor_graph_is_refused(tmp_path):
     with pytest.raises(ConfigurationError, match="cannot be exported"):
         export_model(fitted("factor_graph"), None, tmp_path / "c")
 

@@ -1,6 +1,10 @@
-"""A changed generator shows as a changed golden file."""
+"""A changed generator shows as a changed golden file, and counts of the rules of MISRA as other counts."""
+
+from pathlib import Path
 
 import pytest
+from exports import tool
+from misra import VERSION, documented, found, version
 
 from golden import FOLDER, differences, sources
 
@@ -21,3 +25,17 @@ def test_a_digit_beyond_the_ninth_is_no_change_and_any_other_is():
     assert differences("x = 0.31;", "x = 0.3;")
     assert differences("y = 0.3;", "x = 0.3;")
     assert differences("x = 0.3;\n", "x = 0.3;\n\n")
+
+
+DOCUMENT = Path(__file__).parents[2] / "docs" / "export.md"
+
+
+def test_each_broken_rule_is_explained_with_its_count(tmp_path):
+    tool("cppcheck")
+    if version() != VERSION:
+        pytest.skip(f"{version()} counts otherwise than {VERSION}, whose counts are documented")
+    rules, others = found(tmp_path)
+    if "-" in rules or not rules:
+        pytest.skip("cppcheck has no MISRA addon")
+    assert dict(rules) == documented(DOCUMENT.read_text(encoding="utf-8"))
+    assert not [line for line in others if "whitened" not in line]  # a triangle that is written before it is read, row by row

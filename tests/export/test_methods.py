@@ -60,7 +60,6 @@ VARIANTS = [
 ]
 
 pytestmark = [pytest.mark.export, pytest.mark.skipif(not COMPILERS, reason="there is neither gcc nor clang")]
-each_compiler = pytest.mark.parametrize("compiler", COMPILERS)
 each_variant = pytest.mark.parametrize(
     "variant", VARIANTS, ids=lambda own: "-".join([own[0], *(f"{key}={value}" for key, value in own[1].items() if key not in TRACK)])
 )

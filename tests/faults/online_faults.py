@@ -41,23 +41,8 @@ from vehest.trust.watch import STARTED
 SETTLE, LASTS, COMES_BACK, RECOVERS = 4.0, 4.0, 8.0, 3.0  # s
 TIMES_USUAL = 2.0
 
-HEADER = (
-    "data",
-    "kind",
-    "estimator",
-    "rate_hz",
-    "fault",
-    "channel",
-    "severity",
-    "finite",
-    "exceptions",
-    "within_speed",
-    "starts",
-    "usual_error_deg",
-    "error_while_faulted_deg",
-    "error_after_deg",
-    "recovered",
-)
+HEADER = ["data", "kind", "estimator", "rate_hz", "fault", "channel", "severity", "finite", "exceptions", "within_speed", "starts"]
+HEADER += ["usual_error_deg", "error_while_faulted_deg", "error_after_deg", "recovered"]
 
 CAR = "estimator.car={mass: 982, yaw_inertia: 1605.4145, cg_to_front_axle: 1.33, cg_to_rear_axle: 1.07, cg_height: 0.45}"
 SHORT = ("training.method=data", "training.restarts=1", "training.generations=40")

@@ -18,15 +18,7 @@ from vehest.filters.unscented_scan import MARGIN, Function, NonlinearFiltered
 
 
 def sigma_points(rule, mean, factor):
-    """Points of N(mean, L Lᵀ).
-
-    Args:
-        mean: (..., n).
-        factor: L, lower triangular, (..., n, n).
-
-    Returns:
-        (..., 2n + 1, n), the mean first.
-    """
+    """Points of N(mean, L Lᵀ), the mean first, (..., 2n + 1, n), of a mean (..., n) and L, lower triangular, (..., n, n)."""
     offsets = rule.spread * factor.mT
     centre = mean.unsqueeze(-2)
     return torch.cat([centre, centre + offsets, centre - offsets], dim=-2)
@@ -54,13 +46,7 @@ def symmetric(matrix):
 
 
 class Factor(NamedTuple):
-    """A covariance and its factor.
-
-    Attributes:
-        covariance: the repaired one, (..., n, n); NaN where it could not be.
-        factor: L with L Lᵀ = covariance, lower triangular, (..., n, n).
-        repaired: bool, (...).
-    """
+    """A covariance, NaN where it could not be repaired, L with L Lᵀ = covariance, both (..., n, n), and whether it was repaired, (...)."""
 
     covariance: Tensor
     factor: Tensor
@@ -72,9 +58,6 @@ def factorised(covariance):
 
     Lifting adds the same to every eigenvalue, as much as is needed for a margin of `MARGIN`; what is added counts as a constant in
     gradients. Covariances that are not finite stay NaN, each for itself: the others of a batch go on.
-
-    Args:
-        covariance: symmetric, (..., n, n).
     """
     finite = torch.isfinite(covariance).all(-1).all(-1)
     identity = torch.eye(covariance.shape[-1], dtype=covariance.dtype, device=covariance.device)
@@ -98,15 +81,8 @@ class NonlinearModel:
     x[k+1] = f(x[k], u[k]) + w[k],  w[k] ~ N(0, Q(x[k], u[k]))
     y[k]   = h(x[k], u[k]) + v[k],  v[k] ~ N(0, R(x[k], u[k]))
 
-    Args:
-        transition: f, (..., n).
-        observation: h, (..., m).
-        process_noise: Q of the estimated state, (..., n, n).
-        observation_noise: R of the predicted state, (..., m, m).
-        constrain: puts a state back into what is possible, such as a friction above 0; none: everything is.
-        restart: what is known instead after a prediction that leaves too little known, of state and u[k]; none: nothing else.
-        free: bool, which states a measurement may change, (..., n), of the predicted state; none: all. What is held keeps its variance
-            (Schmidt's consider state).
+    ``constrain`` puts a state back into what is possible; ``restart`` says what is known after a prediction that leaves too little known;
+    ``free`` (..., n) is which states a measurement may change: what is held keeps its variance (Schmidt's consider state).
     """
 
     transition: Function
@@ -135,13 +111,7 @@ def unscented_filter(model, measurements, inputs, initial, rule):
 
     Covariances that are not positive definite are repaired. Where a negative weight of the mean point is what takes the definiteness of an
     update, the update goes without it; everything else is lifted.
-
-    Args:
-        model: see `NonlinearModel`.
-        measurements: y, (..., T, m); what is NaN was not measured and is skipped, and gradients stay finite.
-        inputs: u, (..., T, p).
-        initial: state at the first sample before its measurement, mean (..., n).
-        rule: which sigma points.
+    Measurements (..., T, m) that are NaN are skipped, and gradients stay finite; ``initial`` is the state before the first of them.
 
     Source: Julier & Uhlmann 1997; van der Merwe 2004, Algorithm 3.1 with the points drawn again.
     """

@@ -4,7 +4,6 @@ import numba
 import numpy as np
 import pytest
 import torch
-from readable_filters import extended_filter
 from test_filters_kalman import example
 from test_filters_nonlinear import STEP, measured_pendulum, pendulum_with_radar
 
@@ -38,24 +37,6 @@ def compiled_pendulum():
 
 def as_arrays(state):
     return Gaussian(state.mean.numpy(), state.covariance.numpy())
-
-
-@pytest.mark.parametrize("missing", [0.0, 0.4])
-def test_compiled_filter_is_the_readable_one_with_and_without_measurements(missing):
-    measurements, inputs, initial = measured_pendulum(60)
-    y = measurements[0]
-    if missing:
-        y[torch.rand(y.shape, generator=torch.Generator().manual_seed(3)) < missing] = torch.nan
-        y[10:13] = torch.nan
-        assert y.isnan().any(1).sum() > y.isnan().all(1).sum() > 3
-    theirs = extended_filter(pendulum_with_radar(), y, inputs[0], initial)
-    ours = extended_scan(compiled_pendulum(), y.numpy(), inputs[0].numpy(), as_arrays(initial))
-    for part in ("predicted", "filtered"):
-        for own, their in zip(getattr(ours, part), getattr(theirs, part), strict=True):
-            assert np.abs(own - their.numpy()).max() < 1e-9
-    for part in ("innovation", "innovation_covariance", "log_likelihood"):
-        assert np.abs(getattr(ours, part) - getattr(theirs, part).numpy()).max() < 1e-9
-    assert np.array_equal(ours.measured, theirs.measured.numpy())
 
 
 @numba.njit
@@ -106,18 +87,6 @@ def test_jacobian_is_that_of_automatic_differentiation():
     value, slope = with_jacobian(several)(x, u, parameters)
     assert np.abs(value - in_torch(torch.from_numpy(x)).numpy()).max() < 1e-15
     assert np.abs(slope - torch.func.jacrev(in_torch)(torch.from_numpy(x)).numpy()).max() < 1e-14
-
-
-def test_states_go_on_one_sample_at_a_time_as_all_at_once():
-    measurements, inputs, initial = measured_pendulum(20)
-    y, u, model = measurements[0].numpy(), inputs[0].numpy(), compiled_pendulum()
-    whole = extended_scan(model, y, u, as_arrays(initial)).filtered
-    state = Gaussian(*(part[0] for part in extended_scan(model, y[:1], u[:1], as_arrays(initial)).filtered))
-    for k in range(1, 20):
-        pair = np.stack([np.full(2, np.nan), y[k]])
-        state = Gaussian(*(part[-1] for part in extended_scan(model, pair, u[k - 1 : k + 1], state).filtered))
-        assert np.abs(state.mean - whole.mean[k]).max() < 1e-12
-        assert np.abs(state.covariance - whole.covariance[k]).max() < 1e-12
 
 
 def test_what_does_not_fit_is_refused():

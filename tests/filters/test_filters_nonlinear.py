@@ -63,9 +63,6 @@ def measured_pendulum(steps=40, sequences=1, seed=1):
     return torch.stack(ys, 1), inputs, first
 
 
-# Sigma points
-
-
 def test_kappa_of_the_learned_dynamics_paper_meets_the_fourth_moments_of_a_normal_distribution():
     rule = symmetric_rule(5, -2.0)
     points = sigma_points(rule, torch.zeros(5, dtype=torch.float64), torch.eye(5, dtype=torch.float64))
@@ -82,9 +79,6 @@ def test_rules_are_those_of_an_independent_library():
         assert points.numpy() == pytest.approx(known.sigma_points(mean, covariance), abs=1e-12)
         assert [rule.centre_mean, *[rule.other] * 6] == pytest.approx(known.Wm)
         assert [rule.centre_covariance, *[rule.other] * 6] == pytest.approx(known.Wc)
-
-
-# Filters on linear models
 
 
 @pytest.mark.parametrize("name", [*RULES, "extended"])
@@ -106,9 +100,6 @@ def unrepaired(*arguments):
     filtered = unscented_filter(*arguments)
     assert not filtered.repaired.any()
     return filtered.steps
-
-
-# Filters on a nonlinear model
 
 
 @pytest.mark.parametrize(
@@ -170,9 +161,6 @@ def test_extended_filter_is_that_of_an_independent_library():
         theirs.update(y, slope_of_observation, height_and_rate)
         assert ours.filtered.mean[k].numpy() == pytest.approx(theirs.x, abs=1e-8)
         assert ours.filtered.covariance[k].numpy() == pytest.approx(theirs.P, abs=1e-8)
-
-
-# Definiteness
 
 
 def test_a_covariance_that_is_not_definite_is_lifted_just_enough():

@@ -1,21 +1,20 @@
 """Gates: outliers are refused as if they had not been measured, readable as compiled; what contradicts for long is believed again."""
 
 import math
-from functools import partial
 
 import numpy as np
 import pytest
 import torch
-from readable_filters import extended_filter, gated, unscented_filter
+from readable_filters import unscented_filter
 from scipy.stats import chi2, norm
-from test_filters_kalman import example, tensors
-from test_filters_nonlinear import RULES, linear_as_nonlinear, measured_pendulum, pendulum_with_radar
+from test_filters_kalman import example
+from test_filters_nonlinear import RULES, measured_pendulum, pendulum_with_radar
 
 from vehest.filters.gating import Gate
 from vehest.filters.gaussian import Gaussian
 from vehest.filters.kalman import LinearModel
 from vehest.filters.kalman_scan import kalman_scan
-from vehest.filters.unscented_scan import TorchModel, UnscentedStepper, unscented_scan
+from vehest.filters.unscented_scan import TorchModel, unscented_scan
 
 PATIENCE = 5
 NOTHING = torch.zeros(3, dtype=torch.float64)
@@ -37,9 +36,11 @@ def by_the_filter(u, first, rule, y):
     return unscented_filter(pendulum_with_radar(), y, u, first, rule).steps
 
 
-def test_the_limit_is_that_of_the_chi_square_distribution():
+def test_gates_have_the_limit_of_the_chi_square_distribution_and_patience_in_samples():
     limit = Gate(3.0, PATIENCE).deviations ** 2
     assert chi2.sf(limit, 1) == pytest.approx(2.0 * norm.sf(3.0))
+    assert Gate.of(None, 100.0) is None
+    assert Gate.of(5.0, 100.0) == Gate(5.0, 50)
 
 
 def test_a_consistent_filter_refuses_as_often_as_the_normal_distribution_says():
@@ -100,23 +101,6 @@ def outliers(steps, sequences):
     return y, u, first
 
 
-def test_the_scan_refuses_what_the_readable_filter_refuses_whatever_the_rule():
-    y, u, first = outliers(30, 3)
-    model, gate = pendulum_with_radar(), Gate(4.0, PATIENCE)
-    noises = [noise(NOTHING, NOTHING) for noise in (model.process_noise, model.observation_noise)]
-    for name, rule in RULES.items():
-        scanned = unscented_scan(TorchModel(model.transition, model.observation), y, u, first, *noises, rule, gate=gate).steps
-        for row in range(3):
-            judged = gated(partial(by_the_filter, u[row], first, rule), y[row], gate)
-            assert torch.equal(judged.measured, scanned.measured[row]), name
-        readable = by_the_filter(u, first, rule, torch.where(scanned.measured, y, torch.nan))
-        assert not scanned.measured[0, 15 : 15 + PATIENCE, 1].any(), "shut"
-        assert scanned.measured[0, 15 + PATIENCE, 1], "open again"
-        for a, b in zip(readable.filtered, scanned.filtered, strict=True):
-            assert torch.allclose(a, b, rtol=0, atol=1e-12 * float(a.abs().max())), name
-        assert torch.allclose(readable.log_likelihood, scanned.log_likelihood, rtol=1e-10, atol=1e-10)
-
-
 def test_gradients_through_a_gate_are_those_of_missing_measurements():
     y, u, first = outliers(30, 2)
     model = pendulum_with_radar()
@@ -138,60 +122,3 @@ def test_gradients_through_a_gate_are_those_of_missing_measurements():
     mean = by_the_filter(u, first, RULES["symmetric"], readable).filtered.mean
     (theirs,) = torch.autograd.grad((mean * weights).sum(), readable)
     assert torch.allclose(theirs, found[0][0], rtol=0, atol=1e-10 * float(theirs.abs().max()))
-
-
-def test_measurements_that_are_handed_over_are_left_as_they_are():
-    y, u, first = outliers(30, 1)
-    before = y.clone()
-    pendulum(y, u, first, Gate(4.0, PATIENCE))
-    assert torch.equal(torch.nan_to_num(y), torch.nan_to_num(before))
-    model, start = walk(30)
-    measured = np.full((30, 2), 1e3)
-    kalman_scan(model, measured, start, Gate(2.0, PATIENCE))
-    assert (measured == 1e3).all()
-
-
-def test_sample_by_sample_the_gate_is_that_of_the_whole_sequence():
-    y, u, first = outliers(30, 1)
-    model, gate = pendulum_with_radar(), Gate(4.0, PATIENCE)
-    whole = pendulum(y, u, first, gate).steps.filtered.mean[0].numpy()
-    points = TorchModel(model.transition, model.observation)
-    stepper = UnscentedStepper(points, first.mean.numpy(), first.covariance.numpy(), 2, RULES["symmetric"], gate=gate)
-    process, observation = (noise(NOTHING, NOTHING)[None].numpy() for noise in (model.process_noise, model.observation_noise))
-    for k in range(30):
-        assert stepper.step(y[0, k].numpy(), u[0, k].numpy(), process, observation) == pytest.approx(whole[k], abs=1e-12), k
-
-
-def test_every_sequence_has_its_own_gate_however_they_are_shared_out():
-    y, u, first = outliers(30, 4)
-    together = pendulum(y, u, first, Gate(4.0, PATIENCE)).steps
-    for row in range(4):
-        alone = pendulum(y[row : row + 1], u[row : row + 1], first, Gate(4.0, PATIENCE)).steps
-        assert torch.equal(alone.measured[0], together.measured[row])
-    model = pendulum_with_radar()
-    noises = [noise(NOTHING, NOTHING) for noise in (model.process_noise, model.observation_noise)]
-    points = TorchModel(model.transition, model.observation)
-
-    def halves(work, count):
-        work(0, count // 2)
-        work(count // 2, count)
-
-    shared = unscented_scan(points, y, u, first, *noises, RULES["symmetric"], gate=Gate(4.0, PATIENCE), share=halves).steps
-    assert torch.equal(shared.measured, together.measured)
-    assert torch.equal(shared.filtered.mean, together.filtered.mean)
-
-
-def test_the_gate_of_the_kalman_filter_judges_by_its_innovations():
-    model, measurements, first = example(60, seed=5, missing=0.1)
-    measurements[20, 0], measurements[40:, 1] = 1e3, 1e3
-    readable, number, gate = linear_as_nonlinear(tensors(model)), torch.arange(60.0).unsqueeze(-1), Gate(4.0, PATIENCE)
-    judged = gated(lambda y: extended_filter(readable, y, number, tensors(first)), torch.from_numpy(measurements), gate)
-    compiled = kalman_scan(model, measurements, first, gate)
-    assert np.array_equal(judged.measured, compiled.measured)
-    assert not compiled.measured.all()
-    assert judged.filtered.mean.numpy() == pytest.approx(compiled.filtered.mean, abs=1e-9)
-
-
-def test_half_a_second_of_patience_is_counted_in_samples():
-    assert Gate.of(None, 100.0) is None
-    assert Gate.of(5.0, 100.0) == Gate(5.0, 50)

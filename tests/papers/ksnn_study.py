@@ -51,16 +51,7 @@ def planted_segments(fvu, test, seed):
 
 
 def planted_part(folder, fvus, *, train, seeds=3, spread=0.02, tests=("c2", "f2")):
-    """A comparison whose candidates leave this FVU.
-
-    Args:
-        folder: for the errors by segment.
-        fvus: category -> test set -> FVU.
-        train: ``c`` or ``f``, the car that is learnt on.
-        seeds: of each network.
-        spread: of the logarithm of the FVU from seed to seed.
-        tests: test sets.
-    """
+    """A comparison whose candidates leave this FVU, category -> test set -> FVU, whose logarithm has a spread from seed to seed."""
     generator, rows, models = np.random.default_rng(1), [], []
     other = "f" if train == "c" else "c"
     for category, by_test in fvus.items():

@@ -25,16 +25,13 @@ def claimed(ranking, lower, higher):
     return order_claim(ranking, NAMES[lower], NAMES[higher], TITLES, "0.1° and 0.2°", "simulated")
 
 
-def test_orders_are_judged_by_the_interval_of_their_difference(ranking):
+def test_orders_and_limits_are_judged_by_their_intervals(ranking):
     right, wrong, open_ = claimed(ranking, "good", "other"), claimed(ranking, "other", "good"), claimed(ranking, "other", "like")
     assert [own.verdict for own in (right, wrong, open_)] == ["reproduced", "not reproduced", "undecided"]
     one, other = ranking.pairs[NAMES["good"], NAMES["other"]], ranking.pairs[NAMES["other"], NAMES["good"]]
     assert (one.difference, one.low, one.high) == (-other.difference, -other.high, -other.low)
     assert one.high < 0 < other.low
     assert f"{one.difference:.3f}".replace("-", "−") in right.ours.replace("-", "−")
-
-
-def test_a_limit_is_judged_by_the_interval_of_the_error(ranking):
     low, high = ranking.intervals[NAMES["good"]]
     limits = (high * 1.01, low * 0.99, (low + high) / 2)
     verdicts = [bound_claim(ranking, NAMES["good"], "the good", limit, "below", "simulated").verdict for limit in limits]

@@ -23,7 +23,6 @@ from vehest_papers.heavy_ekf.candidates import (
     estimator_of,
     mistaken,
     oracle,
-    rmse,
     states_of,
     tuning_drives,
 )
@@ -36,9 +35,6 @@ SECONDS = 30.0
 @pytest.fixture(scope="module")
 def dry():
     return [drive(Conditions(5.0), seed, SECONDS) for seed in range(6)]
-
-
-# The plant
 
 
 @pytest.mark.parametrize("conditions", [Conditions(3.0), Conditions(8.0, payload=True, wet_patches=True, crossfall=True)], ids=str)
@@ -70,20 +66,20 @@ def test_the_plant_is_what_another_integrator_makes_of_equations_1_to_6(conditio
         state = found.y[:, -1]
 
 
-def test_axles_make_no_more_than_the_paper_s_largest_forces():
+def test_axles_loads_and_curves_of_the_truck_are_the_papers():
     """F_max = c₂ √(2c₁)/2: 39.0 kN front and 38.6 kN rear, the weight of about 8 t."""
     slip = np.linspace(0.0, 0.5, 50001)
     largest = [rational_axle(slip, c1, c2, 1.0).force.max() for c1, c2 in CURVES.reshape(2, 2)]
     np.testing.assert_allclose(largest, [39.03e3, 38.59e3], rtol=2e-4)
     assert sum(largest) / GRAVITY == pytest.approx(TRUCK.mass, rel=2e-3)
-
-
-@pytest.mark.parametrize("payload", [False, True])
-def test_the_truck_slides_before_it_rolls_over(payload):
-    plant = Plant.of(payload=payload)
-    assert plant.slides_at < plant.roll_over
-    own = drive(Conditions(8.0, payload=payload), 0, SECONDS)
-    assert np.abs(own.lateral).max() <= plant.slides_at
+    plant = Plant.of(payload=True)
+    empty = np.array([TRUCK.cg_to_rear_axle, TRUCK.cg_to_front_axle]) / 3.5 * TRUCK.mass
+    loads = np.array([plant.load_front, plant.load_rear]) * empty
+    assert loads.sum() == pytest.approx(plant.car.mass)
+    assert loads[0] * plant.car.cg_to_front_axle == pytest.approx(loads[1] * plant.car.cg_to_rear_axle)
+    plant, slip = Plant.of(payload=False), np.linspace(-0.2, 0.2, 41)
+    c1, c2 = plant.curves(0.6)[:2]
+    np.testing.assert_allclose(rational_axle(slip, c1, c2, 1.0).force, rational_axle(slip, CURVES[0], CURVES[1], 0.6).force, rtol=1e-12)
 
 
 @pytest.mark.parametrize("slip", factorial.SLIPS)
@@ -94,28 +90,17 @@ def test_the_driver_reaches_the_slip_and_does_not_spin(slip):
         assert np.degrees(np.abs(own.sideslip)).max() < 15.0
 
 
-def test_payload_keeps_the_sum_of_loads_and_moments():
-    plant = Plant.of(payload=True)
-    empty = np.array([TRUCK.cg_to_rear_axle, TRUCK.cg_to_front_axle]) / 3.5 * TRUCK.mass
-    loads = np.array([plant.load_front, plant.load_rear]) * empty
-    assert loads.sum() == pytest.approx(plant.car.mass)
-    assert loads[0] * plant.car.cg_to_front_axle == pytest.approx(loads[1] * plant.car.cg_to_rear_axle)
-
-
-def test_curves_under_friction_are_those_that_a_filter_at_friction_1_would_need():
-    plant, slip = Plant.of(payload=False), np.linspace(-0.2, 0.2, 41)
-    c1, c2 = plant.curves(0.6)[:2]
-    np.testing.assert_allclose(rational_axle(slip, c1, c2, 1.0).force, rational_axle(slip, CURVES[0], CURVES[1], 0.6).force, rtol=1e-12)
-
-
-def test_the_seed_decides_course_and_sensors_whatever_the_plant():
+def test_seeds_decide_course_and_sensors_and_tuning_has_seeds_and_cells_of_its_own():
     one, other = drive(Conditions(4.0), 5, SECONDS), drive(Conditions(4.0, crossfall=True), 5, SECONDS)
     np.testing.assert_array_equal(one.samples[:, 1], other.samples[:, 1])
     noise = [own.samples[:, 0] - own.yaw_rate for own in (one, other)]
     np.testing.assert_allclose(noise[0], noise[1], atol=1e-12)
-
-
-# The filters
+    assert not set(TUNED_SLIPS) & set(factorial.SLIPS)
+    assert not set(TUNED_MISMATCHES) & set(factorial.MISMATCHES)
+    assert factorial.SEEDS <= FIRST_TUNING_SEED
+    tuned_on = {factorial.plant_of(own.conditions) for _, own in tuning_drives()}
+    assert tuned_on == set(factorial.PLANTS)
+    assert all(high - low >= 8.0 for low, high in BOX.values())
 
 
 @pytest.mark.parametrize("name", [paper.LINT, paper.RATT, paper.RATTE])
@@ -154,49 +139,20 @@ def test_filter_with_a_crossfall_state_is_the_readable_one_with_automatic_jacobi
     np.testing.assert_allclose(crossfall_filter.filtered(estimator, samples), theirs, atol=1e-9)
 
 
-def test_the_crossfall_is_found_and_its_filter_is_the_better_one_for_it():
-    own = drive(Conditions(5.0, crossfall=True), 1, 60.0)
-    without = states_of(paper.RATT, LEVELS, own, CURVES)
-    state = states_of(f"{paper.RATT}, crossfall state", LEVELS, own, CURVES)
-    assert state[-400:, -1].mean() == pytest.approx(GRAVITY * math.sin(math.radians(1.0)), abs=0.02)
-    assert rmse(state[:, 0], own) < rmse(without[:, 0], own)
-
-
-def test_oracle_tyres_are_not_worse_than_mistaken_ones_on_average(dry):
-    told = np.mean([rmse(oracle(LEVELS, own), own) for own in dry])
-    for mismatch in (-0.3, -0.1, 0.1, 0.2):
-        assert told <= np.mean([rmse(states_of(paper.RATT, LEVELS, own, mistaken(mismatch))[:, 0], own) for own in dry])
-
-
-def test_an_oracle_on_a_dry_road_is_the_filter_with_the_right_curves(dry):
+def test_oracles_know_the_curves_and_go_on_where_friction_steps(dry):
     np.testing.assert_allclose(oracle(LEVELS, dry[0]), states_of(ORACLE, LEVELS, dry[0], CURVES)[:, 0], atol=1e-12)
-
-
-def test_an_oracle_goes_on_where_the_friction_steps():
-    """Steps between frictions that are nearly the same change nothing that is seen."""
+    # Steps between frictions that are nearly the same change nothing that is seen.
     own = drive(Conditions(4.0, wet_patches=True), 2, 60.0)
     assert len(set(own.friction.tolist())) == 2
     same = replace(own, friction=np.where(own.friction < 1.0, 1.0 - 1e-9, 1.0))
     np.testing.assert_allclose(oracle(LEVELS, same), oracle(LEVELS, replace(own, friction=np.ones(len(own.friction)))), atol=1e-7)
 
 
-# The experiment
-
-
-def test_levels_are_tuned_in_cells_and_on_seeds_that_are_not_scored():
-    assert not set(TUNED_SLIPS) & set(factorial.SLIPS)
-    assert not set(TUNED_MISMATCHES) & set(factorial.MISMATCHES)
-    assert factorial.SEEDS <= FIRST_TUNING_SEED
-    tuned_on = {factorial.plant_of(own.conditions) for _, own in tuning_drives()}
-    assert tuned_on == set(factorial.PLANTS)
-    assert all(high - low >= 8.0 for low, high in BOX.values())
-
-
 def cell(name, squared):
     return factorial.Cell(name, Conditions(4.0), 0.0, squared, {}, (0.0, 0.0, 0.0))
 
 
-def test_a_change_is_paired_over_seeds():
+def test_a_change_is_paired_over_seeds_and_corrected_for_the_tables_cells():
     """Seeds that differ a hundredfold, one filter 20 % below the other on each: told apart, and 20 %."""
     generator = np.random.default_rng(0)
     hard = 10.0 ** generator.uniform(-2.0, 0.0, factorial.SEEDS)
@@ -206,9 +162,6 @@ def test_a_change_is_paired_over_seeds():
     assert found[0, ("A", "B")].percent == pytest.approx(-20.0, abs=1.0)
     assert found[0, ("A", "B")].told_apart
     assert not found[1, ("A", "B")].told_apart
-
-
-def test_holm_asks_more_of_a_table_with_more_cells():
     generator = np.random.default_rng(1)
     one = {
         "A": np.exp(0.5 * generator.standard_normal(factorial.SEEDS)),
@@ -219,18 +172,12 @@ def test_holm_asks_more_of_a_table_with_more_cells():
     assert among.low < alone.low < alone.high < among.high
 
 
-# The vehicle
-
-
-def test_eigenvalues_have_the_paper_s_ratios():
+def test_eigenvalues_have_the_papers_ratios_and_tracks_are_found_from_rolling_wheels():
     """1 above 6 m/s and at most about 1.3 below, with Table 1's stiffnesses."""
     stiff = replace(TRUCK, cornering_stiffness_front=CURVES[1], cornering_stiffness_rear=CURVES[3])
     fast, slow = vehicle.ratios(stiff, np.array([6.5, 10.0, 30.0])), vehicle.ratios(stiff, np.array([0.5, 2.0, 4.0]))
     np.testing.assert_allclose(fast, 1.0, atol=1e-9)
     assert 1.0 < slow.max() < 1.35
-
-
-def test_tracks_are_found_from_wheels_that_roll():
     from vehest.data.recording import Recording
 
     time = np.arange(2000) / 20.0

@@ -63,22 +63,6 @@ def test_taking_the_other_cars_bias_off_gives_the_errors_of_a_drive_without_it(t
     assert errors.value(f"{paper.LINEAR}, as measured", "rmse_vy") != pytest.approx(math.sqrt(np.mean(error**2)), rel=2e-4)
 
 
-def test_a_network_that_can_hold_an_offset_is_given_that_of_its_own_car(tmp_path):
-    turned = scheme(tmp_path, bias=True)
-    turned = Scheme(
-        "scheme_2",
-        "Scheme 2",
-        replace(turned.part, split=replace(turned.part.split, train=turned.part.split.validation, validation=turned.part.split.train)),
-        "f2",
-        "c2",
-    )
-    errors, _ = behaviour.without_biases(turned, [paper.LINEAR_BIAS], "c2")
-    network = ksnn_with_weights(n_local=2, bias=True)
-    shifted = without_ay(planar_drive(SECONDS, seed=1), OFFSET)
-    error = (network.estimate([shifted.without_references()])[0]["vy"] - shifted["vy_ref"])[30:]
-    assert errors.value(f"{paper.LINEAR_BIAS}, corrected", "rmse_vy") == pytest.approx(math.sqrt(np.mean(error**2)), rel=2e-4)
-
-
 def test_at_the_length_it_was_trained_on_a_window_gives_the_networks_own_estimate(tmp_path):
     own = scheme(tmp_path)
     errors = behaviour.after_start(own, paper.LINEAR, "c2")
@@ -90,7 +74,7 @@ def test_at_the_length_it_was_trained_on_a_window_gives_the_networks_own_estimat
     assert errors.value("5", "rmse_vy") != errors.value("30", "rmse_vy")
 
 
-def test_at_little_yaw_rate_v_0_errs_by_v(tmp_path):
+def test_at_little_yaw_rate_v_0_errs_by_v_and_thresholds_beyond_tell_nothing(tmp_path):
     own = scheme(tmp_path)
     errors, share = behaviour.at_low_yaw_rate(own, 0.1, [paper.ZERO, paper.LINEAR], "c2")
     drive = planar_drive(SECONDS, seed=1)
@@ -98,10 +82,6 @@ def test_at_little_yaw_rate_v_0_errs_by_v(tmp_path):
     low = scored & (np.abs(drive["yaw_rate"]) < 0.1)
     assert share == pytest.approx(low.sum() / scored.sum())
     assert errors.value(paper.ZERO, "rmse_vy") == pytest.approx(math.sqrt(np.mean(drive["vy_ref"][low] ** 2)), rel=1e-6)
-
-
-def test_a_threshold_that_is_never_or_always_reached_tells_nothing(tmp_path):
-    own = scheme(tmp_path)
     for threshold in (0.0, 100.0):
         assert paper.ZERO not in behaviour.at_low_yaw_rate(own, threshold, [paper.ZERO], "c2")[0]
 

@@ -6,14 +6,14 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import pytest
-from ksnn_study import DEVIATION, NAMES, SEGMENTS, of_the_paper, planted_part, planted_segments
+from ksnn_study import DEVIATION, of_the_paper, planted_part, planted_segments
 from scipy import stats
 
 from vehest.evaluation.blocks import Segments, segments_of
 from vehest.evaluation.metrics import Scored
 from vehest_papers.kit.statements import Change, Compared, Statement, counted, decided, outcomes
-from vehest_papers.ksnn import claims, cost, paper, tables
-from vehest_papers.ksnn.causes import CAUSES, causes_in_words, causes_table, headline, orders
+from vehest_papers.ksnn import claims, cost, paper
+from vehest_papers.ksnn.causes import headline
 from vehest_papers.ksnn.comparing import SegmentErrors, masked_segments
 from vehest_papers.ksnn.schemes import Scheme
 
@@ -63,7 +63,7 @@ def test_the_papers_own_figures_give_the_papers_verdicts(tmp_path):
     assert found[next(claim for claim in found if claim.startswith("a third car"))] == "not testable on this data"
 
 
-def test_turned_figures_turn_the_verdicts(tmp_path):
+def test_turned_figures_turn_verdicts_and_the_headline(tmp_path):
     found = verdicts(schemes(tmp_path, turned))
     for claim in (
         "nonlinear no bias: RMSE(v) on the other car below Luenberger's",
@@ -71,9 +71,6 @@ def test_turned_figures_turn_the_verdicts(tmp_path):
         "the same by FVU, GRU, LSTM",
     ):
         assert found[claim] == "not reproduced", claim
-
-
-def test_headline_says_whether_the_order_of_families_is_the_papers(tmp_path):
     assert "comes out in both schemes" in headline(schemes(tmp_path / "as"), {})
     words = headline(schemes(tmp_path / "turned", turned), {})
     assert words.startswith("**The paper's order of families does not come out** (scheme 1 and scheme 2)")
@@ -82,44 +79,6 @@ def test_headline_says_whether_the_order_of_families_is_the_papers(tmp_path):
         schemes(tmp_path / "level", lambda table: {name: {"c2": 0.3, "f2": 0.3} for name in of_the_paper(table)}, spread=0.0), {}
     )
     assert "is not decided here" in level
-
-
-def test_the_cause_without_which_the_order_is_lost_is_named(tmp_path):
-    made = schemes(tmp_path / "main")
-    ablations = {
-        cause: [
-            Scheme(f"{cause}_{own.name[-1]}", cause, own.part, own.own, own.other)
-            for own in schemes(tmp_path / cause, turned if cause == "same_sensors" else None)
-        ]
-        for cause in CAUSES
-    }
-    words = causes_in_words(made, orders(made), ablations)
-    assert words.count("It needs that the cars do not have the same sensors.") == 2
-    table = causes_table(made, ablations)
-    assert table.frame.iloc[-1]["S1 as it is"] == "comes out"
-    assert table.frame.iloc[-1]["S2 same sensors"] == "does not come out"
-    assert {paper.ZERO, paper.STATIC_MAP} <= set(table.frame["model"])
-    whole = causes_in_words(made, orders(made), {cause: own for cause, own in ablations.items() if cause != "same_sensors"})
-    assert whole.count("survives without each of them") == 2
-    other = causes_in_words(
-        schemes(tmp_path / "t", turned),
-        dict.fromkeys(("scheme_1", "scheme_2"), "does not come out"),
-        {"same_tyres": ablations["same_tyres"]},
-    )
-    assert "difference that the same tyres take away" in other
-
-
-def test_a_third_car_counts_where_it_is_there(tmp_path):
-    def with_third(table):
-        return {name: {**own, "j1": own["c2"]} for name, own in of_the_paper(table).items()}
-
-    made = schemes(tmp_path, with_third, tests=("c2", "f2", "j1"))
-    found = verdicts(made)
-    assert found[next(claim for claim in found if claim.startswith("a third car"))] in ("reproduced", "not reproduced")
-    table = tables.across_cars(made, "overview", "caption")
-    assert "fvu_third_shown" in table.columns
-    assert table.frame["model"].tolist()[:2] == [paper.ZERO, paper.STATIC_MAP]
-    assert table.frame.set_index(["scheme", "model"]).loc[("Scheme 1", paper.LINEAR), "fvu_other"] == pytest.approx(0.152, rel=0.05)
 
 
 def test_regularisation_is_compared_on_the_same_structures(tmp_path):
@@ -131,23 +90,18 @@ def test_regularisation_is_compared_on_the_same_structures(tmp_path):
     assert "−57 %" in found[0].ours
 
 
-def test_an_order_is_not_read_where_a_candidate_failed_on_its_own_car(tmp_path):
-    made = schemes(tmp_path)[0]
-    assert "the paper's order of families" in tables.whether_an_order_means_anything(made)
-    failing = of_the_paper(paper.TABLE_IV) | {paper.GRU: {"c2": 1.3, "f2": 0.9}}
-    scheme = Scheme("x_1", "Pair", planted_part(tmp_path / "failing", failing, train="c"), "c2", "f2")
-    words = tables.whether_an_order_means_anything(scheme)
-    assert "on the car that they learnt on themselves GRU do no better than the baselines" in words
-    assert "order of families." not in words.split("No order")[1]
-
-
-def test_figures_are_those_of_the_samples():
+def test_figures_are_those_of_the_samples_and_infinite_errors_left_out():
     segments = planted_segments(0.2, "c2", 3)
     errors = SegmentErrors({"one": [segments, segments]}, "c2")
     assert errors.value("one", "fvu") == pytest.approx(0.2)
     assert errors.value("one", "rmse_vy") == pytest.approx(math.sqrt(0.2) * DEVIATION["c2"])
     low, high = errors.get("one", "fvu").interval
     assert low < 0.2 < high
+    broken = planted_segments(math.inf, "c2", 0)
+    errors = SegmentErrors({"good": [planted_segments(0.1, "c2", 0)], "broken": [broken]}, "c2")
+    assert "broken" not in errors
+    assert errors.change("good", "broken", "fvu") is None
+    assert errors.in_words("broken", "fvu") == "–"
 
 
 def test_intervals_hold_the_true_ratio_as_often_as_they_say():
@@ -169,22 +123,6 @@ def _of_pieces(squares):
     zeros = np.zeros_like(squares)
     n = np.arange(len(squares), dtype=float)
     return Segments(n, zeros, np.ones_like(squares), squares, squares, zeros, zeros, np.ones_like(squares))
-
-
-def test_the_same_networks_under_two_conditions_are_compared_seed_by_seed():
-    parts = {name: [planted_segments(level * fvu, "c2", 3) for fvu in (0.1, 0.2, 0.4)] for name, level in (("a", 0.9), ("b", 1.0))}
-    together = SegmentErrors(parts, "c2", same_models=True).change("a", "b", "fvu")
-    apart = SegmentErrors(parts, "c2").change("a", "b", "fvu")
-    assert together.ends() == pytest.approx((0.9, 0.9), rel=1e-6)
-    assert apart.ends()[0] < 0.5
-
-
-def test_candidates_with_infinite_errors_are_left_out():
-    broken = planted_segments(math.inf, "c2", 0)
-    errors = SegmentErrors({"good": [planted_segments(0.1, "c2", 0)], "broken": [broken]}, "c2")
-    assert "broken" not in errors
-    assert errors.change("good", "broken", "fvu") is None
-    assert errors.in_words("broken", "fvu") == "–"
 
 
 def test_masked_segments_without_a_mask_are_the_evaluations_own():
@@ -214,21 +152,15 @@ def test_a_statement_is_reproduced_only_where_all_its_comparisons_are(ratios, ve
     assert ("−50 % [" in claim.ours) == bool(ratios)
 
 
-def test_many_comparisons_are_corrected_for_their_number():
+def test_many_comparisons_bounds_and_counts_are_judged_as_relative_changes():
     weak = Compared("", change(0.9, 0.045))
     assert outcomes([weak])[0][0] == "as claimed"
     assert {outcome for outcome, _ in outcomes([weak] * 10)} == {"not told apart"}
     _, confidence = outcomes([weak] * 10)[0]
     assert confidence == pytest.approx(1.0 - 0.05 / 10)
-
-
-def test_bounds_are_relative_changes_too():
     within = Compared("", change(1.0, 0.005), beyond=0.02)
     assert outcomes([within])[0][0] == "as claimed"
     assert outcomes([Compared("", change(1.05, 0.005), beyond=0.02)])[0][0] == "the other way round"
-
-
-def test_counted_claims_need_every_case():
     assert counted("c", "p", "o", "d", [True, True], "w").verdict == "reproduced"
     assert counted("c", "p", "o", "d", [True, False], "w").verdict == "undecided"
     assert counted("c", "p", "o", "d", [False], "w").verdict == "not reproduced"
@@ -281,8 +213,3 @@ def test_times_in_c_are_those_that_were_published():
         own = published[(published["family"] == estimator) & (published["variant"] == variant) & (published["drive"] == "ferrari_250lm")]
         measured = float(own[own["precision"] == "double"]["c_method_ns"].iloc[0]) / 1e3
         assert shown == pytest.approx(measured, rel=0.01)
-
-
-def test_every_category_has_a_name_here():
-    assert set(NAMES) >= set(paper.CATEGORIES)
-    assert SEGMENTS % 2 == 0

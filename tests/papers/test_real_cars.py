@@ -1,16 +1,17 @@
-"""What is said of real recordings: statistics against closed forms, and the report on recordings made here."""
+"""What is said of real recordings: statistics against closed forms, the report on recordings made here, and planted faults."""
 
 import math
-from dataclasses import replace
 
 import numpy as np
 import pytest
 
+from real_drives import real_drive
 from vehest.data.recording import Recording
 from vehest.data.store import write_recording
 from vehest.report.document import Table
 from vehest.studies.artefacts import StoredDataset, StudyArtefacts
 from vehest_papers.real_cars.document import documents
+from vehest_papers.real_cars.planted import detections, planted_faults
 from vehest_papers.real_cars.statistics import statistics_of
 
 
@@ -52,14 +53,6 @@ def test_a_recording_that_cannot_rank_says_why(recording, what):
     assert any(what in reason for reason in statistics_of([recording]).reasons)
 
 
-def test_a_standing_car_counts_for_nothing():
-    moving = drive()
-    speed = np.concatenate([np.zeros(3000), moving["vx"][3000:]])
-    assert statistics_of([replace(moving, channels={**moving.channels, "vx": speed})]).driven == pytest.approx(90.0, abs=1.5)
-    parked = replace(moving, channels={**moving.channels, "vx": np.zeros(12_000)})
-    assert statistics_of([parked]).driven == 0.0
-
-
 def test_the_report_tells_what_can_rank_and_why_the_rest_cannot(tmp_path):
     datasets = []
     for name, recording in (("long", drive()), ("short", drive(seconds=40.0))):
@@ -71,3 +64,45 @@ def test_the_report_tells_what_can_rank_and_why_the_rest_cannot(tmp_path):
     assert "`short` (40 s of driving)" in text
     tables = {block.name: block for block in report.blocks if isinstance(block, Table)}
     assert set(tables) == {"overview", "recordings", "findings", "licences"}
+
+
+LENGTH = 2000
+
+
+def noise():
+    generator = np.random.default_rng(0)
+    names = ("vx", "yaw_rate", "ax", "ay", "steer", "vy_ref", "sideslip_ref")
+    return Recording("r", "car", 100.0, 0.0, {name: generator.standard_normal(LENGTH) for name in names})
+
+
+def fault(name, channel, size):
+    (found,) = [one for one in planted_faults() if (one.name, one.channels[0], one.size) == (name, channel, size)]
+    return found
+
+
+def test_faults_change_their_channels_alone_and_are_what_they_are_called():
+    whole = noise()
+    for one in planted_faults():
+        changed = one(whole)
+        assert {name for name in whole.channels if not np.array_equal(whole[name], changed[name])} == set(one.channels)
+    whole = noise()
+    np.testing.assert_allclose(fault("late", "ay", "40 ms")(whole)["ay"][4:], whole["ay"][:-4], atol=1e-9)
+    np.testing.assert_allclose(fault("held", "ay", "10 Hz")(whole)["ay"], np.repeat(whole["ay"][::10], 10))
+    slow = fault("low-passed", "ax", "0.4 s")(whole)["ax"]
+    state = whole["ax"][0]
+    for sample in range(1, 50):
+        state += (1.0 - np.exp(-0.01 / 0.4)) * (whole["ax"][sample] - state)
+        assert slow[sample] == pytest.approx(state)
+    assert set(detections(noise().select(["vx", "ay"]))["channel"]) == {"vx", "ay"}
+
+
+@pytest.mark.parametrize(("start", "stop", "missed"), [(150.0, 450.0, {20}), (450.0, 550.0, {20, 40}), (550.0, 700.0, {20})])
+def test_all_but_the_shortest_delays_of_the_reference_are_found_in_the_ferrari_without_a_false_alarm(data_root, start, stop, missed):
+    """Its accelerometers are late by some 15 ms themselves, which a late reference makes good."""
+    table = detections(real_drive(data_root).cut(start, stop))
+    assert len(table) == len(planted_faults())
+    lost = table[table["decidable"] & ~table["found"]]
+    assert set(lost["channel"]) == {"vy_ref and sideslip_ref"}
+    assert set(lost["size"]) == {f"{size} ms" for size in missed}
+    assert not table["false_alarms"].any()
+    assert not table[~table["decidable"]]["found"].any()

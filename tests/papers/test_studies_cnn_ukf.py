@@ -16,7 +16,7 @@ from test_sample_network import loaded_drive
 from dugoff_drive import TYRES
 from vehest.data.errors import DataError
 from vehest.data.splits import Span, Split
-from vehest.data.store import write_estimate, write_recording
+from vehest.data.store import write_estimate
 from vehest.data.transforms import transform_from_config
 from vehest.estimators.base import FitData
 from vehest.estimators.dugoff_ukf import DugoffUkf, PseudoMeasurement
@@ -29,7 +29,7 @@ from vehest.report.document import Figure, Table
 from vehest.studies.artefacts import EvaluatedModel, StudyArtefacts
 from vehest.training.samples import SampleSettings
 from vehest.training.sequences import PhaseSettings
-from vehest_papers.cnn_ukf import claims, document, documents, networks, observability, paper, perturbed, search, tables, traces
+from vehest_papers.cnn_ukf import claims, document, documents, networks, observability, paper, perturbed, search
 from vehest_papers.cnn_ukf.limited import AS_TUNED, OF_THE_FULL_SET, limited
 from vehest_papers.cnn_ukf.measures import MSE, ManoeuvreErrors
 from vehest_papers.cnn_ukf.subjects import OFFLINE, OWN, Prepared, Run, candidate_of, chosen, line_of, runs_of, until
@@ -175,17 +175,16 @@ def test_the_published_page_for_a_busy_engineer_is_short():
     assert len(text[: text.index("## Appendix")].split()) <= 2500
 
 
-def test_candidates_have_the_papers_names(part):
+def test_candidates_have_the_papers_names_and_lines(part):
     assert set(map(candidate_of, part.models)) == {*paper.OF_FOUR, paper.SMOOTH, paper.ZERO}
     away = replace(part.models[-2], estimator="cnn_ukf", variant="full_no_adaptive_process")
     assert candidate_of(away) == "process noise constant"
     twice = replace(part, models=[part.models[0], part.models[0]])
     with pytest.raises(DataError, match="Model-based was trained twice with one seed"):
         runs_of(twice, Prepared(twice))
-
-
-def test_a_hybrid_that_is_its_own_filter_is_drawn_as_the_hybrid():
     assert line_of(paper.CNN + OWN) == line_of(paper.CNN)
+    with pytest.raises(DataError, match="'GRU' is none of the paper's methods"):
+        candidate_of(EvaluatedModel("gru", "states_5", "GRU", 0, Path(), Path()))
 
 
 def made_run(candidate, errors, seed=0, validation=None, ay=5.0):
@@ -208,15 +207,12 @@ def noisy(level, generator, count=12):
     return [level * own * WAVE for own in generator.uniform(0.8, 1.2, count)]
 
 
-def test_indicators_are_those_of_the_paper(runs):
+def test_indicators_and_differences_are_those_of_the_paper(runs):
     own = ManoeuvreErrors(runs, "t")
     for candidate, seeds in runs.items():
         for indicator in ("mse", "mse_nonlinear", "max_error", "max_error_nonlinear"):
             expected = np.mean([getattr(run.kpis, indicator) for run in seeds])
             assert own.get(candidate, indicator).value == pytest.approx(expected)
-
-
-def test_a_real_difference_is_told_and_none_is_not():
     generator = np.random.default_rng(0)
     levels = {"a": 1.0, "b": 1.5, "c": 1.0}
     made = {name: [made_run(name, noisy(level, generator), seed) for seed in range(3)] for name, level in levels.items()}
@@ -235,15 +231,6 @@ def test_a_filter_that_does_not_listen_is_called_its_own():
     assert claims.is_own_filter(ManoeuvreErrors({paper.SMOOTH: same, paper.CNN: other}, "t"), paper.CNN, 0.01)
 
 
-def test_groups_in_which_a_candidate_is_best_are_counted():
-    generator = np.random.default_rng(0)
-    levels = {paper.MODEL: 3.0, paper.DATA: 2.0, paper.DEEP: 2.0, paper.CNN: 1.0}
-    own = ManoeuvreErrors({name: [made_run(name, noisy(level, generator))] for name, level in levels.items()}, "t")
-    (found,) = [entry for entry in claims.on_accuracy(own, "d") if getattr(entry, "claim", "").startswith("Fig. 6")]
-    assert found.ours.startswith("2 [")
-    assert found.verdict == "not reproduced"  # of two groups there are not five
-
-
 def test_validation_chooses_the_seed_and_no_single_manoeuvre_does():
     one = made_run(paper.MODEL, [np.full(10, 1.0)], 0, validation=np.full(10, 2.0))
     other = made_run(paper.MODEL, [np.full(10, 2.0)], 1, validation=np.full(10, 1.0))
@@ -253,11 +240,19 @@ def test_validation_chooses_the_seed_and_no_single_manoeuvre_does():
     assert chosen([quiet, wild]).model.seed == 0
 
 
-def test_a_drive_is_scored_until_it_slides_beyond_twelve_degrees():
+def test_a_drive_is_scored_until_it_slides_and_the_report_counts_those_that_are_cut():
     angle = np.array([0.1, 0.2, 0.22, 0.1])
     part = Scored(np.arange(4.0), angle, angle, angle, angle, angle)
     assert len(until(part, 0.21).time) == 2
     assert len(until(part, 0.3).time) == 4
+
+    def driven(*largest):
+        test = {f"drive {k}": [SimpleNamespace(sideslip_ref=np.radians([0.0, -angle]))] for k, angle in enumerate(largest)}
+        return SimpleNamespace(runs={"any": [SimpleNamespace(test=test)]})
+
+    assert document._cut_in_words(driven(3.0, 43.0, 11.9, 180.0)) == "2 of 4 drives, with up to 180° and 43°, are"
+    assert document._cut_in_words(driven(3.0, 13.0)) == "1 of 2 drives, with up to 13°, is"
+    assert document._cut_in_words(driven(3.0)) == "no drive is"
 
 
 def test_what_networks_say_is_held_against_the_reference_of_the_same_time(part, runs, monkeypatch):
@@ -283,17 +278,7 @@ def test_a_filter_moves_by_no_more_than_its_network_and_less_where_it_distrusts(
     assert perfect.kpis.mse < max(runs[paper.CNN][0].kpis.mse, 1e-3)
 
 
-def test_filters_that_are_not_those_that_were_found_are_named(runs, tmp_path):
-    assert "are those that the filters found" in tables.given_as_found(runs)
-    other = estimator_class("dugoff_ukf").from_config({"tyres": {**TYRES, "friction_rear": 1.2 * TYRES["friction_rear"]}, "noise": LEVELS})
-    save_model(other, tmp_path)
-    changed = replace(runs[paper.MODEL][0], model=replace(runs[paper.MODEL][0].model, model_folder=tmp_path))
-    words = tables.given_as_found({**runs, paper.MODEL: [changed]})
-    assert "are not those that the filters find now" in words
-    assert "friction_rear of DE-UKF" in words
-
-
-def test_tyres_and_body_are_changed_in_a_copy():
+def test_tyres_and_body_are_changed_in_a_copy_and_wrong_ones_cost_more(part, runs):
     for name in ("dugoff_ukf", "cnn_ukf"):
         fitted = estimator_class(name).from_config({"tyres": TYRES, "noise": LEVELS})
         changed, heavy = perturbed.with_stiffness(fitted, 0.1, -0.1), perturbed.with_body(fitted, 1.1, 0.9)
@@ -304,9 +289,6 @@ def test_tyres_and_body_are_changed_in_a_copy():
     for change in (perturbed.with_stiffness, perturbed.with_body):
         with pytest.raises(DataError, match=r"has no cornering stiffness|knows no mass"):
             change(estimator_class("sideslip_ffnn").from_config({}), 0.1, 0.1)
-
-
-def test_wrong_tyres_cost_the_model_more_than_nothing(part, runs):
     table = perturbed.values(perturbed.perturbed({paper.MODEL: runs[paper.MODEL]}, Prepared(part)))
     assert table["mse"].to_numpy().argmin() == perturbed.NOMINAL
 
@@ -356,19 +338,20 @@ def test_the_search_compares_validation_with_the_papers_widths(everything, runs)
     assert search.search_table(parts, {**runs, paper.DATA: [wild]}, "D").frame["validation"].tolist() == table.frame["validation"].tolist()
 
 
-def test_a_report_without_its_main_part_is_refused(part):
+def test_manoeuvres_in_two_ranges_and_reports_without_a_main_part_are_refused(part):
+    spans = (*SPLIT.tests["test"], Span("car", "test_lap_1", 4.0))
+    twice = replace(part, split=Split("made", SPLIT.train, SPLIT.validation, {"test": spans}))
+    with pytest.raises(DataError, match="has several ranges, but a manoeuvre is one"):
+        runs_of(twice, Prepared(twice))
     with pytest.raises(DataError, match="needs part 'full'"):
         documents(StudyArtefacts("cnn_ukf", "t", "a", "c", {"limited": "l"}, {"limited": part}, []))
 
 
-def test_the_study_prepares_references_as_the_pipeline_prepares_recordings():
+def test_recordings_are_prepared_as_the_pipeline_prepares_them(part):
     content = yaml.safe_load((ROOT / "pipelines" / "cnn_ukf.yaml").read_text())
     offline = {override for part in content["parts"].values() for sweep in part["sweeps"] for override in sweep}
     (told,) = {override for override in offline if override.startswith("downsample.transforms=")}
     assert tuple(transform_from_config(entry) for entry in yaml.safe_load(told.partition("=")[2])) == OFFLINE
-
-
-def test_references_and_accelerations_are_low_passed_before_they_are_scored(part):
     prepared = Prepared(part)
     noisy = part.references["car", "test_lap_1"]
     assert np.std(np.diff(prepared.recording("car", "test_lap_1")["ay"], 2)) < 0.1 * np.std(np.diff(loaded_ay(noisy), 2))
@@ -376,41 +359,3 @@ def test_references_and_accelerations_are_low_passed_before_they_are_scored(part
 
 def loaded_ay(path):
     return pd.read_parquet(path)["ay"].to_numpy()
-
-
-def test_the_manoeuvre_drawn_is_the_one_with_the_largest_angle_whose_car_did_not_spin(part, tmp_path):
-    calm = Prepared(part).recording("car", "test_j_turn_1")
-    references, spans = dict(part.references), list(SPLIT.tests["test"])
-    for name, factor, spun in (("test_j_turn_2", 1.5, False), ("test_j_turn_3", 2.0, True)):
-        channels = {**calm.channels, "vy_ref": factor * calm["vy_ref"]}
-        references["car", name] = tmp_path / f"{name}.parquet"
-        flagged = replace(calm, id=name, channels=channels, provenance={"flags": {"spun": spun}})
-        write_recording(flagged, references["car", name])
-        spans.append(Span("car", name, 1.5))
-    split = Split("made", SPLIT.train, SPLIT.validation, {"test": tuple(spans)})
-    more = replace(part, references=references, split=split)
-    assert traces.manoeuvre_of(more, Prepared(more), "J-turn").recording == "test_j_turn_2"
-    with pytest.raises(DataError, match="no test manoeuvre is a skidpad"):
-        traces.manoeuvre_of(part, Prepared(part), "skidpad")
-
-
-def test_manoeuvres_in_two_ranges_are_refused(part):
-    spans = (*SPLIT.tests["test"], Span("car", "test_lap_1", 4.0))
-    twice = replace(part, split=Split("made", SPLIT.train, SPLIT.validation, {"test": spans}))
-    with pytest.raises(DataError, match="has several ranges, but a manoeuvre is one"):
-        runs_of(twice, Prepared(twice))
-
-
-def test_a_method_that_the_paper_does_not_have_is_refused():
-    with pytest.raises(DataError, match="'GRU' is none of the paper's methods"):
-        candidate_of(EvaluatedModel("gru", "states_5", "GRU", 0, Path(), Path()))
-
-
-def test_the_report_counts_the_drives_that_are_cut_and_tells_how_far_they_slide():
-    def driven(*largest):
-        test = {f"drive {k}": [SimpleNamespace(sideslip_ref=np.radians([0.0, -angle]))] for k, angle in enumerate(largest)}
-        return SimpleNamespace(runs={"any": [SimpleNamespace(test=test)]})
-
-    assert document._cut_in_words(driven(3.0, 43.0, 11.9, 180.0)) == "2 of 4 drives, with up to 180° and 43°, are"
-    assert document._cut_in_words(driven(3.0, 13.0)) == "1 of 2 drives, with up to 13°, is"
-    assert document._cut_in_words(driven(3.0)) == "no drive is"

@@ -44,19 +44,18 @@ def ratte():
     )
 
 
-def test_every_fault_leaves_the_filter_finite(ratte):
+def test_every_fault_leaves_the_filter_finite_and_the_monitor_sees_another_sign(ratte):
     drive = short_drive()
     for name, apply in watching.faults(WHEELS).items():
         estimate = ratte.estimate([apply(drive).without_references()])[0]
         assert all(np.isfinite(values).all() for values in estimate.channels.values()), name
-
-
-def test_the_monitor_sees_a_yaw_rate_of_the_other_sign(ratte):
     drive = short_drive()
     wrong = watching.faults(WHEELS)["yaw rate of the other sign"](drive)
     sound, flipped = (ratte.estimate([own.without_references()])[0] for own in (drive, wrong))
     limit = watching.MARGIN * np.max(watching.monitor(sound["nis"], sound["nis_dof"], RATE))
     assert np.max(watching.monitor(flipped["nis"], flipped["nis_dof"], RATE)) > 3.0 * limit
+    nis, dof = np.repeat([2.0, 6.0, 0.0], 200), np.repeat([2.0, 1.0, 0.0], 200)
+    np.testing.assert_array_equal(watching.monitor(nis, dof, RATE), [1.0, 6.0, math.nan])
 
 
 def test_table_of_bad_input_names_the_drive_backwards(ratte):
@@ -70,18 +69,6 @@ def test_table_of_bad_input_names_the_drive_backwards(ratte):
     assert not any("the drive backwards" in str(block) for block in words)
 
 
-def test_monitor_is_the_mean_over_measured_numbers_in_windows():
-    nis, dof = np.repeat([2.0, 6.0, 0.0], 200), np.repeat([2.0, 1.0, 0.0], 200)
-    np.testing.assert_array_equal(watching.monitor(nis, dof, RATE), [1.0, 6.0, math.nan])
-
-
-def test_parameters_show_where_the_truck_turns(ratte):
-    seen = watching.observability_of(ratte, short_drive(), 2.0).smallest
-    turning = np.abs(np.sin(0.4 * (np.arange(len(seen)) + 10) / RATE))
-    assert np.median(seen[turning > 0.9]) > np.median(seen[turning < 0.1])
-    assert np.isfinite(seen).all()
-
-
 def test_convergence_counts_from_the_last_time_outside():
     time = np.arange(6.0) + 100.0
     assert tyres.convergence_time(time, np.array([2.0, 1.0, 1.5, 1.05, 1.0, 0.95]), 1.0) == 3.0
@@ -89,7 +76,7 @@ def test_convergence_counts_from_the_last_time_outside():
     assert tyres.convergence_time(time, np.array([1.0, 1.0, 1.0, 1.0, 1.0, 1.2]), 1.0) == math.inf
 
 
-def test_gains_are_those_of_the_figures():
+def test_gains_are_those_of_the_figures_and_locked_axles_named():
     rmse = {
         (name, f"{kind}_{drive}"): value
         for name, value in (("LINT", 1.0), ("RATT", 0.5), ("RATTE", 0.25))
@@ -99,6 +86,8 @@ def test_gains_are_those_of_the_figures():
     frame = tables.gains_table(rmse).frame
     assert frame["nominal_laps"].tolist() == ["50 %", "50 %", "75 %"]
     assert frame["paper"].tolist() == ["37 %", "44 %", "65 %"]
+    assert "rear (Eqs. 63, 64)" in vehicle._locked_in_words(np.array([1.6, 0.0]))
+    assert vehicle._locked_in_words(np.array([1.6, 1.5])) == ""
 
 
 def estimated(drive, gain, noise=0.0):
@@ -116,34 +105,15 @@ def test_an_estimate_that_is_a_fifth_too_small_has_a_gain_of_0_8_and_reproduces_
     assert [claim.verdict for claim in accuracy.underestimation_claims(gains)] == ["reproduced", "undecided"] * 2
 
 
-def test_laps_are_thirds_of_the_way():
+def test_laps_are_thirds_of_the_way_and_the_stop_is_when_the_truck_last_moved():
     drive = short_drive(90.0)
     laps = accuracy.laps_of(drive)
     assert [int(lap.sum()) for lap in laps] == [600, 600, 600]
     assert not (laps[0] & laps[1]).any()
-
-
-def test_the_stop_is_the_last_time_that_the_truck_moved():
     drive = short_drive(60.0)
     speed = np.where(drive.time < 40.0, 10.0, 0.0)
     stopped = Recording("stops", "truck", RATE, 0.0, {**drive.channels, "vx_ref": speed}, "simulated")
     assert accuracy.stop_of(stopped) == pytest.approx(40.0, abs=0.06)
-
-
-def test_tracks_of_the_truck_are_found_from_its_wheels():
-    """The truck's tracks, from wheels with the rolling radius of the AV-21."""
-    drive = short_drive(60.0)
-    wheels = {
-        name: samples * WHEELS.wheel_radius / vehicle.RADIUS for name, samples in drive.channels.items() if name.startswith("wheel_speed")
-    }
-    rolling = Recording("rolls", "truck", RATE, 0.0, {**drive.channels, **wheels}, "simulated")
-    front, rear = vehicle.tracks_of(rolling)
-    assert (front, rear) == pytest.approx((2.08, 2.08), rel=0.02)
-
-
-def test_an_axle_whose_wheels_turn_alike_is_named_and_not_corrected():
-    assert "rear (Eqs. 63, 64)" in vehicle._locked_in_words(np.array([1.6, 0.0]))
-    assert vehicle._locked_in_words(np.array([1.6, 1.5])) == ""
 
 
 def test_an_order_that_every_draw_has_is_told_apart_and_one_that_draws_decide_is_not():

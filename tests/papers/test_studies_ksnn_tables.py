@@ -51,15 +51,12 @@ def part(figures=FIGURES, drop=""):
     return part_of(SPLIT, Protocol(), models, rows, kinds={"cars": "simulated"}, data_titles={"cars": "Cars"})
 
 
-def test_runs_have_a_row_a_model_with_all_metrics():
+def test_runs_have_a_row_a_model_with_all_metrics_and_missing_ones_are_said():
     runs = runs_of(part())
     assert len(runs) == len(FIGURES)
     row = runs[(runs["variant"] == "states_3") & (runs["seed"] == 1)].iloc[0]
     assert (row["category"], row["structure"], row["epochs"]) == (paper.GRU, "3 states", 20)
     assert (row["rmse_vy.validation"], row["fvu.c2"], row["r2.f2"]) == (0.25, 0.01, 0.99)
-
-
-def test_a_metric_that_is_missing_is_said():
     with pytest.raises(DataError, match=r"luenberger-luenberger-seed0 has no r2\.validation; evaluate it again"):
         runs_of(part(drop="r2"))
 
@@ -83,14 +80,11 @@ def test_candidates_fall_into_the_papers_categories(estimator, variant, category
     assert (category_of(estimator, variant), structure_of(variant)) == (category, structure)
 
 
-def test_validation_chooses_and_tests_do_not():
+def test_validation_chooses_and_neither_tests_nor_diverged_runs_do():
     picked = chosen_by_category(runs_of(part()))
     assert list(picked) == [paper.LUENBERGER, paper.GRU, paper.NONLINEAR_BIAS, paper.LINEAR]
     assert (picked[paper.GRU]["variant"], picked[paper.GRU]["seed"]) == ("states_3", 0), "seed 1 is far better on both tests"
     assert (picked[paper.LINEAR]["variant"], picked[paper.LINEAR]["seed"]) == ("linear_no_bias_p2", 1)
-
-
-def test_a_run_that_diverged_is_not_chosen():
     figures = {("gru", "states_2", 0): (math.nan, 0.1, 0.1), ("gru", "states_2", 1): (0.3, 0.2, 0.2)}
     assert chosen(runs_of(part(figures)))["seed"] == 1
 
@@ -108,22 +102,10 @@ def test_sideslip_table_has_a_column_a_kind_of_data():
     assert tables.sideslip(runs, drive, None, "real").columns["scheme_2"].header == "ours: REAL F-2, scheme 2 [deg]"
 
 
-def test_regularisation_compares_the_same_structure():
-    figures = {("lstm", "states_2", 0): (0.2, 0.4, 0.1), ("lstm", "states_5", 0): (0.1, 0.3, 0.1)}
-    without = {("lstm", "states_2", 0): (0.2, 0.8, 0.05)}
-    table = tables.regularisation(runs_of(part(figures)), runs_of(part(without))).frame
-    assert table["model"].tolist() == ["LSTM, 2 states"] * 2
-    assert table["fvu_c2"].tolist() == [0.4, 0.8]
-    assert table["paper_fvu_c2"].tolist() == [0.483, 0.840]
-
-
-def test_stopping_counts_fits_that_train():
+def test_stopping_and_candidates_count_what_was_trained():
     table = tables.stopping({"scheme_1": runs_of(part())}, {"scheme_1": "Scheme 1"}).frame.set_index("model")
     assert paper.LUENBERGER not in table.index
     assert table.loc[paper.GRU, ["fits", "least", "median", "most"]].tolist() == [3, 10, 10, 20]
-
-
-def test_every_candidate_is_in_the_file_of_its_scheme():
     table = tables.candidates(runs_of(part()), ["c2", "f2"])
     assert len(table) == 6
     row = table[table["variant"] == "linear_no_bias_p2"].iloc[0]

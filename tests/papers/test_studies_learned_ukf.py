@@ -10,7 +10,7 @@ import pytest
 import torch
 from study_parts import metric_rows, part_of, stored
 
-from vehest.data.errors import ConfigurationError, DataError
+from vehest.data.errors import DataError
 from vehest.data.estimate import Estimate
 from vehest.data.recording import Recording
 from vehest.data.splits import VALIDATION, Span, Split
@@ -33,32 +33,20 @@ from vehest_papers.learned_ukf.additions import (
     samples_seen,
 )
 from vehest_papers.learned_ukf.candidates import candidate_of, chosen, models_by_candidate, runs_of, scored_of
-from vehest_papers.learned_ukf.departures import departures, settings_table
 from vehest_papers.learned_ukf.errors import Losses
-from vehest_papers.learned_ukf.filtering import drives_of, filtered, loaded, lost_sequences, one_step_squares, squares_of, swapped, weighted
+from vehest_papers.learned_ukf.filtering import drives_of, filtered, loaded, lost_sequences, one_step_squares, swapped
 from vehest_papers.learned_ukf.lengths import lengths
-from vehest_papers.learned_ukf.oracle import TRAINING, train_on
 from vehest_papers.learned_ukf.order import APART, AS_IN_THE_PAPER, LEVEL, TURNED, UNDECIDED, differences, order_in_words
 from vehest_papers.learned_ukf.slips import rear_slip
 from vehest_papers.learned_ukf.traces import hardest
-from vehest_papers.learned_ukf.trials import trials_table
 
 PROTOCOL = Protocol(rate_hz=100.0, warm_up_seconds=0.0, skip_seconds=0.2, sequence_seconds=1.0, initial_state=True)
 SPANS = {name: Span("car", name) for name in ("learnt", "judged", "a", "d")}
 SPLIT = Split("tyres", (SPANS["learnt"],), (SPANS["judged"],), {"tyre_a": (SPANS["a"],), "tyre_d": (SPANS["d"],)})
 PHASE = {"learning_rate": 5e-4, "max_epochs": 1000, "schedule": "constant"}
-AS_THE_PAPER = {
-    **dict.fromkeys(("one_step", "through", "noise"), PHASE),
-    **{
-        "batch_size": 256,
-        "placing": "fixed",
-        "start_spread": 0.0,
-        "mirrored": 0.0,
-        "start_noise": "given",
-        "drop_steps": 200,
-        "steps": 500,
-    },
-}
+AS_THE_PAPER = dict.fromkeys(("one_step", "through", "noise"), PHASE)
+AS_THE_PAPER |= {"batch_size": 256, "placing": "fixed", "start_spread": 0.0, "mirrored": 0.0, "start_noise": "given"}
+AS_THE_PAPER |= {"drop_steps": 200, "steps": 500}
 CANDIDATES = {
     "NNT": {"dynamics": "tyre_network", "noise": "constant", "through_filter": False},
     "NNTF": {"noise": "constant", "through_filter": False},
@@ -140,10 +128,16 @@ def test_candidates_have_the_papers_names(settings, candidate):
     assert candidate_of(EvaluatedModel("learned_ukf", estimator.variant, estimator.full_title, 0, Path(), Path())) == candidate
 
 
-def test_two_variants_under_one_name_are_refused(part):
+def test_candidates_keep_the_papers_names_one_model_a_seed(part):
     twice = replace(part, models=[part.models[0], part.models[0]])
     with pytest.raises(DataError, match="NNT was trained twice with one seed"):
         models_by_candidate(twice)
+    (name,) = models_by_candidate(only(part, "NNTF_UH", {"one_step": {**PHASE, "max_epochs": 0}}))
+    assert name == "NNTF_UH from scratch"
+    assert candidate_of(EvaluatedModel("learned_ukf_variant", "pc_curved", "", 0, Path(), Path())) == "PC with E"
+    metrics = part.metrics[~((part.metrics["metric"] == "mae_weighted") & (part.metrics["seed"] == 1))]
+    with pytest.raises(DataError, match=r"seed1 has no mae_weighted\.tyre_a; evaluate it again"):
+        runs_of(replace(part, metrics=metrics))
 
 
 def test_report_shows_every_table_and_figure_of_the_paper_and_says_what_its_data_are(part, tmp_path):
@@ -250,24 +244,12 @@ def test_one_step_error_of_a_model_on_its_own_motion_is_nothing(part):
     np.testing.assert_allclose(one_step_squares(estimator, drives), [[0.0, 0.05, 0.0, 0.0]], rtol=1e-5)
 
 
-def test_protocol_without_sequences_is_refused(part):
-    whole = replace(part, protocol=Protocol(100.0, 0.0, 0.2))
-    with pytest.raises(ConfigurationError, match=r"needs evaluation\.sequence_seconds"):
-        drives_of(whole, loaded(model(part, "NNTF")), "tyre_a")
-
-
 def test_validation_chooses_the_seed_and_tests_do_not(part):
     runs = runs_of(part)
     column = runs["candidate"] == "NNTF"
     runs.loc[column, "mse_weighted.validation"] = [2.0, 1.0]
     runs.loc[column, "mse_weighted.tyre_d"] = [0.1, 9.0]
     assert chosen(part, runs, "NNTF").seed == 1
-
-
-def test_a_metric_that_is_missing_is_said(part):
-    metrics = part.metrics[~((part.metrics["metric"] == "mae_weighted") & (part.metrics["seed"] == 1))]
-    with pytest.raises(DataError, match=r"seed1 has no mae_weighted\.tyre_a; evaluate it again"):
-        runs_of(replace(part, metrics=metrics))
 
 
 def errors_of(**levels):
@@ -290,7 +272,7 @@ def test_tables_show_means_with_intervals_beside_the_paper():
     assert math.isnan(frame.loc["oracle", "paper_mse"])
 
 
-def test_pairs_that_are_planted_get_their_verdicts():
+def test_ratios_percentiles_and_seeds_that_are_planted_get_their_verdicts():
     errors = errors_of(NNTF_UH=1.0, GRU=2.0, LSTM=1.0, NN=1.0, NN_U=1.5)
     found = {own.claim: own.verdict for own in claims.pair_claims(errors, "tyre_a", "simulated")}
     assert found == {
@@ -299,25 +281,16 @@ def test_pairs_that_are_planted_get_their_verdicts():
         "NN_U below NN": "not reproduced",
         "NN_U below NNTF_UH": "not reproduced",
     }
-
-
-def test_a_ratio_has_the_interval_of_fieller_and_a_factor_its_verdict():
     errors = errors_of(NNTF_UH=1.0, GRU=2.0)
     value, low, high = errors.ratio("NNTF_UH", "GRU")
     assert value == pytest.approx(0.5, rel=0.01)
     assert 0.45 < low < value < high < 0.55
     first, second = claims.factor_claims({"tyre_a": errors, "tyre_d": errors}, "simulated")
     assert (first.verdict, second.verdict) == ("reproduced", "not reproduced")
-
-
-def test_percentiles_are_compared_over_sequences_and_seeds():
     own = errors_of(NNTF_UH=1.0, GRU=4.0).percentile("NNTF_UH", "GRU")
     assert own.high < 0.0
     same = errors_of(NNTF_UH=1.0, GRU=1.0).percentile("NNTF_UH", "GRU")
     assert same.low < 0.0 < same.high
-
-
-def test_same_weights_are_compared_seed_by_seed():
     errors = errors_of(NNTF_UH=1.0)
     seeds = np.array([1.0, 5.0, 9.0])[:, None]
     errors.squared["NNTF_UH"] = errors.squared["NNTF_UH"] * seeds
@@ -344,13 +317,10 @@ def test_friction_is_judged_by_its_time_and_its_end(median, final, verdicts):
     assert [own.verdict for own in claims.friction_claims(median, final, "real")] == verdicts
 
 
-def test_instability_counts_seeds_that_lose_a_sequence():
+def test_instability_and_several_states_need_all_of_them():
     found = claims.instability_claims({"NNT": [(0, 9), (0, 9)], "NNT_U": [(1, 9), (0, 9)]}, "real")
     assert [own.verdict for own in found] == ["not reproduced", "reproduced"]
     assert claims.instability_claims({"NNT": [(1, 9), (0, 9), (0, 9)]}, "real")[0].verdict == "undecided"
-
-
-def test_a_claim_on_several_states_needs_all_of_them():
     lower, level, higher = interval(-2.0, -1.0), interval(-1.0, 1.0), interval(1.0, 2.0)
 
     def verdict(*states):
@@ -360,34 +330,13 @@ def test_a_claim_on_several_states_needs_all_of_them():
     assert claims.states_claim("c", "w", {"vx": (higher, 1.0, False)}, "real").verdict == "reproduced"
 
 
-def test_friction_settles_after_the_last_sample_outside():
+def test_friction_settles_after_the_last_sample_outside_and_slip_is_that_of_a_hand_calculation():
     outside = np.array([[True, True, False, True, False, False], [False] * 6, [False] * 5 + [True]])
     np.testing.assert_allclose(friction.settled(outside, 10.0), [0.4, 0.0, 0.6])
-
-
-def test_friction_starts_where_it_is_told_and_with_the_deviation_it_is_told(part):
-    estimator = loaded(model(part, "NNTF_UH"))
-    drives = drives_of(part, estimator, "tyre_d")
-    low, high = (friction.tracks_of([estimator], drives, start) for start in (0.3, 0.9))
-    assert low.mean.shape == (1, 3, 100)
-    assert float(low.mean[..., 0].mean()) < float(high.mean[..., 0].mean())
-    assert not low.apart(low).any()
-    assert (low.apart(high) > 0.0).all()
-    sure = filtered(estimator, drives, friction=0.3, deviation=1e-4).steps.filtered.mean[..., 0, -1]
-    np.testing.assert_allclose(sure.numpy(), 0.3, atol=1e-3)
-
-
-def test_oracle_is_no_worse_on_what_it_learns_from(part):
-    estimator = loaded(model(part, "NNTF_UH"))
-    drives = drives_of(part, estimator, "tyre_d")
-
-    def mse():
-        return float(weighted(squares_of(filtered(estimator, drives).steps.filtered.mean, drives, 20)).mean())
-
-    before = mse()
-    quick = replace(TRAINING, through=replace(TRAINING.through, max_epochs=3, validate_every=1))
-    train_on(estimator, drives, 20, quick)
-    assert mse() < before
+    states = {"vx_ref": [1.0, 1.0, 0.1], "vy_ref": [1.0, 0.0, 1.0], "yaw_rate_ref": [0.0, 10.0, 0.0]}
+    own = Recording("r", "car", 100.0, 0.0, {name: np.array(values) for name, values in states.items()}, "real")
+    np.testing.assert_allclose(rear_slip([own], 0.1), [45.0, -45.0])
+    assert hardest([[np.array([1.0]), np.array([5.0])], [np.array([9.0]), np.array([2.0])]]) == 0
 
 
 def test_baselines_take_their_other_velocities_from_what_is_measured(part, tmp_path):
@@ -405,19 +354,7 @@ def test_baselines_take_their_other_velocities_from_what_is_measured(part, tmp_p
     assert not scored[0].errors["vx"].any(), "the measured speed of the test is the true one"
 
 
-def test_trials_show_what_validation_chose_and_what_the_tables_use_instead(part):
-    def trial(size, validation):
-        own = replace(model(part, "NNTF_UH"), training={"through": {"learning_rate": size}})
-        metrics = part.metrics.copy()
-        metrics.loc[(metrics["test_set"] == "validation") & (metrics["metric"] == "mse_weighted"), "value"] = validation
-        return replace(part, models=[own], metrics=metrics)
-
-    table, other = trials_table({"trial_1": trial(1e-3, 0.2), "trial_2": trial(2e-3, 0.1)}, {"NNTF_UH": 1e-3})
-    assert table.frame["chosen"].tolist() == ["", "chosen"]
-    assert other == ["NNTF_UH"]
-
-
-def test_differences_that_are_planted_are_told_from_those_that_are_not():
+def test_differences_that_are_planted_are_told_from_those_that_are_not_or_level():
     generator = np.random.default_rng(0)
     sequence = np.repeat(np.arange(12), 50)
     hard = np.repeat(generator.uniform(1.0, 3.0, 12), 50)
@@ -438,9 +375,6 @@ def test_differences_that_are_planted_are_told_from_those_that_are_not():
     assert "3 in its order, 2 the other way round, and includes zero for 1" in words
     assert "The other way round: C before B; D before B." in words
     assert "do not tell apart: C and D." in words
-
-
-def test_pairs_that_are_level_in_the_paper_have_a_verdict_of_their_own_and_share_their_neighbours():
     generator = np.random.default_rng(0)
     table = {name: level * generator.uniform(0.9, 1.1, (3, 600)) for name, level in (("A", 1.0), ("B", 2.0), ("C", 2.0), ("D", 3.0))}
     pairs = differences(table, np.repeat(np.arange(12), 50), {"A": 0.1, "B": 0.1, "C": 0.1, "D": 0.2}, 100.0)
@@ -450,34 +384,7 @@ def test_pairs_that_are_level_in_the_paper_have_a_verdict_of_their_own_and_share
     assert "Level in the paper: A and B; A and C; B and C; told apart here: A and B; A and C." in order_in_words(pairs, {}, "x")
 
 
-def test_slip_angle_of_the_rear_axle_is_that_of_a_hand_calculation():
-    states = {"vx_ref": [1.0, 1.0, 0.1], "vy_ref": [1.0, 0.0, 1.0], "yaw_rate_ref": [0.0, 10.0, 0.0]}
-    own = Recording("r", "car", 100.0, 0.0, {name: np.array(values) for name, values in states.items()}, "real")
-    np.testing.assert_allclose(rear_slip([own], 0.1), [45.0, -45.0])
-
-
-def test_hardest_sequence_is_that_of_all_models_together():
-    assert hardest([[np.array([1.0]), np.array([5.0])], [np.array([9.0]), np.array([2.0])]]) == 0
-
-
-def test_only_what_departs_from_the_paper_is_said(part):
-    assert [line.split(":")[0] for line in departures({"real": part})] == [
-        "Data",
-        "Hidden layers of some candidates are 4 wide (paper",
-        "Not part of this run",
-        "GRU and LSTM",
-    ]
-    training = {**AS_THE_PAPER, "batch_size": 6, "through": {**PHASE, "max_epochs": 300, "schedule": "cosine"}, "mirrored": 0.5}
-    changed = [EvaluatedModel(**{**vars(own), "training": training}) for own in part.models if own.estimator == "learned_ukf"]
-    text = "\n".join(departures({"real": replace(part, models=changed)}))
-    assert "Batches of 6 sequences" in text
-    assert "300 epochs (paper: 1000, of one batch each); a step size of 0.0005 that falls to zero along a cosine" in text
-    assert "mirror" in text
-    table = settings_table({"real": replace(part, models=changed)})
-    assert table[(table["candidate"] == "NNT") & (table["setting"] == "through.max_epochs")]["value"].tolist() == [300]
-
-
-def test_lengths_are_those_of_trainings_through_the_filter(part):
+def test_lengths_and_samples_are_those_of_trainings_through_the_filter(part):
     own = replace(part, models=[model(part, "NNTF_U")])
     (row,) = lengths({"length_500": own})
     assert (row.steps, row.epochs) == (500, 1000)
@@ -485,9 +392,11 @@ def test_lengths_are_those_of_trainings_through_the_filter(part):
     assert (row.sequences, row.batches) == (6, 3), "a drive of 3.2 s"
     with pytest.raises(DataError, match="was not trained through the filter"):
         lengths({"length_500": replace(part, models=[model(part, "GRU")])})
-
-
-# Comparisons that were added
+    training = {"one_step": {**PHASE, "max_epochs": 10}, "through": {**PHASE, "max_epochs": 3}, "steps": 50}
+    own = Subject.of(only(part, "NNTF_UH", training), "NNTF_UH")
+    assert samples_seen(own) == 10 * 319 + 3 * 300
+    alone = Subject.of(only(part, "NNTF", {**training, "noise": {**PHASE, "max_epochs": 5}}), "NNTF")
+    assert samples_seen(alone) == 10 * 319 + 5 * 300
 
 
 def subject_of(squared, title="own", validation=()):
@@ -530,16 +439,6 @@ def test_added_claims_on_two_tyres_need_both_and_shared_seeds_are_paired(level, 
     )
 
 
-def test_added_intervals_widen_with_their_number_and_those_without_claims_count():
-    one, other = planted(tyre_a=0.9), planted(tyre_a=1.0)
-    alone = Comparison(one, other, "c", "p", ("tyre_a",), shared=False)
-    silent = Comparison(other, one, "", "", ("tyre_a",), shared=False)
-    first = corrected([alone])[0, "tyre_a"]
-    together = corrected([alone, silent])[0, "tyre_a"]
-    assert together[2] - together[1] > first[2] - first[1]
-    assert len(comparison_claims([alone, silent], corrected([alone, silent]), "real")) == 1
-
-
 @pytest.mark.parametrize(
     ("losses", "verdict"), [((0.5, 0.5, 0.5), "not reproduced"), ((2.0, 2.0, 0.5), "reproduced"), ((2.0, 0.5, 0.5), "undecided")]
 )
@@ -551,20 +450,6 @@ def test_local_minima_are_counted_on_validation(losses, verdict):
     assert thin.verdict == ("not reproduced" if verdict == "not reproduced" else "undecided")
     assert thin.ours.startswith(f"{sum(loss > 1.0 for loss in losses)} of 3 seeds")
     assert thin.why.endswith("20 % of their samples")
-
-
-def test_samples_are_counted_as_often_as_they_are_seen(part):
-    training = {"one_step": {**PHASE, "max_epochs": 10}, "through": {**PHASE, "max_epochs": 3}, "steps": 50}
-    own = Subject.of(only(part, "NNTF_UH", training), "NNTF_UH")
-    assert samples_seen(own) == 10 * 319 + 3 * 300
-    alone = Subject.of(only(part, "NNTF", {**training, "noise": {**PHASE, "max_epochs": 5}}), "NNTF")
-    assert samples_seen(alone) == 10 * 319 + 5 * 300
-
-
-def test_a_candidate_without_one_step_training_is_called_so(part):
-    (name,) = models_by_candidate(only(part, "NNTF_UH", {"one_step": {**PHASE, "max_epochs": 0}}))
-    assert name == "NNTF_UH from scratch"
-    assert candidate_of(EvaluatedModel("learned_ukf_variant", "pc_curved", "", 0, Path(), Path())) == "PC with E"
 
 
 def test_published_figures_agree_with_the_text_of_the_paper():

@@ -1,9 +1,7 @@
 """The study of the simulated cars: its statistics against plain ones, its pages, and pipelines of data sets alone."""
 
 import json
-import os
 import re
-import signal
 from dataclasses import replace
 from pathlib import Path
 
@@ -15,9 +13,7 @@ from test_cli import _statuses
 
 from conftest import planar_drive
 from place import DATASET
-from vehest.data.files import ASIDE_PREFIX
 from vehest.data.store import write_recording
-from vehest.report.document import write_document
 from vehest.simulation.plant.parameters import Vehicle
 from vehest.studies.artefacts import AbsentDataset, StoredDataset, StudyArtefacts
 from vehest_papers.proving_ground import documents, gates
@@ -81,9 +77,6 @@ def made(study):
     return documents(study)
 
 
-# Statistics
-
-
 def test_statistics_of_many_recordings_are_those_of_all_samples_together():
     drives = [_drive(f"d{seed}", seed, 20.0 + seed) for seed in range(5)]
     tally = Tally()
@@ -102,7 +95,7 @@ def test_statistics_of_many_recordings_are_those_of_all_samples_together():
     np.testing.assert_allclose(values["sideslip_abs_q50"], np.degrees(np.quantile(np.abs(together["sideslip_ref"]), 0.5)), **tight)
 
 
-def test_two_tallies_merged_are_one_tally_of_both():
+def test_tallies_merge_count_slow_samples_in_the_duration_alone_and_have_the_papers_bins():
     first, second, both = Tally(), Tally(), Tally()
     one, two = _simulated(_drive("a", 1), spun=True), _drive("b", 2)
     first.add(one)
@@ -112,9 +105,6 @@ def test_two_tallies_merged_are_one_tally_of_both():
     first.merge(second)
     assert first.values() == both.values()
     assert first.flags["spun"] == 1
-
-
-def test_histogram_has_the_bins_of_the_paper_and_loses_no_sample():
     drive = _drive(seconds=30.0)
     tally = Tally()
     tally.add(drive)
@@ -126,9 +116,6 @@ def test_histogram_has_the_bins_of_the_paper_and_loses_no_sample():
     assert np.array_equal(Grid(2.0, 1.0).count(np.array([-9.0, -1.0, 0.0, 0.5, 9.0])), [1, 1, 2, 1]), "beyond the limit: outermost bins"
     with pytest.raises(ValueError, match="do not fit"):
         tally.histogram("ay", 0.03)
-
-
-def test_slow_samples_count_in_the_duration_and_not_in_distributions():
     drive = _drive(seconds=10.0)
     stopped = {**drive.channels, "vx": np.zeros(len(drive)), "vy_ref": np.zeros(len(drive)), "sideslip_ref": np.full(len(drive), 3.0)}
     tally = Tally()
@@ -136,19 +123,6 @@ def test_slow_samples_count_in_the_duration_and_not_in_distributions():
     tally.add(replace(drive, channels=stopped))
     assert tally.seconds == 20.0
     assert tally.counts["sideslip"].sum() == len(drive)
-
-
-def test_memory_does_not_grow_with_the_number_of_recordings():
-    tally, points = Tally(), HandlingPoints(2.4)
-    sizes = []
-    for seed in range(3):
-        tally.add(_drive(seed=seed))
-        points.add(_drive(seed=seed))
-        sizes.append(sum(counts.nbytes for counts in tally.counts.values()) + points.everything.nbytes + points.steady.nbytes)
-    assert len(set(sizes)) == 1
-
-
-# Handling
 
 
 def test_medians_find_the_steering_that_was_added_to_the_curvature():
@@ -176,9 +150,6 @@ def test_ramp_of_the_plant_starts_with_the_slope_of_the_linear_single_track():
     assert wet.ay.max() == pytest.approx(0.7 * own.ay.max(), rel=0.05)
 
 
-# What is shown
-
-
 def test_spectrum_of_white_noise_is_flat_at_its_density():
     noise = np.random.default_rng(0).standard_normal(60_000)
     drive = replace(_drive(seconds=600.0, rate_hz=100.0), channels=dict.fromkeys(CHANNELS, 0.3 * noise))
@@ -188,19 +159,19 @@ def test_spectrum_of_white_noise_is_flat_at_its_density():
     assert own.frequency[-1] > 40.0
 
 
-def test_busiest_stretch_is_the_one_with_the_most_lateral_acceleration():
+def test_pages_sets_and_stretches_are_those_of_the_names_and_the_busiest_drive():
     drive = _drive(seconds=60.0)
     ay = np.zeros(len(drive))
     ay[400:500] = 5.0
     stretch = busiest_stretch(replace(drive, channels={**drive.channels, "ay": ay}), 5.0)
     assert (stretch.time[0], len(stretch.time)) == (20.0, 100)
-
-
-def test_variants_share_a_page_and_counters_a_set():
     assert page_of("heavy_truck_worn") == page_of("heavy_truck") == "heavy_truck"
     assert page_of("bmw_320i_low") == "bmw_320i_low"
     assert set_of("train_j_turn_off_012") == "train_j_turn_off"
     assert set_of("nominal_fast") == "nominal_fast"
+    edges = np.array([-30.0, -20.0, 0.0, 20.0, 30.0])
+    distributions = [Distribution("simulated", edges, np.array([1, 50, 45, 4])), Distribution("real", edges, np.array([0, 60, 40, 0]))]
+    assert beyond(distributions, 20.0) == pytest.approx(2.5)
 
 
 def test_table_i_is_what_the_paper_prints():
@@ -251,9 +222,6 @@ def test_without_the_real_recording_the_page_says_how_to_get_it(study):
     assert "somebody's licence" in text
     assert "vehest data check ferrari_250lm" in text
     assert not any(getattr(block, "name", "").endswith("_spectra") for block in made["ferrari_250_lm"].blocks)
-
-
-# Pipelines of data sets alone
 
 
 @pytest.fixture
@@ -315,56 +283,6 @@ def test_overrides_reach_the_data_sets_that_have_their_key(survey_place):
     assert "run 'vehest run" in place.refused("report", "ground")[1]
 
 
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        ({"split": "mine"}, "one of: split and sweeps; parts"),
-        ({"datasets": ["other"]}, "datasets, each once"),
-        ({"report": "drive"}, "'drive' draws its report from split and sweeps"),
-    ],
-)
-def test_pipelines_of_data_sets_that_make_no_sense_are_refused(survey_place, change, message):
-    file = survey_place.folder / "pipelines" / "ground.yaml"
-    file.write_text(yaml.safe_dump({**yaml.safe_load(file.read_text()), **change}))
-    code, line = survey_place.refused("run", "ground")
-    assert code == 2
-    assert message in line
-
-
-def test_needed_recordings_that_are_missing_are_one_clear_line(survey_place):
-    file = survey_place.folder / "pipelines" / "ground.yaml"
-    file.write_text(yaml.safe_dump({"study": "ground", "report": "proving_ground", "datasets": ["other"]}))
-    code, line = survey_place.refused("run", "ground")
-    assert code == 4
-    assert "no data root is set" in line
-
-
-def test_a_signal_while_pages_are_drawn_leaves_nothing_and_the_next_run_goes_on(survey_place, monkeypatch):
-    place, reports = survey_place, survey_place.folder / "outputs" / "report"
-
-    def interrupted(made, folder, **_):
-        write_document(made["report"], folder)
-        assert any(reports.glob(f"{ASIDE_PREFIX}*/report.md"))
-        os.kill(os.getpid(), signal.SIGTERM)
-
-    monkeypatch.setattr("vehest.report.document.write_documents", interrupted)
-    code, _, err = place("run", "ground", "--jobs", "1")
-    assert code == 143, err
-    assert not list(reports.iterdir())
-    assert not (place.folder / "results").exists()
-    code, _, err = place("run", "ground", "--dry-run")
-    assert _statuses(err) == [("skipped", "ingest"), ("would", "report")]
-
-
-def test_samples_beyond_the_drawn_range_are_counted():
-    edges = np.array([-30.0, -20.0, 0.0, 20.0, 30.0])
-    distributions = [Distribution("simulated", edges, np.array([1, 50, 45, 4])), Distribution("real", edges, np.array([0, 60, 40, 0]))]
-    assert beyond(distributions, 20.0) == pytest.approx(2.5)
-
-
-# Gates
-
-
 def _set(name, seed, seconds=60.0):
     return replace(_simulated(_drive(f"{name}_001", seed, seconds)), vehicle=f"car {name[0]}")
 
@@ -404,14 +322,3 @@ def test_the_gate_on_the_spectrum_is_zero_against_itself_and_in_decibels():
     assert all(abs(gate.values[gates.AFTER]) < 1e-9 for gate in found)
     doubled = [gate for gate in gates.gates({gates.AFTER: {"f1": [twice]}}, [own]) if "process noise" in gate.quantity]
     np.testing.assert_allclose([gate.values[gates.AFTER] for gate in doubled], 20.0 * np.log10(2.0), atol=0.1)
-
-
-def test_the_first_cars_stand_in_the_gates_only(tmp_path):
-    stored = [
-        _stored(tmp_path, name, "simulated", [replace(_set(letter, seed), vehicle=vehicle)])
-        for name, letter, seed, vehicle in ((gates.AFTER, "f1", 4, "ferrari_250_lm"), (gates.BEFORE, "c1", 5, "corvette_grand_sport"))
-    ]
-    made = documents(StudyArtefacts("proving_ground", "Proving ground", "About it.", "vehest run x.yaml", datasets=stored))
-    assert "corvette_grand_sport" not in made
-    assert "ferrari_250_lm" in made
-    assert any(getattr(block, "name", "") == "excitation" for block in made["report"].blocks)

@@ -5,23 +5,21 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from cars import plant_of
 from scipy.integrate import solve_ivp
 from scipy.signal import welch
 from test_simulation_sensors import motion_of, only
-from test_simulation_vehicles import plant_of
 
 from vehest.constants import GRAVITY
 from vehest.data.errors import ConfigurationError
 from vehest.run.config import compose_config
-from vehest.simulation.drive import drive, simulate_drive
-from vehest.simulation.driving.car import car_of
+from vehest.simulation.drive import drive
 from vehest.simulation.driving.driver import HIGHEST_CORRECTION, LOWEST_CORRECTION, Hands
 from vehest.simulation.driving.laps import Laps
 from vehest.simulation.fleet import SensorVariation, variations_from_config
 from vehest.simulation.plant.multi_body import MultiBodyPlant
 from vehest.simulation.plant.parameters import loaded
 from vehest.simulation.plant.wear import Stint, stint_from_config
-from vehest.simulation.road.surface import SURFACES
 from vehest.simulation.sensors.levels import SensorLevel, SensorLevels, Tilt
 from vehest.simulation.sensors.recording import measure
 from vehest.sources.base import open_source
@@ -40,9 +38,6 @@ def _swerve(plant, seconds=1.5):
         steering = 0.25 * math.cos(2.0 * math.pi * 1.5 * k / 1000.0)
         states.append(plant.advance(states[-1], np.array([steering, 0.0, 0.0, 0.0, 0.0]), 1))
     return states
-
-
-# --- tyres that lag
 
 
 def test_lateral_forces_follow_the_slip_over_the_relaxation_length():
@@ -70,7 +65,7 @@ def test_lateral_forces_follow_the_slip_over_the_relaxation_length():
         np.testing.assert_allclose(ours, held, atol=0.01 * np.abs(held).max())
 
 
-def test_a_short_relaxation_length_is_none_but_for_the_step():
+def test_a_short_relaxation_length_is_none_but_for_the_step_and_a_negative_one_refused():
     def off(step):
         ends = []
         for length in (1e-4, 0.0):
@@ -84,25 +79,11 @@ def test_a_short_relaxation_length_is_none_but_for_the_step():
 
     assert off(1e-3) < 5e-3
     assert off(2.5e-4) < 0.4 * off(1e-3)  # first order in the step
-
-
-def test_a_long_relaxation_length_delays_the_yaw_rate():
-    def first_peak(lengths):
-        yaw_rate = np.array([state.yaw_rate for state in _swerve(_lagging(lengths))])
-        return int(np.argmax(yaw_rate[:600]))  # ms; the steering turns back after a third of a second
-
-    assert first_peak((0.9, 0.9)) > first_peak((0.0, 0.0)) + 5
-
-
-def test_relaxation_is_refused_where_it_makes_no_sense():
     with pytest.raises(ConfigurationError, match=r"relaxation rear must be zero or positive, not -0\.1 m"):
         _lagging((0.1, -0.1))
 
 
-# --- payload, wear
-
-
-def test_a_payload_moves_the_static_loads_as_levers_say():
+def test_a_payload_moves_the_static_loads_as_levers_say_and_stays_on_the_axles():
     empty = plant_of("corvette_grand_sport")
     full = MultiBodyPlant(loaded(empty.vehicle, 80.0, forward=-0.6, up=0.1))
     loads = []
@@ -114,14 +95,11 @@ def test_a_payload_moves_the_static_loads_as_levers_say():
     assert more.sum() == pytest.approx(80.0 * GRAVITY, rel=2e-3)
     assert more[:2].sum() == pytest.approx(80.0 * GRAVITY * (b - 0.6) / (a + b), rel=0.02)
     assert full.parameters.I_z - empty.parameters.I_z == pytest.approx(80.0 * 0.6**2 * empty.parameters.m / full.parameters.m)
-
-
-def test_a_payload_off_the_axles_is_refused():
     with pytest.raises(ConfigurationError, match="puts the centre of gravity off the axles"):
         loaded(plant_of("corvette_grand_sport").vehicle, 5000.0, forward=-3.0, up=0.0)
 
 
-def test_tyres_warm_up_and_wear():
+def test_tyres_warm_up_and_wear_which_the_plant_feels_and_the_driver_does_not_know():
     stint = Stint(cold=0.1, warm_time=100.0, wear=0.04, wear_time=1000.0)
     assert stint.friction_at(-2.0) == stint.friction_at(0.0) == pytest.approx(0.9)
     assert stint.friction_at(100.0) == pytest.approx((1.0 - 0.1 / math.e) * (1.0 - 0.004))
@@ -130,17 +108,11 @@ def test_tyres_warm_up_and_wear():
         stint_from_config({"wear": 0.9})
     with pytest.raises(ConfigurationError, match="cold, warm_time, wear, wear_time"):
         stint_from_config({"hot": 0.1})
-
-
-def test_the_plant_feels_the_tyres_lose_grip_and_the_driver_does_not_know():
     laps = Laps(course="palm_beach_like", duration=5.0, severity=0.8)
     plant = plant_of("ferrari_250_lm")
     plain, cold = drive(plant, laps, 3), drive(plant, laps, 3, stint=Stint(cold=0.1))
     np.testing.assert_allclose(cold.motion.friction[0] / plain.motion.friction[0], 0.9, rtol=1e-9)
     assert cold.drawn == plain.drawn
-
-
-# --- drivers
 
 
 def test_corrections_have_their_size_and_their_band():
@@ -154,52 +126,11 @@ def test_corrections_have_their_size_and_their_band():
     assert hands.at(1.0, 0.0) == pytest.approx(hands.at(1.0, 1.0) / 3.0)
 
 
-def test_corrections_put_energy_into_the_lateral_velocity_at_1_hz():
-    plant = plant_of("ferrari_250_lm")
-
-    def at_1_hz(corrections):
-        vy = drive(plant, Laps(course="palm_beach_like", duration=60.0, severity=0.7, corrections=corrections), 5).motion.vy
-        frequency, density = welch(np.gradient(vy) * 100.0, 100.0, nperseg=1024)
-        return float(density[(frequency > 0.7) & (frequency < 1.5)].mean())
-
-    assert at_1_hz(1.0) > 3.0 * at_1_hz(0.0)
-
-
-def test_traffic_slows_the_car_down_where_it_is_met():
-    car = car_of(plant_of("ferrari_250_lm"))
-    free = Laps(course="palm_beach_like", duration=200.0, severity=0.8)
-    held = replace(free, traffic=2.0, traffic_speed=(7.0, 12.0))
-    plans = [laps.controller(car, SURFACES["dry"], 7).plan for laps in (free, held)]
-    alone, behind = (plan.speed[: min(len(plan.speed) for plan in plans)] for plan in plans)
-    assert (behind <= alone + 1e-9).all()
-    assert 6.9 < behind.min() < 12.1
-    assert behind.min() < 0.8 * alone.min()
-
-
-def test_what_a_drive_does_without_is_not_spoken_of():
-    plain = Laps(course="palm_beach_like", duration=5.0).description()
-    assert not {"corrections", "traffic", "traffic_speed"} & set(plain)
-    assert Laps(course="palm_beach_like", duration=5.0, traffic=1.0).description()["traffic"] == 1.0
-
-
-# --- installations
-
-
-def test_gain_and_bias_are_the_same_in_every_drive():
+def test_installations_have_a_gain_a_bias_and_a_speed_of_wheels():
     motion = motion_of(50, ay=3.0)
     levels = only(ay=SensorLevel(gain=0.02, bias=-0.1))
     for seed in (1, 2):
         np.testing.assert_allclose(measure(motion, levels, seed)["ay"], 3.0 * 1.02 - 0.1)
-
-
-@pytest.mark.parametrize("share", [1.0, 0.4, -0.5])
-def test_roll_leaks_by_its_share_and_sign(share):
-    motion = motion_of(10, roll=0.03)
-    shown = measure(motion, only(tilt=Tilt(roll_share=share)), 0)["ay"]
-    np.testing.assert_allclose(shown, GRAVITY * math.sin(0.03 * share), rtol=1e-9)
-
-
-def test_a_speed_of_wheels_is_right_on_the_straight_and_errs_with_slip():
     steer = np.concatenate([np.zeros(80), np.full(20, 0.1)])
     wheels = np.full((100, 4), 30.0 / 0.32)
     wheels[90:] *= 0.8  # locking
@@ -208,28 +139,11 @@ def test_a_speed_of_wheels_is_right_on_the_straight_and_errs_with_slip():
     np.testing.assert_allclose(shown[90:], 24.0)
 
 
-def test_idle_values_are_not_spoken_of_and_others_are():
-    laps = Laps(course="palm_beach_like", duration=1.0)
-    about = simulate_drive(id="d", vehicle=plant_of("ferrari_250_lm").vehicle, manoeuvre=laps, seed=1).provenance
-    assert not {"gain", "bias"} & set(about["sensors"]["ay"])
-    assert "roll_share" not in about["sensors"]["tilt"]
-    assert not {"tyres", "relaxation"} & set(about)
-    own = SensorLevels(ay=SensorLevel(gain=0.01), speed_of_wheels=True)
-    car = replace(plant_of("ferrari_250_lm").vehicle, relaxation=LENGTHS)
-    about = simulate_drive(id="d", vehicle=car, manoeuvre=laps, seed=1, sensors=own, stint=Stint(wear=0.1)).provenance
-    assert (about["sensors"]["ay"]["gain"], about["sensors"]["speed_of_wheels"]) == (0.01, True)
-    assert (about["tyres"]["wear"], about["relaxation"]) == (0.1, list(LENGTHS))
-
-
-# --- data sets
-
-
-def test_each_race_car_has_an_installation_of_its_own():
-    source = open_source(compose_config("ingest", ["dataset=sim_race_cars"])["dataset"])
-    installed = {name: str(source.drives[f"{name}_001"].sensors) for name in ("c1", "f1", "j1")}
-    assert len(set(installed.values())) == 3
-    same = open_source(compose_config("ingest", ["dataset=sim_race_cars_same_sensors"])["dataset"])
-    assert str(same.drives["c1_001"].sensors) == str(same.drives["f1_001"].sensors)
+@pytest.mark.parametrize("share", [1.0, 0.4, -0.5])
+def test_roll_leaks_by_its_share_and_sign(share):
+    motion = motion_of(10, roll=0.03)
+    shown = measure(motion, only(tilt=Tilt(roll_share=share)), 0)["ay"]
+    np.testing.assert_allclose(shown, GRAVITY * math.sin(0.03 * share), rtol=1e-9)
 
 
 @pytest.mark.parametrize(
@@ -247,15 +161,12 @@ def test_what_a_drive_says_of_its_own_is_checked_before_anything_is_simulated(ch
         open_source(dataset)
 
 
-def test_a_scale_over_the_logarithm_is_as_often_below_one_as_above():
+def test_variations_of_parameters_and_sensors_are_drawn_over_their_ranges():
     variation = variations_from_config([{"parameters": ["m"], "factor": [0.5, 2.0], "log": True}])[0]
     drawn = [variation.drawn(np.random.default_rng(seed)) for seed in range(2000)]
     assert np.mean(np.array(drawn) < 1.0) == pytest.approx(0.5, abs=0.04)
     assert 0.5 <= min(drawn) < 0.52
     assert 1.95 < max(drawn) <= 2.0
-
-
-def test_a_fleet_draws_the_share_of_roll_of_either_sign():
     variation = SensorVariation.from_config({"roll_share": [-0.5, 1.5]})
     shares = [variation.applied(SensorLevels(), seed).tilt.roll_share for seed in range(200)]
     assert min(shares) < -0.3

@@ -3,11 +3,11 @@
 import math
 from dataclasses import fields, replace
 from functools import cache
-from pathlib import Path
 
 import numpy as np
 import pytest
-import yaml
+from cars import ALL as CARS
+from cars import shipped
 
 from vehest.data.errors import ConfigurationError
 from vehest.simulation.drive import drive, simulate_drive
@@ -17,14 +17,10 @@ from vehest.simulation.driving.laps import Laps
 from vehest.simulation.driving.manoeuvre import Manoeuvre
 from vehest.simulation.driving.manoeuvres import MANOEUVRES, manoeuvre_from_config
 from vehest.simulation.plant.multi_body import MultiBodyPlant
-from vehest.simulation.plant.parameters import PUBLISHED_SETS, Vehicle, vehicle_from_configuration
+from vehest.simulation.plant.parameters import PUBLISHED_SETS, Vehicle
 from vehest.simulation.road.course import course_by_name
 from vehest.simulation.road.surface import surface_from_config
 
-VEHICLES = Path(__file__).parents[2] / "conf" / "vehicle"
-CARS = sorted(
-    path.stem for path in VEHICLES.glob("*.yaml") if "plant" not in yaml.safe_load(path.read_text(encoding="utf-8"))
-)  # multi-body
 MODERATE = {
     "lane change": {"name": "double_lane_change", "severity": 0.55},
     "obstacle": {"name": "double_lane_change", "layout": "iso_3888_2", "severity": 0.5},
@@ -45,11 +41,8 @@ MODERATE_LAPS = {  # whole laps, seconds each
 PUBLISHED = {name: Vehicle(name, number) for number, name in PUBLISHED_SETS.items()}
 
 
-@cache
 def vehicle(name):
-    if name in PUBLISHED:
-        return PUBLISHED[name]
-    return vehicle_from_configuration(yaml.safe_load((VEHICLES / f"{name}.yaml").read_text(encoding="utf-8")))
+    return PUBLISHED[name] if name in PUBLISHED else shipped(name)
 
 
 @cache
@@ -71,11 +64,11 @@ def times(trip):
     return np.arange(len(trip.motion)) / trip.motion.rate_hz
 
 
-# --- all of them
-
-
-def test_every_manoeuvre_is_among_the_moderate_ones():
+def test_every_manoeuvre_is_among_the_moderate_ones_and_seeds_take_both_sides():
     assert {configuration["name"] for configuration in (MODERATE | MODERATE_LAPS).values()} == set(MANOEUVRES)
+    car, surface = car_of(MultiBodyPlant(vehicle("bmw_545i"))), surface_from_config("dry")
+    sides = {manoeuvre_from_config({"name": "slalom"}).controller(car, surface, seed).drawn["side"] for seed in range(12)}
+    assert sides == {"left", "right"}
 
 
 @pytest.mark.parametrize("car", [*CARS, *(pytest.param(name, marks=pytest.mark.slow) for name in PUBLISHED)])
@@ -109,15 +102,6 @@ def test_seed_decides_every_sample_and_nothing_else_does(name):
     assert first.drawn == again.drawn
     n_common = min(len(first.motion), len(other.motion))
     assert np.abs(first.motion.yaw_rate[:n_common] - other.motion.yaw_rate[:n_common]).max() > 0.02
-
-
-def test_seeds_take_both_sides():
-    car, surface = car_of(MultiBodyPlant(vehicle("bmw_545i"))), surface_from_config("dry")
-    sides = {manoeuvre_from_config({"name": "slalom"}).controller(car, surface, seed).drawn["side"] for seed in range(12)}
-    assert sides == {"left", "right"}
-
-
-# --- between cones
 
 
 @pytest.mark.parametrize("car", CARS)
@@ -163,9 +147,6 @@ def test_slalom_passes_the_cones_on_alternating_sides(car, which):
     assert (np.diff(np.sign(between[np.abs(between) > 1.0])) != 0.0).sum() == manoeuvre.cones - 1
 
 
-# --- on a circle
-
-
 @pytest.mark.parametrize("car", CARS)
 def test_skidpad_keeps_its_radius_while_the_lateral_acceleration_rises(car):
     trip = moderate(car, "skidpad")
@@ -208,9 +189,6 @@ def test_braking_in_turn_can_end_at_a_speed_and_keep_to_the_circle():
     assert np.abs(trip.lateral_error[-100:]).max() < 0.5
 
 
-# --- by the clock
-
-
 @pytest.mark.parametrize("car", CARS)
 def test_j_turn_reaches_the_steady_turn_that_was_asked_for(car):
     trip = moderate(car, "j-turn")
@@ -247,9 +225,6 @@ def test_random_steer_stays_in_its_band_at_roughly_constant_speed():
     assert spectrum[inside].sum() > 0.99 * spectrum.sum()
     assert steer.std() == pytest.approx(trip.drawn["steer_deviation"], rel=0.1)
     assert np.abs(trip.motion.vx - 20.0).max() < 1.0
-
-
-# --- laps
 
 
 @pytest.mark.parametrize(("car", "reached"), [("corvette_grand_sport", 11.6), ("ferrari_250_lm", 10.8)])
@@ -293,21 +268,15 @@ def test_three_speed_laps_take_as_long_as_in_the_paper():
     np.testing.assert_allclose(laps, [299.0, 227.0, 195.0], rtol=0.04)
 
 
-def test_fast_lap_has_the_papers_mean_and_top_speed():
+def test_fast_lap_has_the_papers_mean_and_top_speed_and_says_what_is_reached():
     # Di Biase et al. 2020: mean 76 km/h, top 115 km/h. The driver lags a little behind the plan that has them exactly.
     trip = go("heavy_truck", name="fast_lap")
     duration = len(trip.motion) / 100.0
     assert 3.6 * course_by_name("vairano_like").length / duration == pytest.approx(76.0, rel=0.02)
     assert 3.6 * trip.motion.vx.max() == pytest.approx(115.0, rel=0.01)
     assert not trip.flags.left_road
-
-
-def test_fast_lap_beyond_the_cars_reach_says_what_is_reached():
     with pytest.raises(ConfigurationError, match=r"heavy_truck.* m/s at most"):
         go("heavy_truck", name="fast_lap", mean_speed=32.0, top_speed=33.0)
-
-
-# --- what goes wrong
 
 
 SPINNING = {"name": "j_turn", "severity": 1.3, "speed": 30.0, "turn_time": 8.0}
@@ -345,12 +314,7 @@ def test_stability_control_prevents_that_spin(seed):
     assert held.motion.vx[-1] > 10.0  # it was not simply stopped
 
 
-def test_stability_control_leaves_a_calm_drive_alone():
-    calm = go("bmw_545i", name="slalom", severity=0.3, stability_control=True)
-    assert calm.flags.stability_share == 0.0
-
-
-def test_drive_that_is_cut_off_is_not_completed():
+def test_drives_that_are_cut_off_or_leave_the_road_are_flagged():
     class Impatient(Laps):
         @property
         def longest(self):
@@ -360,9 +324,6 @@ def test_drive_that_is_cut_off_is_not_completed():
         trip = drive(MultiBodyPlant(vehicle("bmw_545i")), manoeuvre, seed=0)
         assert len(trip.motion) == 300
         assert (trip.flags.completed, trip.flags.gave_up_at) == (completed, None)
-
-
-def test_car_that_leaves_the_road_is_kept_and_flagged():
     manoeuvre = manoeuvre_from_config({"name": "double_lane_change", "layout": "iso_3888_2", "speed": 45.0})
     recording = simulate_drive(id="out", vehicle=vehicle("bmw_545i"), manoeuvre=manoeuvre, seed=0)
     flags = recording.provenance["flags"]
@@ -371,9 +332,6 @@ def test_car_that_leaves_the_road_is_kept_and_flagged():
     assert recording["vx_ref"][0] > 40.0
     assert abs(recording["vx_ref"][-1]) < 0.2  # of the reference's own noise
     assert math.isfinite(flags["gave_up_at"])
-
-
-# --- configurations
 
 
 @pytest.mark.parametrize("name", sorted(MANOEUVRES))

@@ -4,13 +4,12 @@ import fcntl
 import math
 from dataclasses import fields
 from functools import cache
-from pathlib import Path
 from threading import Event, Thread
 from types import FunctionType
 
 import numpy as np
 import pytest
-import yaml
+from cars import ALL, shipped
 from numba.core.dispatcher import Dispatcher
 from scipy.integrate import solve_ivp
 from vehiclemodels.init_mb import init_mb
@@ -30,16 +29,8 @@ from vehest.simulation.plant.parameters import (
     compiled_parameters,
     library_parameters,
     rear_tyre,
-    vehicle_from_configuration,
 )
 from vehest.simulation.plant.regimes import FIRST_WHEEL, ROLL, VX, VY, YAW_RATE, Regime
-
-CONFIGURATIONS = Path(__file__).parents[2] / "conf" / "vehicle"
-
-
-def shipped(name):
-    return vehicle_from_configuration(yaml.safe_load((CONFIGURATIONS / f"{name}.yaml").read_text(encoding="utf-8")))
-
 
 AS_PUBLISHED = Vehicle("bmw_320i", parameter_set=2)
 LOWERED = shipped("bmw_320i_low")
@@ -135,9 +126,6 @@ def spin():
     return drive(plant, plant.initial_state(0.0, 0.0, 0.0, 40.0), spins, 12.0)
 
 
-# --- the library's equations
-
-
 def test_published_derivatives_are_reproduced():
     computed = derivatives_of(PUBLISHED_STATE, list(PUBLISHED_INPUTS), AS_PUBLISHED)
     np.testing.assert_allclose(computed, PUBLISHED_DERIVATIVES, rtol=0.0, atol=5e-8)  # as the library's own test: seven places
@@ -199,25 +187,6 @@ def test_fixed_step_agrees_with_solve_ivp():
     assert abs(state.yaw_rate * state.vx) > 6.0  # the manoeuvre is not a harmless one
 
 
-def test_halving_the_step_changes_nothing_that_matters():
-    # A lane change at 8 m/s², braking at 6 m/s² to standstill: all of a drive but the spin.
-    whole, half = (
-        drive(plant, plant.initial_state(0.0, 0.0, 0.0, 30.0), lane_change, 8.0)[0]
-        for plant in (MultiBodyPlant(FERRARI, 1e-3), MultiBodyPlant(FERRARI, 5e-4))
-    )
-    assert np.abs(whole.ay).max() > 8.0
-    assert whole.vx[-1] == 0.0
-    for name, largest in (("vx", 2e-5), ("vy", 1e-7), ("yaw_rate", 2e-7), ("roll", 1e-8), ("x", 1e-5), ("y", 1e-6)):
-        assert np.abs(getattr(whole, name) - getattr(half, name)).max() < largest, name
-    standing = np.flatnonzero(half.vx == 0.0)[0]  # where a step decides when ax ends
-    moving = slice(0, standing - 2)
-    for name in ("ax", "ay"):
-        assert np.abs(getattr(whole, name)[moving] - getattr(half, name)[moving]).max() < 0.01, name
-
-
-# --- signs and references
-
-
 def turn_left(speed, steer, seconds, vehicle=LOWERED):
     plant = MultiBodyPlant(vehicle)
 
@@ -227,13 +196,7 @@ def turn_left(speed, steer, seconds, vehicle=LOWERED):
     return drive(plant, plant.initial_state(0.0, 0.0, 0.0, speed), hold, seconds)[0]
 
 
-def test_steady_cornering_at_45_m_per_s_reaches_the_known_figure():
-    turn = turn_left(speed=45.0, steer=0.0275, seconds=15.0)
-    assert turn.ay[-1] == pytest.approx(9.3, abs=0.1)
-    assert math.degrees(turn.sideslip[-1]) == pytest.approx(-3.4, abs=0.15)
-
-
-def test_left_turn_has_the_signs_of_iso_8855():
+def test_left_turn_and_braking_have_the_signs_of_iso_8855():
     turn = turn_left(speed=20.0, steer=0.04, seconds=5.0)
     for name in ("steer", "yaw_rate", "ay", "yaw", "y"):
         assert getattr(turn, name)[-1] > 0, name
@@ -243,9 +206,6 @@ def test_left_turn_has_the_signs_of_iso_8855():
     assert rear_right > rear_left + 0.5
     assert (turn.tyre_fz[-1, [1, 3]] > turn.tyre_fz[-1, [0, 2]] + 500.0).all()  # and carry more
     assert (turn.tyre_fy[-1] > 0).all()
-
-
-def test_braking_lowers_the_nose():
     plant = MultiBodyPlant(LOWERED)
     motion, _ = drive(plant, plant.initial_state(0.0, 0.0, 0.0, 30.0), lambda time, state: inputs_of(acceleration=-5.0), 1.0)
     assert motion.pitch[-1] > 0.005
@@ -266,9 +226,6 @@ def test_right_is_the_mirror_image_of_left():
         np.testing.assert_allclose(getattr(right, name), -getattr(left, name), atol=1e-9)
     np.testing.assert_allclose(right.tyre_fz[:, [1, 0, 3, 2]], left.tyre_fz, rtol=1e-9)
     np.testing.assert_allclose(right.tyre_fy[:, [1, 0, 3, 2]], -left.tyre_fy, atol=1e-6)
-
-
-# --- balances
 
 
 def test_accelerations_are_consistent_with_velocities_in_every_regime(spin):
@@ -327,25 +284,19 @@ def test_yaw_moment_turns_left_and_brakes_within_what_one_side_can():
     assert after.yaw_rate == pytest.approx(900.0 / p.I_z * 0.01, rel=0.05)  # the tyres already resist
 
 
-def test_gravity_on_a_bank_pulls_body_and_axles_alike():
+def test_gravity_on_a_bank_pulls_alike_and_friction_halves_what_is_reached():
     # Hardly any friction: the car slips sideways as a whole, and its joints are not strained.
     plant, across = MultiBodyPlant(FERRARI), road_gravity(bank=0.1, grade=0.0)[1]
     assert across == pytest.approx(-GRAVITY * math.sin(0.1))  # the left side is higher
     motion, states = drive(plant, plant.initial_state(0.0, 0.0, 0.0, 20.0), lambda t, s: inputs_of(across=across), 1.0, friction=1e-3)
     assert motion.vy[-1] == pytest.approx(across * 0.99, rel=0.02)
     assert np.abs([state.values[27:29] for state in states]).max() < 1e-4  # 1e-2 with the body pulled alone
-
-
-def test_friction_halved_halves_the_reachable_lateral_acceleration():
     plant = MultiBodyPlant(CORVETTE)
     dry, wet = (ramp_steer(plant, 25.0, friction=friction).ay.max() for friction in (1.0, 0.5))
     assert wet / dry == pytest.approx(0.5, rel=0.08)  # above: smaller slip angles cost less drag
 
 
-# --- standstill, spin, rollover
-
-
-def test_car_in_equilibrium_stays_there():
+def test_cars_stand_in_equilibrium_and_on_a_slope_stop_and_drive_off():
     for vehicle in (FERRARI, TRUCK, LOWERED):
         plant = MultiBodyPlant(vehicle)
         for speed in (0.0, 0.5, 30.0):
@@ -355,9 +306,17 @@ def test_car_in_equilibrium_stays_there():
             assert moved[0] == pytest.approx(2.0 * speed, abs=2e-3)
             if vehicle is not LOWERED or speed == 0.0:  # whose published tyres pull to one side when they roll
                 assert np.abs(moved[1:]).max() < 1e-9
-
-
-def test_truck_stops_from_45_km_per_h_in_five_seconds_stands_and_drives_off():
+    plant = MultiBodyPlant(FERRARI)
+    along = road_gravity(bank=0.0, grade=0.1)[0]
+    assert along > 0.0  # downhill
+    state = plant.initial_state(0.0, 0.0, 0.0, 0.0)
+    held = plant.advance(state, inputs_of(acceleration=-2.0, along=along), 1000)
+    assert held.stands
+    rolls = plant.advance(state, inputs_of(along=along), 1000)
+    assert rolls.vx == pytest.approx(along, rel=0.1)
+    motion = plant.motion([held], inputs_of(acceleration=-2.0, along=along)[None], 100.0, grade=0.1)
+    assert motion.tyre_fx[0].sum() == pytest.approx(-plant.parameters.m * along)
+    assert motion.grade[0] == 0.1
     plant = MultiBodyPlant(TRUCK)
     motion, states = drive(
         plant, plant.initial_state(0.0, 0.0, 0.0, 12.5), lambda time, state: inputs_of(acceleration=-2.54 if time < 7.0 else 1.5), 12.0
@@ -393,20 +352,6 @@ def test_regimes_join_without_jumps_that_matter():
     assert np.abs(path).max() < 0.01  # follows its front wheels
 
 
-def test_brakes_hold_the_car_on_a_slope():
-    plant = MultiBodyPlant(FERRARI)
-    along = road_gravity(bank=0.0, grade=0.1)[0]
-    assert along > 0.0  # downhill
-    state = plant.initial_state(0.0, 0.0, 0.0, 0.0)
-    held = plant.advance(state, inputs_of(acceleration=-2.0, along=along), 1000)
-    assert held.stands
-    rolls = plant.advance(state, inputs_of(along=along), 1000)
-    assert rolls.vx == pytest.approx(along, rel=0.1)
-    motion = plant.motion([held], inputs_of(acceleration=-2.0, along=along)[None], 100.0, grade=0.1)
-    assert motion.tyre_fx[0].sum() == pytest.approx(-plant.parameters.m * along)
-    assert motion.grade[0] == 0.1
-
-
 def test_spin_is_survived_and_ends_at_standstill(spin):
     motion, states = spin
     assert states[-1].spun
@@ -429,10 +374,19 @@ def test_spin_is_survived_and_ends_at_standstill(spin):
     assert away.spun  # it has been in a spin, whatever it does now
 
 
-def test_published_bmw_rolls_over_where_the_lowered_one_corners():
+def test_states_and_starts_that_make_no_sense_are_errors_and_the_published_bmw_rolls_over():
     with pytest.raises(SimulationError, match="rolled over") as raised:
         turn_left(speed=45.0, steer=0.0275, seconds=15.0, vehicle=AS_PUBLISHED)
     assert raised.value.exit_code == 3
+    plant = MultiBodyPlant(LOWERED)
+    state = plant.initial_state(0.0, 0.0, 0.0, 20.0)
+    state.values[VY] = np.nan
+    with pytest.raises(SimulationError):
+        plant.advance(state, inputs_of(), 1)
+    with pytest.raises(ConfigurationError, match="step"):
+        MultiBodyPlant(LOWERED, step=0.0)
+    with pytest.raises(ConfigurationError, match="-1"):
+        MultiBodyPlant(LOWERED).initial_state(0.0, 0.0, 0.0, -1.0)
 
 
 def test_lifted_wheel_carries_nothing_and_does_not_outrun_the_engine():
@@ -445,10 +399,7 @@ def test_lifted_wheel_carries_nothing_and_does_not_outrun_the_engine():
     assert driven.max() < 1.2 * p.longitudinal.v_max
 
 
-MULTI_BODY = [
-    path.stem for path in sorted(CONFIGURATIONS.glob("*.yaml")) if "plant" not in yaml.safe_load(path.read_text(encoding="utf-8"))
-]
-ALL_VEHICLES = [*(shipped(name) for name in MULTI_BODY), *(Vehicle(f"set {n}", n) for n in PUBLISHED_SETS)]
+ALL_VEHICLES = [*(shipped(name) for name in ALL), *(Vehicle(f"set {n}", n) for n in PUBLISHED_SETS)]
 
 
 @pytest.mark.parametrize("vehicle", ALL_VEHICLES, ids=lambda vehicle: vehicle.name)
@@ -461,24 +412,6 @@ def test_no_state_becomes_infinite_between_standstill_and_70_m_per_s(vehicle):
                 state = plant.advance(state, inputs_of(steering, acceleration, 500.0), 600, friction)
                 assert np.isfinite(state.values).all()
                 assert abs(state.values[ROLL]) < (0.3 if vehicle.name.startswith("set") else 0.2)  # the published springs are soft
-
-
-def test_state_that_is_not_finite_is_an_error():
-    plant = MultiBodyPlant(LOWERED)
-    state = plant.initial_state(0.0, 0.0, 0.0, 20.0)
-    state.values[VY] = np.nan
-    with pytest.raises(SimulationError):
-        plant.advance(state, inputs_of(), 1)
-
-
-def test_start_that_makes_no_sense_is_refused():
-    with pytest.raises(ConfigurationError, match="step"):
-        MultiBodyPlant(LOWERED, step=0.0)
-    with pytest.raises(ConfigurationError, match="-1"):
-        MultiBodyPlant(LOWERED).initial_state(0.0, 0.0, 0.0, -1.0)
-
-
-# --- repeatability
 
 
 def test_first_call_waits_for_another_process_that_compiles(monkeypatch):

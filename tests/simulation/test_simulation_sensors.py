@@ -10,8 +10,6 @@ from scipy import signal, stats
 
 from vehest.data.channels import CHANNELS
 from vehest.data.errors import ConfigurationError
-from vehest.data.recording import Recording
-from vehest.data.transforms import MountingCorrection
 from vehest.simulation.plant.motion import WHEELS, Motion
 from vehest.simulation.sensors.config import sensor_levels_from_config, switched_off
 from vehest.simulation.sensors.levels import PRESETS, Mounting, Reference, SensorLevel, SensorLevels, Tilt, Vibration, ideal_sensors
@@ -94,10 +92,7 @@ def different(one, other):
     return {name for name in one if not np.array_equal(one[name], other[name])}
 
 
-# --- what is shown
-
-
-def test_ideal_sensors_show_the_motion_itself():
+def test_ideal_and_switched_off_sensors_show_the_motion_itself_without_angles_of_the_body():
     motion = weaving()
     shown = measure(motion, ideal_sensors(), seed=3)
     for name in ("vx", "yaw_rate", "roll_rate", "pitch_rate", "ax", "ay", "steer"):
@@ -109,16 +104,16 @@ def test_ideal_sensors_show_the_motion_itself():
     for name in ("vx", "vy", "yaw_rate"):
         np.testing.assert_array_equal(shown[f"{name}_ref"], getattr(motion, name))
     np.testing.assert_array_equal(shown["sideslip_ref"], motion.sideslip)
-
-
-def test_channels_are_those_of_the_table_without_angles_of_the_body():
     shown = measure(weaving(1.0), SensorLevels(), seed=0)
     assert set(shown) <= set(CHANNELS)
     assert {"roll", "pitch", "handwheel"}.isdisjoint(shown)
     assert len(shown) == 2 + 5 + 4 + 12 + 2 + 4
+    motion = weaving()
+    nothing = switched_off(PRESETS["race"], "tilt", "imu", "reference", *SENSORS)
+    assert different(measure(motion, nothing, 0), measure(motion, ideal_sensors(), 1)) == set()
 
 
-def test_a_car_without_an_electric_motor_shows_none_and_its_recording_speaks_of_none():
+def test_a_single_sample_is_measured_and_cars_without_an_electric_motor_show_none():
     electric = weaving(1.0)
     motion = replace(electric, motor_speed=None, motor_current=None)
     with_motor, without = measure(electric, SensorLevels(), 0), measure(motion, SensorLevels(), 0)
@@ -127,6 +122,8 @@ def test_a_car_without_an_electric_motor_shows_none_and_its_recording_speaks_of_
     assert set(described(SensorLevels(), electric)) - set(described(SensorLevels(), motion)) == {"motor_speed", "motor_current"}
     assert "vibration" not in described(SensorLevels(), electric)
     assert "vibration" in described(PRESETS["small_car"], electric)
+    levels = replace(SensorLevels(), imu=Mounting(lever_x=0.5), reference=PRESETS["race"].reference)
+    assert all(np.isfinite(samples).all() and samples.shape == (1,) for samples in measure(motion_of(1, vx=20.0), levels, 0).values())
 
 
 def test_vibration_grows_with_the_wheels_speed_and_moves_nothing_else():
@@ -139,14 +136,6 @@ def test_vibration_grows_with_the_wheels_speed_and_moves_nothing_else():
             assert shaken[name][part].std() == pytest.approx(expected, rel=0.06), name
     louder = measure(motion, only(vibration=Vibration(ax=0.1)), seed=3)
     np.testing.assert_array_equal(louder["ax"], shaken["ax"])
-
-
-def test_a_single_sample_is_measured_too():
-    levels = replace(SensorLevels(), imu=Mounting(lever_x=0.5), reference=PRESETS["race"].reference)
-    assert all(np.isfinite(samples).all() and samples.shape == (1,) for samples in measure(motion_of(1, vx=20.0), levels, 0).values())
-
-
-# --- each error against theory
 
 
 @pytest.mark.parametrize("rate_hz", [20.0, 100.0, 1000.0])
@@ -219,9 +208,6 @@ def test_delay_holds_the_start_and_takes_whole_samples_as_they_are():
     np.testing.assert_array_equal(longer, 5.0)
 
 
-# --- gravity and mounting
-
-
 @pytest.mark.parametrize(("angle", "ax", "ay"), [("roll", 0, 1), ("bank", 0, 1), ("pitch", -1, 0), ("grade", -1, 0)])
 def test_gravity_leaks_in_at_rest_with_the_left_side_up_or_the_nose_down(angle, ax, ay):
     shown = measure(motion_of(3, **{angle: 0.05}), only(tilt=Tilt()), seed=0)
@@ -229,25 +215,13 @@ def test_gravity_leaks_in_at_rest_with_the_left_side_up_or_the_nose_down(angle, 
     np.testing.assert_allclose(shown["ay"], ay * G * math.sin(0.05), rtol=1e-12, atol=1e-12)
 
 
-def test_specific_force_is_the_acceleration_less_gravity_in_turned_axes():
+def test_specific_force_and_gyros_are_those_of_turned_axes():
     motion = weaving()
     force = specific_force(motion)
     for k in (0, 333, 1999):
         road, body = _rotation(motion.bank[k], motion.grade[k]), _rotation(motion.roll[k], motion.pitch[k])
         level = road @ np.array([motion.ax[k], motion.ay[k], 0.0]) - np.array([0.0, 0.0, -G])
         np.testing.assert_allclose(force[:, k], (road @ body).T @ level, atol=1e-12)
-
-
-def test_each_angle_is_switched_off_alone():
-    motion = weaving()
-    for angle in ("roll", "pitch", "bank", "grade"):
-        without = replace(motion, **{angle: np.zeros(len(motion))})
-        expected = specific_force(without)
-        np.testing.assert_array_equal(specific_force(motion, Tilt(**{angle: False})), expected)
-        assert np.abs(expected - specific_force(motion)).max() > 0.1
-
-
-def test_gyros_of_a_rolled_body_feel_the_yaw_rate():
     # A turntable: the body's axes in the road's are R(t) = Rz(ψ)Ry(θ)Rx(φ), its angular velocity the skew matrix RᵀdR/dt.
     motion = weaving()
     shown = body_rates(motion)
@@ -258,17 +232,21 @@ def test_gyros_of_a_rolled_body_feel_the_yaw_rate():
     skew = at(t).T @ (at(t + h) - at(t - h)) / (2.0 * h)
     np.testing.assert_allclose(shown[:, k], [skew[2, 1], skew[0, 2], skew[1, 0]], atol=1e-8)
     assert measure(motion_of(1, roll=0.05, yaw_rate=0.6), only(tilt=Tilt()), 0)["pitch_rate"][0] == pytest.approx(0.6 * math.sin(0.05))
+    motion = weaving()
+    straight = measure(motion, only(tilt=Tilt()), seed=0)
+    turned = measure(motion, only(tilt=Tilt(), imu=Mounting(roll=0.1, pitch=-0.05, yaw=0.2)), seed=0)
+    axes = _turn_z(0.2) @ _rotation(0.1, -0.05)
+    for names, third in ((("roll_rate", "pitch_rate", "yaw_rate"), None), (("ax", "ay"), specific_force(motion)[2])):
+        vector = np.stack([straight[name] for name in names] + ([third] if third is not None else []))
+        np.testing.assert_allclose(np.stack([turned[name] for name in names]), (axes.T @ vector)[: len(names)], atol=1e-12)
 
 
-def test_accelerometer_away_from_the_axis_of_a_turntable():
+def test_accelerometer_away_from_the_axis_feels_turning_and_swinging():
     # Yaw rate 0.5 t about the centre: tangential 0.5 l, centripetal (0.5 t)² l; central differences of a line are exact.
     t = np.arange(200) / 100.0
     shown = measure(motion_of(200, yaw_rate=0.5 * t), only(imu=Mounting(lever_x=1.2, lever_y=-0.4)), seed=0)
     np.testing.assert_allclose(shown["ax"], 0.5 * 0.4 - (0.5 * t) ** 2 * 1.2, atol=1e-12)
     np.testing.assert_allclose(shown["ay"], 0.5 * 1.2 + (0.5 * t) ** 2 * 0.4, atol=1e-12)
-
-
-def test_accelerometer_on_a_swinging_arm_feels_the_second_derivative_of_its_place():
     # Place R(t) l by differentiation, with all three rates at work; differences over 10 ms are good to 1e-3 of the amplitude.
     motion = weaving()
     lever = np.array([1.0, -0.6, 0.8])
@@ -283,63 +261,29 @@ def test_accelerometer_on_a_swinging_arm_feels_the_second_derivative_of_its_plac
         np.testing.assert_allclose([shown["ax"][k] - bare["ax"][k], shown["ay"][k] - bare["ay"][k]], expected[:2], atol=1e-3)
 
 
-def test_mounting_correction_undoes_the_mounting():
-    motion = weaving()
-    mounting = Mounting(lever_x=0.8, lever_y=-0.3, yaw=0.1)
-    turned = measure(motion, only(imu=mounting), seed=0)
-    flat = replace(motion, roll_rate=np.zeros(len(motion)), pitch_rate=np.zeros(len(motion)))
-    recording = Recording("drive", "car", 100.0, 0.0, measure(flat, only(imu=mounting), seed=0), "simulated")
-    corrected = MountingCorrection(lever_x=0.8, lever_y=-0.3, yaw=0.1)(recording)
-    for name in ("ax", "ay"):
-        np.testing.assert_allclose(corrected[name], getattr(motion, name), atol=1e-12)
-        assert np.abs(turned[name] - getattr(motion, name)).max() > 0.1
-
-
-def test_turned_unit_shows_the_same_vectors_along_other_axes():
-    motion = weaving()
-    straight = measure(motion, only(tilt=Tilt()), seed=0)
-    turned = measure(motion, only(tilt=Tilt(), imu=Mounting(roll=0.1, pitch=-0.05, yaw=0.2)), seed=0)
-    axes = _turn_z(0.2) @ _rotation(0.1, -0.05)
-    for names, third in ((("roll_rate", "pitch_rate", "yaw_rate"), None), (("ax", "ay"), specific_force(motion)[2])):
-        vector = np.stack([straight[name] for name in names] + ([third] if third is not None else []))
-        np.testing.assert_allclose(np.stack([turned[name] for name in names]), (axes.T @ vector)[: len(names)], atol=1e-12)
-
-
-def test_misalignment_lets_gravity_in_by_its_level():
+def test_misalignment_lever_and_heading_errors_have_their_size():
     shown = [measure(motion_of(1), only(imu=Mounting(misalignment=0.01)), seed) for seed in range(400)]
     for name in ("ax", "ay"):
         assert np.std([drive[name][0] for drive in shown]) == pytest.approx(G * 0.01, rel=0.14)  # 400 draws
-
-
-# --- the reference
-
-
-def test_reference_in_the_bumper_is_moved_to_the_centre_of_gravity():
-    motion = replace(weaving(), roll_rate=np.zeros(2000), pitch_rate=np.zeros(2000))
-    shown = measure(motion, only(reference=Reference("optical", lever_x=2.0, lever_y=0.4, lever_z=-0.2)), seed=0)
-    np.testing.assert_allclose(shown["vx_ref"], motion.vx, atol=1e-12)
-    np.testing.assert_allclose(shown["vy_ref"], motion.vy, atol=1e-12)
-
-
-def test_lever_error_of_the_reference_goes_with_the_yaw_rate():
     motion = motion_of(10, vx=20.0, yaw_rate=0.5)
     errors = [measure(motion, only(reference=Reference("gnss", lever_error=0.02)), seed)["vy_ref"][0] for seed in range(400)]
     assert np.std(errors) == pytest.approx(0.5 * 0.02, rel=0.14)
-
-
-def test_roll_moves_a_reference_below_the_centre_of_gravity():
-    shown = measure(motion_of(5, vx=20.0, roll_rate=0.2, pitch_rate=0.1), only(reference=Reference("optical", lever_z=-0.3)), seed=0)
-    np.testing.assert_allclose(shown["vy_ref"], 0.2 * 0.3)  # left side going up: what is below goes left
-    np.testing.assert_allclose(shown["vx_ref"], 20.0 - 0.1 * 0.3)  # nose going down: what is below goes back
-
-
-def test_heading_error_of_the_reference_is_an_error_of_the_sideslip_angle():
     motion, levels = weaving(1.0), only(reference=Reference("gnss", heading=SensorLevel(offset=0.01)))
     drives = [measure(motion, levels, seed) for seed in range(400)]
     errors = np.array([drive["sideslip_ref"] - motion.sideslip for drive in drives])
     assert np.ptp(errors, axis=1).max() < 1e-12
     assert np.std(errors[:, 0]) == pytest.approx(0.01, rel=0.14)  # 400 draws
     np.testing.assert_allclose(np.hypot(drives[0]["vx_ref"], drives[0]["vy_ref"]), np.hypot(motion.vx, motion.vy))
+
+
+def test_reference_in_the_bumper_is_moved_and_rolls_below_the_centre_of_gravity():
+    motion = replace(weaving(), roll_rate=np.zeros(2000), pitch_rate=np.zeros(2000))
+    shown = measure(motion, only(reference=Reference("optical", lever_x=2.0, lever_y=0.4, lever_z=-0.2)), seed=0)
+    np.testing.assert_allclose(shown["vx_ref"], motion.vx, atol=1e-12)
+    np.testing.assert_allclose(shown["vy_ref"], motion.vy, atol=1e-12)
+    shown = measure(motion_of(5, vx=20.0, roll_rate=0.2, pitch_rate=0.1), only(reference=Reference("optical", lever_z=-0.3)), seed=0)
+    np.testing.assert_allclose(shown["vy_ref"], 0.2 * 0.3)  # left side going up: what is below goes left
+    np.testing.assert_allclose(shown["vx_ref"], 20.0 - 0.1 * 0.3)  # nose going down: what is below goes back
 
 
 def test_reference_and_car_err_apart():
@@ -350,9 +294,6 @@ def test_reference_and_car_err_apart():
     motion = weaving()
     changed = different(measure(motion, PRESETS["default"], 1), measure(motion, replace(PRESETS["default"], reference=Reference()), 1))
     assert changed == {"vx_ref", "vy_ref", "yaw_rate_ref", "sideslip_ref"}
-
-
-# --- one by one
 
 
 def channels_of(sensor):
@@ -371,15 +312,12 @@ def test_switching_off_an_error_leaves_all_else_bit_by_bit(sensor):
     assert different(all_on, measure(motion, silent, seed=7)) == channels_of(sensor)
 
 
-def test_errors_of_one_sensor_do_not_disturb_each_other():
+def test_errors_of_sensors_have_streams_of_their_own_and_do_not_disturb_each_other():
     motion = motion_of(500, ay=3.0)
     ay = {kind: measure(motion, only(ay=level), seed=7)["ay"] - 3.0 for kind, level in _alone(LOUD).items()}
     together = measure(motion, only(ay=replace(LOUD, quantisation=0.0)), seed=7)["ay"] - 3.0
     np.testing.assert_allclose(ay["noise"] + ay["offset"] + ay["drift"] + ay["scale"], together, atol=1e-12)
     assert ay["scale"][0] / (LOUD.scale * 3.0) != pytest.approx(ay["offset"][0] / LOUD.offset)
-
-
-def test_streams_of_all_errors_differ():
     levels = {name: SensorLevel(offset=1.0, drift=1.0, noise=1.0, scale=1.0) for name in SENSORS}
     first = []
     for kind in ("offset", "drift", "noise"):
@@ -402,12 +340,6 @@ def test_switching_off_takes_parts_wholes_and_kinds():
     assert switched_off(levels) == levels
 
 
-def test_everything_switched_off_shows_the_motion():
-    motion = weaving()
-    nothing = switched_off(PRESETS["race"], "tilt", "imu", "reference", *SENSORS)
-    assert different(measure(motion, nothing, 0), measure(motion, ideal_sensors(), 1)) == set()
-
-
 @pytest.mark.parametrize("name", ["az", "ay.slope", "ay.noise.much", "ay.drift_time", "reference.kind", "*.lever_x", ""])
 def test_switching_off_what_there_is_not_names_what_there_is(name):
     with pytest.raises(ConfigurationError, match="cannot switch off") as error:
@@ -415,20 +347,14 @@ def test_switching_off_what_there_is_not_names_what_there_is(name):
     assert "\n" not in str(error.value)
 
 
-def test_same_seed_same_samples_and_another_seed_others():
+def test_the_seed_decides_every_sample_and_a_longer_drive_begins_alike():
     motion = weaving()
     one, again, other = (measure(motion, PRESETS["race"], seed) for seed in (5, 5, 6))
     assert different(one, again) == set()
     assert different(one, other) == set(one)
-
-
-def test_a_longer_drive_begins_with_the_same_errors():
     short, long = (measure(motion_of(n, vx=20.0), SensorLevels(), seed=3) for n in (500, 900))
     for name in short:
         np.testing.assert_array_equal(short[name], long[name][:500], err_msg=name)
-
-
-# --- configurations
 
 
 @pytest.mark.parametrize(
@@ -454,13 +380,6 @@ def test_configurations_mean_what_they_say(spelt, meant):
     assert sensor_levels_from_config(yaml.safe_load(spelt)) == meant
 
 
-def test_reference_kinds_are_different():
-    kinds = {kind: sensor_levels_from_config({"reference": kind}).reference for kind in ("optical", "gnss", "ideal")}
-    assert {reference.kind for reference in kinds.values()} == set(kinds)
-    assert kinds["optical"].lever_x > 1.0 > kinds["gnss"].lever_x
-    assert kinds["ideal"] == Reference()
-
-
 @pytest.mark.parametrize(
     ("spelt", "said"),
     [
@@ -480,9 +399,6 @@ def test_configuration_that_makes_no_sense_is_refused_in_one_line(spelt, said):
         sensor_levels_from_config(yaml.safe_load(spelt))
     assert said in str(error.value)
     assert "\n" not in str(error.value)
-
-
-# --- levels from the real recording
 
 
 def test_density_is_found_beside_a_resonance_and_jolts():
@@ -522,9 +438,6 @@ def test_race_levels_are_those_of_the_ferrari_recording(data_root):
         for part in name.split("."):
             level = level[part]
         assert level == pytest.approx(value, rel=0.03), name  # the levels are rounded
-
-
-# --- helpers
 
 
 def _turn_z(angle):

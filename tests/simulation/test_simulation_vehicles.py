@@ -1,13 +1,12 @@
-"""The shipped vehicles: steady handling, load transfer, springs, and that they are the cars their sources describe."""
+"""The shipped vehicles: steady handling, load transfer, springs, stability control, and that they are the cars of their sources."""
 
 import math
 import re
 from functools import cache
-from pathlib import Path
 
 import numpy as np
 import pytest
-import yaml
+from cars import ALL, FOLDER, OURS, plant_of
 
 from vehest.constants import GRAVITY
 from vehest.data.errors import ConfigurationError
@@ -15,20 +14,10 @@ from vehest.simulation.plant.handling import ramp_steer
 from vehest.simulation.plant.multi_body import MultiBodyPlant, PlantState
 from vehest.simulation.plant.parameters import Vehicle, library_parameters, rear_tyre, vehicle_from_configuration
 from vehest.simulation.plant.regimes import HEAVE, PITCH, ROLL, ROLL_RATE, Regime
+from vehest.simulation.plant.stability import StabilityControl, StabilityState, stability_control
 from vehest_papers.proving_ground.handling import understeer_angle
 
-CONFIGURATIONS = Path(__file__).parents[2] / "conf" / "vehicle"
-OURS = ("corvette_grand_sport", "ferrari_250_lm", "bmw_545i", "heavy_truck")
-ALL = (*OURS, "bmw_320i_low", "jaguar_e_type")
-
 each_vehicle = pytest.mark.parametrize("name", ALL)
-each_of_ours = pytest.mark.parametrize("name", OURS)
-
-
-@cache
-def plant_of(name):
-    configuration = yaml.safe_load((CONFIGURATIONS / f"{name}.yaml").read_text(encoding="utf-8"))
-    return MultiBodyPlant(vehicle_from_configuration(configuration))
 
 
 @cache
@@ -52,9 +41,6 @@ def cornering_stiffnesses(plant):
     p = plant.parameters
     weight = p.m * GRAVITY / (p.a + p.b)
     return -p.tire.p_ky1 * weight * p.b, -p.tire_rear.p_ky1 * weight * p.a
-
-
-# --- steady cornering
 
 
 @each_vehicle
@@ -100,46 +86,6 @@ def test_cars_reach_the_lateral_accelerations_of_the_papers():
             assert shown < ramp.ay.max() < at_most, name
             assert ramp.tyre_fz[: np.argmax(ramp.ay)].min() > 100.0, name  # no wheel lifts
             assert 2.0 < -math.degrees(ramp.sideslip[np.argmax(ramp.ay)]) < 6.0, name
-
-
-@each_of_ours
-def test_steering_to_and_fro_at_the_limit_ends_without_rollover(name):
-    plant, state = plant_of(name), plant_of(name).initial_state(0.0, 0.0, 0.0, 22.0)
-    for k in range(400):
-        target = 0.12 * math.sin(2.0 * math.pi * 0.7 * 0.01 * k) if k < 285 else 0.0
-        state = plant.advance(state, np.array([20.0 * (target - state.steer), 0.0, 0.0, 0.0, 0.0]), 10)
-        assert abs(state.values[ROLL]) < 0.12
-    assert abs(state.yaw_rate) < 0.05
-    assert not state.spun
-
-
-@each_of_ours
-def test_understeer_and_roll_gradients_are_a_cars_usual_ones(name):
-    ramp, plant = ramp_of(name), plant_of(name)
-    low = (ramp.ay > 1.0) & (ramp.ay < 3.0)
-    for angle, smallest, largest in ((understeer_angle(ramp, plant.wheelbase), 0.5, 1.5), (ramp.roll, 1.5, 4.5)):
-        gradient = np.polyfit(ramp.ay[low], angle[low], 1)[0]
-        assert smallest < math.degrees(gradient) * GRAVITY < largest  # degrees at 1 g
-
-
-def test_the_third_race_car_hardly_understeers_and_has_a_race_cars_springs():
-    ramp, plant = ramp_of("jaguar_e_type"), plant_of("jaguar_e_type")
-    low = (ramp.ay > 1.0) & (ramp.ay < 3.0)
-    gradient = np.polyfit(ramp.ay[low], understeer_angle(ramp, plant.wheelbase)[low], 1)[0]
-    others = [
-        np.polyfit(ramp_of(name).ay[part], understeer_angle(ramp_of(name), plant_of(name).wheelbase)[part], 1)[0]
-        for name in ("corvette_grand_sport", "ferrari_250_lm")
-        for part in [(ramp_of(name).ay > 1.0) & (ramp_of(name).ay < 3.0)]
-    ]
-    assert 0.0 < gradient < min(others)
-    front, rear = cornering_stiffnesses(plant)
-    mass, a, b = plant.parameters.m, plant.parameters.a, plant.parameters.b
-    assert gradient == pytest.approx(mass / (a + b) * (b / front - a / rear), rel=0.5)  # of tyres alone, without load transfer and camber
-    bounce = [mode for mode in suspension_modes(plant) if abs(mode) < 2.0 * math.pi * 5.0 and mode.imag > 0.0][:2]
-    assert all(2.0 < abs(mode) / (2.0 * math.pi) < 4.0 for mode in bounce)
-
-
-# --- loads
 
 
 @each_vehicle
@@ -220,38 +166,13 @@ def suspension_modes(plant):
     return sorted(np.linalg.eigvals(np.array(columns).T), key=abs)
 
 
-@pytest.mark.parametrize(
-    ("name", "top"), [("corvette_grand_sport", 64.0), ("ferrari_250_lm", 65.4), ("bmw_545i", 60.0), ("heavy_truck", 32.0)]
-)
-def test_top_speed_of_the_recordings_is_reached_and_straight(name, top):
-    plant = plant_of(name)
-    state = plant.initial_state(0.0, 0.0, 0.0, top - 1.0)
-    kick = state.values.copy()
-    kick[5] = 0.1  # rad/s of yaw
-    state = PlantState(kick, state.regime)
-    for _ in range(100):
-        state = plant.advance(state, np.array([0.0, 1.5, 0.0, 0.0, 0.0]), 40)
-    assert state.vx > top
-    assert abs(state.yaw_rate) < 1e-4
-    assert abs(state.vy) < 1e-3
-    limit = plant.parameters.longitudinal.v_max
-    beyond = plant.advance(plant.initial_state(0.0, 0.0, 0.0, limit - 0.05), np.array([0.0, 2.0, 0.0, 0.0, 0.0]), 5000)
-    assert beyond.vx == pytest.approx(limit, abs=0.3)
-
-
-# --- sources
-
-
-def test_ferrari_has_the_published_axle_stiffnesses_and_yaw_inertia():
+def test_ferrari_and_truck_have_the_axles_and_eigenvalues_that_were_published():
     plant = plant_of("ferrari_250_lm")
     p, (front, rear) = plant.parameters, cornering_stiffnesses(plant)
     assert (p.m, p.a, p.b) == (982.0, 1.33, 1.07)
     assert p.I_z == pytest.approx(982.0 / 12.0 * (1.7**2 + 4.09**2), rel=1e-4)
     assert front == pytest.approx(0.7e5, rel=0.01)
     assert rear == pytest.approx(1.2e5, rel=0.01)
-
-
-def test_truck_has_the_axle_forces_that_were_fitted_and_the_eigenvalues_that_were_reported():
     # Di Biase et al. 2020, Table 1 and the remark below Eq. 27, with the rational tyre at friction 1.
     plant = plant_of("heavy_truck")
     p = plant.parameters
@@ -279,7 +200,7 @@ SOURCE = re.compile(
 
 @each_vehicle
 def test_every_value_says_where_it_comes_from_or_that_it_is_assumed(name):
-    overrides = (CONFIGURATIONS / f"{name}.yaml").read_text(encoding="utf-8").partition("overrides:\n")[2]
+    overrides = (FOLDER / f"{name}.yaml").read_text(encoding="utf-8").partition("overrides:\n")[2]
     block = ""  # comment above a group of values that have none of their own
     for line in overrides.splitlines():
         value, _, comment = line.strip().partition("#")
@@ -289,18 +210,22 @@ def test_every_value_says_where_it_comes_from_or_that_it_is_assumed(name):
             block = ""
         else:
             assert SOURCE.search(comment or block), line
-    assert "parameter_set: 2  # BMW 320i (Althoff and Würsching" in (CONFIGURATIONS / f"{name}.yaml").read_text(encoding="utf-8")
+    assert "parameter_set: 2  # BMW 320i (Althoff and Würsching" in (FOLDER / f"{name}.yaml").read_text(encoding="utf-8")
 
 
-def test_cars_without_stated_shifts_pull_to_neither_side():
+def test_overrides_reach_the_plant_and_cars_without_stated_shifts_pull_to_neither_side():
     for name in OURS:
         plant = plant_of(name)
         after = plant.advance(plant.initial_state(0.0, 0.0, 0.0, 30.0), np.array([0.0, -3.0, 0.0, 0.0, 0.0]), 2000)
         assert abs(after.y) < 1e-12
         assert abs(after.yaw) < 1e-12
-
-
-# --- configuration
+    slippery = Vehicle("slippery", 2, {"h_s": 0.45, "tire": {"p_dy1": 0.5}, "tire_rear": {"p_dx1": 0.6}})
+    assert library_parameters(slippery).tire.p_dy1 == 0.5
+    assert library_parameters(slippery).h_s == 0.45
+    assert library_parameters(Vehicle("bmw", 2)).h_s == pytest.approx(0.61373004)
+    assert (rear_tyre(slippery).p_dy1, rear_tyre(slippery).p_dx1) == (0.5, 0.6)  # the front tyre, but for what is replaced
+    compiled = MultiBodyPlant(slippery).parameters
+    assert (compiled.tire.p_dx1, compiled.tire_rear.p_dx1, compiled.tire_rear.p_dy1) == (pytest.approx(1.1739), 0.6, 0.5)
 
 
 @pytest.mark.parametrize(
@@ -317,11 +242,74 @@ def test_vehicle_that_makes_no_sense_names_the_value(configuration, complaint):
         vehicle_from_configuration(configuration)
 
 
-def test_overrides_reach_the_plant():
-    slippery = Vehicle("slippery", 2, {"h_s": 0.45, "tire": {"p_dy1": 0.5}, "tire_rear": {"p_dx1": 0.6}})
-    assert library_parameters(slippery).tire.p_dy1 == 0.5
-    assert library_parameters(slippery).h_s == 0.45
-    assert library_parameters(Vehicle("bmw", 2)).h_s == pytest.approx(0.61373004)
-    assert (rear_tyre(slippery).p_dy1, rear_tyre(slippery).p_dx1) == (0.5, 0.6)  # the front tyre, but for what is replaced
-    compiled = MultiBodyPlant(slippery).parameters
-    assert (compiled.tire.p_dx1, compiled.tire_rear.p_dx1, compiled.tire_rear.p_dy1) == (pytest.approx(1.1739), 0.6, 0.5)
+CONTROL = StabilityControl(wheelbase=2.5, understeer_gradient=0.002, yaw_inertia=2000.0, grip=9.0, largest_moment=3000.0)
+
+
+def sine_with_dwell(plant, amplitude, control, friction):
+    """Largest sideslip [rad] of the manoeuvre of FMVSS 126 at 80 km/h, and the moments [N m] that the control asked for."""
+    state, doing = plant.initial_state(0.0, 0.0, 0.0, 80.0 / 3.6), StabilityState()
+    largest, moments = 0.0, []
+    for k in range(400):
+        time = 0.01 * k
+        phase = min(time, max(time - 0.5, 0.75 / 0.7)) * 0.7
+        target = amplitude * math.sin(2.0 * math.pi * phase) if phase < 1.0 else 0.0
+        if control is not None:
+            doing = control.step(doing, 0.01, steer=state.steer, vx=state.vx, yaw_rate=state.yaw_rate, friction=friction)
+        moments.append(doing.moment)
+        state = plant.advance(state, np.array([30.0 * (target - state.steer), 0.0, doing.moment, 0.0, 0.0]), 10, friction)
+        largest = max(largest, abs(math.atan2(state.vy, state.vx)))
+    return largest, np.array(moments)
+
+
+@pytest.mark.parametrize("name", OURS)
+@pytest.mark.parametrize("friction", [1.0, 0.5])
+def test_sideslip_stays_lower_with_control_than_without(name, friction):
+    plant = plant_of(name)
+    control, amplitude = stability_control(plant), 0.16 if friction == 1.0 else 0.09
+    without, _ = sine_with_dwell(plant, amplitude, None, friction)
+    with_control, moments = sine_with_dwell(plant, amplitude, control, friction)
+    assert with_control < 0.7 * without
+    assert 0.0 < np.abs(moments).max() <= friction * control.largest_moment
+
+
+@pytest.mark.parametrize("name", OURS)
+def test_largest_moment_is_within_what_the_plant_can_brake_on_either_side(name):
+    plant = plant_of(name)
+    rolling = plant.initial_state(0.0, 0.0, 0.0, 20.0)
+    forces = plant.motion([rolling] * 2, np.array([[0.0, 0.0, moment, 0.0, 0.0] for moment in (1e9, -1e9)]), 100.0).tyre_fx
+    arm = 0.25 * (plant.parameters.T_f + plant.parameters.T_r)
+    most = min(-forces[0, [0, 2]].sum(), -forces[1, [1, 3]].sum()) * arm  # to turn left, the left wheels are braked
+    assert 0.85 * most < stability_control(plant).largest_moment <= 1.01 * most  # 15 %: front and rear tyres differ
+
+
+@pytest.mark.parametrize("name", OURS)
+def test_control_leaves_calm_driving_alone(name):
+    plant = plant_of(name)
+    _, moments = sine_with_dwell(plant, 0.03, stability_control(plant), 1.0)
+    assert not moments.any()
+
+
+def test_moment_turns_the_car_towards_the_reference_with_hysteresis_and_a_limit():
+    turns_too_much = CONTROL.step(StabilityState(reference=0.2), 0.01, steer=0.025, vx=20.0, yaw_rate=0.5)
+    turns_too_little = CONTROL.step(StabilityState(reference=0.2), 0.01, steer=0.025, vx=20.0, yaw_rate=0.0)
+    assert turns_too_much.moment < 0.0 < turns_too_little.moment
+    mirrored = CONTROL.step(StabilityState(reference=-0.2), 0.01, steer=-0.025, vx=20.0, yaw_rate=-0.5)
+    assert mirrored.moment == -turns_too_much.moment
+    between = StabilityState(reference=0.05, active=False)
+    assert not CONTROL.step(between, 1e-6, steer=0.0, vx=20.0, yaw_rate=0.0).active
+    assert CONTROL.step(StabilityState(reference=0.05, active=True), 1e-6, steer=0.0, vx=20.0, yaw_rate=0.0).active
+    assert not CONTROL.step(StabilityState(reference=0.02, active=True), 1e-6, steer=0.0, vx=20.0, yaw_rate=0.0).active
+    assert CONTROL.step(StabilityState(reference=0.0), 0.01, steer=0.0, vx=20.0, yaw_rate=2.0).moment == -3000.0
+    assert CONTROL.step(StabilityState(reference=0.0), 0.01, steer=0.0, vx=20.0, yaw_rate=2.0, friction=0.5).moment == -1500.0
+    assert CONTROL.step(StabilityState(reference=0.0, active=True), 0.01, steer=0.3, vx=3.0, yaw_rate=0.0).moment == 0.0
+
+
+def test_reference_is_the_linear_single_track_within_friction():
+    state = StabilityState()
+    for _ in range(200):
+        state = CONTROL.step(state, 0.01, steer=0.02, vx=20.0, yaw_rate=0.0)
+    assert state.reference == pytest.approx(20.0 * 0.02 / (2.5 + 0.002 * 400.0))
+    for friction in (1.0, 0.5):
+        for _ in range(200):
+            state = CONTROL.step(state, 0.01, steer=0.3, vx=20.0, yaw_rate=0.0, friction=friction)
+        assert state.reference == pytest.approx(friction * 9.0 / 20.0)

@@ -20,18 +20,8 @@ THROUGH = PhaseSettings(learning_rate=1e-3, max_epochs=2)
 
 
 def settings(**changes):
-    known = {
-        "one_step": ONE_STEP,
-        "one_step_batch": 100,
-        "through": THROUGH,
-        "noise": THROUGH,
-        "steps": 40,
-        "batch_size": 3,
-        "validation_steps": 60,
-        "validation_drop_steps": 10,
-        "mirrored": 0.0,
-        "dtype": "float64",
-    }
+    known = {"one_step": ONE_STEP, "one_step_batch": 100, "through": THROUGH, "noise": THROUGH, "steps": 40, "batch_size": 3}
+    known |= {"validation_steps": 60, "validation_drop_steps": 10, "mirrored": 0.0, "dtype": "float64"}
     return ThroughFilterSettings(**known | changes)
 
 
@@ -62,18 +52,13 @@ def numbered(*lengths):
     return made
 
 
-# What is learnt from
-
-
-def test_drives_are_cut_from_their_start_and_remainders_are_left_out():
+def test_drives_are_cut_from_their_start_or_at_random_places():
     cut = sequences_of(numbered(25, 9, 10), 10)
     assert cut.states[:, 0].tolist() == [[0.0, 0.0], [10.0, 0.0], [0.0, 2.0]]
     assert cut.inputs.shape == (3, 10, 1)
     with pytest.raises(DataError, match=r"no drive is 26 samples long.* lower training\.steps"):
         sequences_of(numbered(25, 9), 26)
 
-
-def test_random_places_are_reproducible_fit_and_keep_each_drives_share():
     def drawn(seed):
         return placed(numbered(45, 9, 20), 10, torch.Generator().manual_seed(seed))
 
@@ -133,10 +118,7 @@ def test_a_share_of_sequences_is_seen_in_a_mirror():
         assert seen == allowed
 
 
-# Truncation
-
-
-def test_truncated_training_has_the_same_estimates_and_other_gradients():
+def test_truncated_training_has_the_same_estimates_and_gradients_that_end_at_its_starts():
     made = estimator()
     sequences = drives(made)
     results = {}
@@ -150,9 +132,6 @@ def test_truncated_training_has_the_same_estimates_and_other_gradients():
     assert torch.equal(results[40][1], results[None][1]), "as long as the sequence: nothing is cut"
     off = float((results[15][1] - results[None][1]).norm() / results[None][1].norm())
     assert 1e-4 < off < 2.0
-
-
-def test_truncated_gradients_do_not_reach_the_start():
     made = estimator()
     sequences = drives(made)
     start = sequences.states[:, 0].clone().requires_grad_()
@@ -160,9 +139,6 @@ def test_truncated_gradients_do_not_reach_the_start():
     assert start.grad is None or not start.grad.any()
     made.filter.estimated(sequences, start, None)[:, 10:].sum().backward()
     assert start.grad.abs().max() > 0
-
-
-# Noise
 
 
 def test_surprise_is_the_log_density_of_errors_under_the_covariance():
@@ -173,21 +149,7 @@ def test_surprise_is_the_log_density_of_errors_under_the_covariance():
     assert float(gaussian_surprise(torch.from_numpy(errors), torch.from_numpy(covariances))) == pytest.approx(expected, rel=1e-9)
 
 
-def test_likelihood_teaches_the_filter_how_sure_to_be():
-    """With the term the filter's own variances come nearer to its squared errors in training; without it they are left where they are."""
-    ratios = {}
-    for weight in (0.0, 0.05):
-        made = estimator(noise="constant")
-        made.fit(DATA, settings(through=PhaseSettings(learning_rate=5e-3, max_epochs=15), likelihood=weight))
-        own = sequences_of([made.drive(recording, torch.float64) for recording in DATA.train], 40)
-        with torch.no_grad():
-            mean, covariance = made.filter.estimate_with_covariance(own, own.states[:, 0], None)
-        error = (mean - own.states)[..., :3]
-        ratios[weight] = float(gaussian_surprise(error, covariance[..., :3, :3]))
-    assert ratios[0.05] < ratios[0.0] - 0.1
-
-
-def test_noise_starts_where_the_models_residuals_say():
+def test_noise_starts_where_residuals_say_or_as_given():
     made = estimator(dynamics="pacejka", noise="constant")
     parts = [made.drive(recording, torch.float64) for recording in DATA.train]
     made.filter.to(torch.float64).begin_noise(parts, 0.0)
@@ -202,9 +164,6 @@ def test_noise_starts_where_the_models_residuals_say():
     assert float(process[4, 4]) == pytest.approx(1e-4, rel=1e-2), "a friction that is constant in training says nothing about its noise"
     off = observation - seen.T @ seen / len(seen)
     assert torch.allclose(off, torch.diag(torch.tensor([0.0, 0.0, 0.0, 1e-3], dtype=torch.float64)), atol=2e-7)
-
-
-def test_noise_given_is_not_started_from_residuals():
     made = estimator()
     fitted = made.fit(DATA, settings(through=PhaseSettings(max_epochs=1, learning_rate=1e-12), start_noise="given"))
     assert np.isfinite(fitted.metrics["best_validation_loss"])
@@ -214,10 +173,7 @@ def test_noise_given_is_not_started_from_residuals():
     assert (other.weights()["process_noise.unit"] != 1.0).all()
 
 
-# Phases
-
-
-def test_noise_alone_leaves_the_dynamics_as_the_one_step_training_left_them():
+def test_noise_learns_alone_or_with_the_dynamics_through_the_filter():
     nothing = PhaseSettings(max_epochs=1, learning_rate=1e-300)
     alone, after = estimator(through_filter=False), estimator(through_filter=False)
     alone.fit(DATA, settings(noise=nothing))
@@ -225,9 +181,6 @@ def test_noise_alone_leaves_the_dynamics_as_the_one_step_training_left_them():
     changed = {name for name, values in after.weights().items() if not np.array_equal(values, alone.weights()[name])}
     assert changed
     assert all("noise" in name for name in changed)
-
-
-def test_through_the_filter_dynamics_and_noise_learn():
     before, after = estimator(), estimator()
     before.fit(DATA, settings(through=PhaseSettings(max_epochs=1, learning_rate=1e-300)))
     record = after.fit(DATA, settings(through=PhaseSettings(max_epochs=4, learning_rate=2e-3)))
@@ -268,9 +221,6 @@ def test_killed_training_goes_on_to_the_same_weights(tmp_path, stop):
     again = resumed.fit(DATA, settings(checkpoint_seconds=0.0), FitContext([tmp_path]))
     assert np.array_equal(weights_of(resumed), weights_of(whole))
     assert again.history == record.history
-
-
-# What is refused
 
 
 @pytest.mark.parametrize(

@@ -53,33 +53,6 @@ def test_members_equal_training_each_alone_over_the_whole_training_in_float64(na
         assert np.allclose(own.history["validation_loss"], record.history["validation_loss"], rtol=0, atol=1e-8)
 
 
-@pytest.mark.parametrize(("name", "config"), SHAPES)
-def test_members_equal_training_each_alone_over_first_epochs_in_float32(name, config):
-    settings = SupervisedSettings(max_epochs=3)
-    together, _ = _fit(name, config, [0, 1, 2], settings)
-    for seed, member in enumerate(together):
-        (alone,), _ = _fit(name, config, [seed], settings)
-        assert np.allclose(_weights(alone), _weights(member), rtol=0, atol=1e-5)
-
-
-def test_compiled_training_equals_plain_training():
-    plain = SupervisedSettings(dtype="float64", max_epochs=2, compiled=False)
-    compiled = SupervisedSettings(dtype="float64", max_epochs=2)
-    for name, config in SHAPES:
-        (one,), _ = _fit(name, config, [5], plain)
-        (other,), _ = _fit(name, config, [5], compiled)
-        assert np.allclose(_weights(one), _weights(other), rtol=0, atol=1e-9)
-
-
-def test_same_seed_gives_the_same_numbers_and_another_seed_others():
-    settings = SupervisedSettings(max_epochs=3)
-    (first,), _ = _fit("ksnn", {}, [7], settings)
-    (again,), _ = _fit("ksnn", {}, [7], settings)
-    (other,), _ = _fit("ksnn", {}, [8], settings)
-    assert np.array_equal(_weights(first), _weights(again))
-    assert not np.allclose(_weights(first), _weights(other))
-
-
 def test_early_stopping_keeps_the_best_weights_on_validation():
     settings = SupervisedSettings(dtype="float64", max_epochs=40, patience=4, learning_rate=3e-2)
     (member,), (record,) = _fit("ksnn", {"n_hidden": 2, "bias": True}, [0], settings)
@@ -90,13 +63,6 @@ def test_early_stopping_keeps_the_best_weights_on_validation():
     windows = windows_of(DATA.validation, member.channels, "vy_ref", member.settings.window)
     error = member._predict(windows.series, windows.starts) - windows.targets
     assert np.mean(error**2) == pytest.approx(losses[best], rel=1e-9)
-
-
-def test_gamma_1_stays_in_its_range():
-    (member,), _ = _fit("ksnn", {"n_hidden": 0}, [0], SupervisedSettings(max_epochs=10, learning_rate=5e-2))
-    gamma = member.weights()["gamma"][:, 0]
-    assert (gamma > 0).all()
-    assert (gamma <= 1).all()
 
 
 class _StopAfter:
@@ -134,7 +100,7 @@ def test_interrupted_training_goes_on_to_the_same_result(tmp_path, name, config)
         assert record.history == resumed_record.history
 
 
-def test_member_goes_on_alone_from_a_checkpoint_it_shared(tmp_path):
+def test_a_member_goes_on_alone_and_a_damaged_checkpoint_starts_anew(tmp_path):
     settings = SupervisedSettings(max_epochs=10, patience=10)
     (whole,), _ = _fit("ksnn", {}, [1], settings)
     folders = [tmp_path / str(seed) for seed in range(3)]
@@ -142,9 +108,6 @@ def test_member_goes_on_alone_from_a_checkpoint_it_shared(tmp_path):
     assert resume_epoch(folders[1]) > 0
     (resumed,), _ = _fit("ksnn", {}, [1], settings, FitContext([folders[1]]))
     assert np.array_equal(_weights(whole), _weights(resumed))
-
-
-def test_damaged_checkpoint_starts_anew(tmp_path):
     settings = SupervisedSettings(max_epochs=4)
     _fit("ksnn", {}, [0], settings, FitContext([tmp_path], should_stop=_StopAfter(20)))
     file = tmp_path / "checkpoint.safetensors"
@@ -160,18 +123,7 @@ def test_diverging_training_is_one_clear_error():
         _fit("ksnn", {"n_hidden": 0, "bias": True}, [0], SupervisedSettings(max_epochs=200, learning_rate=1e3))
 
 
-def test_ksnn_learns_exact_kinematics_better_than_a_zero_estimate():
-    settings = SupervisedSettings(max_epochs=25)
-    data = FitData([planar_drive(120.0, seed=1)], [planar_drive(40.0, seed=2)])
-    (member,), _ = _fit("ksnn", {"n_hidden": 0}, [0], settings, data=data)
-    test = planar_drive(40.0, seed=3)
-    estimate = member.estimate([test.without_references()])[0]
-    known = ~np.isnan(estimate["vy"])
-    error = (estimate["vy"] - test["vy_ref"])[known]
-    assert np.var(error) < 0.3 * np.var(test["vy_ref"][known])
-
-
-def test_direct_search_finds_the_minimum_that_a_fine_grid_finds():
+def test_direct_search_finds_the_minimum_of_a_fine_grid_within_its_box():
     def cost(p):
         return float((p[0] - 7.0) ** 2 + 30 * abs(p[1] - 0.11) + 5 * np.sin(3 * p[0]) ** 2)
 
@@ -179,9 +131,6 @@ def test_direct_search_finds_the_minimum_that_a_fine_grid_finds():
     grid = optimize.brute(cost, ((0, 50), (0, 0.5)), Ns=401, finish=optimize.fmin)
     assert record.cost <= cost(grid) + 1e-6
     assert len(record.starts) == 16
-
-
-def test_direct_search_stays_in_its_box():
     record = nelder_mead_over_grid(
         lambda p: float(-p.sum()), [(0, 2), (0, 1)], [(0.5, 1), (0.1, 0.5)], DirectSearchSettings(), FitContext()
     )
@@ -252,26 +201,6 @@ def test_averaging_never_reaches_the_optimiser():
     (_,), (averaged,) = _fit("ksnn", {}, [0], SupervisedSettings(max_epochs=5, averaging=0.99))
     assert averaged.history["train_loss"] == plain.history["train_loss"]
     assert averaged.history["validation_loss"] != plain.history["validation_loss"]
-
-
-def test_validation_loss_of_averaged_weights_jumps_less():
-    def jumps(averaging):
-        settings = SupervisedSettings(max_epochs=30, patience=30, learning_rate=1e-2, averaging=averaging)
-        _, (record,) = _fit("gru", {"n_states": 3}, [1], settings)
-        return np.abs(np.diff(record.history["validation_loss"][10:], n=2)).mean()
-
-    assert jumps(0.98) < 0.5 * jumps(0.0)
-
-
-@pytest.mark.parametrize(("name", "config"), SHAPES)
-def test_members_with_averaged_weights_equal_training_each_alone(name, config):
-    settings = SupervisedSettings(dtype="float64", max_epochs=30, patience=3, learning_rate=1e-2, averaging=0.9)
-    together, records = _fit(name, config, [0, 1, 2, 3], settings)
-    assert len({record.metrics["epochs"] for record in records}) > 1, "members must stop at different times for this to mean anything"
-    for seed, member, record in zip(range(4), together, records, strict=True):
-        (alone,), (own,) = _fit(name, config, [seed], settings)
-        assert own.metrics["epochs"] == record.metrics["epochs"]
-        assert np.allclose(_weights(alone), _weights(member), rtol=0, atol=1e-8)
 
 
 @pytest.mark.parametrize("batches", [2, 25])

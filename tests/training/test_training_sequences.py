@@ -96,7 +96,7 @@ def test_killed_training_goes_on_from_its_last_checkpoint_to_the_same_bits(tmp_p
     assert torch.equal(_flat(whole), _flat(resumed))
 
 
-def test_finished_training_is_not_done_again(tmp_path):
+def test_checkpoints_are_each_members_own_of_its_network_and_end_what_is_finished(tmp_path):
     one, other = _network(), _network()
     records = train_phases(_two_phases(one), 3, FitContext([tmp_path]))
     assert resume_epoch(tmp_path) == -1
@@ -104,18 +104,12 @@ def test_finished_training_is_not_done_again(tmp_path):
     assert _without_times(train_phases(_two_phases(other), 3, FitContext([tmp_path], on_progress=asked.append))) == _without_times(records)
     assert not asked
     assert torch.equal(_flat(one), _flat(other))
-
-
-def test_members_keep_checkpoints_of_their_own_and_draw_other_batches(tmp_path):
     folders = [tmp_path / "0", tmp_path / "1"]
     networks = [_network(), _network()]
     for index, network in enumerate(networks):
         train_phases([_phase(network)], index, FitContext(folders), folder_index=index)
     assert [resume_epoch(folder) for folder in folders] == [-1, -1]
     assert not torch.allclose(_flat(networks[0]), _flat(networks[1]))
-
-
-def test_checkpoint_of_another_network_starts_anew(tmp_path):
     train_phases([_phase(_network())], 0, FitContext([tmp_path], should_stop=_StopAfter(9)))
     assert resume_epoch(tmp_path) > 0
     other = nn.Linear(1, 1)
@@ -157,12 +151,16 @@ def test_best_validation_is_kept_and_the_start_is_a_candidate():
     assert torch.equal(_flat(network), start)
 
 
-def test_validation_every_third_epoch_and_after_the_last():
+def test_validation_comes_every_third_epoch_and_progress_counts_over_all_phases():
     (record,) = train_phases([_phase(_network(), validate_every=3, max_epochs=8)], 0, FitContext())
     assert [math.isfinite(loss) for loss in record.validation_loss] == [False, False, True, False, False, True, False, True]
+    told = []
+    train_phases(_two_phases(_network()), 3, FitContext(on_progress=told.append))
+    assert [progress.epoch for progress in told] == list(range(1, len(told) + 1))
+    assert told[0].max_epochs == 19
 
 
-def test_gradients_are_clipped_element_by_element():
+def test_gradients_are_clipped_and_step_sizes_fall_along_a_cosine():
     """Of two elements one is over the bound: AdamW's first moment holds a tenth of the bound and of the other as it is."""
     line = nn.Linear(2, 1, bias=False)
     gradient = torch.tensor([[50.0, 0.5]])
@@ -178,6 +176,18 @@ def test_gradients_are_clipped_element_by_element():
         patch.setattr(torch.optim.AdamW, "step", watched)
         train_phases([phase], 0, FitContext())
     assert torch.equal(seen[0], torch.tensor([[3.0, 0.5]]))
+    rates = []
+    step = torch.optim.AdamW.step
+
+    def watched(self, *arguments):
+        rates.append(self.param_groups[0]["lr"])
+        return step(self, *arguments)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(torch.optim.AdamW, "step", watched)
+        train_phases([_phase(_network(), learning_rate=0.2, max_epochs=4, schedule="cosine")], 0, FitContext())
+    expected = [0.1 * (1 + math.cos(math.pi * epoch / 4)) for epoch in range(4) for _ in range(3)]
+    assert rates == pytest.approx(expected)
 
 
 @pytest.mark.parametrize("where", ["loss", "gradient"])
@@ -200,14 +210,11 @@ def test_step_that_is_not_finite_is_skipped_and_counted(where):
     assert math.isfinite(record.train_loss[0])
 
 
-def test_twenty_steps_in_a_row_that_are_not_finite_are_an_error():
+def test_bad_steps_end_nothing_between_good_ones_and_training_twenty_in_a_row():
     network = _network()
     phase = _phase(network, "through the filter", loss=lambda batch: network(batch[0]).sum() * math.inf)
     with pytest.raises(DataError, match=r"phase 'through the filter', epoch 7, step 2: .* 20 times in a row; lower its learning_rate"):
         train_phases([phase], 0, FitContext())
-
-
-def test_bad_steps_with_good_ones_between_them_end_nothing():
     network, calls = _network(), 0
 
     def loss(batch):
@@ -217,26 +224,8 @@ def test_bad_steps_with_good_ones_between_them_end_nothing():
 
     (record,) = train_phases([_phase(network, loss=loss)], 0, FitContext())
     assert record.skipped_steps == 24, "two of three in twelve epochs"
-
-
-def test_phase_without_a_finite_validation_is_an_error():
     with pytest.raises(DataError, match="no finite validation loss in 12 epochs"):
         train_phases([_phase(_network(), validation=lambda: math.nan)], 0, FitContext())
-
-
-def test_cosine_schedule_falls_from_the_full_step_size_to_zero():
-    rates = []
-    step = torch.optim.AdamW.step
-
-    def watched(self, *arguments):
-        rates.append(self.param_groups[0]["lr"])
-        return step(self, *arguments)
-
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(torch.optim.AdamW, "step", watched)
-        train_phases([_phase(_network(), learning_rate=0.2, max_epochs=4, schedule="cosine")], 0, FitContext())
-    expected = [0.1 * (1 + math.cos(math.pi * epoch / 4)) for epoch in range(4) for _ in range(3)]
-    assert rates == pytest.approx(expected)
 
 
 def test_stop_leaves_the_best_so_far_and_says_so(tmp_path):
@@ -248,13 +237,6 @@ def test_stop_leaves_the_best_so_far_and_says_so(tmp_path):
     assert checkpoint is not None
     assert torch.equal(_flat(network)[:8], checkpoint.tensors["best.0.0.weight"].reshape(-1))
     assert math.isclose(records[-1].best_loss, float((network(X) - Y).square().mean().detach()), rel_tol=1e-6)
-
-
-def test_progress_counts_epochs_over_all_phases():
-    told = []
-    train_phases(_two_phases(_network()), 3, FitContext(on_progress=told.append))
-    assert [progress.epoch for progress in told] == list(range(1, len(told) + 1))
-    assert told[0].max_epochs == 19
 
 
 def test_phases_that_make_no_sense_are_refused():

@@ -67,9 +67,14 @@ def test_scale_of_a_filter_is_its_variance_and_a_floor():
     assert math.sqrt(weights[1] / weights[0]) == pytest.approx(0.2, rel=0.05)
 
 
-def test_a_filter_s_band_takes_its_variance_and_nothing_else():
+def test_band_is_wider_where_errors_are_and_a_filters_takes_its_variance():
     assert set(bands_of(variance=0.01).vy.weights) <= {"variance", "one"}
     assert "ay" in bands_of().vy.weights
+    bands = bands_of()
+    rows = np.tile([0.0, 25.0, 0.0, 0.0, 0.0], (2, 1))
+    rows[1, 2] = 6.0
+    calm, hard = bands.half_widths(rows, np.zeros(2), np.full(2, np.nan))[:, 0]
+    assert hard / calm == pytest.approx(math.sqrt(0.1**2 + 0.3**2) / 0.1, rel=0.25)
 
 
 def test_pooled_quantile_of_blocks_of_one_is_that_of_split_conformal():
@@ -79,22 +84,16 @@ def test_pooled_quantile_of_blocks_of_one_is_that_of_split_conformal():
         assert pooled_quantile(scores, np.arange(40), level) == (np.sort(scores)[rank - 1], False)
 
 
-def test_each_block_counts_once_however_long_it_is():
+def test_each_block_counts_once_and_blocks_that_say_nothing_as_their_samples():
     scores = np.concatenate([np.full(1000, 5.0), np.arange(1.0, 9.0)])
     blocks = np.concatenate([np.zeros(1000, dtype=int), np.arange(1, 9)])
     assert pooled_quantile(scores, blocks, 0.5)[0] == 5.0
     assert pooled_quantile(scores, np.arange(1008), 0.003)[0] == 4.0
-
-
-def test_too_few_blocks_for_a_level_take_the_largest_score_and_say_so():
+    scores = np.random.default_rng(5).permutation(np.arange(1.0, 1001.0))
+    assert pooled_quantile(scores, np.arange(1000) // 100, 0.9)[0] == pytest.approx(901.0, abs=3.0)
     scores, blocks = np.repeat(np.arange(1.0, 6.0), 2), np.arange(10) // 2  # K = 5, alike within: levels up to 5/6
     assert pooled_quantile(scores, blocks, 0.9) == (pytest.approx(5.0 * 1.2), True)
     assert pooled_quantile(scores, blocks, 0.68)[1] is False
-
-
-def test_blocks_that_say_nothing_count_as_their_samples():
-    scores = np.random.default_rng(5).permutation(np.arange(1.0, 1001.0))
-    assert pooled_quantile(scores, np.arange(1000) // 100, 0.9)[0] == pytest.approx(901.0, abs=3.0)
 
 
 def test_coverage_of_a_further_block_averages_the_level():
@@ -113,28 +112,6 @@ def test_coverage_of_a_further_block_averages_the_level():
     for level, own in covered.items():
         error = own.std() / math.sqrt(len(own))
         assert level - 3.0 * error <= own.mean() <= level + 0.02  # with all weight of K at infinity it would be up to 1/13 more
-
-
-def test_coverage_on_further_ranges_of_the_whole_calibration():
-    """Scale, blocks and factors together: 60 calibrations on 32 turns, each judged on 100 s more."""
-    rng, covered = np.random.default_rng(5), []
-    for _ in range(60):
-        bands = calibrated([piece_of(rng, 3000)], [piece_of(rng, 4000)], CHANNELS, **ORIGIN)
-        further = piece_of(rng, 2000)
-        shown = bands.half_widths(further.rows, further.vy, further.variance)[:, :, None]
-        half = shown * np.stack([own.beside(SHOWN_LEVEL) for own in (bands.vy, bands.sideslip)])
-        covered.append((np.abs(further.errors)[:, :, None] <= half).mean(axis=0))
-    mean, error = np.mean(covered, axis=0), np.std(covered, axis=0) / math.sqrt(60)
-    assert np.all(mean[:, :3] >= np.array(LEVELS)[:3] - 3.0 * error[:, :3])
-    assert np.all(mean[:, :3] <= np.array(LEVELS)[:3] + 0.09)
-
-
-def test_band_is_wider_where_errors_are():
-    bands = bands_of()
-    rows = np.tile([0.0, 25.0, 0.0, 0.0, 0.0], (2, 1))
-    rows[1, 2] = 6.0
-    calm, hard = bands.half_widths(rows, np.zeros(2), np.full(2, np.nan))[:, 0]
-    assert hard / calm == pytest.approx(math.sqrt(0.1**2 + 0.3**2) / 0.1, rel=0.25)
 
 
 def by_numpy(bands, rows, vy, variance, *, elsewhere):
@@ -165,16 +142,13 @@ def test_kernel_agrees_with_numpy(variance, elsewhere):
     np.testing.assert_allclose(found, by_numpy(bands, rows, vy, spread, elsewhere=elsewhere), rtol=1e-13, equal_nan=True)
 
 
-def test_rows_one_by_one_are_rows_together():
+def test_rows_one_by_one_are_rows_together_and_bands_finite_where_estimates_are():
     packed, own = bands_of().packed(), piece_of(np.random.default_rng(7), 50)
     together, one = np.empty((50, 2)), np.empty((1, 2))
     band_rows(own.rows, own.vy, own.variance, packed.columns, packed.numbers, together)
     for k in range(50):
         band_rows(own.rows[k : k + 1], own.vy[k : k + 1], own.variance[k : k + 1], packed.columns, packed.numbers, one)
         assert np.array_equal(one[0], together[k])
-
-
-def test_band_is_finite_where_an_estimate_is_and_nowhere_else():
     bands, own = bands_of(), piece_of(np.random.default_rng(8), 20)
     rows, vy = own.rows.copy(), own.vy.copy()
     rows[:10] = np.nan
@@ -184,7 +158,7 @@ def test_band_is_finite_where_an_estimate_is_and_nowhere_else():
     assert (half[:10, 1] == math.pi).all()  # without a speed nothing is known of the angle
 
 
-def test_widening_is_the_excess_over_the_training_s_largest():
+def test_bands_widen_with_the_excess_over_training_and_where_nothing_was_measured():
     bands = bands_of()
     flat = replace(bands, vy=replace(bands.vy, weights={"one": 1.0}))
     rows = np.tile([0.0, 25.0, 0.0, 0.0, 0.0], (2, 1))
@@ -192,9 +166,6 @@ def test_widening_is_the_excess_over_the_training_s_largest():
     inside, outside = flat.half_widths(rows, np.zeros(2), np.full(2, np.nan))[:, 0]
     assert outside / inside == pytest.approx(1.7)
     assert flat.half_widths(rows, np.zeros(2), np.full(2, np.nan), elsewhere=True)[0, 0] == pytest.approx(OTHER_VEHICLE * inside)
-
-
-def test_what_was_not_measured_counts_as_the_training_s_largest():
     bands = bands_of()
     rows = np.tile([0.0, 25.0, bands.largest["ay"], 0.0, 0.0], (2, 1))
     rows[1, 2] = np.nan
@@ -202,7 +173,7 @@ def test_what_was_not_measured_counts_as_the_training_s_largest():
     assert half[0] == pytest.approx(half[1])
 
 
-def test_blocks_are_ranges_where_there_are_ten_and_turns_elsewhere():
+def test_blocks_are_ranges_where_there_are_ten_and_turns_of_two_seconds_elsewhere():
     yaw_rate = 0.3 * np.sin(2.0 * math.pi * np.arange(400) / 100.0)  # 20 s at 20 Hz, a turn each 2.5 s
     labels, kind = block_labels([yaw_rate] * 10, [400] * 10, 20.0)
     assert kind == "range"
@@ -211,25 +182,19 @@ def test_blocks_are_ranges_where_there_are_ten_and_turns_elsewhere():
     assert kind == "turn"
     assert len(np.unique(labels[0])) == 8  # turns start at 0.13, 2.63 … s; that at 0.13 s comes too soon after the range's start
     assert np.unique(labels[1]).tolist() == [8]
-
-
-def test_turns_shorter_than_two_seconds_are_joined():
     yaw_rate = np.zeros(200)
     yaw_rate[[50, 60, 70, 100, 190]] = 0.1
     labels = turns_of(yaw_rate, 20.0)
     assert np.flatnonzero(np.diff(labels)).tolist() == [49, 99]
 
 
-def test_bands_say_what_they_were_calibrated_on():
+def test_bands_say_what_they_were_calibrated_on_and_need_a_reference():
     bands = bands_of()
     assert (bands.vehicles, bands.datasets, bands.calibrated_on) == (("my car",), ("mine",), ("two (all)",))
     assert bands.blocks == "turn"
     assert bands.n_blocks == 32  # 200 s, a turn each 2π s
     assert 1.0 < bands.vy.effective_blocks <= bands.n_blocks
     assert bands.seconds == 200.0
-
-
-def test_calibration_without_a_reference_is_refused():
     rng = np.random.default_rng(9)
     blind = replace(piece_of(rng, 100), errors=np.full((100, 2), np.nan))
     with pytest.raises(DataError, match="no sample of the validation ranges"):

@@ -21,12 +21,17 @@ def guard(skippable=(), limits=None):
     return Guard(CHANNELS, skippable, limits or usual_limits(CHANNELS, RATE), RATE)
 
 
-def test_a_drive_without_faults_passes_as_it_is(drive):
+def test_a_drive_without_faults_passes_as_it_is_once_every_channel_was_there(drive):
     cleaned = guard()(rows_of(drive))
     assert np.array_equal(cleaned.rows, rows_of(drive))
     assert cleaned.measured.all()
     assert cleaned.flow[0] == RESTART
     assert (cleaned.flow[1:] == USE).all()
+    rows = rows_of(drive)
+    rows[:5, 3] = math.nan
+    flow = guard()(rows).flow
+    assert (flow[:5] == WAIT).all()
+    assert flow[5] == RESTART
 
 
 @pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf, 1e6, -70.0, 30.0])
@@ -39,10 +44,15 @@ def test_a_value_that_no_car_reaches_holds_the_last_one(drive, value):
     assert cleaned.measured.sum() == rows.size - 1
 
 
-def test_a_channel_that_can_be_skipped_becomes_nan(drive):
+def test_a_channel_is_missing_for_as_long_as_another_can_be_skipped(drive):
     rows = rows_of(drive)
     rows[100, 2] = math.inf
     assert math.isnan(guard(("ay", "yaw_rate"))(rows).rows[100, 2])
+    rows = rows_of(drive)
+    rows[300:400, 0] = math.nan
+    assert (guard(("ay", "yaw_rate"))(rows).flow[1:] == USE).all()
+    rows[300:400, 2] = math.nan
+    assert (guard(("ay", "yaw_rate"))(rows).flow == WAIT).sum() == 90
 
 
 def test_a_spike_is_left_aside_and_a_new_level_believed_once_it_stands(drive):
@@ -60,22 +70,6 @@ def test_gaps_up_to_half_a_second_are_bridged_and_longer_ones_start_anew(drive, 
     flow = guard()(rows).flow
     assert (flow[1:] == RESTART).sum() == restarts
     assert (flow == WAIT).sum() == max(samples - 10, 0)
-
-
-def test_one_of_two_channels_that_can_be_skipped_may_be_missing_for_long(drive):
-    rows = rows_of(drive)
-    rows[300:400, 0] = math.nan
-    assert (guard(("ay", "yaw_rate"))(rows).flow[1:] == USE).all()
-    rows[300:400, 2] = math.nan
-    assert (guard(("ay", "yaw_rate"))(rows).flow == WAIT).sum() == 90
-
-
-def test_nothing_is_used_before_every_needed_channel_was_there_once(drive):
-    rows = rows_of(drive)
-    rows[:5, 3] = math.nan
-    flow = guard()(rows).flow
-    assert (flow[:5] == WAIT).all()
-    assert flow[5] == RESTART
 
 
 def test_a_frozen_channel_counts_as_not_measured_after_its_longest_run(drive):
@@ -100,13 +94,10 @@ def test_a_steering_that_stands_still_is_believed_at_its_lock_alone(drive, held,
     assert measured.all() == believed
 
 
-def test_a_speed_has_no_lock(drive):
+def test_speeds_have_no_lock_and_standing_cars_no_frozen_channels(drive):
     standing = np.minimum(drive["vx"], np.median(drive["vx"]))
     limits = learn_limits([Recording("slow", "car", RATE, 0.0, {"vx": standing})], ("vx",), RATE)
     assert limits.channels["vx"].stops == (-1e300, 1e300)
-
-
-def test_a_car_that_stands_has_no_frozen_channels():
     still = planar_drive(20.0)
     rows = rows_of(still)
     rows[100:300] = 0.0

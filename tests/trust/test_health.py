@@ -125,15 +125,12 @@ def test_a_slide_does_not_accuse_the_longitudinal_acceleration_where_ay_tells_of
     assert bool((statistics[:, at] > np.array(model.limits)[at]).any()) is accused
 
 
-def test_a_channel_that_is_lost_degrades_at_once_and_invalidates_after_half_a_second():
+def test_noise_jumps_and_lost_channels_are_told():
     drive = measured_drive(3)
     found = judged(model_of(), drive, ay=after(drive["ay"], math.nan))
     assert found.status[ONSET] == DEGRADED
     assert found.status[ONSET + round(0.6 * RATE)] == INVALID
     assert reason_in_words(found.reason[ONSET]) == "ay is not measured"
-
-
-def test_noise_is_flagged_as_noise_and_a_spike_as_a_jump():
     drive, generator = measured_drive(3), np.random.default_rng(0)
     noisy = judged(model_of(), drive, ax=after(drive["ax"], lambda part: part + 1.0 * generator.standard_normal(len(part))))
     assert reason_in_words(noisy.reason[ONSET + round(RATE)]) in {
@@ -245,18 +242,17 @@ def test_a_glitch_of_the_recording_is_no_limit():
     np.testing.assert_allclose(model.limits, model_of().limits, rtol=0.25)
 
 
-def test_what_lies_outside_training_is_said_in_one_line():
+def test_models_come_back_from_files_and_say_what_lies_outside_training_or_of_another_rate():
     model, drive = model_of(), measured_drive(3)
     fast = {name: np.array(drive[name]) for name in CHANNELS}
     assert domain_verdict(model, fast) == ""
     fast["ay"][: len(drive) // 4] = 50.0
     assert domain_verdict(model, fast).startswith("25 % of the drive outside what the model learnt: |ay| above ")
-
-
-def test_a_model_comes_back_from_a_file_as_it_was():
     model = model_of()
     read = validated(HealthModel, yaml.safe_load(yaml.safe_dump(plain(asdict(model)))), "'trust.yaml'")
     np.testing.assert_array_equal(read.packed(), model.packed())
+    with pytest.raises(DataError, match="is sampled at 50 Hz, health is learnt at 20 Hz"):
+        learn_health([measured_drive(0)], [], CHANNELS, 20.0)
 
 
 def plain(value):
@@ -264,11 +260,6 @@ def plain(value):
     if isinstance(value, dict):
         return {key: plain(inner) for key, inner in value.items()}
     return [plain(inner) for inner in value] if isinstance(value, (tuple, list)) else value
-
-
-def test_another_rate_is_refused():
-    with pytest.raises(DataError, match="is sampled at 50 Hz, health is learnt at 20 Hz"):
-        learn_health([measured_drive(0)], [], CHANNELS, 20.0)
 
 
 def ferrari(data_root, start, stop):

@@ -30,16 +30,16 @@ def heeded(kind, channel, *, rollback=0, starts_anew=True, status=2, first=10, l
     return rows, measured, flow
 
 
-def test_an_accused_channel_is_left_out_where_the_method_can_do_without_it():
+def test_accused_channels_are_left_out_unless_needed_or_merely_suspected():
     rows, measured, _ = heeded(kernel.OFFSET, "ay")
     assert np.isnan(rows[10:40, 2]).all()
     assert not measured[10:40, 2].any()
     assert np.isfinite(np.delete(rows, np.s_[10:40], axis=0)).all()
     assert np.isfinite(rows[:, :2]).all()
-
-
-def test_a_channel_that_is_needed_stays():
     assert np.isfinite(heeded(kernel.SCALE, "vx")[0]).all()
+    rows, _, flow = heeded(kernel.OFFSET, "ay", status=1)
+    assert np.isfinite(rows).all()
+    assert (flow == USE).all()
 
 
 @pytest.mark.parametrize("kind", [kernel.OUTSIDE, kernel.SPIN, kernel.MISSING])
@@ -49,23 +49,11 @@ def test_what_is_no_fault_of_a_sensor_changes_nothing(kind):
     assert (flow == USE).all()
 
 
-def test_a_suspicion_that_only_degrades_changes_nothing():
-    rows, _, flow = heeded(kernel.OFFSET, "ay", status=1)
-    assert np.isfinite(rows).all()
-    assert (flow == USE).all()
-
-
-def test_what_remembers_starts_anew_once_the_fault_is_over():
+def test_what_remembers_starts_anew_and_what_adapts_goes_back_every_second():
     assert np.flatnonzero(heeded(kernel.OFFSET, "ay")[2] == RESTART).tolist() == [40]
     assert not (heeded(kernel.OFFSET, "ay", starts_anew=False)[2] == RESTART).any()
-
-
-def test_what_adapts_goes_back_every_second_only_while_a_needed_channel_is_accused():
     assert np.flatnonzero(heeded(kernel.SCALE, "vx", rollback=10, starts_anew=False)[2] == RESTART).tolist() == [18, 28, 38]
     assert not (heeded(kernel.OFFSET, "ay", rollback=10, starts_anew=False)[2] == RESTART).any()
-
-
-def test_one_row_at_a_time_heeds_the_same():
     reasons, statuses = np.zeros(STEPS), np.zeros(STEPS)
     statuses[10:40], reasons[10:40] = 2.0, code(kernel.SCALE, "vx")
     rows, measured, flow = np.ones((STEPS, 3)), np.ones((STEPS, 3), np.bool_), np.full(STEPS, USE, np.int8)
@@ -89,16 +77,13 @@ def test_the_verdict_names_what_guard_and_watch_know():
     assert reason[4] == NO_ESTIMATE * 10_000
 
 
-def test_a_band_is_wider_the_less_an_estimate_is_worth():
+def test_a_band_is_wider_the_less_an_estimate_is_worth_and_invalid_beyond_six_degrees():
     bands = np.full((4, 2), 0.1)
     marks = np.array([0, 0, 0, EXTRAPOLATED], np.int8)
     widen_rows(np.array([0.0, 1.0, 2.0, 2.0]), np.zeros(4), marks, np.full(4, 0.5), np.full(4, 20.0), 1.5, bands)
     assert bands[:3, 0].tolist() == pytest.approx([0.1, 0.2, 0.4])
     assert bands[3].tolist() == pytest.approx([2.0, max(0.4, math.atan(2.0 / 20.0))])  # as far as |v| and the farthest in training
-
-
-def test_a_band_of_more_than_six_degrees_is_invalid_and_not_degraded():
-    """Half widths of 2, 2, 4 and 7 degrees, the second and third twice as wide since they are degraded."""
+    # Half widths of 2, 2, 4 and 7 degrees, the second and third twice as wide since they are degraded.
     status, reason = np.array([0.0, 1.0, 1.0, 0.0]), np.array([0.0, 40_200.0, 40_200.0, 0.0])
     bands = np.radians([[2.0, 2.0], [2.0, 2.0], [4.0, 4.0], [7.0, 7.0]])
     widen_rows(status, reason, np.zeros(4, np.int8), np.full(4, 0.5), np.full(4, 20.0), 1.5, bands)

@@ -46,31 +46,30 @@ def test_runge_kutta_is_an_independent_integrator(car):
     assert 10.0 < errors[0] / errors[1] < 24.0
 
 
-def test_a_car_that_rolls_straight_feels_drag_and_losses_alone(car):
+def test_rolling_cars_feel_drag_and_accelerometers_what_they_read(car):
     state, inputs = tensor(4.0, 0.0, 0.0, 4.0), tensor(0.0, 0.0)
     own = rates(car, state, inputs)
     drag = 0.1 + 0.01 * 4.0 + 0.1 * 16.0
     assert float(own[0]) == pytest.approx(-drag / F1TENTH.mass)
     assert own[1:3].abs().max() < 1e-12
     assert float(own[3]) == pytest.approx(-0.05 / 0.2 * (0.304115174 * 4.0 + 0.50421894))
-
-
-def test_mirrored_drives_give_mirrored_rates(car):
-    state, inputs = tensor(3.0, -0.6, 2.5, 3.4), tensor(0.2, 8.0)
-    mirror = tensor(1.0, -1.0, -1.0, 1.0)
-    assert torch.allclose(rates(car, mirror * state, tensor(-0.2, 8.0)), mirror * rates(car, state, inputs), atol=1e-12)
-
-
-def test_accelerations_are_what_an_accelerometer_reads(car):
-    """ax = dvx/dt - r vy and ay = dvy/dt + r vx (Węgrzynowski et al. 2024, Section III-B.1)."""
+    # ax = dvx/dt - r vy and ay = dvy/dt + r vx (Węgrzynowski et al. 2024, Section III-B.1).
     chassis, tyres = car
     state, inputs = tensor(3.0, -0.6, 2.5, 3.4), tensor(0.2, 8.0)
     own = chassis.motion(state, inputs, tyres(chassis.slips(state, inputs), chassis.loads()))
     assert float(own.ax) == pytest.approx(float(own.rates[0] - 2.5 * -0.6))
     assert float(own.ay) == pytest.approx(float(own.rates[1] + 2.5 * 3.0))
+    chassis = PlanarCar().double().requires_grad_(False)
+    none = TyreForces(*(tensor(0.0)[0],) * 4)
+    own = chassis.motion(tensor(3.0, 1.0, 2.0, 0.0), tensor(0.1, 0.0), none)
+    drag = 0.1 + 0.01 * 3.0 + 0.1 * 9.0
+    assert own.rates[:3].tolist() == pytest.approx([2.0 - drag / 5.1, -6.0, 0.0])
 
 
-def test_loads_carry_the_weight_and_balance(car):
+def test_loads_carry_the_weight_and_mirrored_drives_give_mirrored_rates(car):
+    state, inputs = tensor(3.0, -0.6, 2.5, 3.4), tensor(0.2, 8.0)
+    mirror = tensor(1.0, -1.0, -1.0, 1.0)
+    assert torch.allclose(rates(car, mirror * state, tensor(-0.2, 8.0)), mirror * rates(car, state, inputs), atol=1e-12)
     front, rear = car[0].loads()
     assert float(front + rear) == pytest.approx(F1TENTH.mass * GRAVITY)
     assert float(front * (F1TENTH.wheelbase - 0.115)) == pytest.approx(float(rear * 0.115))
@@ -148,11 +147,3 @@ def test_positive_parameters_stay_positive():
     for wrong in ({"mass": 0.0}, {"mass": math.nan}):
         with pytest.raises(ValueError, match="mass must be positive"):
             PositiveParameters(wrong)
-
-
-def test_forces_of_no_tyre_leave_the_car_to_its_inertia():
-    chassis = PlanarCar().double().requires_grad_(False)
-    none = TyreForces(*(tensor(0.0)[0],) * 4)
-    own = chassis.motion(tensor(3.0, 1.0, 2.0, 0.0), tensor(0.1, 0.0), none)
-    drag = 0.1 + 0.01 * 3.0 + 0.1 * 9.0
-    assert own.rates[:3].tolist() == pytest.approx([2.0 - drag / 5.1, -6.0, 0.0])

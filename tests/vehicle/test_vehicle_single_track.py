@@ -11,7 +11,7 @@ CAR = FERRARI_250LM
 SPEEDS = np.array([8.0, 20.0, 45.0])
 
 
-def test_derivatives_and_acceleration_are_those_of_forces_and_moments():
+def test_derivatives_eigenvalues_and_steady_state_are_the_textbooks():
     """Slip angles and axle forces written out, then Newton and Euler."""
     sideslip, yaw_rate, steer = 0.03, 0.4, -0.02
     state = np.array([sideslip, yaw_rate])
@@ -25,10 +25,7 @@ def test_derivatives_and_acceleration_are_those_of_forces_and_moments():
         assert float(derivative[0]) == pytest.approx(acceleration / u - yaw_rate, rel=1e-12)
         assert float(derivative[1]) == pytest.approx(moment / CAR.yaw_inertia, rel=1e-12)
         assert float(C[k] @ state + D[k] * steer) == pytest.approx(acceleration, rel=1e-12)
-
-
-def test_eigenvalues_are_the_roots_of_the_textbook_polynomial():
-    """λ² + 2σλ + ω²: sum and product of the poles as vehicle dynamics books give them."""
+    # λ² + 2σλ + ω²: sum and product of the poles as vehicle dynamics books give them.
     front, rear, lf, lr = CAR.cornering_stiffness_front, CAR.cornering_stiffness_rear, CAR.cg_to_front_axle, CAR.cg_to_rear_axle
     m, J, wheelbase = CAR.mass, CAR.yaw_inertia, CAR.cg_to_front_axle + CAR.cg_to_rear_axle
     for u, A in zip(SPEEDS, lateral_model(CAR, SPEEDS).A, strict=True):
@@ -37,10 +34,7 @@ def test_eigenvalues_are_the_roots_of_the_textbook_polynomial():
         roots = np.sort_complex(np.roots([1.0, damping, stiffness]))
         assert np.allclose(np.sort_complex(np.linalg.eigvals(A)), roots, rtol=1e-10)
         assert (roots.real < 0).all(), "this car understeers: stable at any speed"
-
-
-def test_steady_state_yaw_gain_is_u_over_wheelbase_plus_understeer():
-    """r/δ = u / (L + K u²), K = m (lr Cr - lf Cf) / (L Cf Cr)."""
+    # r/δ = u / (L + K u²), K = m (lr Cr - lf Cf) / (L Cf Cr).
     A, B, C, D = lateral_model(CAR, SPEEDS)
     steady = -np.linalg.solve(A, B[..., None])[..., 0]
     wheelbase = CAR.cg_to_front_axle + CAR.cg_to_rear_axle

@@ -1,4 +1,4 @@
-"""Scores of bands against closed forms of a Gaussian, and coverage intervals against simulations."""
+"""Scores of bands, covariances, innovations, delays and misses of detections against closed forms and simulations."""
 
 import math
 
@@ -6,6 +6,9 @@ import numpy as np
 import pytest
 from scipy import stats
 
+from single_track_drive import NOISE, linear_drive
+from vehest.data.splits import Span
+from vehest.estimators.registry import estimator_class
 from vehest.evaluation.bands import (
     band_figures,
     banded,
@@ -15,7 +18,9 @@ from vehest.evaluation.bands import (
     interval_score,
     proportion_interval,
 )
-from vehest.evaluation.metrics import UNITS, Scored
+from vehest.evaluation.consistency import COVERAGE, coverage, normalised_error_squared, normalised_innovation_squared
+from vehest.evaluation.integrity import detection_delay, error_while_undetected, missed_detections
+from vehest.evaluation.metrics import UNITS, Protocol, Scored, accuracy, score
 from vehest.trust.bands import LEVELS, Bands, Quantity, intraclass_correlation
 
 GAUSSIAN = stats.norm.ppf([0.5 + 0.5 * level for level in LEVELS])
@@ -34,7 +39,7 @@ def part_of(rng, seconds=100.0, deviation=0.1):
     return Scored(np.arange(n) / 20.0, vy + error, vy, *angles, rng.uniform(0.0, 5.0, n), bands=bands)
 
 
-def test_interval_score_of_a_gaussian_is_its_closed_form():
+def test_interval_score_of_a_gaussian_is_its_closed_form_and_lowest_at_the_true_width():
     """E = 2σ(z + (2/α)(φ(z) - z(1 - Φ(z)))) for the central interval of half width zσ; each side misses with the same."""
     errors = np.random.default_rng(0).standard_normal(400_000)
     for level in (0.5, 0.9):
@@ -42,15 +47,12 @@ def test_interval_score_of_a_gaussian_is_its_closed_form():
         expected = 2.0 * z + 2.0 / (1.0 - level) * 2.0 * (stats.norm.pdf(z) - z * stats.norm.sf(z))
         found = interval_score(errors, np.full_like(errors, z), level)
         assert found.mean() == pytest.approx(expected, abs=4.0 * found.std() / math.sqrt(len(found)))
-
-
-def test_interval_score_is_lowest_at_the_true_width():
     errors = np.random.default_rng(1).standard_normal(100_000)
     scores = [interval_score(errors, np.full_like(errors, width * GAUSSIAN[2]), 0.9).mean() for width in (0.7, 1.0, 1.4)]
     assert scores[1] == min(scores)
 
 
-def test_crps_of_four_levels_is_a_little_below_that_of_a_gaussian():
+def test_crps_of_levels_is_that_of_a_gaussian_or_a_little_below():
     """Sample by sample against σ(z(2Φ(z) - 1) + 2φ(z) - 1/√π) (Gneiting & Raftery 2007, Eq. 21)."""
     z = np.linspace(-5.0, 5.0, 2001)
     exact = z * (2.0 * stats.norm.cdf(z) - 1.0) + 2.0 * stats.norm.pdf(z) - 1.0 / math.sqrt(math.pi)
@@ -59,9 +61,6 @@ def test_crps_of_four_levels_is_a_little_below_that_of_a_gaussian():
     weight = stats.norm.pdf(z) / stats.norm.pdf(z).sum()
     assert weight @ exact == pytest.approx(1.0 / math.sqrt(math.pi), rel=1e-3)
     assert weight @ found == pytest.approx((weight @ exact) * (1.0 - 0.026), rel=1e-3)
-
-
-def test_crps_of_many_levels_is_that_of_a_gaussian():
     levels = np.arange(0.002, 0.9999, 0.002)
     z = np.linspace(-2.0, 2.0, 41)
     exact = z * (2.0 * stats.norm.cdf(z) - 1.0) + 2.0 * stats.norm.pdf(z) - 1.0 / math.sqrt(math.pi)
@@ -123,3 +122,64 @@ def test_figures_by_lateral_acceleration_leave_out_what_is_hardly_there():
     found = figures_by_regime(banded([part], BANDS), [masks], 20.0)
     assert set(found) == {"ay_0_2", "ay_2_4", "ay_4_6"}
     assert found["ay_0_2"]["coverage_90"] == pytest.approx(0.9, abs=0.05)
+
+
+def flags(length, *spans):
+    found = np.zeros(length, bool)
+    for begin, end in spans:
+        found[begin:end] = True
+    return found
+
+
+def test_delays_and_errors_of_detections_count_from_the_fault_to_the_flag():
+    assert detection_delay(flags(100, (5, 8), (30, 40)), 20, 100, 10.0) == pytest.approx(1.1)
+    assert detection_delay(flags(100, (5, 8)), 20, 100, 10.0) == math.inf
+    assert missed_detections([0.2, 1.1, math.inf, 0.4], [0.5, 1.0, 5.0, 0.5]) == 0.5
+    error = np.array([9.0, 9.0, 3.0, -4.0, 9.0, 9.0])
+    assert error_while_undetected(error, flags(6, (4, 6)), 2, 6) == (pytest.approx(math.sqrt(12.5)), 4.0)
+    assert error_while_undetected(error, flags(6, (2, 6)), 2, 6) == (0.0, 0.0)
+
+
+DRIVES = [linear_drive(60.0, seed=seed)[0] for seed in range(3)]
+
+
+def figures_of_kalman(factor):
+    """Metrics of a Kalman filter on drives of its own model, which believes noise to be ``factor`` times what it is."""
+    noise = {name: factor * level for name, level in NOISE.items()} | {"steer_factor": 1.0}
+    estimator = estimator_class("kalman").from_config({"noise": noise})
+    estimates = estimator.estimate([drive.without_references() for drive in DRIVES])
+    parts = [
+        score(estimate, drive, Span("d", drive.id), Protocol(100.0, 0.0, 2.0)) for estimate, drive in zip(estimates, DRIVES, strict=True)
+    ]
+    assert parts[0].covariance_of == ("vy", "yaw_rate")
+    return accuracy(parts)
+
+
+def test_a_kalman_filter_is_consistent_on_its_own_model_and_not_with_half_the_noise():
+    right, sure = figures_of_kalman(1.0), figures_of_kalman(0.5)
+    assert right["nees"] == pytest.approx(1.0, abs=0.1)
+    assert right["nis"] == pytest.approx(1.0, abs=0.05)
+    assert right["coverage_1sigma"] == pytest.approx(COVERAGE[1], abs=0.05)
+    assert right["coverage_2sigma"] == pytest.approx(COVERAGE[2], abs=0.03)
+    assert sure["rmse_vy"] == pytest.approx(right["rmse_vy"]), "the gain depends on ratios of noise only"
+    assert sure["nees"] == pytest.approx(4.0 * right["nees"])
+    assert sure["nis"] == pytest.approx(4.0 * right["nis"])
+    assert sure["coverage_2sigma"] == pytest.approx(right["coverage_1sigma"])
+
+
+def test_normalised_errors_are_those_of_a_hand_calculation_and_infinite_without_a_covariance():
+    errors = np.array([[1.0, 2.0], [3.0, 0.0]])
+    covariance = np.array([[[2.0, 1.0], [1.0, 3.0]], [[1e-12, 0.0], [0.0, 1e6]]])
+    expected = [errors[0] @ np.linalg.inv(covariance[0]) @ errors[0] / 2.0, 9e12 / 2.0]
+    np.testing.assert_allclose(normalised_error_squared(errors, covariance), expected, rtol=1e-9)
+    improper = np.array([[[0.0, 0.0], [0.0, 1.0]], [[1.0, 2.0], [2.0, 1.0]], [[-1.0, 0.0], [0.0, 1.0]], [[1.0, 0.0], [0.0, 1.0]]])
+    squared = normalised_error_squared(np.full((4, 2), 0.5), improper)
+    assert np.isinf(squared[:3]).all()
+    assert squared[3] == pytest.approx(0.25)
+
+
+def test_edges_count_and_updates_without_measurements_do_not():
+    nis, dof = np.array([0.0, 3.0, 1.0]), np.array([0.0, 4.0, 2.0])
+    assert normalised_innovation_squared(nis, dof) == pytest.approx((0.75 + 0.5) / 2)
+    assert math.isnan(normalised_innovation_squared(nis[:1], dof[:1]))
+    assert coverage(np.array([0.1, -2.0, 2.0, 3.0]), np.ones(4), 2.0) == 0.75

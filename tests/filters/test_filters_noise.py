@@ -1,10 +1,12 @@
-"""Covariances that can be learnt: definite, differentiable, with the entropy that is asked for."""
+"""Covariances that can be learnt: definite, differentiable, with the entropy that is asked for; noise levels read off signals."""
 
+import numpy as np
 import pytest
 import torch
 from scipy.stats import multivariate_normal
 
 from vehest.filters.compiled_noise import compiled_noise
+from vehest.filters.noise_levels import high_passed_level
 from vehest.filters.noise_models import FLOOR, ConstantNoise, StateDependentNoise, entropy, with_entropy
 
 STATE, INPUTS = torch.randn(7, 5, generator=torch.Generator().manual_seed(0)), torch.zeros(7, 2)
@@ -35,10 +37,12 @@ def test_learnt_noises_stay_definite_and_give_gradients_wherever_they_go():
         assert all(parameter.grad is not None and parameter.grad.abs().sum() > 0 for parameter in noise.parameters())
 
 
-def test_a_factor_of_zero_leaves_the_floor():
+def test_factors_of_zero_leave_the_floor_and_numbers_of_parameters_are_those_of_factors():
     noise = ConstantNoise([1.0, 1.0])
     torch.nn.init.zeros_(noise.factor)
     assert torch.equal(noise(STATE, INPUTS)[0], FLOOR * torch.eye(2))
+    assert sum(parameter.numel() for parameter in ConstantNoise(START).parameters()) == 15
+    assert sum(parameter.numel() for parameter in StateDependentNoise(START, 5).parameters()) == 15 + 15 * 6
 
 
 def test_state_dependent_noise_is_the_formula_written_out():
@@ -48,19 +52,11 @@ def test_state_dependent_noise_is_the_formula_written_out():
     assert torch.allclose(noise(STATE, INPUTS)[2], torch.diag(torch.tensor([0.2, 0.3])) + 0.01 * lower @ lower.mT, atol=1e-6)
 
 
-def test_noises_have_as_many_parameters_as_their_factors():
-    assert sum(parameter.numel() for parameter in ConstantNoise(START).parameters()) == 15
-    assert sum(parameter.numel() for parameter in StateDependentNoise(START, 5).parameters()) == 15 + 15 * 6
-
-
-def test_entropy_is_that_of_an_independent_library():
+def test_entropy_is_that_of_a_library_and_is_raised_to_its_floor():
     root = torch.randn(4, 3, 3, generator=torch.Generator().manual_seed(4), dtype=torch.float64)
     covariance = root @ root.mT + 0.1 * torch.eye(3, dtype=torch.float64)
     for own, value in zip(covariance, entropy(covariance), strict=True):
         assert float(value) == pytest.approx(multivariate_normal(cov=own.numpy()).entropy())
-
-
-def test_entropy_below_the_floor_is_raised_to_it_and_above_is_left():
     small, large = 1e-4 * torch.eye(5, dtype=torch.float64), 10.0 * torch.eye(5, dtype=torch.float64)
     small[0, 1] = small[1, 0] = 5e-5
     raised = with_entropy(torch.stack([small, large]), -9.0)
@@ -81,3 +77,33 @@ def test_compiled_it_is_the_same_with_and_without_a_floor(dtype, tolerance):
     for expected, own in ((known, compiled_noise(noise)), (with_entropy(known, floor), compiled_noise(noise, floor))):
         assert own(states.numpy(), states.numpy()) == pytest.approx(expected.numpy(), rel=tolerance, abs=tolerance)
     assert float((with_entropy(known, floor) - known).abs().max()) > 0.01, "the floor is met"
+
+
+def test_level_of_white_noise_is_its_share_above_the_cutoff():
+    """A fraction 1 - c of white noise's power lies above c times the Nyquist frequency; 2 % leaves room for the filter's slopes."""
+    noise = 0.3 * np.random.default_rng(0).standard_normal(100_000)
+    for cutoff in (0.1, 0.2):
+        assert high_passed_level([noise], cutoff) == pytest.approx(0.3 * np.sqrt(1 - cutoff), rel=0.02)
+
+
+def test_slow_signals_and_offsets_are_no_noise():
+    """60 dB down below 0.75 times the cut-off."""
+    time = np.arange(20_000) / 100.0
+    noise = 0.01 * np.random.default_rng(1).standard_normal(len(time))
+    slow = 5.0 + 3.0 * np.sin(2 * np.pi * 0.5 * time) + np.sin(2 * np.pi * 7.0 * time)
+    assert high_passed_level([slow], 0.2) < 1e-3
+    assert high_passed_level([slow + noise], 0.2) == pytest.approx(high_passed_level([noise], 0.2), rel=0.02)
+
+
+def test_gaps_and_ends_do_not_count():
+    noise = np.random.default_rng(2).standard_normal(2_000)
+    offset = noise + 1e3
+    offset[700] = np.nan
+    without = high_passed_level([noise[:700], noise[701:]], 0.2)
+    assert high_passed_level([offset], 0.2) == pytest.approx(without, rel=1e-6)
+
+
+@pytest.mark.parametrize(("series", "cutoff", "what"), [(np.zeros(50), 0.2, "samples without a gap"), (np.zeros(500), 0.9, "cut-off must")])
+def test_what_cannot_be_read_is_refused(series, cutoff, what):
+    with pytest.raises(ValueError, match=what):
+        high_passed_level([series], cutoff)

@@ -1,4 +1,6 @@
-"""A KS-NN's linear forms and sub-models against the network itself and against Eqs. 11 and 12 filtered literally."""
+"""A KS-NN's linear forms, sub-models and noise sensitivities against the network, Eqs. 11 and 12, impulse responses and injected noise."""
+
+import math
 
 import numpy as np
 import pytest
@@ -9,7 +11,10 @@ from trained_ksnn import ksnn_with_weights
 
 from conftest import planar_drive
 from vehest.data.errors import DataError
+from vehest.estimators.kernels.luenberger import observe
+from vehest.estimators.luenberger import Luenberger
 from vehest_papers.ksnn.linear_system import LocalModels, decomposed, decomposed_estimate
+from vehest_papers.ksnn.noise_sensitivity import ksnn_sensitivity, luenberger_sensitivity
 
 STRUCTURES = [(1, 0, True), (2, 0, False), (4, 0, True), (2, 2, False), (3, 3, True)]
 LINEAR = [structure for structure in STRUCTURES if structure[1] == 0]
@@ -69,7 +74,7 @@ def test_local_models_have_the_activations_and_feedback_of_the_network(structure
     np.testing.assert_allclose(models.activations(values).sum(axis=-1), 1.0, atol=1e-14)
 
 
-def test_gains_are_those_of_a_local_model_at_its_centre_and_of_the_last_beyond():
+def test_gains_are_those_of_the_nearest_models_and_linearisation_the_tangent():
     model = LocalModels.of(ksnn_with_weights(3, 0, True)).linearised()
     for position, centre in enumerate(model.centres.tolist()):
         own = model.gains(-centre)
@@ -77,9 +82,6 @@ def test_gains_are_those_of_a_local_model_at_its_centre_and_of_the_last_beyond()
             np.testing.assert_allclose(found, table[position], rtol=1e-12)
     np.testing.assert_allclose(model.gains(0.5 * model.centres[1]).gamma, model.gamma[:2].mean(axis=0), rtol=1e-12)
     np.testing.assert_array_equal(model.gains(2.0).beta, model.beta[-1])
-
-
-def test_linearisation_is_the_tangent_of_nonlinear_feedback():
     models, tiny = LocalModels.of(ksnn_with_weights(2, 2, True)), 1e-6
     for at in (0.0, -0.4):
         rise = (models.feedback(np.array(at + tiny)) - models.feedback(np.array(at - tiny))) / (2 * tiny)
@@ -139,19 +141,108 @@ def test_sub_models_at_constant_yaw_rate_are_the_terms_of_eq_11(yaw_rate):
     np.testing.assert_allclose(first + second + third + bias + start, lateral[0], rtol=0, atol=1e-9)
 
 
-def test_start_is_all_that_keeps_the_speed_from_entering_as_a_step():
-    """With γ₂ = β₂ = 1 a constant speed says nothing of v: second and third sub-model stay zero."""
-    models = LocalModels.of(ksnn_with_weights(1, 0, False))
-    models.gamma[:, 1] = models.beta[:, 1] = 1.0
-    measurements = np.tile([0.3, 25.0, 7.0, 0.0], (1, 30, 1))
-    parts = decomposed(models, measurements)
-    np.testing.assert_allclose(parts.pseudo_measurement, 0.0, atol=1e-12)
-    np.testing.assert_allclose(parts.third, 0.0, atol=1e-12)
-
-
 def test_recording_at_another_rate_or_too_short_is_refused():
     estimator = ksnn_with_weights()
     with pytest.raises(DataError, match=r"100 Hz.*20 Hz"):
         decomposed_estimate(estimator, planar_drive(seconds=5.0, rate_hz=100.0))
     with pytest.raises(DataError, match="30 samples"):
         decomposed_estimate(estimator, planar_drive(seconds=1.5))
+
+
+FREQUENCY = np.linspace(0.0, 10.0, 101)
+AY, AX = 2, 3
+
+
+def _luenberger(gain=7.0, threshold=0.05, rate_hz=100.0):
+    estimator = Luenberger(Luenberger.settings_type(rate_hz=rate_hz))
+    estimator.gain, estimator.threshold = gain, threshold
+    return estimator
+
+
+def _turn(yaw_rate, n_samples):
+    return np.tile([yaw_rate, 25.0, 25.0 * yaw_rate, 0.0], (n_samples, 1))
+
+
+def _run(estimator, windows):
+    with torch.no_grad():
+        return estimator.network(torch.as_tensor(windows)).numpy()
+
+
+def _measured_impulse_response(estimator, yaw_rate, channel, n_window, size=1.0):
+    """Lags 0 to N of the network itself: the impulse stands at each place of the window in turn."""
+    windows = np.repeat(_turn(yaw_rate, n_window)[None], n_window + 1, axis=0)
+    for lag in range(1, n_window + 1):
+        windows[lag, n_window - lag, channel] += size
+    lateral = _run(estimator, windows)
+    return (lateral - lateral[0]) / size
+
+
+def _transform(impulse_response, rate_hz):
+    return np.exp(-2j * np.pi * np.outer(FREQUENCY / rate_hz, np.arange(len(impulse_response)))) @ impulse_response
+
+
+@pytest.mark.parametrize("yaw_rate", [0.2, -0.4])
+@pytest.mark.parametrize("bias", [False, True])
+def test_sensitivity_of_windows_is_the_transform_of_the_networks_impulse_response(yaw_rate, bias):
+    estimator = ksnn_with_weights(2, 0, bias)
+    closed = ksnn_sensitivity(LocalModels.of(estimator).linearised(), yaw_rate).truncated(30)
+    for channel, response in zip((AY, AX), closed.response(FREQUENCY), strict=True):
+        measured = _transform(_measured_impulse_response(estimator, yaw_rate, channel, 30), 20.0)
+        assert np.abs(measured).max() > 1e-3
+        np.testing.assert_allclose(response, measured, rtol=0, atol=1e-9)
+
+
+@pytest.mark.parametrize("yaw_rate", [0.2, -0.35])
+def test_closed_form_of_the_ksnn_is_that_of_its_state_space(yaw_rate):
+    model = LocalModels.of(ksnn_with_weights(3, 0, True)).linearised()
+    inputs = np.diag(model.gains(yaw_rate).beta * model.step)
+    z = np.exp(2j * np.pi * FREQUENCY / 20.0)
+    expected = np.linalg.solve(z[:, None, None] * np.eye(2) - model.state_matrix(yaw_rate), inputs.astype(complex))[:, 0]
+    found = ksnn_sensitivity(model, yaw_rate)
+    np.testing.assert_allclose(np.stack(found.response(FREQUENCY), axis=1), expected, rtol=1e-9)
+    np.testing.assert_allclose(np.sort_complex(found.poles), np.sort_complex(np.linalg.eigvals(model.state_matrix(yaw_rate))), rtol=1e-9)
+
+
+@pytest.mark.parametrize("yaw_rate", [0.2, -0.4])
+@pytest.mark.parametrize("rate_hz", [100.0, 20.0])
+def test_luenberger_sensitivity_is_the_transform_of_the_observers_impulse_response(yaw_rate, rate_hz):
+    estimator = _luenberger(rate_hz=rate_hz)
+    closed, turn = luenberger_sensitivity(estimator, yaw_rate), _turn(yaw_rate, 3000)
+    still = observe(turn, estimator.gain, estimator.threshold, 1.0 / rate_hz)[0]
+    for channel, response in zip((AY, AX), closed.response(FREQUENCY), strict=True):
+        struck = turn.copy()
+        struck[0, channel] += 1.0
+        measured = observe(struck, estimator.gain, estimator.threshold, 1.0 / rate_hz)[0] - still
+        np.testing.assert_allclose(response, _transform(measured, rate_hz), rtol=0, atol=1e-8)  # 3000 rounded differences add up
+
+
+def test_printed_order_of_the_luenberger_gains_disagrees_with_appendix_b():
+    """With f₁ = 2α|ω|e and f₂ = (α² - 1)ωe, as Eq. 17 prints them, the denominator is another one than that of Eq. 18."""
+    gain, omega, tau = 7.0, 0.3, 0.01
+    of_paper = luenberger_sensitivity(_luenberger(gain), omega).denominator
+    corrected = np.array([[0.0, -omega - (gain**2 - 1.0) * omega], [omega, -2.0 * gain * omega]])
+    printed = np.array([[0.0, -omega - 2.0 * gain * omega], [omega, -(gain**2 - 1.0) * omega]])
+    characteristic = [
+        np.linalg.det(np.eye(2) - tau * matrix) * np.poly(np.linalg.inv(np.eye(2) - tau * matrix)) for matrix in (corrected, printed)
+    ]
+    np.testing.assert_allclose(characteristic[0], of_paper, rtol=1e-9)
+    assert np.abs(characteristic[1] - of_paper).max() > 0.01
+
+
+def test_observer_passes_constant_errors_by_kinematics_and_nothing_where_it_is_reset():
+    closed = luenberger_sensitivity(_luenberger(threshold=0.1), 0.05)
+    assert np.abs(np.stack(closed.response(FREQUENCY))).max() == 0.0
+    assert closed.white_noise_gains() == (0.0, 0.0)
+    # At 0 Hz: δv = 2 δa_y/(α|ω|) and -δa_x/ω for the Luenberger observer, whatever its step.
+    for yaw_rate in (0.2, -0.4):
+        to_ay, to_ax = luenberger_sensitivity(_luenberger(gain=5.0), yaw_rate).response(np.zeros(1))
+        assert to_ay[0] == pytest.approx(2.0 / (5.0 * abs(yaw_rate)))
+        assert to_ax[0] == pytest.approx(-1.0 / yaw_rate)
+
+
+def test_variance_is_the_integral_of_the_squared_magnitude():
+    model = LocalModels.of(ksnn_with_weights(2, 0, False)).linearised()
+    for closed in (ksnn_sensitivity(model, 0.3), ksnn_sensitivity(model, 0.3).truncated(30), luenberger_sensitivity(_luenberger(), 0.3)):
+        band = closed.band_gains(closed.rate_hz / 2, n_lines=20_001)
+        for gain, over_band in zip(closed.white_noise_gains(), band, strict=True):
+            assert over_band / math.sqrt(closed.rate_hz / 2) == pytest.approx(gain, rel=1e-6)
