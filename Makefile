@@ -216,7 +216,7 @@ bench-cnn: $(INSTALLED) ## training through the filter and twenty networks toget
 	$(BIN)/python benchmarks/cnn_ukf.py
 
 lock: $(INSTALLED) ## write the installed versions to constraints.txt (after make install CONSTRAINTS=); raise versions of code whose numbers moved
-	$(BIN)/python -m pip install -q -e ".[dev,ray,slurm]"
+	$(BIN)/python -m pip install -q -e ".[dev,ray,slurm,bench]"
 	$(BIN)/python -m pip freeze --exclude-editable | sed -E '/ @ |^(pip|setuptools|wheel|nvidia-.*|cuda-.*|triton)==/d; s/^(torch==[^+]*).*/\1/' > constraints.txt
 
 clean: ## remove what can be made again (not outputs/)

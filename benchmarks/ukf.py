@@ -4,7 +4,8 @@ Writes results/benchmarks/ukf.json. A training step is forward and backward over
 (BENCH_THREADS). The plain implementation stands in this file, from the equations of Węgrzynowski et al. 2024: torchdiffeq's rk4,
 torch.linalg.cholesky twice a sample, a loop over samples, autograd through it all. Both start from the same parameters (pre-trained
 for a moment), noise and sequences, and their losses and gradients are compared; for that torchdiffeq takes its classical weights
-instead of its default ones, of the 3/8 rule, at the same cost.
+instead of its default ones, of the 3/8 rule, at the same cost. Where jax is installed (`pip install 'vehest[bench]'`), its scan of the same
+equations (ukf_jax.py) stands beside, compiled before it is timed.
 
 Every case runs in a process of its own; a figure is the best of its repeats, by turns. On a machine that does other things too, look at
 the processor's seconds on one thread: threads that wait for each other waste time. Memory is the peak beyond what imports, data and a
@@ -24,6 +25,7 @@ import sys
 import tempfile
 import time
 from concurrent.futures import ProcessPoolExecutor
+from importlib.util import find_spec
 from multiprocessing import get_context
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -241,7 +243,14 @@ def _noise(noise: Any, states: Any, least_entropy: float | None = None) -> Any:
     return torch.exp(2.0 / n * (least_entropy - entropy).clamp(min=0.0))[..., None, None] * covariance
 
 
-WAYS = {"plain": plain, "ours": ours}
+def scanned(task: Problem) -> Any:
+    """The same by JAX."""
+    from ukf_jax import loss_of
+
+    return loss_of(task)
+
+
+WAYS = {"plain": plain, "ours": ours} | ({"jax": scanned} if find_spec("jax") else {})
 
 
 def training_step(way: str, sequences: int, repeats: int, weights: str, dtype: str = "float32") -> Figures:
@@ -250,7 +259,7 @@ def training_step(way: str, sequences: int, repeats: int, weights: str, dtype: s
 
     torch.set_num_threads(THREADS)
     task, warm = problem(sequences, STEPS, dtype, weights), problem(2, 3, dtype)
-    WAYS[way](warm).backward()
+    WAYS[way](task if way == "jax" else warm).backward()  # JAX compiles for every shape
     before, seconds, busy = _peak(), [], []
     for _ in range(repeats):
         task.estimator.filter.zero_grad()
@@ -350,10 +359,15 @@ def row_of(sequences: int, weights: str) -> dict[str, Any]:
     runs: dict[str, list[Figures]] = {way: [] for way in WAYS}
     for _ in range(rounds):
         for way in WAYS:
-            runs[way].append(in_own_process(training_step, way, sequences, repeats if way == "ours" else 1, weights))
+            runs[way].append(in_own_process(training_step, way, sequences, 1 if way == "plain" else repeats, weights))
     best = {way: min(figures.seconds for figures in own) for way, own in runs.items()}
     busy = {way: min(figures.processor_seconds for figures in own) for way, own in runs.items()}
     memory = {way: statistics.median(figures.megabytes for figures in own) for way, own in runs.items()}
+    beside: dict[str, Any] = {}
+    if "jax" in WAYS:
+        beside = {"jax_seconds": round(best["jax"], 3), "jax_processor_seconds": round(busy["jax"], 3)}
+        beside |= {"ratio_to_jax": round(best["jax"] / best["ours"], 2)}
+        beside |= {f"jax_{name}": value for name, value in differences(runs["jax"][0], runs["plain"][0]).items()}
     return {
         "case": f"NNTF_UH, {sequences} sequences of {STEPS} samples of {dataset()}: one training step, plain PyTorch against vehest",
         "baseline_seconds": round(best["plain"], 3),
@@ -365,11 +379,13 @@ def row_of(sequences: int, weights: str) -> dict[str, Any]:
         "baseline_mb": round(memory["plain"], 1),
         "ours_mb": round(memory["ours"], 1),
         **differences(runs["ours"][0], runs["plain"][0]),
+        **beside,
     }
 
 
 def tell(row: dict[str, Any]) -> None:
     """Print a row, and whether it is what was asked for."""
+    jax = f"; JAX {row['jax_seconds']:.2f} s" if "jax_seconds" in row else ""
     met = (
         row["ratio"] >= row["least_ratio"]
         and row["ours_mb"] <= MOST_MEMORY * row["baseline_mb"]
@@ -379,13 +395,15 @@ def tell(row: dict[str, Any]) -> None:
         f"{row['ratio']:6.1f} x (at least {row['least_ratio']:.0f})  {row['case']}  ({row['baseline_seconds']:.2f} s -> "
         f"{row['ours_seconds']:.2f} s, processor {row['baseline_processor_seconds']:.2f} s -> {row['ours_processor_seconds']:.2f} s; "
         f"{row['baseline_mb']:.0f} MB -> {row['ours_mb']:.0f} MB; losses differ by {row['relative_difference_of_losses']:.1e}, "
-        f"gradients by {row['relative_difference_of_gradients']:.1e}; target {'met' if met else 'MISSED'})",
+        f"gradients by {row['relative_difference_of_gradients']:.1e}{jax}; target {'met' if met else 'MISSED'})",
         flush=True,
     )
 
 
 def main() -> None:
     """Measure, write, print the ratios."""
+    if "jax" not in WAYS:
+        print("jax is not installed, its scan is left out: pip install 'vehest[bench]'", flush=True)
     print("compiling once with an empty cache (up to a minute or two) ...", flush=True)
     compilation, loading = compiling()
     rows = []

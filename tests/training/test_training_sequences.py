@@ -8,6 +8,7 @@ from torch import nn
 
 from vehest.data.errors import ConfigurationError, DataError
 from vehest.data.schema import settings_from_config
+from vehest.training.adam import Adam
 from vehest.training.checkpoints import load_checkpoint, resume_epoch
 from vehest.training.context import FitContext
 from vehest.training.sequences import Phase, PhaseSettings, train_phases
@@ -160,31 +161,45 @@ def test_validation_comes_every_third_epoch_and_progress_counts_over_all_phases(
     assert told[0].max_epochs == 19
 
 
+@pytest.mark.parametrize("decay", [0.0, 0.1])
+def test_adam_is_that_of_torch_bit_by_bit(decay):
+    generator = torch.Generator().manual_seed(0)
+    own, other = (_network(), _network())
+    adam, theirs = Adam(own.parameters(), 0.01, decay), torch.optim.AdamW(other.parameters(), lr=0.01, weight_decay=decay)
+    for _ in range(20):
+        for one, two in zip(own.parameters(), other.parameters(), strict=True):
+            one.grad = torch.randn(one.shape, generator=generator, dtype=one.dtype)
+            two.grad = one.grad.clone()
+        adam.step()
+        theirs.step()
+    assert torch.equal(_flat(own), _flat(other))
+
+
 def test_gradients_are_clipped_and_step_sizes_fall_along_a_cosine():
     """Of two elements one is over the bound: AdamW's first moment holds a tenth of the bound and of the other as it is."""
     line = nn.Linear(2, 1, bias=False)
     gradient = torch.tensor([[50.0, 0.5]])
     phase = Phase("clip", PhaseSettings(clip=3.0, max_epochs=1), line, lambda _: [0], lambda _: (line.weight * gradient).sum(), lambda: 0.0)
     seen = []
-    step = torch.optim.AdamW.step
+    step = Adam.step
 
     def watched(self, *arguments):
         seen.append(line.weight.grad.clone())
         return step(self, *arguments)
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(torch.optim.AdamW, "step", watched)
+        patch.setattr(Adam, "step", watched)
         train_phases([phase], 0, FitContext())
     assert torch.equal(seen[0], torch.tensor([[3.0, 0.5]]))
     rates = []
-    step = torch.optim.AdamW.step
+    step = Adam.step
 
     def watched(self, *arguments):
-        rates.append(self.param_groups[0]["lr"])
+        rates.append(self.learning_rate)
         return step(self, *arguments)
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(torch.optim.AdamW, "step", watched)
+        patch.setattr(Adam, "step", watched)
         train_phases([_phase(_network(), learning_rate=0.2, max_epochs=4, schedule="cosine")], 0, FitContext())
     expected = [0.1 * (1 + math.cos(math.pi * epoch / 4)) for epoch in range(4) for _ in range(3)]
     assert rates == pytest.approx(expected)

@@ -15,6 +15,7 @@ from torch import Tensor, nn
 
 from vehest.data.errors import ConfigurationError, DataError
 from vehest.declared import Group, setting
+from vehest.training.adam import Adam
 from vehest.training.checkpoints import Checkpoint, load_checkpoint, save_checkpoint
 from vehest.training.context import FitContext, FitRecord, Progress, record_of_epochs
 
@@ -195,7 +196,7 @@ class _Run:
         if not self.learning:
             raise ConfigurationError(f"training: phase '{phase.name}' has no parameters to learn; correct which of them are trainable")
         settings = phase.settings
-        self.adam = torch.optim.AdamW(self.learning.values(), lr=settings.learning_rate, weight_decay=settings.weight_decay)
+        self.adam = Adam(self.learning.values(), settings.learning_rate, settings.weight_decay)
 
     def train_phase(self) -> None:
         """Train the phase under way from where it stands to its end, or until a stop."""
@@ -240,8 +241,7 @@ class _Run:
             now.start_loss, now.validated = self._validate(), True
         before = self._checkpoint()
         if settings.schedule == "cosine":
-            for group in self.adam.param_groups:
-                group["lr"] = settings.learning_rate * 0.5 * (1.0 + math.cos(math.pi * now.epochs / settings.max_epochs))
+            self.adam.learning_rate = settings.learning_rate * 0.5 * (1.0 + math.cos(math.pi * now.epochs / settings.max_epochs))
         total, taken = 0.0, 0
         for number, batch in enumerate(phase.batches(self.generator), start=1):
             if self.context.should_stop():
@@ -268,13 +268,13 @@ class _Run:
 
     def _step(self, batch: Any, where: str) -> float | None:
         """One step of AdamW; returns the loss, or none if it or its gradient is not finite, in which case nothing is changed."""
-        self.adam.zero_grad(set_to_none=True)
+        self.adam.zero_grad()
         loss, now = self.phase.loss(batch), self.now
         value = float(loss.detach())
         if math.isfinite(value):
             loss.backward()
             gradients = [parameter.grad for parameter in self.learning.values() if parameter.grad is not None]
-            if all(bool(torch.isfinite(gradient).all()) for gradient in gradients):
+            if all(np.isfinite(gradient.numpy()).all() for gradient in gradients):
                 if self.phase.settings.clip:
                     nn.utils.clip_grad_value_(self.learning.values(), self.phase.settings.clip)
                 self.adam.step()

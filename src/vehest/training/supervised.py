@@ -13,6 +13,7 @@ from torch import Tensor, nn
 
 from vehest.data.errors import DataError
 from vehest.data.windows import WindowSet
+from vehest.training.adam import Adam
 from vehest.training.checkpoints import Checkpoint, load_checkpoint, save_checkpoint
 from vehest.training.context import FitContext, FitRecord, Progress, record_of_epochs
 from vehest.training.members import FlatParameters, constrain, fixed_state, is_plain, predict_members, prepare
@@ -99,7 +100,7 @@ class _Run:
         """Take back what `_rows` gave; there is no average before the first step, and none without averaging."""
         self.average = rows.pop("average", None)
         self.flat = nn.Parameter(rows.pop("parameters").clone())
-        self.adam = torch.optim.Adam([self.flat], lr=self.settings.learning_rate)
+        self.adam = Adam([self.flat], self.settings.learning_rate)
         if rows:
             self.adam.state[self.flat] = rows
 
@@ -121,7 +122,7 @@ class _Run:
 
     def _step(self, batch: Tensor) -> Tensor:
         """One step of Adam; sums of squared errors of the members, (M,)."""
-        self.adam.zero_grad(set_to_none=True)
+        self.adam.zero_grad()
         views = self.layout.views(self.flat)
         error = self._predict(views, self.train, self.train.starts[batch], self._batch_seeds()) - self.train.targets[batch]
         losses = error.square().mean(dim=1)

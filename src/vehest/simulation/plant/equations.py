@@ -108,7 +108,7 @@ def lateral_force(angle, camber, load, tyre):  # type: ignore[no-untyped-def]
 @_kernel
 def _weighted(force, shape, stiffness, curvature, shift, slip):  # type: ignore[no-untyped-def]
     """A force of pure slip, reduced by slip in the other direction."""
-    at_none = math.cos(shape * _bent(stiffness, curvature, shift))
+    at_none = math.cos(shape * _bent(stiffness, curvature, shift)) if shift != 0.0 else 1.0
     return force / at_none * math.cos(shape * _bent(stiffness, curvature, slip + shift))
 
 
@@ -119,12 +119,11 @@ def _tyre_forces(slip, angle, camber, load, tyre):  # type: ignore[no-untyped-de
     across, friction = lateral_force(angle, camber, load, tyre)
     stiffness_along = tyre.r_bx1 * math.cos(math.atan(tyre.r_bx2 * slip))
     stiffness_across = tyre.r_by1 * math.cos(math.atan(tyre.r_by2 * (angle - tyre.r_by3)))
-    induced = friction * load * (tyre.r_vy1 + tyre.r_vy3 * camber) * math.cos(math.atan(tyre.r_vy4 * angle))
-    return (
-        _weighted(along, tyre.r_cx1, stiffness_along, tyre.r_ex1, tyre.r_hx1, angle),
-        _weighted(across, tyre.r_cy1, stiffness_across, tyre.r_ey1, tyre.r_hy1, slip)
-        + induced * math.sin(tyre.r_vy5 * math.atan(tyre.r_vy6 * slip)),
-    )
+    across = _weighted(across, tyre.r_cy1, stiffness_across, tyre.r_ey1, tyre.r_hy1, slip)
+    if tyre.r_vy1 != 0.0 or tyre.r_vy3 != 0.0:
+        induced = friction * load * (tyre.r_vy1 + tyre.r_vy3 * camber) * math.cos(math.atan(tyre.r_vy4 * angle))
+        across += induced * math.sin(tyre.r_vy5 * math.atan(tyre.r_vy6 * slip))
+    return _weighted(along, tyre.r_cx1, stiffness_along, tyre.r_ex1, tyre.r_hx1, angle), across
 
 
 @_kernel

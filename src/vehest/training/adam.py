@@ -1,0 +1,60 @@
+"""Adam as torch has it, without the classes of `torch.optim`: the first of them that is made imports a compiler, for a second and 70 MB."""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Iterable
+
+import torch
+from torch import Tensor
+from torch.optim.adamw import adamw
+
+
+class Adam:
+    """Steps of `torch.optim.AdamW`, or without weight decay of `torch.optim.Adam`, bit by bit.
+
+    Args:
+        parameters: leaves that learn.
+        learning_rate: step size; may be changed between steps.
+        weight_decay: decoupled, times the step size.
+
+    Attributes:
+        state: of each parameter that was stepped: ``step`` (), and the moments ``exp_avg`` and ``exp_avg_sq`` in its shape.
+
+    Source: Kingma & Ba, Adam, 2015; Loshchilov & Hutter, Decoupled weight decay regularization, 2019.
+    """
+
+    def __init__(self, parameters: Iterable[Tensor], learning_rate: float, weight_decay: float = 0.0) -> None:
+        self.parameters, self.learning_rate, self.weight_decay = list(parameters), learning_rate, weight_decay
+        self.state: defaultdict[Tensor, dict[str, Tensor]] = defaultdict(dict)
+
+    def zero_grad(self) -> None:
+        """Forget the gradients."""
+        for parameter in self.parameters:
+            parameter.grad = None
+
+    @torch.no_grad()
+    def step(self) -> None:
+        """Step all parameters that have a gradient."""
+        learning = [parameter for parameter in self.parameters if parameter.grad is not None]
+        for parameter in learning:
+            if not self.state[parameter]:
+                moments = {name: torch.zeros_like(parameter) for name in ("exp_avg", "exp_avg_sq")}
+                self.state[parameter] = {"step": torch.tensor(0.0), **moments}
+        states = [self.state[parameter] for parameter in learning]
+        adamw(
+            learning,
+            [parameter.grad for parameter in learning if parameter.grad is not None],
+            [state["exp_avg"] for state in states],
+            [state["exp_avg_sq"] for state in states],
+            [],
+            [state["step"] for state in states],
+            foreach=True,
+            amsgrad=False,
+            beta1=0.9,
+            beta2=0.999,
+            lr=self.learning_rate,
+            weight_decay=self.weight_decay,
+            eps=1e-8,
+            maximize=False,
+        )
