@@ -86,7 +86,7 @@ def test_cars_of_the_fleets_differ_as_widely_as_stated():
 
 ERRORS = {  # part -> (on validation, on race cars, on another simulation's car, on the real car) of every seed
     "one": [(0.30, 0.20, 0.0, 0.10), (0.31, 0.21, 0.0, 0.11)],
-    "rough": [(0.20, 0.30, 0.40, 0.40), (0.10, 0.32, 0.41, 0.60), (0.16, 0.31, 0.42, 0.50)],
+    "rough": [(0.20, 0.30, 4.00, 0.40), (0.10, 0.32, 4.10, 0.60), (0.16, 0.31, 4.20, 0.50)],
     "level": [(0.05, 0.25, 0.31, 0.05), (0.05, 0.26, 0.30, 0.06)],
 }
 
@@ -103,17 +103,19 @@ def part(folder, name):
         "ferrari": Span("ferrari", recording.id),
     }
     models, rows = [], []
-    for seed, sizes in enumerate(ERRORS[name]):
+    for seed, sizes in enumerate([*ERRORS[name], *([None] if name == "level" else [])]):
         home = folder / name / str(seed)
         model = EvaluatedModel("ksnn", "nonlinear_no_bias_p2_q2", "KS-NN", seed, home / "model", home)
+        if sizes is None:
+            model = replace(model, estimator="zero", variant="zero", title="v = 0", seed=0)
         models.append(model)
         model.model_folder.mkdir(parents=True)
         fitted = estimator_class("ksnn").from_config({"name": "ksnn"})
         weights = {key: np.full_like(value, 0.1 * seed) for key, value in fitted.weights().items()}
         fitted.load_weights(weights)
         save_model(fitted, model.model_folder)
-        for (where, span), size in zip(spans.items(), sizes, strict=True):
-            vy = recording["vy_ref"] + size * np.sin(3.0 * recording.time)
+        for (where, span), size in zip(spans.items(), sizes or [0.0] * 4, strict=True):
+            vy = recording["vy_ref"] * (sizes is not None) + size * np.sin(3.0 * recording.time)
             estimate = Estimate(recording.id, "ksnn", 20.0, recording.start_time, {"vy": vy, "sideslip": np.arctan2(vy, recording["vx"])})
             write_estimate(estimate, home / where / "0.parquet")
             found = accuracy([score(estimate, recording, span, PROTOCOL)])
@@ -133,7 +135,8 @@ def artefacts(tmp_path_factory):
 
 def overview(document):
     (table,) = (block.frame for block in document.blocks if isinstance(block, Table))
-    return table.set_index("part")
+    assert table["step"].is_unique
+    return table[table["step"] != "Level: v = 0"].set_index("part")
 
 
 def test_validation_cars_choose_first_even_where_the_real_car_says_otherwise(artefacts):
@@ -151,6 +154,15 @@ def test_race_cars_choose_second_and_another_simulation_third_among_those_that_h
     assert table.loc["one", "chosen"] == "second"
     assert table.loc["level", "chosen"] == "third"
     assert np.isnan(table.loc["one", "other_simulator_rmse_vy"]), "the lowest error there, but not asked"
+
+
+def test_report_shows_v_0_beside_the_candidates_and_says_how_many_are_worse_on_the_car_that_makes_the_third_choice(artefacts):
+    document = documents(artefacts)["report"]
+    (table,) = (block.frame.set_index("step") for block in document.blocks if isinstance(block, Table))
+    zero = table.loc["Level: v = 0"]
+    assert (zero["fvu_median"], zero["other_simulator_fvu"], zero["chosen"]) == (1.0, 1.0, "")
+    assert table.loc["Rough: KS-NN", "other_simulator_fvu"] > 1.0 > table.loc["Level: KS-NN", "other_simulator_fvu"]
+    assert any("**1 of these 2 candidates are worse than v = 0 on that car**" in str(block) for block in document.blocks)
 
 
 def test_shipped_seed_is_that_of_the_third_choice(artefacts):
