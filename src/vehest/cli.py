@@ -91,10 +91,14 @@ def _complete_model(incomplete: str) -> list[str]:
     return [*shipped, *(folder.name for folder in own if not folder.name.startswith("."))]
 
 
-def _complete_model_or_file(incomplete: str) -> list[str]:
+def _complete_file(incomplete: str) -> list[str]:
     before = incomplete[: incomplete.rfind("/") + 1]
     files = [f"{before}{file.name}" for file in sorted(Path(before).glob("*")) if file.suffix.lower() in (".csv", ".parquet")]
-    return _complete_model(incomplete) + [file for file in files if file.startswith(incomplete)]
+    return [file for file in files if file.startswith(incomplete)]
+
+
+def _complete_model_or_file(incomplete: str) -> list[str]:
+    return _complete_model(incomplete) + _complete_file(incomplete)
 
 
 DryRun = Annotated[bool, typer.Option("--dry-run", help="List the stages that would run or be skipped; run nothing.")]
@@ -335,6 +339,9 @@ def estimate(
     out: Annotated[
         Path, typer.Option("--out", "-o", help="Where to write the estimate: .parquet, .csv, or the log with it: .mf4, .mat.")
     ] = Path("estimate.parquet"),
+    car: Annotated[
+        Path | None, typer.Option("--car", help="A car's record by `vehest identify`, which the filter starts from.", show_default=False)
+    ] = None,
     strict: Annotated[
         bool, typer.Option("--strict", help="Exit code 3 and no file where a check finds something in the channels read.")
     ] = False,
@@ -351,7 +358,31 @@ def estimate(
     """
     from vehest.run.estimate import estimate_file
 
-    emit(as_json, estimate_file([word for word in (model, recording, *(overrides or [])) if word is not None], out, strict=strict))
+    words = [word for word in (model, recording, *(overrides or [])) if word is not None]
+    emit(as_json, estimate_file(words, out, strict=strict, car=car))
+
+
+@app.command()
+def identify(
+    words: Annotated[
+        list[str],
+        typer.Argument(metavar="FILE... [OVERRIDES]...", help="Drives of a car; then key=value …", autocompletion=_complete_file),
+    ],
+    out: Annotated[Path, typer.Option("--out", "-o", help="The car's record to write, .yaml.")] = Path("my_car.yaml"),
+    wheelbase: Annotated[float | None, typer.Option("--wheelbase", min=0.05, help="Of the car [m]; by default a typical one.")] = None,
+    cg_to_rear_axle: Annotated[
+        float | None, typer.Option("--cg-to-rear-axle", min=0.0, help="Distance of the centre of gravity from the rear axle, if known [m].")
+    ] = None,
+    as_json: AsJson = False,
+) -> None:
+    """Find a car's numbers on its drives, without a reference: `vehest identify lap*.csv -o my_car.yaml`.
+
+    Roll leakage, rear axle and grip limit, each with its deviation. `vehest estimate lap.csv --car my_car.yaml` starts from them.
+    """
+    from vehest.run.identify import identify_files, in_words
+
+    record = identify_files(words, out, {"wheelbase": wheelbase, "cg_to_rear_axle": cg_to_rear_axle})
+    emit(as_json, {"out": str(out), **asdict(record)}, [in_words(record), f"out: {out}"])
 
 
 @app.command()

@@ -20,6 +20,7 @@ from vehest.data.errors import DataError
 from vehest.data.splits import VALIDATION
 from vehest.estimators.model_files import load_model
 from vehest.evaluation.metrics import Scored
+from vehest.evaluation.ranking import BASELINES
 from vehest.report import figures
 from vehest.report.document import PATENT_NOTE, REPORT, Block, Column, Document, Figure, Table, as_code
 from vehest.report.style import REFERENCE, fixed, line_of
@@ -94,6 +95,11 @@ class Step:
         """Median over seeds on the real car."""
         return float(np.median(self.test["fvu"]))
 
+    @property
+    def other_fvu(self) -> float:
+        """Median over seeds on the car of another simulation; 1 is what v = 0 leaves."""
+        return float(np.median(self.other["fvu"]))
+
 
 @dataclass(frozen=True)
 class Choice:
@@ -124,14 +130,15 @@ def documents(artefacts: StudyArtefacts) -> dict[str, Document]:
     Raises:
         DataError: the steps were not validated on the same ranges, or not on simulated cars alone.
     """
-    steps = steps_of(artefacts)
+    every = steps_of(artefacts)
+    steps, baselines = ([step for step in every if (step.models[0].estimator in BASELINES) is found] for found in (False, True))
     choices = choices_of(steps)
     blocks: list[Block] = [
         _headline(steps, choices),
         artefacts.about,
         *_how_it_was_made(artefacts),
         "## Steps",
-        _overview(steps, choices),
+        _overview(steps, choices, baselines),
         _reasons(artefacts),
         _spread(steps, choices),
         *filter(None, [_why(steps)]),
@@ -143,7 +150,7 @@ def documents(artefacts: StudyArtefacts) -> dict[str, Document]:
 
 
 def steps_of(artefacts: StudyArtefacts) -> list[Step]:
-    """All steps in the order of the pipeline."""
+    """All steps in the order of the pipeline, baselines too."""
     parts = artefacts.parts
     if len({(part.split.validation, part.split.tests[RACE_CARS]) for part in parts.values()}) > 1:
         raise DataError(f"study '{artefacts.study}': its parts stop or choose on different ranges, nothing can be chosen among them")
@@ -199,11 +206,23 @@ def _headline(steps: Sequence[Step], choices: Mapping[str, Choice]) -> str:
         f"validation cars choose {_named(choices['second'])}. {_result(choices['second'])}\n"
         f"- **Third choice, after that:** the car of another simulation (`tum`), since the first two rules reward what a network learns of "
         f"the simulator that it came from, chooses {_named(choices['third'])} among the steps that have not learnt on it. "
-        f"{_result(choices['third'])}\n\n"
+        f"{_worse_than_zero(steps)}{_result(choices['third'])}\n\n"
         "Only the first figure is a clean test. The other two rules use simulated cars alone, but were made up knowing how every step does "
         "on the real car, and the last one knowing that two had failed; whether it is the right rule needs another real car to decide.\n\n"
         f"The model that comes with vehest for cars without a model of their own is seed {shipped.model.seed} of the {SHIPPED} choice: on "
         f"the real car FVU {error['fvu']}, RMSE(v) {error['rmse_vy']} m/s, RMSE(β) {error['rmse_sideslip']}°."
+    )
+
+
+def _worse_than_zero(steps: Sequence[Step]) -> str:
+    """How many candidates of the third choice leave more than v = 0 does."""
+    left = [step.other_fvu for step in steps if np.isfinite(step.other_fvu)]
+    worse = sum(fvu > 1.0 for fvu in left)
+    if not worse:
+        return ""
+    return (
+        f"**{worse} of these {len(left)} candidates are worse than v = 0 on that car**, whose FVU is 1; theirs is {fixed(min(left), 1)} to "
+        f"{fixed(max(left), 1)}. "
     )
 
 
@@ -254,10 +273,10 @@ def _facts(artefacts: StudyArtefacts) -> list[str]:
     return [fact if len(names) == len(artefacts.parts) else f"{', '.join(names)}: {fact}" for fact, names in of_parts.items()]
 
 
-def _overview(steps: Sequence[Step], choices: Mapping[str, Choice]) -> Table:
+def _overview(steps: Sequence[Step], choices: Mapping[str, Choice], baselines: Sequence[Step]) -> Table:
     shipped = choices[SHIPPED]
     rows: list[dict[str, object]] = []
-    for step in steps:
+    for step in (*steps, *baselines):
         row: dict[str, object] = {
             "part": step.part,
             "step": step.label,
@@ -268,6 +287,7 @@ def _overview(steps: Sequence[Step], choices: Mapping[str, Choice]) -> Table:
             "validation_rmse_vy": step.errors[0],
             "race_cars_rmse_vy": step.errors[1],
             "other_simulator_rmse_vy": step.errors[2],
+            "other_simulator_fvu": step.other_fvu,
             "weight": float(np.median(step.weight)),
             "fvu_median": step.fvu,
             "fvu_min": step.test["fvu"].min(),
@@ -283,8 +303,8 @@ def _overview(steps: Sequence[Step], choices: Mapping[str, Choice]) -> Table:
     return Table(
         "overview",
         "Steps, their errors on simulated cars, and on the whole recording of the real Ferrari: medians over the seeds, for "
-        "FVU also the smallest and largest. β₁(0) is what the network makes of an acceleration without yaw rate (Eq. 7a). Below: Da Lio et "
-        "al. 2023, real cars, two recordings of which ours is one.",
+        "FVU also the smallest and largest. β₁(0) is what the network makes of an acceleration without yaw rate (Eq. 7a). Below: "
+        "baselines, which are no candidates, and Da Lio et al. 2023, real cars, two recordings of which ours is one.",
         pd.DataFrame(rows),
         {
             "step": Column("learns on: estimator"),
@@ -293,6 +313,7 @@ def _overview(steps: Sequence[Step], choices: Mapping[str, Choice]) -> Table:
             "validation_rmse_vy": Column("RMSE(v) [m/s], simulated validation cars", decimals=3),
             "race_cars_rmse_vy": Column("RMSE(v) [m/s], simulated race cars", decimals=3),
             "other_simulator_rmse_vy": Column("RMSE(v) [m/s], other simulation", decimals=3),
+            "other_simulator_fvu": Column("FVU, other simulation", decimals=2),
             "chosen": Column("choice"),
             "fvu_median": Column("FVU, real", decimals=3),
             "fvu_min": Column("min", decimals=3),

@@ -28,6 +28,7 @@ from vehest.estimators.kernels.compiling import has_to_compile
 from vehest.estimators.model_files import DESCRIPTION, WEIGHTS, load_model, read_description
 from vehest.run.artefacts import MANIFEST, Artefact, read_artefact
 from vehest.run.calibrate import trust_of
+from vehest.run.car_record import calibrated, read_car
 from vehest.run.config import Config, compose_config, key_of
 from vehest.run.config_files import is_file_name
 from vehest.run.downsample import resampled
@@ -87,13 +88,14 @@ def open_model(name: str, output: Path, say: Callable[[str], None]) -> tuple[Pat
     return folder, model, trust_of(folder, output)
 
 
-def estimate_file(words: Sequence[str], out: Path, *, strict: bool = False) -> dict[str, Any]:
+def estimate_file(words: Sequence[str], out: Path, *, strict: bool = False, car: Path | None = None) -> dict[str, Any]:
     """Run a model on a recording and write the estimate to ``out``; returns its figures and a verdict.
 
     Args:
         words: a model, which may be left out, a recording and overrides of conf/estimate.yaml.
         out: table to write, or the log with further channels (`estimate_log`).
         strict: whether findings in the channels are an error; else they are printed as warnings.
+        car: record of `vehest identify` to start from.
 
     Raises:
         VehestError: model, recording or table cannot be used.
@@ -112,13 +114,15 @@ def estimate_file(words: Sequence[str], out: Path, *, strict: bool = False) -> d
         raise ConfigurationError(f"'{out}' is the recording itself; name another file")
     config = compose_config("estimate", overrides)
     folder, model, trust = open_model(name, Path(config["output"]), note)
+    if car is not None:
+        model = calibrated(model, read_car(car))
     if has_to_compile(model.slow_kernel) or (trust is not None and has_to_compile(SLOW_KERNEL)):
         note("compiling once, about 20 s")
     if any(key_of(override).split(".")[0] == "downsample" for override in overrides):
         model.preparation = config["downsample"]
     with use_limits(limits_from_config(config["limits"])):
         drive = _read(config, file)
-        findings = _findings(drive, model, config["dataset"].get("accept") or ())
+        findings = findings_of(drive, model, config["dataset"].get("accept") or ())
         if strict and findings:
             raise DataError(f"'{file}': {findings[0]}")
         result = estimate_recording(model, drive, trust)
@@ -131,6 +135,7 @@ def estimate_file(words: Sequence[str], out: Path, *, strict: bool = False) -> d
     return {
         "out": str(out),
         "model": name if name in WITH_VEHEST else str(folder),
+        **({"car": str(car)} if car is not None else {}),
         **_summary(result),
         "verdict": _verdict(result, drive, trust),
         "findings": findings,
@@ -187,7 +192,7 @@ def _without_references(dataset: dict[str, Any]) -> dict[str, Any]:
     return {key: value for key, value in dataset.items() if key not in changed} | {key: new for key, new in changed.items() if new}
 
 
-def _findings(recording: Recording, model: Estimator, accepted: Sequence[str]) -> list[str]:
+def findings_of(recording: Recording, model: Estimator, accepted: Sequence[str]) -> list[str]:
     """Findings in the channels that a model reads; raises `DataError` where they contradict each other, so that no estimate is right."""
     read = [name for name in model.channels if name in recording]
     findings = [finding for finding in checks_of_recording(recording.select(read)) if finding.level != "note"] if read else []

@@ -1,0 +1,125 @@
+"""A car's record: found on drives of a car whose numbers are known, written, read back and started from."""
+
+import json
+import math
+
+import numpy as np
+import pandas as pd
+import pytest
+import yaml
+from test_self_calibrating import RATE, drive
+
+from vehest.data.errors import DataError
+from vehest.data.recording import Recording
+from vehest.estimators.model_files import load_model
+from vehest.run.car_record import LIMITS, Number, calibrated, read_car, with_settings
+from vehest.run.estimate import pretrained_folder
+from vehest.run.identify import posterior_of, prior_of, record_of, together, without_prior
+
+PLANTED = {"leakage": -0.06, "rear_axle": 1.25, "compliance": 0.0051}
+
+
+def lap(seed, seconds=120.0, angle=1.0):
+    samples, vy = drive(seconds, seed, PLANTED["compliance"], PLANTED["rear_axle"], PLANTED["leakage"], 0.2, angle=angle)
+    return dict(zip(("yaw_rate", "vx", "ay", "ax"), samples.T, strict=True)), vy
+
+
+def recording(name, channels):
+    return Recording(name, "car", RATE, 0.0, channels)
+
+
+@pytest.fixture(scope="module")
+def model():
+    return with_settings(load_model(pretrained_folder("self_calibrating")), {"wheelbase": 2.7, "cg_to_rear_axle": 1.25})
+
+
+@pytest.fixture(scope="module")
+def record(model):
+    return record_of(model, {name: posterior_of(model, recording(name, lap(seed)[0])) for name, seed in (("one", 0), ("two", 1))})
+
+
+def test_numbers_of_a_known_car_are_found_within_their_deviations(record):
+    for name, truth in PLANTED.items():
+        number = getattr(record, name)
+        assert number.told_by == (() if name == "rear_axle" else ("one", "two"))  # nearly one speed: C u and b/u are alike
+        assert abs(number.value - truth) < 2.0 * number.deviation
+    for offsets in record.offsets.values():
+        assert abs(offsets["ay"].value - 0.2) < offsets["ay"].deviation
+
+
+def test_an_estimate_that_starts_from_the_record_is_closer_from_the_first_seconds_on(model, record):
+    channels, vy = lap(2, 20.0)
+    errors = [np.mean((one.estimate([recording("lap", channels)])[0]["vy"] - vy) ** 2) for one in (model, calibrated(model, record))]
+    assert errors[1] < 0.7 * errors[0]
+
+
+def test_what_no_drive_tells_is_said_and_not_started_from(model):
+    still = recording("still", {"yaw_rate": np.zeros(600), "vx": np.full(600, 30.0), "ay": np.full(600, 0.1), "ax": np.zeros(600)})
+    found = record_of(model, {"still": posterior_of(model, still)})
+    assert not any(getattr(found, name).told_by for name in LIMITS)
+    assert calibrated(model, found).settings == model.settings
+
+
+def test_drives_count_by_what_they_add_to_the_prior_and_contradictions_widen():
+    prior, likelihoods = (1.0, 2.0), {"a": (3.0, 1.0), "b": (3.2, 0.5)}
+    posteriors = {}
+    for name, (mean, deviation) in likelihoods.items():
+        variance = 1.0 / (1.0 / prior[1] ** 2 + 1.0 / deviation**2)
+        posteriors[name] = variance * (prior[0] / prior[1] ** 2 + mean / deviation**2), math.sqrt(variance)
+        assert without_prior(prior, posteriors[name]) == pytest.approx((mean, deviation))
+    both = together(prior, posteriors)
+    precision = 1.0 / 4.0 + 1.0 + 4.0
+    assert (both.value, both.deviation) == pytest.approx(((0.25 + 3.0 + 4.0 * 3.2) / precision, precision**-0.5))
+    assert both.told_by == ("a", "b")
+    assert together(prior, posteriors | {"c": (-1.0, 0.4)}).deviation > 2.0 * both.deviation
+    assert together(prior, {"d": prior}) == Number(*prior)
+
+
+def test_identify_writes_a_record_from_which_estimate_starts(place):
+    for name, seed in (("one", 0), ("two", 1), ("three", 2)):
+        channels, _ = lap(seed, 40.0)
+        pd.DataFrame({"time": np.arange(len(channels["vx"])) / RATE, **channels}).to_csv(f"{name}.csv", index=False)
+    code, out, err = place("identify", "one.csv", "two.csv", "-o", "car.yaml", "--wheelbase", "2.7", "--cg-to-rear-axle", "1.25", "--json")
+    assert code == 0, err
+    said, kept = json.loads(out), read_car(place.folder / "car.yaml")
+    assert said["leakage"]["value"] == kept.leakage.value == pytest.approx(PLANTED["leakage"], abs=0.03)
+    code, out, err = place("identify", "one.csv", "-o", "again.yaml")
+    assert "told by" in out
+    assert place("estimate", "three.csv", "-o", "cold.csv")[0] == 0
+    code, out, err = place("estimate", "three.csv", "--car", "car.yaml", "-o", "warm.csv", "--json")
+    assert code == 0, err
+    assert json.loads(out)["car"] == "car.yaml"
+    assert np.abs(pd.read_csv("warm.csv")["vy"] - pd.read_csv("cold.csv")["vy"]).max() > 0.01
+    assert "leave the model out" in place.refused("estimate", "pretrained", "three.csv", "--car", "car.yaml")[1]
+    assert "must end in .yaml" in place.refused("identify", "one.csv", "-o", "car.txt")[1]
+    assert "called 'one'" in place.refused("identify", "one.csv", "one.csv", "-o", "twice.yaml")[1]
+    assert not (place.folder / "twice.yaml").exists()
+    assert prior_of(calibrated(load_model(pretrained_folder("self_calibrating")), kept))["leakage"][0] == kept.leakage.value
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"leakage": {"value": 0.9, "deviation": 0.01}}, "leakage must lie between -0.3 and 0.3"),
+        ({"compliance": {"value": 0.005, "deviation": 0.0}}, "compliance.deviation"),
+        ({"wheelbase": 2000.0}, "wheelbase"),
+        ({"grip": None}, "grip"),
+        ({"mass": 1500.0}, "mass"),
+        ({"format": 2}, "newer vehest"),
+        ("!!python/object/apply:os.system [touch MARK]", "cannot be read as YAML"),
+        ("just text", "no record of a car"),
+    ],
+)
+def test_a_record_that_is_damaged_or_of_no_car_is_refused_in_one_line(tmp_path, monkeypatch, change, words):
+    monkeypatch.chdir(tmp_path)
+    number = {"value": 0.01, "deviation": 0.01}
+    numbers = {"leakage": number, "rear_axle": number, "compliance": number, "grip": {"value": 9.0, "deviation": 1.0}}
+    honest = {"format": 1, "wheelbase": 2.7, "cg_to_rear_axle": None, **numbers, "offsets": {}}
+    file = tmp_path / "car.yaml"
+    file.write_text(yaml.safe_dump(honest))
+    assert read_car(file).wheelbase == 2.7
+    file.write_text(change if isinstance(change, str) else yaml.safe_dump(honest | change))
+    with pytest.raises(DataError, match=words) as refused:
+        read_car(file)
+    assert "\n" not in str(refused.value)
+    assert list(tmp_path.iterdir()) == [file]
