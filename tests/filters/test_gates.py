@@ -1,11 +1,12 @@
 """Gates: outliers are refused as if they had not been measured, readable as compiled; what contradicts for long is believed again."""
 
 import math
+from functools import partial
 
 import numpy as np
 import pytest
 import torch
-from readable_filters import unscented_filter
+from readable_filters import gated, unscented_filter
 from scipy.stats import chi2, norm
 from test_filters_kalman import example
 from test_filters_nonlinear import RULES, measured_pendulum, pendulum_with_radar
@@ -99,6 +100,23 @@ def outliers(steps, sequences):
     y[0, 15:, 1] += 30.0  # longer than the gate is patient
     y[-1, 20, 0] = torch.nan
     return y, u, first
+
+
+def test_the_scan_refuses_what_the_readable_filter_refuses_whatever_the_rule():
+    y, u, first = outliers(30, 3)
+    model, gate = pendulum_with_radar(), Gate(4.0, PATIENCE)
+    noises = [noise(NOTHING, NOTHING) for noise in (model.process_noise, model.observation_noise)]
+    for name, rule in RULES.items():
+        scanned = unscented_scan(TorchModel(model.transition, model.observation), y, u, first, *noises, rule, gate=gate).steps
+        for row in range(3):
+            judged = gated(partial(by_the_filter, u[row], first, rule), y[row], gate)
+            assert torch.equal(judged.measured, scanned.measured[row]), name
+        readable = by_the_filter(u, first, rule, torch.where(scanned.measured, y, torch.nan))
+        assert not scanned.measured[0, 15 : 15 + PATIENCE, 1].any(), "shut"
+        assert scanned.measured[0, 15 + PATIENCE, 1], "open again"
+        for a, b in zip(readable.filtered, scanned.filtered, strict=True):
+            assert torch.allclose(a, b, rtol=0, atol=1e-12 * float(a.abs().max())), name
+        assert torch.allclose(readable.log_likelihood, scanned.log_likelihood, rtol=1e-10, atol=1e-10)
 
 
 def test_gradients_through_a_gate_are_those_of_missing_measurements():
