@@ -49,13 +49,18 @@ def chosen_step(table: Path = TABLE) -> pd.Series:
 def note_of(row: pd.Series, estimator: Estimator) -> str:
     """What people should know who use the model."""
     patent = " The KS-NN is patented by its authors (PCT/IT2023/050058)." if estimator.name == "ksnn" else ""
+    left, worse = row["other_simulator_fvu"], ""
+    if left > 1.0:  # of the candidate with the lowest error there
+        worse = (
+            f" All candidates of the rule are worse than v = 0 on the simulated car that it asked; this one leaves FVU {fixed(left, 1)}."
+        )
     return (
         f"pre-trained {estimator.full_title}, learnt on {row['recordings']:.0f} drives of simulated cars and not on this one. On a real "
         f"Ferrari 250 LM, which it had not seen either, it leaves {fixed(row['model_fvu'], 3)} of the variance of v unexplained, RMSE(v) "
         f"{fixed(row['model_rmse_vy'], 3)} m/s, RMSE(β) {fixed(row['model_rmse_sideslip'], 3)}° (seed {row['model_seed']:.0f}, "
         "results/sim_to_real): the figure of the best of thirteen on the car that judged them, by a rule made after the test was seen, "
-        "and no evidence for another. Recordings of a production saloon that are not here gave 0.14, 0.23 and 0.61 in three manoeuvres. "
-        f"Train on your car if you can.{patent}"
+        f"and no evidence for another.{worse} Recordings of a production saloon that are not here gave 0.14, 0.23 and 0.61 in three "
+        f"manoeuvres. Train on your car if you can.{patent}"
     )
 
 

@@ -220,9 +220,10 @@ def _worse_than_zero(steps: Sequence[Step]) -> str:
     worse = sum(fvu > 1.0 for fvu in left)
     if not worse:
         return ""
+    how_many = "All" if worse == len(left) else str(worse)
     return (
-        f"**{worse} of these {len(left)} candidates are worse than v = 0 on that car**, whose FVU is 1; theirs is {fixed(min(left), 1)} to "
-        f"{fixed(max(left), 1)}. "
+        f"**{how_many} of these {len(left)} candidates are worse than v = 0 on that car**, whose FVU is 1; theirs is "
+        f"{fixed(min(left), 1)} to {fixed(max(left), 1)}. "
     )
 
 
