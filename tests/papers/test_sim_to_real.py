@@ -147,7 +147,6 @@ def test_report_shows_v_0_beside_the_candidates_and_says_how_many_are_worse_on_t
     assert any("**1 of these 2 candidates are worse than v = 0 on that car**" in str(block) for block in document.blocks)
 
 
-
 def test_report_says_what_was_found_on_the_real_car_and_whether_it_is_what_was_asked_for(artefacts, tmp_path):
     document = documents(artefacts)["report"]
     write_document(document, tmp_path)
