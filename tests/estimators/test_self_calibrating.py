@@ -41,10 +41,13 @@ def drive(seconds=60.0, seed=0, compliance=0.006, rear=1.3, leakage=0.02, offset
     return np.ascontiguousarray(samples), v[::fine]
 
 
-def plain_filter(model, samples):
-    """One filter of the bank with matrices, its axle's derivatives by central differences; the size of its error from itself alone."""
+def plain_filter(model, samples, network=None):
+    """One filter of the bank with matrices, its axle's derivatives by central differences; the size of its error from itself alone.
+
+    With v of the network at each sample, (T,), that is the filter whose axle slips as the network has it.
+    """
     n, (mean, deviation) = model.numbers(), model.prior
-    (grip,) = model.grips
+    grip, of_network = model.grips[0], 0.0
     x, p = mean.copy(), np.diag(deviation**2)
     x[1] = samples[0, 1]
     times = np.array([np.inf, np.inf, model.offset_ay_time, model.offset_ax_time, np.inf, np.inf, np.inf, model.axle_error_time])
@@ -52,6 +55,8 @@ def plain_filter(model, samples):
     smooth, sums, last, found = samples[0].copy(), np.zeros(3), samples[0], np.empty((len(samples), 8))
 
     def curve(force):
+        if network is not None:
+            return of_network, 0.0
         limit = np.sqrt(max(grip**2 - smooth[3] ** 2, (0.3 * grip) ** 2))
         share = min(abs(force) / limit, n.largest_share)
         return np.sign(force) * limit * (1.0 - (1.0 - share) ** n.exponent) / n.exponent, (1.0 - share) ** (n.exponent - 1.0)
@@ -63,8 +68,10 @@ def plain_filter(model, samples):
         r, ay, ax = ((last + sample) / 2.0)[[0, 2, 3]]
         turn, speed = (last[0] * last[1] + sample[0] * sample[1]) / 2.0, sample[1]
         sums = (1.0 - g) * (sums + n.dt * np.array([ay, turn, 1.0]))
+        if network is not None:
+            of_network += g * ((mean[5] * sample[0] - network[t]) / n.compliance / sample[1] - of_network)
         phi, slope = curve((smooth[2] - x[2]) * (1.0 - x[4]) - x[5] * turning)
-        bent = n.axle_per_slip * abs(phi) + n.axle_per_bend * (slope - 1.0) + n.axle_per_slope * slope
+        bent = n.axle_per_slip * abs(phi) + n.axle_per_bend * max(slope - 1.0, 0.0) + n.axle_per_slope * slope
         size = n.axle_constant + speed * (n.axle_per_speed + n.compliance * bent)
         a = np.eye(8)
         a[0, 2], a[0, 4], a[1, 0], a[1, 3] = -n.dt, -n.dt * ay, n.dt * r, -n.dt
@@ -75,7 +82,8 @@ def plain_filter(model, samples):
 
         def axle(x, smooth=smooth, sums=sums, turning=turning, size=size, speed=speed):
             phi = curve((smooth[2] - x[2]) * (1.0 - x[4]) - x[5] * turning)[0]
-            return x[0] - (sums[0] * (1.0 - x[4]) - x[2] * sums[2] - sums[1]) - x[5] * smooth[0] + x[6] * speed * phi + size * x[7]
+            rear = x[5] if network is None else mean[5]
+            return x[0] - (sums[0] * (1.0 - x[4]) - x[2] * sums[2] - sums[1]) - rear * smooth[0] + x[6] * speed * phi + size * x[7]
 
         variance = n.axle_white**2 + n.axle_white_share * size**2
         for measured, modelled, r_ in ((speed, lambda x: x[1], n.noise_speed**2), (0.0, axle, variance)):
@@ -94,11 +102,24 @@ def model_of(**settings):
 
 def test_filter_of_one_grip_limit_matches_plain_matrices():
     samples, _ = drive(20.0)
-    model = model_of(grips=[12.0])
+    model = model_of(grips=[12.0], network_start=1e-300)
     _, states, _ = model.trace(samples, model.first_state(samples[0], {}))
     expected = plain_filter(model, samples)
     largest = np.abs(expected).max(axis=0)
     np.testing.assert_allclose(states[:, :8] / largest, expected / largest, rtol=0.0, atol=1e-6)
+
+
+def test_filter_with_the_networks_axle_matches_plain_matrices():
+    samples, _ = drive(20.0)
+    model = model_of(grips=[300.0], network_start=1e12)  # so that the other filter has no weight
+    state, network, states = model.first_state(samples[0], {}), np.empty(len(samples)), np.empty((len(samples), 8))
+    for k in range(len(samples)):
+        network[k] = state.lags[kernel.PREDICTED]
+        _, _, state = model.trace(samples[k : k + 1], state)
+        states[k] = state.means[-1]
+    expected = plain_filter(model, samples, network)
+    largest = np.abs(expected).max(axis=0)
+    np.testing.assert_allclose(states / largest, expected / largest, rtol=0.0, atol=1e-6)
 
 
 def test_network_inside_is_the_one_that_comes_with_vehest():
