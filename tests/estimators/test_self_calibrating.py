@@ -12,6 +12,7 @@ from vehest.data.recording import Recording
 from vehest.estimators.kernels import self_calibrating as kernel
 from vehest.estimators.model_files import load_model
 from vehest.estimators.self_calibrating import SelfCalibrating
+from vehest.export.method import method_source
 from vehest.run.estimate import pretrained_folder
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -224,3 +225,50 @@ def test_a_slow_car_rolls_about_the_rear_axle_that_was_found():
 def test_compiled_code_is_found_again_in_the_next_process():
     numbers = SelfCalibrating.from_config({}).numbers()
     assert pickle.loads(pickle.dumps(type(numbers))) is type(numbers), "its type is in the key of the compiled code"
+
+
+def test_smoother_matches_joint_least_squares_of_a_rolling_car():
+    rng, model = np.random.default_rng(2), model_of(smoothed=True, leakage=0.0, leakage_deviation=1e-9, steady_odds=1e-12, angle_floor=0.0)
+    samples = np.column_stack([np.zeros(25), 2.0 + 0.1 * rng.normal(size=25), 0.1 * rng.normal(size=25), 0.2 * rng.normal(size=25)])
+    n, deviation, steps = model.numbers(), model.prior[1], len(samples)
+    step, decay = np.eye(4), model.decay[:4]  # of v, u and the offsets of ay and ax
+    step[0, 2], step[1, 3] = -n.dt, -n.dt
+    step *= decay[:, None]
+    noise = np.array([n.dt * n.noise_vy**2, n.dt * n.noise_vx**2, *np.square(deviation[2:4]) * (1.0 - decay[2:] ** 2)])
+    middle = (np.vstack([samples[:1], samples[:-1]]) + samples) / 2.0
+    rows, values = [np.hstack([np.eye(4), np.zeros((4, 4 * steps))]) / deviation[:4, None]], [np.array([0.0, samples[0, 1], 0, 0])]
+    values[0] /= deviation[:4]
+    for k in range(steps):
+        moved = np.zeros((4, 4 * (steps + 1)))
+        moved[:, 4 * k : 4 * k + 4], moved[:, 4 * k + 4 : 4 * k + 8] = -step, np.eye(4)
+        rows.append(moved / np.sqrt(noise)[:, None])
+        values.append(np.array([n.dt * middle[k, 2], n.dt * middle[k, 3], 0.0, 0.0]) / np.sqrt(noise))
+        measured = np.zeros((2, 4 * (steps + 1)))
+        measured[0, 4 * k + 5], measured[1, 4 * k + 4] = 1.0 / n.noise_speed, 1.0 / kernel.ROLLING
+        rows.append(measured)
+        values.append(np.array([samples[k, 1] / n.noise_speed, 0.0]))
+    stacked = np.vstack(rows)
+    expected, covariance = np.linalg.lstsq(stacked, np.concatenate(values), rcond=None)[0], np.linalg.inv(stacked.T @ stacked)
+    estimate, _ = model.run(samples, model.first_state(samples[0], {}))
+    np.testing.assert_allclose(estimate["vy"], expected[4::4], rtol=0.0, atol=1e-8)
+    np.testing.assert_allclose(estimate["covariance"][:, 0, 0], np.diag(covariance)[4::4], rtol=1e-6)
+
+
+def test_smoothed_estimates_err_less_within_their_bands():
+    causal, smooth, within = [], [], []
+    for seed in range(4):
+        samples, vy = drive(40.0, seed, compliance=0.004 + 0.001 * seed)
+        for errors, model in ((causal, model_of()), (smooth, model_of(smoothed=True))):
+            estimate, _ = model.run(samples, model.first_state(samples[0], {}))
+            errors.append(np.std(estimate["vy"] - vy))
+        within.append(np.mean(np.abs(estimate["vy"] - vy) < 1.645 * np.sqrt(estimate["covariance"][:, 0, 0])))
+    assert np.median(smooth) < 0.8 * np.median(causal)
+    assert np.mean(within) > 0.85
+
+
+def test_smoother_is_offline_and_refuses_online_and_c():
+    model = model_of(smoothed=True)
+    assert not model.causal
+    for refused in (model.online, lambda: method_source(model, "double")):
+        with pytest.raises(ConfigurationError, match="smooths a whole drive and cannot run online; use estimator"):
+            refused()

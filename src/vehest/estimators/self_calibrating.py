@@ -14,7 +14,8 @@ import numpy as np
 from vehest.constants import FloatArray
 from vehest.data.errors import ConfigurationError, DataError
 from vehest.declared import setting
-from vehest.estimators.base import rate
+from vehest.estimators.base import Stepper, rate
+from vehest.estimators.filtering.rear_axle_smoother import smoothed
 from vehest.estimators.kernels import self_calibrating as kernel
 from vehest.estimators.kernels.ksnn import packed
 from vehest.estimators.ksnn import Ksnn
@@ -68,6 +69,7 @@ class SelfCalibrating(Recursive):
     rate_hz: float = rate(20.0)
     wheelbase: float = setting(TYPICAL_WHEELBASE, "wheelbase", unit="m", positive=True)
     cg_to_rear_axle: float = setting(None, "distance of the centre of gravity from the rear axle; null: 0.48 wheelbases", unit="m")
+    smoothed: bool = setting(False, "whether each estimate is made of the whole drive, offline; parameters are those at its end")
     measured_ax: bool = setting(True, "whether ax is measured; else the longitudinal equation tells nothing")
     grips: tuple[float, ...] = setting((4.5, 6.0, 7.5, 9.0, 10.5, 12.0, 14.0, 17.0, 25.0), "grip limits a_max of the bank [m/s²]")
     grip: float = setting(14.0, "median of the prior of a_max", unit="m/s²", positive=True)
@@ -114,12 +116,12 @@ class SelfCalibrating(Recursive):
     network_odds: float = setting(5.0, "weight of the network over the bank's at the start", positive=True)
     decision_time: float = setting(25.0, "driving after which they differ e times less", unit="s", positive=True)
     steady_odds: float = setting(0.4, "weight of steady cornering over the bank's at the start", positive=True)
-    network_start: float = setting(0.7, "weight at the start of the filter whose axle is the network's, over the likeliest other's", positive=True)
+    network_start: float = setting(0.7, "weight at the start of the filter with the network's axle", positive=True)
 
     def __init__(self, settings: Any) -> None:
         super().__init__(settings)
         self.channels = type(self).channels if self.measured_ax else type(self).channels[:3]
-        self._network, self._width = _shipped_network()
+        self.network, self._width = _shipped_network()
 
     def check(self) -> None:
         """Raises:
@@ -133,12 +135,28 @@ class SelfCalibrating(Recursive):
             raise ConfigurationError(f"estimator.grips must be positive accelerations, not {list(self.grips)}")
 
     @property
+    def causal(self) -> bool:
+        """Unless it smooths."""
+        return not self.smoothed
+
+    @property
+    def full_title(self) -> str:
+        """Title with whether it smooths."""
+        return f"{self.title}, smoothed" if self.smoothed else self.title
+
+    def online(self) -> Stepper:
+        """A stepper in its initial state; raises `ConfigurationError` where it smooths."""
+        if self.smoothed:
+            raise ConfigurationError(f"estimator '{self.name}' smooths a whole drive and cannot run online; use estimator.smoothed=false")
+        return super().online()
+
+    @property
     def rear(self) -> float:
         """Distance of the rear axle behind the reference point [m], as given or typical."""
         return TYPICAL_REAR * self.wheelbase if self.cg_to_rear_axle is None else float(self.cg_to_rear_axle)
 
     @property
-    def bank(self) -> tuple[FloatArray, FloatArray]:
+    def bank_arrays(self) -> tuple[FloatArray, FloatArray]:
         """Grip limits of the filters [m/s²], 0 for that with the network's axle, and logarithms of their weights at the start, (J,)."""
         grips = np.array(self.grips, dtype=np.float64)
         start = -0.5 * np.square(np.log(grips / self.grip) / self.grip_deviation)
@@ -160,7 +178,7 @@ class SelfCalibrating(Recursive):
 
     def numbers(self) -> Any:
         """What the compiled recursion takes: numeric settings, times scaled, and what follows from them."""
-        own = {name: float(value) for name, value in vars(self.settings).items() if isinstance(value, int | float)}
+        own = {name: float(value) for name, value in vars(self.settings).items() if isinstance(value, int | float) and name != "smoothed"}
         own |= {"dt": 1.0 / self.rate_hz, "rear": self.rear, "rear_known": 1.0 if self.cg_to_rear_axle is not None else self.rear_share}
         own |= {"yaw_rate_max": self._width, "without_ax": float(not self.measured_ax)}
         if self.rate_hz != NETWORK_HZ or self.wheelbase < SHORTEST_OF_NETWORK:
@@ -176,17 +194,20 @@ class SelfCalibrating(Recursive):
         mean, deviation = self.prior
         mean[kernel.V], mean[kernel.U] = given.get("vy", 0.0), sample[1]
         lags = np.zeros(kernel.LAGS)
-        first = self._four(sample[None])[0]
+        first = self.with_ax(sample[None])[0]
         lags[[kernel.YAW_RATE, kernel.AY, kernel.AX, kernel.SPEED, kernel.AX_OF_SPEED]] = *first[[0, 2, 3]], sample[1], sample[1]
         lags[kernel.PREDICTED] = first[0] * (self.rear - self.compliance * first[1] ** 2)
-        weights = self.bank[1]
+        weights = self.bank_arrays[1]
         means, covariances = np.tile(mean, (len(weights), 1)), np.tile(np.diag(np.square(deviation)), (len(weights), 1, 1))
         candidates = np.zeros((kernel.CANDIDATES, 8)), np.ones(kernel.CANDIDATES)
         return kernel.State(means, covariances, weights, lags, *candidates, first, np.tile(first, (WINDOW, 1)))
 
     def run(self, samples: FloatArray, state: kernel.State) -> tuple[dict[str, Any], kernel.State]:
         """vy [m/s] and its variance."""
-        found, _, state = self.trace(samples, state)
+        if self.smoothed:
+            found = smoothed(self, samples, state)
+        else:
+            found, _, state = self.trace(samples, state)
         return {"vy": found[:, 0].copy(), "covariance": found[:, 1].reshape(-1, 1, 1).copy()}, state
 
     def trace(self, samples: FloatArray, state: kernel.State) -> tuple[FloatArray, FloatArray, kernel.State]:
@@ -194,16 +215,17 @@ class SelfCalibrating(Recursive):
         state = kernel.State(*(part.copy() for part in state))
         mean, deviation = self.prior
         found, parameters = np.empty((len(samples), 2)), np.empty((len(samples), 2 * kernel.STATES))
-        kernel.scan(self.numbers(), *self.bank, mean, deviation, self.decay, self._network, state, self._four(samples), found, parameters)
+        rows = self.with_ax(samples)
+        kernel.scan(self.numbers(), *self.bank_arrays, mean, deviation, self.decay, self.network, state, rows, found, parameters)
         return found, parameters, state
 
-    def _four(self, samples: FloatArray) -> FloatArray:
+    def with_ax(self, samples: FloatArray) -> FloatArray:
         """Samples with a column for ax, also where it is not measured."""
         return np.ascontiguousarray(samples if self.measured_ax else np.column_stack([samples, np.zeros(len(samples))]))
 
     def c_values(self) -> dict[str, Any]:
         """Numbers, priors and the network."""
-        n, (mean, deviation), (grips, start) = self.numbers(), self.prior, self.bank
+        n, (mean, deviation), (grips, start) = self.numbers(), self.prior, self.bank_arrays
         gains = {"g": n.axle_lag, "g_1": n.residual_time, "g_slow": n.slow_time}
         numbers = n._asdict() | {name: -math.expm1(-n.dt / time) for name, time in gains.items()}
         return {
@@ -214,7 +236,7 @@ class SelfCalibrating(Recursive):
             "spread": deviation,
             "decay": self.decay,
             "odds": np.log([1.0, n.network_odds, n.steady_odds]),
-            "theta": self._network,
+            "theta": self.network,
             "window": WINDOW,
             "measured_ax": self.measured_ax,
             "least_limit": kernel.LEAST_LIMIT,
@@ -224,7 +246,7 @@ class SelfCalibrating(Recursive):
 
     def weights(self) -> dict[str, np.ndarray[Any, Any]]:
         """The network's rows, and the yaw rate of its last local model."""
-        return {"network": self._network, "yaw_rate_max": np.array([self._width])}
+        return {"network": self.network, "yaw_rate_max": np.array([self._width])}
 
     def load_weights(self, weights: Mapping[str, np.ndarray[Any, Any]]) -> None:
         """Take the network back.
@@ -235,7 +257,7 @@ class SelfCalibrating(Recursive):
         expected = self.weights()
         if {name: values.shape for name, values in weights.items()} != {name: values.shape for name, values in expected.items()}:
             raise DataError(f"weights of '{self.name}' must be {', '.join(expected)} of the network that comes with vehest")
-        self._network, self._width = np.ascontiguousarray(weights["network"]), float(weights["yaw_rate_max"][0])
+        self.network, self._width = np.ascontiguousarray(weights["network"]), float(weights["yaw_rate_max"][0])
 
 
 @cache

@@ -21,8 +21,9 @@ V, U, OFFSET_Y, OFFSET_X, LEAKAGE, REAR, COMPLIANCE, ERROR = range(STATES)
 CANDIDATES = 3  # this bank, the network that comes with vehest, steady cornering with the priors
 BANK, NETWORK, STEADY = range(CANDIDATES)
 # lagged signals: those of the axle's equation, then those of the candidates' residuals
-YAW_RATE, AY, AX, SUM_AY, SUM_TURN, SUM_ONE, SPEED, SUM_AY_1, SUM_TURN_1, SUM_AX_1, SLOW_AY, TIME, POWER, PREDICTED, AX_OF_SPEED, SLIP = range(16)
 LAGS = 16
+YAW_RATE, AY, AX, SUM_AY, SUM_TURN, SUM_ONE, SPEED, SUM_AY_1, SUM_TURN_1, SUM_AX_1 = range(10)
+SLOW_AY, TIME, POWER, PREDICTED, AX_OF_SPEED, SLIP = range(10, LAGS)
 # of a candidate: low-passed v, sum of ω v, slow parts of both residuals, moments of the residuals, last v
 SMOOTH, SUM_TURN_V, SLOW_Y, SLOW_X, SQUARE_Y, CROSS_Y, SQUARE_X, LAST = range(8)
 LEAST_LIMIT = 0.3  # of a grip limit that longitudinal acceleration leaves
