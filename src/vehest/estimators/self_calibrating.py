@@ -42,8 +42,8 @@ NAMES = (
     "leakage leakage_deviation rear_deviation imu_deviation rear_share offset_ay offset_ay_time offset_ax offset_ax_time "
     "noise_vy noise_delay noise_vx noise_speed axle_lag axle_error_time axle_constant axle_per_speed axle_per_slip "
     "axle_per_bend axle_per_slope axle_white axle_white_share gate memory minimum_speed variance_share angle_floor residual_time slow_time "
-    "residual_floor lateral_power longitudinal_power network_odds steady_odds decision_time network_start dt rear rear_known yaw_rate_max "
-    "without_ax"
+    "residual_floor lateral_power longitudinal_power network_odds steady_odds decision_time network_start dt point rear rear_known "
+    "yaw_rate_max without_ax"
 )
 Numbers: Any = namedtuple("Numbers", NAMES)  # type: ignore[misc]  # importable by its name, else compiled code is not found again
 
@@ -82,7 +82,7 @@ class SelfCalibrating(Recursive):
     leakage: float = setting(0.015, "prior of κ", least=-0.5, most=0.5)
     leakage_deviation: float = setting(0.03, "its deviation", positive=True)
     rear_deviation: float = setting(0.1, "deviation of b over the wheelbase where the centre of gravity is not given", positive=True)
-    imu_deviation: float = setting(0.05, "deviation of the inertial unit's place over the wheelbase, where it is", positive=True)
+    imu_deviation: float = setting(0.05, "deviation of the inertial unit's place over the wheelbase, else of v's point", positive=True)
     rear_share: float = setting(
         0.3, "of b found over typical by which vy is moved to the typical point, where it is not given", least=0.0, most=1.0
     )
@@ -180,6 +180,7 @@ class SelfCalibrating(Recursive):
         """What the compiled recursion takes: numeric settings, times scaled, and what follows from them."""
         own = {name: float(value) for name, value in vars(self.settings).items() if isinstance(value, int | float) and name != "smoothed"}
         own |= {"dt": 1.0 / self.rate_hz, "rear": self.rear, "rear_known": 1.0 if self.cg_to_rear_axle is not None else self.rear_share}
+        own["point"] = 0.0 if self.cg_to_rear_axle is not None else self.imu_deviation * self.wheelbase  # m: of the point of v
         own |= {"yaw_rate_max": self._width, "without_ax": float(not self.measured_ax)}
         if self.rate_hz != NETWORK_HZ or self.wheelbase < SHORTEST_OF_NETWORK:
             own |= {"network_odds": UNLIKELY, "decision_time": 1e9, "network_start": UNLIKELY}  # its weights hold for its own steps alone

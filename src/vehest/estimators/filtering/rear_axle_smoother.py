@@ -74,4 +74,4 @@ def smoothed(estimator: SelfCalibrating, samples: FloatArray, state: kernel.Stat
     values = np.column_stack([own, network, steady])
     vy = (shares * values).sum(axis=1)
     variance = found[:, 2] + (shares * np.square(values - vy[:, None])).sum(axis=1)
-    return np.column_stack([vy, variance + np.square(n.angle_floor * rows[:, 1])])
+    return np.column_stack([vy, variance + np.square(n.angle_floor * rows[:, 1]) + np.square(n.point * rows[:, 0])])

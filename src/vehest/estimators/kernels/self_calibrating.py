@@ -303,4 +303,4 @@ def _combine(values, weights, parameters, sample, n, found):  # type: ignore[no-
     for c in range(CANDIDATES):
         spread += own[c] * (values[c] - mean) ** 2
     found[0] = mean
-    found[1] = n.variance_share * (parameters[STATES + V] + spread) + (n.angle_floor * sample[1]) ** 2
+    found[1] = n.variance_share * (parameters[STATES + V] + spread) + (n.angle_floor * sample[1]) ** 2 + (n.point * sample[0]) ** 2
