@@ -2,7 +2,8 @@
 
 Run by ``make pretrained``, after the study sim_to_real, which has chosen the network's seed, with the study's output root. Bands and
 health are learnt from the simulated drives that the network was trained on and from the other simulated cars on which its training was
-stopped, bands of the filter from 30 other simulated cars; ``--trust`` makes them anew for the models as they are.
+stopped; bands of the filter from 30 other simulated cars and the development cars of ``make unseen_car``, which needs VEHEST_DATA.
+``--trust`` makes them anew for the models as they are.
 """
 
 from __future__ import annotations
@@ -12,7 +13,9 @@ import os
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pandas as pd
+from make_unseen_car import CARS, drives_of
 
 from vehest.data.store import read_recording
 from vehest.estimators.base import Estimator
@@ -95,18 +98,33 @@ def write_its_trust(step: str, output: Path, target: Path = TARGET) -> None:
 
 
 def write_filter(output: Path, target: Path = FILTER) -> None:
-    """The self-calibrating filter, with bands from 30 simulated cars, scaled on one half and calibrated on the other."""
+    """The self-calibrating filter, with bands scaled on 30 simulated cars and calibrated on the drives of its development cars."""
     counts = [f"dataset.drives.{at}.count=5" for at in range(6)]
     made = Runner(output, Messages(), StopSignals()).ingest(
         compose_config("ingest", ["dataset=sim_fleet_real", *counts, f"output={output}"])
     )
     estimator = estimator_class("self_calibrating").from_config({})
     drives = [resampled(read_recording(made.folder / name), estimator.rate_hz, estimator.preparation) for name in sorted(made.outputs)]
-    stretches = [Stretch(drive, drive.start_time, "sim_fleet_real", drive.id) for drive in drives]
+    fleet = [Stretch(drive, drive.start_time, "sim_fleet_real", drive.id) for drive in drives]
     target.mkdir(exist_ok=True)
     save_model(estimator, target, {"n_parameters": 0, "downsample": dict(estimator.preparation), "note": FILTER_NOTE})
     health = read_trust(TARGET).health  # of the same channels, from more cars
-    write_trust(replace(learn_trust(estimator, stretches[::2], stretches[1::2]), guard=None, health=health), target)
+    trust = learn_trust(estimator, fleet, development_drives(output))
+    if trust.bands is None:
+        raise SystemExit(f"no bands: {trust.about.note}")
+    bands = replace(trust.bands, vehicles=())  # of many cars, so that they hold for the next one
+    write_trust(replace(trust, bands=bands, guard=None, health=health), target)
+
+
+def development_drives(output: Path) -> list[Stretch]:
+    """Drives of the cars that the filter's choices were made on, with ax from the speed where it was not measured."""
+    runner, found = Runner(output, Messages(), StopSignals()), []
+    for car in (car for car in CARS if car.development):
+        for drive in drives_of(car, runner, os.environ["VEHEST_DATA"]):
+            ax = drive["ax"] if "ax" in drive else np.gradient(drive["vx"], 1.0 / drive.rate_hz)
+            whole = replace(drive, channels={**drive.channels, "ax": ax})
+            found.append(Stretch(whole, whole.start_time, car.dataset, whole.id))
+    return found
 
 
 def main() -> None:

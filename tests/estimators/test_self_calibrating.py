@@ -10,6 +10,7 @@ from vehest.data.recording import Recording
 from vehest.estimators.kernels import self_calibrating as kernel
 from vehest.estimators.model_files import load_model
 from vehest.estimators.self_calibrating import SelfCalibrating
+from vehest.export.method import method_source
 from vehest.run.estimate import pretrained_folder
 
 RATE = 20.0
@@ -38,10 +39,13 @@ def drive(seconds=60.0, seed=0, compliance=0.006, rear=1.3, leakage=0.02, offset
     return np.ascontiguousarray(samples), v[::fine]
 
 
-def plain_filter(model, samples):
-    """One filter of the bank with matrices, its axle's derivatives by central differences; the size of its error from itself alone."""
+def plain_filter(model, samples, network=None):
+    """One filter of the bank with matrices, its axle's derivatives by central differences; the size of its error from itself alone.
+
+    With v of the network at each sample, (T,), that is the filter whose axle slips as the network has it.
+    """
     n, (mean, deviation) = model.numbers(), model.prior
-    (grip,) = model.grips
+    grip, of_network = model.grips[0], 0.0
     x, p = mean.copy(), np.diag(deviation**2)
     x[1] = samples[0, 1]
     times = np.array([np.inf, np.inf, model.offset_ay_time, model.offset_ax_time, np.inf, np.inf, np.inf, model.axle_error_time])
@@ -49,6 +53,8 @@ def plain_filter(model, samples):
     smooth, sums, last, found = samples[0].copy(), np.zeros(3), samples[0], np.empty((len(samples), 8))
 
     def curve(force):
+        if network is not None:
+            return of_network, 0.0
         limit = np.sqrt(max(grip**2 - smooth[3] ** 2, (0.3 * grip) ** 2))
         share = min(abs(force) / limit, n.largest_share)
         return np.sign(force) * limit * (1.0 - (1.0 - share) ** n.exponent) / n.exponent, (1.0 - share) ** (n.exponent - 1.0)
@@ -60,8 +66,10 @@ def plain_filter(model, samples):
         r, ay, ax = ((last + sample) / 2.0)[[0, 2, 3]]
         turn, speed = (last[0] * last[1] + sample[0] * sample[1]) / 2.0, sample[1]
         sums = (1.0 - g) * (sums + n.dt * np.array([ay, turn, 1.0]))
+        if network is not None:
+            of_network += g * ((mean[5] * sample[0] - network[t]) / n.compliance / sample[1] - of_network)
         phi, slope = curve((smooth[2] - x[2]) * (1.0 - x[4]) - x[5] * turning)
-        bent = n.axle_per_slip * abs(phi) + n.axle_per_bend * (slope - 1.0) + n.axle_per_slope * slope
+        bent = n.axle_per_slip * abs(phi) + n.axle_per_bend * max(slope - 1.0, 0.0) + n.axle_per_slope * slope
         size = n.axle_constant + speed * (n.axle_per_speed + n.compliance * bent)
         a = np.eye(8)
         a[0, 2], a[0, 4], a[1, 0], a[1, 3] = -n.dt, -n.dt * ay, n.dt * r, -n.dt
@@ -72,7 +80,8 @@ def plain_filter(model, samples):
 
         def axle(x, smooth=smooth, sums=sums, turning=turning, size=size, speed=speed):
             phi = curve((smooth[2] - x[2]) * (1.0 - x[4]) - x[5] * turning)[0]
-            return x[0] - (sums[0] * (1.0 - x[4]) - x[2] * sums[2] - sums[1]) - x[5] * smooth[0] + x[6] * speed * phi + size * x[7]
+            rear = x[5] if network is None else mean[5]
+            return x[0] - (sums[0] * (1.0 - x[4]) - x[2] * sums[2] - sums[1]) - rear * smooth[0] + x[6] * speed * phi + size * x[7]
 
         variance = n.axle_white**2 + n.axle_white_share * size**2
         for measured, modelled, r_ in ((speed, lambda x: x[1], n.noise_speed**2), (0.0, axle, variance)):
@@ -91,11 +100,24 @@ def model_of(**settings):
 
 def test_filter_of_one_grip_limit_matches_plain_matrices():
     samples, _ = drive(20.0)
-    model = model_of(grips=[12.0])
+    model = model_of(grips=[12.0], network_start=1e-300)
     _, states, _ = model.trace(samples, model.first_state(samples[0], {}))
     expected = plain_filter(model, samples)
     largest = np.abs(expected).max(axis=0)
     np.testing.assert_allclose(states[:, :8] / largest, expected / largest, rtol=0.0, atol=1e-6)
+
+
+def test_filter_with_the_networks_axle_matches_plain_matrices():
+    samples, _ = drive(20.0)
+    model = model_of(grips=[300.0], network_start=1e12)  # so that the other filter has no weight
+    state, network, states = model.first_state(samples[0], {}), np.empty(len(samples)), np.empty((len(samples), 8))
+    for k in range(len(samples)):
+        network[k] = state.lags[kernel.PREDICTED]
+        _, _, state = model.trace(samples[k : k + 1], state)
+        states[k] = state.means[-1]
+    expected = plain_filter(model, samples, network)
+    largest = np.abs(expected).max(axis=0)
+    np.testing.assert_allclose(states / largest, expected / largest, rtol=0.0, atol=1e-6)
 
 
 def test_network_inside_is_the_one_that_comes_with_vehest():
@@ -180,3 +202,50 @@ def test_refuses_weights_of_another_network():
 def test_compiled_code_is_found_again_in_the_next_process():
     numbers = SelfCalibrating.from_config({}).numbers()
     assert pickle.loads(pickle.dumps(type(numbers))) is type(numbers), "its type is in the key of the compiled code"
+
+
+def test_smoother_matches_joint_least_squares_of_a_rolling_car():
+    rng, model = np.random.default_rng(2), model_of(smoothed=True, leakage=0.0, leakage_deviation=1e-9, steady_odds=1e-12, angle_floor=0.0)
+    samples = np.column_stack([np.zeros(25), 2.0 + 0.1 * rng.normal(size=25), 0.1 * rng.normal(size=25), 0.2 * rng.normal(size=25)])
+    n, deviation, steps = model.numbers(), model.prior[1], len(samples)
+    step, decay = np.eye(4), model.decay[:4]  # of v, u and the offsets of ay and ax
+    step[0, 2], step[1, 3] = -n.dt, -n.dt
+    step *= decay[:, None]
+    noise = np.array([n.dt * n.noise_vy**2, n.dt * n.noise_vx**2, *np.square(deviation[2:4]) * (1.0 - decay[2:] ** 2)])
+    middle = (np.vstack([samples[:1], samples[:-1]]) + samples) / 2.0
+    rows, values = [np.hstack([np.eye(4), np.zeros((4, 4 * steps))]) / deviation[:4, None]], [np.array([0.0, samples[0, 1], 0, 0])]
+    values[0] /= deviation[:4]
+    for k in range(steps):
+        moved = np.zeros((4, 4 * (steps + 1)))
+        moved[:, 4 * k : 4 * k + 4], moved[:, 4 * k + 4 : 4 * k + 8] = -step, np.eye(4)
+        rows.append(moved / np.sqrt(noise)[:, None])
+        values.append(np.array([n.dt * middle[k, 2], n.dt * middle[k, 3], 0.0, 0.0]) / np.sqrt(noise))
+        measured = np.zeros((2, 4 * (steps + 1)))
+        measured[0, 4 * k + 5], measured[1, 4 * k + 4] = 1.0 / n.noise_speed, 1.0 / kernel.ROLLING
+        rows.append(measured)
+        values.append(np.array([samples[k, 1] / n.noise_speed, 0.0]))
+    stacked = np.vstack(rows)
+    expected, covariance = np.linalg.lstsq(stacked, np.concatenate(values), rcond=None)[0], np.linalg.inv(stacked.T @ stacked)
+    estimate, _ = model.run(samples, model.first_state(samples[0], {}))
+    np.testing.assert_allclose(estimate["vy"], expected[4::4], rtol=0.0, atol=1e-8)
+    np.testing.assert_allclose(estimate["covariance"][:, 0, 0], np.diag(covariance)[4::4], rtol=1e-6)
+
+
+def test_smoothed_estimates_err_less_within_their_bands():
+    causal, smooth, within = [], [], []
+    for seed in range(4):
+        samples, vy = drive(40.0, seed, compliance=0.004 + 0.001 * seed)
+        for errors, model in ((causal, model_of()), (smooth, model_of(smoothed=True))):
+            estimate, _ = model.run(samples, model.first_state(samples[0], {}))
+            errors.append(np.std(estimate["vy"] - vy))
+        within.append(np.mean(np.abs(estimate["vy"] - vy) < 1.645 * np.sqrt(estimate["covariance"][:, 0, 0])))
+    assert np.median(smooth) < 0.8 * np.median(causal)
+    assert np.mean(within) > 0.85
+
+
+def test_smoother_is_offline_and_refuses_online_and_c():
+    model = model_of(smoothed=True)
+    assert not model.causal
+    for refused in (model.online, lambda: method_source(model, "double")):
+        with pytest.raises(ConfigurationError, match="smooths a whole drive and cannot run online; use estimator"):
+            refused()

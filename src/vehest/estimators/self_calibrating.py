@@ -14,7 +14,8 @@ import numpy as np
 from vehest.constants import FloatArray
 from vehest.data.errors import ConfigurationError, DataError
 from vehest.declared import setting
-from vehest.estimators.base import rate
+from vehest.estimators.base import Stepper, rate
+from vehest.estimators.filtering.rear_axle_smoother import smoothed
 from vehest.estimators.kernels import self_calibrating as kernel
 from vehest.estimators.kernels.ksnn import packed
 from vehest.estimators.ksnn import Ksnn
@@ -26,19 +27,23 @@ TYPICAL_REAR = 0.48  # of the wheelbase, where the centre of gravity is not give
 SCALED = {
     **dict.fromkeys(("axle_lag", "residual_time", "slow_time", "memory", "decision_time"), 0.5),
     **dict.fromkeys(("minimum_speed", "noise_speed", "axle_constant", "axle_white", "residual_floor"), 0.5),
-    **{"noise_vy": 0.25, "noise_vx": 0.25, "noise_delay": 0.75},
+    **{"noise_vy": 0.25, "noise_vx": 0.25, "noise_delay": 0.75, "steady_odds": -4.0},
 }
-"""Powers of the wheelbase over the typical one that scale settings: times and speeds go with its root, accelerations are alike."""
+"""Powers of the wheelbase over the typical one that scale settings: times and speeds go with its root, accelerations are alike.
+
+Steady cornering counts for more the smaller the car, whose turns the filter's samples and wheel speeds resolve less."""
+SHORTEST_OF_NETWORK = 1.5  # m, wheelbase: smaller cars turn faster than the network's steps of time resolve
 WINDOW, NETWORK_HZ = 30, 20.0  # samples that the network sees, and their rate
+UNLIKELY = 1e-300  # weight of what does not count
 UNMEASURED = 20.0  # m/s per √s: process noise of u where ax is not measured
 
 NAMES = (
     "rate_hz wheelbase measured_ax grip grip_deviation grip_excess exponent largest_share compliance compliance_deviation "
     "leakage leakage_deviation rear_deviation imu_deviation rear_share offset_ay offset_ay_time offset_ax offset_ax_time "
     "noise_vy noise_delay noise_vx noise_speed axle_lag axle_error_time axle_constant axle_per_speed axle_per_slip "
-    "axle_per_bend axle_per_slope axle_white axle_white_share gate memory minimum_speed angle_floor residual_time slow_time "
-    "residual_floor lateral_power longitudinal_power decision_time network_odds steady_odds dt rear rear_known yaw_rate_max "
-    "without_ax"
+    "axle_per_bend axle_per_slope axle_white axle_white_share gate memory minimum_speed variance_share angle_floor residual_time slow_time "
+    "residual_floor lateral_power longitudinal_power network_odds steady_odds decision_time network_start dt point rear rear_known "
+    "yaw_rate_max without_ax"
 )
 Numbers: Any = namedtuple("Numbers", NAMES)  # type: ignore[misc]  # importable by its name, else compiled code is not found again
 
@@ -54,7 +59,7 @@ class SelfCalibrating(Recursive):
     and C count by how well each explains v' and u' on the drive so far, which needs no reference.
     """
 
-    name, title = "self_calibrating", "Self-calibrating filter"
+    name, title, version = "self_calibrating", "Self-calibrating filter", "2"
     covariance_of = ("vy",)
     channels: tuple[str, ...] = ("yaw_rate", "vx", "ay", "ax")  # type: ignore[misc]  # ax may be absent
     notice = Ksnn.notice
@@ -64,9 +69,10 @@ class SelfCalibrating(Recursive):
     rate_hz: float = rate(20.0)
     wheelbase: float = setting(TYPICAL_WHEELBASE, "wheelbase", unit="m", positive=True)
     cg_to_rear_axle: float = setting(None, "distance of the centre of gravity from the rear axle; null: 0.48 wheelbases", unit="m")
+    smoothed: bool = setting(False, "whether each estimate is made of the whole drive, offline; parameters are those at its end")
     measured_ax: bool = setting(True, "whether ax is measured; else the longitudinal equation tells nothing")
     grips: tuple[float, ...] = setting((4.5, 6.0, 7.5, 9.0, 10.5, 12.0, 14.0, 17.0, 25.0), "grip limits a_max of the bank [m/s²]")
-    grip: float = setting(16.0, "median of the prior of a_max", unit="m/s²", positive=True)
+    grip: float = setting(14.0, "median of the prior of a_max", unit="m/s²", positive=True)
     grip_deviation: float = setting(0.55, "deviation of its logarithm", positive=True)
     grip_excess: float = setting(2.0, "deviation over a second of accelerations beyond a grip limit", unit="m/s²", positive=True)
     exponent: float = setting(0.25, "p of the axle's curve", above=0.0, most=1.0)
@@ -76,16 +82,16 @@ class SelfCalibrating(Recursive):
     leakage: float = setting(0.015, "prior of κ", least=-0.5, most=0.5)
     leakage_deviation: float = setting(0.03, "its deviation", positive=True)
     rear_deviation: float = setting(0.1, "deviation of b over the wheelbase where the centre of gravity is not given", positive=True)
-    imu_deviation: float = setting(0.05, "deviation of the inertial unit's place over the wheelbase, where it is", positive=True)
+    imu_deviation: float = setting(0.05, "deviation of the inertial unit's place over the wheelbase, else of v's point", positive=True)
     rear_share: float = setting(
         0.3, "of b found over typical by which vy is moved to the typical point, where it is not given", least=0.0, most=1.0
     )
     offset_ay: float = setting(0.65, "deviation of β_y", unit="m/s²", positive=True)
     offset_ay_time: float = setting(20.0, "time constant of β_y", unit="s", positive=True)
     offset_ax: float = setting(0.2, "deviation of β_x", unit="m/s²", positive=True)
-    offset_ax_time: float = setting(15.0, "time constant of β_x", unit="s", positive=True)
+    offset_ax_time: float = setting(10.0, "time constant of β_x", unit="s", positive=True)
     noise_vy: float = setting(0.05, "process noise of v over a second", unit="m/s", positive=True)
-    noise_delay: float = setting(0.03, "process noise of v for each m/s³ by which u ω changes", unit="√s³", least=0.0)
+    noise_delay: float = setting(0.02, "process noise of v for each m/s³ by which u ω changes", unit="√s³", least=0.0)
     noise_vx: float = setting(0.1, "process noise of u over a second", unit="m/s", positive=True)
     noise_speed: float = setting(0.15, "deviation of the measured speed", unit="m/s", positive=True)
     axle_lag: float = setting(0.3, "low-pass of v, ω and ay in the axle's equation", unit="s", positive=True)
@@ -100,20 +106,22 @@ class SelfCalibrating(Recursive):
     gate: float = setting(3.0, "deviations at which an innovation is cut off", positive=True)
     memory: float = setting(150.0, "time after which the drive counts e times less in all weights", unit="s", positive=True)
     minimum_speed: float = setting(3.0, "speed below which v = b ω and parameters stay", unit="m/s", positive=True)
-    angle_floor: float = setting(0.0035, "least deviation of the sideslip angle", unit="rad", least=0.0)
+    variance_share: float = setting(0.5, "share of the filters' and candidates' variance that is reported", positive=True)
+    angle_floor: float = setting(0.0025, "least deviation of the sideslip angle", unit="rad", least=0.0)
     residual_time: float = setting(1.0, "high-pass of v in the candidates' residuals", unit="s", positive=True)
     slow_time: float = setting(20.0, "high-pass of the residuals", unit="s", positive=True)
     residual_floor: float = setting(0.03, "residual below which candidates are alike", unit="m/s", positive=True)
-    lateral_power: float = setting(6.0, "power by which the residual of v' counts", least=0.0)
-    longitudinal_power: float = setting(4.0, "power by which the residual of u' counts", least=0.0)
-    decision_time: float = setting(10.0, "driving after which residuals count", unit="s", positive=True)
-    network_odds: float = setting(1.2, "weight of the network over the bank's at the start", positive=True)
-    steady_odds: float = setting(0.2, "weight of steady cornering over the bank's at the start", positive=True)
+    lateral_power: float = setting(10.0, "power by which the residual of v' counts", least=0.0)
+    longitudinal_power: float = setting(7.0, "power by which the residual of u' counts", least=0.0)
+    network_odds: float = setting(5.0, "weight of the network over the bank's at the start", positive=True)
+    decision_time: float = setting(25.0, "driving after which they differ e times less", unit="s", positive=True)
+    steady_odds: float = setting(0.4, "weight of steady cornering over the bank's at the start", positive=True)
+    network_start: float = setting(0.7, "weight at the start of the filter with the network's axle", positive=True)
 
     def __init__(self, settings: Any) -> None:
         super().__init__(settings)
         self.channels = type(self).channels if self.measured_ax else type(self).channels[:3]
-        self._network, self._width = _shipped_network()
+        self.network, self._width = _shipped_network()
 
     def check(self) -> None:
         """Raises:
@@ -127,9 +135,32 @@ class SelfCalibrating(Recursive):
             raise ConfigurationError(f"estimator.grips must be positive accelerations, not {list(self.grips)}")
 
     @property
+    def causal(self) -> bool:
+        """Unless it smooths."""
+        return not self.smoothed
+
+    @property
+    def full_title(self) -> str:
+        """Title with whether it smooths."""
+        return f"{self.title}, smoothed" if self.smoothed else self.title
+
+    def online(self) -> Stepper:
+        """A stepper in its initial state; raises `ConfigurationError` where it smooths."""
+        if self.smoothed:
+            raise ConfigurationError(f"estimator '{self.name}' smooths a whole drive and cannot run online; use estimator.smoothed=false")
+        return super().online()
+
+    @property
     def rear(self) -> float:
         """Distance of the rear axle behind the reference point [m], as given or typical."""
         return TYPICAL_REAR * self.wheelbase if self.cg_to_rear_axle is None else float(self.cg_to_rear_axle)
+
+    @property
+    def bank_arrays(self) -> tuple[FloatArray, FloatArray]:
+        """Grip limits of the filters [m/s²], 0 for that with the network's axle, and logarithms of their weights at the start, (J,)."""
+        grips = np.array(self.grips, dtype=np.float64)
+        start = -0.5 * np.square(np.log(grips / self.grip) / self.grip_deviation)
+        return np.append(grips, 0.0), np.append(start, math.log(self.numbers().network_start))
 
     @property
     def prior(self) -> tuple[FloatArray, FloatArray]:
@@ -147,11 +178,12 @@ class SelfCalibrating(Recursive):
 
     def numbers(self) -> Any:
         """What the compiled recursion takes: numeric settings, times scaled, and what follows from them."""
-        own = {name: float(value) for name, value in vars(self.settings).items() if isinstance(value, int | float)}
+        own = {name: float(value) for name, value in vars(self.settings).items() if isinstance(value, int | float) and name != "smoothed"}
         own |= {"dt": 1.0 / self.rate_hz, "rear": self.rear, "rear_known": 1.0 if self.cg_to_rear_axle is not None else self.rear_share}
+        own["point"] = 0.0 if self.cg_to_rear_axle is not None else self.imu_deviation * self.wheelbase  # m: of the point of v
         own |= {"yaw_rate_max": self._width, "without_ax": float(not self.measured_ax)}
-        if self.rate_hz != NETWORK_HZ:
-            own["network_odds"] = 1e-300  # its weights hold for its own steps alone
+        if self.rate_hz != NETWORK_HZ or self.wheelbase < SHORTEST_OF_NETWORK:
+            own |= {"network_odds": UNLIKELY, "decision_time": 1e9, "network_start": UNLIKELY}  # its weights hold for its own steps alone
         own.pop("cg_to_rear_axle", None)
         own |= {name: own[name] * (self.wheelbase / TYPICAL_WHEELBASE) ** power for name, power in SCALED.items()}
         if not self.measured_ax:
@@ -162,19 +194,21 @@ class SelfCalibrating(Recursive):
         """The priors, v = 0 or what is given, and the measured speed."""
         mean, deviation = self.prior
         mean[kernel.V], mean[kernel.U] = given.get("vy", 0.0), sample[1]
-        filters, lags = len(self.grips), np.zeros(kernel.LAGS)
-        first = self._four(sample[None])[0]
+        lags = np.zeros(kernel.LAGS)
+        first = self.with_ax(sample[None])[0]
         lags[[kernel.YAW_RATE, kernel.AY, kernel.AX, kernel.SPEED, kernel.AX_OF_SPEED]] = *first[[0, 2, 3]], sample[1], sample[1]
-        weights = -0.5 * np.square(np.log(np.array(self.grips) / self.grip) / self.grip_deviation)
-        covariances = np.repeat(np.diag(np.square(deviation))[None], filters, axis=0)
-        window, candidates = np.full((WINDOW, 4), np.nan), np.zeros((kernel.CANDIDATES, 8))
-        return kernel.State(
-            np.repeat(mean[None], filters, axis=0), covariances, weights, lags, candidates, np.ones(kernel.CANDIDATES), first, window
-        )
+        lags[kernel.PREDICTED] = first[0] * (self.rear - self.compliance * first[1] ** 2)
+        weights = self.bank_arrays[1]
+        means, covariances = np.tile(mean, (len(weights), 1)), np.tile(np.diag(np.square(deviation)), (len(weights), 1, 1))
+        candidates = np.zeros((kernel.CANDIDATES, 8)), np.ones(kernel.CANDIDATES)
+        return kernel.State(means, covariances, weights, lags, *candidates, first, np.tile(first, (WINDOW, 1)))
 
     def run(self, samples: FloatArray, state: kernel.State) -> tuple[dict[str, Any], kernel.State]:
         """vy [m/s] and its variance."""
-        found, _, state = self.trace(samples, state)
+        if self.smoothed:
+            found = smoothed(self, samples, state)
+        else:
+            found, _, state = self.trace(samples, state)
         return {"vy": found[:, 0].copy(), "covariance": found[:, 1].reshape(-1, 1, 1).copy()}, state
 
     def trace(self, samples: FloatArray, state: kernel.State) -> tuple[FloatArray, FloatArray, kernel.State]:
@@ -182,28 +216,28 @@ class SelfCalibrating(Recursive):
         state = kernel.State(*(part.copy() for part in state))
         mean, deviation = self.prior
         found, parameters = np.empty((len(samples), 2)), np.empty((len(samples), 2 * kernel.STATES))
-        grips = np.array(self.grips, dtype=np.float64)
-        kernel.scan(self.numbers(), grips, mean, deviation, self.decay, self._network, state, self._four(samples), found, parameters)
+        rows = self.with_ax(samples)
+        kernel.scan(self.numbers(), *self.bank_arrays, mean, deviation, self.decay, self.network, state, rows, found, parameters)
         return found, parameters, state
 
-    def _four(self, samples: FloatArray) -> FloatArray:
+    def with_ax(self, samples: FloatArray) -> FloatArray:
         """Samples with a column for ax, also where it is not measured."""
         return np.ascontiguousarray(samples if self.measured_ax else np.column_stack([samples, np.zeros(len(samples))]))
 
     def c_values(self) -> dict[str, Any]:
         """Numbers, priors and the network."""
-        n, (mean, deviation), grips = self.numbers(), self.prior, np.array(self.grips)
+        n, (mean, deviation), (grips, start) = self.numbers(), self.prior, self.bank_arrays
         gains = {"g": n.axle_lag, "g_1": n.residual_time, "g_slow": n.slow_time}
         numbers = n._asdict() | {name: -math.expm1(-n.dt / time) for name, time in gains.items()}
         return {
             "numbers": numbers,
             "grips": grips,
-            "start": -0.5 * np.square(np.log(grips / n.grip) / n.grip_deviation),
+            "start": start,
             "prior": mean,
             "spread": deviation,
             "decay": self.decay,
             "odds": np.log([1.0, n.network_odds, n.steady_odds]),
-            "theta": self._network,
+            "theta": self.network,
             "window": WINDOW,
             "measured_ax": self.measured_ax,
             "least_limit": kernel.LEAST_LIMIT,
@@ -213,7 +247,7 @@ class SelfCalibrating(Recursive):
 
     def weights(self) -> dict[str, np.ndarray[Any, Any]]:
         """The network's rows, and the yaw rate of its last local model."""
-        return {"network": self._network, "yaw_rate_max": np.array([self._width])}
+        return {"network": self.network, "yaw_rate_max": np.array([self._width])}
 
     def load_weights(self, weights: Mapping[str, np.ndarray[Any, Any]]) -> None:
         """Take the network back.
@@ -224,7 +258,7 @@ class SelfCalibrating(Recursive):
         expected = self.weights()
         if {name: values.shape for name, values in weights.items()} != {name: values.shape for name, values in expected.items()}:
             raise DataError(f"weights of '{self.name}' must be {', '.join(expected)} of the network that comes with vehest")
-        self._network, self._width = np.ascontiguousarray(weights["network"]), float(weights["yaw_rate_max"][0])
+        self.network, self._width = np.ascontiguousarray(weights["network"]), float(weights["yaw_rate_max"][0])
 
 
 @cache

@@ -180,7 +180,7 @@ def write_evaluation(job: EvaluateJob, folder: Path) -> None:
         for position, piece in enumerate(pieces):
             if bands is not None:  # wider on vehicles without calibration and on test sets that the protocol names
                 measured = job.measured(piece)
-                other_vehicle = measured.vehicle not in bands.vehicles or name in protocol.sets_elsewhere
+                other_vehicle = not bands.are_of(measured.vehicle) or name in protocol.sets_elsewhere
                 estimates[position] = with_bands(estimates[position], measured, bands, elsewhere=other_vehicle)
             write_estimate(estimates[position], folder / name / f"{position}.parquet")
         scored = job.score(spans, estimates)

@@ -84,7 +84,7 @@ class Quantity:
 class Bands:
     """Half widths of v and β of one model."""
 
-    vehicles: tuple[str, ...]  # that were driven where it was calibrated
+    vehicles: tuple[str, ...]  # that were driven where it was calibrated; none: a new car for each drive, as any car is to the model
     datasets: tuple[str, ...]  # whose recordings these are
     scaled_on: tuple[str, ...]  # ranges that gave scale and domain
     calibrated_on: tuple[str, ...]  # ranges that gave the factors
@@ -99,6 +99,10 @@ class Bands:
 
     def __post_init__(self) -> None:
         _check_terms("largest", self.largest)
+
+    def are_of(self, vehicle: str) -> bool:
+        """Whether they were calibrated on a vehicle."""
+        return not self.vehicles or vehicle in self.vehicles
 
     def packed(self, *, elsewhere: bool = False) -> PackedBands:
         """Arguments of `band_rows` for `SHOWN_LEVEL`; ``elsewhere``: the car or its tyres are others than those calibrated on."""

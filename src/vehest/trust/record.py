@@ -41,7 +41,7 @@ class Trust:
 
 def is_other_vehicle(trust: Trust | None, recording: Recording) -> bool:
     """Whether a recording is of another vehicle than those that bands were calibrated on."""
-    return trust is not None and trust.bands is not None and recording.vehicle not in trust.bands.vehicles
+    return trust is not None and trust.bands is not None and not trust.bands.are_of(recording.vehicle)
 
 
 def write_trust(trust: Trust, folder: Path) -> None:

@@ -21,12 +21,13 @@ V, U, OFFSET_Y, OFFSET_X, LEAKAGE, REAR, COMPLIANCE, ERROR = range(STATES)
 CANDIDATES = 3  # this bank, the network that comes with vehest, steady cornering with the priors
 BANK, NETWORK, STEADY = range(CANDIDATES)
 # lagged signals: those of the axle's equation, then those of the candidates' residuals
-YAW_RATE, AY, AX, SUM_AY, SUM_TURN, SUM_ONE, SPEED, SUM_AY_1, SUM_TURN_1, SUM_AX_1, SLOW_AY, TIME, POWER, PREDICTED, AX_OF_SPEED = range(15)
-LAGS = 15
+LAGS = 16
+YAW_RATE, AY, AX, SUM_AY, SUM_TURN, SUM_ONE, SPEED, SUM_AY_1, SUM_TURN_1, SUM_AX_1 = range(10)
+SLOW_AY, TIME, POWER, PREDICTED, AX_OF_SPEED, SLIP = range(10, LAGS)
 # of a candidate: low-passed v, sum of ω v, slow parts of both residuals, moments of the residuals, last v
 SMOOTH, SUM_TURN_V, SLOW_Y, SLOW_X, SQUARE_Y, CROSS_Y, SQUARE_X, LAST = range(8)
 LEAST_LIMIT = 0.3  # of a grip limit that longitudinal acceleration leaves
-LARGEST_LEAKAGE = 0.1
+LARGEST_LEAKAGE = 0.05
 ROLLING = 0.05  # m/s: deviation of v = b ω of a car that rolls slowly
 
 
@@ -36,19 +37,25 @@ class State(NamedTuple):
     means: FloatArray  # (J, 8)
     covariances: FloatArray  # (J, 8, 8)
     log_weights: FloatArray  # (J,)
-    lags: FloatArray  # (15,)
+    lags: FloatArray  # (16,)
     candidates: FloatArray  # (3, 8)
     weights: FloatArray  # (3,), of the candidates
     last: FloatArray  # (4,), the sample before
-    window: FloatArray  # (N, 4), the last samples, the oldest first; unused rows are NaN
+    window: FloatArray  # (N, 4), the last samples, the oldest first; the first sample stands for those before it
 
 
 @part()
-def _curve(force, limit, n):  # type: ignore[no-untyped-def]
-    """φ and dφ/da of the rear axle, φ = a_m (1 - (1 - |a|/a_m)^p)/p with the sign of a."""
+def _rear_slip(force, grip, lags, n):  # type: ignore[no-untyped-def]
+    """φ and dφ/da of the rear axle, and the acceleration beyond its limit; a filter without a grip limit (0) takes φ of the network.
+
+    φ = a_m (1 - (1 - |a|/a_m)^p)/p with the sign of a, a_m what the longitudinal acceleration leaves of the grip limit.
+    """
+    if grip <= 0.0:
+        return lags[SLIP], 0.0, 0.0
+    limit = math.sqrt(max(grip * grip - lags[AX] ** 2, (LEAST_LIMIT * grip) ** 2))
     share = min(abs(force) / limit, n.largest_share)
     left = (1.0 - share) ** n.exponent
-    return math.copysign(limit * (1.0 - left) / n.exponent, force), left / (1.0 - share)
+    return math.copysign(limit * (1.0 - left) / n.exponent, force), left / (1.0 - share), max(abs(force) - limit, 0.0)
 
 
 @part()
@@ -103,27 +110,20 @@ def _update(x, p, row, residual, variance, gate, learns, scratch):  # type: igno
 
 
 @part()
-def _limit(grip, lags):  # type: ignore[no-untyped-def]
-    """Lateral acceleration at the limit of the rear axle that the longitudinal one leaves."""
-    return math.sqrt(max(grip * grip - lags[AX] ** 2, (LEAST_LIMIT * grip) ** 2))
-
-
-@part()
-def _axle(x, p, limit, n, lags, turning, speed, size, row, scratch):  # type: ignore[no-untyped-def]
+def _axle(x, p, grip, n, lags, turning, speed, size, row, scratch):  # type: ignore[no-untyped-def]
     """0 = v - b ω + C u φ(a_r) + s e at the rear axle, low-passed: v - τ dv/dt stands for the low-passed v."""
     own, force = 1.0 - x[LEAKAGE], (lags[AY] - x[OFFSET_Y]) * (1.0 - x[LEAKAGE]) - x[REAR] * turning
-    slip, slope = _curve(force, limit, n)
+    slip, slope, excess = _rear_slip(force, grip, lags, n)
     smooth = x[V] - lags[SUM_AY] * own + x[OFFSET_Y] * lags[SUM_ONE] + lags[SUM_TURN]
     residual = x[REAR] * lags[YAW_RATE] - x[COMPLIANCE] * speed * slip - size * x[ERROR] - smooth
     gain = x[COMPLIANCE] * speed * slope
     row[V], row[U], row[OFFSET_X] = 1.0, 0.0, 0.0
     row[OFFSET_Y] = lags[SUM_ONE] - gain * own
     row[LEAKAGE] = lags[SUM_AY] - gain * (lags[AY] - x[OFFSET_Y])
-    row[REAR] = -lags[YAW_RATE] - gain * turning
+    row[REAR] = -lags[YAW_RATE] - gain * turning if grip > 0.0 else 0.0
     row[COMPLIANCE] = speed * slip
     row[ERROR] = size
-    excess = max(abs(force) - limit, 0.0) / n.grip_excess  # which the grip limit rules out
-    surplus = 0.5 * min(excess * excess, n.gate * n.gate) * n.dt
+    surplus = 0.5 * min(excess / n.grip_excess, n.gate) ** 2 * n.dt  # which the grip limit rules out
     return _update(x, p, row, residual, n.axle_white**2 + n.axle_white_share * size**2, n.gate, True, scratch) - surplus
 
 
@@ -177,7 +177,7 @@ def _judge(found, own, weights, lags, sample, yaw_rate, n, g_1, g_slow, moving):
         lags[TIME] = lags[TIME] * keep + n.dt
         lags[POWER] = lags[POWER] * keep + ay * ay * n.dt
     best = -math.inf
-    ready = 1.0 - math.exp(-lags[TIME] / n.decision_time)
+    odds = (0.0, math.log(n.network_odds) * math.exp(-lags[TIME] / n.decision_time), math.log(n.steady_odds))
     for c in range(CANDIDATES):
         one, v = own[c], found[c]
         one[SMOOTH] += g_1 * (v - one[SMOOTH])
@@ -197,7 +197,7 @@ def _judge(found, own, weights, lags, sample, yaw_rate, n, g_1, g_slow, moving):
         of_y = max(one[SQUARE_Y] - 2.0 * leakage * one[CROSS_Y] + leakage**2 * lags[POWER], 0.0) / time
         of_x = one[SQUARE_X] / time
         score = n.lateral_power * math.log(of_y + n.residual_floor**2) + n.longitudinal_power * math.log(of_x + n.residual_floor**2)
-        weights[c] = (0.0, math.log(n.network_odds), math.log(n.steady_odds))[c] - 0.5 * ready * score
+        weights[c] = odds[c] - 0.5 * score
         best = max(best, weights[c])
     total = 0.0
     for c in range(CANDIDATES):
@@ -208,12 +208,13 @@ def _judge(found, own, weights, lags, sample, yaw_rate, n, g_1, g_slow, moving):
 
 
 @entry()
-def scan(n, grips, prior, spread, decay, theta, state, samples, found, parameters):  # type: ignore[no-untyped-def]
+def scan(n, grips, start, prior, spread, decay, theta, state, samples, found, parameters):  # type: ignore[no-untyped-def]
     """Go through samples; changes ``state`` in place.
 
     Args:
         n: numbers of the estimator, a named tuple.
-        grips: grip limits of the bank, (J,) [m/s²].
+        grips: grip limits of the bank, (J,) [m/s²]; 0 for the filter whose axle slips as the network has it.
+        start: logarithms of the bank's weights at the start, (J,).
         prior, spread: mean and standard deviation of the states at the start, (8,).
         decay: factors by which they return to it in a sample, (8,).
         theta: weights of the network, (P, 8 + 6 Q).
@@ -225,15 +226,15 @@ def scan(n, grips, prior, spread, decay, theta, state, samples, found, parameter
     g, g_1, g_slow = -math.expm1(-n.dt / n.axle_lag), -math.expm1(-n.dt / n.residual_time), -math.expm1(-n.dt / n.slow_time)
     means, lags, last, window = state.means, state.lags, state.last, state.window
     row, scratch, values = np.zeros(STATES), np.zeros(STATES), np.zeros(CANDIDATES)
-    start, weights = np.empty(len(grips)), np.empty(len(grips))
-    for j in range(len(grips)):
-        start[j] = -0.5 * (math.log(grips[j] / n.grip) / n.grip_deviation) ** 2
+    weights = np.empty(len(grips))
     for t in range(len(samples)):
         sample = samples[t].copy()
         if n.without_ax:
             sample[3] = (sample[1] - lags[AX_OF_SPEED]) / n.axle_lag
             lags[AX_OF_SPEED] += g * (sample[1] - lags[AX_OF_SPEED])
         turning = _advance_lags(lags, sample, last, n, g, g_1, g_slow)
+        slip = (n.rear * sample[0] - lags[PREDICTED]) / (n.compliance * max(sample[1], n.minimum_speed))
+        lags[SLIP] += g * (slip - lags[SLIP])
         speed, moving = sample[1], sample[1] > n.minimum_speed
         yaw_rate, turn = (last[0] + sample[0]) / 2.0, (last[0] * last[1] + sample[0] * speed) / 2.0
         ay, ax = (last[2] + sample[2]) / 2.0, (last[3] + sample[3]) / 2.0
@@ -242,8 +243,8 @@ def scan(n, grips, prior, spread, decay, theta, state, samples, found, parameter
         for j in range(len(grips)):
             x = means[j]
             force = (lags[AY] - x[OFFSET_Y]) * (1.0 - x[LEAKAGE]) - x[REAR] * turning
-            slip, slope = _curve(force, _limit(grips[j], lags), n)
-            bent = n.axle_per_slip * abs(slip) + n.axle_per_bend * (slope - 1.0) + n.axle_per_slope * slope
+            slip, slope, _ = _rear_slip(force, grips[j], lags, n)
+            bent = n.axle_per_slip * abs(slip) + n.axle_per_bend * max(slope - 1.0, 0.0) + n.axle_per_slope * slope
             size += weights[j] * (n.axle_constant + max(speed, 0.0) * (n.axle_per_speed + n.compliance * bent))
         for j in range(len(grips)):
             x, p = means[j], state.covariances[j]
@@ -252,54 +253,54 @@ def scan(n, grips, prior, spread, decay, theta, state, samples, found, parameter
             row[U] = 1.0
             likelihood = _update(x, p, row, speed - x[U], n.noise_speed**2, n.gate, moving, scratch)
             if moving:
-                likelihood += _axle(x, p, _limit(grips[j], lags), n, lags, turning, speed, size, row, scratch)
+                likelihood += _axle(x, p, grips[j], n, lags, turning, speed, size, row, scratch)
                 state.log_weights[j] = start[j] + (state.log_weights[j] - start[j]) * (1.0 - n.dt / n.memory) + likelihood
             else:
                 row[:] = 0.0
                 row[V], row[REAR] = 1.0, -sample[0]
                 _update(x, p, row, x[REAR] * sample[0] - x[V], ROLLING**2, n.gate, False, scratch)
-        _normalise(state.log_weights, weights)
-        _mixture(means, state.covariances, weights, parameters[t])
-        values[BANK], values[NETWORK] = parameters[t, V], lags[PREDICTED]
+        _mixture(means, state.covariances, state.log_weights, weights, parameters[t])
+        values[BANK], values[NETWORK] = 0.0, lags[PREDICTED]
+        for j in range(len(grips)):
+            values[BANK] += weights[j] * (means[j, V] + n.rear_known * (n.rear - means[j, REAR]) * sample[0])
         values[STEADY] = sample[0] * (n.rear - n.compliance * speed * speed)
         _judge(values, state.candidates, state.weights, lags, sample, yaw_rate, n, g_1, g_slow, moving)
         _combine(values, state.weights, parameters[t], sample, n, found[t])
         window[:-1] = window[1:]
         window[-1] = sample
-        lags[PREDICTED] = _network(theta, n.yaw_rate_max, window, n.dt) if not math.isnan(window[0, 1]) else values[STEADY]
+        lags[PREDICTED] = _network(theta, n.yaw_rate_max, window, n.dt)
         last[:] = sample
 
 
 @part()
 def _normalise(log_weights, weights):  # type: ignore[no-untyped-def]
-    """Weights of sum 1; the largest logarithm becomes 0."""
-    log_weights -= log_weights.max()
-    weights[:] = np.exp(log_weights)
+    """Weights of sum 1 from their logarithms."""
+    weights[:] = np.exp(log_weights - log_weights.max())
     weights /= weights.sum()
 
 
 @part()
-def _mixture(means, covariances, weights, found):  # type: ignore[no-untyped-def]
-    """Mean and variance of the states over the bank, differences between its filters included."""
+def _mixture(means, covariances, log_weights, weights, found):  # type: ignore[no-untyped-def]
+    """Mean and variance of the states over the bank, differences between filters included; of b and C without the network's filter."""
     found[:] = 0.0
     for i in range(STATES):
-        for j in range(len(weights)):
+        filters = len(weights) - 1 if REAR <= i <= COMPLIANCE else len(weights)
+        _normalise(log_weights[:filters], weights[:filters])
+        for j in range(filters):
             found[i] += weights[j] * means[j, i]
-        for j in range(len(weights)):
+        for j in range(filters):
             found[STATES + i] += weights[j] * (covariances[j, i, i] + (means[j, i] - found[i]) ** 2)
 
 
 @part()
 def _combine(values, weights, parameters, sample, n, found):  # type: ignore[no-untyped-def]
-    """vy at the reference point and its variance: candidates by their weights, the bank alone where the car rolls slowly."""
-    share = min(max(sample[1] / n.minimum_speed - 1.0, 0.0), 1.0)
-    values[BANK] += n.rear_known * (n.rear - parameters[REAR]) * sample[0]
-    mean = values[BANK]
-    for c in range(1, CANDIDATES):
-        mean += share * weights[c] * (values[c] - values[BANK])
-    spread = 0.0
+    """vy at the reference point and its variance: candidates by their weights, without the network where the car rolls slowly."""
+    of_network = weights[NETWORK] * min(max(sample[1] / n.minimum_speed - 1.0, 0.0), 1.0)
+    own = (1.0 - of_network - weights[STEADY], of_network, weights[STEADY])
+    mean, spread = 0.0, 0.0
     for c in range(CANDIDATES):
-        own = share * weights[c] if c != BANK else 1.0 - share * (1.0 - weights[BANK])
-        spread += own * (values[c] - mean) ** 2
+        mean += own[c] * values[c]
+    for c in range(CANDIDATES):
+        spread += own[c] * (values[c] - mean) ** 2
     found[0] = mean
-    found[1] = parameters[STATES + V] + spread + (n.angle_floor * sample[1]) ** 2
+    found[1] = n.variance_share * (parameters[STATES + V] + spread) + (n.angle_floor * sample[1]) ** 2 + (n.point * sample[0]) ** 2
