@@ -94,8 +94,8 @@ def prior_of(model: SelfCalibrating) -> dict[str, Gaussian]:
 
 
 def _grip(model: SelfCalibrating, log_weights: FloatArray) -> Gaussian:
-    """Of log a_max; the bank resolves half a step between its limits."""
-    logs, weights = np.log(model.grips), np.exp(log_weights - log_weights.max())
+    """Of log a_max, over the filters that have one; the bank resolves half a step between its limits."""
+    logs, weights = np.log(model.grips), np.exp(log_weights[: len(model.grips)] - log_weights.max())
     mean = float(weights @ logs / weights.sum())
     return mean, math.sqrt(weights @ (np.square(logs - mean) + np.square(np.gradient(logs) / 2.0)) / weights.sum())
 
