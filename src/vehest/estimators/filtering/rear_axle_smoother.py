@@ -5,27 +5,24 @@ samples -> forward pass: parameters, likeliest filter, weights -> second pass fr
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import Any
 
 import numpy as np
 
 from vehest.constants import FloatArray
 from vehest.estimators.kernels import self_calibrating as kernel
 
-if TYPE_CHECKING:
-    from vehest.estimators.self_calibrating import SelfCalibrating
-
 PARAMETERS = slice(kernel.LEAKAGE, kernel.ERROR)
 
 
-def smoothed(estimator: SelfCalibrating, samples: FloatArray, state: kernel.State) -> FloatArray:
+def smoothed(estimator: Any, samples: FloatArray, state: kernel.State) -> FloatArray:
     """v [m/s] at the reference point and its variance, (T, 2), each from all samples.
 
     The likeliest filter of the bank at the drive's end is smoothed (Rauch, Tung & Striebel 1965), from its own parameters there; network
     and steady cornering count by their weights there.
 
     Args:
-        estimator: the filter.
+        estimator: a `SelfCalibrating`.
         samples: of its channels, (T, C).
         state: before the first of them.
     """
