@@ -5,7 +5,7 @@ import pickle
 import numpy as np
 import pytest
 
-from vehest.data.errors import DataError
+from vehest.data.errors import ConfigurationError, DataError
 from vehest.data.recording import Recording
 from vehest.estimators.kernels import self_calibrating as kernel
 from vehest.estimators.model_files import load_model
