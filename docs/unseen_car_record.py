@@ -57,7 +57,7 @@ filter's prior. `train_1` is the drive that has a reference elsewhere, and is in
 
 RMSE(β) of a held-out drive that starts from the record of the car's other drives, over that of a cold start ([CSV](carry_over.csv)):
 geometric means over a car's drives, and over cars. `vehest estimate --car` starts from κ and b with deviations times {widening}: better
-than cold on {better} of {drives} drives. With C, which differs between calm driving and the limit, the worst drive is half as bad again.
+than cold on {better} of {drives} drives. C differs between calm driving and the limit: with it too, some drives become a third worse.
 
 {ratios}
 
@@ -326,7 +326,7 @@ def report(pairs: pd.DataFrame, rows: pd.DataFrame, cars: pd.DataFrame, seen: pd
     apart = pairs[pairs["z"].abs() > 1.645]["number"]
     worse = seen[seen["RMSE(β)"] - seen["RMSE(β), v = 0"] > seen["band of β, median"]]["scene"]
     return PAGE.format(
-        agreeing=f"{len(pairs) - len(apart)} of {len(pairs)} agree within 90 % bands; apart: {', '.join(apart) or 'none'}.",
+        agreeing=f"{len(pairs) - len(apart)} of {len(pairs)} agree within 90 % bands; apart: {', '.join(sorted(set(apart))) or 'none'}.",
         agreement=markdown(named.pivot(index="number", columns="drives", values="z")),
         ratios=markdown(starts),
         planted=markdown(pd.DataFrame(cells).T.rename_axis("number")),
