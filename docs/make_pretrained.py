@@ -43,10 +43,11 @@ FILTER_NOTE = (
 
 
 def chosen_step(table: Path = TABLE) -> pd.Series:
-    """The row of the study's table that has the model."""
-    frame = pd.read_csv(table)
+    """The row of the study's table that has the model, with its median FVU on the car that made the choice."""
+    frame, scores = pd.read_csv(table), pd.read_csv(table.parents[1] / "metrics.csv")
     (row,) = (row for _, row in frame[frame["model"].notna()].iterrows())
-    return row
+    own = scores["trained_on"].str.endswith(f"/{row['part']}") & (scores["test_set"] == "other_simulator") & (scores["metric"] == "fvu")
+    return pd.concat([row, pd.Series({"other_simulator_fvu": scores.loc[own & (scores["condition"] == "nominal"), "value"].median()})])
 
 
 def note_of(row: pd.Series, estimator: Estimator) -> str:
@@ -135,7 +136,7 @@ def main() -> None:
     given = parser.parse_args()
     row = chosen_step()
     if not given.trust:
-        write(row, find_model(str(row["model"]), given.output))
+        write(row, find_model(str(row["model"]), given.output, print))
     write_its_trust(str(row["part"]), given.output)
     write_filter(given.output)
     print(TARGET, FILTER)
