@@ -45,7 +45,7 @@ endif
 run: $(INSTALLED) ## train and compare four families on simulated drives (a few minutes)
 	$(BIN)/vehest run pipelines/quickstart.yaml
 
-test: $(INSTALLED) ## tests (9 minutes on two cores); `make lint` has style, types and layers
+test: $(INSTALLED) ## tests (9 minutes on two cores, 7 from the second time on); `make lint` has style, types and layers
 	$(TESTS)
 
 test-durations: $(INSTALLED) ## the same, with the 50 that take longest
