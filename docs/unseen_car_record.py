@@ -48,7 +48,7 @@ carried over, and the widening, were chosen on these development cars: no figure
 
 ## Drives of one car
 
-Four drives of a real Ferrari 250 LM without reference ([CSV](agreement.csv)): z-scores between what two drives tell alone, without the
+Four drives of a real Ferrari 250 LM without reference ([CSV](agreement.csv)): z-scores between what two drives add, without the
 filter's prior. `train_1` is the drive that has a reference elsewhere, and is in no record that is tested on it. {agreeing}
 
 {agreement}
@@ -87,10 +87,10 @@ Profile = Callable[[float], float]  # by the time [s]
 
 def started(model: Estimator, record: CarRecord, names: Sequence[str], widening: float) -> Estimator:
     """The filter that starts from some numbers of a record, compliance and grip included, no surer than the filter's own priors."""
-    own = {name: getattr(record, name) if name in names else replace(getattr(record, name), told_by=()) for name in LIMITS}
+    own = {name: getattr(record, name) if name in names else replace(getattr(record, name), identified_on=()) for name in LIMITS}
     new, changed = calibrated(model, replace(record, **own), widening), {}
     for name in ("compliance", "grip"):
-        if own[name].told_by:
+        if own[name].identified_on:
             deviation = min(widening * own[name].deviation / own[name].value, getattr(new, f"{name}_deviation"))
             changed |= {name: own[name].value, f"{name}_deviation": deviation}
     return with_settings(new, changed)
@@ -243,12 +243,12 @@ def identified(shipped: Estimator, seed: int) -> dict[str, Any]:
     row: dict[str, Any] = {"car": seed, "seconds": drive.duration, "rate_hz": drive.rate_hz, "delay": levels.yaw_rate.delay}
     for name, truth in planted(car, levels).items():
         row |= {f"{name}_planted": truth, name: found[name].value, f"{name}_deviation": found[name].deviation}
-        row[f"{name}_told"] = int(bool(found[name].told_by))
+        row[f"{name}_identified"] = int(bool(found[name].identified_on))
     return row
 
 
 def scenes() -> dict[str, Recording]:
-    """Drives that tell the filter little, or that it is not made for, with the sensors of production cars."""
+    """Drives with little excitation, or that the filter is not made for, with the sensors of production cars."""
     car, levels = a_car(rear=0.54, compliance=0.0036), replace(SensorLevels(), reference=Reference())
     loose = a_car(rear=0.42, front=1.4, load_sensitivity=0.3, roll_share_front=0.1)
 
@@ -318,7 +318,7 @@ def report(pairs: pd.DataFrame, rows: pd.DataFrame, cars: pd.DataFrame, seen: pd
     cells: dict[str, dict[str, str]] = {}
     for number in (*LIMITS, "offset_ay", "offset_ax"):
         z = ((cars[number] - cars[f"{number}_planted"]) / cars[f"{number}_deviation"]).groupby(late, observed=True)
-        cells[number] = {"told": f"{cars[f'{number}_told'].sum()}"}
+        cells[number] = {"identified": f"{cars[f'{number}_identified'].sum()}"}
         for title, own in z:
             cells[number][f"{title} ({len(own)})"] = (
                 f"{fixed(own.mean(), 2)} ± {fixed(own.std(), 2)}, {fixed(float((own.abs() < 1.645).mean()), 2)}"

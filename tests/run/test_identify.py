@@ -41,7 +41,7 @@ def record(model):
 def test_numbers_of_a_known_car_are_found_within_their_deviations(record):
     for name, truth in PLANTED.items():
         number = getattr(record, name)
-        assert number.told_by == (() if name == "rear_axle" else ("one", "two"))  # nearly one speed: C u and b/u are alike
+        assert number.identified_on == (() if name == "rear_axle" else ("one", "two"))  # nearly one speed: C u and b/u are alike
         assert abs(number.value - truth) < 2.0 * number.deviation
     for offsets in record.offsets.values():
         assert abs(offsets["ay"].value - 0.2) < offsets["ay"].deviation
@@ -53,10 +53,10 @@ def test_an_estimate_that_starts_from_the_record_is_closer_from_the_first_second
     assert errors[1] < 0.7 * errors[0]
 
 
-def test_what_no_drive_tells_is_said_and_not_started_from(model):
+def test_a_number_identified_on_no_drive_is_marked_and_not_started_from(model):
     still = recording("still", {"yaw_rate": np.zeros(600), "vx": np.full(600, 30.0), "ay": np.full(600, 0.1), "ax": np.zeros(600)})
     found = record_of(model, {"still": posterior_of(model, still)})
-    assert not any(getattr(found, name).told_by for name in LIMITS)
+    assert not any(getattr(found, name).identified_on for name in LIMITS)
     assert calibrated(model, found).settings == model.settings
 
 
@@ -70,7 +70,7 @@ def test_drives_count_by_what_they_add_to_the_prior_and_contradictions_widen():
     both = together(prior, posteriors)
     precision = 1.0 / 4.0 + 1.0 + 4.0
     assert (both.value, both.deviation) == pytest.approx(((0.25 + 3.0 + 4.0 * 3.2) / precision, precision**-0.5))
-    assert both.told_by == ("a", "b")
+    assert both.identified_on == ("a", "b")
     assert together(prior, posteriors | {"c": (-1.0, 0.4)}).deviation > 2.0 * both.deviation
     assert together(prior, {"d": prior}) == Number(*prior)
 
@@ -84,7 +84,7 @@ def test_identify_writes_a_record_from_which_estimate_starts(place):
     said, kept = json.loads(out), read_car(place.folder / "car.yaml")
     assert said["leakage"]["value"] == kept.leakage.value == pytest.approx(PLANTED["leakage"], abs=0.03)
     code, out, err = place("identify", "one.csv", "-o", "again.yaml")
-    assert "told by" in out
+    assert "identified on" in out
     assert place("estimate", "three.csv", "-o", "cold.csv")[0] == 0
     code, out, err = place("estimate", "three.csv", "--car", "car.yaml", "-o", "warm.csv", "--json")
     assert code == 0, err

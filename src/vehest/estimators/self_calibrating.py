@@ -27,12 +27,9 @@ TYPICAL_REAR = 0.48  # of the wheelbase, where the centre of gravity is not give
 SCALED = {
     **dict.fromkeys(("axle_lag", "residual_time", "slow_time", "memory", "decision_time"), 0.5),
     **dict.fromkeys(("minimum_speed", "noise_speed", "axle_constant", "axle_white", "residual_floor"), 0.5),
-    **{"noise_vy": 0.25, "noise_vx": 0.25, "noise_delay": 0.75, "steady_odds": -4.0},
+    **{"noise_vy": 0.25, "noise_vx": 0.25, "noise_delay": 0.75},
 }
-"""Powers of the wheelbase over the typical one that scale settings: times and speeds go with its root, accelerations are alike.
-
-Steady cornering counts for more the smaller the car, whose turns the filter's samples and wheel speeds resolve less."""
-SHORTEST_OF_NETWORK = 1.5  # m, wheelbase: smaller cars turn faster than the network's steps of time resolve
+"""Powers of the wheelbase over the typical one that scale settings: times and speeds go with its root, accelerations are alike."""
 WINDOW, NETWORK_HZ = 30, 20.0  # samples that the network sees, and their rate
 UNLIKELY = 1e-300  # weight of what does not count
 UNMEASURED = 20.0  # m/s per √s: process noise of u where ax is not measured
@@ -41,9 +38,9 @@ NAMES = (
     "rate_hz wheelbase measured_ax grip grip_deviation grip_excess exponent largest_share compliance compliance_deviation "
     "leakage leakage_deviation rear_deviation imu_deviation rear_share offset_ay offset_ay_time offset_ax offset_ax_time "
     "noise_vy noise_delay noise_vx noise_speed axle_lag axle_error_time axle_constant axle_per_speed axle_per_slip "
-    "axle_per_bend axle_per_slope axle_white axle_white_share gate memory minimum_speed variance_share angle_floor residual_time slow_time "
-    "residual_floor lateral_power longitudinal_power network_odds steady_odds decision_time network_start dt point rear rear_known "
-    "yaw_rate_max without_ax"
+    "axle_per_bend axle_per_slope axle_white axle_white_share gate memory minimum_speed variance_share angle_floor residual_time "
+    "slow_time residual_floor largest_leakage lateral_power longitudinal_power network_odds steady_odds decision_time "
+    "network_start dt point rear rear_known yaw_rate_max without_ax"
 )
 Numbers: Any = namedtuple("Numbers", NAMES)  # type: ignore[misc]  # importable by its name, else compiled code is not found again
 
@@ -111,12 +108,15 @@ class SelfCalibrating(Recursive):
     residual_time: float = setting(1.0, "high-pass of v in the candidates' residuals", unit="s", positive=True)
     slow_time: float = setting(20.0, "high-pass of the residuals", unit="s", positive=True)
     residual_floor: float = setting(0.03, "residual below which candidates are alike", unit="m/s", positive=True)
+    largest_leakage: float = setting(0.05, "of κ that residuals of the candidates are freed of", least=0.0)
     lateral_power: float = setting(10.0, "power by which the residual of v' counts", least=0.0)
     longitudinal_power: float = setting(7.0, "power by which the residual of u' counts", least=0.0)
     network_odds: float = setting(5.0, "weight of the network over the bank's at the start", positive=True)
     decision_time: float = setting(25.0, "driving after which they differ e times less", unit="s", positive=True)
     steady_odds: float = setting(0.4, "weight of steady cornering over the bank's at the start", positive=True)
+    steady_power: float = setting(4.0, "power of the typical wheelbase over the car's by which it grows", least=0.0)
     network_start: float = setting(0.7, "weight at the start of the filter with the network's axle", positive=True)
+    network_wheelbase: float = setting(1.5, "shortest wheelbase of cars for which the network counts", unit="m", least=0.0)
 
     def __init__(self, settings: Any) -> None:
         super().__init__(settings)
@@ -178,14 +178,14 @@ class SelfCalibrating(Recursive):
 
     def numbers(self) -> Any:
         """What the compiled recursion takes: numeric settings, times scaled, and what follows from them."""
-        own = {name: float(value) for name, value in vars(self.settings).items() if isinstance(value, int | float) and name != "smoothed"}
+        own = {name: float(value) for name, value in vars(self.settings).items() if name in Numbers._fields}
         own |= {"dt": 1.0 / self.rate_hz, "rear": self.rear, "rear_known": 1.0 if self.cg_to_rear_axle is not None else self.rear_share}
         own["point"] = 0.0 if self.cg_to_rear_axle is not None else self.imu_deviation * self.wheelbase  # m: of the point of v
         own |= {"yaw_rate_max": self._width, "without_ax": float(not self.measured_ax)}
-        if self.rate_hz != NETWORK_HZ or self.wheelbase < SHORTEST_OF_NETWORK:
+        if self.rate_hz != NETWORK_HZ or self.wheelbase < self.network_wheelbase:
             own |= {"network_odds": UNLIKELY, "decision_time": 1e9, "network_start": UNLIKELY}  # its weights hold for its own steps alone
-        own.pop("cg_to_rear_axle", None)
-        own |= {name: own[name] * (self.wheelbase / TYPICAL_WHEELBASE) ** power for name, power in SCALED.items()}
+        powers = SCALED | {"steady_odds": -self.steady_power}
+        own |= {name: own[name] * (self.wheelbase / TYPICAL_WHEELBASE) ** power for name, power in powers.items()}
         if not self.measured_ax:
             own |= {"noise_vx": UNMEASURED, "longitudinal_power": 0.0}
         return Numbers(**own)
@@ -241,7 +241,6 @@ class SelfCalibrating(Recursive):
             "window": WINDOW,
             "measured_ax": self.measured_ax,
             "least_limit": kernel.LEAST_LIMIT,
-            "largest_leakage": kernel.LARGEST_LEAKAGE,
             "rolling": kernel.ROLLING,
         }
 

@@ -26,11 +26,11 @@ Positive = Annotated[float, Field(gt=0.0)]
 
 @dataclass(frozen=True)
 class Number:
-    """A number with its standard deviation, and the drives that tell it; where none does, no estimate starts from it."""
+    """A number with its standard deviation, and the drives on which it was identified; where on none, no estimate starts from it."""
 
     value: float
     deviation: Positive
-    told_by: tuple[str, ...] = ()
+    identified_on: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -68,9 +68,9 @@ def calibrated(model: Estimator, record: CarRecord, widening: float = WIDENING) 
     """
     changed: dict[str, Any] = {"wheelbase": record.wheelbase, "cg_to_rear_axle": record.cg_to_rear_axle}
     base, leakage, rear, point = with_settings(model, changed), record.leakage, record.rear_axle, record.cg_to_rear_axle
-    if leakage.told_by:
+    if leakage.identified_on:
         changed |= {"leakage": leakage.value, "leakage_deviation": min(widening * leakage.deviation, base.leakage_deviation)}
-    if rear.told_by:
+    if rear.identified_on:
         if point is None:  # where the filter's estimates hold without it
             point = rear.value + base.rear_share * (TYPICAL_REAR * record.wheelbase - rear.value)
         changed |= {"cg_to_rear_axle": point, "imu_deviation": math.hypot(widening * rear.deviation, rear.value - point) / record.wheelbase}

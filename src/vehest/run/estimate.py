@@ -121,7 +121,7 @@ def estimate_file(words: Sequence[str], out: Path, *, strict: bool = False, car:
     if any(key_of(override).split(".")[0] == "downsample" for override in overrides):
         model.preparation = config["downsample"]
     with use_limits(limits_from_config(config["limits"])):
-        drive = _read(config, file)
+        drive = read_by(config, file)
         findings = findings_of(drive, model, config["dataset"].get("accept") or ())
         if strict and findings:
             raise DataError(f"'{file}': {findings[0]}")
@@ -167,10 +167,10 @@ def read_table(path: Path, overrides: Sequence[str] = (), *, references: bool = 
 
     Raises what `read_single` does, and `DataError` where a check finds an error that the data set does not accept.
     """
-    return _read(compose_config("estimate", overrides), path, references=references)
+    return read_by(compose_config("estimate", overrides), path, references=references)
 
 
-def _read(config: Config, path: Path, *, references: bool = False) -> Recording:
+def read_by(config: Config, path: Path, *, references: bool = False) -> Recording:
     """`read_table` by a configuration."""
     dataset = config["dataset"] if references else _without_references(config["dataset"])
     with use_limits(limits_from_config(config["limits"])):

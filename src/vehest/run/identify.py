@@ -5,7 +5,6 @@ drives, each from the filter's priors -> means and deviations at its end -> what
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
@@ -23,15 +22,14 @@ from vehest.estimators.self_calibrating import SelfCalibrating
 from vehest.run.car_record import FORMAT, LIMITS, CarRecord, Number, with_settings
 from vehest.run.config import compose_config, key_of
 from vehest.run.config_files import is_file_name
-from vehest.run.estimate import SELF_CALIBRATING, findings_of, open_model, prepared_recording, read_table
+from vehest.run.estimate import SELF_CALIBRATING, findings_of, open_model, prepared_recording, read_by
 from vehest.run.printing import TerminalTable, complain, note
 
-TOLD_SHARE = 0.5
-"""A drive tells a number where it leaves less than this share of the prior's variance."""
+IDENTIFIED_SHARE = 0.5  # of the prior's variance: a number is identified on a drive that leaves less
 ROWS = {"leakage": kernel.LEAKAGE, "rear_axle": kernel.REAR, "compliance": kernel.COMPLIANCE}
 OFFSETS = {"ay": kernel.OFFSET_Y, "ax": kernel.OFFSET_X}
 UNITS = {"leakage": "1", "rear_axle": "m", "compliance": "rad s²/m"}
-Gaussian = tuple[float, float]  # mean and standard deviation
+Normal = tuple[float, float]  # mean and standard deviation
 
 
 def identify_files(words: Sequence[str], out: Path, given: Mapping[str, float | None]) -> CarRecord:
@@ -47,18 +45,17 @@ def identify_files(words: Sequence[str], out: Path, given: Mapping[str, float | 
     model = with_settings(shipped, {name: value for name, value in given.items() if value is not None})
     if any(key_of(override).split(".")[0] == "downsample" for override in overrides):
         model.preparation = config["downsample"]
-    drives: dict[str, dict[str, Gaussian]] = {}
+    drives: dict[str, dict[str, Normal]] = {}
     for file in files:
-        drive = read_table(file, overrides)
+        drive = read_by(config, file)
         if drive.id in drives:
             raise ConfigurationError(f"two recordings are called '{drive.id}'; rename one")
         for finding in findings_of(drive, model, config["dataset"].get("accept") or ()):
             complain(f"warning: {drive.id}: {finding}")
         drives[drive.id] = posterior_of(model, drive)
     record = record_of(model, drives)
-    content = json.loads(json.dumps({"format": FORMAT, **asdict(record)}))  # tuples as lists
     with written_aside(out) as aside:
-        aside.write_text(yaml.safe_dump(content, sort_keys=False, allow_unicode=True), encoding="utf-8")
+        aside.write_text(yaml.safe_dump({"format": FORMAT, **asdict(record)}, sort_keys=False, allow_unicode=True), encoding="utf-8")
     return record
 
 
@@ -67,13 +64,13 @@ def in_words(record: CarRecord) -> TerminalTable:
     numbers = {name: getattr(record, name) for name in LIMITS}
     numbers |= {f"offset of {channel}, {drive}": one for drive, own in record.offsets.items() for channel, one in own.items()}
     rows = [
-        (name, f"{one.value:.4g}", f"{one.deviation:.2g}", UNITS.get(name, "m/s²"), ", ".join(one.told_by) or "not told by these drives")
+        (name, f"{one.value:.4g}", f"{one.deviation:.2g}", UNITS.get(name, "m/s²"), ", ".join(one.identified_on) or "not identified")
         for name, one in numbers.items()
     ]
-    return TerminalTable("", ("quantity", "value", "deviation", "unit", "told by"), rows)
+    return TerminalTable("", ("quantity", "value", "deviation", "unit", "identified on"), rows)
 
 
-def posterior_of(model: SelfCalibrating, recording: Recording) -> dict[str, Gaussian]:
+def posterior_of(model: SelfCalibrating, recording: Recording) -> dict[str, Normal]:
     """Numbers after a drive, grip by its logarithm, and mean offsets; raises `DataError` where a channel is missing or has gaps."""
     drive = prepared_recording(model, recording)
     samples = np.column_stack([drive[name] for name in model.channels])
@@ -86,42 +83,42 @@ def posterior_of(model: SelfCalibrating, recording: Recording) -> dict[str, Gaus
     return numbers | {"grip": _grip(model, last.log_weights)}
 
 
-def prior_of(model: SelfCalibrating) -> dict[str, Gaussian]:
+def prior_of(model: SelfCalibrating) -> dict[str, Normal]:
     """The same before any drive."""
     mean, deviation = model.prior
     start = model.first_state(np.zeros(len(model.channels)), {}).log_weights
     return {name: (float(mean[at]), float(deviation[at])) for name, at in (ROWS | OFFSETS).items()} | {"grip": _grip(model, start)}
 
 
-def _grip(model: SelfCalibrating, log_weights: FloatArray) -> Gaussian:
+def _grip(model: SelfCalibrating, log_weights: FloatArray) -> Normal:
     """Of log a_max, over the filters that have one; the bank resolves half a step between its limits."""
     logs, weights = np.log(model.grips), np.exp(log_weights[: len(model.grips)] - log_weights.max())
     mean = float(weights @ logs / weights.sum())
     return mean, math.sqrt(weights @ (np.square(logs - mean) + np.square(np.gradient(logs) / 2.0)) / weights.sum())
 
 
-def record_of(model: SelfCalibrating, drives: Mapping[str, Mapping[str, Gaussian]]) -> CarRecord:
+def record_of(model: SelfCalibrating, drives: Mapping[str, Mapping[str, Normal]]) -> CarRecord:
     """The record of a car from `posterior_of` its drives; raises `DataError` where a number is not of a car."""
     prior = prior_of(model)
     found = {name: together(prior[name], {drive: own[name] for drive, own in drives.items()}) for name in LIMITS}
     grip = math.exp(found["grip"].value)
-    found["grip"] = Number(grip, grip * found["grip"].deviation, found["grip"].told_by)
+    found["grip"] = Number(grip, grip * found["grip"].deviation, found["grip"].identified_on)
     offsets = {drive: {name: together(prior[name], {drive: own[name]}) for name in OFFSETS} for drive, own in drives.items()}
     return CarRecord(model.wheelbase, model.cg_to_rear_axle, **found, offsets=offsets)
 
 
-def together(prior: Gaussian, drives: Mapping[str, Gaussian]) -> Number:
+def together(prior: Normal, drives: Mapping[str, Normal]) -> Number:
     """The prior and what each drive adds to it, weighted by information; the deviation grows where drives contradict each other."""
     alone = {drive: without_prior(prior, own) for drive, own in drives.items() if own[1] < prior[1]}
     information = {drive: 1.0 / deviation**2 for drive, (_, deviation) in alone.items()}
     total = 1.0 / prior[1] ** 2 + sum(information.values())
     value = prior[0] + sum(information[drive] * (mean - prior[0]) for drive, (mean, _) in alone.items()) / total
     scatter = sum(information[drive] * (mean - value) ** 2 for drive, (mean, _) in alone.items()) / max(len(alone) - 1, 1)
-    told = tuple(drive for drive, (_, deviation) in drives.items() if deviation**2 < TOLD_SHARE * prior[1] ** 2)
-    return Number(value, math.sqrt(max(scatter if len(alone) > 1 else 1.0, 1.0) / total), told)
+    identified = tuple(drive for drive, (_, deviation) in drives.items() if deviation**2 < IDENTIFIED_SHARE * prior[1] ** 2)
+    return Number(value, math.sqrt(max(scatter if len(alone) > 1 else 1.0, 1.0) / total), identified)
 
 
-def without_prior(prior: Gaussian, posterior: Gaussian) -> Gaussian:
-    """What a drive says alone, where its deviation is below the prior's."""
+def without_prior(prior: Normal, posterior: Normal) -> Normal:
+    """What a drive adds without the prior, where its deviation is below the prior's."""
     information = 1.0 / posterior[1] ** 2 - 1.0 / prior[1] ** 2
     return prior[0] + (posterior[0] - prior[0]) / posterior[1] ** 2 / information, information**-0.5

@@ -28,6 +28,7 @@ def smoothed(estimator: Any, samples: FloatArray, state: kernel.State) -> FloatA
     """
     _, _, last = estimator.trace(samples, state)
     best, n, (mean, deviation), decay = int(np.argmax(last.log_weights)), estimator.numbers(), estimator.prior, estimator.decay
+    bank = estimator.bank_arrays
     state = kernel.State(*(part.copy() for part in state))
     state.means[:, PARAMETERS] = last.means[:, PARAMETERS]
     state.covariances[:, PARAMETERS, PARAMETERS] = last.covariances[:, PARAMETERS, PARAMETERS]
@@ -37,7 +38,7 @@ def smoothed(estimator: Any, samples: FloatArray, state: kernel.State) -> FloatA
     network, turning, scratch = np.empty(len(rows)), np.empty(len(rows)), (np.empty((1, 2)), np.empty((1, 2 * kernel.STATES)))
     for k in range(len(rows)):
         network[k], turning[k] = state.lags[kernel.PREDICTED], -state.lags[kernel.YAW_RATE]
-        kernel.scan(n, *estimator.bank_arrays, mean, deviation, decay, estimator.network, state, rows[k : k + 1], *scratch)
+        kernel.scan(n, *bank, mean, deviation, decay, estimator.network, state, rows[k : k + 1], *scratch)
         turning[k] += state.lags[kernel.YAW_RATE]
         means[k], covariances[k], rows[k] = state.means[best], state.covariances[best], state.last
     middle = (np.vstack([before, rows[:-1]]) + rows) / 2.0  # yaw rate, u, ay, ax

@@ -27,7 +27,6 @@ SLOW_AY, TIME, POWER, PREDICTED, AX_OF_SPEED, SLIP = range(10, LAGS)
 # of a candidate: low-passed v, sum of ω v, slow parts of both residuals, moments of the residuals, last v
 SMOOTH, SUM_TURN_V, SLOW_Y, SLOW_X, SQUARE_Y, CROSS_Y, SQUARE_X, LAST = range(8)
 LEAST_LIMIT = 0.3  # of a grip limit that longitudinal acceleration leaves
-LARGEST_LEAKAGE = 0.05
 ROLLING = 0.05  # m/s: deviation of v = b ω of a car that rolls slowly
 
 
@@ -193,7 +192,7 @@ def _judge(found, own, weights, lags, sample, yaw_rate, n, g_1, g_slow, moving):
             one[CROSS_Y] = one[CROSS_Y] * keep + y * ay * n.dt
             one[SQUARE_X] = one[SQUARE_X] * keep + x * x * n.dt
         time = max(lags[TIME], n.dt)
-        leakage = min(max(one[CROSS_Y] / (lags[POWER] + 1e-9), -LARGEST_LEAKAGE), LARGEST_LEAKAGE)
+        leakage = min(max(one[CROSS_Y] / (lags[POWER] + 1e-9), -n.largest_leakage), n.largest_leakage)
         of_y = max(one[SQUARE_Y] - 2.0 * leakage * one[CROSS_Y] + leakage**2 * lags[POWER], 0.0) / time
         of_x = one[SQUARE_X] / time
         score = n.lateral_power * math.log(of_y + n.residual_floor**2) + n.longitudinal_power * math.log(of_x + n.residual_floor**2)
