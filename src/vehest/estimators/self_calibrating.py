@@ -15,7 +15,6 @@ from vehest.constants import FloatArray
 from vehest.data.errors import ConfigurationError, DataError
 from vehest.declared import setting
 from vehest.estimators.base import Stepper, rate
-from vehest.estimators.filtering.rear_axle_smoother import smoothed
 from vehest.estimators.kernels import self_calibrating as kernel
 from vehest.estimators.kernels.ksnn import packed
 from vehest.estimators.ksnn import Ksnn
@@ -32,6 +31,7 @@ SCALED = {
 """Powers of the wheelbase over the typical one that scale settings: times and speeds go with its root, accelerations are alike."""
 WINDOW, NETWORK_HZ = 30, 20.0  # samples that the network sees, and their rate
 UNLIKELY = 1e-300  # weight of what does not count
+PARAMETERS = slice(kernel.LEAKAGE, kernel.ERROR)  # among the states
 UNMEASURED = 20.0  # m/s per √s: process noise of u where ax is not measured
 
 NAMES = (
@@ -206,7 +206,7 @@ class SelfCalibrating(Recursive):
     def run(self, samples: FloatArray, state: kernel.State) -> tuple[dict[str, Any], kernel.State]:
         """vy [m/s] and its variance."""
         if self.smoothed:
-            found = smoothed(self, samples, state)
+            found = _smoothed(self, samples, state)
         else:
             found, _, state = self.trace(samples, state)
         return {"vy": found[:, 0].copy(), "covariance": found[:, 1].reshape(-1, 1, 1).copy()}, state
@@ -265,6 +265,66 @@ def _shipped_network() -> tuple[FloatArray, float]:
     """Rows of the network that comes with vehest, (P, 8 + 6 Q), and the yaw rate of its last local model [rad/s]."""
     weights = load_model(Path(__file__).parents[1] / "pretrained").weights()
     return packed(np, {name: values.astype(np.float64) for name, values in weights.items()}), float(weights["yaw_rate_max"])
+
+
+def _smoothed(estimator: Any, samples: FloatArray, state: kernel.State) -> FloatArray:
+    """v [m/s] at the reference point and its variance, (T, 2), each from all samples.
+
+    A forward pass gives parameters, weights and the likeliest filter at the drive's end; a second one starts from these parameters and is
+    smoothed (Rauch, Tung & Striebel 1965). Network and steady cornering count by their weights at the end.
+
+    Args:
+        estimator: a `SelfCalibrating`.
+        samples: of its channels, (T, C).
+        state: before the first of them.
+    """
+    _, _, last = estimator.trace(samples, state)
+    best, n, (mean, deviation), decay = int(np.argmax(last.log_weights)), estimator.numbers(), estimator.prior, estimator.decay
+    bank = estimator.bank_arrays
+    state = kernel.State(*(part.copy() for part in state))
+    state.means[:, PARAMETERS] = last.means[:, PARAMETERS]
+    state.covariances[:, PARAMETERS, PARAMETERS] = last.covariances[:, PARAMETERS, PARAMETERS]
+    state.log_weights[:] = last.log_weights
+    rows, before = estimator.with_ax(samples).copy(), state.last.copy()
+    means, covariances = np.empty((len(rows), kernel.STATES)), np.empty((len(rows), kernel.STATES, kernel.STATES))
+    network, turning, scratch = np.empty(len(rows)), np.empty(len(rows)), (np.empty((1, 2)), np.empty((1, 2 * kernel.STATES)))
+    for k in range(len(rows)):
+        network[k], turning[k] = state.lags[kernel.PREDICTED], -state.lags[kernel.YAW_RATE]
+        kernel.scan(n, *bank, mean, deviation, decay, estimator.network, state, rows[k : k + 1], *scratch)
+        turning[k] += state.lags[kernel.YAW_RATE]
+        means[k], covariances[k], rows[k] = state.means[best], state.covariances[best], state.last
+    middle = (np.vstack([before, rows[:-1]]) + rows) / 2.0  # yaw rate, u, ay, ax
+    turn = rows[:, 0] * rows[:, 1]
+    turn = (np.append(before[0] * before[1], turn[:-1]) + turn) / 2.0
+    constant = mean * (1.0 - decay)
+    constant[[kernel.V, kernel.U]] = 0.0
+    noise = np.square(deviation) * (1.0 - np.square(decay))
+    noise[kernel.U] = n.dt * n.noise_vx**2
+    x, p = means[-1].copy(), covariances[-1].copy()
+    found = np.empty((len(rows), 3))
+    for k in range(len(rows) - 1, -1, -1):
+        found[k] = x[kernel.V], x[kernel.REAR], p[kernel.V, kernel.V]
+        if k == 0:
+            break
+        step = np.eye(kernel.STATES)
+        step[kernel.V, kernel.LEAKAGE], step[kernel.V, kernel.OFFSET_Y] = -n.dt * middle[k, 2], -n.dt
+        step[kernel.U, kernel.V], step[kernel.U, kernel.OFFSET_X] = n.dt * middle[k, 0], -n.dt
+        step *= decay[:, None]
+        predicted = step @ means[k - 1] + constant
+        predicted[[kernel.V, kernel.U]] += n.dt * (middle[k, 2] - turn[k]), n.dt * middle[k, 3]
+        noise[kernel.V] = n.dt * (n.noise_vy**2 + (n.noise_delay * turning[k] / n.dt * rows[k, 1]) ** 2)
+        spread = step @ covariances[k - 1] @ step.T + np.diag(noise)
+        gain = np.linalg.solve(spread, step @ covariances[k - 1]).T
+        x, p = means[k - 1] + gain @ (x - predicted), covariances[k - 1] + gain @ (p - spread) @ gain.T
+    own = found[:, 0] + n.rear_known * (n.rear - found[:, 1]) * rows[:, 0]
+    steady = rows[:, 0] * (n.rear - n.compliance * np.square(rows[:, 1]))
+    moving = np.clip(rows[:, 1] / n.minimum_speed - 1.0, 0.0, 1.0)
+    shares = last.weights * np.column_stack([moving, moving, np.ones(len(rows))])
+    shares[:, kernel.BANK] = 1.0 - shares[:, kernel.NETWORK] - shares[:, kernel.STEADY]
+    values = np.column_stack([own, network, steady])
+    vy = (shares * values).sum(axis=1)
+    variance = found[:, 2] + (shares * np.square(values - vy[:, None])).sum(axis=1)
+    return np.column_stack([vy, variance + np.square(n.angle_floor * rows[:, 1]) + np.square(n.point * rows[:, 0])])
 
 
 ESTIMATOR = SelfCalibrating
