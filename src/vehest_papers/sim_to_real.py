@@ -150,7 +150,7 @@ def documents(artefacts: StudyArtefacts) -> dict[str, Document]:
 
 
 def steps_of(artefacts: StudyArtefacts) -> list[Step]:
-    """All steps in the order of the pipeline, baselines too."""
+    """All steps in the order of the pipeline, baselines too; raises `DataError` where validation differs, or a step learns on real data."""
     parts = artefacts.parts
     if len({(part.split.validation, part.split.tests[RACE_CARS]) for part in parts.values()}) > 1:
         raise DataError(f"study '{artefacts.study}': its parts stop or choose on different ranges, nothing can be chosen among them")

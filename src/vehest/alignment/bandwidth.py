@@ -97,7 +97,7 @@ def held_findings(recording: Recording) -> list[Finding]:
 
 
 def held_rate(samples: FloatArray, rate_hz: float) -> float | None:
-    """How often a held channel really changes [1/s]; None if it is not held.
+    """How often a held channel, (T,), really changes [1/s]; None if it is not held.
 
     A held channel hardly ever changes twice in a row, and then by any amount. A quantised one does so too while it moves slowly, but
     by one quantum at a time.

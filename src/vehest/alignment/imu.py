@@ -150,7 +150,7 @@ class Signals:
 
 
 def signals_of(recording: Recording, settings: AlignmentSettings) -> Signals:
-    """Signals of a recording."""
+    """Signals of a recording; raises `DataError` where one is missing, short or has gaps, `ConfigurationError` for too high a cut-off."""
     asked = ", ".join(settings.kinematic)
     if "vy_ref" not in recording:
         raise DataError(f"recording '{recording.id}' has no reference channel 'vy_ref', which {asked} are estimated against")

@@ -62,7 +62,7 @@ class CrossSpectra:
 
 
 def cross_spectra(signals: Mapping[str, FloatArray], rate_hz: float, used: BoolArray | None = None) -> CrossSpectra | None:
-    """Welch's cross-spectra in the band, from segments of ``used`` samples under a Hann window; None where the recording is too short."""
+    """Welch's cross-spectra in the band, from segments of ``used`` samples, (T,) as signals, under a Hann window; None where too short."""
     duration = len(next(iter(signals.values()), ())) / rate_hz
     if duration < SHORTEST_DRIVE or rate_hz < LOWEST_RATE:
         return None

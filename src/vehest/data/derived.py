@@ -93,7 +93,10 @@ class SpeedFromWheels:
     relative_tolerance: ClassVar[float] = 0.05
 
     def corrected(self, recording: Recording) -> FloatArray:
-        """Speeds of the centre of gravity by each wheel, (4, T) [m/s]: front left, front right, rear left, rear right; NaN without it."""
+        """Speeds of the centre of gravity by each wheel, (4, T) [m/s]: front left, front right, rear left, rear right; NaN without it.
+
+        Raises `DataError` where there is no wheel speed at all, or tracks are given and ``yaw_rate`` is missing.
+        """
         names = [f"wheel_speed_{wheel}" for wheel in WHEELS]
         if not set(names) & set(recording.channels):
             raise DataError(f"recording '{recording.id}' has no wheel speed to make vx of; declare one of {', '.join(names)}")

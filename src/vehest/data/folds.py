@@ -49,6 +49,7 @@ def fold_of(blocks: Sequence[Span], folds: FoldsFile, fold: int, where: str) -> 
     """Training, validation and test of the fold, from 0, that is tested: blocks stay in order and folds last about equally long.
 
     The fold after the tested one (the first after the last) is the one to stop on.
+    Raises `ConfigurationError` where there is no such fold, or too few blocks to fill them.
     """
     if not 0 <= fold < folds.number:
         raise ConfigurationError(f"{where}: fold {fold} is not one of 0 to {folds.number - 1}")

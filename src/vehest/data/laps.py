@@ -27,7 +27,7 @@ def laps_of(recording: Recording) -> list[tuple[float, float]]:
     recording does, wherever that is on the course.
 
     Args:
-        recording: with vx (else vx_ref) and yaw_rate (else yaw_rate_ref).
+        recording: with vx (else vx_ref) and yaw_rate (else yaw_rate_ref); raises `DataError` where it lacks them.
     """
     speed, turning = _first_of(recording, "vx", "vx_ref"), _first_of(recording, "yaw_rate", "yaw_rate_ref")
     distance = np.cumsum(np.maximum(speed, 0.0)) / recording.rate_hz

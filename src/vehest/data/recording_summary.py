@@ -30,7 +30,7 @@ def summary_of(recording: Recording) -> RecordingSummary:
 
 
 def stored_summary(path: Path) -> RecordingSummary:
-    """Summary of a recording in the store, from the description in its file; ``gappy`` are those channels that may have gaps."""
+    """Summary of a stored recording, from its file's description; ``gappy`` channels may have gaps; raises `MissingError`, `DataError`."""
     with parquet_file(path) as file:
         schema = file.schema_arrow
     described = description_of(schema, path, RecordingDescription)

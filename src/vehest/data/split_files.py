@@ -30,7 +30,7 @@ LEAST_SECONDS = 3.0  # of a piece of limited minutes; shorter ones hold no windo
 
 @dataclass(frozen=True)
 class RangeFile:
-    """One range of conf/split/*.yaml: a recording, or a pattern of several; from start to stop [s or %], or some of its laps."""
+    """A range of conf/split/*.yaml: a recording or a pattern of several; start to stop [s or %] or some laps; else raises `ValueError`."""
 
     dataset: str | None = None
     recording: str | None = None
@@ -120,14 +120,14 @@ def split_from_config(config: Mapping[str, Any], catalogue: Catalogue | None = N
 
 
 def dataset_names(config: Mapping[str, Any]) -> list[str]:
-    """Names of the data sets that a split's plain values draw on, sorted."""
+    """Names of the data sets that a split's plain values draw on, sorted; raises `ConfigurationError` where a range names none."""
     file = _read(config)
     entries = [entry for entries in (file.train, file.validation, *file.tests.values()) for entry in entries]
     return [file.dataset_of()] if file.folds else sorted({file.dataset_of(entry) for entry in entries})
 
 
 def limit_minutes(spans: Sequence[Span], seconds: float, at: float) -> tuple[Span, ...]:
-    """A stretch of ranges laid end to end, ``seconds`` long from the share ``at`` on; it wraps around, and ends of seconds are left out."""
+    """A stretch of ranges laid end to end, ``seconds`` [s] long from the share ``at`` on; it wraps around; ends of seconds are left out."""
     total = _seconds_of(spans)
     begin = at * total
     kept = _between(spans, begin, min(begin + seconds, total))

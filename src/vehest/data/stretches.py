@@ -45,7 +45,7 @@ class Condition:
 
 
 def stretches_where(recording: Recording, condition: Condition, first: int, end: int) -> list[tuple[int, int]]:
-    """Longest runs [first, end) of samples, as indices, that all meet a condition; samples that were not measured do not."""
+    """Longest runs [first, end) of sample indices that meet a condition; unmeasured ones do not; raises `DataError` without a channel."""
     holds = np.ones(max(end - first, 0), dtype=bool)
     for channel, bounds in condition.magnitude.items():
         size = np.abs(recording[channel][first:end])

@@ -31,7 +31,7 @@ class WindowSet:
 
 
 def windows_of(recordings: Sequence[Recording], channels: Sequence[str], target: str, n_window: int) -> WindowSet:
-    """Cut recordings into windows r[k-N+1 … k] with target[k+1] (Da Lio et al. 2023, Fig. 1)."""
+    """Cut recordings into windows r[k-N+1 … k] with target[k+1] (Da Lio et al. 2023, Fig. 1); raises `DataError` for gaps or no windows."""
     check_limit("filter_samples", n_window, f"a window of {n_window} samples is asked for")
     series, targets, starts, offset = [], [], [], 0
     for recording in recordings:

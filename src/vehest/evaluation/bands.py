@@ -55,7 +55,7 @@ def banded(parts: Sequence[Scored], bands: Bands) -> dict[str, Banded]:
 def band_figures(
     own: Mapping[str, Banded], parts: Sequence[Scored], turns: Sequence[FloatArray | None], rate_hz: float
 ) -> dict[str, float]:
-    """Figures of the bands of a test set.
+    """Figures of the bands of a test set at ``rate_hz`` [Hz], whose yaw rates ``turns`` [rad/s] are None where not measured.
 
     ``coverage_…`` fraction of errors inside; ``width_90`` mean full width; ``interval_score`` and ``crps`` as below; ``coverage_90_p10``
     and ``…_p90`` 10 and 90 % quantiles of the coverage of manoeuvres, which are the blocks that bands are calibrated by; ``error_icc``
@@ -119,6 +119,7 @@ def interval_score(errors: FloatArray, half: FloatArray, level: float) -> FloatA
     """Width of each interval, and 2/α times by how far it missed; the lowest on average is the true central interval's.
 
     Args:
+        errors, half: (N,), in the unit of the score; half widths of the intervals.
         level: 1 - α.
 
     Source: Gneiting & Raftery, Strictly proper scoring rules, prediction, and estimation, JASA 102 (477), 2007, Eq. 43.

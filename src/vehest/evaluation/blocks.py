@@ -44,7 +44,7 @@ COLUMNS = tuple(field.name for field in fields(Segments))
 
 
 def segments_of(parts: Sequence[Scored], rate_hz: float) -> Segments:
-    """Cut scored ranges or sequences into segments of `SEGMENT_SECONDS`; the last of a range may be shorter."""
+    """Cut ranges or sequences scored at ``rate_hz`` [Hz] into segments of `SEGMENT_SECONDS`; the last of a range may be shorter."""
     steps = max(round(SEGMENT_SECONDS * rate_hz), 1)
     columns: dict[str, list[FloatArray]] = {name: [] for name in COLUMNS}
     for position, part in enumerate(parts):
@@ -86,7 +86,7 @@ def write_segments(path: Path, by_test_set: dict[str, Segments]) -> None:
 
 
 def read_segments(path: Path) -> dict[str, Segments]:
-    """Segments of every test set."""
+    """Segments of every test set; raises `MissingError` where there is no such file, `DataError` where it is damaged."""
     rows: dict[str, list[list[float]]] = {}
     for row in read_rows(path, ("test_set", *COLUMNS)):
         rows.setdefault(row["test_set"], []).append([number_in(row, name, path) for name in COLUMNS])
@@ -94,7 +94,7 @@ def read_segments(path: Path) -> dict[str, Segments]:
 
 
 def block_labels(segments: Segments, losses: FloatArray) -> NDArray[np.int64]:
-    """Number of the block that each segment belongs to, (K,): a range or sequence each, or stretches of the Politis-White length."""
+    """Number of each segment's block, (K,), by ``losses`` (C, K): a range or sequence each, or stretches of the Politis-White length."""
     pieces = np.unique(segments.piece)
     if len(pieces) >= LEAST_PIECES:
         return np.asarray(np.searchsorted(pieces, segments.piece), dtype=np.int64)

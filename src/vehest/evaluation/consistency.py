@@ -51,5 +51,5 @@ def normalised_innovation_squared(nis: FloatArray, dof: FloatArray) -> float:
 
 
 def coverage(errors: FloatArray, variance: FloatArray, n_sigma: float) -> float:
-    """Fraction of errors within ``n_sigma`` standard deviations; `COVERAGE` says what is expected of Gaussian ones."""
+    """Fraction of errors, (K,) like ``variance``, within ``n_sigma`` standard deviations; `COVERAGE` says what is expected of Gaussians."""
     return float(np.mean(np.square(errors) <= n_sigma**2 * variance))

@@ -33,7 +33,10 @@ class LeverArm:
 def best_lever_arm(
     parts: Sequence[Scored], yaw_rates: Sequence[FloatArray], speeds: Sequence[FloatArray], least_speed: float = 0.0
 ) -> LeverArm:
-    """The lever arm x that leaves the least error: argmin of the mean of (v̂ - v - x·r)², that is Σ(v̂ - v)r / Σr², within `LONGEST`."""
+    """The lever arm x that leaves the least error: argmin of the mean of (v̂ - v - x·r)², that is Σ(v̂ - v)r / Σr², within `LONGEST`.
+
+    ``yaw_rates`` r [rad/s] and ``speeds`` u [m/s], by which sideslip is made of v, are at the samples of ``parts``.
+    """
     error = np.concatenate([part.vy - part.vy_ref for part in parts])
     turning = np.concatenate(list(yaw_rates))
     power = float(turning @ turning)

@@ -167,7 +167,7 @@ def reference_state(reference: Recording, span: Span) -> dict[str, float]:
 def score_all(
     estimate_of: Callable[[int], Estimate], spans: Sequence[Span], recording_of: Callable[[Span], Recording], protocol: Protocol
 ) -> list[Scored]:
-    """Score the estimates of a test set by position among its `sequences`; ``recording_of`` a range is at ``protocol.rate_hz``."""
+    """Score a test set's estimates by place in its `sequences`; ``recording_of`` a range is at ``protocol.rate_hz``; raises `DataError`."""
     return [
         score(estimate_of(position), reference, piece, protocol)
         for position, (reference, piece) in enumerate(pieces_of(spans, recording_of, protocol))
@@ -175,7 +175,7 @@ def score_all(
 
 
 def pieces_of(spans: Sequence[Span], recording_of: Callable[[Span], Recording], protocol: Protocol) -> Iterator[tuple[Recording, Span]]:
-    """Each range, or sequence, of a test set with the whole recording that it lies in, one recording in memory at a time."""
+    """Each range or sequence of a test set with the whole recording that it lies in, one in memory at a time; raises `DataError`."""
     read = lru_cache(maxsize=1)(lambda dataset, recording: recording_of(Span(dataset, recording)))  # a range's sequences stand together
 
     def cached(span: Span) -> Recording:

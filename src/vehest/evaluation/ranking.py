@@ -82,7 +82,7 @@ def rank(segments: Mapping[Name, Sequence[Segments]], rate_hz: float, asked: Seq
     together by Holm are: the best against every other, every candidate against each baseline, and the pairs that are asked for.
 
     Args:
-        segments: of each seed of each estimator, all over the same samples.
+        segments: of each seed of each estimator, all over the same samples at ``rate_hz`` [Hz].
         asked: further pairs to compare, such as those whose order a paper claims; left out where one of the two is missing.
     """
     first = next(iter(segments.values()))[0]

@@ -85,7 +85,7 @@ def filled(samples: FloatArray) -> FloatArray:
 
 
 def errors_by_regime(parts: Sequence[Scored], masks: Sequence[Mapping[str, Mask]], rate_hz: float) -> dict[str, dict[str, float]]:
-    """Regime -> `METRICS` and the share of the samples that lie in it, over all parts together.
+    """Regime -> `METRICS` and the share of the samples that lie in it, over all parts together, at ``rate_hz`` [Hz].
 
     Returns:
         Only regimes that every part tells, and of which there are `LEAST_SECONDS` of samples.

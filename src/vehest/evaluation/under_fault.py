@@ -71,7 +71,7 @@ class Flagged:
 
 
 def flags_under_fault(parts: Sequence[Scored], flagged: Sequence[Flagged], windows: Sequence[Window], rate_hz: float) -> dict[str, float]:
-    """Whether bands hold and faults are flagged while they last, over all parts together.
+    """Whether bands hold and faults are flagged while they last, over all parts together, at ``rate_hz`` [Hz].
 
     ``coverage_90`` share of samples whose error of β lies in the band, ``coverage_90_unflagged`` the same of those marked valid; of
     ranges that were valid before: ``missed_detections`` share in which nothing is flagged before the fault's end, ``detection_delay`` mean

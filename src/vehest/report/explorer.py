@@ -109,7 +109,10 @@ def packed(columns: dict[str, FloatArray]) -> tuple[dict[str, list[float]], str]
 
 
 def reckoned_course(vx: FloatArray, vy: FloatArray, yaw_rate: FloatArray, step: float) -> tuple[FloatArray, FloatArray]:
-    """Where the car went, x and y (K,) [m], by integrating velocities from the origin, heading along x; after NaN it starts anew."""
+    """Where the car went, x and y (K,) [m], by integrating velocities from the origin, heading along x; after NaN it starts anew.
+
+    ``vx`` and ``vy`` [m/s] and ``yaw_rate`` [rad/s] are (K,); ``step`` [s] lies between two samples.
+    """
     x, y = np.full(len(vx), np.nan), np.full(len(vx), np.nan)
     known = np.isfinite(vx) & np.isfinite(vy) & np.isfinite(yaw_rate)
     for first, end in true_runs(known).tolist():

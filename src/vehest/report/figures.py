@@ -87,7 +87,7 @@ def spread_figure(rows: Sequence[Spread], quantity: str) -> MatplotlibFigure:
 
 
 def traces_figure(time: FloatArray, reference: Traces, estimates: Sequence[Traces], time_label: str) -> MatplotlibFigure:
-    """Reference and estimate over a whole test set, one row an estimator: lateral velocity left, sideslip right."""
+    """Reference and estimate over a whole test set, ``time`` (K,) [s], one row an estimator: lateral velocity left, sideslip right."""
     with new_figure(DOUBLE_COLUMN, 0.75 + 0.68 * max(len(estimates), 2)) as figure:
         grid = figure.subplots(len(estimates), 2, sharex=True, sharey="col", squeeze=False)
         for (left, right), estimate in zip(grid, estimates, strict=True):
@@ -106,7 +106,7 @@ def traces_figure(time: FloatArray, reference: Traces, estimates: Sequence[Trace
 def zoom_figure(
     time: FloatArray, ay: FloatArray | None, reference: Traces, estimates: Sequence[Traces], time_label: str
 ) -> MatplotlibFigure:
-    """Reference and all estimates over a short while: lateral velocity, sideslip, its error, and the lateral acceleration."""
+    """Reference and all estimates over a short time, (K,) [s]: lateral velocity, sideslip, its error and, if given, ``ay`` (K,) [m/s²]."""
     from matplotlib.ticker import MaxNLocator
 
     heights = (1.5, 1.5, 1.2, 0.6) if ay is not None else (1.5, 1.5, 1.2)
@@ -160,7 +160,7 @@ def error_histogram(estimates: Sequence[Errors]) -> MatplotlibFigure:
 
 
 def error_over_ay(ay: FloatArray, estimates: Sequence[Errors]) -> MatplotlibFigure:
-    """RMSE of the sideslip in bins of |a_y| of 1 m/s², and how many samples each bin holds; bins of fewer than 20 samples show none."""
+    """RMSE of the sideslip in bins of 1 m/s² of |a_y|, (K,) [m/s²], and how many samples each holds; bins of fewer than 20 show none."""
     n_bins = max(math.ceil(float(np.abs(ay).max())), 1)
     edges = np.arange(n_bins + 1)
     centres = edges[:-1] + 0.5
@@ -208,7 +208,7 @@ def learning_curves(runs: Sequence[Learning], quantity: str) -> MatplotlibFigure
 
 
 def decimated(time: FloatArray, values: FloatArray, n_points: int) -> tuple[FloatArray, FloatArray]:
-    """Fewer points of a time series that keep its peaks: lowest and highest value of each stretch, in their order."""
+    """Fewer points of a time series, (K,), that keep its peaks: lowest and highest value of each stretch, in their order."""
     if len(values) <= n_points:
         return time, values
     kept: list[int] = []

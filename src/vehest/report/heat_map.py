@@ -32,7 +32,7 @@ class Panel:
 def heat_map(
     panels: Sequence[Panel], columns: Sequence[str], rows: Sequence[str], column_label: str, row_label: str, quantity: str
 ) -> MatplotlibFigure:
-    """Panels on one scale of colours, the darker the larger; logarithmic where the largest value is 20 times the smallest."""
+    """Panels, (R, C) each, on one scale of colours, the darker the larger; logarithmic where the largest value is 20 times the smallest."""
     import matplotlib
     from matplotlib.cm import ScalarMappable
     from matplotlib.colors import LinearSegmentedColormap

@@ -31,7 +31,7 @@ def trace_figure(
     measured: tuple[FloatArray, FloatArray],
     estimated: tuple[FloatArray, FloatArray],
 ) -> Figure:
-    """Measured and estimated lateral velocity [m/s] and sideslip [rad] over the scored times of a test range."""
+    """Measured and estimated lateral velocity [m/s] and sideslip [rad], (K,) each, over the scored times, (K,) [s], of a test range."""
     reference = Traces("measured", REFERENCE, measured[0], np.degrees(measured[1]))
     own = Traces(label, line_of(estimator, variant), estimated[0], np.degrees(estimated[1]))
     return traces_figure(time, reference, [own], "time [s]")

@@ -25,7 +25,7 @@ FILES = ("alignment.md", "alignment.csv", "alignment.yaml", "alignment.png", "al
 
 
 def align_recording(source: str, overrides: Sequence[str], recording_id: str | None, settings: AlignmentSettings) -> Alignment:
-    """Estimate quantities from one recording."""
+    """Estimate quantities from one recording; raises `VehestError` where it is not there, cannot be read or does not determine them."""
     with reading(source, overrides) as config:
         recording = _one_recording(source, config, recording_id)
         for finding in checks_of_recording(recording):
@@ -76,7 +76,7 @@ def as_plain(alignment: Alignment) -> dict[str, Any]:
 
 
 def write_alignment(alignment: Alignment, folder: Path) -> None:
-    """Write the report, its table, the transforms and the figure into a folder of their own, all or nothing."""
+    """Write report, table, transforms and figure into a folder of its own, all or nothing; raises `ConfigurationError`, `MissingError`."""
     import pandas as pd
 
     from vehest.report.alignment_figures import alignment_figure, figure_files

@@ -137,7 +137,7 @@ def find(plan: StagePlan) -> Artefact | None:
 
 
 def read_artefact(folder: Path) -> Artefact:
-    """Read a stage's folder."""
+    """Read a stage's folder; raises `MissingError` without a manifest, `DataError` where it is damaged or the files differ from it."""
     path = folder / MANIFEST
     try:
         content = read_json(path)
@@ -163,7 +163,10 @@ def _files(folder: Path) -> list[Path]:
 
 
 def make(plan: StagePlan, write: Callable[[Path], Status | None]) -> Artefact:
-    """Run a stage: ``write`` fills an empty folder, which then gets its manifest and its final name; ``interrupted`` if it was stopped."""
+    """Run a stage: ``write`` fills an empty folder, which then gets its manifest and its final name; ``interrupted`` if it was stopped.
+
+    Raises `MissingError` where the disk is full or not writable, and what ``write`` raises; nothing is left behind then.
+    """
     started = time.monotonic()
     remove_leftovers(plan.folder.parent)
     with written_aside(plan.folder, replace_folder=True) as aside:
@@ -190,7 +193,7 @@ def ensured(
     should_stop: Callable[[], bool],
     on_wait: Callable[[Waiting], None],
 ) -> Artefact | None:
-    """Make an artefact under its lock, or take the one of another process; none if ``should_stop`` ended the wait for it."""
+    """Make an artefact under its lock, or take another process's; none if ``should_stop`` ended the wait for it; raises as `make` does."""
     with held(plan.lock, should_stop, on_wait) as mine:
         if not mine:
             return None

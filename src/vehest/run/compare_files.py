@@ -86,7 +86,7 @@ def compare_files(recording: Path, words: Sequence[str], models: Sequence[str]) 
 
 
 def read_estimate_table(file: Path, vx: Recording) -> Estimate:
-    """Read v or β from a table of any tool, or of ``vehest estimate``.
+    """Read v or β from a table of any tool, or of ``vehest estimate``; raises `DataError` where it has neither, or no time.
 
     Columns are found by name, whatever their case; units in brackets behind a name count, else v is in m/s and β in rad. Where only
     β is there, v = u tan β with the recording's u.
@@ -126,6 +126,7 @@ def compare_estimates(drive: Recording, estimates: Mapping[str, Estimate]) -> Co
     """Score estimates on the clock of ``drive`` where all of them have values, beside v = 0 and a static map.
 
     The map is fitted on one half of the scored range and scored on the other, and vice versa, so that its samples are held out.
+    Raises `DataError` without a reference, or with too little or gaps in common, `ConfigurationError` for none or a baseline's name.
     """
     if not estimates:
         raise ConfigurationError("name at least one estimate to compare")

@@ -70,7 +70,10 @@ class Comparison:
         return {name: failure.message for name, failure in named_failures(self.jobs)} | dict.fromkeys(self.unfinished, NO_TIME)
 
     def plan(self, runner: Runner) -> None:
-        """Fit jobs to the recordings of their split, find those that lack something, and plan trainings; data are made on the way."""
+        """Fit jobs to the recordings of their split, find those that lack something, and plan trainings; data are made on the way.
+
+        Raises `ConfigurationError` for a wrong setting, `DataError` where no job can be done, `DryRunStop` where a dry run would make data.
+        """
         usable, names = self.usable, dict[Any, Any]()
         self._print_failures(self.jobs, runner)
         evaluated = "evaluation" in usable[0].config
@@ -158,7 +161,7 @@ def slowest(contents: Mapping[str, Sequence[RecordingSummary]]) -> RecordingSumm
 
 
 def lower_rate(config: Config, group: str, limit: RecordingSummary) -> tuple[Config, list[Note]]:
-    """A configuration whose ``GROUP.rate_hz`` is no higher than that of a recording, and a note if it was."""
+    """Configuration with ``GROUP.rate_hz`` no higher than a recording's, and a note if it was; raises `DataError`, `ConfigurationError`."""
     rate, key, lowest = config.get(group, {}).get("rate_hz"), f"{group}.rate_hz", limit.rate_hz
     if not isinstance(rate, int | float) or not rate > lowest * (1.0 + TOLERANCE):
         return config, []
@@ -194,7 +197,10 @@ def print_notes(notes: Iterable[Note], runner: Runner) -> None:
 
 
 def plan_training(config: Mapping[str, Any], split: Split, data: Mapping[str, Artefact]) -> TrainJob:
-    """A training, be it from scratch or from another model's weights, whose digest is then one of its inputs; see `plan_train`."""
+    """A training, be it from scratch or from another model's weights, whose digest is then one of its inputs; see `plan_train`.
+
+    Raises as `plan_train` does, and `MissingError` where the model to start from is not there.
+    """
     job = plan_train(config, split, data)
     start = config["training"].get("start_from")
     if start is None:

@@ -94,6 +94,8 @@ class _LocalFirst(SearchPathPlugin):  # type: ignore[misc]
 def compose_config(command: str, overrides: Sequence[str] = ()) -> Config:
     """The resolved configuration of a command, a root file in conf/, with overrides in Hydra's grammar, but no sweeps.
 
+    Raises `ConfigurationError` for an unknown key or choice, a wrong value or bad syntax.
+
     Returns:
         Plain dicts, lists, strings and numbers; and under `GIVEN` the rates that overrides name, if any.
     """

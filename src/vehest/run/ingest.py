@@ -141,7 +141,7 @@ def recording_file(recording_id: str) -> str:
 
 
 def simulation_config(dataset: str, overrides: Sequence[str]) -> Config:
-    """The configuration of a simulated data set's ingest; ``seed=1`` among the overrides is short for ``dataset.seed=1``."""
+    """Configuration of a simulated data set's ingest; override ``seed=1`` is short for ``dataset.seed=1``; raises `ConfigurationError`."""
     spelt_out = [f"dataset.{override.lstrip('+')}" if key_of(override).lstrip("+") == "seed" else override for override in overrides]
     config = compose_config("ingest", [f"dataset={dataset}", *spelt_out])
     if config["dataset"].get("source") != SIMULATED:
@@ -150,7 +150,7 @@ def simulation_config(dataset: str, overrides: Sequence[str]) -> Config:
 
 
 def outcome_of(ingested: Artefact) -> dict[str, Any]:
-    """Number and hours of the drives, and the names of those that span, left the road or ended before their manoeuvre did."""
+    """Number and hours of drives, and names of those that span, left the road or ended before their manoeuvre did; raises `DataError`."""
     drives = [read_recording(ingested.folder / name, ["vx"]) for name in sorted(ingested.outputs)]
     flags = {drive.id: drive.provenance["flags"] for drive in drives}
     return {
@@ -163,7 +163,7 @@ def outcome_of(ingested: Artefact) -> dict[str, Any]:
 
 
 def download_files(config: Config, messages: Messages, *, dry_run: bool) -> None:
-    """Fetch missing files of a data set, and record or compare the checksums of the others; errors as of `Download.fetch`."""
+    """Fetch a data set's missing files and record or compare the others' checksums; raises as `Download.fetch`, or `ConfigurationError`."""
     from vehest.sources.download import download_of
 
     source = open_source(config["dataset"])

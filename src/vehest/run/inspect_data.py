@@ -53,7 +53,7 @@ def list_datasets() -> tuple[list[dict[str, str]], Lines]:
 
 
 def describe(source: str, overrides: Sequence[str]) -> tuple[dict[str, Any], Lines]:
-    """Recordings of a data set or file, with ranges of their channels: for JSON and for a terminal."""
+    """Recordings of a data set or file, with ranges of their channels: for JSON and for a terminal; raises `VehestError`."""
     with reading(source, overrides) as config:
         recordings = [_described(read()) for _, read in _readers(source, config)]
     lines: Lines = []
@@ -84,7 +84,7 @@ def check(source: str, overrides: Sequence[str]) -> tuple[list[dict[str, str]], 
 
 
 def examine_usability(source: str, overrides: Sequence[str]) -> tuple[dict[str, Any], Lines]:
-    """Estimators that a data set or file can be used with, and missing channels: for JSON and for a terminal."""
+    """Estimators that a data set or file can be used with, and missing channels: for JSON and for a terminal; raises `VehestError`."""
     with reading(source, overrides) as config:
         recordings = _contents(source, config)
         columns = unused_columns(config["dataset"], None if source in choices("dataset") else Path(source))
@@ -110,7 +110,7 @@ def examine_usability(source: str, overrides: Sequence[str]) -> tuple[dict[str, 
 
 @contextmanager
 def reading(source: str, overrides: Sequence[str]) -> Iterator[Config]:
-    """The configuration that reads a data set or a file, while its limits hold."""
+    """The configuration that reads a data set or a file, while its limits hold; raises `ConfigurationError` where it is neither."""
     if source in choices("dataset"):
         config = compose_config("ingest", [f"dataset={source}", *overrides])
     elif os.path.lexists(source):  # also of a name that is too long or holds a null character

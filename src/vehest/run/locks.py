@@ -66,7 +66,7 @@ class Lock:
 
 @contextmanager
 def held(lock: Lock, should_stop: Callable[[], bool] = lambda: True, on_wait: Callable[[Waiting], None] | None = None) -> Iterator[bool]:
-    """Hold a lock, and wait for it until ``should_stop``, by default not at all; yields whether it is held."""
+    """Hold a lock, and wait for it until ``should_stop``, by default not at all; yields whether it is held; raises `MissingError`."""
     try:
         mine = lock.take()
         if not mine and on_wait is not None:

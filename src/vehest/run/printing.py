@@ -61,7 +61,7 @@ def open_streams() -> None:
 
 
 def emit(as_json: bool, outcome: Any, shown: Iterable[str | TerminalTable] | None = None) -> None:
-    """Print the outcome of a command, as one JSON object or in lines and tables; by default a line for each key."""
+    """Print the outcome of a command, as one JSON object or in lines and tables; by default a line for each key; raises `MissingError`."""
     if as_json:
         echo(as_json_text(outcome), keep="\n")
         return

@@ -72,7 +72,7 @@ def unused_artefacts(output: Path) -> list[Unused]:
 
 
 def remove_unused(unused: Sequence[Unused], on_removed: Callable[[Unused], None]) -> None:
-    """Remove listed files and folders, each renamed first, so that no half of it is found; ``on_removed`` is called after each."""
+    """Remove files and folders, each renamed first so that no half is found; ``on_removed`` is called after each; raises `MissingError`."""
     for one in unused:
         aside = aside_of(one.path)
         try:

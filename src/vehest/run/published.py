@@ -136,7 +136,10 @@ class Verdict:
 
 
 def check_published(names: Sequence[str], overrides: Sequence[str] = ()) -> list[Verdict]:
-    """Compare the recorded keys of published studies with those of today's code, configuration and raw files."""
+    """Compare the recorded keys of published studies with those of today's code, configuration and raw files.
+
+    Raises `ConfigurationError` for an override that would change results, `MissingError` for a name of no pipeline or published study.
+    """
     if content_overrides(overrides):
         raise ConfigurationError(f"'{content_overrides(overrides)[0]}' changes the results, which are published without overrides")
     published = sorted(file.parent.name for file in RESULTS.glob(f"*/{PROVENANCE}"))

@@ -63,6 +63,7 @@ def publish_study(publication: Publication | None, report: Artefact, messages: M
 
     A published report that shows data which this run could not read stays. Where keys and all other files are the same, the provenance
     stays that of the first run with these results.
+    Raises `MissingError` where it cannot be written, `ConfigurationError` where the folder holds something else or is reached by a link.
     """
     if publication is None:
         return None

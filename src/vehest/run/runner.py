@@ -158,6 +158,8 @@ class Runner:
     def run(self, groups: Sequence[Group]) -> tuple[dict[str, Member], dict[str, Failure]]:
         """Train and evaluate groups, side by side where there are cores; where members of a group fail by their data, each is tried alone.
 
+        Raises `MissingError` where no member is there and a command has to be run first, `Stopped` at a signal; finished artefacts stay.
+
         Returns:
             Key of a training -> its member, and key of a training -> why it failed. Where the time is up, members lack what was not
             made, and trainings that were not begun are in neither.

@@ -108,7 +108,7 @@ Jobs = Mapping[str, Sequence[Job]]  # part of a study -> its jobs; the one part 
 
 
 def read_study(name: str, overrides: Sequence[str] = ()) -> Study:
-    """Read a pipeline by path or name; ``overrides`` are those of the command."""
+    """Read a pipeline by path or name; ``overrides`` are those of the command; raises `MissingError` or `ConfigurationError`."""
     file, content = _content_of(name)
     read = validated(PipelineFile, content, f"'{file}'", error=ConfigurationError)
     shown = [*read.datasets, *read.optional_datasets]
@@ -197,7 +197,7 @@ def _folds_of(part: Part, file: Path) -> dict[str, Part]:
 
 
 def jobs_of(study: Study, overrides: Sequence[str]) -> Jobs:
-    """Every job of a pipeline; further overrides apply to the sweeps, or data sets, that have their key."""
+    """Every job of a pipeline; further overrides apply to the sweeps, or data sets, that have their key; raises `ConfigurationError`."""
     what, fixed = ("data set", "dataset") if study.datasets else ("sweep", "split")
     if fixed in map(key_of, overrides):
         raise ConfigurationError(
@@ -257,7 +257,7 @@ def content_overrides(overrides: Sequence[str]) -> list[str]:
 
 
 def sweep_of(overrides: Sequence[str], name: str | None = None) -> tuple[Study, Jobs]:
-    """A study with one sweep: all combinations of overrides over their seeds, in the order of the command.
+    """A study with one sweep: all combinations of overrides over their seeds, in the order of the command; raises `ConfigurationError`.
 
     A combination that its estimator refuses stays in the list with the reason. By default the study is named after estimators and split.
     """

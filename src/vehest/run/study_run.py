@@ -206,7 +206,7 @@ def _publication(
 
 
 def train_one(overrides: Sequence[str], options: RunOptions) -> dict[str, Any]:
-    """Train and calibrate one estimator; empty where it was stopped before its first epoch was over."""
+    """Train and calibrate one estimator; empty where it was stopped before its first epoch was over; raises `VehestError`."""
     config = compose_config("train", overrides)
     with open_runner(config, options, ("train", "calibrate")) as runner:
         members, failures = runner.run([_only_group(config, runner)])
@@ -223,7 +223,7 @@ def train_one(overrides: Sequence[str], options: RunOptions) -> dict[str, Any]:
 
 
 def evaluate_one(overrides: Sequence[str], model: str | None, options: RunOptions, note: Callable[[str], None]) -> dict[str, Any]:
-    """Evaluate a model by folder or start of its name, or the one that the overrides train, on the tests of a split."""
+    """Evaluate a model by folder or start of its name, or the one that overrides train, on the tests of a split; raises `MissingError`."""
     config = compose_config("eval", overrides)
     with open_runner(config, options, ("calibrate", "evaluate")) as runner:
         split = runner.split(config)

@@ -56,7 +56,7 @@ def new_estimator(config: Mapping[str, Any]) -> Estimator:
 
 
 def plan_train(config: Mapping[str, Any], split: Split, data: Mapping[str, Artefact]) -> TrainJob:
-    """A training and its artefact."""
+    """A training and its artefact; raises `ConfigurationError` for a wrong setting or nothing to learn, `DataError` without a recording."""
     estimator, seed = new_estimator(config["estimator"]), config["seed"]
     settings_from_config(estimator.training_type, config["training"], "training")
     if not isinstance(seed, int) or isinstance(seed, bool) or not 0 <= seed < 2**63:

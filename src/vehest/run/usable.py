@@ -152,7 +152,7 @@ def _cells(row: Usability) -> list[str]:
 
 
 def lack(config: Config, split: Split, contents: Mapping[str, Sequence[RecordingSummary]]) -> str:
-    """Channels that recordings of a split lack and its estimator needs, as one line; empty if none."""
+    """Channels that recordings of a split lack and its estimator needs, as one line; empty if none; raises `ConfigurationError`."""
     estimator, training = _built(config)
     tested = [span for spans in split.tests.values() for span in spans] if "evaluation" in config else []
     scored = _recordings([*tested, *split.validation] if tested else [], contents)

@@ -47,7 +47,7 @@ def write_weights(models: Iterable[Artefact], path: Path) -> None:
 
 
 class PublishedWeights:
-    """The models of a published study by the keys of their trainings; none where there is no such file."""
+    """Models of a published study by the keys of their trainings; none where there is no such file; raises `DataError` where damaged."""
 
     def __init__(self, path: Path) -> None:
         self.path = path

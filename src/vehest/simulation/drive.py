@@ -142,7 +142,7 @@ def drive(
     stability_control: bool = False,
     stint: Stint | None = None,
 ) -> Trip:
-    """Drive a car through a manoeuvre and keep its true motion."""
+    """Drive a car through a manoeuvre and keep its true motion; raises `ConfigurationError` or, where it rolls over, `SimulationError`."""
     per_command = whole_steps(DRIVER_RATE_HZ, plant.step, "driver's")
     per_sample = whole_steps(rate_hz, plant.step, "sampling")
     controller = manoeuvre.controller(car_of(plant), surface, seed)
@@ -272,7 +272,7 @@ class _Ride:
 
 
 def whole_steps(rate_hz: float, step: float, what: str) -> int:
-    """Steps of the plant [s] between two ticks of a rate."""
+    """Steps of the plant [s] between two ticks of a rate; raises `ConfigurationError` where they are not whole; ``what`` names the rate."""
     n_steps = round(1.0 / (rate_hz * step)) if rate_hz > 0 else 0
     if n_steps < 1 or abs(n_steps * step * rate_hz - 1.0) > 1e-9:
         raise ConfigurationError(

@@ -48,12 +48,15 @@ class Variations:
 
 
 def variations_from_config(entries: Any) -> tuple[Variation, ...]:
-    """Variations from a data set's ``vary``: a list of ``{parameters: [m, m_s], factor: [0.9, 1.2]}``, ``log: true`` if wanted."""
+    """Variations from a data set's ``vary``: a list of ``{parameters: [m, m_s], factor: [0.9, 1.2]}``, ``log: true`` if wanted.
+
+    Raises `ConfigurationError` where an entry is no variation.
+    """
     return validated(Variations, {"vary": entries}, "", error=ConfigurationError).vary
 
 
 def varied(vehicle: Vehicle, variations: Sequence[Variation], seed: int) -> Vehicle:
-    """The vehicle with its parameters scaled as the seed draws them; the same one if nothing varies."""
+    """The vehicle with its parameters scaled as the seed draws them; the same one if nothing varies; raises `ConfigurationError`."""
     if not variations:
         return vehicle
     generator = np.random.default_rng(np.random.SeedSequence(entropy=seed, spawn_key=(_STREAM, 0)))
@@ -99,7 +102,7 @@ class SensorVariation:
 
     @classmethod
     def from_config(cls, entries: Any) -> SensorVariation:
-        """Variation from a data set's ``vary_sensors``: ``{noise: [0.5, 2], delay: [0, 1.5]}``."""
+        """Variation from a data set's ``vary_sensors``: ``{noise: [0.5, 2], delay: [0, 1.5]}``; raises `ConfigurationError` otherwise."""
         kinds = [entry.name for entry in fields(SensorLevel)]
         if not isinstance(entries, Mapping) or set(entries) - {*kinds, "roll_share"}:
             raise ConfigurationError(f"vary_sensors is a mapping from {', '.join(kinds)} or roll_share to ranges of scales, not {entries}")

@@ -73,7 +73,10 @@ def simulate_planar_drive(
 def drive_freely(
     plant: PlanarPlant, manoeuvre: Freestyle, seed: int, *, rate_hz: float = RATE_HZ, surface: Surface = SURFACES["dry"]
 ) -> Trip:
-    """Drive a car for the time of a recording and keep its true motion; it starts from standstill, SETTLING_TIME before."""
+    """Drive a car for the time of a recording and keep its true motion; it starts from standstill, SETTLING_TIME before.
+
+    Raises `ConfigurationError` where rate or step make no sense, `SimulationError` where a state is not finite.
+    """
     per_command = whole_steps(COMMAND_RATE_HZ, plant.step, "driver's")
     per_sample = whole_steps(rate_hz, plant.step, "sampling")
     stride = int(np.gcd(per_command, per_sample))

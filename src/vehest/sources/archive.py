@@ -38,7 +38,7 @@ class _Archive(io.FileIO):
 
 @contextmanager
 def unpacked(file: Path, *, most_bytes: int = MOST_BYTES) -> Iterator[Path]:
-    """Yield a temporary folder with the contents of a zip archive; it is removed afterwards.
+    """Yield a temporary folder with the contents of a zip archive; it is removed afterwards; raises `DataError` or `MissingError`.
 
     All entries are checked before anything is written: no path outside the folder, no links or special files, no more bytes or files than
     the limits. zipfile unpacks no entry beyond its stated size, and checks its checksum. Archives inside stay packed.

@@ -198,7 +198,7 @@ class Source(ABC):
 
 
 def open_source(dataset: Mapping[str, Any]) -> Source:
-    """The source that a data set's configuration names."""
+    """The source that a data set's configuration names; raises `ConfigurationError` for an unknown source or option."""
     return source_class(dataset)(dataset)
 
 
@@ -224,7 +224,7 @@ def require_no_spreadsheet(file: Path) -> None:
 
 
 def source_class(dataset: Mapping[str, Any]) -> type[Source]:
-    """The class of a data set's source: ``SOURCE`` of the module ``vehest.sources.NAME``."""
+    """The class of a data set's source: ``SOURCE`` of the module ``vehest.sources.NAME``; raises `ConfigurationError` without one."""
     name = str(dataset.get("source"))
     found: type[Source] | None = _source_of(name) if name in _modules() else None
     if found is None:

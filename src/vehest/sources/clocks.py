@@ -65,7 +65,7 @@ def clock_fault(stamps: FloatArray, fix: str = SORT, *, may_repeat: bool = False
 
 
 def span_fault(stamps: FloatArray) -> str:
-    """A stray one among time stamps, more than 1e8 median steps from the others, in words; empty where none is."""
+    """A stray one among time stamps (T,), more than 1e8 median steps from the others, in words; empty where none is."""
     steps = np.diff(stamps)
     step = float(np.median(steps)) or float(steps.mean())
     if not stamps[-1] - stamps[0] > MOST_STEPS * step:
@@ -109,7 +109,7 @@ def unevenness(stamps: FloatArray) -> str:
 
 
 def require_samples(values: FloatArray, times: FloatArray, longest: float, where: str) -> None:
-    """Refuse samples, shape (T,), that are no finite numbers or whose increasing times [s] lie further apart than ``longest`` [s]."""
+    """Raise `DataError` for samples, (T,), that are not finite or whose increasing times [s] lie further apart than ``longest`` [s]."""
     bad, steps = np.flatnonzero(~np.isfinite(values)), np.diff(times)
     if len(bad):
         what = f"{len(bad)} samples between {times[bad[0]]:.6g} s and {times[bad[-1]]:.6g} s that are marked invalid or no finite numbers"
@@ -282,7 +282,7 @@ def mean_step(steps: FloatArray) -> float:
 
 
 def plain_rate(rate: float, tolerance: float) -> float:
-    """The rate that was meant: the nearest whole number of Hz, ms, mHz or µs, the coarse ones first.
+    """The rate [Hz] that was meant: the nearest whole number of Hz, ms, mHz or µs, the coarse ones first.
 
     A double holds unix time to 0.24 µs, so that the rate computed from time stamps would not be a rational multiple of any other.
     """

@@ -51,7 +51,7 @@ def columns_from_config(entries: Mapping[str, Any], dataset: str, kind: type[Col
 
 
 def column_from_config(entry: Any, where: str, si_unit: str, kind: type[Column] = Column) -> Column:
-    """A declaration of ``kind`` whose unit is convertible to ``si_unit``."""
+    """A declaration of ``kind`` whose unit is convertible to ``si_unit``; raises `ConfigurationError` for another key or quantity."""
     column = validated(kind, entry, where, error=ConfigurationError)
     if column.factor == 0:
         raise ConfigurationError(f"{where}: factor must be a number other than 0")

@@ -74,7 +74,7 @@ class Download:
         return f"{self.url.rstrip('/')}/{quote(name)}"
 
     def missing(self) -> list[str]:
-        """Files that are not there; those that are there are checked. Writes nothing."""
+        """Files that are not there; those that are there are checked. Writes nothing; raises `DataError` where one is damaged."""
         return [name for name in self.files if self._checked(name) is None]
 
     def fetch(self, progress: Progress | None = None) -> Iterator[Outcome]:
@@ -136,7 +136,7 @@ class Download:
 
 
 def download_of(source: Source) -> Download:
-    """Option ``download`` of a data set."""
+    """Option ``download`` of a data set; raises `ConfigurationError` where it is missing or wrong, `MissingError` without a data root."""
     where = f"data set '{source.name}'"
     options = validated(DownloadOptions, source.dataset.get("download"), where, error=ConfigurationError, group="dataset.download")
     try:

@@ -32,7 +32,7 @@ class FileSource(Source):
         return {file.name: file for file in self._files()}
 
     def read_raw(self, recording_id: str) -> Recording:
-        """Read one file by its name."""
+        """Read one file by its name; raises `MissingError` where there is none, `DataError` where it cannot be used."""
         for file in self._files():
             if self._id_of(file) == recording_id:
                 return self.read_raw_file(file)

@@ -91,7 +91,7 @@ def read_limited(reader: str, file: Path, **request: Any) -> Reading:
 
 
 def require_package(module: str, extra: str, what: str) -> None:
-    """See that an optional package is installed."""
+    """See that an optional package is installed; raises `MissingError` where it is not."""
     if find_spec(module) is None:
         raise MissingError(f"{what} needs the package {module}; install it with: pip install 'vehest[{extra}]'")
 

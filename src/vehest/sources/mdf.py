@@ -48,7 +48,7 @@ class MdfSource(SignalSource):
 
 
 def read_measurement(file: Path, wanted: Wanted | None) -> tuple[dict[str, Signal], list[str], dict[str, Any]]:
-    """Signals of a measurement.
+    """Signals of a measurement; raises `MissingError` without file or asammdf, `DataError` where it or a wanted signal is unusable.
 
     Args:
         wanted: where each signal stands; None for every signal of numbers whose group has times.

@@ -51,11 +51,12 @@ class PoseOptions:
             raise ValueError(f"window must be an odd number above order, and order at least 1, not {self.window} and {self.order}")
 
     def motion(self, positions: FloatArray, yaw: FloatArray, interval: float, turned: float = 0.0, where: str = "poses") -> PlanarMotion:
-        """Differentiate poses by a Savitzky-Golay filter and turn the velocity into the car's axes.
+        """Differentiate poses by a Savitzky-Golay filter and turn the velocity into the car's axes; raises `DataError` for too few poses.
 
         Args:
             positions: of the rigid body's origin, x and y with z up [m], evenly sampled, shape (T, 2).
             yaw: of the rigid body, unwrapped [rad], shape (T,).
+            interval: between two samples [s].
             turned: from the rigid body's x axis to the car's forward axis, counter-clockwise [rad].
 
         Source:
@@ -75,7 +76,7 @@ class PoseOptions:
 
 
 def ground_plane(positions: FloatArray, orientations: FloatArray, up: UpAxis, where: str) -> tuple[FloatArray, FloatArray]:
-    """Positions in the ground plane and unwrapped yaw, from poses in space.
+    """Positions in the ground plane and unwrapped yaw, from poses in space; raises `DataError` where a quaternion is not of unit length.
 
     Args:
         positions: x, y, z in the world [m], shape (T, 3).

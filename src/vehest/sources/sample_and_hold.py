@@ -38,7 +38,7 @@ class SampleAndHold:
     def interpolated(
         self, columns: Mapping[str, Column], values: Mapping[str, FloatArray], clock: Clock, where: str
     ) -> tuple[dict[str, FloatArray], slice, float]:
-        """Held channels on a recording's clock, along straight lines, which look ahead by up to one interval.
+        """Held channels on a recording's clock, along straight lines, which look ahead by up to one interval; raises `DataError`.
 
         Args:
             columns: of the held channels.
@@ -67,7 +67,7 @@ class SampleAndHold:
 
 
 def held_from_config(entry: Any, known: Sequence[str], where: str) -> SampleAndHold:
-    """A data set's declaration of held channels."""
+    """A data set's declaration of held channels; raises `ConfigurationError` for an undeclared channel, or another mistake."""
     held = validated(SampleAndHold, entry, where, error=ConfigurationError)
     if unknown := [name for name in held.channels if name not in known]:
         raise ConfigurationError(f"{where} names '{unknown[0]}', which is not one of the data set's channels")

@@ -86,7 +86,7 @@ class SignalSource(FileSource):
             raise ConfigurationError(f"{self.where}: raster must name one of its channels that is not gappy, not '{options.raster}'")
 
     def read_raw_file(self, file: Path) -> Recording:
-        """Read a file of signals wherever it is."""
+        """Read a file of signals wherever it is; raises `MissingError` without it, `DataError` where it or its clocks are unusable."""
         require_files([file], self.name)
         signals, provenance = self._read_signals(file)
         if self.options.file_units == "check":

@@ -33,7 +33,7 @@ class TablePose(PoseOptions):
         return {"x": self.x, "y": self.y, "yaw": self.yaw}
 
     def made_of(self, values: Mapping[str, FloatArray], clock: Clock, where: str) -> dict[str, FloatArray]:
-        """Reference channels on the recording's clock, on which poses are differentiated: offline, by half a window."""
+        """Reference channels on the recording's clock, on which poses are differentiated: offline, by half a window; raises `DataError`."""
         poses = {name: column.to_si(values[column.column], UNITS[name]) for name, column in self.columns.items()}
         for name, samples in poses.items():
             odd = np.flatnonzero(~np.isfinite(samples))
@@ -46,7 +46,7 @@ class TablePose(PoseOptions):
 
 
 def table_pose_from_config(entry: Any, where: str) -> TablePose:
-    """A data set's declaration of poses in columns."""
+    """A data set's declaration of poses in columns; raises `ConfigurationError` where a column or unit is missing, or one unknown."""
     pose = validated(TablePose, entry, where, error=ConfigurationError)
     for name, unit in UNITS.items():
         column_from_config(entry[name], f"{where}: {name}", unit)

@@ -17,7 +17,7 @@ RANGE = re.compile(r"([1-9]\d*)(?:-(\d*))?")
 
 
 def dropped_rows_from_config(entries: Mapping[str, Iterable[int | str]], where: str) -> dict[str, list[slice]]:
-    """Rows that a data set leaves out, by the stem of their file: numbers from 1 below the header, or ranges of them."""
+    """Rows that a data set leaves out, by their file's stem: numbers from 1 below the header, or ranges; raises `ConfigurationError`."""
     return {str(stem): [_rows(row, f"{where}: drop_rows of '{stem}'") for row in rows] for stem, rows in entries.items()}
 
 

@@ -48,7 +48,7 @@ def is_parquet(file: Path) -> bool:
 
 
 def column_names(file: Path, layout: TextLayout = TextLayout()) -> list[str]:
-    """Names of a table's columns, in order."""
+    """Names of a table's columns, in order; raises `MissingError` where there is no such file, `DataError` where it cannot be read."""
     if layout.names is not None:
         names = list(layout.names)
     elif is_parquet(file):
@@ -66,7 +66,7 @@ def column_names(file: Path, layout: TextLayout = TextLayout()) -> list[str]:
 
 
 def read_head(file: Path, size: int = BLOCK) -> bytes:
-    """First bytes of a table, unpacked."""
+    """First bytes of a table, unpacked; raises `MissingError` where there is no such file, `DataError` where it cannot be read."""
     try:
         with table_stream(file) as stream:
             return bytes(stream.read(size))
@@ -138,7 +138,10 @@ def parse_table(opened: Callable[[], pa.NativeFile], layout: TextLayout, convert
 
 
 def table_stream(file: Path) -> pa.NativeFile:
-    """Text of a table; one whose name ends in ``.gz``, ``.bz2``, ``.zst`` or ``.lz4`` is unpacked into memory, within the limits."""
+    """Text of a table; one whose name ends in ``.gz``, ``.bz2``, ``.zst`` or ``.lz4`` is unpacked into memory, within the limits.
+
+    Raises `MissingError` where there is no such file, `DataError` for a pipe, a folder or too much, `OSError` where it cannot be opened.
+    """
     packed = PACKED.get(regular_file(file).suffix.lower())
     stream = pa.input_stream(open(file, "rb"), compression=packed)  # noqa: SIM115 (pyarrow opens no name that is not UTF-8)
     if packed is None:

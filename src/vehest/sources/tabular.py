@@ -97,7 +97,7 @@ class TabularSource(FileSource):
         return self._read(*found[recording_id])
 
     def read_raw_file(self, file: Path) -> Recording:
-        """Read a table wherever it is."""
+        """Read a table wherever it is; raises `MissingError` without it, `DataError` where it cannot be read or lacks a column."""
         runs = list(self._runs_of(file))
         if len(runs) > 1:
             raise DataError(f"'{file}' holds {len(runs)} runs ({listed([str(run) for run in runs])}); keep the rows of one")
@@ -188,7 +188,7 @@ class TabularSource(FileSource):
 
 
 def unused_columns(dataset: Mapping[str, Any], file: Path | None = None) -> list[str]:
-    """Names of columns that could be declared as channels; none where the source of the data set is not ``tabular``."""
+    """Columns that could be declared as channels; none unless the data set's source is ``tabular``; raises `MissingError`, `DataError`."""
     source = open_source(dataset)
     if type(source) is not TabularSource:
         return []

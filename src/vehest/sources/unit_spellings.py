@@ -45,7 +45,7 @@ def plain_unit(text: str) -> str | None:
 
 
 def require_unit(written: str, column: Column, si_unit: str, where: str, fix: str) -> None:
-    """Refuse a declared unit that contradicts the file's; unknown spellings pass."""
+    """Refuse a declared unit that contradicts the file's; unknown spellings pass; raises `DataError` where the units differ."""
     plain = plain_unit(written)
     if plain is None or column.factor != 1.0:
         return

@@ -76,7 +76,7 @@ class VboSource(FileSource):
         self._require_pattern()
 
     def read_raw_file(self, file: Path) -> Recording:
-        """Read a log wherever it is."""
+        """Read a log wherever it is; raises `MissingError` without it, `DataError` for damage or a wrong column, unit, clock or offset."""
         require_files([file], self.name)
         log = read_log(file)
         used = [column.column for column in self.columns.values()]
@@ -92,7 +92,7 @@ class VboSource(FileSource):
 
 
 def read_log(file: Path) -> Log:
-    """Everything in a log.
+    """Everything in a log; raises `DataError` where it is no such file, damaged, or more than the limits allow.
 
     A last row that is cut off, or comes more than half an interval late, as loggers write when they are stopped, is left out.
     """
@@ -137,7 +137,7 @@ def require_slip_offsets(log: Log, where: str) -> None:
     """See that slip at two wheels of one side differs by what the yaw rate makes between the axles.
 
     The logger computes slip at points whose offsets from the antenna were entered as {lateral, longitudinal}. Where the two change places,
-    front and rear wheel of a side have the same longitudinal offset, and the same slip.
+    front and rear wheel of a side have the same longitudinal offset, and the same slip, which raises `DataError`.
     """
     needed = ("Slip_FL", "Slip_RL", "YawRate", "velocity")
     if not {"FL", "RL"} <= set(log.offsets) or not set(needed) <= set(log.columns):

@@ -21,7 +21,7 @@ from vehest.evaluation.metrics import Protocol, Scored, score_all
 
 
 def read_frame(path: Path, columns: Iterable[str] = (), *, numbers: Iterable[str] = ()) -> pd.DataFrame:
-    """A table that vehest wrote as CSV, its numbers bit for bit, with ``columns`` of which ``numbers`` hold numbers; else an error."""
+    """A table that vehest wrote as CSV, its numbers bit for bit, with ``columns`` of which ``numbers`` hold numbers; else a `DataError`."""
     text = read_text(path)
     try:
         table = pd.read_csv(io.StringIO(text), float_precision="round_trip")
@@ -146,7 +146,7 @@ class StoredDataset:
     citation: str = ""  # what to cite
 
     def recordings(self, channels: Iterable[str] | None = None) -> Iterator[Recording]:
-        """All recordings, one at a time, with all or some of their channels."""
+        """All recordings, one at a time, with all or some of their channels; raises `DataError` where a file is damaged or lacks one."""
         wanted = None if channels is None else list(channels)
         for file in self.files.values():
             yield read_recording(file, wanted)

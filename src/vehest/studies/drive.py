@@ -78,7 +78,7 @@ def leaderboard(artefacts: PartArtefacts) -> pd.DataFrame:
     corrected by Holm (`ranking_of`). ``floor_cramer_rao`` is the bound for what the estimator reads, NaN where there is none.
     ``epochs`` is NaN for a method without. ``start`` is ``reference`` if the protocol hands the true
     initial state over, else ``own``.
-    Sideslip in deg, velocities in m/s.
+    Sideslip in deg, velocities in m/s. Raises `DataError` where a run has two values of a metric, or no validation metrics.
     """
     runs, start = runs_of(artefacts), "reference" if artefacts.protocol.initial_state else "own"
     rankings = {test_set: ranking_of(artefacts, test_set) for test_set in artefacts.split.tests}

@@ -30,7 +30,7 @@ TEST = "test"
 
 
 def documents(artefacts: StudyArtefacts) -> dict[str, Document]:
-    """The report: verdict over all folds, the table, errors of each fold; ranges and budgets are the appendix."""
+    """The report: verdict over all folds, the table, errors of each fold; ranges and budgets are the appendix; raises `DataError`."""
     parts = artefacts.parts
     folds = segments_of_folds(parts)
     first = next(iter(parts.values()))

@@ -28,7 +28,7 @@ REFERENCES = ("zero", "static_map", "kinematic", "data_sheet")  # baselines, in 
 
 
 def documents(artefacts: StudyArtefacts) -> dict[str, Document]:
-    """The report: what carried over, a table estimator x vehicle with the baselines first, each vehicle by itself, then how it was made."""
+    """Report: what carried over, a table estimator x vehicle, baselines first, each vehicle alone, how it was made; raises `DataError`."""
     parts = artefacts.parts
     rankings = {(name, test_set): ranking_of(part, test_set) for name, part in parts.items() for test_set in part.split.tests}
     board = overview(parts, rankings)

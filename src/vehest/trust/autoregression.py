@@ -47,7 +47,7 @@ class Autoregression:
 
 
 def fit_autoregression(pieces: Sequence[FloatArray], max_order: int = 10) -> Autoregression:
-    """Fit orders 1 to ``max_order`` to the same rows of uninterrupted stretches, (T, C) each, and keep the one with the least BIC."""
+    """Fit orders 1 to ``max_order`` to the same rows of unbroken stretches, (T, C) each; keep that of least BIC; raises `DataError`."""
     n_channels = pieces[0].shape[1]
     regressors, targets = _rows(pieces, max_order)
     if len(targets) < ROWS_A_NUMBER * (1 + max_order * n_channels):

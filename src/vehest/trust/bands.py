@@ -169,7 +169,7 @@ def band_rows(rows, vy, variance, columns, numbers, bands):  # type: ignore[no-u
 
 
 def with_bands(estimate: Estimate, measured: Recording, bands: Bands, *, elsewhere: bool = False) -> Estimate:
-    """An estimate of ``measured`` with its 90 % half widths as ``band_vy`` [m/s] and ``band_sideslip`` [rad]."""
+    """An estimate of ``measured`` with its 90 % half widths as ``band_vy`` [m/s] and ``band_sideslip`` [rad]; raises `DataError`."""
     rows, vy, variance = band_inputs(estimate, measured, bands.channels, bands.horizon_steps)
     half = bands.half_widths(rows, vy, variance, elsewhere=elsewhere)
     return replace(estimate, channels={**estimate.channels, "band_vy": half[:, 0].copy(), "band_sideslip": half[:, 1].copy()})
@@ -178,7 +178,7 @@ def with_bands(estimate: Estimate, measured: Recording, bands: Bands, *, elsewhe
 def band_inputs(
     estimate: Estimate, measured: Recording, channels: Sequence[str], horizon_steps: int
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Rows (T, C), estimates (T,) and their variances (T,), NaN where the method gives none, as bands take them.
+    """Rows (T, C), estimates (T,) and their variances (T,), NaN where the method gives none, as bands take them; raises `DataError`.
 
     A row is the last sample that the estimate was made of, so that online they are the same.
     """
@@ -221,6 +221,7 @@ def calibrated(training: Sequence[Piece], validation: Sequence[Piece], channels:
     """Bands of a model: scale and domain from training ranges, factors from validation ranges that it has not learnt from.
 
     ``channels`` are the columns of the rows; ``origin`` holds what else `Bands` says of the model and its recordings.
+    Raises `DataError` where one of the two has no sample whose error is known.
     """
     for pieces, what in ((training, "training"), (validation, "validation")):
         if not any(piece.known.any() for piece in pieces):

@@ -51,7 +51,7 @@ def write_trust(trust: Trust, folder: Path) -> None:
 
 
 def read_trust(folder: Path) -> Trust:
-    """Read trust.yaml of a folder back."""
+    """Read trust.yaml of a folder back; raises `MissingError` where there is none, `DataError` where it is damaged or of another format."""
     path = folder / TRUST
     content = read_yaml(path)
     if not isinstance(content, dict) or "format" not in content:

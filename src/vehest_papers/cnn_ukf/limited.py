@@ -29,7 +29,7 @@ AS_TUNED, OF_THE_FULL_SET = "tuned on the limited set", "p₁, p₂ of the full 
 
 
 def limited(full: Runs, learnt: Runs, prepared: Prepared) -> Limited:
-    """Hold what learnt on the limited set beside the filters of the full set; the test of both is the same."""
+    """Hold what learnt on the limited set beside the filters of the full set; the test of both is the same; raises `DataError`."""
     missing = [name for name in (paper.DATA, *paper.HYBRIDS) if name not in learnt]
     if missing:
         raise DataError(f"no {' and no '.join(missing)} among the models of part 'limited'; it needs all three methods that learn")

@@ -54,7 +54,7 @@ class ErrorDistribution:
 
 
 def manoeuvres_of(spans: Sequence[Span], parts: Sequence[Scored]) -> dict[str, list[Scored]]:
-    """What was scored of each recording, which is one manoeuvre, in the order of a test set's ranges."""
+    """What was scored of each recording, which is one manoeuvre, in the order of a test set's ranges; raises `DataError`."""
     if len(spans) != len(parts):
         raise DataError(f"{len(parts)} scored parts do not belong to {len(spans)} ranges; leave evaluation.sequence_seconds empty")
     found: dict[str, list[Scored]] = {}
@@ -93,7 +93,7 @@ def kpis_by_group(manoeuvres: Mapping[str, Sequence[Scored]]) -> dict[str, Kpis]
 
 
 def error_distribution(parts: Sequence[Scored], nonlinear_only: bool = True) -> ErrorDistribution:
-    """Distribution of the error of the sideslip angle, by default of samples with |ay| ≥ 4 m/s² only."""
+    """Distribution of the error of the sideslip angle, by default of samples with |ay| ≥ 4 m/s² only; raises `DataError` where none is."""
     errors = np.concatenate([sideslip_error(part)[is_nonlinear(part)] if nonlinear_only else sideslip_error(part) for part in parts])
     if not len(errors):
         raise DataError(f"no sample has a lateral acceleration of {NONLINEAR_AY:g} m/s² or more; count all with nonlinear_only=False")

@@ -59,7 +59,7 @@ def with_stiffness(fitted: Estimator, front: float, rear: float) -> Estimator:
 
 
 def with_body(fitted: Estimator, mass: float, inertia: float) -> Estimator:
-    """A copy of a filter that takes the car's mass and yaw inertia for so many times what they are; its tyres stay as they were found."""
+    """A copy of a filter that takes mass and yaw inertia for so many times what they are; its tyres stay as found; raises `DataError`."""
     changed = copy.deepcopy(fitted)
     of_filter = filter_of(changed)
     if of_filter is None:

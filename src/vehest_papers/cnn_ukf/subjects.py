@@ -100,7 +100,7 @@ Runs = Mapping[str, Sequence[Run]]  # candidate -> its seeds
 
 
 def candidate_of(model: EvaluatedModel) -> str:
-    """What the paper calls a model, or what of its method is taken away; of a network's inputs z-scores are named."""
+    """What the paper calls a model, or what of its method is taken away; of a network's inputs z-scores are named; raises `DataError`."""
     if model.estimator == "cnn_ukf":
         away = [words for name, words in PARTS_AWAY.items() if name in model.variant]
         if away:
@@ -117,7 +117,7 @@ def filter_of(fitted: Estimator) -> DugoffUkf | None:
 
 
 def runs_of(part: PartArtefacts, prepared: Prepared) -> dict[str, list[Run]]:
-    """Candidate -> its seeds, in the order of Table II."""
+    """Candidate -> its seeds, in the order of Table II; raises `DataError` for two of one seed, other models, or several test ranges."""
     recordings = [span.recording for span in prepared.spans(TEST)]
     if len(set(recordings)) != len(recordings):
         raise DataError(f"study '{part.study}': a recording of the test set has several ranges, but a manoeuvre is one; correct the split")

@@ -27,7 +27,7 @@ LAP_SECONDS = 32.0  # what Fig. 10 shows of a lap
 
 
 def manoeuvre_of(part: PartArtefacts, prepared: Prepared, group: str) -> Span:
-    """The test manoeuvre of a group with the largest sideslip angle among those in which the car did not spin."""
+    """The test manoeuvre of a group with the largest sideslip angle among those in which the car did not spin; raises `DataError`."""
     peaks = {}
     for span in part.split.tests[TEST]:
         drive = prepared.recording(span.dataset, span.recording)
@@ -60,7 +60,7 @@ def compared(runs: Mapping[str, Run], span: Span, number: int, what: str, data: 
 def inner_life(runs: Mapping[str, Run], prepared: Prepared, warm_up: float, span: Span, constant: FloatArray, data: str) -> Figure:
     """Outputs of the hybrids' networks in one manoeuvre: β_DD beside β, both deviations of the process noise, distrust (Figure 8).
 
-    ``constant``, (2,), are deviations of the filter's process noise where no network gives them.
+    ``constant``, (2,), are deviations of the filter's process noise where no network gives them; ``warm_up`` [s] is of the estimates.
     """
     hybrids = {candidate: run for candidate, run in runs.items() if plain_name(candidate) in paper.HYBRIDS}
     outputs = _network_outputs(hybrids, prepared, warm_up, span)

@@ -25,7 +25,7 @@ from vehest_papers.kit.statements import corrected
 
 
 def draws_blocks(part: PartArtefacts, cg_to_rear_axle: float) -> tuple[list[Block], list[Claim]]:
-    """Table ``draws`` and the claims of order, both over the draws of each test set."""
+    """Table ``draws`` and the claims of order, both over the draws of each test set; ``cg_to_rear_axle`` [m] is of the truck."""
     titles = titles_of(part)
     models = {titles[model.estimator, model.variant]: model for model in part.models}
     sums = {test: {title: by_drive(part, model, test) for title, model in models.items()} for test in part.split.tests}

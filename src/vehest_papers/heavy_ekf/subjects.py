@@ -49,7 +49,7 @@ class Filter:
 
 
 def filters_of(part: PartArtefacts) -> dict[str, Filter]:
-    """Name -> filter, in the order of `paper.VARIANTS`; of several of one variant the first."""
+    """Name -> filter, in the order of `paper.VARIANTS`; of several of one variant the first; raises `DataError` where one is missing."""
     found: dict[str, Filter] = {}
     for model in part.models:
         if model.estimator == "rational_ekf" and model.variant in paper.VARIANTS:

@@ -39,7 +39,7 @@ class Observability(NamedTuple):
 def jacobians_along(
     transition: StateFunction, observation: StateFunction, states: FloatArray, inputs: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """A (T, n, n) and H (T, m, n) about the states along a drive, by automatic differentiation."""
+    """A (T, n, n) and H (T, m, n) about the states (T, n) with inputs (T, p) along a drive, by automatic differentiation."""
     from torch.func import jacrev, vmap
 
     at = (torch.as_tensor(states, dtype=torch.float64), torch.as_tensor(inputs, dtype=torch.float64))
@@ -48,7 +48,7 @@ def jacobians_along(
 
 
 def observability_matrices(A: FloatArray, H: FloatArray, steps: int) -> FloatArray:
-    """O of every window of N samples, (T - N + 1, N m, n); raises ValueError unless N is between 1 and T."""
+    """O of every window of N samples of A (T, n, n) and H (T, m, n), (T - N + 1, N m, n); raises ValueError unless N is between 1 and T."""
     count = len(A) - steps + 1
     if not 1 <= steps <= len(A):
         raise ValueError(f"a window of {steps} samples does not fit into {len(A)}; take 1 to {len(A)}")

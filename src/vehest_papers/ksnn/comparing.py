@@ -88,7 +88,7 @@ class SegmentErrors(SampledErrors):
 
 
 def masked_segments(parts: Sequence[Scored], masks: Sequence[FloatArray], rate_hz: float) -> Segments:
-    """Sums over segments as `vehest.evaluation.blocks.segments_of` makes them, of the scored samples where ``masks`` (K,) are 1."""
+    """Sums over segments as `vehest.evaluation.blocks.segments_of` makes them at ``rate_hz`` [Hz], of samples where masks (K,) are 1."""
     marked, fields = list(zip(parts, masks, strict=True)), ("vy", "vy_ref", "sideslip", "sideslip_ref")
     chosen = segments_of([replace(part, **{name: getattr(part, name) * mask for name in fields}) for part, mask in marked], rate_hz)
     counts = segments_of([replace(part, vy_ref=np.asarray(mask, dtype=np.float64)) for part, mask in marked], rate_hz).vy_ref

@@ -70,7 +70,7 @@ def statistics(recordings: Sequence[Recording]) -> Statistics:
 
 
 def data_quality(sets: Mapping[str, Sequence[Recording]], source: str) -> list[Block]:
-    """Table I, then Figs. 4 and 5 by car, over all of its sets of one kind; ``C-1`` to ``F-2`` stand beside the paper's."""
+    """Table I and Figs. 4 and 5 by car, over all its sets of one kind; ``C-1`` to ``F-2`` stand beside the paper's; raises `DataError`."""
     groups: dict[tuple[str, str], list[Recording]] = {}
     for recording in (recording for recordings in sets.values() for recording in recordings):
         groups.setdefault((recording.vehicle, recording.kind), []).append(recording)

@@ -42,7 +42,10 @@ STEADY_YAW_RATE = 0.4  # yaw rate for it where the last centre is at zero [rad/s
 def interpretation(
     linear: Sequence[Trained], nonlinear: Sequence[Trained], drive: Recording, stretch: tuple[float, float], source: str
 ) -> list[Block]:
-    """Everything of Section IV: gains, sub-models of the first network along a drive, feedback functions; ``stretch`` [s] is drawn."""
+    """Everything of Section IV: gains, sub-models of the first network along a drive, feedback functions; ``stretch`` [s] is drawn.
+
+    Raises `ConfigurationError` where a model is no KS-NN of its kind, `DataError` where the drive lacks a channel or samples or the rate.
+    """
     blocks = gain_curves(linear) if linear else []
     for own in (*linear, *nonlinear)[:1]:
         blocks += sub_models(own, drive, stretch, source)
@@ -56,7 +59,7 @@ def interpretation(
 
 
 def gain_curves(models: Sequence[Trained]) -> list[Block]:
-    """γ, β, w, b and the poles of linear KS-NNs over |ω|, and what they mean in words."""
+    """γ, β, w, b and the poles of linear KS-NNs over |ω|, and what they mean in words; raises `ConfigurationError` where one is not."""
     linear = [_linear(own) for own in models]
     with_bias = any(np.any(model.bias) for model in linear)
     panels = ["gamma", "beta", "weight", *(["bias"] if with_bias else []), "poles"]
@@ -205,7 +208,7 @@ def _poles(model: LpvModel, yaw_rate: FloatArray) -> FloatArray:
 
 
 def sub_models(own: Trained, drive: Recording, stretch: tuple[float, float], source: str) -> list[Block]:
-    """The parts that an estimate consists of along a drive, and what each contributes to its variance; ``stretch`` [s] is drawn."""
+    """Parts of an estimate along a drive, and what each adds to its variance; ``stretch`` [s] is drawn; raises as `interpretation` does."""
     estimator = _ksnn(own)
     parts = decomposed_estimate(estimator, drive)
     estimate = estimator.estimate([drive.without_references()])[0]["vy"]
@@ -293,7 +296,7 @@ def _table_of_parts(own: Trained, drive: Recording, parts: SubModels, source: st
 
 
 def feedback_functions(own: Trained, drive: Recording, source: str, *, name: str = "feedback") -> list[Block]:
-    """f₁ and f₂ of every local model over e = û - u_m, and how their gain varies where e lies along a drive."""
+    """f₁ and f₂ of each local model over e = û - u_m, and how their gain varies where e lies along a drive; raises `ConfigurationError`."""
     estimator = _ksnn(own)
     if not estimator.settings.n_hidden:
         raise ConfigurationError(f"{own.named} is linear; its feedback functions are straight lines")

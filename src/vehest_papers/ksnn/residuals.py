@@ -48,7 +48,7 @@ class Panel:
 
 
 def residuals(panels: Sequence[Panel]) -> list[Block]:
-    """Spectra of v and of the residuals, one panel a test set, and how far they lie apart."""
+    """Spectra of v and of the residuals, one panel a test set, and how far they lie apart; raises `DataError` for too short a range."""
     spectra = [_spectra(panel) for panel in panels]
     frame = pd.DataFrame([row for panel, own in zip(panels, spectra, strict=True) for row in _rows(panel, own)])
     return [_figure(panels, spectra), _in_words(panels, spectra), _table(frame, panels)]

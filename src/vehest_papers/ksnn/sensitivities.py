@@ -40,7 +40,10 @@ class Injected:
 
 
 def sensitivity_of(estimator: Estimator, yaw_rate: float, error: float = 0.0) -> NoiseSensitivity:
-    """Closed form at constant yaw rate: a KS-NN's by its windows, linearised at û - u_m = ``error`` where it is not linear."""
+    """Closed form at constant yaw rate: a KS-NN's by its windows, linearised at û - u_m = ``error`` where it is not linear.
+
+    Raises `ConfigurationError` where it is neither a KS-NN nor a Luenberger observer.
+    """
     if isinstance(estimator, Ksnn):
         return ksnn_sensitivity(LocalModels.of(estimator).linearised(error), yaw_rate).truncated(estimator.settings.window)
     if isinstance(estimator, Luenberger):
@@ -73,7 +76,10 @@ def injected(
 
 
 def sensitivities(columns: Sequence[tuple[Trained, Trained]], *, n_samples: int = INJECTED_SAMPLES, error: float = 0.0) -> list[Block]:
-    """Magnitudes of H_Y and H_X, a column a training vehicle (KS-NN and Luenberger observer), with the check by injection."""
+    """Magnitudes of H_Y and H_X, a column a training vehicle (KS-NN and Luenberger observer), with the check by injection.
+
+    ``error`` [m/s] is the û - u_m at which nonlinear networks are linearised. Raises `ConfigurationError` for estimators of another kind.
+    """
     frames = [pd.DataFrame([row for own in pair for row in _rows(own, n_samples, error)]) for pair in columns]
     return [_figure(columns, error), _in_words(columns, frames), _table(pd.concat(frames, ignore_index=True), n_samples)]
 

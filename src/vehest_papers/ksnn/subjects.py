@@ -33,7 +33,7 @@ class Trained:
 
     @classmethod
     def of(cls, model: EvaluatedModel, trained_on: str) -> Trained:
-        """Load it from the folder of an evaluated model."""
+        """Load it from the folder of an evaluated model; raises `MissingError` where there is no model, `DataError` where it is damaged."""
         estimator = load_model(model.model_folder)
         return cls(estimator, model.title, trained_on, model.seed if estimator.name != "luenberger" else None)
 

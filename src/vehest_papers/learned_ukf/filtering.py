@@ -52,7 +52,7 @@ class Swapped(PointModel):
 
 
 def loaded(model: EvaluatedModel) -> LearnedUkf:
-    """The filter of an evaluated model."""
+    """The filter of an evaluated model; raises `MissingError` where there is none, `DataError` where it is damaged or another's."""
     estimator = load_model(model.model_folder)
     if not isinstance(estimator, LearnedUkf):
         raise DataError(f"'{model.model_folder}' holds a model of '{estimator.name}', not of '{LearnedUkf.name}'")
@@ -60,7 +60,7 @@ def loaded(model: EvaluatedModel) -> LearnedUkf:
 
 
 def drives_of(part: PartArtefacts, estimator: LearnedUkf, test: str) -> Drive:
-    """The sequences of a test set, as the filter takes them, side by side: (B, T, ...)."""
+    """The sequences of a test set, as the filter takes them, side by side: (B, T, ...); raises `ConfigurationError` or `DataError`."""
     if part.protocol.sequence_seconds is None or part.protocol.rate_hz != estimator.settings.rate_hz:
         raise ConfigurationError(
             f"study '{part.study}' needs evaluation.sequence_seconds, and evaluation.rate_hz={estimator.settings.rate_hz:g} as its filters "

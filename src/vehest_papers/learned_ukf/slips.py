@@ -37,7 +37,7 @@ def rear_slip(recordings: Sequence[Recording], cg_to_rear_axle: float) -> FloatA
 
 
 def distribution(slips: Mapping[str, FloatArray], name: str, data: str, note: str) -> tuple[Figure, Table, pd.DataFrame]:
-    """Density of each set's slip angle, its percentiles, and the drawn values."""
+    """Density of each set's slip angle [deg], its percentiles, and the drawn values."""
     edges = np.arange(-LIMIT, LIMIT + WIDTH, WIDTH)
     drawn = pd.DataFrame({"from_deg": edges[:-1], "to_deg": edges[1:]})
     with new_figure(DOUBLE_COLUMN * 0.8, 2.9) as figure:

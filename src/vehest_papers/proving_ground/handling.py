@@ -37,7 +37,10 @@ def _no_samples() -> Counts:
 
 @dataclass
 class HandlingPoints:
-    """Samples of recordings over centripetal acceleration and understeer angle, (bins of ay, bins of angle); does not grow with them."""
+    """Samples of recordings over centripetal acceleration and understeer angle, (bins of ay, bins of angle); does not grow with them.
+
+    ``wheelbase`` [m] is the car's.
+    """
 
     wheelbase: float  # [m]
     everything: Counts = field(default_factory=_no_samples)  # all samples above `SLOWEST`

@@ -139,7 +139,7 @@ def motion_of(samples: Mapping[str, FloatArray], rate_hz: float) -> dict[str, Fl
 
 
 def learn_oracle(train: Sequence[Recording], validation: Sequence[Recording], channels: Sequence[str], rate_hz: float) -> Oracle:
-    """Fit relations and autoregression to training drives; healthy drives are these and those of validation."""
+    """Fit relations and autoregression to training drives at ``rate_hz`` [Hz]; these and validation's are healthy; raises `DataError`."""
     names = tuple(channels)
     train, validation = ([without_glitches(recording, names) for recording in part] for part in (train, validation))
     least_speed = least_speed_of(train, names)

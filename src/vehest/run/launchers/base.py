@@ -40,14 +40,17 @@ class Launcher(Protocol):
         """Groups that can run at a time."""
 
     def launch(self, groups: Sequence[Group], stop: StopSignals | TimeLimit, report: Reporter) -> Iterator[Done]:
-        """Run groups as `local.launch` runs tasks, with members as outcomes; on a cluster only the begin of a group is reported."""
+        """Run groups as `local.launch` runs tasks, with members as outcomes; on a cluster only the begin of a group is reported.
+
+        Raises `MissingError` where there is no cluster, it takes no tasks, or one of its machines cannot run them.
+        """
 
     def close(self) -> None:
         """Release processes and connections."""
 
 
 def chosen_launcher(options: LauncherOptions, jobs: int | None, output: Path, messages: Messages) -> Launcher:
-    """The launcher of a command; without ``jobs`` it runs as many groups at a time as there are cores."""
+    """A command's launcher; without ``jobs`` it runs as many groups at a time as cores; raises `ConfigurationError` or `MissingError`."""
     name = options.launcher
     if name not in LAUNCHERS:
         raise ConfigurationError(f"--launcher must be one of {', '.join(LAUNCHERS)}, not '{name}'")

@@ -75,7 +75,10 @@ def task_of(position: int, group: Group, output: Path, mark: Path) -> TaskSpec:
 
 
 def run_task(spec: TaskSpec, copies: Files | None, should_stop: Callable[[], bool]) -> Done:
-    """Run a group on a machine of a cluster; ``copies`` are the artefacts that it reads, none where machines share the output root."""
+    """Run a group on a machine of a cluster; ``copies`` are the artefacts that it reads, none where machines share the output root.
+
+    Raises `MissingError` for other versions or copies that cannot be written, `NotShared` with neither a shared root nor copies.
+    """
     begun, here = time.monotonic(), versions_here()
     unlike = [f"{name} {here.get(name, 'missing')} instead of {own}" for name, own in spec.versions.items() if here.get(name) != own]
     if unlike:
@@ -117,7 +120,7 @@ def pack(folders: set[Path]) -> Files:
 
 
 def unpack(packed: Files) -> None:
-    """Put artefacts in their places, each whole or not at all, unless they are there."""
+    """Put artefacts in their places, each whole or not at all, unless they are there; raises `DataError` or `MissingError`."""
     for folder, files in packed.items():
         if not (folder / MANIFEST).is_file() or (folder / MANIFEST).read_bytes() != files[MANIFEST]:
             remove_leftovers(folder.parent)
@@ -241,7 +244,7 @@ def _line(error: BaseException) -> str:
 
 
 def slurm_parameters(words: Sequence[str]) -> dict[str, Any]:
-    """What jobs ask the queue for."""
+    """What jobs ask the queue for; raises `ConfigurationError` unless each is NAME=VALUE of `PARAMETERS`, positive where it must be."""
     found: dict[str, Any] = {"mem_gb": 2.0, "timeout_min": 60, "cpus_per_task": 1, "name": "vehest"}
     for word in words:
         name, _, value = word.partition("=")

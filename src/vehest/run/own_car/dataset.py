@@ -39,7 +39,7 @@ REMARKS = (*CONTRADICTIONS, "dropout", "stuck", "held")
 
 @dataclass(frozen=True, eq=False)
 class Draft:
-    """A data set with what its recordings show."""
+    """A data set with what its recordings, of ``durations`` [s], show."""
 
     examined: Examined  # the logs, delays among their proposals
     dataset: Mapping[str, Any]  # for conf/dataset
@@ -62,7 +62,7 @@ class Draft:
 
 
 def draft(examined: Examined) -> Draft:
-    """A data set by the proposals, read as an ingest reads it."""
+    """A data set by the proposals, read as an ingest reads it; raises `VehestError` where it cannot be read."""
     proposals, vehicle = examined.proposals, examined.vehicle
     if not proposals.channels:
         raise ConfigurationError("no column is left that would be a channel")

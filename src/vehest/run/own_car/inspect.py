@@ -71,7 +71,10 @@ class Examined:
 
 
 def inspect(name: str, files: Sequence[Path], vehicle: Mapping[str, float | None] | None = None, *, force: bool = False) -> Examined:
-    """Read logs, of one format and one set of columns, and propose a channel, unit and sign for each column."""
+    """Read logs, of one format and one set of columns, and propose a channel, unit and sign for each column.
+
+    Raises `ConfigurationError` for a taken name or several formats or folders, `MissingError` without a file, `DataError` for a bad one.
+    """
     check_name(name, "data set")
     existing = [file for file in paths_of(name) if os.path.lexists(file)]
     if existing and not force:

@@ -40,7 +40,7 @@ class Question:
 
 
 def ask(examined: Examined, answers: Sequence[str] = (), *, interactive: bool) -> tuple[Examined, tuple[Question, ...]]:
-    """Answer the questions that logs leave open, by ``KEY=ANSWER`` or at the terminal; returns the logs and the questions left open."""
+    """Answer logs' open questions, by ``KEY=ANSWER`` or at the terminal; returns logs and questions left; raises `ConfigurationError`."""
     questions = list(questions_of(examined))
     keys = [question.key for question in questions]
     given: dict[str, str] = {}

@@ -74,7 +74,7 @@ class Plan:
 
 
 def registered(word: str) -> str:
-    """The name of an estimator that is given by its name or as ``package.module:Class``."""
+    """The name of an estimator that is given by its name or as ``package.module:Class``; raises `ConfigurationError` where it is none."""
     name = next((point.name for point in entry_points(group=ENTRY_POINTS) if point.value == word), word)
     if name not in estimator_names():
         declared = f'NAME = "{word if ":" in word else "package.module:Class"}"'
@@ -91,7 +91,10 @@ def registered(word: str) -> str:
 def write(
     examined: Examined, left: Sequence[Question] = (), further: Sequence[str] = (), *, dry_run: bool = False
 ) -> tuple[dict[str, Any], list[str]]:
-    """Write data set, split and pipeline, all or none (only the data set where nothing can be trained); returns JSON and lines."""
+    """Write data set, split and pipeline, all or none (only the data set where nothing can be trained); returns JSON and lines.
+
+    Raises `MissingError` where the disk is full or a folder cannot be written to, `VehestError` where the data set cannot be read.
+    """
     name = examined.name
     with use_limits(limits_from_config(compose_config("estimate")["limits"])):
         made = draft(examined)

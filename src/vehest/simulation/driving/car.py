@@ -54,6 +54,7 @@ class Car:
         """Road-wheel angle [rad] of a steady turn; beyond the grip as much as at the grip.
 
         Friction scales forces and slip angles alike, because a tyre's cornering stiffness hardly depends on it.
+        Curvature [1/m] and lateral acceleration [m/s²] are positive to the left.
         """
         excess = self._at(self.excess_steer, lateral_acceleration, friction)
         return self.wheelbase * curvature + math.copysign(friction * excess, lateral_acceleration)
@@ -76,7 +77,7 @@ class Car:
 
 
 def car_of(plant: MultiBodyPlant) -> Car:
-    """The car as its driver knows it; measured once a process for each vehicle and step."""
+    """The car as its driver knows it; measured once a process for each vehicle and step; raises `ConfigurationError`."""
     own = dict(plant.vehicle.driver)
     key = json.dumps([plant.vehicle.name, plant.vehicle.parameter_set, plant.vehicle.overrides, own, plant.step], sort_keys=True)
     if key not in _KNOWN:

@@ -179,7 +179,7 @@ class FastLap(Manoeuvre):
         return 2.0 * course_by_name(self.course).length / self.mean_speed
 
     def controller(self, car: Car, surface: Surface, seed: int) -> Controller:
-        """A driver who uses as much of the grip as the mean speed takes."""
+        """A driver who uses as much of the grip as the mean speed takes; raises `ConfigurationError` where the car is too slow for it."""
         course, driver = _course(self.course, self.flat), draw_driver(seed)
         friction = course.friction * surface.along(course.arc_length, seed, course.length)
 

@@ -33,7 +33,7 @@ MANOEUVRES: Mapping[str, type[Manoeuvre]] = {
 
 
 def manoeuvre_from_config(configuration: Mapping[str, Any]) -> Manoeuvre:
-    """A manoeuvre of the multi-body plant from its ``name`` and any of its parameters."""
+    """A manoeuvre of the multi-body plant from its ``name`` and any of its parameters; raises `ConfigurationError` where one is wrong."""
     return one_of(configuration, MANOEUVRES)
 
 

@@ -137,7 +137,7 @@ class MultiBodyPlant:
         return values
 
     def initial_state(self, x: float, y: float, yaw: float, vx: float) -> PlantState:
-        """In equilibrium, rolling straight ahead at the given place [m], heading [rad] and speed [m/s], or standing."""
+        """In equilibrium, rolling straight on at a place [m], heading [rad] and speed [m/s], or standing; raises `ConfigurationError`."""
         if not vx >= 0:
             raise ConfigurationError(f"a car starts forwards or standing, not at {vx} m/s")
         values = self._at_rest.copy()
@@ -159,7 +159,10 @@ class MultiBodyPlant:
         return PlantState(values, Regime(regime), state.spun or slid, held)
 
     def evaluate(self, states: Sequence[PlantState], inputs: FloatArray, friction: ArrayLike = 1.0) -> tuple[FloatArray, FloatArray]:
-        """Derivatives of the states (T, 29), and tyre forces (T, 3, 4) along, across and up, for motion.WHEELS [N]."""
+        """Derivatives of the states (T, 29), and tyre forces (T, 3, 4) along, across and up, for motion.WHEELS [N].
+
+        ``inputs`` are (T, 5); ``friction`` scales friction, (T,) or one for all.
+        """
         values = np.array([state.values for state in states]).reshape(-1, compiled.N_STATES)
         regimes = np.array([int(state.regime) for state in states], dtype=np.int64)
         inputs = _writable(inputs).reshape(-1, N_INPUTS)
@@ -178,7 +181,7 @@ class MultiBodyPlant:
         bank: ArrayLike = 0.0,
         grade: ArrayLike = 0.0,
     ) -> Motion:
-        """States sampled at ``rate_hz``, each with the inputs that hold from then on, as motion in ISO 8855 axes.
+        """States sampled at ``rate_hz`` [Hz], each with the inputs (T, 5) that hold from then on, as motion in ISO 8855 axes.
 
         Args:
             friction: scale of friction, (T,) or one for all.

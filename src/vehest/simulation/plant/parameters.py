@@ -57,7 +57,7 @@ POSITIVE = ("m", "m_s", "m_uf", "m_ur", "a", "b", "I_z", "I_Phi_s", "I_y_s", "I_
 
 @dataclass(frozen=True)
 class Vehicle:
-    """A car that the multi-body plant can drive.
+    """A car that the multi-body plant can drive; ``relaxation`` [m] is of its tyres.
 
     ``overrides`` replace the published values, by the library's names; a mapping inside it replaces values of a group (``tire``,
     ``tire_rear``, ``steering``, ``longitudinal``). `ConfigurationError` for an unknown set or parameter, or what is no finite number.
@@ -87,7 +87,10 @@ class Vehicle:
 
 
 def vehicle_from_configuration(configuration: Mapping[str, Any]) -> Vehicle:
-    """A vehicle from the keys ``name``, ``parameter_set`` and (optional) ``overrides``, ``driver`` and ``relaxation`` (front, rear)."""
+    """A vehicle from the keys ``name``, ``parameter_set`` and (optional) ``overrides``, ``driver`` and ``relaxation`` (front, rear).
+
+    Raises `ConfigurationError` where a key is missing or unknown, and as `Vehicle` does.
+    """
     known = {"name", "parameter_set", "overrides", "driver", "relaxation"}
     unknown = sorted(set(configuration) - known)
     missing = sorted({"name", "parameter_set"} - set(configuration))
@@ -107,7 +110,7 @@ def loaded(vehicle: Vehicle, mass: float, forward: float, up: float) -> Vehicle:
     Unsprung masses are shared anew between the axles, so that body and car keep one centre of gravity in plan.
 
     Args:
-        mass: of the payload [kg].
+        mass: of the payload [kg]; raises `ConfigurationError` where it is negative, or an axle would carry nothing.
         forward, up: its place from the centre of gravity [m].
     """
     if mass == 0.0:

@@ -137,7 +137,7 @@ class Inputs:
 
 
 class PlanarPlant:
-    """A car and its equations of motion."""
+    """A car and its equations of motion, integrated by ``step`` [s]; raises `ConfigurationError` where that is not positive."""
 
     def __init__(self, car: PlanarCar, step: float = 1e-3) -> None:
         if not step > 0.0:

@@ -82,13 +82,13 @@ class PlanarVehicle:
 
 
 def planar_car_from_configuration(configuration: Mapping[str, Any]) -> PlanarCar:
-    """A car from the keys ``name``, ``plant`` and ``parameters``."""
+    """A car from the keys ``name``, ``plant`` and ``parameters``; raises `ConfigurationError` where one is missing, unknown or wrong."""
     whole = validated(PlanarVehicle, dict(configuration), "planar vehicle", error=ConfigurationError)
     return _checked(whole.name, whole.parameters)
 
 
 def scaled_car(car: PlanarCar, factors: Mapping[str, float]) -> PlanarCar:
-    """The car with some of its parameters scaled."""
+    """The car with some of its parameters scaled; raises `ConfigurationError` where a name is no parameter or a value makes no sense."""
     unknown = sorted(set(factors) - set(PARAMETERS))
     if unknown:
         raise ConfigurationError(f"vary: '{unknown[0]}' is no parameter of vehicle '{car.name}' that can be scaled")

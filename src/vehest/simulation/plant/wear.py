@@ -40,5 +40,5 @@ class Stint:
 
 
 def stint_from_config(values: Any) -> Stint:
-    """A stint from a drive's ``tyres``: ``{cold: 0.06, wear: 0.04}``."""
+    """A stint from a drive's ``tyres``: ``{cold: 0.06, wear: 0.04}``; raises `ConfigurationError` for another name or value."""
     return validated(Stint, values, "tyres", error=ConfigurationError)

@@ -73,7 +73,7 @@ SURFACES: dict[str, Surface] = {"dry": Surface(), "wet": Surface("wet", 0.7), "p
 
 
 def surface_from_config(configuration: str | Mapping[str, Any] | None) -> Surface:
-    """A surface from its name, or from a mapping of Surface's arguments; none is the dry road."""
+    """A surface from its name, or from a mapping of Surface's arguments; none is the dry road; raises `ConfigurationError` otherwise."""
     if configuration is None:
         return SURFACES["dry"]
     if isinstance(configuration, str):

@@ -51,7 +51,7 @@ def _require_finite(levels: Any, *not_negative: str) -> None:
 
 @dataclass(frozen=True)
 class Mounting:
-    """Where the inertial unit sits and how it is turned against the body."""
+    """Where the inertial unit sits and how it is turned against the body; raises `ConfigurationError` for a value that makes no sense."""
 
     lever_x: float = 0.0  # its place forward of the centre of gravity [m]
     lever_y: float = 0.0  # its place left of the centre of gravity [m]
@@ -67,7 +67,7 @@ class Mounting:
 
 @dataclass(frozen=True)
 class Tilt:
-    """Which angles the inertial unit is tilted by, so that gravity leaks into the accelerometers; the others count as zero."""
+    """Which angles tilt the inertial unit, so that gravity leaks into the accelerometers; others are zero; raises `ConfigurationError`."""
 
     roll: bool = True  # of the body against the road; also makes the gyros measure about the body's axes instead of the road's
     pitch: bool = True  # likewise
@@ -82,7 +82,7 @@ class Tilt:
 
 @dataclass(frozen=True)
 class Vibration:
-    """How the wheels' turning shakes the inertial unit: white noise whose standard deviation grows with their mean speed."""
+    """How turning wheels shake the inertial unit: white noise whose deviation grows with their mean speed; raises `ConfigurationError`."""
 
     yaw_rate: float = 0.0  # standard deviation of a sample per speed of the wheels [1]
     ax: float = 0.0  # the same [m/s² per rad/s]

@@ -61,12 +61,12 @@ class CanSource(SignalSource):
         self.dbc = Path(self.options.dbc).expanduser()
 
     def inputs(self) -> dict[str, str | Path]:
-        """The logs and the DBC."""
+        """The logs and the DBC; raises `MissingError` where one of them is not there."""
         require_files([self.dbc], self.name)
         return {**super().inputs(), self.dbc.name: self.dbc}
 
     def wanted(self) -> tuple[Database, dict[str, Wanted]]:
-        """The DBC, and the signal of each channel."""
+        """The DBC, and the signal of each channel; raises `MissingError` without DBC or package, `DataError` where a signal is missing."""
         require_files([self.dbc], self.name)
         database = read_database(self.dbc, [declared.column for declared in self.channels.values()])
         found = {}
@@ -100,7 +100,7 @@ class CanSource(SignalSource):
 def decoded(
     frames: Frames, database: Database, wanted: Mapping[str, Wanted], bus: int | str | None = None
 ) -> Iterator[tuple[Any, dict[str, float]]]:
-    """Frames of a log that carry a wanted message, each with its values, channel -> value in the unit of the DBC; NaN: invalid."""
+    """Frames of a log with a wanted message, each with its values, channel -> value in the DBC's unit; NaN: invalid; raises `DataError`."""
     channels_of = channels_by_message(wanted)
     for frame in frames:
         message = database.messages.get((frame.arbitration_id, frame.is_extended_id))

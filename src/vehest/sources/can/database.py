@@ -37,7 +37,7 @@ class Message:
         return str(self.described.name)
 
     def decode(self, data: bytes | bytearray) -> dict[str, float]:
-        """Wanted signals that a frame carries, in the unit of the DBC; those that its multiplexer leaves out are not among them."""
+        """Wanted signals that a frame carries, in the DBC's unit, without those that its multiplexer leaves out; raises `DataError`."""
         length = self.described.length
         if len(data) < length:
             raise DataError(f"a frame of message '{self.name}' holds {len(data)} of the {length} bytes that the DBC says")
@@ -67,7 +67,7 @@ class Database:
 
 
 def read_dbc(file: Path) -> list[Any]:
-    """All messages of a DBC, as cantools holds them."""
+    """All messages of a DBC, as cantools holds them; raises `MissingError` without file or cantools, `DataError` where it is damaged."""
     size = regular_file(file).stat().st_size
     check_limit("text_bytes", size, f"'{file}' is {size} bytes long")
     require_package("cantools", "bus", "reading CAN")
@@ -86,7 +86,7 @@ def read_dbc(file: Path) -> list[Any]:
 
 
 def read_database(file: Path, wanted: Sequence[str]) -> Database:
-    """What a DBC says of wanted signals."""
+    """What a DBC says of wanted signals; raises `MissingError` without file or cantools, `DataError` where a signal is unusable."""
     described = read_dbc(file)
     known: dict[str, list[tuple[Any, str]]] = {}
     for message in described:

@@ -34,7 +34,7 @@ class Frames:
 
 
 def read_frames(file: Path, wanted: Collection[tuple[int, bool]] | None = None) -> Frames:
-    """Read the frames of a log whose (identifier, extended) is wanted; None for all."""
+    """Read the frames of a log whose (identifier, extended) is wanted; None for all; raises `MissingError` or `DataError`."""
     if regular_file(file).suffix.lower() not in SUFFIXES:
         raise DataError(f"'{file}' is no log of a bus: its name ends in none of {', '.join(SUFFIXES)}")
     require_package("can", "bus", "reading CAN")

@@ -34,7 +34,7 @@ Topic = Sequence[Any]  # name, message type, paths of fields
 
 
 def read_topics(bag: Path, topics: Sequence[Topic], layouts: Mapping[str, str]) -> tuple[Arrays, dict[str, Any]]:
-    """All messages of topics, in the order in which the bag received them.
+    """All messages of topics, in the order in which the bag received them; raises `ConfigurationError` or `DataError`.
 
     Args:
         bag: a bag's folder, or one of its files.

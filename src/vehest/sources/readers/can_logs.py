@@ -20,7 +20,7 @@ LATEST = 1e11  # s
 
 
 def read_frames(file: Path, wanted: Collection[Sequence[Any]] | None) -> tuple[Arrays, dict[str, Any]]:
-    """Frames of a log in their order, without error frames and remote frames.
+    """Frames of a log in their order, without error frames and remote frames; raises `DataError` where there is none, or too many.
 
     Returns:
         ``time`` [s], ``identifier``, ``extended``, ``fd``, ``fast`` (bit rate switched), ``length`` [bytes] and ``bus`` (number in

@@ -16,7 +16,7 @@ from vehest.sources.limited import Arrays
 
 
 def read_channels(file: Path, columns: Sequence[str], time: str) -> tuple[Arrays, dict[str, Any]]:
-    """Values and times of channels, structs with a field ``value`` and one of times.
+    """Values and times of channels, structs with a field ``value`` and one of times; raises `DataError` where one is missing or ambiguous.
 
     Args:
         file: of version 5 to 7.

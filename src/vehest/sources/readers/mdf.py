@@ -41,7 +41,7 @@ BUS_FRAMES = ("CAN_DataFrame", "LIN_Frame", "ETH_Frame", "FLX_Frame")
 
 
 def read(file: Path, wanted: Mapping[str, tuple[str, int | str | None]] | None) -> tuple[Arrays, dict[str, Any]]:
-    """Signals with the times of their groups.
+    """Signals with the times of their groups; raises `DataError` for a formula, too much, or a wanted signal that cannot be read.
 
     Args:
         wanted: key -> name of a signal, and number or name of its group where the name occurs in several; None for every signal
@@ -85,7 +85,7 @@ def read(file: Path, wanted: Mapping[str, tuple[str, int | str | None]] | None) 
 def with_signals(
     file: Path, seconds: list[float], signals: list[tuple[str, list[float], str, str, dict[str, str]]]
 ) -> tuple[Arrays, dict[str, Any]]:
-    """A measurement of version 4 with a group of signals more.
+    """A measurement of version 4 with a group of signals more; raises `DataError` where it is of another version.
 
     Args:
         seconds: times of the new group [s].

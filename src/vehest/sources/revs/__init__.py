@@ -69,7 +69,7 @@ class RevsSource(FileSource):
         self.gappy_columns = set(self.column_names) - strict
 
     def ids(self) -> list[str]:
-        """The recordings that the data set names, or else those whose files match ``files``, in alphabetical order."""
+        """Recordings that the data set names, or else those whose files match ``files``, in alphabetical order; raises `MissingError`."""
         suffix = SUFFIXES[self.options.layout]
         if self.options.recordings is not None:
             return [name.removesuffix(suffix) for name in self.options.recordings]

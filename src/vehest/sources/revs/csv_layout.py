@@ -26,7 +26,7 @@ LONGEST_HEAD = 0.5  # of the rows: a column that begins later is not slow but br
 def read_csv(
     file: Path, columns: Sequence[str], gappy: Collection[str], preamble_lines: int
 ) -> tuple[dict[str, FloatArray], dict[str, str], dict[str, Any]]:
-    """Columns from the first row on in which all of them hold a value.
+    """Columns from the first row on in which all of them hold a value; raises `DataError` where a column or cell cannot be read.
 
     Args:
         columns: names of columns, the one of time first.
@@ -60,7 +60,7 @@ def read_csv(
 
 
 def read_vehicle_parameters(file: Path) -> dict[str, dict[str, Any]]:
-    """Parameters by their names: ``{"mass": {"value": 982.0, "unit": "kg"}}``.
+    """Parameters by their names: ``{"mass": {"value": 982.0, "unit": "kg"}}``; raises `DataError` where it is no such table.
 
     A parameter with several values (a curve, such as road-wheel angles over the angle of the steering wheel) has a list of them.
     Cells below a column's last value are blank; text is kept as text.

@@ -28,7 +28,7 @@ def read_mat_columns(
     policy: ClockPolicy = "strict",
     gappy: Collection[str] = (),
 ) -> tuple[Clock, dict[str, FloatArray], dict[str, float]]:
-    """Columns of a recording on one clock.
+    """Columns of a recording on one clock; raises `DataError` where the file or a column cannot be used as it is.
 
     A sample is the column's last value at or before its time: nothing is interpolated, and nothing comes from the future. The clock
     spans the time in which every column has a value.

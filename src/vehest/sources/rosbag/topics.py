@@ -21,7 +21,7 @@ PACKED = ".zstd"  # a file that ROS has compressed as a whole
 
 
 def read_bag(path: Path, function: str, most_bytes: int = MOST_BYTES, **request: Any) -> Reading:
-    """Topics of a bag.
+    """Topics of a bag; raises `MissingError` without rosbags or bag, `ConfigurationError` for a bad layout, `DataError` for a damaged bag.
 
     Args:
         path: a bag's folder, one of its ``.db3`` or ``.mcap`` files, or a zip archive that holds one bag.
@@ -38,7 +38,7 @@ def read_bag(path: Path, function: str, most_bytes: int = MOST_BYTES, **request:
 
 
 def bag_files(path: Path) -> list[Path]:
-    """The files that a bag is made of: the archive or file itself, or what its folder holds."""
+    """The files that a bag is made of: the archive or file itself, or what its folder holds; raises `MissingError` where there are none."""
     if not path.is_dir():
         return [regular_file(path)]
     try:

@@ -26,7 +26,7 @@ DEGREES = {"heading": "deg"}  # of a VBOX, which does not say so: a compass's, c
 
 
 def survey(path: Path) -> Log:
-    """Columns of one file, or of a bag's folder."""
+    """Columns of one file, or of a bag's folder; raises `MissingError` without file or package, `DataError` where it cannot be read."""
     if not path.exists():
         raise MissingError(f"there is no file '{path}'")
     require_no_spreadsheet(path)

@@ -24,7 +24,7 @@ UNITS = {  # of ROS's own types, REP 103
 
 
 def survey_bag(path: Path) -> Log:
-    """What a bag holds, as far as the types of its messages are ROS's own."""
+    """What a bag holds, as far as the types of its messages are ROS's own; raises `MissingError` or, if none is readable, `DataError`."""
     reading = read_bag(path, "survey_topics", ignored=IGNORED, most_fields=MOST_FIELDS)
     columns, skipped = [], reading.summary["skipped"]
     for topic, kind, fields in reading.summary["topics"]:

@@ -41,7 +41,7 @@ class Found:
 
 
 def find_clock(columns: Mapping[str, FloatArray], units: Mapping[str, str]) -> Found:
-    """The column that grows evenly, by name or unit before another."""
+    """The column, (N,), that grows evenly, by name or unit before another."""
     best, likely, step = None, -1, 0.0
     for name, values in columns.items():
         own = _step(values)

@@ -9,7 +9,7 @@ from vehest.sources.surveys.log import Log, RawColumn
 
 
 def survey_mdf(file: Path) -> Log:
-    """What a measurement holds: every signal of numbers whose group has times."""
+    """What a measurement holds: every signal of numbers whose group has times; raises `MissingError` or, if damaged, `DataError`."""
     signals, skipped, about = read_measurement(file, None)
     columns = []
     for key, signal in signals.items():

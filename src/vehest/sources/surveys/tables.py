@@ -118,7 +118,7 @@ def unit_in_name(name: str) -> str:
 
 
 def shape_of(file: Path) -> Shape:
-    """Layout of a table of text, by its beginning."""
+    """Layout of a table of text, by its beginning; raises `DataError` where it is none, or has one column or no line of names."""
     head = read_head(file, HEAD)
     encoding, text = _decoded(head, file)
     lines = [line[:LONGEST_LINE] for line in re.split(r"\r\n|\n|\r", text)[: -1 if len(head) >= HEAD else None][:MOST_LINES]]

@@ -18,7 +18,7 @@ Runs = dict[tuple[str, str, int, str], dict[str, float]]  # (estimator, variant,
 
 
 def runs_of(artefacts: PartArtefacts, column: str = "value") -> Runs:
-    """The metrics (``column``: or an end of their intervals) of all samples under nominal conditions, by run and test set."""
+    """The metrics (``column``: or an interval's end) of all samples under nominal conditions, by run and test set; raises `DataError`."""
     metrics = artefacts.metrics
     nominal = metrics[(metrics["subset"] == "all") & (metrics["condition"] == "nominal")]
     columns = (nominal[name].tolist() for name in ("estimator", "variant", "seed", "test_set", "metric", column))
@@ -48,7 +48,7 @@ def of_model(runs: Runs, name: Name, seed: int, metric: str) -> float:
 
 
 def chosen_seed(seeds: Sequence[int], name: Name, runs: Runs) -> int:
-    """The seed with the lowest RMSE(v) on the validation range, the lower one of equals: test data choose nothing."""
+    """The seed with the lowest RMSE(v) on the validation range, the lower one of equals: test data choose nothing; raises `DataError`."""
     if len(seeds) > 1 and not any((*name, seed, VALIDATION) in runs for seed in seeds):
         raise DataError(
             f"{name[0]}/{name[1]} has {len(seeds)} seeds and no metrics on the validation range to choose one by; evaluate it there"

@@ -16,7 +16,7 @@ BASELINE_TITLES = {"zero": "v = 0", "static_map": "the static map"}
 
 
 def ranking_of(artefacts: PartArtefacts, test_set: str, asked: Sequence[tuple[Name, Name]] = ()) -> Ranking:
-    """Candidates of a comparison, ranked on a test set by RMSE(β) over all their seeds; those with infinite errors are left out."""
+    """Candidates of a comparison, ranked on a test set by RMSE(β) over all their seeds, without infinite errors; raises `DataError`."""
     segments = {name: [model.segments(test_set) for model in own] for name, own in by_name(artefacts.models).items()}
     finite = {name: own for name, own in segments.items() if all(math.isfinite(float(part.squared_error_sideslip.sum())) for part in own)}
     return rank(finite, artefacts.protocol.rate_hz, asked=asked)
