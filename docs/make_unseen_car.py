@@ -232,8 +232,10 @@ def report(found: Mapping[Car, Sequence[Errors]]) -> str:
     by_time = []
     for car, drives in found.items():
         parts = [np.concatenate([d.sideslip["cold"][(d.time >= low) & (d.time < high)] for d in drives]) for low, high in early]
-        by_time.append([car.title, *[fixed(float(np.sqrt(part.mean())), 2) if len(part) > BLOCK // 4 else "–" for part in parts]])
-    ablated = [[car.title, *[fixed(rmse(drives, name), 2) for name in ABLATIONS]] for car, drives in found.items()]
+        by_time.append(
+            [f"{car.title} ({car.origin})", *[fixed(float(np.sqrt(part.mean())), 2) if len(part) > BLOCK // 4 else "–" for part in parts]]
+        )
+    ablated = [[f"{car.title} ({car.origin})", *[fixed(rmse(drives, name), 2) for name in ABLATIONS]] for car, drives in found.items()]
     verdict = "meets" if ships else "does not meet"
     return "\n".join(
         [

@@ -352,7 +352,8 @@ def estimate(
     The table holds v, β, half widths of their calibrated 90 % bands, and the health of each sample: 0 valid, 1 degraded, 2 invalid. An .mf4
     is the log, MDF 4, with these as channels of their own, a .mat the log's channels and these.
 
-    For a car without a model of its own, leave the model out: `vehest estimate lap.csv` takes the filter of vehest's own, with a note.
+    For a car without a model of its own, leave the model out: `vehest estimate lap.csv estimator.wheelbase=2.7` takes the self-calibrating
+    filter, with a note; estimator.measured_ax=false where there is no ax, estimator.smoothed=true for the whole drive at once.
 
     Columns named like channels, in SI units, need no more; for others, describe them in conf/dataset/NAME.yaml and add `dataset=NAME`.
     """
@@ -366,22 +367,23 @@ def estimate(
 def identify(
     words: Annotated[
         list[str],
-        typer.Argument(metavar="FILE... [OVERRIDES]...", help="Drives of a car; then key=value …", autocompletion=_complete_file),
+        typer.Argument(
+            metavar="FILE... [OVERRIDES]...",
+            help="Drives of a car; then estimator.wheelbase=2.7 and the like.",
+            autocompletion=_complete_file,
+        ),
     ],
     out: Annotated[Path, typer.Option("--out", "-o", help="The car's record to write, .yaml.")] = Path("my_car.yaml"),
-    wheelbase: Annotated[float | None, typer.Option("--wheelbase", min=0.05, help="Of the car [m]; by default a typical one.")] = None,
-    cg_to_rear_axle: Annotated[
-        float | None, typer.Option("--cg-to-rear-axle", min=0.0, help="Distance of the centre of gravity from the rear axle, if known [m].")
-    ] = None,
     as_json: AsJson = False,
 ) -> None:
-    """Find a car's numbers on its drives, without a reference: `vehest identify lap*.csv -o my_car.yaml`.
+    """Find a car's numbers on its drives, without a reference: `vehest identify lap*.csv estimator.wheelbase=2.7 -o my_car.yaml`.
 
-    Roll leakage, rear axle and grip limit, each with its deviation. `vehest estimate lap.csv --car my_car.yaml` starts from them.
+    Roll leakage, rear axle, its compliance and grip limit, each with its deviation. `vehest estimate lap.csv --car my_car.yaml` starts from
+    wheelbase, leakage and rear axle.
     """
     from vehest.run.identify import identify_files, in_words
 
-    record = identify_files(words, out, {"wheelbase": wheelbase, "cg_to_rear_axle": cg_to_rear_axle})
+    record = identify_files(words, out)
     emit(as_json, {"out": str(out), **asdict(record)}, [in_words(record), f"out: {out}"])
 
 

@@ -79,7 +79,8 @@ def test_identify_writes_a_record_from_which_estimate_starts(place):
     for name, seed in (("one", 0), ("two", 1), ("three", 2)):
         channels, _ = lap(seed, 40.0)
         pd.DataFrame({"time": np.arange(len(channels["vx"])) / RATE, **channels}).to_csv(f"{name}.csv", index=False)
-    code, out, err = place("identify", "one.csv", "two.csv", "-o", "car.yaml", "--wheelbase", "2.7", "--cg-to-rear-axle", "1.25", "--json")
+    known = ("estimator.wheelbase=2.7", "estimator.cg_to_rear_axle=1.25")
+    code, out, err = place("identify", "one.csv", "two.csv", *known, "-o", "car.yaml", "--json")
     assert code == 0, err
     said, kept = json.loads(out), read_car(place.folder / "car.yaml")
     assert said["leakage"]["value"] == kept.leakage.value == pytest.approx(PLANTED["leakage"], abs=0.03)
@@ -91,6 +92,14 @@ def test_identify_writes_a_record_from_which_estimate_starts(place):
     assert json.loads(out)["car"] == "car.yaml"
     assert np.abs(pd.read_csv("warm.csv")["vy"] - pd.read_csv("cold.csv")["vy"]).max() > 0.01
     assert "leave the model out" in place.refused("estimate", "pretrained", "three.csv", "--car", "car.yaml")[1]
+    smooth = place.told("estimate", "three.csv", *known, "estimator.smoothed=true", "-o", "smooth.csv")
+    assert smooth["samples"] > 0
+    assert np.abs(pd.read_csv("smooth.csv")["vy"] - pd.read_csv("cold.csv")["vy"]).max() > 0.01
+    assert "estimator.smooth" in place.refused("estimate", "three.csv", "estimator.smooth=true")[1]
+    pd.read_csv("three.csv").drop(columns="ax").to_csv("no_ax.csv", index=False)
+    assert place.told("estimate", "no_ax.csv", "estimator.measured_ax=false", "-o", "no_ax.parquet")["samples"] > 0
+    (place.folder / "other.yaml").write_text("precious: 1\n")
+    assert "other.yaml" in place.refused("identify", "one.csv", "-o", "other.yaml")[1]
     assert "must end in .yaml" in place.refused("identify", "one.csv", "-o", "car.txt")[1]
     assert "called 'one'" in place.refused("identify", "one.csv", "one.csv", "-o", "twice.yaml")[1]
     assert not (place.folder / "twice.yaml").exists()

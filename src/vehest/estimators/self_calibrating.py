@@ -64,7 +64,7 @@ class SelfCalibrating(Recursive):
     template = "self_calibrating"
     refuses = ("NaN", "infinite")
     rate_hz: float = rate(20.0)
-    wheelbase: float = setting(TYPICAL_WHEELBASE, "wheelbase", unit="m", positive=True)
+    wheelbase: float = setting(TYPICAL_WHEELBASE, "wheelbase", unit="m", least=0.05, most=20.0)
     cg_to_rear_axle: float = setting(None, "distance of the centre of gravity from the rear axle; null: 0.48 wheelbases", unit="m")
     smoothed: bool = setting(False, "whether each estimate is made of the whole drive, offline; parameters are those at its end")
     measured_ax: bool = setting(True, "whether ax is measured; else the longitudinal equation tells nothing")

@@ -49,12 +49,15 @@ class CarRecord:
         for name, (low, high) in LIMITS.items():
             if not low < getattr(self, name).value < high:
                 raise DataError(f"{name} must lie between {low:g} and {high:g}, not at {getattr(self, name).value:.4g}")
+        if self.cg_to_rear_axle is not None and self.cg_to_rear_axle >= self.wheelbase:
+            raise DataError(f"cg_to_rear_axle must be below the wheelbase ({self.wheelbase:g} m), not {self.cg_to_rear_axle:g}")
 
 
 def with_settings(model: Estimator, changed: dict[str, Any]) -> SelfCalibrating:
     """The filter with some settings changed; raises `ConfigurationError` where it is another estimator, or one is out of bounds."""
     if not isinstance(model, SelfCalibrating):
-        raise ConfigurationError(f"a car's record is for the self-calibrating filter, not for '{model.name}'; leave the model out")
+        what = "a car's record and estimator.KEY=VALUE are for the self-calibrating filter"
+        raise ConfigurationError(f"{what}, not for '{model.name}'; leave the model out")
     new = SelfCalibrating(settings_from_config(SelfCalibrating.settings_type, asdict(model.settings) | changed, "estimator"))
     new.load_weights(model.weights())
     new.preparation = model.preparation
@@ -81,6 +84,9 @@ def read_car(path: Path) -> CarRecord:
     """Read a car's record back; raises `MissingError`, or `DataError` where it is damaged, of another format or not of a car."""
     content = read_yaml(path)
     if not isinstance(content, dict) or "format" not in content:
-        raise DataError(f"'{path}' is no record of a car; make one by vehest identify")
+        raise DataError(f"'{path}' is no record of a car as vehest identify writes it")
     check_format(content.pop("format"), FORMAT, f"'{path}'")
-    return validated(CarRecord, content, f"'{path}'")
+    try:
+        return validated(CarRecord, content, f"'{path}'")
+    except DataError as error:
+        raise error if str(path) in str(error) else DataError(f"'{path}': {error}") from None

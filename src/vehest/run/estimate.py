@@ -9,6 +9,7 @@ import csv
 import hashlib
 import json
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -28,8 +29,8 @@ from vehest.estimators.kernels.compiling import has_to_compile
 from vehest.estimators.model_files import DESCRIPTION, WEIGHTS, load_model, read_description
 from vehest.run.artefacts import MANIFEST, Artefact, read_artefact
 from vehest.run.calibrate import trust_of
-from vehest.run.car_record import calibrated, read_car
-from vehest.run.config import Config, compose_config, key_of
+from vehest.run.car_record import calibrated, read_car, with_settings
+from vehest.run.config import Config, compose_config, key_of, value_of
 from vehest.run.config_files import is_file_name
 from vehest.run.downsample import resampled
 from vehest.run.estimate_log import LOGS, check_log_name, write_log
@@ -92,7 +93,8 @@ def estimate_file(words: Sequence[str], out: Path, *, strict: bool = False, car:
     """Run a model on a recording and write the estimate to ``out``; returns its figures and a verdict.
 
     Args:
-        words: a model, which may be left out, a recording and overrides of conf/estimate.yaml.
+        words: a model, which may be left out, a recording and overrides of conf/estimate.yaml; ``estimator.KEY=VALUE``: settings of the
+            self-calibrating filter.
         out: table to write, or the log with further channels (`estimate_log`).
         strict: whether findings in the channels are an error; else they are printed as warnings.
         car: record of `vehest identify` to start from.
@@ -112,8 +114,13 @@ def estimate_file(words: Sequence[str], out: Path, *, strict: bool = False, car:
         raise ConfigurationError(f"'{out}' is a folder; name a file")
     if out.exists() and file.exists() and out.samefile(file):
         raise ConfigurationError(f"'{out}' is the recording itself; name another file")
+    settings, overrides = split_settings(overrides)
     config = compose_config("estimate", overrides)
     folder, model, trust = open_model(name, Path(config["output"]), note)
+    if settings:
+        model = with_settings(model, settings)
+        if trust is not None and trust.health is not None and trust.health.channels != model.channels:
+            trust = replace(trust, health=None)  # of a channel that is not measured
     if car is not None:
         model = calibrated(model, read_car(car))
     if has_to_compile(model.slow_kernel) or (trust is not None and has_to_compile(SLOW_KERNEL)):
@@ -141,6 +148,12 @@ def estimate_file(words: Sequence[str], out: Path, *, strict: bool = False, car:
         "findings": findings,
         **({"note": pretrained_note(name)} if name in WITH_VEHEST else {}),
     }
+
+
+def split_settings(overrides: Sequence[str]) -> tuple[dict[str, Any], list[str]]:
+    """Settings of an estimator among overrides, ``estimator.KEY=VALUE``, and the others; raises `ConfigurationError` on bad syntax."""
+    own = [override for override in overrides if key_of(override).startswith("estimator.")]
+    return {key_of(one).partition(".")[2]: value_of(one) for one in own}, [one for one in overrides if one not in own]
 
 
 def model_artefact(folder: Path) -> Artefact:

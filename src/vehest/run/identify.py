@@ -19,11 +19,11 @@ from vehest.data.files import written_aside
 from vehest.data.recording import Recording
 from vehest.estimators.kernels import self_calibrating as kernel
 from vehest.estimators.self_calibrating import SelfCalibrating
-from vehest.run.car_record import FORMAT, LIMITS, CarRecord, Number, with_settings
+from vehest.run.car_record import FORMAT, LIMITS, CarRecord, Number, read_car, with_settings
 from vehest.run.config import compose_config, key_of
 from vehest.run.config_files import is_file_name
-from vehest.run.estimate import SELF_CALIBRATING, findings_of, open_model, prepared_recording, read_by
-from vehest.run.printing import TerminalTable, complain, note
+from vehest.run.estimate import SELF_CALIBRATING, findings_of, open_model, prepared_recording, read_by, split_settings
+from vehest.run.printing import TerminalTable, complain
 
 IDENTIFIED_SHARE = 0.5  # of the prior's variance: a number is identified on a drive that leaves less
 ROWS = {"leakage": kernel.LEAKAGE, "rear_axle": kernel.REAR, "compliance": kernel.COMPLIANCE}
@@ -32,17 +32,20 @@ UNITS = {"leakage": "1", "rear_axle": "m", "compliance": "rad s²/m"}
 Normal = tuple[float, float]  # mean and standard deviation
 
 
-def identify_files(words: Sequence[str], out: Path, given: Mapping[str, float | None]) -> CarRecord:
+def identify_files(words: Sequence[str], out: Path) -> CarRecord:
     """Run the filter that comes with vehest over drives of one car, and write the car's record, YAML; raises `VehestError`.
 
-    ``words`` are recordings, then overrides of conf/estimate.yaml; ``given`` are wheelbase and cg_to_rear_axle [m], where known.
+    ``words`` are recordings, then overrides of conf/estimate.yaml and settings of the filter, ``estimator.KEY=VALUE``.
     """
     files, overrides = [Path(word) for word in words if is_file_name(word)], [word for word in words if not is_file_name(word)]
     if not files or out.suffix.lower() not in (".yaml", ".yml"):
         raise ConfigurationError(f"'{out}' must end in .yaml" if files else "no recording is named: vehest identify lap*.csv -o car.yaml")
+    if out.exists():
+        read_car(out)  # refuses to write over anything else
+    settings, overrides = split_settings(overrides)
     config = compose_config("estimate", overrides)
-    _, shipped, _ = open_model(SELF_CALIBRATING, Path(config["output"]), note)
-    model = with_settings(shipped, {name: value for name, value in given.items() if value is not None})
+    _, shipped, _ = open_model(SELF_CALIBRATING, Path(config["output"]), lambda _: None)
+    model = with_settings(shipped, settings)
     if any(key_of(override).split(".")[0] == "downsample" for override in overrides):
         model.preparation = config["downsample"]
     drives: dict[str, dict[str, Normal]] = {}
