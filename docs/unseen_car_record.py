@@ -65,7 +65,8 @@ C differs between calm driving and the limit: with it too, some drives become a 
 ## Planted numbers
 
 {cars} **simulated** cars on the planar plant, drawn with tyres, masses, sensors and drives of 60 to 120 s at 20 to 100 Hz
-([CSV](planted.csv)); wheelbase and centre of gravity are given, every second yaw rate is late. Cells: mean ± deviation of z-scores, share of cars within 90 %.
+([CSV](planted.csv)); wheelbase and centre of gravity are given, every second yaw rate is late. Cells: mean ± deviation of
+z-scores, share of cars within 90 %.
 
 {planted}
 

@@ -27,6 +27,7 @@ from vehest.estimators.registry import estimator_class, estimator_names
 from vehest.evaluation.metrics import UNITS
 from vehest.run.config import compose_config, expand
 from vehest.run.config_files import GROUPS, choices
+from vehest.run.estimate import split_settings
 from vehest.run.study import Part, PipelineFile, jobs_of, read_study
 from vehest.sources.base import COMMON_KEYS, open_source, source_class, source_names
 from vehest.studies.artefacts import METRIC_COLUMNS
@@ -240,6 +241,9 @@ def test_command_line_is_one_that_vehest_takes(file, line, workplace):
             assert not given.overrides or jobs_of(pipeline, given.overrides)
     else:
         for root, overrides in overrides_of(given):
+            if root == "estimate":  # beside its configuration it takes settings of the filter
+                settings, overrides = split_settings(overrides)
+                estimator_class("self_calibrating").from_config(settings)
             if not PLACEHOLDER.search(" ".join([root, *overrides])):
                 compose_config(root, overrides)
 
