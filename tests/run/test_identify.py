@@ -14,7 +14,7 @@ from vehest.data.recording import Recording
 from vehest.estimators.model_files import load_model
 from vehest.run.car_record import LIMITS, Number, calibrated, read_car, with_settings
 from vehest.run.estimate import pretrained_folder
-from vehest.run.identify import posterior_of, prior_of, record_of, together, without_prior
+from vehest.run.identify import LATENESS, Normal, posterior_of, prior_of, record_of, together, without_prior
 
 PLANTED = {"leakage": -0.06, "rear_axle": 1.25, "compliance": 0.0051}
 
@@ -61,18 +61,42 @@ def test_a_number_identified_on_no_drive_is_marked_and_not_started_from(model):
 
 
 def test_drives_count_by_what_they_add_to_the_prior_and_contradictions_widen():
-    prior, likelihoods = (1.0, 2.0), {"a": (3.0, 1.0), "b": (3.2, 0.5)}
+    prior, likelihoods = Normal(1.0, 2.0), {"a": (3.0, 1.0), "b": (3.2, 0.5)}
     posteriors = {}
     for name, (mean, deviation) in likelihoods.items():
         variance = 1.0 / (1.0 / prior[1] ** 2 + 1.0 / deviation**2)
-        posteriors[name] = variance * (prior[0] / prior[1] ** 2 + mean / deviation**2), math.sqrt(variance)
+        posteriors[name] = Normal(variance * (prior.mean / prior.deviation**2 + mean / deviation**2), math.sqrt(variance))
         assert without_prior(prior, posteriors[name]) == pytest.approx((mean, deviation))
     both = together(prior, posteriors)
     precision = 1.0 / 4.0 + 1.0 + 4.0
     assert (both.value, both.deviation) == pytest.approx(((0.25 + 3.0 + 4.0 * 3.2) / precision, precision**-0.5))
     assert both.identified_on == ("a", "b")
-    assert together(prior, posteriors | {"c": (-1.0, 0.4)}).deviation > 2.0 * both.deviation
-    assert together(prior, {"d": prior}) == Number(*prior)
+    assert together(prior, posteriors | {"c": Normal(-1.0, 0.4)}).deviation > 2.0 * both.deviation
+    assert together(prior, {"d": prior}) == Number(prior.mean, prior.deviation)
+
+
+def test_lateness_widens_what_it_moves_and_more_drives_do_not_narrow_that():
+    prior, sure = Normal(0.0, 1.0), Normal(0.2, 1e-3, 0.5)
+    for drives in ({"a": sure}, dict.fromkeys("abcd", sure)):
+        found = together(prior, drives)
+        assert (found.value, found.deviation) == pytest.approx((0.2, 0.5), rel=1e-4)
+        assert found.identified_on == tuple(drives)
+    assert together(prior, {"a": sure._replace(of_lateness=0.8)}).identified_on == ()
+
+
+def test_numbers_of_a_drive_whose_yaw_rate_is_late_keep_within_their_deviations(model):
+    channels, _ = lap(3)
+    late = channels | {
+        "yaw_rate": np.interp(np.arange(len(channels["vx"])) - 0.04 * RATE, np.arange(len(channels["vx"])), channels["yaw_rate"])
+    }
+    on_time, found = (posterior_of(model, recording("lap", own)) for own in (channels, late))
+    for name in ("compliance", "rear_axle"):
+        moved = found[name].mean - on_time[name].mean
+        assert moved == pytest.approx(0.04 / LATENESS * on_time[name].of_lateness, rel=0.4)
+        assert (
+            abs(getattr(record_of(model, {"lap": found}), name).value - PLANTED[name])
+            < 1.645 * getattr(record_of(model, {"lap": found}), name).deviation
+        )
 
 
 def test_identify_writes_a_record_from_which_estimate_starts(place):
