@@ -2,6 +2,7 @@
 
 import json
 import math
+import re
 
 import numpy as np
 import pandas as pd
@@ -13,7 +14,7 @@ from vehest.data.errors import DataError
 from vehest.data.recording import Recording
 from vehest.estimators.model_files import load_model
 from vehest.run.car_record import LIMITS, Number, calibrated, read_car, with_settings
-from vehest.run.estimate import pretrained_folder
+from vehest.run.estimate import findings_of, pretrained_folder
 from vehest.run.identify import LATENESS, Normal, posterior_of, prior_of, record_of, together, without_prior
 
 PLANTED = {"leakage": -0.06, "rear_axle": 1.25, "compliance": 0.0051}
@@ -128,6 +129,26 @@ def test_identify_writes_a_record_from_which_estimate_starts(place):
     assert "called 'one'" in place.refused("identify", "one.csv", "one.csv", "-o", "twice.yaml")[1]
     assert not (place.folder / "twice.yaml").exists()
     assert prior_of(calibrated(load_model(pretrained_folder("self_calibrating")), kept))["leakage"][0] == kept.leakage.value
+
+
+@pytest.mark.parametrize(
+    ("scale", "wheelbase", "words"),
+    [
+        (1.0, 2.7, None),
+        (0.1, 0.27, None),
+        (0.1, 2.7, "does not turn within 1.* m"),
+        (1.0, 0.1, "does not reach 25 m/s"),
+    ],
+)
+def test_a_wheelbase_that_the_drive_rules_out_is_found(scale, wheelbase, words):
+    """A drive up to 25 m/s with bends of 11 m, and the same at a tenth of the size: speeds go with its root, yaw rates against it."""
+    time = np.arange(0.0, 60.0, 1.0 / RATE)
+    speed, curvature = np.interp(time, [0.0, 30.0, 60.0], [5.0, 5.0, 25.0]), np.where(time < 20.0, 0.09, 0.01)
+    channels = {"yaw_rate": speed * curvature * scale**-0.5, "vx": speed * scale**0.5, "ay": speed**2 * curvature, "ax": 0.0 * time}
+    sized = with_settings(load_model(pretrained_folder("self_calibrating")), {"wheelbase": wheelbase})
+    found = [one for one in findings_of(recording("lap", channels), sized, ["sign", "unit"]) if "wheelbase" in one]
+    assert len(found) == (words is not None)
+    assert words is None or re.search(words, found[0])
 
 
 @pytest.mark.parametrize(
