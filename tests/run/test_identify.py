@@ -127,6 +127,10 @@ def test_identify_writes_a_record_from_which_estimate_starts(place):
     assert "other.yaml" in place.refused("identify", "one.csv", "-o", "other.yaml")[1]
     assert "must end in .yaml" in place.refused("identify", "one.csv", "-o", "car.txt")[1]
     assert "called 'one'" in place.refused("identify", "one.csv", "one.csv", "-o", "twice.yaml")[1]
+    pd.DataFrame({"time": [0.0, 0.01], "yaw_rate": [0.1, 0.11], "vx": [10.0, 10.1], "ay": [1.0, 1.1], "ax": [0.0, 0.1]}).to_csv(
+        "short.csv", index=False
+    )
+    assert "too short" in place.refused("identify", "short.csv", "-o", "twice.yaml")[1]
     assert not (place.folder / "twice.yaml").exists()
     assert prior_of(calibrated(load_model(pretrained_folder("self_calibrating")), kept))["leakage"][0] == kept.leakage.value
 

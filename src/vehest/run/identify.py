@@ -83,9 +83,11 @@ def in_words(record: CarRecord) -> TerminalTable:
 
 
 def posterior_of(model: SelfCalibrating, recording: Recording) -> dict[str, Normal]:
-    """Numbers after a drive, grip by its logarithm, and mean offsets; raises `DataError` where a channel is missing or has gaps."""
+    """Numbers after a drive, grip by its logarithm, and mean offsets; raises `DataError` where it is too short or has gaps."""
     drive = prepared_recording(model, recording)
     samples = np.column_stack([drive[name] for name in model.channels])
+    if len(samples) < 2:
+        raise DataError(f"recording '{recording.id}' is too short to identify anything")
     if not np.isfinite(samples).all():
         raise DataError(f"recording '{recording.id}' has gaps in {', '.join(model.channels)}; identify on a part without them")
     turning = LATENESS * model.rate_hz * np.gradient(samples[:, 0])
