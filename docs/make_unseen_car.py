@@ -10,6 +10,7 @@ import csv
 import os
 import subprocess
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import suppress
 from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -18,7 +19,7 @@ import numpy as np
 import scipy.io
 
 from vehest.constants import FloatArray
-from vehest.data.errors import MissingError
+from vehest.data.errors import DataError, MissingError
 from vehest.data.recording import Recording
 from vehest.data.store import read_recording
 from vehest.estimators.base import Estimator
@@ -175,7 +176,8 @@ def errors_of(car: Car, recording: Recording, shipped: Estimator, others: Mappin
     variance = np.zeros(len(speed))
     models, found["carried over"] = models_of(car, plain.rate_hz, has_ax), found["v = 0"] * np.nan
     if others:
-        models["carried over"] = calibrated(models["cold"], record_of(with_settings(models["cold"], {}), others))
+        with suppress(DataError):  # numbers that are not of a car
+            models["carried over"] = calibrated(models["cold"], record_of(with_settings(models["cold"], {}), others))
     for name, model in models.items():
         estimate = model.estimate([plain.select(model.channels)])[0]
         found[name] = estimate["vy"]
@@ -303,8 +305,8 @@ def report(found: Mapping[Car, Sequence[Errors]], changed: Mapping[Car, Sequence
             "drive. Cars on which choices were made are development cars: their figures are no evidence for another car. The others were",
             "[opened](openings.csv) more than once, with the settings chosen in between that stand there. The network inside, also",
             "the shipped model, learnt on a simulated fleet of variants of the BMW; no real car of full size has judged the filter so far.",
-            "Carried over: started as by `vehest estimate --car` from a record of the car's other drives, where there are others; of the",
-            "Ferrari from three drives without reference.",
+            "Carried over: started as by `vehest estimate --car` from a record of the car's other drives, of the Ferrari from three",
+            "without reference; – where there are none, or `vehest identify` refuses numbers that are not of a car.",
             "",
             *table(heads, rows),
             "",
