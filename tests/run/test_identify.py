@@ -14,8 +14,10 @@ from vehest.data.errors import DataError
 from vehest.data.recording import Recording
 from vehest.estimators.model_files import load_model
 from vehest.run.car_record import LIMITS, Number, calibrated, read_car, with_settings
-from vehest.run.estimate import findings_of, pretrained_folder
+from vehest.run.config import compose_config
+from vehest.run.estimate import findings_of, pretrained_folder, wheelbase_findings
 from vehest.run.identify import LATENESS, Normal, posterior_of, prior_of, record_of, together, without_prior
+from vehest.sources.base import open_source
 
 PLANTED = {"leakage": -0.06, "rear_axle": 1.25, "compliance": 0.0051}
 
@@ -153,6 +155,18 @@ def test_a_wheelbase_that_the_drive_rules_out_is_found(scale, wheelbase, words):
     found = [one for one in findings_of(recording("lap", channels), sized, ["sign", "unit"]) if "wheelbase" in one]
     assert len(found) == (words is not None)
     assert words is None or re.search(words, found[0])
+
+
+@pytest.mark.parametrize(
+    ("dataset", "wheelbase"),
+    [("dart", 0.175), ("roboracer", 0.33), ("f1tenth", 0.33), ("ferrari_250lm", 2.4), ("s90", 2.941), ("tum", 3.0), ("av21", 3.0)],
+)
+def test_no_real_car_is_denied_its_wheelbase_and_no_small_one_passes_for_a_large_one(data_root, dataset, wheelbase):
+    config = compose_config("ingest", [f"dataset={dataset}", f"root={data_root}"])["dataset"]
+    moving = [one for one in open_source(config).recordings() if np.mean(one["vx"] > 1.0) > 0.2]
+    assert moving
+    assert not any(wheelbase_findings(one, wheelbase) for one in moving)
+    assert wheelbase > 1.0 or all(wheelbase_findings(one, 2.7) for one in moving)
 
 
 @pytest.mark.parametrize(

@@ -217,11 +217,11 @@ def findings_of(recording: Recording, model: Estimator, accepted: Sequence[str])
             what = f"channels contradict each other: {finding.message}"
             raise DataError(f"recording '{recording.id}': {what} (or dataset.accept=[{finding.check}])")
     told = [f"{finding.channel}: {finding.message}" if finding.channel else finding.message for finding in findings]
-    return told + _wheelbase_findings(recording, getattr(model.settings, "wheelbase", None))
+    return told + wheelbase_findings(recording, getattr(model.settings, "wheelbase", None))
 
 
-def _wheelbase_findings(recording: Recording, wheelbase: float | None) -> list[str]:
-    """Whether a drive above 1 m/s turns too sharply, or is too fast, for any car of a wheelbase [m]."""
+def wheelbase_findings(recording: Recording, wheelbase: float | None) -> list[str]:
+    """A finding where a drive above 1 m/s turns too sharply, or is too fast, for any car of a wheelbase [m]; None: not known."""
     if wheelbase is None or not {"vx", "yaw_rate"} <= set(recording.channels):
         return []
     speed, yaw_rate = recording["vx"], np.abs(recording["yaw_rate"])
