@@ -10,6 +10,7 @@ import csv
 import os
 import subprocess
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import suppress
 from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -18,17 +19,19 @@ import numpy as np
 import scipy.io
 
 from vehest.constants import FloatArray
-from vehest.data.errors import MissingError
+from vehest.data.errors import DataError, MissingError
 from vehest.data.recording import Recording
 from vehest.data.store import read_recording
 from vehest.estimators.base import Estimator
 from vehest.estimators.data_sheet import DataSheet
 from vehest.estimators.self_calibrating import TYPICAL_REAR, TYPICAL_WHEELBASE, SelfCalibrating
 from vehest.report.style import fixed
+from vehest.run.car_record import LIMITS, calibrated, with_settings
 from vehest.run.config import compose_config
 from vehest.run.console import Messages
 from vehest.run.downsample import resampled
-from vehest.run.estimate import open_model
+from vehest.run.estimate import SELF_CALIBRATING, estimate_recording, open_model
+from vehest.run.identify import Normal, posterior_of, record_of
 from vehest.run.runner import Runner
 from vehest.run.signals import StopSignals
 
@@ -38,7 +41,7 @@ TARGET = ROOT / "results" / "unseen_car"
 RATE = 20.0
 BLOCK = round(10.0 * RATE)  # samples of a block of the bootstrap
 WARM_UP = 30  # samples until the shipped network estimates; scored for no method
-CHANNELS = ("yaw_rate", "vx", "ay", "ax")
+PLAIN = {"method": "polyphase", "transforms": []}
 ABLATIONS: dict[str, dict[str, Any]] = {
     "cold": {},
     "car not given": {"wheelbase": TYPICAL_WHEELBASE, "cg_to_rear_axle": None},
@@ -65,11 +68,14 @@ class Car(NamedTuple):
     drives: str = "*"
     overrides: tuple[str, ...] = ()
     slowest: float = 5.0  # m/s, below which nothing is scored
+    unlabelled: tuple[str, ...] = ()  # overrides of ingest for its drives without a reference
 
 
+HELD_BACK = "telemetry_train_1"  # the Ferrari's unlabelled drive that is the labelled one
+ROBUSTNESS = ("dataset=roboracer", "dataset.files=robustness/*.csv", "~dataset.drop_rows", "~dataset.pose", "~dataset.reference_point")
 FIRST = tuple(f"dataset.drives.{at}.count=1" for at in range(5))
 CARS = (
-    Car("Ferrari 250 LM", "real", True, 2.4, 1.07, "ferrari_250lm"),
+    Car("Ferrari 250 LM", "real", True, 2.4, 1.07, "ferrari_250lm", unlabelled=("dataset=ferrari_250lm_unlabelled",)),
     Car("Volvo S90", "real", True, 2.941, 1.291, "s90"),
     Car("Audi TTS, no ax", "real", True, 2.468, 1.45, "stanford_tts"),
     Car("DevBot, by TUM", "simulated", True, 3.0, None, "tum"),
@@ -79,7 +85,7 @@ CARS = (
     Car("BMW 545i", "simulated", False, 2.88, 1.41, "sim_bmw_unseen", "unseen_*"),
     Car("F1TENTH, 1:8", "real", False, 0.33, 0.115, "f1tenth", slowest=1.0),
     Car("DART, 1:10", "real", False, 0.175, 0.094, "dart", slowest=0.5),
-    Car("RoboRacer, 1:10", "real", False, 0.33, None, "roboracer", slowest=0.5),
+    Car("RoboRacer, 1:10", "real", False, 0.33, None, "roboracer", slowest=0.5, unlabelled=ROBUSTNESS),
     Car("AutoRally, 1:5, smoothed signals", "real", False, 0.57, None, "autorally", slowest=1.0),
 )
 SHIPS_ON = ("Ferrari 250 LM", "DevBot, by TUM", "Corvette Grand Sport", "BMW 545i")
@@ -107,7 +113,7 @@ def drives_of(car: Car, runner: Runner, root: str) -> Iterator[Recording]:
                 yaw_rate, 0.005
             )  # measured that far behind the point of the sideslip
             channels = {"yaw_rate": yaw_rate, "vx": speed, "ay": ay, "vy_ref": speed * np.tan(held["Sideslip_rad"])}
-            yield resampled(Recording(file.stem, "audi_tts", 200.0, 0.0, channels), RATE, {"method": "polyphase", "transforms": []})
+            yield resampled(Recording(file.stem, "audi_tts", 200.0, 0.0, channels), RATE, PLAIN)
         return
     if car.dataset == "autorally":
         for file in sorted((Path(root) / "autorally").glob("mppi_states_controls*.mat")):
@@ -115,28 +121,50 @@ def drives_of(car: Car, runner: Runner, root: str) -> Iterator[Recording]:
             whole = slice(2000, -2000)  # poses, from which the states were made, blow up at both ends
             channels = {"yaw_rate": states[2], "vx": states[0], "ay": -accelerations[1], "ax": accelerations[0], "vy_ref": states[1]}
             channels = {name: np.ascontiguousarray(values[whole], dtype=float) for name, values in channels.items()}
-            yield resampled(Recording(file.stem, "autorally", 1000.0, 0.0, channels), RATE, {"method": "polyphase", "transforms": []})
+            yield resampled(Recording(file.stem, "autorally", 1000.0, 0.0, channels), RATE, PLAIN)
         return
-    made = runner.ingest(compose_config("ingest", [f"dataset={car.dataset}", f"root={root}", f"output={runner.output}", *car.overrides]))
-    for name in made.outputs:
-        if fnmatchcase(Path(name).stem, car.drives):
-            recording = read_recording(made.folder / name)
-            if {"yaw_rate", "vx", "ay", "vy_ref"} <= set(recording.channels) and recording.duration > 5.0:
-                yield resampled(recording, min(RATE, recording.rate_hz), {"method": "polyphase", "transforms": []})
+    for recording in ingested(runner, root, f"dataset={car.dataset}", *car.overrides):
+        read = {"yaw_rate", "vx", "ay", "vy_ref"} <= set(recording.channels)
+        if fnmatchcase(recording.id, car.drives) and read and recording.duration > 5.0:
+            yield resampled(recording, min(RATE, recording.rate_hz), PLAIN)
+
+
+def ingested(runner: Runner, root: str, *overrides: str) -> Iterator[Recording]:
+    """Recordings of a data set as they are."""
+    made = runner.ingest(compose_config("ingest", [f"root={root}", f"output={runner.output}", *overrides]))
+    return (read_recording(made.folder / name) for name in made.outputs)
+
+
+def unlabelled_of(car: Car, runner: Runner, root: str) -> list[Recording]:
+    """Its drives without a reference."""
+    return [one for one in ingested(runner, root, *car.unlabelled) if one.id != HELD_BACK] if car.unlabelled else []
+
+
+def filter_of(car: Car, rate_hz: float, **changed: Any) -> SelfCalibrating:
+    """The filter with the car's sheet."""
+    own = {"wheelbase": car.wheelbase, "cg_to_rear_axle": car.cg_to_rear_axle, "rate_hz": rate_hz}
+    model = with_settings(SelfCalibrating.from_config({}), own | changed)
+    model.preparation = PLAIN
+    return model
+
+
+def identified_on(car: Car, drives: Sequence[Recording]) -> dict[str, dict[str, Normal]]:
+    """What `vehest identify` finds on each drive."""
+    return {drive.id: posterior_of(filter_of(car, min(RATE, drive.rate_hz), measured_ax="ax" in drive), drive) for drive in drives}
 
 
 def models_of(car: Car, rate_hz: float, has_ax: bool) -> dict[str, Estimator]:
     """The methods that are compared, by title."""
-    own = {"wheelbase": car.wheelbase, "cg_to_rear_axle": car.cg_to_rear_axle, "rate_hz": rate_hz}
     sheet = {"wheelbase": car.wheelbase, "cg_to_rear_axle": car.cg_to_rear_axle or TYPICAL_REAR * car.wheelbase, "rate_hz": rate_hz}
-    filters = {
-        name: SelfCalibrating.from_config(own | {"measured_ax": has_ax} | changed) for name, changed in (ABLATIONS | SMOOTHED).items()
-    }
+    filters = {name: filter_of(car, rate_hz, **({"measured_ax": has_ax} | changed)) for name, changed in (ABLATIONS | SMOOTHED).items()}
     return {"data sheet": DataSheet.from_config(sheet), **filters}
 
 
-def errors_of(car: Car, recording: Recording, shipped: Estimator) -> Errors:
-    """Squared errors of every method where the car moves; the map is v = r (b - k u²), fitted to this drive's own reference."""
+def errors_of(car: Car, recording: Recording, shipped: Estimator, others: Mapping[str, Mapping[str, Normal]]) -> Errors:
+    """Squared errors of every method where the car moves; the map is v = r (b - k u²), fitted to this drive's own reference.
+
+    ``others`` are the numbers found on the car's other drives, from which "carried over" starts; NaN without any.
+    """
     speed, truth, has_ax = recording["vx"], recording["vy_ref"], "ax" in recording
     ax = recording["ax"] if has_ax else np.gradient(speed, 1.0 / recording.rate_hz)
     inputs = {"yaw_rate": recording["yaw_rate"], "vx": speed, "ay": recording["ay"], "ax": ax}
@@ -146,7 +174,11 @@ def errors_of(car: Car, recording: Recording, shipped: Estimator) -> Errors:
     found = {"v = 0": np.zeros(len(speed)), "map": columns @ np.linalg.lstsq(columns[moving], truth[moving], rcond=None)[0]}
     found["shipped"] = np.nan_to_num(shipped.estimate([plain])[0]["vy"]) if abs(plain.rate_hz - RATE) < 1e-9 else found["v = 0"] * np.nan
     variance = np.zeros(len(speed))
-    for name, model in models_of(car, plain.rate_hz, has_ax).items():
+    models, found["carried over"] = models_of(car, plain.rate_hz, has_ax), found["v = 0"] * np.nan
+    if others:
+        with suppress(DataError):  # numbers that are not of a car
+            models["carried over"] = calibrated(models["cold"], record_of(with_settings(models["cold"], {}), others))
+    for name, model in models.items():
         estimate = model.estimate([plain.select(model.channels)])[0]
         found[name] = estimate["vy"]
         if name == "cold" and estimate.covariance is not None:
@@ -155,6 +187,30 @@ def errors_of(car: Car, recording: Recording, shipped: Estimator) -> Errors:
     within = (np.abs(found["cold"] - truth) < 1.645 * np.sqrt(variance))[moving]
     time = np.arange(len(speed))[moving] / plain.rate_hz
     return Errors(recording.id, angle, {name: (vy - truth)[moving] ** 2 for name, vy in found.items()}, within, truth[moving], time)
+
+
+def scored(car: Car, runner: Runner, root: str, shipped: Estimator) -> list[Errors]:
+    """Of its drives, each also from a record of the others."""
+    drives = list(drives_of(car, runner, root))
+    own = identified_on(car, drives) | identified_on(car, unlabelled_of(car, runner, root) if car.development else [])
+    return [errors_of(car, drive, shipped, {name: one for name, one in own.items() if name != drive.id}) for drive in drives]
+
+
+def under_change(car: Car, runner: Runner, root: str) -> list[list[str]]:
+    """Rows of drives without a reference: numbers that are found from the priors, the median band and the share that is not valid."""
+    _, shipped, trust = open_model(SELF_CALIBRATING, runner.output, print)
+    rows = []
+    for title, drives in (
+        ("its labelled drives", list(drives_of(car, runner, root))),
+        *((d.id, [d]) for d in unlabelled_of(car, runner, root)),
+    ):
+        model = with_settings(shipped, {"wheelbase": car.wheelbase, "cg_to_rear_axle": car.cg_to_rear_axle})
+        record = record_of(model, identified_on(car, drives))
+        estimates = [estimate_recording(model, drive, trust) for drive in drives]
+        band, health = (np.concatenate([estimate[name] for estimate in estimates]) for name in ("band_sideslip", "health"))
+        numbers = [f"{one.value:.3g} ± {one.deviation:.2g}" for one in (getattr(record, name) for name in LIMITS)]
+        rows.append([title, *numbers, fixed(float(np.degrees(np.nanmedian(band))), 2), fixed(float(np.mean(health > 0)), 2)])
+    return rows
 
 
 def rmse(drives: Sequence[Errors], name: str) -> float:
@@ -203,20 +259,20 @@ def table(heads: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str]:
     return [f"| {' | '.join(row)} |" for row in (heads, [":--", *["--:"] * (len(heads) - 1)], *rows)]
 
 
-def report(found: Mapping[Car, Sequence[Errors]]) -> str:
+def report(found: Mapping[Car, Sequence[Errors]], changed: Mapping[Car, Sequence[Sequence[str]]]) -> str:
     """The page."""
     ratios = {car: ratio_interval(drives) for car, drives in found.items() if np.isfinite(rmse(drives, "shipped"))}
     judged = [car for car in ratios if car.title in SHIPS_ON]
     limits = {car.title: ratio_interval(found[car], "car not given")[1] for car in judged}
     ships = len(judged) == len(SHIPS_ON) and max(limits.values()) <= LARGEST_RATIO
-    methods = ["v = 0", "data sheet", "shipped", "self-calibrating", "smoothed, offline", "map with reference"]
+    methods = ["v = 0", "data sheet", "shipped", "self-calibrating", "carried over", "smoothed, offline", "map with reference"]
     worse = ["drives", "worse than v = 0", "than 1.1 times shipped"]
     heads = ["car", "choices", *methods, "over shipped", "FVU, median (worst)", "band holds", *worse]
     rows, drives_below = [], []
     for car, drives in found.items():
         shares = [fvu(drive, "cold") for drive in drives]
         drives_below += [rmse([drive], "cold") < rmse([drive], "v = 0") for drive in drives]
-        over, errors = "–", [rmse(drives, name) for name in ("v = 0", "data sheet", "shipped", "cold", "smoothed", "map")]
+        over, errors = "–", [rmse(drives, name) for name in ("v = 0", "data sheet", "shipped", "cold", "carried over", "smoothed", "map")]
         if car in ratios:
             over = f"{fixed(errors[3] / errors[2], 2)} [{fixed(ratios[car][0], 2)}, {fixed(ratios[car][1], 2)}]"
         figures = [fixed(error, 2) if np.isfinite(error) else "–" for error in errors]
@@ -249,6 +305,8 @@ def report(found: Mapping[Car, Sequence[Errors]]) -> str:
             "drive. Cars on which choices were made are development cars: their figures are no evidence for another car. The others were",
             "[opened](openings.csv) more than once, with the settings chosen in between that stand there. The network inside, also",
             "the shipped model, learnt on a simulated fleet of variants of the BMW; no real car of full size has judged the filter so far.",
+            "Carried over: started as by `vehest estimate --car` from a record of the car's other drives, of the Ferrari from three",
+            "without reference; – where there are none, or `vehest identify` refuses numbers that are not of a car.",
             "",
             *table(heads, rows),
             "",
@@ -263,8 +321,23 @@ def report(found: Mapping[Car, Sequence[Errors]]) -> str:
             "Small cars are seen at their wheelbase: times and speeds scale with its root, the network does not count, and",
             "steady cornering counts the more the smaller they are.",
             "",
+            *[line for car, own in changed.items() for line in changed_table(car, own)],
         ]
     )
+
+
+def changed_table(car: Car, rows: Sequence[Sequence[str]]) -> list[str]:
+    """Numbers of a car under other masses and tyres."""
+    heads = ["drive", *LIMITS, "band of β, median [deg]", "not valid"]
+    about = "what `vehest identify` finds from the filter's priors (leakage [1], rear axle [m], compliance [rad s²/m], grip [m/s²])"
+    return [
+        f"## {car.title} ({car.origin}) under other masses and tyres",
+        "",
+        f"No reference: {about}, bands and health.",
+        "",
+        *table(heads, rows),
+        "",
+    ]
 
 
 def main() -> None:
@@ -283,12 +356,15 @@ def main() -> None:
         open_cars([car.title for car in cars if not car.development])
     runner, (_, shipped, _) = Runner(given.output, Messages(), StopSignals()), open_model("pretrained", given.output, print)
     found: dict[Car, list[Errors]] = {}
+    changed: dict[Car, list[list[str]]] = {}
     for car in cars:
         try:
-            found[car] = [errors_of(car, recording, shipped) for recording in drives_of(car, runner, root)]
+            found[car] = scored(car, runner, root, shipped)
+            if car.unlabelled and not car.development:
+                changed[car] = under_change(car, runner, root)
         except MissingError as error:
             print(f"left out: {car.title}: {error}")
-    page = report({car: [drive for drive in drives if len(drive.time)] for car, drives in found.items() if drives})
+    page = report({car: [drive for drive in drives if len(drive.time)] for car, drives in found.items() if drives}, changed)
     if given.development:
         print(page)
     else:

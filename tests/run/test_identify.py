@@ -2,6 +2,7 @@
 
 import json
 import math
+import re
 
 import numpy as np
 import pandas as pd
@@ -13,8 +14,10 @@ from vehest.data.errors import DataError
 from vehest.data.recording import Recording
 from vehest.estimators.model_files import load_model
 from vehest.run.car_record import LIMITS, Number, calibrated, read_car, with_settings
-from vehest.run.estimate import pretrained_folder
-from vehest.run.identify import posterior_of, prior_of, record_of, together, without_prior
+from vehest.run.config import compose_config
+from vehest.run.estimate import findings_of, pretrained_folder, wheelbase_findings
+from vehest.run.identify import LATENESS, Normal, posterior_of, prior_of, record_of, together, without_prior
+from vehest.sources.base import open_source
 
 PLANTED = {"leakage": -0.06, "rear_axle": 1.25, "compliance": 0.0051}
 
@@ -61,18 +64,42 @@ def test_a_number_identified_on_no_drive_is_marked_and_not_started_from(model):
 
 
 def test_drives_count_by_what_they_add_to_the_prior_and_contradictions_widen():
-    prior, likelihoods = (1.0, 2.0), {"a": (3.0, 1.0), "b": (3.2, 0.5)}
+    prior, likelihoods = Normal(1.0, 2.0), {"a": (3.0, 1.0), "b": (3.2, 0.5)}
     posteriors = {}
     for name, (mean, deviation) in likelihoods.items():
         variance = 1.0 / (1.0 / prior[1] ** 2 + 1.0 / deviation**2)
-        posteriors[name] = variance * (prior[0] / prior[1] ** 2 + mean / deviation**2), math.sqrt(variance)
+        posteriors[name] = Normal(variance * (prior.mean / prior.deviation**2 + mean / deviation**2), math.sqrt(variance))
         assert without_prior(prior, posteriors[name]) == pytest.approx((mean, deviation))
     both = together(prior, posteriors)
     precision = 1.0 / 4.0 + 1.0 + 4.0
     assert (both.value, both.deviation) == pytest.approx(((0.25 + 3.0 + 4.0 * 3.2) / precision, precision**-0.5))
     assert both.identified_on == ("a", "b")
-    assert together(prior, posteriors | {"c": (-1.0, 0.4)}).deviation > 2.0 * both.deviation
-    assert together(prior, {"d": prior}) == Number(*prior)
+    assert together(prior, posteriors | {"c": Normal(-1.0, 0.4)}).deviation > 2.0 * both.deviation
+    assert together(prior, {"d": prior}) == Number(prior.mean, prior.deviation)
+
+
+def test_lateness_widens_what_it_moves_and_more_drives_do_not_narrow_that():
+    prior, sure = Normal(0.0, 1.0), Normal(0.2, 1e-3, 0.5)
+    for drives in ({"a": sure}, dict.fromkeys("abcd", sure)):
+        found = together(prior, drives)
+        assert (found.value, found.deviation) == pytest.approx((0.2, 0.5), rel=1e-4)
+        assert found.identified_on == tuple(drives)
+    assert together(prior, {"a": sure._replace(of_lateness=0.8)}).identified_on == ()
+
+
+def test_numbers_of_a_drive_whose_yaw_rate_is_late_keep_within_their_deviations(model):
+    channels, _ = lap(3)
+    late = channels | {
+        "yaw_rate": np.interp(np.arange(len(channels["vx"])) - 0.04 * RATE, np.arange(len(channels["vx"])), channels["yaw_rate"])
+    }
+    on_time, found = (posterior_of(model, recording("lap", own)) for own in (channels, late))
+    for name in ("compliance", "rear_axle"):
+        moved = found[name].mean - on_time[name].mean
+        assert moved == pytest.approx(0.04 / LATENESS * on_time[name].of_lateness, rel=0.4)
+        assert (
+            abs(getattr(record_of(model, {"lap": found}), name).value - PLANTED[name])
+            < 1.645 * getattr(record_of(model, {"lap": found}), name).deviation
+        )
 
 
 def test_identify_writes_a_record_from_which_estimate_starts(place):
@@ -102,8 +129,44 @@ def test_identify_writes_a_record_from_which_estimate_starts(place):
     assert "other.yaml" in place.refused("identify", "one.csv", "-o", "other.yaml")[1]
     assert "must end in .yaml" in place.refused("identify", "one.csv", "-o", "car.txt")[1]
     assert "called 'one'" in place.refused("identify", "one.csv", "one.csv", "-o", "twice.yaml")[1]
+    pd.DataFrame({"time": [0.0, 0.01], "yaw_rate": [0.1, 0.11], "vx": [10.0, 10.1], "ay": [1.0, 1.1], "ax": [0.0, 0.1]}).to_csv(
+        "short.csv", index=False
+    )
+    assert "too short" in place.refused("identify", "short.csv", "-o", "twice.yaml")[1]
     assert not (place.folder / "twice.yaml").exists()
     assert prior_of(calibrated(load_model(pretrained_folder("self_calibrating")), kept))["leakage"][0] == kept.leakage.value
+
+
+@pytest.mark.parametrize(
+    ("scale", "wheelbase", "words"),
+    [
+        (1.0, 2.7, None),
+        (0.1, 0.27, None),
+        (0.1, 2.7, "does not turn within 1.* m"),
+        (1.0, 0.1, "does not reach 25 m/s"),
+    ],
+)
+def test_a_wheelbase_that_the_drive_rules_out_is_found(scale, wheelbase, words):
+    """A drive up to 25 m/s with bends of 11 m, and the same at a tenth of the size: speeds go with its root, yaw rates against it."""
+    time = np.arange(0.0, 60.0, 1.0 / RATE)
+    speed, curvature = np.interp(time, [0.0, 30.0, 60.0], [5.0, 5.0, 25.0]), np.where(time < 20.0, 0.09, 0.01)
+    channels = {"yaw_rate": speed * curvature * scale**-0.5, "vx": speed * scale**0.5, "ay": speed**2 * curvature, "ax": 0.0 * time}
+    sized = with_settings(load_model(pretrained_folder("self_calibrating")), {"wheelbase": wheelbase})
+    found = [one for one in findings_of(recording("lap", channels), sized, ["sign", "unit"]) if "wheelbase" in one]
+    assert len(found) == (words is not None)
+    assert words is None or re.search(words, found[0])
+
+
+@pytest.mark.parametrize(
+    ("dataset", "wheelbase"),
+    [("dart", 0.175), ("roboracer", 0.33), ("f1tenth", 0.33), ("ferrari_250lm", 2.4), ("s90", 2.941), ("tum", 3.0), ("av21", 3.0)],
+)
+def test_no_real_car_is_denied_its_wheelbase_and_no_small_one_passes_for_a_large_one(data_root, dataset, wheelbase):
+    config = compose_config("ingest", [f"dataset={dataset}", f"root={data_root}"])["dataset"]
+    moving = [one for one in open_source(config).recordings() if np.mean(one["vx"] > 1.0) > 0.2]
+    assert moving
+    assert not any(wheelbase_findings(one, wheelbase) for one in moving)
+    assert wheelbase > 1.0 or all(wheelbase_findings(one, 2.7) for one in moving)
 
 
 @pytest.mark.parametrize(

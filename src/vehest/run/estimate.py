@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 
 from vehest.alignment.checks import checks_of_recording
+from vehest.constants import GRAVITY
 from vehest.data.channels import REFERENCE_SUFFIX
 from vehest.data.errors import ConfigurationError, DataError, MissingError
 from vehest.data.estimate import QUANTITIES, Estimate
@@ -42,6 +43,8 @@ from vehest.trust.health import SLOW_KERNEL, domain_verdict, reason_in_words
 from vehest.trust.record import Trust, is_other_vehicle
 
 SUFFIXES = (".parquet", ".csv")
+SHARPEST_TURN = 0.8  # wheelbase over radius that a tenth of a drive may exceed; 0.42 on real cars that drift
+LARGEST_FROUDE = 400.0  # vx² over gravity and wheelbase that a hundredth of a drive may exceed; 170 on real race cars
 CONTRADICTIONS = ("sign", "unit")  # checks that compare channels with each other
 PRETRAINED, SELF_CALIBRATING = "pretrained", "self_calibrating"
 """Names of the models that come with vehest, for cars without a model of their own: a network, and the filter around it."""
@@ -213,7 +216,26 @@ def findings_of(recording: Recording, model: Estimator, accepted: Sequence[str])
         if finding.check in CONTRADICTIONS and finding.check not in accepted:
             what = f"channels contradict each other: {finding.message}"
             raise DataError(f"recording '{recording.id}': {what} (or dataset.accept=[{finding.check}])")
-    return [f"{finding.channel}: {finding.message}" if finding.channel else finding.message for finding in findings]
+    told = [f"{finding.channel}: {finding.message}" if finding.channel else finding.message for finding in findings]
+    return told + wheelbase_findings(recording, getattr(model.settings, "wheelbase", None))
+
+
+def wheelbase_findings(recording: Recording, wheelbase: float | None) -> list[str]:
+    """A finding where a drive above 1 m/s turns too sharply, or is too fast, for any car of a wheelbase [m]; None: not known."""
+    if wheelbase is None or not {"vx", "yaw_rate"} <= set(recording.channels):
+        return []
+    speed, yaw_rate = recording["vx"], np.abs(recording["yaw_rate"])
+    moving = (speed > 1.0) & np.isfinite(yaw_rate)
+    if not moving.any():
+        return []
+    speed, turn = speed[moving], float(np.quantile(yaw_rate[moving] / speed[moving], 0.9))
+    what = f"the drive does not fit a wheelbase of {wheelbase:g} m: a car of that size"
+    if wheelbase * turn > SHARPEST_TURN:
+        return [f"{what} does not turn within {1.0 / turn:.2g} m, as in a tenth of it; give estimator.wheelbase"]
+    fast = float(np.quantile(speed, 0.99))
+    if fast**2 > LARGEST_FROUDE * GRAVITY * wheelbase:
+        return [f"{what} does not reach {fast:.0f} m/s; give estimator.wheelbase"]
+    return []
 
 
 def estimate_recording(model: Estimator, recording: Recording, trust: Trust | None = None) -> Estimate:

@@ -9,6 +9,7 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
+from typing import Any, NamedTuple
 
 import numpy as np
 import yaml
@@ -29,7 +30,15 @@ IDENTIFIED_SHARE = 0.5  # of the prior's variance: a number is identified on a d
 ROWS = {"leakage": kernel.LEAKAGE, "rear_axle": kernel.REAR, "compliance": kernel.COMPLIANCE}
 OFFSETS = {"ay": kernel.OFFSET_Y, "ax": kernel.OFFSET_X}
 UNITS = {"leakage": "1", "rear_axle": "m", "compliance": "rad s²/m"}
-Normal = tuple[float, float]  # mean and standard deviation
+LATENESS = 0.03  # s: standard deviation of the yaw rate's lateness behind ay, which drives do not tell apart from b and C
+
+
+class Normal(NamedTuple):
+    """A number's mean and standard deviation, and what a yaw rate that is late by `LATENESS` adds to the mean."""
+
+    mean: Any
+    deviation: Any
+    of_lateness: Any = 0.0
 
 
 def identify_files(words: Sequence[str], out: Path) -> CarRecord:
@@ -74,11 +83,20 @@ def in_words(record: CarRecord) -> TerminalTable:
 
 
 def posterior_of(model: SelfCalibrating, recording: Recording) -> dict[str, Normal]:
-    """Numbers after a drive, grip by its logarithm, and mean offsets; raises `DataError` where a channel is missing or has gaps."""
+    """Numbers after a drive, grip by its logarithm, and mean offsets; raises `DataError` where it is too short or has gaps."""
     drive = prepared_recording(model, recording)
     samples = np.column_stack([drive[name] for name in model.channels])
+    if len(samples) < 2:
+        raise DataError(f"recording '{recording.id}' is too short to identify anything")
     if not np.isfinite(samples).all():
         raise DataError(f"recording '{recording.id}' has gaps in {', '.join(model.channels)}; identify on a part without them")
+    turning = LATENESS * model.rate_hz * np.gradient(samples[:, 0])
+    on_time, early, late = (_found(model, np.column_stack([samples[:, 0] + shift, samples[:, 1:]])) for shift in (0.0, turning, -turning))
+    return {name: Normal(*own, (late[name][0] - early[name][0]) / 2.0) for name, own in on_time.items()}
+
+
+def _found(model: SelfCalibrating, samples: FloatArray) -> dict[str, tuple[float, float]]:
+    """Means and deviations after samples of the model's channels, (T, C)."""
     _, states, last = model.trace(samples, model.first_state(samples[0], {}))
     mean, variance = np.split(states, 2, axis=1)
     numbers = {name: (float(mean[-1, at]), math.sqrt(variance[-1, at])) for name, at in ROWS.items()}
@@ -90,10 +108,11 @@ def prior_of(model: SelfCalibrating) -> dict[str, Normal]:
     """The same before any drive."""
     mean, deviation = model.prior
     start = model.first_state(np.zeros(len(model.channels)), {}).log_weights
-    return {name: (float(mean[at]), float(deviation[at])) for name, at in (ROWS | OFFSETS).items()} | {"grip": _grip(model, start)}
+    numbers = {name: Normal(float(mean[at]), float(deviation[at])) for name, at in (ROWS | OFFSETS).items()}
+    return numbers | {"grip": Normal(*_grip(model, start))}
 
 
-def _grip(model: SelfCalibrating, log_weights: FloatArray) -> Normal:
+def _grip(model: SelfCalibrating, log_weights: FloatArray) -> tuple[float, float]:
     """Of log a_max, over the filters that have one; the bank resolves half a step between its limits."""
     logs, weights = np.log(model.grips), np.exp(log_weights[: len(model.grips)] - log_weights.max())
     mean = float(weights @ logs / weights.sum())
@@ -111,17 +130,22 @@ def record_of(model: SelfCalibrating, drives: Mapping[str, Mapping[str, Normal]]
 
 
 def together(prior: Normal, drives: Mapping[str, Normal]) -> Number:
-    """The prior and what each drive adds to it, weighted by information; the deviation grows where drives contradict each other."""
-    alone = {drive: without_prior(prior, own) for drive, own in drives.items() if own[1] < prior[1]}
-    information = {drive: 1.0 / deviation**2 for drive, (_, deviation) in alone.items()}
-    total = 1.0 / prior[1] ** 2 + sum(information.values())
-    value = prior[0] + sum(information[drive] * (mean - prior[0]) for drive, (mean, _) in alone.items()) / total
-    scatter = sum(information[drive] * (mean - value) ** 2 for drive, (mean, _) in alone.items()) / max(len(alone) - 1, 1)
-    identified = tuple(drive for drive, (_, deviation) in drives.items() if deviation**2 < IDENTIFIED_SHARE * prior[1] ** 2)
-    return Number(value, math.sqrt(max(scatter if len(alone) > 1 else 1.0, 1.0) / total), identified)
+    """The prior and what each drive adds to it, weighted by information; deviations hold the yaw rate's lateness, which drives share.
+
+    The deviation grows where drives contradict each other.
+    """
+    mean, deviation, of_lateness = np.array([own for own in drives.values() if own.deviation < prior.deviation]).reshape(-1, 3).T
+    alone, of_alone = without_prior(prior, Normal(mean, deviation))
+    total = prior.deviation**-2.0 + float(np.sum(of_alone**-2.0))
+    shares = deviation**-2.0 / total
+    value = prior.mean + float(shares @ (mean - prior.mean))
+    scatter = float(np.sum(np.square((alone - value) / of_alone))) / (len(alone) - 1) if len(alone) > 1 else 1.0
+    least = math.sqrt(IDENTIFIED_SHARE) * prior.deviation
+    identified = tuple(drive for drive, own in drives.items() if math.hypot(own.deviation, own.of_lateness) < least)
+    return Number(value, math.hypot(math.sqrt(max(scatter, 1.0) / total), float(shares @ of_lateness)), identified)
 
 
-def without_prior(prior: Normal, posterior: Normal) -> Normal:
-    """What a drive adds without the prior, where its deviation is below the prior's."""
-    information = 1.0 / posterior[1] ** 2 - 1.0 / prior[1] ** 2
-    return prior[0] + (posterior[0] - prior[0]) / posterior[1] ** 2 / information, information**-0.5
+def without_prior(prior: Normal, posterior: Normal) -> tuple[Any, Any]:
+    """Mean and deviation, also of arrays, that a drive adds without the prior, where its deviation is below the prior's."""
+    information = 1.0 / posterior.deviation**2 - 1.0 / prior.deviation**2
+    return prior.mean + (posterior.mean - prior.mean) / posterior.deviation**2 / information, information**-0.5

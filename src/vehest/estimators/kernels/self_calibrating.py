@@ -175,7 +175,6 @@ def _judge(found, own, weights, lags, sample, yaw_rate, n, g_1, g_slow, moving):
     if moving:
         lags[TIME] = lags[TIME] * keep + n.dt
         lags[POWER] = lags[POWER] * keep + ay * ay * n.dt
-    best = -math.inf
     odds = (0.0, math.log(n.network_odds) * math.exp(-lags[TIME] / n.decision_time), math.log(n.steady_odds))
     for c in range(CANDIDATES):
         one, v = own[c], found[c]
@@ -197,13 +196,7 @@ def _judge(found, own, weights, lags, sample, yaw_rate, n, g_1, g_slow, moving):
         of_x = one[SQUARE_X] / time
         score = n.lateral_power * math.log(of_y + n.residual_floor**2) + n.longitudinal_power * math.log(of_x + n.residual_floor**2)
         weights[c] = odds[c] - 0.5 * score
-        best = max(best, weights[c])
-    total = 0.0
-    for c in range(CANDIDATES):
-        weights[c] = math.exp(weights[c] - best)
-        total += weights[c]
-    for c in range(CANDIDATES):
-        weights[c] /= total
+    _normalise(weights, weights)
 
 
 @entry()
