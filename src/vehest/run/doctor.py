@@ -22,6 +22,7 @@ EXTRAS = {
     "tuning": ("optuna", "noise levels tuned by Optuna"),
     "ray": ("ray", "trainings on many machines"),
     "slurm": ("submitit", "trainings as SLURM jobs"),
+    "ui": ("flask", "MLflow's page of all runs"),
 }
 """Extra -> the package it brings, and its use."""
 
