@@ -145,7 +145,7 @@ def test_score_is_the_error_at_the_times_that_the_protocol_scores(examples):
     bare = lap.without_references()
     for act, error, said in (
         (lambda: vehest.score(model, [bare]), DataError, "has no channel 'vy_ref'"),
-        (lambda: vehest.train("static_map", [bare], [lap]), DataError, "no channel 'vy_ref', which the fit of 'static_map' needs"),
+        (lambda: vehest.train("static_map", [bare], [lap]), DataError, "no channel 'vy_ref', which estimator 'static_map' learns from"),
         (lambda: vehest.train("ksnn", [lap], [lap], ["estimator.n_hiden=2"]), ConfigurationError, "n_hiden"),
     ):
         with pytest.raises(error, match=said):

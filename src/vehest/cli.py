@@ -20,7 +20,7 @@ from vehest.version import __version__
 
 if TYPE_CHECKING:
     from vehest.run.config import Config
-    from vehest.run.run_cache import Ran
+    from vehest.run.run_cache import RunOptions
 
 app = typer.Typer(
     name="vehest",
@@ -569,18 +569,11 @@ def run(
     Existing artefacts are skipped, and trained weights that the study has published are taken where their keys are the same. Overrides
     apply to every sweep that has their key. Sweeps are worked off in the order of the file.
     """
-    from vehest.run.run_cache import RunCache, RunOptions
+    from vehest.run.run_cache import RunOptions
 
-    words = overrides or []
     chosen = LauncherOptions(launcher, address, tuple(slurm or ()))
     options = RunOptions(force, dry_run, quiet, jobs, minutes=minutes, launcher=chosen, retrain=retrain)
-    cache = RunCache("run", pipeline, words)
-    ran = cache.repeat(options)
-    if ran is None:
-        from vehest.run.study_run import run_study
-
-        ran = run_study(pipeline, words, options, cache)
-    _print_ran(ran, as_json)
+    _run_study(pipeline, overrides or [], options, as_json)
 
 
 @app.command()
@@ -617,16 +610,9 @@ def report(
         return
     if pipeline is None:
         raise ConfigurationError(f"no pipeline is named; there are: {', '.join(pipeline_names())}; or use --check")
-    from vehest.run.run_cache import RunCache, RunOptions
+    from vehest.run.run_cache import RunOptions
 
-    words, options = overrides or [], RunOptions(force, dry_run, quiet, 1)
-    cache = RunCache("run", pipeline, words)
-    ran = cache.repeat(options)
-    if ran is None:
-        from vehest.run.study_run import run_study
-
-        ran = run_study(pipeline, words, options, cache, only_report=True)
-    _print_ran(ran, as_json)
+    _run_study(pipeline, overrides or [], RunOptions(force, dry_run, quiet, 1), as_json, only_report=True)
 
 
 def _check_published(words: list[str], as_json: bool) -> None:
@@ -660,17 +646,10 @@ def sweep(
     Prints the mean RMSE(β) of each combination over its seeds with a 95 % confidence interval (Student's t), and marks the one that is best
     on the validation range. Existing artefacts are skipped, a failed job stops no other, the same command finishes what is missing.
     """
-    from vehest.run.run_cache import RunCache, RunOptions
+    from vehest.run.run_cache import RunOptions
 
-    words = overrides or []
     options = RunOptions(force, dry_run, quiet, jobs, launcher=LauncherOptions(launcher, address, tuple(slurm or ())))
-    cache = RunCache("sweep", name or "", words)
-    ran = cache.repeat(options)
-    if ran is None:
-        from vehest.run.study_run import run_study
-
-        ran = run_study(name, words, options, cache, sweep=True)
-    _print_ran(ran, as_json, sweep=True)
+    _run_study(name, overrides or [], options, as_json, sweep=True)
 
 
 @app.command("config", rich_help_panel=STAGES)
@@ -891,8 +870,18 @@ def _fail(message: str, exit_code: int) -> NoReturn:
     sys.exit(exit_code)
 
 
-def _print_ran(ran: Ran, as_json: bool, *, sweep: bool = False) -> None:
-    """Print a study's tables and the path of its report, or all as one JSON object; raises `JobsFailedError` where some jobs failed."""
+def _run_study(
+    name: str | None, overrides: list[str], options: RunOptions, as_json: bool, *, sweep: bool = False, only_report: bool = False
+) -> None:
+    """Run a study or sweep, or repeat its record; prints tables and the report's path; raises `JobsFailedError` where some jobs failed."""
+    from vehest.run.run_cache import RunCache
+
+    cache = RunCache("sweep" if sweep else "run", name or "", overrides)
+    ran = cache.repeat(options)
+    if ran is None:
+        from vehest.run.study_run import run_study
+
+        ran = run_study(name, overrides, options, cache, sweep=sweep, only_report=only_report)
     page, summary = ran.folder / ran.summary.page, ran.summary
     own: dict[str, Any] = {"folder": str(ran.folder), "skipped": ran.skipped}
     if not sweep:

@@ -8,7 +8,7 @@ from dugoff_drive import dugoff_drive
 from vehest.data.errors import DataError
 from vehest.data.recording import Recording
 from vehest.estimators.base import FitData
-from vehest.estimators.kernels.sample_network import gaussian_likelihood, kept, losses_of, outputs_of, squared_error
+from vehest.estimators.kernels.sample_network import LEVELS, _activate, gaussian_likelihood, losses_of, outputs_of, squared_error
 from vehest.estimators.model_files import load_model, save_model
 from vehest.estimators.networks.sample_network import INPUTS, SampleNetwork
 from vehest.estimators.registry import estimator_class
@@ -41,6 +41,13 @@ def network(outputs, members=3):
             if name.startswith("bias"):
                 parameter.copy_(0.1 * torch.randn(parameter.shape, generator=torch.Generator().manual_seed(4), dtype=torch.float64))
     return made
+
+
+def kept(seed, layer, shape, dropout):
+    """Which values of a hidden layer (0 or 1) a member's mask leaves, (B, H)."""
+    ones = np.ones(shape, np.float32)
+    _activate(ones, np.zeros(shape[1], np.float32), seed, layer, round(LEVELS * dropout))
+    return ones > 0
 
 
 def readable(inputs, parameters, member, dropout):

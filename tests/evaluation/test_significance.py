@@ -9,11 +9,10 @@ from vehest.evaluation.significance import (
     _degrees_of_freedom,
     difference_of_blocks,
     differences_of_blocks,
-    paired_difference,
     root_interval,
     root_intervals,
-    sequence_labels,
 )
+from vehest_papers.kit.paired import paired_difference, sequence_labels
 
 N_SEQUENCES, LENGTH = 16, 100
 LABELS = sequence_labels([LENGTH] * N_SEQUENCES)

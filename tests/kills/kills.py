@@ -49,7 +49,7 @@ RUN_SECONDS, LOOK_SECONDS = 1800.0, 0.002  # after the first a run hangs
 HEADER = ("number", "round", "jobs", "signal", "stage", "moment", "exit_code", "resumed_runs", "metrics_equal", "tracking_complete")
 HEADER += ("leftovers", "outcome")
 HEAVY = ("mlflow", "matplotlib.pyplot", "vehest.run.study_run", "vehest.studies.drive", "vehest.report.document")
-HEAVY += ("vehest.report.run_figures",)
+HEAVY += ("vehest.report.figures",)
 
 
 @dataclass(frozen=True)

@@ -16,7 +16,7 @@ from vehest.data.store import read_recording
 from vehest.evaluation.metrics import Protocol
 from vehest.run.artefacts import read_artefact
 from vehest.run.config import compose_config
-from vehest.run.config_files import choices, packaged_conf
+from vehest.run.config_files import choices, packaged
 from vehest.run.evaluate import Evaluation, code_of_evaluation
 from vehest.run.evaluate_faults import FaultSettings, all_of, faults_of
 from vehest.run.study import jobs_of, read_study
@@ -42,7 +42,7 @@ def trained(place):
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_every_file_is_a_fault_with_every_key_and_a_word_on_each(kind):
-    text = (packaged_conf() / "fault" / f"{kind}.yaml").read_text()
+    text = (packaged("conf") / "fault" / f"{kind}.yaml").read_text()
     assert set(yaml.safe_load(text)) == {"name", "channel", "severity", "size", "start", "duration", "seed"}
     assert all("#" in line for line in text.splitlines() if not line.startswith("name"))
     (fault,) = faults_of(compose_config("eval", [f"fault={kind}"]))

@@ -22,13 +22,12 @@ from vehest.data.schema import settings_from_config
 from vehest.data.store import write_recording
 from vehest.data.transforms import TRANSFORMS, transform_from_config
 from vehest.estimators.base import FitData
-from vehest.estimators.needs import lacking_to_train
 from vehest.estimators.registry import estimator_class, estimator_names
 from vehest.run import usable
 from vehest.run.comparison import lower_rate
 from vehest.run.config import compose_config
 from vehest.run.train import new_estimator
-from vehest.run.usable import all_usabilities, usability
+from vehest.run.usable import all_usabilities, lacking_to_train, usability
 from vehest.training.context import FitContext
 
 RADIUS, RATIO = 0.32, 16.0

@@ -21,7 +21,6 @@ from typing import Any
 import numpy as np
 from scipy import stats
 
-from vehest.alignment.findings import listed
 from vehest.alignment.imu import (
     FEWEST_BLOCKS,
     IMU_CHANNELS,
@@ -44,7 +43,7 @@ from vehest.alignment.imu import (
 from vehest.alignment.motion import rms
 from vehest.alignment.settings import QUANTITIES, AlignmentSettings
 from vehest.constants import GRAVITY, FloatArray
-from vehest.data.errors import DataError
+from vehest.data.errors import DataError, listed
 from vehest.data.recording import Recording
 from vehest.data.transforms import transform_from_config
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Collection, Iterable, Iterator
 
 import numpy as np
 import scipy
@@ -26,6 +26,7 @@ from vehest.alignment.signs import (
 )
 from vehest.alignment.standstill import standstill
 from vehest.data.channels import CHANNELS
+from vehest.data.errors import DataError
 from vehest.data.recording import Recording
 from vehest.data.runs import equal_runs, true_runs
 
@@ -54,6 +55,13 @@ def checks_of_recording(recording: Recording) -> list[Finding]:
         findings = [finding for check in _CHECKS for finding in check(recording)]
     order = {"error": 0, "warning": 1, "note": 2}
     return sorted(findings, key=lambda finding: order[finding.level])
+
+
+def refuse_errors(recording: Recording, accepted: Collection[str], place: str) -> None:
+    """Raise `DataError`, whose message begins with ``place``, where a check that is not accepted finds an error."""
+    for finding in checks_of_recording(recording):
+        if finding.level == "error" and finding.check not in accepted:
+            raise DataError(f"{place}: channel '{finding.channel}': {finding.message} (or dataset.accept=[{finding.check}])")
 
 
 def _impossible_values(recording: Recording) -> Iterator[Finding]:

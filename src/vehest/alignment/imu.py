@@ -18,11 +18,10 @@ from scipy import signal
 from scipy.interpolate import CubicSpline
 from scipy.ndimage import gaussian_filter1d
 
-from vehest.alignment.findings import listed
 from vehest.alignment.motion import rms
 from vehest.alignment.settings import TILT_LAG_GAIN, AlignmentSettings
 from vehest.constants import GRAVITY, FloatArray
-from vehest.data.errors import ConfigurationError, DataError
+from vehest.data.errors import ConfigurationError, DataError, listed
 from vehest.data.limits import check_limit
 from vehest.data.recording import Recording
 

@@ -9,10 +9,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from vehest.alignment.band_pass import butterworth_band, without_phase
-from vehest.alignment.findings import Finding, Level, listed
+from vehest.alignment.findings import Finding, Level
 from vehest.alignment.motion import Motion, rms
 from vehest.alignment.standstill import BoolArray
 from vehest.constants import GRAVITY, FloatArray
+from vehest.data.errors import listed
 
 KINEMATIC_BAND_HZ = (0.1, 2.0)
 FILTER_END_SECONDS = 2.0  # where the band-pass still feels the ends of a recording

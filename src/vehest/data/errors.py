@@ -7,6 +7,7 @@ something. Functions that take plain values of a configuration (``…_from_confi
 from __future__ import annotations
 
 import unicodedata
+from collections.abc import Sequence
 
 
 class VehestError(Exception):
@@ -41,6 +42,11 @@ class JobsFailedError(VehestError):
     """Some jobs of a sweep failed; the others were finished and kept."""
 
     exit_code = 5
+
+
+def listed(words: Sequence[str]) -> str:
+    """``a``, ``a and b``, ``a, b and c``."""
+    return " and ".join([", ".join(words[:-1]), words[-1]]) if len(words) > 1 else "".join(words)
 
 
 def printable(text: str, keep: str = "") -> str:

@@ -41,6 +41,27 @@ class FitData:
     validation: Sequence[Recording]
 
 
+def require_learnable(
+    recordings: Sequence[Recording],
+    channels: Sequence[str],
+    estimator: str,
+    skippable: Collection[str] = (),
+    hints: Mapping[str, str] | None = None,
+) -> None:
+    """Raise `DataError` where recordings lack a channel that an estimator learns from, or have gaps in one that is not skippable.
+
+    ``hints``: channel -> what to do where it is missing.
+    """
+    for recording in recordings:
+        for name in channels:
+            if name not in recording:
+                hint = (hints or {}).get(name, "")
+                raise DataError(f"recording '{recording.id}' has no channel '{name}', which estimator '{estimator}' learns from{hint}")
+            if name not in skippable and np.isnan(recording[name]).any():
+                what = f"channel '{name}' has gaps, which estimator '{estimator}' cannot learn from; cut them out in conf/split"
+                raise DataError(f"recording '{recording.id}': {what}")
+
+
 class Trial(NamedTuple):
     """A family in the first comparison on a car without a trained model (`vehest new`).
 

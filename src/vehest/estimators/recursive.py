@@ -16,7 +16,7 @@ import numpy as np
 from vehest.constants import FloatArray
 from vehest.data.errors import ConfigurationError, DataError
 from vehest.data.recording import Recording
-from vehest.estimators.base import Estimator, FitData, FitRecord
+from vehest.estimators.base import Estimator, FitData, FitRecord, require_learnable
 from vehest.training.context import FitContext, NoTraining
 from vehest.training.search import nelder_mead_over_grid
 
@@ -145,20 +145,13 @@ class Recursive(Estimator):
         values: Mapping[str, float] = {}
         record = FitRecord()
         if own[0].learns:
-            for recording in (*data.train, *data.validation):
-                own[0]._check_complete(recording)
+            channels = (*own[0].channels, *own[0].learns_from)
+            require_learnable([*data.train, *data.validation], channels, own[0].name, own[0].skippable)
             values, record = own[0].find_numbers(data, training, context)
         for member in own:
             member.values |= {name: float(value) for name, value in values.items()}
         metrics = {"epochs": 0, **record.metrics, "train_seconds": time.monotonic() - started}
         return [replace(record, metrics=metrics)] * len(members)
-
-    def _check_complete(self, recording: Recording) -> None:
-        for name in (*self.channels, *self.learns_from):
-            if name not in recording:
-                raise DataError(f"recording '{recording.id}' has no channel '{name}', which the fit of '{self.name}' needs")
-            if name not in self.skippable and np.isnan(recording[name]).any():
-                raise DataError(f"recording '{recording.id}': channel '{name}' has gaps, which estimator '{self.name}' cannot learn from")
 
     def mean_squared_error(self, recordings: Sequence[Recording]) -> float:
         """Of vy against ``vy_ref`` with the present `values` [m²/s²]; NaN without recordings."""

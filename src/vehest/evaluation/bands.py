@@ -15,7 +15,7 @@ from scipy import stats
 from vehest.constants import FloatArray
 from vehest.evaluation.blocks import LEAST_BLOCKS, block_labels, effective_blocks, segments_of
 from vehest.evaluation.metrics import Scored
-from vehest.evaluation.regimes import AY_BANDS, LEAST_SECONDS, Mask
+from vehest.evaluation.regimes import AY_BANDS, Mask, is_known
 from vehest.trust.bands import LEVELS, SHOWN_LEVEL, Bands, intraclass_correlation
 from vehest.trust.bands import block_labels as manoeuvre_labels
 
@@ -100,15 +100,10 @@ def coverage_intervals(own: Mapping[str, Banded], parts: Sequence[Scored], rate_
 def figures_by_regime(own: Mapping[str, Banded], masks: Sequence[Mapping[str, Mask]], rate_hz: float) -> dict[str, dict[str, float]]:
     """Band of lateral acceleration -> `IN_REGIMES` of β and v over all ranges; only those that have 2 s of samples."""
     found: dict[str, dict[str, float]] = {}
-    for regime in AY_BANDS:
-        if not all(regime in mask for mask in masks):
-            continue
-        chosen = [mask[regime] for mask in masks]
-        if sum(int(mask.sum()) for mask in chosen) < max(LEAST_SECONDS * rate_hz, 1.0):
-            continue
+    for regime in (regime for regime in AY_BANDS if is_known(regime, masks, rate_hz)):
         found[regime] = {}
         for name, suffix in SUFFIXES.items():
-            errors, half = own[name].only(chosen).together
+            errors, half = own[name].only([mask[regime] for mask in masks]).together
             shown = half[:, LEVELS.index(SHOWN_LEVEL)]
             values = (np.mean(np.abs(errors) <= shown), 2.0 * shown.mean(), interval_score(errors, shown, SHOWN_LEVEL).mean())
             found[regime] |= {f"{metric}{suffix}": float(value) for metric, value in zip(IN_REGIMES, values, strict=True)}

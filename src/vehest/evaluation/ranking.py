@@ -78,8 +78,8 @@ class Ranking:
 def rank(segments: Mapping[Name, Sequence[Segments]], rate_hz: float, asked: Sequence[tuple[Name, Name]] = ()) -> Ranking:
     """Compare estimators on one test set by RMSE(β).
 
-    Every pair is compared on the same blocks, drawn together, with the seeds of each drawn on their own (`paired_difference`). Corrected
-    together by Holm are: the best against every other, every candidate against each baseline, and the pairs that are asked for.
+    Every pair is compared on the same blocks, drawn together, with the seeds of each drawn on their own (`differences_of_blocks`).
+    Corrected together by Holm are: the best against every other, every candidate against each baseline, and the pairs that are asked for.
 
     Args:
         segments: of each seed of each estimator, all over the same samples at ``rate_hz`` [Hz].

@@ -84,6 +84,11 @@ def filled(samples: FloatArray) -> FloatArray:
     return np.interp(at, at[known], samples[known]) if known.any() else np.zeros_like(samples)
 
 
+def is_known(regime: str, masks: Sequence[Mapping[str, Mask]], rate_hz: float) -> bool:
+    """Whether every range tells a regime, and it has `LEAST_SECONDS` of samples in all, at ``rate_hz`` [Hz]."""
+    return all(regime in own for own in masks) and sum(int(own[regime].sum()) for own in masks) >= max(LEAST_SECONDS * rate_hz, 1.0)
+
+
 def errors_by_regime(parts: Sequence[Scored], masks: Sequence[Mapping[str, Mask]], rate_hz: float) -> dict[str, dict[str, float]]:
     """Regime -> `METRICS` and the share of the samples that lie in it, over all parts together, at ``rate_hz`` [Hz].
 
@@ -92,14 +97,9 @@ def errors_by_regime(parts: Sequence[Scored], masks: Sequence[Mapping[str, Mask]
     """
     total = sum(len(part.time) for part in parts)
     found = {}
-    for name in REGIMES:
-        if not all(name in own for own in masks):
-            continue
+    for name in (name for name in REGIMES if is_known(name, masks, rate_hz)):
         chosen = [(part, own[name]) for part, own in zip(parts, masks, strict=True)]
         inside = [Scored(*(getattr(part, column)[mask] for column in _OF_SAMPLES)) for part, mask in chosen]
-        count = sum(len(part.time) for part in inside)
-        if count < max(LEAST_SECONDS * rate_hz, 1.0):
-            continue
-        figures = accuracy(inside)
+        figures, count = accuracy(inside), sum(len(part.time) for part in inside)
         found[name] = {**{metric: figures[metric] for metric in METRICS}, "share": count / total}
     return found

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -47,16 +46,13 @@ class Difference:
     dof: float  # degrees of freedom of Student's t behind both intervals
 
 
-def paired_difference(
-    first: FloatArray,
-    second: FloatArray,
-    sequence: NDArray[np.int64],
-    *,
-    rate_hz: float,
-    block_seconds: float | None = None,
-    n_resamples: int = 10_000,
-) -> Difference:
-    """Compare two estimators on the same samples.
+def difference_of_blocks(first: FloatArray, second: FloatArray, sizes: FloatArray, *, n_resamples: int = 10_000) -> Difference:
+    """`differences_of_blocks` of one pair."""
+    return differences_of_blocks([(first, second)], sizes, n_resamples=n_resamples)[0]
+
+
+def differences_of_blocks(pairs: Sequence[Pair], sizes: FloatArray, *, n_resamples: int = 10_000) -> list[Difference]:
+    """Compare pairs of estimators on the same samples; all pairs see the same draws.
 
     Each resample draws blocks with replacement, the same for both estimators, since what is difficult for one is for the other; and
     seeds of each estimator, independently, since they are different trainings. Of n blocks or seeds n - 1 are drawn, which makes the
@@ -68,49 +64,15 @@ def paired_difference(
     common neither to an estimator's seeds nor to its sequences, intervals are wider than need be (Owen 2007), never narrower.
 
     Args:
-        first: loss of each seed at each sample, shape (S, K), S not necessarily that of ``second``.
-        second: shape (S', K).
-        sequence: which uninterrupted sequence a sample belongs to, shape (K,); a sequence's samples stand together, in order.
-        rate_hz: of the samples [Hz].
-        block_seconds: length of a block within a sequence [s], longer than errors are correlated; None takes whole sequences.
-
-    Raises:
-        DataError: shapes do not fit, a loss is not finite, or there are fewer than two blocks.
-
-    Source: Künsch, The jackknife and the bootstrap for general stationary observations, Annals of Statistics 17 (3), 1989; Rao & Wu,
-    Resampling inference with complex survey data, JASA 83 (401), 1988; Owen, The pigeonhole bootstrap, Annals of Applied Statistics 1 (2),
-    2007.
-    """
-    for name, losses in (("first", first), ("second", second)):
-        if losses.ndim != 2 or losses.shape[0] == 0 or losses.shape[1] != len(sequence):
-            raise DataError(f"losses of the {name} estimator must be of shape (seeds, {len(sequence)}), not {losses.shape}")
-        if not np.isfinite(losses).all():
-            raise DataError(f"losses of the {name} estimator hold {int((~np.isfinite(losses)).sum())} values that are not finite")
-    starts = _block_starts(sequence, None if block_seconds is None else max(round(block_seconds * rate_hz), 1))
-    if len(starts) < 2:
-        raise DataError(
-            f"there are {len(starts)} blocks to resample, at least two are needed; give more sequences or a shorter block_seconds"
-        )
-    sizes = np.diff([*starts, len(sequence)]).astype(np.float64)
-    return difference_of_blocks(
-        np.add.reduceat(first, starts, axis=1), np.add.reduceat(second, starts, axis=1), sizes, n_resamples=n_resamples
-    )
-
-
-def difference_of_blocks(first: FloatArray, second: FloatArray, sizes: FloatArray, *, n_resamples: int = 10_000) -> Difference:
-    """`differences_of_blocks` of one pair."""
-    return differences_of_blocks([(first, second)], sizes, n_resamples=n_resamples)[0]
-
-
-def differences_of_blocks(pairs: Sequence[Pair], sizes: FloatArray, *, n_resamples: int = 10_000) -> list[Difference]:
-    """Compare pairs of estimators on the same blocks, each as `paired_difference` says; all pairs see the same draws.
-
-    Args:
         pairs: sum of the losses of each seed over each block, shape (S, B) and (S', B).
         sizes: samples in each block, shape (B,).
 
     Raises:
         DataError: there are fewer than two blocks.
+
+    Source: Künsch, The jackknife and the bootstrap for general stationary observations, Annals of Statistics 17 (3), 1989; Rao & Wu,
+    Resampling inference with complex survey data, JASA 83 (401), 1988; Owen, The pigeonhole bootstrap, Annals of Applied Statistics 1 (2),
+    2007.
     """
     if len(sizes) < 2:
         raise DataError(f"there are {len(sizes)} blocks to resample, at least two are needed")
@@ -140,8 +102,8 @@ def root_interval(sums: FloatArray, sizes: FloatArray, *, n_resamples: int = 400
 def root_intervals(candidates: Sequence[FloatArray], sizes: FloatArray, *, n_resamples: int = 4000) -> list[Interval]:
     """The square root of a mean loss over blocks and seeds, an RMSE where losses are squared errors, with its interval.
 
-    Blocks and seeds are drawn as in `paired_difference`; the interval is symmetric on a logarithmic axis, on which the distribution of a
-    root of few blocks is less skewed.
+    Blocks and seeds are drawn as in `differences_of_blocks`; the interval is symmetric on a logarithmic axis, on which the distribution of
+    a root of few blocks is less skewed.
 
     Args:
         candidates: sum of the losses of each seed over each block, (S, B), none negative, of each estimator.
@@ -196,19 +158,6 @@ def holm(p_values: Sequence[float]) -> list[float]:
         largest = max(largest, min((len(p_values) - rank) * p_values[position], 1.0))
         adjusted[int(position)] = largest
     return adjusted
-
-
-def sequence_labels(lengths: Sequence[int]) -> NDArray[np.int64]:
-    """Number of the sequence that each sample belongs to, for sequences of these lengths one after another, (sum of lengths,)."""
-    return np.repeat(np.arange(len(lengths), dtype=np.int64), lengths)
-
-
-def _block_starts(sequence: NDArray[np.int64], block: int | None) -> NDArray[np.int64]:
-    """First sample of each block; a sequence's last block may be shorter."""
-    bounds = np.flatnonzero(np.diff(sequence)) + 1
-    edges = [0, *bounds.tolist(), len(sequence)]
-    starts = [np.arange(begin, end, block or max(end - begin, 1)) for begin, end in itertools.pairwise(edges)]
-    return np.concatenate(starts).astype(np.int64)
 
 
 def _counts(n_blocks: int, n: int, generator: np.random.Generator) -> FloatArray:

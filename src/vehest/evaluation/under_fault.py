@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vehest.constants import FloatArray
-from vehest.evaluation.integrity import detection_delay, error_while_undetected, missed_detections
+from vehest.evaluation.integrity import detection_delay, error_while_undetected
 from vehest.evaluation.metrics import Scored
 
 SETTLED_SECONDS = 3.0
@@ -89,14 +89,14 @@ def flags_under_fault(parts: Sequence[Scored], flagged: Sequence[Flagged], windo
         if len(at) and (at[0] == 0 or own.health[at[0] - 1] == 0):
             flags, onset, end = own.health > 0, int(at[0]), int(at[-1]) + 1
             delays.append(detection_delay(flags, onset, end, rate_hz))
-            undetected.append(error_while_undetected(np.degrees(error), flags, onset, end)[1])
+            undetected.append(error_while_undetected(np.degrees(error), flags, onset, end))
     held, calm = np.concatenate(inside), np.concatenate(valid)
     found = [delay for delay in delays if math.isfinite(delay)]
     figures = {"coverage_90": float(held.mean())} if len(held) else {}
     figures |= {"coverage_90_unflagged": float(held[calm].mean())} if calm.any() else {}
     figures |= {"detection_delay": float(np.mean(found))} if found else {}
     if delays:
-        figures |= {"missed_detections": missed_detections(delays), "max_error_sideslip_undetected": max(undetected)}
+        figures |= {"missed_detections": (len(delays) - len(found)) / len(delays), "max_error_sideslip_undetected": max(undetected)}
     return figures
 
 

@@ -11,7 +11,7 @@ import numpy as np
 
 from vehest.constants import FloatArray
 from vehest.filters.gaussian import Filtered, Gaussian
-from vehest.filters.kalman_scan import _cholesky, _contiguous, _make_symmetric, _multiply, _multiply_transposed, _solve
+from vehest.filters.kalman_scan import _contiguous, move, scratch, update
 
 Compiled = Callable[..., Any]
 """A function that numba has compiled."""
@@ -102,7 +102,7 @@ def extended_scan(
         _contiguous(measurements, (steps, m), "measurements"),
         _contiguous(inputs, inputs.shape, "inputs"),
         _contiguous(initial.mean, (n,), "initial.mean"),
-        _contiguous(initial.covariance, (n, n), "initial.covariance").copy(),
+        _contiguous(initial.covariance, (n, n), "initial.covariance"),
         predicted,
         filtered,
         innovation,
@@ -122,82 +122,22 @@ def _scan(  # type: ignore[no-untyped-def]
 
     This much is compiled for each model; the rest is loaded.
     """
+    m, n = y.shape[1], len(mean)
+    seen, room = np.empty((m, n)), scratch(m, n)
     for k in range(len(y)):
-        if k > 0:
-            mean, slope = transition(mean, u[k - 1], parameters)
-            _move(cov, slope, Q[k - 1])
-        _note(mean, cov, predicted.mean[k], predicted.covariance[k])
-        expected, slope = observation(mean, u[k], parameters)
-        mean = mean.copy()
-        likelihood[k] = _update(mean, cov, expected, slope, y[k], R[k], innovation[k], innovation_cov[k])
+        prior, post = (predicted.mean[k], predicted.covariance[k]), (filtered.mean[k], filtered.covariance[k])
+        if k == 0:
+            prior[0][:], prior[1][:] = mean, cov
+        else:
+            prior[0][:], slope = transition(filtered.mean[k - 1], u[k - 1], parameters)
+            move(slope, filtered.covariance[k - 1], Q[k - 1], prior[1], room)
+        expected, slope = observation(prior[0], u[k], parameters)
+        for i in range(m):
+            known = not math.isnan(y[k, i])
+            innovation[k, i] = y[k, i] - expected[i] if known else 0.0
+            for j in range(n):
+                seen[i, j] = slope[i, j] if known else 0.0
+        likelihood[k] = update(prior, post, y[k], R[k], innovation[k], innovation_cov[k], seen, room)
         if math.isnan(likelihood[k]):
             return k
-        _note(mean, cov, filtered.mean[k], filtered.covariance[k])
     return -1
-
-
-@numba.njit(cache=True)
-def _note(mean, cov, mean_out, cov_out):  # type: ignore[no-untyped-def]
-    for i in range(len(mean)):
-        mean_out[i] = mean[i]
-        for j in range(len(mean)):
-            cov_out[i, j] = cov[i, j]
-
-
-@numba.njit(cache=True, error_model="numpy")
-def _move(cov, slope, noise):  # type: ignore[no-untyped-def]
-    """F P Fᵀ + Q, in place."""
-    n = len(cov)
-    left = np.empty((n, n))
-    _multiply(slope, cov, left)
-    _multiply_transposed(left, slope, cov)
-    for i in range(n):
-        for j in range(n):
-            cov[i, j] += noise[i, j]
-    _make_symmetric(cov)
-
-
-@numba.njit(cache=True, error_model="numpy")
-def _update(mean, cov, expected, slope, measured, noise, innovation, S):  # type: ignore[no-untyped-def]
-    """Mean and covariance after a measurement, in place; writes the innovation and its covariance S, returns the log-likelihood."""
-    m, n, count = len(measured), len(mean), 0
-    seen, cross, factor, weights, left = np.empty((m, n)), np.empty((m, n)), np.empty((m, m)), np.empty((m, n)), np.empty((m, n))
-    for i in range(m):
-        known = not math.isnan(measured[i])
-        count += known
-        innovation[i] = measured[i] - expected[i] if known else 0.0
-        for j in range(n):
-            seen[i, j] = slope[i, j] if known else 0.0
-    _multiply(seen, cov, cross)
-    _multiply_transposed(cross, seen, S)
-    for i in range(m):
-        for j in range(m):
-            both = not math.isnan(measured[i]) and not math.isnan(measured[j])
-            S[i, j] += noise[i, j] if both else (1.0 if i == j else 0.0)
-    _make_symmetric(S)
-    if not _cholesky(S, factor):
-        return math.nan
-    column = np.empty(m)
-    for j in range(n):  # Kᵀ = S⁻¹ H P
-        for i in range(m):
-            column[i] = cross[i, j]
-        _solve(factor, column)
-        for i in range(m - 1, -1, -1):
-            total = column[i]
-            for c in range(i + 1, m):
-                total -= factor[c, i] * weights[c, j]
-            weights[i, j] = total / factor[i, i]
-    _multiply(S, weights, left)
-    for i in range(n):
-        for c in range(m):
-            mean[i] += weights[c, i] * innovation[c]
-            for j in range(n):
-                cov[i, j] -= weights[c, i] * left[c, j]
-    _make_symmetric(cov)
-    for i in range(m):
-        column[i] = innovation[i]
-    _solve(factor, column)
-    total = count * math.log(2.0 * math.pi)
-    for i in range(m):
-        total += column[i] * column[i] + 2.0 * math.log(factor[i, i])
-    return -0.5 * total

@@ -86,81 +86,107 @@ def _scan(  # type: ignore[no-untyped-def]
     """
     steps, m = y.shape
     n = len(mean)
-    seen_C, seen_R = np.empty((m, n)), np.empty((m, m))
-    cross, gain, whitened = np.empty((m, n)), np.empty((n, m)), np.empty(m)
-    kept, left, right = np.empty((n, n)), np.empty((n, n)), np.empty((n, n))
-    factor, weighted = np.empty((m, m)), np.empty((n, m))
+    seen, room = np.empty((m, n)), scratch(m, n)
     for k in range(steps):
         if k == 0:
             prior_mean[0], prior_cov[0] = mean, cov
         else:
-            _multiply(A[k - 1], post_cov[k - 1], left)
-            _multiply_transposed(left, A[k - 1], right)
+            move(A[k - 1], post_cov[k - 1], Q[k - 1], prior_cov[k], room)
             for i in range(n):
                 total = b[k - 1, i]
                 for j in range(n):
                     total += A[k - 1, i, j] * post_mean[k - 1, j]
-                    prior_cov[k, i, j] = right[i, j] + Q[k - 1, i, j]
                 prior_mean[k, i] = total
-            _make_symmetric(prior_cov[k])
         if limit < math.inf:
             _gate(y[k], C[k], d[k], R[k], prior_mean[k], prior_cov[k], limit, patience, refused)
-        count = 0
         for i in range(m):
             known = not math.isnan(y[k, i])
-            count += known
             error = y[k, i] - d[k, i] if known else 0.0
             for j in range(n):
-                seen_C[i, j] = C[k, i, j] if known else 0.0
-                error -= seen_C[i, j] * prior_mean[k, j]
+                seen[i, j] = C[k, i, j] if known else 0.0
+                error -= seen[i, j] * prior_mean[k, j]
             innovation[k, i] = error
-            for j in range(m):
-                both = known and not math.isnan(y[k, j])
-                seen_R[i, j] = R[k, i, j] if both else (1.0 if i == j else 0.0)
-        S = innovation_cov[k]
-        _multiply(seen_C, prior_cov[k], cross)
-        _multiply_transposed(cross, seen_C, S)
-        for i in range(m):
-            for j in range(m):
-                S[i, j] += seen_R[i, j]
-        _make_symmetric(S)
-        if not _cholesky(S, factor):
+        prior, post = (prior_mean[k], prior_cov[k]), (post_mean[k], post_cov[k])
+        likelihood[k] = update(prior, post, y[k], R[k], innovation[k], innovation_cov[k], seen, room)
+        if math.isnan(likelihood[k]):
             return k
-        for j in range(n):  # gain = (S⁻¹ C P)ᵀ
-            for i in range(m):
-                whitened[i] = cross[i, j]
-            _solve(factor, whitened)
-            for i in range(m - 1, -1, -1):
-                total = whitened[i]
-                for c in range(i + 1, m):
-                    total -= factor[c, i] * gain[j, c]
-                gain[j, i] = total / factor[i, i]
-        for i in range(n):
-            total = prior_mean[k, i]
-            for c in range(m):
-                total += gain[i, c] * innovation[k, c]
-            post_mean[k, i] = total
-            for j in range(n):
-                part = 1.0 if i == j else 0.0
-                for c in range(m):
-                    part -= gain[i, c] * seen_C[c, j]
-                kept[i, j] = part
-        _multiply(kept, prior_cov[k], left)
-        _multiply_transposed(left, kept, post_cov[k])
-        _multiply(gain, seen_R, weighted)
-        _multiply_transposed(weighted, gain, right)
-        for i in range(n):
-            for j in range(n):
-                post_cov[k, i, j] += right[i, j]
-        _make_symmetric(post_cov[k])
-        for i in range(m):
-            whitened[i] = innovation[k, i]
-        _solve(factor, whitened)
-        total = count * math.log(2.0 * math.pi)
-        for i in range(m):
-            total += whitened[i] * whitened[i] + 2.0 * math.log(factor[i, i])
-        likelihood[k] = -0.5 * total
     return -1
+
+
+@numba.njit(inline="always")
+def scratch(m, n):  # type: ignore[no-untyped-def]
+    """Room for `move` and `update` of n states by m measurements."""
+    pairs = np.empty((m, n)), np.empty((n, m)), np.empty((n, m))
+    return pairs, (np.empty((n, n)), np.empty((n, n)), np.empty((n, n))), (np.empty((m, m)), np.empty((m, m)), np.empty(m))
+
+
+@numba.njit(inline="always")
+def move(slope, cov, noise, out, room):  # type: ignore[no-untyped-def]
+    """F P Fᵀ + Q into ``out``."""
+    left = room[1][0]
+    _multiply(slope, cov, left)
+    _multiply_transposed(left, slope, out)
+    for i in range(len(out)):
+        for j in range(len(out)):
+            out[i, j] += noise[i, j]
+    _make_symmetric(out)
+
+
+@numba.njit(inline="always")
+def update(prior, post, y, R, innovation, S, seen, room):  # type: ignore[no-untyped-def]
+    """Write mean and covariance after a measurement, from those before, by Joseph's form, and S; returns the log-likelihood, or NaN.
+
+    What is NaN in ``y`` (m,) was not measured: its ``innovation`` and its row of ``seen``, H (m, n), are 0.
+    """
+    (mean, cov), (post_mean, post_cov), (of_both, of_states, of_measured) = prior, post, room
+    (cross, gain, weighted), (kept, left, right), (noise, factor, whitened) = of_both, of_states, of_measured
+    m, n, count = len(y), len(mean), 0
+    for i in range(m):
+        count += not math.isnan(y[i])
+        for j in range(m):
+            noise[i, j] = R[i, j] if not math.isnan(y[i]) and not math.isnan(y[j]) else (1.0 if i == j else 0.0)
+    _multiply(seen, cov, cross)
+    _multiply_transposed(cross, seen, S)
+    for i in range(m):
+        for j in range(m):
+            S[i, j] += noise[i, j]
+    _make_symmetric(S)
+    if not _cholesky(S, factor):
+        return math.nan
+    for j in range(n):  # gain = (S⁻¹ H P)ᵀ
+        for i in range(m):
+            whitened[i] = cross[i, j]
+        _solve(factor, whitened)
+        for i in range(m - 1, -1, -1):
+            total = whitened[i]
+            for c in range(i + 1, m):
+                total -= factor[c, i] * gain[j, c]
+            gain[j, i] = total / factor[i, i]
+    for i in range(n):
+        total = mean[i]
+        for c in range(m):
+            total += gain[i, c] * innovation[c]
+        post_mean[i] = total
+        for j in range(n):
+            part = 1.0 if i == j else 0.0
+            for c in range(m):
+                part -= gain[i, c] * seen[c, j]
+            kept[i, j] = part
+    _multiply(kept, cov, left)
+    _multiply_transposed(left, kept, post_cov)
+    _multiply(gain, noise, weighted)
+    _multiply_transposed(weighted, gain, right)
+    for i in range(n):
+        for j in range(n):
+            post_cov[i, j] += right[i, j]
+    _make_symmetric(post_cov)
+    for i in range(m):
+        whitened[i] = innovation[i]
+    _solve(factor, whitened)
+    total = count * math.log(2.0 * math.pi)
+    for i in range(m):
+        total += whitened[i] * whitened[i] + 2.0 * math.log(factor[i, i])
+    return -0.5 * total
 
 
 @numba.njit(inline="always")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 import math
 from typing import Any
 
@@ -22,14 +21,12 @@ from vehest.report.style import (
     MatplotlibFigure,
     fixed,
     new_figure,
-    paper_style,
     significant,
     with_unit,
 )
 
 POINTS = 2500
 SCATTER_POINTS = 1500
-PNG_DPI = 150
 OVERVIEW_HEIGHT, STEERING_HEIGHT = 1.9, 2.0  # of the height of a residual
 SYMBOLS = {"ax": "$a_x$", "ay": "$a_y$", "yaw_rate": "yaw rate"}
 
@@ -56,17 +53,6 @@ def alignment_figure(alignment: Alignment) -> MatplotlibFigure:
             _draw_steering(figure.add_subplot(grid[-1, :]), steering, alignment)
         figure.align_ylabels()
     return figure
-
-
-def figure_files(figure: MatplotlibFigure) -> dict[str, bytes]:
-    """A figure as PNG and SVG: ending -> content."""
-    files = {}
-    with paper_style():
-        for ending, metadata in (("png", {"Software": None}), ("svg", {"Date": None, "Creator": None})):
-            buffer = io.BytesIO()
-            figure.savefig(buffer, format=ending, dpi=PNG_DPI, metadata=metadata)
-            files[ending] = buffer.getvalue()
-    return files
 
 
 def _draw_correlation(axes: Any, alignment: Alignment) -> None:

@@ -144,8 +144,8 @@ def write_document(
             _write_table(folder, block.name, block.frame)
         elif isinstance(block, Figure):
             (folder / "figures").mkdir(exist_ok=True)
-            (folder / "figures" / f"{block.name}.png").write_bytes(_png(block.static))
-            images[block.name] = _svg(block.static)
+            (folder / "figures" / f"{block.name}.png").write_bytes(png_of(block.static))
+            images[block.name] = svg_of(block.static)
             (folder / "figures" / f"{block.name}.svg").write_bytes(images[block.name])
     _write_text(folder / f"{name}.md", _markdown(document, numbers))
     if page:
@@ -208,7 +208,7 @@ def _numbers(document: Document) -> dict[int, str]:
     return numbers
 
 
-def _png(figure: MatplotlibFigure) -> bytes:
+def png_of(figure: MatplotlibFigure) -> bytes:
     """A figure as pixels, in as few colours as look the same: a third of the size."""
     from PIL import Image
 
@@ -221,7 +221,8 @@ def _png(figure: MatplotlibFigure) -> bytes:
     return small.getvalue()
 
 
-def _svg(figure: MatplotlibFigure) -> bytes:
+def svg_of(figure: MatplotlibFigure) -> bytes:
+    """A figure as SVG."""
     buffer = io.BytesIO()
     with paper_style():
         figure.savefig(buffer, format="svg", dpi=PNG_DPI, metadata={"Date": None, "Creator": None})

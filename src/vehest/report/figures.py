@@ -5,12 +5,15 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from vehest.constants import FloatArray
 from vehest.report.style import DOUBLE_COLUMN, REFERENCE, Line, MatplotlibFigure, new_figure, significant
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 STATIC_POINTS = 500
 LEAST_SAMPLES = 20
@@ -60,6 +63,13 @@ class Learning:
     epoch: FloatArray  # shape (E,)
     train: FloatArray  # training loss, shape (E,)
     validation: FloatArray  # validation loss, shape (E,)
+
+    @classmethod
+    def of(cls, label: str, line: Line, history: pd.DataFrame | None) -> Learning | None:
+        """The losses of a training history; none where a fit has no epochs."""
+        if history is None or history.empty or not {"epoch", "train_loss", "validation_loss"} <= set(history.columns):
+            return None
+        return cls(label, line, *(history[name].to_numpy(np.float64) for name in ("epoch", "train_loss", "validation_loss")))
 
 
 def spread_figure(rows: Sequence[Spread], quantity: str) -> MatplotlibFigure:

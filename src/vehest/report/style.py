@@ -7,8 +7,9 @@ import zlib
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any, TypeAlias
+from typing import TYPE_CHECKING, TypeAlias
 
+from vehest.data.errors import listed as listed
 from vehest.estimators.registry import estimator_class, estimator_names
 
 if TYPE_CHECKING:
@@ -131,15 +132,6 @@ def new_figure(width: float = DOUBLE_COLUMN, height: float = 3.0) -> Iterator[Ma
         yield Figure(figsize=(width, height), layout="constrained")
 
 
-def legend_above(figure: MatplotlibFigure, *axes: Any, columns: int = 4) -> None:
-    """One legend over the figure with every label of some axes once."""
-    entries: dict[str, Any] = {}
-    for own in axes:
-        for handle, label in zip(*own.get_legend_handles_labels(), strict=True):
-            entries.setdefault(label, handle)
-    figure.legend(list(entries.values()), list(entries), loc="outside upper left", ncols=columns, columnspacing=1.3, handlelength=2.6)
-
-
 def with_unit(quantity: str, unit: str) -> str:
     """Header of a column or label of an axis: ``RMSE(β) [deg]``; no brackets where there is no unit."""
     return quantity if unit in {"", "1"} else f"{quantity} [{unit}]"
@@ -164,11 +156,6 @@ def decimals_for(values: Sequence[float], digits: int = 3) -> int:
 def fixed(value: float, decimals: int) -> str:
     """A number with a fixed count of decimals, thousands set apart; `MISSING` if it is not finite."""
     return _grouped(value, decimals) if math.isfinite(value) else MISSING
-
-
-def listed(words: Sequence[str]) -> str:
-    """``a``, ``a and b``, ``a, b and c``."""
-    return " and ".join([", ".join(words[:-1]), words[-1]]) if len(words) > 1 else "".join(words)
 
 
 def _grouped(value: float, decimals: int) -> str:

@@ -10,9 +10,9 @@ from typing import Any
 import yaml
 
 from vehest.alignment.align import READ_AS, Alignment, Parameter, align
-from vehest.alignment.checks import checks_of_recording
+from vehest.alignment.checks import refuse_errors
 from vehest.alignment.settings import AlignmentSettings
-from vehest.data.errors import ConfigurationError, DataError
+from vehest.data.errors import ConfigurationError
 from vehest.data.files import written_aside
 from vehest.data.recording import Recording
 from vehest.run.config import Config
@@ -28,10 +28,7 @@ def align_recording(source: str, overrides: Sequence[str], recording_id: str | N
     """Estimate quantities from one recording; raises `VehestError` where it is not there, cannot be read or does not determine them."""
     with reading(source, overrides) as config:
         recording = _one_recording(source, config, recording_id)
-        for finding in checks_of_recording(recording):
-            if finding.level == "error" and finding.check not in (config["dataset"].get("accept") or []):
-                channel = f"recording '{recording.id}': channel '{finding.channel}'"
-                raise DataError(f"{channel}: {finding.message} (or dataset.accept=[{finding.check}])")
+        refuse_errors(recording, config["dataset"].get("accept") or (), f"recording '{recording.id}'")
         return align(recording, settings)
 
 
@@ -79,7 +76,8 @@ def write_alignment(alignment: Alignment, folder: Path) -> None:
     """Write report, table, transforms and figure into a folder of its own, all or nothing; raises `ConfigurationError`, `MissingError`."""
     import pandas as pd
 
-    from vehest.report.alignment_figures import alignment_figure, figure_files
+    from vehest.report.alignment_figures import alignment_figure
+    from vehest.report.document import png_of, svg_of
 
     if folder.is_symlink() or (folder.exists() and not folder.is_dir()):
         raise ConfigurationError(f"'{folder}' is not a folder; name a new one")
@@ -89,8 +87,8 @@ def write_alignment(alignment: Alignment, folder: Path) -> None:
     recording = {"recording": alignment.recording.id, "kind": alignment.recording.kind}
     table = pd.DataFrame([recording | _plain_parameter(parameter) for parameter in alignment.parameters])
     texts = (_report(alignment), table.to_csv(index=False, lineterminator="\n"), _transforms(alignment))
-    figures = figure_files(alignment_figure(alignment))
-    contents = [*(text.encode("utf-8", "backslashreplace") for text in texts), figures["png"], figures["svg"]]
+    figure = alignment_figure(alignment)
+    contents = [*(text.encode("utf-8", "backslashreplace") for text in texts), png_of(figure), svg_of(figure)]
     with written_aside(folder, replace_folder=True) as aside:
         aside.mkdir()
         for name, content in zip(FILES, contents, strict=True):

@@ -30,7 +30,7 @@ from vehest.data.limits import Limits, check_limit, current_limits, limits_from_
 from vehest.data.schema import FURTHER_KEYS, validated
 from vehest.data.text_files import first_line
 from vehest.data.transforms import Preparation
-from vehest.run.config_files import GROUPS, choices, conf_folders, packaged_conf
+from vehest.run.config_files import GROUPS, choices, conf_folders, packaged
 
 Config = dict[str, Any]
 
@@ -105,7 +105,7 @@ def compose_config(command: str, overrides: Sequence[str] = ()) -> Config:
     if _LocalFirst not in Plugins.instance().discover(SearchPathPlugin):
         Plugins.instance().register(_LocalFirst)
     try:
-        with initialize_config_dir(config_dir=str(packaged_conf()), version_base="1.3"):
+        with initialize_config_dir(config_dir=str(packaged("conf")), version_base="1.3"):
             composed = compose(command, overrides=[OWN_SEARCH_PATH, *(override.input_line for override in parsed)])
         resolved: Any = OmegaConf.to_container(composed, resolve=True, throw_on_missing=False)
     except Exception as error:  # Hydra raises nearly anything for a file that is no configuration

@@ -13,18 +13,8 @@ from vehest.data.errors import VehestError
 GROUPS = ("dataset", "split", "vehicle", "estimator", "training", "fault", "tracking")
 
 
-def packaged_conf() -> Path:
-    """The conf folder that came with vehest."""
-    return _packaged("conf")
-
-
-def packaged_pipelines() -> Path:
-    """The pipelines folder that came with vehest."""
-    return _packaged("pipelines")
-
-
-def _packaged(name: str) -> Path:
-    """A folder inside the installed package, or beside src in a checkout."""
+def packaged(name: str) -> Path:
+    """A folder that came with vehest, ``conf`` or ``pipelines``: inside the installed package, or beside src in a checkout."""
     package = Path(__file__).resolve().parents[1]
     inside = package / name
     return inside if inside.is_dir() else package.parents[1] / name
@@ -32,9 +22,9 @@ def _packaged(name: str) -> Path:
 
 def conf_folders() -> list[Path]:
     """Folders of configuration, the first one searched first: ./conf, if there is one, the packaged folder, that of the papers' studies."""
-    local, packaged = Path("conf"), packaged_conf()
-    own = [local] if local.is_dir() and local.resolve() != packaged.resolve() else []
-    return [*own, packaged, Path(__file__).resolve().parents[2] / "vehest_papers" / "conf"]
+    local, ours = Path("conf"), packaged("conf")
+    own = [local] if local.is_dir() and local.resolve() != ours.resolve() else []
+    return [*own, ours, Path(__file__).resolve().parents[2] / "vehest_papers" / "conf"]
 
 
 def conf_text(name: str) -> str:
@@ -68,12 +58,12 @@ def find_pipeline(name: str) -> Path | None:
     """A pipeline by path or by name: as given, then ./pipelines, then the packaged ones."""
     given = Path(name)
     file = f"{given.name.removesuffix('.yaml')}.yaml"
-    return next((path for path in (given, Path("pipelines") / file, packaged_pipelines() / file) if path.is_file()), None)
+    return next((path for path in (given, Path("pipelines") / file, packaged("pipelines") / file) if path.is_file()), None)
 
 
 def pipeline_names() -> list[str]:
     """Names of the pipelines in ./pipelines and in the package."""
-    return sorted({file.stem for folder in (Path("pipelines"), packaged_pipelines()) for file in folder.glob("*.yaml")})
+    return sorted({file.stem for folder in (Path("pipelines"), packaged("pipelines")) for file in folder.glob("*.yaml")})
 
 
 def complete_override(command: str, given: list[str], incomplete: str) -> list[tuple[str, str]]:

@@ -13,7 +13,7 @@ from typing import Literal
 
 from vehest.data.text_files import first_line
 from vehest.run.artefacts import library_versions
-from vehest.run.config_files import packaged_conf
+from vehest.run.config_files import packaged
 
 EXTRAS = {
     "ros": ("rosbags", "ROS 2 bags"),
@@ -44,7 +44,7 @@ def examine() -> Iterator[Item]:
 
     versions = ", ".join(f"{name} {version}" for name, version in library_versions().items())
     yield Item("ok", "python", f"{platform.python_version()}; {versions}")
-    yield Item("ok", "configuration", f"{packaged_conf()}{'; ./conf is searched first' if Path('conf').is_dir() else ''}")
+    yield Item("ok", "configuration", f"{packaged('conf')}{'; ./conf is searched first' if Path('conf').is_dir() else ''}")
     yield _kernels()
     absent = [f"{use} need 'vehest[{extra}]'" for extra, (package, use) in EXTRAS.items() if importlib.util.find_spec(package) is None]
     if absent:

@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from vehest.alignment.checks import checks_of_recording
+from vehest.alignment.checks import checks_of_recording, refuse_errors
 from vehest.constants import GRAVITY
 from vehest.data.channels import REFERENCE_SUFFIX
 from vehest.data.errors import ConfigurationError, DataError, MissingError
@@ -191,9 +191,7 @@ def read_by(config: Config, path: Path, *, references: bool = False) -> Recordin
     dataset = config["dataset"] if references else _without_references(config["dataset"])
     with use_limits(limits_from_config(config["limits"])):
         recording = read_single(dataset, path)
-        for finding in checks_of_recording(recording):
-            if finding.level == "error" and finding.check not in (dataset.get("accept") or []):
-                raise DataError(f"'{path}': channel '{finding.channel}': {finding.message} (or dataset.accept=[{finding.check}])")
+        refuse_errors(recording, dataset.get("accept") or (), f"'{path}'")
     return recording
 
 

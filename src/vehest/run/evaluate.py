@@ -38,7 +38,7 @@ from vehest.evaluation.under_fault import UNITS as UNITS_UNDER_FAULT
 from vehest.run.artefacts import TIMINGS, Artefact, StagePlan
 from vehest.run.evaluate_faults import FaultSettings, code_under_faults, errors_under
 from vehest.run.train import FIT_METRICS, file_digest, learnt_spans, read_fit_metrics, recording_file
-from vehest.studies.artefacts import read_frame
+from vehest.studies.artefacts import HEAD, METRIC_COLUMNS, read_frame
 from vehest.trust.bands import Bands, with_bands
 from vehest.trust.faults import is_fault
 from vehest.trust.record import Trust, read_trust
@@ -52,8 +52,7 @@ TIMED_STEPS = 200
 FIT_FIGURES = ("n_parameters", "epochs", "train_seconds")
 TRAINING_METRICS = ("rmse_vy", "fvu", "rmse_sideslip")
 
-HEAD = ("estimator", "variant", "trained_on", "dataset", "kind", "test_set", "subset", "condition", "rate_hz", "mode", "seed")
-COLUMNS = (*HEAD, "metric", "value", "unit", "low", "high")
+COLUMNS = METRIC_COLUMNS[1:]
 ALL_UNITS = UNITS | UNITS_UNDER_FAULT
 
 

@@ -14,7 +14,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from vehest.alignment.checks import checks_of_recording
+from vehest.alignment.checks import refuse_errors
 from vehest.data.errors import ConfigurationError, DataError, printable
 from vehest.data.files import remove, remove_leftovers, sha256_of
 from vehest.data.store import read_recording, write_recording
@@ -102,12 +102,7 @@ def _make_part(dataset: Mapping[str, Any], recording_id: str, parts: Path, *_: o
 def _make(source: Source, recording_id: str, folder: Path) -> None:
     """Read, check and write a recording; raises `DataError` where a check finds an error that the data set does not accept."""
     recording = source.read(recording_id)
-    for finding in checks_of_recording(recording):
-        if finding.level == "error" and finding.check not in (source.dataset.get("accept") or []):
-            raise DataError(
-                f"data set '{source.name}', recording '{recording.id}': channel '{finding.channel}': {finding.message} "
-                f"(or accept: [{finding.check}])"
-            )
+    refuse_errors(recording, source.dataset.get("accept") or (), f"data set '{source.name}', recording '{recording.id}'")
     write_recording(recording, folder / recording_file(recording_id))
 
 

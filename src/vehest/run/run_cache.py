@@ -26,7 +26,7 @@ from vehest.data.files import file_name, remove_leftovers, written_aside
 from vehest.data.schema import validated
 from vehest.data.text_files import read_json, read_yaml
 from vehest.run.artefacts import Artefact, library_versions, read_artefact
-from vehest.run.config_files import conf_folders, find_pipeline, packaged_pipelines
+from vehest.run.config_files import conf_folders, find_pipeline, packaged
 from vehest.run.console import WARNING, Messages
 from vehest.run.launchers.base import LauncherOptions
 from vehest.run.printing import TerminalSummary
@@ -202,7 +202,7 @@ def _next_time(printed: Iterable[tuple[str, str, str, str]], made: Iterable[Arte
 
 def _configuration(pipeline: str) -> Iterator[Path]:
     """Files of the configuration and of the pipeline, with the one that it is based on."""
-    for folder in [*conf_folders(), packaged_pipelines()]:
+    for folder in [*conf_folders(), packaged("pipelines")]:
         yield from sorted(folder.rglob("*.yaml"))
     own = find_pipeline(pipeline) if pipeline else None
     if own is not None:

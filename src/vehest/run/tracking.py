@@ -208,19 +208,24 @@ def test_figures(evaluation: Artefact) -> dict[str, float]:
 
 
 def _learning_figure(model: Artefact) -> Any:
-    from vehest.report.run_figures import fit_figure
+    """Loss over the epochs; none where a fit has no epochs."""
+    from vehest.report.figures import Learning, learning_curves
+    from vehest.report.style import line_of
 
-    if not (model.folder / HISTORY).is_file():
-        return None
-    about = read_description(model.folder)
-    return fit_figure(model.label, about.estimator, about.variant, read_frame(model.folder / HISTORY))
+    about, history = read_description(model.folder), model.folder / HISTORY
+    run = Learning.of(model.label, line_of(about.estimator, about.variant), read_frame(history) if history.is_file() else None)
+    return None if run is None else learning_curves([run], "loss [m²/s²]")
 
 
 def _trace_figure(evaluation: Artefact, model: Artefact, how: Evaluation, test_set: str) -> Any:
-    from vehest.report.run_figures import trace_figure
+    """Measured and estimated lateral velocity and sideslip over the scored times of a test set."""
+    from vehest.report.figures import Traces, traces_figure
+    from vehest.report.style import REFERENCE, line_of
 
     about = read_description(model.folder)
     parts = read_scored(evaluation, how.split, how.references, how.protocol, test_set)
     series = [np.concatenate([getattr(part, name) for part in parts]) for name in ("vy_ref", "sideslip_ref", "vy", "sideslip")]
     time = parts[0].time[0] + np.arange(len(series[0])) / how.protocol.rate_hz  # several ranges stand end to end
-    return trace_figure(model.label, about.estimator, about.variant, time, (series[0], series[1]), (series[2], series[3]))
+    reference = Traces("measured", REFERENCE, series[0], np.degrees(series[1]))
+    estimated = Traces(model.label, line_of(about.estimator, about.variant), series[2], np.degrees(series[3]))
+    return traces_figure(time, reference, [estimated], "time [s]")

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, fields, is_dataclass, replace
 from typing import Any, Literal, get_args, get_origin, get_type_hints
@@ -13,7 +13,6 @@ from vehest.data.recording_summary import RecordingSummary, common_channels
 from vehest.data.schema import settings_from_config
 from vehest.data.splits import Span, Split
 from vehest.estimators.base import Estimator
-from vehest.estimators.needs import gaps_that_matter, lacking_to_estimate, lacking_to_train
 from vehest.estimators.registry import estimator_class, estimator_names
 from vehest.run.config import Config, compose_config
 from vehest.run.config_files import choices
@@ -103,7 +102,8 @@ def usability(
     settings, without = _settings_without(config, missing.unsupplied, recordings, to_estimate)
     patterns = estimator.unmatched_patterns(training, [one.id for one in recordings]) if recordings else ()
     own_rate = estimator.settings.rate_hz
-    rate, gaps = min([own_rate, *(one.rate_hz for one in both)]), gaps_that_matter(estimator, _gappy(both))
+    rate, gappy = min([own_rate, *(one.rate_hz for one in both)]), _gappy(both)
+    gaps = tuple(channel for channel in estimator.channels if channel in gappy and channel not in estimator.skippable)
     return Usability(name, rate, own_rate, missing, gaps, settings, without, patterns, car=car_parameters(own))
 
 
@@ -192,9 +192,15 @@ def _built(config: Config) -> tuple[Estimator, Any]:
 
 
 def _missing(estimator: Estimator, training: Any, to_train: Sequence[RecordingSummary], to_estimate: Sequence[RecordingSummary]) -> Missing:
-    read = [name for own in to_estimate for name in lacking_to_estimate(estimator, own.channels)]
+    read = [name for own in to_estimate for name in estimator.channels if name not in own.channels]
     learnt = [name for own in to_train for name in lacking_to_train(estimator, training, own.channels)]
     return _with_supplies(read, learnt, [*to_train, *to_estimate])
+
+
+def lacking_to_train(estimator: Estimator, training: Any, channels: Collection[str]) -> list[str]:
+    """Channels that a fit with settings ``training`` reads and a recording with ``channels`` lacks; none where nothing is learnt."""
+    wanted = (*estimator.channels, *estimator.references(training, channels)) if estimator.learns else ()
+    return [name for name in dict.fromkeys(wanted) if name not in channels]
 
 
 def _with_supplies(read: Sequence[str], learnt: Sequence[str], recordings: Sequence[RecordingSummary]) -> Missing:

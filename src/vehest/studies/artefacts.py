@@ -36,25 +36,8 @@ def read_frame(path: Path, columns: Iterable[str] = (), *, numbers: Iterable[str
     return table
 
 
-METRIC_COLUMNS = (
-    "study",
-    "estimator",
-    "variant",
-    "trained_on",
-    "dataset",
-    "kind",
-    "test_set",
-    "subset",
-    "condition",
-    "rate_hz",
-    "mode",
-    "seed",
-    "metric",
-    "value",
-    "unit",
-    "low",
-    "high",
-)
+HEAD = ("estimator", "variant", "trained_on", "dataset", "kind", "test_set", "subset", "condition", "rate_hz", "mode", "seed")
+METRIC_COLUMNS = ("study", *HEAD, "metric", "value", "unit", "low", "high")
 
 
 @dataclass(frozen=True)

@@ -39,7 +39,6 @@ VERSION = "2"
 _ACCURACY = ("rmse_sideslip", "rmse_vy", "fvu", "p99_sideslip", "max_error_sideslip")
 _OF_MODEL = ("n_parameters", "epochs")
 _BOUND = "floor_cramer_rao"
-_OTHER_RANGES = (("sideslip", TRAINING), ("sideslip", VALIDATION), ("vy", VALIDATION))
 _SPREAD = ("rmse_sideslip_median", "rmse_sideslip_min", "rmse_sideslip_max", "rmse_sideslip_std")
 
 
@@ -88,50 +87,23 @@ def leaderboard(artefacts: PartArtefacts) -> pd.DataFrame:
         seed = chosen_seed(seeds, name, runs)
         for test_set, ranking in rankings.items():
             own = {metric: values_of(runs, name, seeds, test_set, metric) for metric in _ACCURACY}
+            shown = {metric: values[seeds.index(seed)] for metric, values in own.items()}
             row: dict[str, object] = {"estimator": name[0], "variant": name[1], "title": models[0].title, "test_set": test_set}
-            row |= {"seed": seed, "n_seeds": len(seeds), "start": start}
-            row |= {metric: values[seeds.index(seed)] for metric, values in own.items()}
-            row |= _spread_of(own["rmse_sideslip"])
-            row |= standing_columns(ranking, name)
-            row |= {f"rmse_{what}_{role}": values_of(runs, name, [seed], role, f"rmse_{what}")[0] for what, role in _OTHER_RANGES}
+            row |= {"seed": seed, "n_seeds": len(seeds), "start": start, "rmse_sideslip": shown["rmse_sideslip"]}
+            row |= {**standing_columns(ranking, name), **_spread_of(own["rmse_sideslip"])}
+            row |= {f"rmse_sideslip_{role}": values_of(runs, name, [seed], role, "rmse_sideslip")[0] for role in (TRAINING, VALIDATION)}
+            row |= {"rmse_vy": shown["rmse_vy"], "rmse_vy_validation": values_of(runs, name, [seed], VALIDATION, "rmse_vy")[0]}
+            row |= {**shown, _BOUND: values_of(runs, name, [seed], test_set, _BOUND)[0]}
             row |= {metric: of_model(runs, name, seed, metric) for metric in _OF_MODEL}
-            row[_BOUND] = values_of(runs, name, [seed], test_set, _BOUND)[0]
-            finite = name in ranking.order and math.isfinite(own["rmse_sideslip"][seeds.index(seed)])
+            finite = name in ranking.order and math.isfinite(shown["rmse_sideslip"])
             row["_place"] = ranking.order.index(name) if finite else math.inf
             rows.append(row)
-    board = pd.DataFrame(rows, columns=[*_LEADERBOARD_COLUMNS, "_place"])
+    board = pd.DataFrame(rows)
     board["epochs"] = board["epochs"].where(board["epochs"] > 0)
     order = {test_set: position for position, test_set in enumerate(artefacts.split.tests)}
     board["_position"] = board["test_set"].map(order)
     board = board.sort_values(["_position", "_place"], kind="stable")
     return board.drop(columns=["_position", "_place"]).reset_index(drop=True)
-
-
-_LEADERBOARD_COLUMNS = (
-    "estimator",
-    "variant",
-    "title",
-    "test_set",
-    "seed",
-    "n_seeds",
-    "start",
-    "rmse_sideslip",
-    "rmse_sideslip_low",
-    "rmse_sideslip_high",
-    "beats_zero",
-    "beats_static_map",
-    "against_best",
-    *_SPREAD,
-    "rmse_sideslip_training",
-    "rmse_sideslip_validation",
-    "rmse_vy",
-    "rmse_vy_validation",
-    "fvu",
-    "p99_sideslip",
-    "max_error_sideslip",
-    _BOUND,
-    *_OF_MODEL,
-)
 
 
 _BOUND_SENTENCE = " Bound: the Cramér-Rao bound for what the estimator reads, as in the table of floors."
@@ -512,12 +484,9 @@ def _training(artefacts: PartArtefacts, board: pd.DataFrame, lines: dict[Name, L
     runs = []
     for row in _shown(first).to_dict("records"):
         name = (row["estimator"], row["variant"])
-        history = models[*name, row["seed"]].history()
-        if history is None or history.empty or not {"epoch", "train_loss", "validation_loss"} <= set(history.columns):
-            continue
-        columns = (history[column].to_numpy(dtype=float) for column in ("epoch", "train_loss", "validation_loss"))
-        runs.append(figures.Learning(row["title"], lines[name], *columns))
-    if not runs:
+        runs.append(figures.Learning.of(row["title"], lines[name], models[*name, row["seed"]].history()))
+    known = [run for run in runs if run is not None]
+    if not known:
         return []
     return [
         "## Training",
@@ -525,6 +494,6 @@ def _training(artefacts: PartArtefacts, board: pd.DataFrame, lines: dict[Name, L
             "learning",
             "Loss over the epochs of each chosen seed: mean squared error of v on training and validation ranges. The marker is where the "
             "validation loss is lowest, whose weights are kept.",
-            figures.learning_curves(runs, "loss [m²/s²]"),
+            figures.learning_curves(known, "loss [m²/s²]"),
         ),
     ]

@@ -9,10 +9,11 @@ import pandas as pd
 
 from vehest.constants import FloatArray
 from vehest.report.document import Column, Figure, Table
-from vehest.report.style import DOUBLE_COLUMN, fixed, legend_above, new_figure
+from vehest.report.style import DOUBLE_COLUMN, fixed, new_figure
 from vehest.studies.artefacts import PartArtefacts
 from vehest_papers.cnn_ukf.manoeuvres import BIN, error_distribution, kpis_by_group
 from vehest_papers.cnn_ukf.subjects import Prepared, Runs, chosen, line_of
+from vehest_papers.kit.legends import legend_above
 from vehest_papers.kit.reading import median_and_range
 
 SETS_COLOURS = ("#9aa7b5", "#0b4f9c")

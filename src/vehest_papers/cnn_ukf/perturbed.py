@@ -20,13 +20,14 @@ from vehest.estimators.ensemble_ukf import BOX, EnsembleUkf, scaled_variance
 from vehest.estimators.model_files import load_model
 from vehest.estimators.network_ukf import LEAST_VARIANCE
 from vehest.report.document import Column, Figure, Table
-from vehest.report.style import DOUBLE_COLUMN, legend_above, new_figure
+from vehest.report.style import DOUBLE_COLUMN, new_figure
 from vehest.training.context import FitContext
 from vehest.training.search import optuna_search
 from vehest.vehicle.dugoff import DugoffAxle
 from vehest_papers.cnn_ukf import paper
 from vehest_papers.cnn_ukf.measures import MSE, MSE_NL, ManoeuvreErrors
 from vehest_papers.cnn_ukf.subjects import Prepared, Run, Runs, chosen, filter_of, line_of
+from vehest_papers.kit.legends import legend_above
 
 STEPS = (-paper.STIFFNESS_STEP, 0.0, paper.STIFFNESS_STEP)
 COMBINATIONS = tuple(itertools.product(STEPS, STEPS))  # shares by which the front and the rear axle's cornering stiffness are off

@@ -14,12 +14,13 @@ from vehest.data.splits import Span
 from vehest.estimators.dugoff_ukf import PseudoMeasurement
 from vehest.evaluation.metrics import Scored
 from vehest.report.document import Figure, as_code
-from vehest.report.style import DOUBLE_COLUMN, REFERENCE, fixed, legend_above, new_figure
+from vehest.report.style import DOUBLE_COLUMN, REFERENCE, fixed, new_figure
 from vehest.studies.artefacts import PartArtefacts
 from vehest_papers.cnn_ukf import paper
 from vehest_papers.cnn_ukf.manoeuvres import group_of
 from vehest_papers.cnn_ukf.networks import pseudo_measurements_of
 from vehest_papers.cnn_ukf.subjects import TEST, Prepared, Run, line_of, plain_name
+from vehest_papers.kit.legends import legend_above
 from vehest_papers.kit.reading import sideslip_error
 
 WIDE = 5.0  # ratio from which deviations stand on a logarithmic axis

@@ -13,9 +13,10 @@ from vehest.data.estimate import Estimate
 from vehest.data.recording import Recording
 from vehest.report.document import Figure
 from vehest.report.figures import decimated
-from vehest.report.style import DOUBLE_COLUMN, fixed, legend_above, new_figure
+from vehest.report.style import DOUBLE_COLUMN, fixed, new_figure
 from vehest_papers.heavy_ekf import paper
 from vehest_papers.heavy_ekf.subjects import LINES, MEASURED, moving
+from vehest_papers.kit.legends import legend_above
 
 POINTS = 800  # a line across the page
 STRAIGHT_SECONDS = 25.0

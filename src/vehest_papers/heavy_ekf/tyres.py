@@ -16,11 +16,12 @@ from vehest.data.recording import Recording
 from vehest.estimators.filtering.tyre_fit import AxleMotion, TyreFit, axle_force, axle_motion, fit_motion
 from vehest.report.document import Column, Figure, Table
 from vehest.report.figures import decimated
-from vehest.report.style import DOUBLE_COLUMN, MISSING, fixed, legend_above, new_figure, significant
+from vehest.report.style import DOUBLE_COLUMN, MISSING, fixed, new_figure, significant
 from vehest.vehicle.parameters import SingleTrackParameters
 from vehest_papers.heavy_ekf import paper
 from vehest_papers.heavy_ekf.laps import POINTS
 from vehest_papers.heavy_ekf.subjects import TYRE_COLOURS, TYRES
+from vehest_papers.kit.legends import legend_above
 
 BAND = 0.10  # of the plant's own value, within which a parameter counts as found
 DOTS = 1500

@@ -15,9 +15,10 @@ from vehest.data.recording import Recording
 from vehest.estimators.rational_ekf import RationalFilter
 from vehest.report.document import Block, Column, Figure, Table
 from vehest.report.figures import decimated
-from vehest.report.style import DOUBLE_COLUMN, MISSING, fixed, legend_above, listed, new_figure
+from vehest.report.style import DOUBLE_COLUMN, MISSING, fixed, listed, new_figure
 from vehest_papers.heavy_ekf.laps import POINTS
 from vehest_papers.heavy_ekf.subjects import CORNERING, LINES, Filter, corners
+from vehest_papers.kit.legends import legend_above
 from vehest_papers.kit.observability import Observability, observability_along
 
 WINDOW_SECONDS = 1.0

@@ -13,7 +13,8 @@ import pandas as pd
 from vehest.constants import FloatArray
 from vehest.data.recording import Recording
 from vehest.report.document import Block, Column, Figure, Table
-from vehest.report.style import DOUBLE_COLUMN, MISSING, fixed, legend_above, listed, new_figure
+from vehest.report.style import DOUBLE_COLUMN, MISSING, fixed, listed, new_figure
+from vehest_papers.kit.legends import legend_above
 from vehest_papers.kit.spectra import Periodogram, decibels, lateral_velocity_rate, mean_bias, periodogram, process_noise
 from vehest_papers.ksnn.subjects import car_colours, car_title, kinds_of, plain_frequencies
 

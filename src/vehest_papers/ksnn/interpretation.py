@@ -15,7 +15,8 @@ from vehest.data.recording import Recording
 from vehest.data.runs import true_runs
 from vehest.estimators.ksnn import Ksnn
 from vehest.report.document import Block, Column, Figure, Table
-from vehest.report.style import DOUBLE_COLUMN, REFERENCE_COLOUR, fixed, legend_above, listed, new_figure, significant, with_unit
+from vehest.report.style import DOUBLE_COLUMN, REFERENCE_COLOUR, fixed, listed, new_figure, significant, with_unit
+from vehest_papers.kit.legends import legend_above
 from vehest_papers.ksnn.activation import LOCAL_COLOURS, LOCAL_DASHES
 from vehest_papers.ksnn.linear_system import LocalModels, LpvModel, SubModels, decomposed_estimate
 from vehest_papers.ksnn.subjects import Trained

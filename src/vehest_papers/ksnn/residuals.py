@@ -11,7 +11,8 @@ import pandas as pd
 
 from vehest.evaluation.metrics import Scored
 from vehest.report.document import Block, Column, Figure, Table
-from vehest.report.style import DOUBLE_COLUMN, REFERENCE_COLOUR, fixed, legend_above, lines_of, listed, new_figure
+from vehest.report.style import DOUBLE_COLUMN, REFERENCE_COLOUR, fixed, lines_of, listed, new_figure
+from vehest_papers.kit.legends import legend_above
 from vehest_papers.kit.spectra import SEGMENT_SECONDS, Periodogram, decibels, periodogram
 from vehest_papers.ksnn.subjects import plain_frequencies
 

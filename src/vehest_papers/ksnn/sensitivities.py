@@ -15,7 +15,8 @@ from vehest.estimators.base import Estimator
 from vehest.estimators.ksnn import Ksnn
 from vehest.estimators.luenberger import Luenberger
 from vehest.report.document import Block, Column, Figure, Table
-from vehest.report.style import DOUBLE_COLUMN, fixed, legend_above, line_of, listed, new_figure
+from vehest.report.style import DOUBLE_COLUMN, fixed, line_of, listed, new_figure
+from vehest_papers.kit.legends import legend_above
 from vehest_papers.kit.reading import percent_below
 from vehest_papers.ksnn.linear_system import LocalModels
 from vehest_papers.ksnn.noise_sensitivity import NoiseSensitivity, ksnn_sensitivity, luenberger_sensitivity

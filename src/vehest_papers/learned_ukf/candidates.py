@@ -22,9 +22,9 @@ from vehest.evaluation.metrics import (
     weighted_absolute_errors,
     weighted_squared_errors,
 )
-from vehest.evaluation.significance import sequence_labels
 from vehest.studies.artefacts import EvaluatedModel, PartArtefacts
 from vehest_papers.kit import reading
+from vehest_papers.kit.paired import sequence_labels
 from vehest_papers.kit.reading import metric_values
 from vehest_papers.learned_ukf import paper
 from vehest_papers.learned_ukf.errors import Losses

@@ -12,7 +12,8 @@ from scipy import stats
 
 from vehest.constants import FloatArray
 from vehest.evaluation.metrics import WEIGHTS
-from vehest.evaluation.significance import CONFIDENCE, Interval, paired_difference
+from vehest.evaluation.significance import CONFIDENCE, Interval
+from vehest_papers.kit.paired import paired_difference
 from vehest_papers.learned_ukf import paper
 
 N_RESAMPLES = 500

@@ -14,8 +14,9 @@ from vehest.estimators.learned_ukf import LearnedUkf
 from vehest.evaluation.metrics import Protocol
 from vehest.evaluation.significance import CONFIDENCE, Interval
 from vehest.report.document import Column, Figure, Table
-from vehest.report.style import DOUBLE_COLUMN, MISSING, fixed, legend_above, new_figure
+from vehest.report.style import DOUBLE_COLUMN, MISSING, fixed, new_figure
 from vehest.training.through_filter import Drive
+from vehest_papers.kit.legends import legend_above
 from vehest_papers.kit.reading import with_interval
 from vehest_papers.learned_ukf import paper
 from vehest_papers.learned_ukf.candidates import SETS

@@ -11,9 +11,10 @@ import pandas as pd
 
 from vehest.data.errors import DataError
 from vehest.report.document import Column, Figure, Table
-from vehest.report.style import DOUBLE_COLUMN, OTHER_COLOURS, legend_above, listed, new_figure
+from vehest.report.style import DOUBLE_COLUMN, OTHER_COLOURS, listed, new_figure
 from vehest.studies.artefacts import PartArtefacts
 from vehest_papers.kit.claims import Claim
+from vehest_papers.kit.legends import legend_above
 from vehest_papers.kit.reading import lengths_of, with_interval
 from vehest_papers.learned_ukf.additions import Comparison, Subject
 from vehest_papers.learned_ukf.candidates import SETS, models_by_candidate

@@ -10,9 +10,9 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from vehest.constants import FloatArray
-from vehest.evaluation.significance import paired_difference
 from vehest.report.document import Column, Table
 from vehest.report.style import fixed
+from vehest_papers.kit.paired import paired_difference
 
 AS_IN_THE_PAPER, TURNED, UNDECIDED, LEVEL, APART = (
     "as in the paper",

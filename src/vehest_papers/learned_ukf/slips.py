@@ -10,7 +10,8 @@ import pandas as pd
 from vehest.constants import FloatArray
 from vehest.data.recording import Recording
 from vehest.report.document import Column, Figure, Table
-from vehest.report.style import DOUBLE_COLUMN, OTHER_COLOURS, legend_above, new_figure
+from vehest.report.style import DOUBLE_COLUMN, OTHER_COLOURS, new_figure
+from vehest_papers.kit.legends import legend_above
 from vehest_papers.learned_ukf import paper
 
 LEAST_SPEED = 0.5  # [m/s] below which a slip angle is noise

@@ -14,8 +14,9 @@ from vehest.data.splits import Span
 from vehest.data.store import read_recording
 from vehest.evaluation.metrics import REFERENCES, sequences, weighted_squared_errors
 from vehest.report.document import Figure, as_code
-from vehest.report.style import DOUBLE_COLUMN, NONLINEAR_ORANGES, REFERENCE, Line, MatplotlibFigure, fixed, legend_above, new_figure
+from vehest.report.style import DOUBLE_COLUMN, NONLINEAR_ORANGES, REFERENCE, Line, MatplotlibFigure, fixed, new_figure
 from vehest.studies.artefacts import EvaluatedModel, PartArtefacts
+from vehest_papers.kit.legends import legend_above
 from vehest_papers.learned_ukf import paper
 
 LINES = {

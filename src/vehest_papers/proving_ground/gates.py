@@ -17,8 +17,9 @@ from vehest.data.recording import Recording
 from vehest.data.transforms import Resample
 from vehest.estimators.static_map import StaticMap
 from vehest.report.document import Block, Column, Figure, Table
-from vehest.report.style import DOUBLE_COLUMN, fixed, legend_above, new_figure
+from vehest.report.style import DOUBLE_COLUMN, fixed, new_figure
 from vehest.studies.artefacts import StoredDataset
+from vehest_papers.kit.legends import legend_above
 from vehest_papers.kit.spectra import SEGMENT_SECONDS, decibels, mean_bias
 from vehest_papers.ksnn.data_quality import PUBLISHED, PUBLISHED_BIAS, Statistics, spectra_of, statistics
 from vehest_papers.proving_ground.papers import PROFILES

@@ -8,7 +8,7 @@ from fuzz.case import Command, generator
 from fuzz.honest import KSNN, LUENBERGER, PIPELINE, SPLIT, write_yaml
 from fuzz.mutations import NAMES, WRITABLE_NAMES, hostile, spoil_items, spoil_yaml, yaml_of
 from place import DATASET
-from vehest.run.config_files import packaged_conf, packaged_pipelines
+from vehest.run.config_files import packaged
 
 HEAD = "# @package _global_\n"
 ESTIMATORS = (
@@ -63,7 +63,7 @@ def _write(case, name, tree, head=""):
 
 def _write_packaged(case, group, name, **changes):
     """A packaged file, with the line that it must begin with, in ./conf."""
-    text = (packaged_conf() / group / f"{name}.yaml").read_text(encoding="utf-8")
+    text = (packaged("conf") / group / f"{name}.yaml").read_text(encoding="utf-8")
     _write(case, f"conf/{group}/{name}.yaml", yaml.safe_load(text) | changes, HEAD if text.startswith(HEAD) else "")
 
 
@@ -141,7 +141,7 @@ def root_file(case):
             case, "conf/tracking/mine.yaml", {"name": "none"} if case.honest else {"name": "mlflow", "uri": None, "experiment": "vehest"}
         )
     elif case.honest or case.rng.random() < 0.8:
-        _write(case, f"conf/{name}.yaml", yaml.safe_load((packaged_conf() / f"{name}.yaml").read_text(encoding="utf-8")))
+        _write(case, f"conf/{name}.yaml", yaml.safe_load((packaged("conf") / f"{name}.yaml").read_text(encoding="utf-8")))
     else:
         group = case.rng.choice(["split", "estimator", "training", "tracking"])
         tree = {"name": "odd", case.rng.choice(["a", *NAMES[:10]]): hostile(case.rng), "defaults": hostile(case.rng)}
@@ -182,7 +182,7 @@ def pipeline(case):
         return Command(("report", "small", "tracking=none"))
     name = "small"
     if how in (1, 2):
-        file = case.rng.choice(sorted(packaged_pipelines().glob("*.yaml")))
+        file = case.rng.choice(sorted(packaged("pipelines").glob("*.yaml")))
         name, tree = file.stem, yaml.safe_load(file.read_text(encoding="utf-8"))
     else:
         tree = PIPELINE if case.honest else case.rng.choice(PIPELINES)

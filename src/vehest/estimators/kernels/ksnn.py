@@ -16,7 +16,7 @@ import numpy as np
 
 from vehest.estimators.kernels.activation import tanh
 from vehest.estimators.kernels.compiling import entry, part
-from vehest.estimators.kernels.recursion import Recursion, gather, slopes_of, squared_error, step_of_adam
+from vehest.estimators.kernels.recursion import Recursion, add, gather, slopes_of, squared_error, step_of_adam
 from vehest.lanes import choose, least, load, most, store, total, width
 
 LINEAR = 8  # parameters of a local model besides its neurons
@@ -190,14 +190,14 @@ def _backward(car, room, k, to_v, to_u, sums):  # type: ignore[no-untyped-def]
     to_f1, to_f2 = -omega * to_v, -to_u
     for p in range(n_local):
         phi, at = most(1 - abs(position - p), 0), p * row * lanes
-        _add(sums, at, phi * to_v * v)
-        _add(sums, at + lanes, phi * to_u * u)
-        _add(sums, at + 2 * lanes, phi * to_v * slip)
-        _add(sums, at + 3 * lanes, phi * to_u * thrust)
-        _add(sums, at + 4 * lanes, phi * to_f1 * error)
-        _add(sums, at + 5 * lanes, phi * to_f1)
-        _add(sums, at + 6 * lanes, phi * to_f2 * error)
-        _add(sums, at + 7 * lanes, phi * to_f2)
+        add(sums, at, phi * to_v * v)
+        add(sums, at + lanes, phi * to_u * u)
+        add(sums, at + 2 * lanes, phi * to_v * slip)
+        add(sums, at + 3 * lanes, phi * to_u * thrust)
+        add(sums, at + 4 * lanes, phi * to_f1 * error)
+        add(sums, at + 5 * lanes, phi * to_f1)
+        add(sums, at + 6 * lanes, phi * to_f2 * error)
+        add(sums, at + 7 * lanes, phi * to_f2)
     next_v = load(kept, then + 2 * lanes) * to_v + load(kept, then + 4 * lanes) * step * omega * to_u
     next_u = load(kept, then + 3 * lanes) * to_u + load(kept, then + 5 * lanes) * to_f1 + load(kept, then + 6 * lanes) * to_f2
     if n_hidden:
@@ -216,12 +216,7 @@ def _backward(car, room, k, to_v, to_u, sums):  # type: ignore[no-untyped-def]
                     for p in range(max(n_local - 1, 1)):
                         here, slot = model == p, (column + p * row) * lanes
                         own = choose(here, inner, 0)
-                        _add(sums, slot, own * error)
-                        _add(sums, slot + lanes, own)
-                        _add(sums, slot + 2 * lanes, choose(here, a * h, 0))
+                        add(sums, slot, own * error)
+                        add(sums, slot + lanes, own)
+                        add(sums, slot + 2 * lanes, choose(here, a * h, 0))
     return next_v, next_u
-
-
-@part()
-def _add(sums, at, value):  # type: ignore[no-untyped-def]
-    store(sums, at, load(sums, at) + value)

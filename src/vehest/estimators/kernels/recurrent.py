@@ -10,7 +10,7 @@ import numpy as np
 
 from vehest.estimators.kernels.activation import sigmoid, tanh
 from vehest.estimators.kernels.compiling import entry, part
-from vehest.estimators.kernels.recursion import gather, slopes_of, squared_error, step_of_adam
+from vehest.estimators.kernels.recursion import add, gather, slopes_of, squared_error, step_of_adam
 from vehest.lanes import load, store, total, width
 
 GRU, LSTM = 3, 4  # gates
@@ -52,9 +52,9 @@ def loop(flat, given, series, starts, targets, batch, values, gradient, losses, 
                 if gradient.size:
                     slopes_of(out, targets[m, start:end], first, losses.size > 0, scratch)
                     slope = load(scratch, 0) * scale
-                    _add(sums, (read + states) * lanes, slope)
+                    add(sums, (read + states) * lanes, slope)
                     for i in range(states):
-                        _add(sums, (read + i) * lanes, slope * load(state, i * lanes))
+                        add(sums, (read + i) * lanes, slope * load(state, i * lanes))
                         store(state, i * lanes, slope * own[read + i])  # from here on the adjoint of the state
                         store(state, (states + i) * lanes, slope * 0)
                     for k in range(n_window - 1, -1, -1):
@@ -234,15 +234,10 @@ def _sum_block(seen, kept, sums, at, first, count, strides, weights):  # type: i
                 three = three + bar * load(seen, x + 2 * lanes)
             if left > 3:
                 four = four + bar * load(seen, x + 3 * lanes)
-        _add(sums, weights + block * lanes, one)
+        add(sums, weights + block * lanes, one)
         if left > 1:
-            _add(sums, weights + (block + 1) * lanes, two)
+            add(sums, weights + (block + 1) * lanes, two)
         if left > 2:
-            _add(sums, weights + (block + 2) * lanes, three)
+            add(sums, weights + (block + 2) * lanes, three)
         if left > 3:
-            _add(sums, weights + (block + 3) * lanes, four)
-
-
-@part()
-def _add(sums, at, value):  # type: ignore[no-untyped-def]
-    store(sums, at, load(sums, at) + value)
+            add(sums, weights + (block + 3) * lanes, four)

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from vehest.estimators.kernels.compiling import part
 from vehest.estimators.kernels.threads import over_members
+from vehest.lanes import load, store
 
 Floats = NDArray[Any]
 
@@ -149,3 +150,9 @@ def step_of_adam(flat, gradient, adam, m, batches):  # type: ignore[no-untyped-d
         flat[j] = min(max(moved, bounds[0, j]), bounds[1, j])
         if averaging:
             average[m, j] += (flat[j] - average[m, j]) * number((1 - averaging) / (1 - averaging**t))
+
+
+@part()
+def add(sums, at, value):  # type: ignore[no-untyped-def]
+    """Add to what stands in lanes from a place on."""
+    store(sums, at, load(sums, at) + value)

@@ -74,13 +74,6 @@ def gaussian_likelihood(outputs: NDArray[Any], targets: NDArray[Any], gradient: 
     return float(_gaussian_likelihood(outputs, targets, gradient))
 
 
-def kept(seed: int, layer: int, shape: tuple[int, int], dropout: float) -> NDArray[np.bool_]:
-    """Which values of a hidden layer (0 or 1) a member's mask leaves, (B, H)."""
-    ones = np.ones(shape, np.float32)
-    _activate(ones, np.zeros(shape[1], np.float32), seed, layer, round(LEVELS * dropout))
-    return ones > 0
-
-
 class _Outputs(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, inputs: Tensor, seeds: NDArray[np.int64], hidden: int, *parameters: Tensor) -> Tensor:

@@ -15,7 +15,7 @@ from vehest.constants import FloatArray
 from vehest.data.errors import ConfigurationError, DataError
 from vehest.data.recording import Recording
 from vehest.declared import setting
-from vehest.estimators.base import FitData, FitRecord
+from vehest.estimators.base import FitData, FitRecord, require_learnable
 from vehest.estimators.kernels.sample_network import Criterion, losses_of, outputs_of, squared_error
 from vehest.estimators.network import Network
 from vehest.training.context import FitContext
@@ -195,16 +195,9 @@ def learnt_samples(
     Raises:
         DataError: a channel is missing or has gaps, or all samples are too slow.
     """
-    for recording in recordings:
-        for name in (*channels, "vy_ref"):
-            if name not in recording:
-                hint = "; set estimator.inputs=imu for cars without measured tyre forces" if name.startswith("f") else ""
-                raise DataError(f"recording '{recording.id}' has no channel '{name}', which estimator '{estimator}' learns from{hint}")
-            if np.isnan(recording[name]).any():
-                raise DataError(
-                    f"recording '{recording.id}': channel '{name}' has gaps, which estimator '{estimator}' cannot learn from; "
-                    f"cut them out in conf/split"
-                )
+    hint = "; set estimator.inputs=imu for cars without measured tyre forces"
+    hints = {name: hint for name in channels if name.startswith("f")}
+    require_learnable(recordings, (*channels, "vy_ref"), estimator, hints=hints)
     fast = np.concatenate([recording["vx"] >= minimum_speed for recording in recordings])
     if not fast.any():
         raise DataError(f"no sample that estimator '{estimator}' learns from is faster than {minimum_speed:g} m/s")

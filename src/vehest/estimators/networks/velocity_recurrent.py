@@ -18,7 +18,7 @@ from vehest.data.channels import channel
 from vehest.data.errors import ConfigurationError, DataError
 from vehest.data.recording import Recording
 from vehest.declared import Group, setting
-from vehest.estimators.base import FitData, FitRecord, Trial
+from vehest.estimators.base import FitData, FitRecord, Trial, require_learnable
 from vehest.estimators.networks.recurrent import HiddenStateEstimator
 from vehest.estimators.networks.standardised import StandardisedNetwork
 from vehest.training.context import FitContext, record_of_epochs
@@ -246,13 +246,7 @@ class _Drives:
     """Recordings one after another as tensors, (N, …), from which sequences are cut by their first samples."""
 
     def __init__(self, estimator: RecurrentVelocityEstimator, recordings: Sequence[Recording], dtype: torch.dtype) -> None:
-        for recording in recordings:
-            for name in (*estimator.channels, *estimator.learns_from):
-                if np.isnan(recording[name]).any():
-                    raise DataError(
-                        f"recording '{recording.id}': channel '{name}' has gaps, which estimator '{estimator.name}' cannot learn from; "
-                        f"cut them out in conf/split"
-                    )
+        require_learnable(recordings, (*estimator.channels, *estimator.learns_from), estimator.name)
         self.names, self.lengths = [recording.id for recording in recordings], [len(recording) for recording in recordings]
         parts = (
             [estimator._measured_velocities(recording.channels) for recording in recordings],

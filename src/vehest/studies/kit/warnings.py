@@ -14,7 +14,7 @@ from vehest.data.store import read_recording
 from vehest.report.document import as_code, as_text
 from vehest.report.style import listed
 from vehest.studies.artefacts import PartArtefacts
-from vehest.studies.kit.runs import by_name, of_model, runs_of
+from vehest.studies.kit.runs import Runs, by_name, of_model, runs_of
 
 LITTLE_SIDESLIP = 0.5  # deg, root mean square of the reference, below which a test hardly tells estimators apart
 CLOSE = 2.0  # lowest error over the noise of the reference, below which the reference may decide
@@ -33,17 +33,16 @@ def cannot_rank(artefacts: PartArtefacts, test_set: str) -> list[str]:
     level, found = _level(artefacts, artefacts.split.tests[test_set]), []
     if level < LITTLE_SIDESLIP:
         found.append(f"they hardly excite sideslip ({level:.2g}° rms)")
-    bound = min(
-        (
-            metrics["floor_cramer_rao"]
-            for (*_, name), metrics in runs_of(artefacts).items()
-            if name == test_set and "floor_cramer_rao" in metrics
-        ),
-        default=math.nan,
-    )
+    bound = _lowest(runs_of(artefacts), test_set, "floor_cramer_rao")
     if bound > SILENT * level:
         found.append(f"what was measured tells sideslip to no better than {bound:.2g}° (Cramér-Rao), where v = 0 errs by {level:.2g}°")
     return found
+
+
+def _lowest(runs: Runs, test_set: str, metric: str) -> float:
+    """Lowest value of a metric on a test set; NaN where no run has it."""
+    own = [metrics for (*_, name), metrics in runs.items() if name == test_set]
+    return min((metrics[metric] for metrics in own if metric in metrics), default=math.nan)
 
 
 def _level(artefacts: PartArtefacts, spans: Sequence[Span]) -> float:
@@ -69,11 +68,7 @@ def _floors(artefacts: PartArtefacts) -> list[str]:
     """Tests whose reference is about as noisy as the lowest error is large, or whose inputs say little of v."""
     runs, found = runs_of(artefacts), list[str]()
     for test_set, spans in artefacts.split.tests.items():
-        own = [metrics for (*_, name), metrics in runs.items() if name == test_set]
-        error, noise, bound = (
-            min((metrics[name] for metrics in own if name in metrics), default=math.nan)
-            for name in ("rmse_sideslip", "floor_reference", "floor_cramer_rao")
-        )
+        error, noise, bound = (_lowest(runs, test_set, name) for name in ("rmse_sideslip", "floor_reference", "floor_cramer_rao"))
         if error < CLOSE * noise:
             found.append(
                 f"Test set `{test_set}`: the lowest error, {error:.2g}°, is close to the noise of the reference, at least {noise:.2g}°; "
