@@ -54,13 +54,6 @@ BASES = (
     ("data", "check", "lap.csv"),
 )
 OUTS = ("out.csv", "out.parquet", "out", "out.csv/x", "/dev/full", "/dev/null", "", "lap.csv", "raw", "OUT.CSV", "outputs/x.csv")
-TYPED = (("train", "estimator=k"), ("ingest", ""), ("estimate", ""), ("run", ""), ("sweep", "estimator.n_l"), ("eval", "--model", ""))
-SWEEPS = (
-    "seed=range(100000000)", "seed=range(1000) estimator.n_local=range(1000)", "seed=" + ",".join(map(str, range(20_000))),
-    "seed=0,1 estimator.n_local=range(2,4) estimator.bias=true,false", "seed=range(0,1,1e-9)", "seed=range(1000000) seed=range(1000000)",
-    "seed=choice(1,2) limits.jobs=1", "limits.jobs=1,2", "estimator=ksnn,gru,nothing", "estimator=glob(*)", "split=mine,mine", "seed=0,0,0",
-    "output=a,b", "seed=", "seed=range()", "+a=1,2", "seed=nan,inf", "seed=range(-5,5)", "seed=1e400,2",
-)  # fmt: skip
 
 
 @generator("drives", "steered", weight=10)
@@ -80,14 +73,6 @@ def settings(case):
     base = case.rng.choice([("train", *KSNN), ("train", *LUENBERGER), ("train", *KALMAN), ("eval", *KSNN)])
     keys = [key for key in KEYS if key.startswith(("evaluation", "downsample") if base[0] == "eval" else starts)]
     return Command((*base, *(() if case.honest else (f"{case.rng.choice(keys)}={case.rng.choice(VALUES[:30])}",))))
-
-
-@generator("drives", weight=3)
-def sweep(case):
-    case.copy("drives")
-    words = ("seed=0,1",) if case.honest else SWEEPS[case.visit % len(SWEEPS)].split()
-    name = () if case.honest or case.rng.random() < 0.5 else ("--name", case.rng.choice(WRITABLE_NAMES))
-    return Command(("sweep", *KSNN, *words, *name, "--dry-run"))
 
 
 def _commands():
@@ -166,22 +151,3 @@ def _argument(argument, words, rng):
     if rng.random() < 0.75 and argument.name in sound:
         return [sound[argument.name]]
     return [rng.choice([*WRITABLE_NAMES, "mine", "sim_small", "tabular", "lap.parquet", "raw", "conf", "quickstart", "one"])]
-
-
-@generator("study", weight=2)
-def completion(case):
-    """What a shell asks for while somebody types."""
-    case.copy("study")
-    words = ["vehest", *case.rng.choice(TYPED)]
-    if not case.honest:
-        words.append(case.rng.choice([*VALUES, _override(case.rng)]))
-        if case.visit % 4 == 0:
-            case.write(f"conf/dataset/{case.rng.choice(['odd', 'a b'])}.yaml", b"\xff\xfe: [")
-    line = " ".join(words)
-    environment = {
-        "_VEHEST_COMPLETE": f"complete_{case.rng.choice(['bash', 'zsh', 'fish'])}",
-        "COMP_WORDS": line,
-        "_TYPER_COMPLETE_ARGS": line,
-    }
-    environment |= {"COMP_CWORD": str(len(words) - 1), "_TYPER_COMPLETE_FISH_ACTION": "get-args"}
-    return Command((), environment=environment | {"_TYPER_COMPLETE_WORD_TO_COMPLETE": words[-1]})

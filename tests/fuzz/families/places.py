@@ -4,7 +4,6 @@ import os
 import socket
 
 from fuzz.case import Command, generator
-from fuzz.honest import KSNN
 
 NAMES = (
     b"\xff\xfe.csv", b"lap\xe4.csv", b"a\nb.csv", b"\x1b[2J.csv", b" .csv", b"a b.csv", b"-x.csv", b"--out.csv", b"a=b.csv", b"~a.csv",
@@ -20,11 +19,6 @@ TARGETS = (
     "a\nb.csv", "deep/er/out.csv", "/proc/x.csv", "-.csv",
 )  # fmt: skip
 ROOTS = ("/dev/null", "/dev/full/x", "outputs/" + "x" * 300, "''", "null", "[1]", "outputs/\x01", "3", "/proc/x", "/dev/stdin")
-VARIABLES = ("VEHEST_DATA", "VEHEST_OUTPUT", "MLFLOW_TRACKING_URI", "HOME", "COLUMNS", "TMPDIR", "VEHEST_DEBUG_X", "LANG", "TERM")
-VALUES = (
-    "", "/dev/null", "nothing", "raw/one.csv", "\udcff\udcfe", "${root}", "a\nb", "x" * 5000, "-1", "null", "[1]", "{", "http://[",
-    "file:///evil", "sqlite:////dev/full",
-)  # fmt: skip
 
 
 def _bind(path):
@@ -90,20 +84,6 @@ def targets(case):
     out = "out.csv" if case.honest else case.rng.choice(TARGETS)
     named = ("out.csv", "deep", "a\nb.csv", "-.csv", "pipe.csv", *links)
     return Command(("estimate", *case.rng.choice([(), ("ksnn",)]), "lap.csv", "--out", out), targets=named)
-
-
-@generator("study", weight=2)
-def environment(case):
-    """Variables that vehest reads, with values that make no sense."""
-    case.copy("study")
-    variable, value = case.rng.choice(VARIABLES), case.rng.choice(VALUES)
-    command = case.rng.choice([("ingest", "mine"), ("data", "show", "mine"), ("train", *KSNN, "--dry-run"), ("data", "channels")])
-    if variable == "MLFLOW_TRACKING_URI":
-        command = ("config", "train")
-    if case.honest:
-        return Command(command)
-    written = "file:" if value.startswith("file:") else value.strip("/") or "."
-    return Command(command, environment={variable: value}, targets=(written,) if variable == "VEHEST_OUTPUT" else ())
 
 
 @generator("drives")
