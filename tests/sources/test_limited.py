@@ -21,7 +21,7 @@ def file(tmp_path, monkeypatch):
 
 
 def test_arrays_and_summary_come_back_and_limits_go_along(file):
-    with use_limits(Limits(samples=77)):
+    with use_limits(Limits(samples=77, memory=1_000_000_000)):
         reading = read_limited("limited_readers:answers", file, factor=2.0)
     np.testing.assert_array_equal(reading.arrays["vx"], 2.0 * VALUES)
     np.testing.assert_array_equal(reading.arrays["n"], [0, 1, 2])
