@@ -8,6 +8,7 @@ import pytest
 from study_parts import metric_rows, part_of
 
 from conftest import planar_drive
+from place import undrawn
 from vehest.data.errors import DataError
 from vehest.data.estimate import Estimate
 from vehest.data.splits import Span, Split
@@ -145,7 +146,8 @@ def test_report_shows_v_0_beside_the_candidates_and_says_how_many_are_worse_on_t
     assert any("**1 of these 2 candidates are worse than v = 0 on that car**" in str(block) for block in document.blocks)
 
 
-def test_report_says_what_was_found_on_the_real_car_and_whether_it_is_what_was_asked_for(artefacts, tmp_path):
+def test_report_says_what_was_found_on_the_real_car_and_whether_it_is_what_was_asked_for(artefacts, tmp_path, monkeypatch):
+    undrawn(monkeypatch)
     document = documents(artefacts)["report"]
     write_document(document, tmp_path)
     text = (tmp_path / "report.md").read_text(encoding="utf-8")
