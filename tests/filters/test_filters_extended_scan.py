@@ -5,9 +5,33 @@ import numpy as np
 import pytest
 import torch
 from test_filters_kalman import example
+from test_filters_nonlinear import STEP, pendulum_with_radar
 
 from vehest.filters.extended_scan import CompiledModel, extended_scan, with_jacobian
 from vehest.filters.kalman_scan import kalman_scan
+
+
+@numba.njit
+def swing(x, u, parameters):
+    out = np.empty(3, x.dtype)
+    out[0] = x[0] + STEP * x[1]
+    out[1] = x[1] + STEP * (u[0] - parameters[0] * np.sin(x[0]) - x[2] * x[1])
+    out[2] = x[2]
+    return out
+
+
+@numba.njit
+def radar(x, u, parameters):
+    out = np.empty(2, x.dtype)
+    out[0] = 1.0 - np.cos(x[0])
+    out[1] = np.sin(x[0]) * x[1]
+    return out
+
+
+def compiled_pendulum():
+    readable, none = pendulum_with_radar(), torch.zeros(3, dtype=torch.float64)
+    noises = (readable.process_noise(none, none).numpy(), readable.observation_noise(none, none).numpy())
+    return CompiledModel(with_jacobian(swing), with_jacobian(radar), np.array([9.81]), *noises)
 
 
 @numba.njit
