@@ -71,7 +71,7 @@ TESTS = $(BIN)/python -m pytest -n $(JOBS) --dist worksteal -m "not slow and not
 TESTS_docs := tests/test_docs.py tests/test_examples.py
 TESTS_fuzz := tests/fuzz
 TESTS_wheel := tests/test_wheel.py
-TESTS_processes := tests/run/test_locks.py tests/run/test_kills.py tests/run/test_tracking.py
+TESTS_processes := tests/run/test_locks.py tests/run/test_tracking.py
 
 lint: $(INSTALLED) ## style, types, layers of imports
 	$(BIN)/ruff check .

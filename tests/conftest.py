@@ -49,6 +49,14 @@ def _composed_once():
         yield
 
 
+@pytest.fixture(scope="session", autouse=True)
+def _readers_forked():
+    """Files of others are read in a process that has imported what it reads with, which takes a new one 1 to 2 s."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("vehest.sources.limited.subprocess", processes.READING)
+        yield
+
+
 @pytest.fixture(autouse=True)
 def _processes_end_with_their_test():
     yield

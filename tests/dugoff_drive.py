@@ -1,9 +1,9 @@
 """Drives of the single track on Dugoff's tyres itself, with known tyres and sensors."""
 
 import numpy as np
-import torch
 
 from vehest.data.recording import Recording
+from vehest.estimators.kernels.dugoff_track import CompiledDugoffTrack
 from vehest.vehicle.dugoff import DugoffAxle, DugoffTrack, LoadedCar
 
 FRONT, REAR = DugoffAxle(1.2e5, 1.0, 0.005), DugoffAxle(1.7e5, 1.05, 0.004)
@@ -13,6 +13,14 @@ NOISE = {"ay": 0.06, "yaw_rate": 0.002, "fy": 70.0}
 
 def dugoff_track(tyres="plain", *, sees_sideslip=False):
     return DugoffTrack(LoadedCar(), FRONT, REAR, 0.01, tyres, 3.0, sees_sideslip)
+
+
+def driven(inputs):
+    """What the track does at 100 Hz from rest under speed, steering angle and ax, (T, 3): its two states and what is measured of them."""
+    track, states = CompiledDugoffTrack(dugoff_track()), np.zeros((len(inputs), 1, 2))
+    for k in range(len(inputs) - 1):
+        states[k + 1] = track.transition(states[k : k + 1], inputs[k : k + 1])[0]
+    return (*states[:, 0].T, *track.observation(states, inputs)[:, 0].T)
 
 
 def dugoff_drive(seconds=20.0, seed=0, noise=1.0, name="drive", *, straight=0.0):
@@ -25,12 +33,7 @@ def dugoff_drive(seconds=20.0, seed=0, noise=1.0, name="drive", *, straight=0.0)
     steer = 0.07 * np.sin(0.7 * time + phases[1]) * np.sin(0.2 * time) + 0.01 * np.sin(2.9 * time + phases[2])
     if straight:  # the wheel is turned back smoothly before
         steer *= np.cos(0.5 * np.pi * np.clip(1.0 - (seconds - straight - time) / 4.0, 0.0, 1.0)) ** 2
-    track = dugoff_track()
-    inputs = torch.as_tensor(np.stack([vx, steer, ax], 1))
-    states = torch.zeros(len(time), 2, dtype=torch.float64)
-    for k in range(len(time) - 1):
-        states[k + 1] = track.transition(states[k], inputs[k])
-    ay, yaw_rate, front, rear = track.observation(states, inputs).T.numpy()
+    vy, true_yaw_rate, ay, yaw_rate, front, rear = driven(np.stack([vx, steer, ax], 1))
 
     def shown(values, level):
         return values + noise * level * generator.standard_normal(len(time))
@@ -46,8 +49,8 @@ def dugoff_drive(seconds=20.0, seed=0, noise=1.0, name="drive", *, straight=0.0)
         "fy_rl": shown(0.4 * rear, NOISE["fy"]),
         "fy_rr": shown(0.6 * rear, NOISE["fy"]),
         "vx_ref": vx,
-        "vy_ref": states[:, 0].numpy(),
-        "yaw_rate_ref": states[:, 1].numpy(),
-        "sideslip_ref": np.arctan2(states[:, 0].numpy(), vx),
+        "vy_ref": vy,
+        "yaw_rate_ref": true_yaw_rate,
+        "sideslip_ref": np.arctan2(vy, vx),
     }
     return Recording(name, "Dugoff's single track", 100.0, 0.0, channels, "simulated")

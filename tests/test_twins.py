@@ -8,9 +8,9 @@ import pytest
 import torch
 from readable_filters import NonlinearModel, extended_filter, gated, rational_model, unscented_filter
 from test_estimators_rational import rational
-from test_filters_extended_scan import compiled_pendulum, measured_pendulum, pendulum_with_radar
+from test_filters_extended_scan import compiled_pendulum
 from test_filters_kalman import example, tensors
-from test_filters_nonlinear import linear_as_nonlinear
+from test_filters_nonlinear import linear_as_nonlinear, measured_pendulum, pendulum_with_radar
 from test_kernels import STRUCTURES, _problem
 from test_planar_car import CARS, LOWER, a_car, driven
 from test_planar_car import STEP as CAR_STEP

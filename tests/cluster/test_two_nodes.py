@@ -2,9 +2,7 @@
 
 import importlib.util
 import os
-import random
 import signal
-from collections import Counter
 from pathlib import Path
 
 import pytest
@@ -184,31 +182,3 @@ def test_the_head_lost_loses_nothing_that_was_finished(mortal, folder, alone, tm
     assert again.ended() == 0, again.said
     assert metrics(output) == metrics(alone["longer"])
     assert before.items() <= manifests(output).items()
-
-
-@pytest.mark.slow
-def test_two_hundred_trainings_survive_twenty_kills_at_random_moments(cluster, folder, tmp_path):
-    words = (*SMALL, "estimator.n_local=2,3,4,5,6", "estimator.n_hidden=0,1,2,3", "seed=range(10)", "training.patience=1000")
-    words = (*words, "training.max_epochs=30", "training.checkpoint_seconds=0.01")
-    alone = Driver(folder, tmp_path / "alone", "sweep", *words, "--jobs", "2")
-    assert alone.ended() == 0, alone.said
-    output = with_recordings(alone.output, tmp_path / "out")
-    driver = swept(cluster, folder, output, *words)
-    draw = random.Random(0)
-    killed = set()
-    deaths = Counter()
-    for moment in sorted(draw.randrange(200) for _ in range(20)):  # trainings that are finished by then
-        entry = driver.sees(lambda moment=moment: victim(output, moment, killed, deaths, draw))
-        killed.add(entry["pid"])
-        deaths[entry["name"].partition("-seed")[0]] += 1
-        os.kill(entry["pid"], signal.SIGKILL)
-    assert driver.ended() == 0, driver.said
-    assert (metrics(output), weights(output)) == (metrics(alone.output), weights(alone.output))
-
-
-def victim(output, moment, killed, deaths, draw):
-    """A worker to kill, once so many trainings are finished; one group is not killed more than it may die."""
-    if len(manifests(output)) < moment:
-        return None
-    open_ones = [entry for entry in under_way(output) if entry["pid"] not in killed and deaths[entry["name"].partition("-seed")[0]] < 2]
-    return draw.choice(open_ones) if open_ones else None

@@ -4,6 +4,7 @@ import hashlib
 import os
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
 
@@ -15,19 +16,6 @@ class InterruptedHereError(Exception):
     """Something that goes wrong half-way."""
 
 
-def write_half(path):
-    with written_aside(path) as aside:
-        aside.write_text("half of the ne")
-        raise InterruptedHereError
-
-
-def write_half_a_folder(path):
-    with written_aside(path) as aside:
-        aside.mkdir()
-        (aside / "new").write_text("half")
-        raise InterruptedHereError
-
-
 def test_nothing_stands_at_the_place_before_the_end(tmp_path):
     path = tmp_path / "deep" / "er" / "file"
     with written_aside(path) as aside:
@@ -37,14 +25,22 @@ def test_nothing_stands_at_the_place_before_the_end(tmp_path):
     assert path.read_text() == "new"
 
 
-def test_a_failure_leaves_nothing_and_keeps_an_old_file(tmp_path):
+def write_half(path, make):
+    with written_aside(path) as aside:
+        make(aside)
+        raise InterruptedHereError
+
+
+@pytest.mark.parametrize("make", [Path.touch, Path.mkdir])
+def test_a_failure_leaves_nothing_and_keeps_what_was_there(tmp_path, make):
     with pytest.raises(InterruptedHereError):
-        write_half(tmp_path / "file")
+        write_half(tmp_path / "new", make)
     assert list(tmp_path.iterdir()) == []
-    (tmp_path / "file").write_text("old")
+    make(tmp_path / "old")
+    before = (tmp_path / "old").stat().st_ino
     with pytest.raises(InterruptedHereError):
-        write_half(tmp_path / "file")
-    assert {path.name: path.read_text() for path in tmp_path.iterdir()} == {"file": "old"}
+        write_half(tmp_path / "old", make)
+    assert [(path.name, path.stat().st_ino) for path in tmp_path.iterdir()] == [("old", before)]
 
 
 def test_a_folder_is_replaced_as_a_whole_where_that_is_asked_for(tmp_path):
@@ -60,14 +56,6 @@ def test_a_folder_that_is_not_to_be_replaced_stays(tmp_path):
     (tmp_path / "folder" / "old").write_text("old")
     with pytest.raises(MissingError, match="cannot write"), written_aside(tmp_path / "folder") as aside:
         aside.write_text("new")
-    assert [path.relative_to(tmp_path).as_posix() for path in sorted(tmp_path.rglob("*"))] == ["folder", "folder/old"]
-
-
-def test_a_failure_keeps_the_old_folder(tmp_path):
-    (tmp_path / "folder").mkdir()
-    (tmp_path / "folder" / "old").write_text("old")
-    with pytest.raises(InterruptedHereError):
-        write_half_a_folder(tmp_path / "folder")
     assert [path.relative_to(tmp_path).as_posix() for path in sorted(tmp_path.rglob("*"))] == ["folder", "folder/old"]
 
 

@@ -142,17 +142,7 @@ def test_learned_filters_share_their_training_with_gates_and_unscented_ones_have
     assert estimator("learned_ukf", 5.0).batch_key == estimator("learned_ukf").batch_key
 
 
-SETTINGS = {
-    "data_sheet": {"wheelbase": 2.7},
-    "ksnn": {"window": 5},
-    "gru": {"window": 5},
-    "lstm": {"window": 5},
-    "velocity_gru": {"inputs": ["vx", "yaw_rate", "ay", "ax"], "outputs": ["vx", "vy"], "n_states": 4},
-    "velocity_lstm": {"inputs": ["vx", "yaw_rate", "ay", "ax"], "outputs": ["vx", "vy"], "n_states": 4},
-    "sideslip_ffnn": {"inputs": "imu", "hidden": [8, 4]},
-}
 FILTERS = ("kalman", "factor_graph", "rational_ekf", "dugoff_ukf", "cnn_ukf", "learned_ukf", "learned_ukf_variant")
-FITTED = ("kinematic", "static_map", "luenberger")  # in a moment
 OTHERS = [name for name in estimator_names() if name not in (*FILTERS, "ensemble_ukf")]  # whose stepper is that of cnn_ukf
 
 
@@ -160,10 +150,10 @@ known = cache(fitted)
 
 
 def ready(name):
-    """As it starts to learn, where that runs already."""
-    if name in FITTED:
+    """Filters as they start to learn, the others fitted."""
+    if name not in FILTERS:
         return known(name)
-    made = estimator(name, 5.0) if name in FILTERS else estimator_class(name).from_config(SETTINGS.get(name, {}))
+    made = estimator(name, 5.0)
     made.seed(0)
     return made
 

@@ -111,34 +111,23 @@ def test_ksnn_beyond_its_last_centre_and_at_its_centres_equals_the_plain_one():
     assert (gradients[0] - gradients[1]).abs().max() <= 1e-12 * gradients[1].abs().max()
 
 
-def test_gru_and_lstm_equal_those_of_the_library():
-    states = 5
-    network = Gru(Gru.settings_type(n_states=states)).new_network().double()
+@pytest.mark.parametrize(
+    ("kind", "library_kind", "states", "order"),
+    [(Gru, torch.nn.GRU, 5, [0, 1, 2]), (Lstm, torch.nn.LSTM, 6, [0, 1, 3, 2])],  # the library's LSTM has its output gate last
+)
+def test_gru_and_lstm_equal_those_of_the_library(kind, library_kind, states, order):
+    network = kind(kind.settings_type(n_states=states)).new_network().double()
     network.reset(torch.Generator().manual_seed(3))
+    library = library_kind(4, states, batch_first=True).double()
     with torch.no_grad():
-        network.gate_bias.copy_(torch.randn(3, states, generator=torch.Generator().manual_seed(4), dtype=torch.float64))
-    library = torch.nn.GRU(4, states, batch_first=True).double()
-    with torch.no_grad():
-        library.weight_ih_l0.copy_(network.input_weight.reshape(-1, 4))
-        library.weight_hh_l0.copy_(network.state_weight.reshape(-1, states))
-        library.bias_ih_l0.copy_(network.gate_bias.reshape(-1))
-        library.bias_hh_l0.zero_()
-    windows = torch.randn(11, 30, 4, generator=torch.Generator().manual_seed(5), dtype=torch.float64)
-    assert torch.allclose(network.last_state(windows), library(windows)[1][0], rtol=0, atol=1e-12)
-    states = 6
-    network = Lstm(Lstm.settings_type(n_states=states)).new_network().double()
-    network.reset(torch.Generator().manual_seed(3))
-    with torch.no_grad():
-        network.gate_bias.copy_(torch.randn(4, states, generator=torch.Generator().manual_seed(4), dtype=torch.float64))
-    library = torch.nn.LSTM(4, states, batch_first=True).double()
-    order = [0, 1, 3, 2]  # the library's gates are input, forget, cell, output
-    with torch.no_grad():
+        network.gate_bias.copy_(torch.randn(len(order), states, generator=torch.Generator().manual_seed(4), dtype=torch.float64))
         library.weight_ih_l0.copy_(network.input_weight[order].reshape(-1, 4))
         library.weight_hh_l0.copy_(network.state_weight[order].reshape(-1, states))
         library.bias_ih_l0.copy_(network.gate_bias[order].reshape(-1))
         library.bias_hh_l0.zero_()
     windows = torch.randn(11, 30, 4, generator=torch.Generator().manual_seed(5), dtype=torch.float64)
-    assert torch.allclose(network.last_state(windows), library(windows)[1][0][0], rtol=0, atol=1e-12)
+    last = library(windows)[1]
+    assert torch.allclose(network.last_state(windows), (last[0] if kind is Lstm else last)[0], rtol=0, atol=1e-12)
 
 
 def test_activations_in_single_precision_are_within_rounding_of_the_exact_ones():

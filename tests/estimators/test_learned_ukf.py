@@ -15,8 +15,6 @@ from vehest.estimators.learned_ukf import SHORT, LearnedUkf
 from vehest.estimators.learned_ukf_variant import LearnedUkfVariant
 from vehest.estimators.registry import estimator_class
 from vehest.filters.noise_models import with_entropy
-from vehest.run.config import compose_config
-from vehest.sources.base import open_source
 from vehest.training.context import FitContext
 from vehest.training.sequences import PhaseSettings
 from vehest.training.through_filter import ThroughFilterSettings
@@ -184,21 +182,6 @@ def assert_finite_and_possible(estimate):
 @pytest.mark.parametrize("dtype", ["float64", "float32"])
 def test_pure_noise_stays_finite_and_within_what_is_possible(dtype):
     assert_finite_and_possible(trained(dtype).estimate([noise_drive(20.0)])[0])
-
-
-@pytest.mark.slow
-def test_real_drives_with_dropouts_of_every_sensor_stay_finite(data_root):
-    """Half a second of each sensor in turn, and of all at once, in every recording of both tyres."""
-    config = compose_config("ingest", ["dataset=f1tenth", f"root={data_root}", "output=unused"])
-    recordings = {recording.id: recording for recording in open_source(config["dataset"]).recordings()}
-    learnt = [recording for name, recording in recordings.items() if name.startswith("iros")]
-    made = estimator(width=0)
-    made.fit(FitData(learnt[1:], learnt[:1]), quick(2, 100, "float32", one_step_batch=2048, steps=500, validation_steps=1000))
-    for recording in recordings.values():
-        gaps = {sensor: slice(200 + 150 * k, 250 + 150 * k) for k, sensor in enumerate(SENSORS)}
-        failing = with_gaps(recording.without_references(), gaps)
-        everything = with_gaps(failing, {sensor: slice(1300, 1350) for sensor in SENSORS})
-        assert_finite_and_possible(made.estimate([everything])[0])
 
 
 def test_weights_and_drives_that_do_not_fit_are_one_clear_error():

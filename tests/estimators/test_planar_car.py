@@ -70,16 +70,6 @@ def through_the_filter(car, compiled, dtype):
 
 
 @KINDS
-def test_compiled_points_move_and_are_observed_as_the_readable_ones(kind):
-    car = a_car(kind)
-    points, inputs = driven(7 * 11)
-    points, inputs = points.reshape(7, 11, 5).numpy(), inputs[:7].contiguous().numpy()
-    compiled, known = CompiledPlanarCar(car, STEP, LOWER, torch.float64), readable(car)
-    assert compiled.transition(points, inputs) == pytest.approx(known.transition(points, inputs), rel=1e-11, abs=1e-12)
-    assert compiled.observation(points, inputs) == pytest.approx(known.observation(points, inputs), rel=1e-11, abs=1e-12)
-
-
-@KINDS
 def test_compiled_filter_has_the_values_and_all_gradients_of_the_readable_one(kind):
     car = a_car(kind)
     (known, gradients), (mean, own) = (through_the_filter(car, compiled, torch.float64) for compiled in (False, True))

@@ -1,14 +1,9 @@
 """What has to come out on the real recording of the Ferrari 250 LM; skipped where it is not at hand."""
 
-import json
-import sys
-
 import numpy as np
-import pandas as pd
 import pytest
 
 from real_drives import FERRARI, real_drive
-from vehest.cli import main
 from vehest.data.splits import Span
 from vehest.data.transforms import Resample
 from vehest.estimators.base import FitData
@@ -69,22 +64,3 @@ def test_factor_graph_over_the_whole_ferrari_drive_is_the_published_one(ferrari)
     window = _over_the_whole_drive("factor_graph", ferrari, window=0.05)["rmse_sideslip"]
     assert batch == pytest.approx(0.57, abs=0.02)
     assert batch < window < 0.87
-
-
-@pytest.mark.slow
-def test_whole_study_on_the_ferrari_reaches_its_figures(data_root, tmp_path, monkeypatch, capsys):
-    """Seed chosen on validation; bounds are those that the study was set out with."""
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(sys, "argv", ["vehest", "run", "ferrari_drive", f"root={data_root}", "tracking=none", "--json"])
-    main_exit = None
-    try:
-        main()
-    except SystemExit as leave:
-        main_exit = leave.code
-    assert not main_exit
-    board = pd.DataFrame(json.loads(capsys.readouterr().out)["leaderboard"]).set_index(["estimator", "variant"])["rmse_sideslip"]
-    assert board["ksnn", "linear_bias_p2"] <= 0.33
-    assert board["ksnn", "nonlinear_no_bias_p2_q2"] <= 0.36
-    assert board["ksnn", "linear_no_bias_p2"] <= 0.46
-    assert board["luenberger", "luenberger"] <= 0.80
-    assert (tmp_path / "results" / "ferrari_drive" / "report.md").is_file()

@@ -12,7 +12,6 @@ from vehest.estimators.kernels.sample_network import LEVELS, _activate, gaussian
 from vehest.estimators.model_files import load_model, save_model
 from vehest.estimators.networks.sample_network import INPUTS, SampleNetwork
 from vehest.estimators.registry import estimator_class
-from vehest.training.context import FitContext
 from vehest.training.samples import SampleSettings
 from vehest.training.sequences import PhaseSettings
 
@@ -140,19 +139,6 @@ def test_the_feed_forward_network_learns_and_runs_online_as_in_batch(inputs, tmp
     stepper = load_model(tmp_path).online()
     steps = [stepper.step({name: drive[name][k] for name in estimator.channels}) for k in range(50)]
     np.testing.assert_allclose([step["vy"] for step in steps], estimate["vy"][:50], rtol=0, atol=1e-6)
-
-
-def test_a_stopped_training_goes_on_to_the_same_weights(tmp_path):
-    whole, _ = fitted()
-    halves = [iter([False] * 20), iter(())]
-    for answers in halves:  # the first run is stopped within its third epoch
-        estimator = estimator_class("sideslip_ffnn").from_config({"hidden": [24, 12], "dropout": 0.05})
-        estimator.seed(1)
-        stopping = (lambda own=answers: next(own, True)) if answers is halves[0] else (lambda: False)
-        record = estimator.fit(DATA, QUICK, FitContext([tmp_path], stopping))
-        assert record.interrupted == (answers is halves[0])
-    for name, values in whole.weights().items():
-        assert np.array_equal(values, estimator.weights()[name]), name
 
 
 def test_what_is_missing_or_makes_no_sense_is_said():

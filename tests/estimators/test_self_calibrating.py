@@ -170,7 +170,6 @@ def test_keeps_priors_where_nothing_tells_them_and_rolls_or_stands_without_slip(
     assert np.abs(found[:, 0]).max() < np.radians(0.3) * 30.0
     samples, _ = drive(20.0)
     parked = np.column_stack([np.zeros((400, 2)), np.full(400, 0.3), np.full(400, 0.2)])
-    model = model_of()
     _, moved, state = model.trace(samples, model.first_state(samples[0], {}))
     found, states, _ = model.trace(parked, state)
     assert np.abs(found[40:, 0]).max() < 0.02

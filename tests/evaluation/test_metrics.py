@@ -69,7 +69,6 @@ def test_weighted_metrics_have_the_values_of_a_hand_calculation_where_all_parts_
     assert figures["ae99_weighted"] == pytest.approx(np.quantile(absolute, 0.99))
     assert (figures["rmse_vx"], figures["rmse_yaw_rate"]) == (pytest.approx(math.sqrt(0.5)), pytest.approx(math.sqrt(2.0)))
     assert set(figures) <= set(UNITS)
-    zero = np.zeros(2)
     with_vx = Scored(zero, zero, zero, zero, zero, zero, {"vx": (zero, zero)})
     without = Scored(zero, zero, zero, zero, zero, zero)
     assert "rmse_vx" in accuracy([with_vx])
@@ -118,7 +117,6 @@ def test_without_lateral_acceleration_all_but_the_nonlinear_range_is_scored(driv
     assert {name: value for name, value in figures.items() if name not in blank} == {
         name: value for name, value in known.items() if name not in blank
     }
-    without = drive.select([name for name in drive.channels if name != "ay"])
     part = score(_estimate(drive.time, drive["vy_ref"] + 0.1, 20.0, 0.0), without, Span("d", "drive"), Protocol())
     indicators = kpis({"slalom": [part]})
     assert indicators.mse > 0
@@ -178,7 +176,6 @@ def test_lever_arms_end_at_half_a_metre_and_need_a_turn():
     assert found["lever_arm"] == -LONGEST
     yaw_rate = recording["yaw_rate"][-round((N / RATE - 1.5) * RATE) :]
     assert found["rmse_vy"] == pytest.approx(0.8 * np.sqrt(np.mean(yaw_rate**2)), rel=1e-9)
-    recording = drive()
     part = scored(recording, recording["vy_ref"] + 0.1)
     best = best_lever_arm([part], [np.zeros(len(part.vy))], [np.ones(len(part.vy))])
     assert best.x == 0.0

@@ -35,7 +35,6 @@ def test_regimes_are_where_the_drive_was_made_to_have_them_one_of_each_kind():
     assert tuple(masks) == REGIMES
     for group in (("straight", "turning"), tuple(AY_BANDS), ("transient", "steady")):
         assert (np.sum([masks[name] for name in group], axis=0) == 1).all()
-    masks = regimes_of(stepped_drive(), Span("d", "steps"), ALL)
     time = stepped_drive().time
     assert masks["straight"][time < 10].all()
     assert masks["turning"][time > 10.5].all()
@@ -81,7 +80,6 @@ def test_short_regimes_and_missing_channels_have_no_errors():
     masks = regimes_of(drive, Span("d", "steps"), ALL)
     assert 0 < masks["ay_4_6"].sum() < 2 * RATE
     assert set(errors_by_regime([part], [masks], RATE)) == set(REGIMES) - {"ay_4_6"}
-    drive = stepped_drive()
     without_ay = regimes_of(drive.select(["vx", "yaw_rate", "vy_ref"]), Span("d", "steps"), ALL)
     assert set(without_ay) == {"straight", "turning", "transient", "steady"}
     without_yaw_rate = regimes_of(drive.select(["vx", "ay", "vy_ref"]), Span("d", "steps"), ALL)

@@ -11,7 +11,7 @@ import pytest
 import torch
 from c_build import COMPILERS, OUTPUTS, built
 
-from dugoff_drive import TYRES, dugoff_track
+from dugoff_drive import TYRES, driven
 from every_estimator import drive_for, fitted
 from example_package import forget_examples, install_examples
 from real_drives import real_drive
@@ -109,15 +109,12 @@ def of_dugoff(name, config):
 def dugoff_channels():
     """A car on Dugoff's tyres that moves off, corners hard, nearly stops and moves off again, with all tyre forces."""
     generator, time = np.random.default_rng(1), np.arange(1200) / 100.0
-    n, track = len(time), dugoff_track()
+    n = len(time)
     vx = 13.0 - 12.0 * np.cos(2.0 * np.pi * time / 10.0)
     ax = 2.4 * np.pi * np.sin(2.0 * np.pi * time / 10.0)
     steer = np.minimum(0.2, 17.0 / np.square(vx)) * np.sin(1.7 * time)  # about 6 m/s² at speed
-    inputs, states = torch.as_tensor(np.stack([vx, steer, ax], 1)), torch.zeros(n, 2, dtype=torch.float64)
-    for k in range(n - 1):
-        states[k + 1] = track.transition(states[k], inputs[k])
-    ay, yaw_rate, front, rear = track.observation(states, inputs).T.numpy()
-    channels = {"vx": vx, "steer": steer, "ax": ax, "sideslip_ref": np.arctan2(states[:, 0].numpy(), vx)}
+    vy, _, ay, yaw_rate, front, rear = driven(np.stack([vx, steer, ax], 1))
+    channels = {"vx": vx, "steer": steer, "ax": ax, "sideslip_ref": np.arctan2(vy, vx)}
     channels |= {"ay": ay + 0.06 * generator.standard_normal(n), "yaw_rate": yaw_rate + 0.002 * generator.standard_normal(n)}
     for axis, loads in (("x", (0.0, 0.0)), ("y", (0.5 * front, 0.5 * rear)), ("z", (4800.0, 4800.0))):
         for corner in ("fl", "fr", "rl", "rr"):

@@ -5,10 +5,9 @@ import numpy as np
 import pytest
 import torch
 from test_filters_kalman import example
-from test_filters_nonlinear import STEP, measured_pendulum, pendulum_with_radar
+from test_filters_nonlinear import STEP, pendulum_with_radar
 
 from vehest.filters.extended_scan import CompiledModel, extended_scan, with_jacobian
-from vehest.filters.gaussian import Gaussian
 from vehest.filters.kalman_scan import kalman_scan
 
 
@@ -35,10 +34,6 @@ def compiled_pendulum():
     return CompiledModel(with_jacobian(swing), with_jacobian(radar), np.array([9.81]), *noises)
 
 
-def as_arrays(state):
-    return Gaussian(state.mean.numpy(), state.covariance.numpy())
-
-
 @numba.njit
 def drift(x, u, parameters):
     matrix = parameters.reshape(len(x), len(x))
@@ -51,7 +46,7 @@ def direct(x, u, parameters):
     return matrix @ x, matrix
 
 
-def test_on_a_linear_model_it_is_the_kalman_filter_also_where_noise_changes_with_time():
+def test_on_a_linear_model_it_is_the_kalman_filter_also_where_noise_changes_with_time_and_what_does_not_fit_is_refused():
     model, measurements, initial = example(30, missing=0.3)
     steps, n = 30, model.transition.shape[-1]
     A, C = np.broadcast_to(model.transition, (steps, n, n))[0].copy(), np.eye(n)[:2]
@@ -61,10 +56,19 @@ def test_on_a_linear_model_it_is_the_kalman_filter_also_where_noise_changes_with
     y = measurements[:, :2]
     linear = type(model)(A, offsets, Q, C, np.zeros(2), R)
     theirs = kalman_scan(linear, y, initial)
-    ours = extended_scan(CompiledModel(drift, direct, A.ravel(), Q, R), y, offsets, initial)
+    compiled = CompiledModel(drift, direct, A.ravel(), Q, R)
+    ours = extended_scan(compiled, y, offsets, initial)
     assert np.abs(ours.filtered.mean - theirs.filtered.mean).max() < 1e-9
     assert np.abs(ours.filtered.covariance - theirs.filtered.covariance).max() < 1e-9
     assert np.abs(ours.log_likelihood - theirs.log_likelihood).max() < 1e-9
+    with pytest.raises(ValueError, match=r"measurements must be of shape \(T, m\) with T > 0"):
+        extended_scan(compiled, y[:0], offsets[:0], initial)
+    with pytest.raises(ValueError, match=r"inputs of shape \(29, 3\) do not fit"):
+        extended_scan(compiled, y, offsets[:29], initial)
+    with pytest.raises(ValueError, match=r"observation_noise of shape \(3, 3\) does not fit \(30, 2, 2\)"):
+        extended_scan(compiled._replace(observation_noise=np.eye(3)), y, offsets, initial)
+    with pytest.raises(np.linalg.LinAlgError, match="not positive definite at sample 0"):
+        extended_scan(compiled._replace(observation_noise=-1e3 * np.eye(2)), y, offsets, initial)
 
 
 @numba.njit
@@ -87,16 +91,3 @@ def test_jacobian_is_that_of_automatic_differentiation():
     value, slope = with_jacobian(several)(x, u, parameters)
     assert np.abs(value - in_torch(torch.from_numpy(x)).numpy()).max() < 1e-15
     assert np.abs(slope - torch.func.jacrev(in_torch)(torch.from_numpy(x)).numpy()).max() < 1e-14
-
-
-def test_what_does_not_fit_is_refused():
-    measurements, inputs, initial = measured_pendulum(5)
-    y, u, model, first = measurements[0].numpy(), inputs[0].numpy(), compiled_pendulum(), as_arrays(initial)
-    with pytest.raises(ValueError, match=r"measurements must be of shape \(T, m\) with T > 0"):
-        extended_scan(model, y[:0], u[:0], first)
-    with pytest.raises(ValueError, match=r"inputs of shape \(4, 1\) do not fit"):
-        extended_scan(model, y, u[:4], first)
-    with pytest.raises(ValueError, match=r"observation_noise of shape \(3, 3\) does not fit \(5, 2, 2\)"):
-        extended_scan(model._replace(observation_noise=np.eye(3)), y, u, first)
-    with pytest.raises(np.linalg.LinAlgError, match="not positive definite at sample 0"):
-        extended_scan(model._replace(observation_noise=-np.eye(2)), y, u, first)

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 import torch
-from scipy.linalg import block_diag, solve_discrete_are
+from scipy.linalg import block_diag
 from scipy.stats import multivariate_normal
 
 from vehest.filters.gaussian import Gaussian
@@ -94,25 +94,7 @@ def test_filter_and_smoother_are_the_posterior_of_all_states_at_once(missing, se
     assert np.abs(smoothed_means(model, result) - mean).max() < 1e-10
 
 
-def test_covariance_settles_at_the_solution_of_the_riccati_equation():
-    model, _, initial = example(1, seed=3)
-    constant = LinearModel(*(part[0] for part in model))
-    result = kalman_scan(constant, np.zeros((200, M)), initial)
-    A, _, Q, C, _, R = constant
-    settled = solve_discrete_are(A.T, C.T, Q, R)
-    assert np.allclose(result.predicted.covariance[-1], settled, rtol=1e-9, atol=1e-12)
-    gain = settled @ C.T @ np.linalg.inv(C @ settled @ C.T + R)
-    last = result.filtered.mean[-1] - result.predicted.mean[-1]
-    assert np.allclose(last, gain @ result.innovation[-1], rtol=1e-9, atol=1e-12)
-
-
-def test_constants_are_averaged_and_predictions_stand_where_nothing_is_measured():
-    """1/P = 1/P₀ + N/R; the mean weighs the first guess like P₀⁻¹ and each measurement like R⁻¹."""
-    one = np.ones((1, 1))
-    model = LinearModel(one, np.zeros(1), 0.0 * one, one, np.zeros(1), 0.5 * one)
-    last = kalman_scan(model, np.array([[1.0], [2.0], [np.nan], [6.0]]), Gaussian(np.full(1, 10.0), 2.0 * one)).filtered
-    assert last.covariance[-1, 0, 0] == pytest.approx(1.0 / (1 / 2.0 + 3 / 0.5))
-    assert last.mean[-1, 0] == pytest.approx((10.0 / 2.0 + 9.0 / 0.5) / (1 / 2.0 + 3 / 0.5))
+def test_predictions_stand_where_nothing_is_measured():
     model, measurements, initial = example(5, seed=6)
     measurements[2] = np.nan
     result = kalman_scan(model, measurements, initial)

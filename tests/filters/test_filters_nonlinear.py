@@ -4,13 +4,12 @@ import filterpy.kalman as filterpy
 import numpy as np
 import pytest
 import torch
-from readable_filters import NonlinearModel, extended_filter, factorised, mean_of, scaled_rule, sigma_points, unscented_filter
+from readable_filters import NonlinearModel, extended_filter, scaled_rule, sigma_points, unscented_filter
 from test_filters_kalman import arrays, example, tensors
 
 from vehest.filters.gaussian import Gaussian
 from vehest.filters.kalman_scan import kalman_scan
 from vehest.filters.sigma_points import cubature_rule, symmetric_rule
-from vehest.filters.unscented_scan import MARGIN
 
 RULES = {"symmetric": symmetric_rule(3, 0.5), "scaled": scaled_rule(3, 0.5, 2.0, 1.0), "cubature": cubature_rule(3)}
 STEP = 0.1
@@ -61,13 +60,6 @@ def measured_pendulum(steps=40, sequences=1, seed=1):
         x = model.transition(x, inputs[:, k])
     first = Gaussian(torch.tensor([0.4, 0.1, 0.2], dtype=torch.float64), torch.diag(torch.tensor([0.1, 0.2, 0.05], dtype=torch.float64)))
     return torch.stack(ys, 1), inputs, first
-
-
-def test_kappa_of_the_learned_dynamics_paper_meets_the_fourth_moments_of_a_normal_distribution():
-    rule = symmetric_rule(5, -2.0)
-    points = sigma_points(rule, torch.zeros(5, dtype=torch.float64), torch.eye(5, dtype=torch.float64))
-    assert rule.centre_mean == pytest.approx(-2.0 / 3.0)
-    assert mean_of(rule, points**4) == pytest.approx(torch.full((5,), 3.0), abs=1e-12)
 
 
 def test_rules_are_those_of_an_independent_library():
@@ -134,45 +126,6 @@ def test_unscented_filter_is_that_of_an_independent_library(rule, points):
         assert ours.filtered.mean[k].numpy() == pytest.approx(theirs.x, abs=1e-8)
         assert ours.filtered.covariance[k].numpy() == pytest.approx(theirs.P, abs=1e-8)
         assert float(ours.log_likelihood[k]) == pytest.approx(theirs.log_likelihood, abs=1e-6)
-
-
-def test_extended_filter_is_that_of_an_independent_library():
-    model = pendulum_with_radar()
-    measurements, inputs, initial = measured_pendulum()
-    ours = extended_filter(model, measurements[0], inputs[0], initial)
-    theirs = filterpy.ExtendedKalmanFilter(3, 2)
-    theirs.x, theirs.P = initial.mean.numpy().copy(), initial.covariance.numpy().copy()
-    none = torch.zeros(3, dtype=torch.float64)
-    theirs.Q, theirs.R = model.process_noise(none, none).numpy(), model.observation_noise(none, none).numpy()
-
-    def slope_of_observation(x):
-        return np.array([[np.sin(x[0]), 0.0, 0.0], [np.cos(x[0]) * x[1], np.sin(x[0]), 0.0]])
-
-    def height_and_rate(x):
-        return np.array([1.0 - np.cos(x[0]), np.sin(x[0]) * x[1]])
-
-    for k, y in enumerate(measurements[0].numpy()):
-        if k > 0:
-            angle, rate, damping = theirs.x
-            slope = np.array([[1, STEP, 0], [-STEP * 9.81 * np.cos(angle), 1 - STEP * damping, -STEP * rate], [0, 0, 1]])
-            push = float(inputs[0, k - 1, 0])
-            theirs.x = np.array([angle + STEP * rate, rate + STEP * (push - 9.81 * np.sin(angle) - damping * rate), damping])
-            theirs.P = slope @ theirs.P @ slope.T + theirs.Q
-        theirs.update(y, slope_of_observation, height_and_rate)
-        assert ours.filtered.mean[k].numpy() == pytest.approx(theirs.x, abs=1e-8)
-        assert ours.filtered.covariance[k].numpy() == pytest.approx(theirs.P, abs=1e-8)
-
-
-def test_a_covariance_that_is_not_definite_is_lifted_just_enough():
-    rotation, _ = torch.linalg.qr(torch.randn(3, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64))
-    eigenvalues = torch.tensor([[2.0, 1.0, 0.5], [2.0, 1.0, -0.3]], dtype=torch.float64)
-    covariance = rotation @ torch.diag_embed(eigenvalues) @ rotation.mT
-    repaired = factorised(covariance)
-    assert repaired.repaired.tolist() == [False, True]
-    assert torch.equal(repaired.covariance[0], covariance[0])
-    assert torch.linalg.eigvalsh(repaired.covariance[1])[0] == pytest.approx(2.0 * MARGIN, rel=1e-3)
-    assert torch.allclose(repaired.covariance[1] - covariance[1], (0.3 + 2.0 * MARGIN) * torch.eye(3, dtype=torch.float64), atol=1e-9)
-    assert torch.allclose(repaired.factor @ repaired.factor.mT, repaired.covariance, atol=1e-12)
 
 
 def sharp():

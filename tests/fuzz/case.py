@@ -7,8 +7,8 @@ import os
 import pkgutil
 import random
 import shutil
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -28,9 +28,6 @@ class Command:
 
     argv: tuple[str | bytes, ...]
     targets: tuple[str, ...] = ("out.csv",)
-    environment: Mapping[str, str] = field(default_factory=dict)
-    stdout: str | None = None  # where it goes to instead of a file
-    unprivileged: bool = False  # runs as a user without rights, so that permissions matter
 
 
 @dataclass(frozen=True)

@@ -210,21 +210,17 @@ def _prepare(case, command):
     stack = open(logs / "stack", "w")  # noqa: SIM115 - open as long as the process lives, like the streams below
     faulthandler.dump_traceback_later(case.seconds, file=stack)
     _redirect(0, "/dev/null", os.O_RDONLY)
-    _redirect(1, command.stdout or logs / "stdout", os.O_WRONLY | os.O_CREAT | os.O_TRUNC)
+    _redirect(1, logs / "stdout", os.O_WRONLY | os.O_CREAT | os.O_TRUNC)
     _redirect(2, logs / "stderr", os.O_WRONLY | os.O_CREAT | os.O_TRUNC)
     sys.stdin = open(0, encoding="utf-8", closefd=False)  # noqa: SIM115
     sys.stdout = open(1, "w", encoding="utf-8", closefd=False)  # noqa: SIM115
     sys.stderr = open(2, "w", encoding="utf-8", errors="backslashreplace", closefd=False, buffering=1)  # noqa: SIM115
     os.chdir(case.place)
-    _environment(case, command.environment)
+    _environment(case)
     tempfile.tempdir = str(case.folder / "tmp")
     sys.modules["__main__"] = types.ModuleType("__main__")  # the name of the program follows from it: vehest, not python -m fuzz
     sys.argv = ["vehest", *(os.fsdecode(word) for word in command.argv)]
     sys.path[:] = [str(Path(__file__).parent / "reader"), *(entry for entry in sys.path if entry not in ("", "."))]
-    if command.unprivileged and os.getuid() == 0:
-        os.setgroups([])
-        os.setgid(65534)
-        os.setuid(65534)
     os.write(report, (json.dumps(["rss", _status("VmRSS")]) + "\n").encode())
     size = _status("VmSize") * 1024 + ADDRESS_SPACE
     for limit, value in {"AS": size, "CPU": 90, "FSIZE": FILE_SIZE, "CORE": 0}.items():
@@ -232,16 +228,11 @@ def _prepare(case, command):
     return report
 
 
-def _environment(case, changes):
+def _environment(case):
     for name in [name for name in os.environ if name.startswith(("VEHEST_", "MLFLOW_", "_VEHEST", "COMP_"))]:
         del os.environ[name]
     os.environ |= {"FUZZ_CASE": str(case.folder), "PYTHONDONTWRITEBYTECODE": "1"}
     os.environ |= {"VEHEST_DATA": str(case.place / "raw"), "HOME": str(case.folder / "home"), "TMPDIR": str(case.folder / "tmp")}
-    for name, value in changes.items():
-        if value is None:
-            os.environ.pop(name, None)
-        else:
-            os.environ[name] = value
 
 
 def _redirect(descriptor, path, flags):

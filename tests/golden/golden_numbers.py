@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
+import contextlib
 import csv
 import hashlib
+import io
 import json
-import os
 import platform
-import subprocess
-import sys
 import tempfile
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -23,6 +22,7 @@ import yaml
 
 from conftest import planar_drive
 from every_estimator import drive_for, fitted
+from fuzz.honest import run
 from place import DATASET, Place, write_csv
 from vehest.estimators.registry import estimator_class, estimator_names
 from vehest.run import calibrate, downsample, evaluate, evaluate_faults
@@ -63,13 +63,13 @@ def subjects():
     for name, make in SOURCES.items():
         tolerance = SIMULATED if name == "simulated" else FIXED
         told = source_class({"source": name})
-        found[f"source {name}"] = Subject({f"{told.__name__}.version": told.version}, tolerance, partial(_in_folder, make))
+        found[f"source {name}"] = Subject({f"{told.__name__}.version": told.version}, tolerance, partial(in_folder, make))
     for stage, numbers in STAGES.items():
         what, tolerance = f"VERSION of {stage.__name__}", FIXED
         if stage is not downsample:
             what, tolerance = f"{what}, unless numbers of {MODEL} moved too,", LEARNT
         name = stage.__name__.removeprefix("vehest.run.")
-        found[f"stage {name}"] = Subject({what: stage.VERSION}, tolerance, partial(_in_folder, numbers))
+        found[f"stage {name}"] = Subject({what: stage.VERSION}, tolerance, partial(in_folder, numbers))
     return found
 
 
@@ -139,7 +139,7 @@ def _estimator(name):
     return Subject(versions, LEARNT if len(versions) > 1 else FIXED, numbers)
 
 
-def _in_folder(make):
+def in_folder(make):
     with tempfile.TemporaryDirectory() as folder:
         return {"numbers": make(Path(folder))}
 
@@ -202,14 +202,14 @@ def _revs(folder):
     return _channels(open_source(configuration(folder)).read("lap"))
 
 
-def _simulated(folder):
-    drive = {"id": "a", "seed": 1, "manoeuvre": {"name": "laps", "course": "handling", "duration": 3.0}}
-    vehicle = yaml.safe_load(VEHICLE.read_text(encoding="utf-8"))
+def simulated(folder, seconds=3.0, **car):
+    drive = {"id": "a", "seed": 1, "manoeuvre": {"name": "laps", "course": "handling", "duration": seconds}}
+    vehicle = yaml.safe_load(VEHICLE.read_text(encoding="utf-8")) | car
     dataset = {"name": "sim", "source": "simulated", "vehicle": vehicle, "rate_hz": 50, "drives": [drive]}
     return _channels(open_source(dataset).read("a"))
 
 
-SOURCES = {"can": _can, "mdf": _mdf, "revs": _revs, "rosbag": _rosbag, "simulated": _simulated}
+SOURCES = {"can": _can, "mdf": _mdf, "revs": _revs, "rosbag": _rosbag, "simulated": simulated}
 SOURCES |= {"tabular": _tabular, "text_log": _text_log, "vbo": _vbo}
 
 
@@ -244,10 +244,9 @@ def _study():
     made = tempfile.TemporaryDirectory()
     folder = Path(made.name)
     Place(folder, None)
-    environment = os.environ | {"VEHEST_DATA": str(folder / "raw"), "VEHEST_OUTPUT": str(folder / "outputs")}
-    for words in (("train", *TRAINED), ("eval", *TRAINED, "fault=noise")):
-        command = [sys.executable, "-c", "from vehest.cli import main; main()", *words]
-        subprocess.run(command, cwd=folder, env=environment, check=True, capture_output=True)
+    with contextlib.chdir(folder), contextlib.redirect_stdout(io.StringIO()), contextlib.redirect_stderr(io.StringIO()):
+        for words in (("train", *TRAINED), ("eval", *TRAINED, "fault=noise")):
+            run(*words)
     return made
 
 

@@ -4,15 +4,30 @@ import json
 import os
 import subprocess
 import sys
+from functools import partial
 
-import pytest
-from golden_numbers import FIXED, moved, subjects
+from golden_numbers import FIXED, Subject, in_folder, moved, simulated
 
-RECORD = "import json, sys; from golden_numbers import subjects; print(json.dumps(subjects()[sys.argv[1]].record()))"
+from every_estimator import drive_for, fitted
+
+CAR = {"driver": {"grip": 8.0, "top_speed": 60.0, "power_per_mass": 100.0}}  # which need not be found by driving
 
 
-@pytest.mark.parametrize("name", ["ksnn", "source simulated"])
-def test_plain_python_gives_the_numbers_of_compiled_code(name):
+def numbers():
+    estimator = fitted("ksnn", window=8)
+    estimate = estimator.estimate([drive_for(estimator)])[0]
+    return {"weights": dict(estimator.weights()), "estimates": dict(estimate.channels), **in_folder(partial(simulated, seconds=0.4, **CAR))}
+
+
+def record():
+    return Subject({"any": "1"}, FIXED, numbers).record()
+
+
+def test_plain_python_gives_the_numbers_of_compiled_code():
     environment = os.environ | {"NUMBA_DISABLE_JIT": "1", "PYTHONPATH": os.pathsep.join(sys.path)}
-    ran = subprocess.run([sys.executable, "-c", RECORD, name], env=environment, capture_output=True, text=True, check=True)
-    assert not moved(name, subjects()[name].record(), json.loads(ran.stdout), FIXED)
+    ran = subprocess.run([sys.executable, __file__], env=environment, capture_output=True, text=True, check=True)
+    assert not moved("compiled code", record(), json.loads(ran.stdout), FIXED)
+
+
+if __name__ == "__main__":
+    print(json.dumps(record()))

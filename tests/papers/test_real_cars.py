@@ -85,7 +85,6 @@ def test_faults_change_their_channels_alone_and_are_what_they_are_called():
     for one in planted_faults():
         changed = one(whole)
         assert {name for name in whole.channels if not np.array_equal(whole[name], changed[name])} == set(one.channels)
-    whole = noise()
     np.testing.assert_allclose(fault("late", "ay", "40 ms")(whole)["ay"][4:], whole["ay"][:-4], atol=1e-9)
     np.testing.assert_allclose(fault("held", "ay", "10 Hz")(whole)["ay"], np.repeat(whole["ay"][::10], 10))
     slow = fault("low-passed", "ax", "0.4 s")(whole)["ax"]

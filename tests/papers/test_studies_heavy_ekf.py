@@ -49,7 +49,6 @@ def test_every_fault_leaves_the_filter_finite_and_the_monitor_sees_another_sign(
     for name, apply in watching.faults(WHEELS).items():
         estimate = ratte.estimate([apply(drive).without_references()])[0]
         assert all(np.isfinite(values).all() for values in estimate.channels.values()), name
-    drive = short_drive()
     wrong = watching.faults(WHEELS)["yaw rate of the other sign"](drive)
     sound, flipped = (ratte.estimate([own.without_references()])[0] for own in (drive, wrong))
     limit = watching.MARGIN * np.max(watching.monitor(sound["nis"], sound["nis_dof"], RATE))

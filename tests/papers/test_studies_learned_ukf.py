@@ -10,6 +10,7 @@ import pytest
 import torch
 from study_parts import metric_rows, part_of, stored
 
+from place import undrawn
 from vehest.data.errors import DataError
 from vehest.data.estimate import Estimate
 from vehest.data.recording import Recording
@@ -140,7 +141,8 @@ def test_candidates_keep_the_papers_names_one_model_a_seed(part):
         runs_of(replace(part, metrics=metrics))
 
 
-def test_report_shows_every_table_and_figure_of_the_paper_and_says_what_its_data_are(part, tmp_path):
+def test_report_shows_every_table_and_figure_of_the_paper_and_says_what_its_data_are(part, tmp_path, monkeypatch):
+    undrawn(monkeypatch)
     titles = {"real": "Real tyre sets", "simulated": "Simulated tyre sets", "likelihood": "With likelihood"}
     parts = {"simulated": part, **{f"length_{steps}": of_length(part, steps) for steps in (50, 100)}, "likelihood": part}
     untrained = {"one_step": {**PHASE, "max_epochs": 0}}

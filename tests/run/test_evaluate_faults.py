@@ -11,13 +11,10 @@ import pytest
 import yaml
 
 from vehest.data.errors import ConfigurationError
-from vehest.data.splits import Span, Split
 from vehest.data.store import read_recording
-from vehest.evaluation.metrics import Protocol
-from vehest.run.artefacts import read_artefact
 from vehest.run.config import compose_config
 from vehest.run.config_files import choices, packaged
-from vehest.run.evaluate import Evaluation, code_of_evaluation
+from vehest.run.evaluate import code_of_evaluation
 from vehest.run.evaluate_faults import FaultSettings, all_of, faults_of
 from vehest.run.study import jobs_of, read_study
 from vehest.trust.faults import KINDS, is_fault
@@ -138,6 +135,7 @@ def test_an_evaluation_under_a_fault_is_skipped_another_seed_is_another_and_with
     manifest = json.loads((evaluated(trained)[0] / "manifest.json").read_text())
     assert set(manifest["config"]) == {"sets", "protocol", "kinds", "split"}
     assert manifest["code"] == code_of_evaluation("kinematic"), "and the code of faults does not count"
+    assert json.loads((first[0] / "manifest.json").read_text())["code"] == f"{manifest['code']} faults=1"
     assert set(manifest["outputs"]) == {"metrics.csv", "timings.csv", "blocks.csv", "validation/0.parquet", "test/0.parquet"}
 
 
@@ -196,12 +194,3 @@ def test_sweeps_of_a_pipeline_over_faults_fill_the_same_list(place):
     assert sum(line.startswith("done") and " train " in line for line in err.splitlines()) == 2
     for file in (place.folder / "outputs" / "evaluate").glob("*/metrics.csv"):
         assert {name for name in pd.read_csv(file)["condition"] if is_fault(name)} == {"frozen:yaw_rate:medium", "bias:yaw_rate:medium"}
-
-
-def test_a_plan_without_faults_is_that_of_the_evaluation(trained):
-    data, model = (read_artefact(next((trained.folder / "outputs").glob(name))) for name in ("downsample/mine-20hz-*", "train/kinematic-*"))
-    split = Split("mine", (), (), {"test": (Span("mine", "three", 0.0, 20.0),)})
-    how = Evaluation(split, {"mine": data}, {"mine": data}, {"mine": "simulated"}, Protocol(), Path("outputs"))
-    faulted = replace(how, faults=(FaultSettings("bias", "ay", "mild"),)).of(model, None).plan
-    assert faulted.key != how.of(model, None).plan.key
-    assert faulted.code == f"{how.of(model, None).plan.code} faults=1"

@@ -188,15 +188,15 @@ def test_the_limit_of_jobs_is_raised_by_an_override_and_holds_for_studies(place)
 
 def test_overrides_that_cannot_be_read_are_one_line_and_long_honest_ones_are_read():
     for override, words in (
-        ("training.x=" + "[" * 9_000 + "]" * 9_000, "cannot be read"),
+        ("training.x=" + "[" * 2_000 + "]" * 2_000, "cannot be read"),
         ("output='a\0b'", "output must name a folder"),
         ("~limits", "only keys inside a group"),
         ("seed=range(0,1,0)", "names several values"),
     ):
         with pytest.raises(ConfigurationError, match=words):
             compose_config("train", [override])
-    ranges = ", ".join(f"{{recording: one, start: {k}.5, stop: {k + 1}}}" for k in range(300))
-    assert len(compose_config("train", [f"split.train=[{ranges}]"])["split"]["train"]) == 300
+    ranges = ", ".join(f"{{recording: one, start: {k}.5, stop: {k + 1}}}" for k in range(100))
+    assert len(compose_config("train", [f"split.train=[{ranges}]"])["split"]["train"]) == 100
     assert compose_config("train", ["output='[((a, {b'"])["output"] == "[((a, {b"
 
 

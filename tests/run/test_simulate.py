@@ -1,5 +1,6 @@
 """`vehest simulate`: seeds, interruption, drives that go wrong, and what it refuses."""
 
+from multiprocessing import get_context
 from pathlib import Path
 
 import numpy as np
@@ -7,6 +8,7 @@ import pytest
 
 from vehest.data.store import read_recording
 from vehest.run.config_files import complete_override
+from vehest.run.launchers import local
 from vehest.simulation.plant import compiled
 from vehest.sources.simulated import SimulatedSource
 
@@ -25,7 +27,8 @@ def samples(folder):
     return {file.stem: read_recording(file)["ay"] for file in sorted(Path(folder).glob("*.parquet"))}
 
 
-def test_a_seed_gives_the_same_samples_however_many_processes_make_them(place):
+def test_a_seed_gives_the_same_samples_however_many_processes_make_them(place, monkeypatch):
+    monkeypatch.setattr(local, "get_context", lambda _: get_context("fork"))  # which need not import vehest again
     simulated(place, [{"id": "lap", "count": 3, "manoeuvre": LAP}])
     alone = samples(place.told("simulate", "sim", "seed=1")["folder"])
     together = samples(place.told("simulate", "sim", "seed=1", "--jobs", "2", "--force")["folder"])

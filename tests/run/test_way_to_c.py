@@ -9,12 +9,13 @@ import pytest
 import yaml
 
 from conftest import planar_drive
-from place import run_vehest
+from place import run_vehest, undrawn
 
 
 @pytest.fixture
 def log(tmp_path, monkeypatch):
     """Four minutes of a simulated car in a logger's dress, in an empty folder."""
+    undrawn(monkeypatch)
     monkeypatch.chdir(tmp_path)
     for name in ("VEHEST_DATA", "VEHEST_OUTPUT", "MLFLOW_TRACKING_URI"):
         monkeypatch.delenv(name, raising=False)

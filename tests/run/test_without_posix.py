@@ -7,9 +7,9 @@ from pathlib import Path
 
 import numpy as np
 import pandas as pd
-import yaml
 
 from conftest import planar_drive
+from place import write_yaml
 
 SOURCE = Path(__file__).resolve().parents[2] / "src"
 CHILD = """
@@ -18,7 +18,10 @@ for name in ("fcntl", "resource", "prctl", "pwd", "grp", "termios"):
     sys.modules[name] = None
 for name in ("fork", "forkpty", "geteuid", "getuid", "killpg", "setsid"):
     delattr(os, name)
+from matplotlib.figure import Figure
 from vehest.cli import main
+save = Figure.savefig
+Figure.savefig = lambda _, *arguments, **options: save(Figure(), *arguments, **options)  # nothing is drawn, for the sake of time
 for words in WORDS:
     sys.argv = ["vehest", *words]
     try:
@@ -30,14 +33,6 @@ print(sorted(name for name in ("fcntl", "resource") if sys.modules[name] is not 
 """
 
 
-def commands(*words):
-    """Run commands, one after another, in a child that has none of it."""
-    environment = {key: value for key, value in os.environ.items() if key not in ("VEHEST_DATA", "VEHEST_OUTPUT")}
-    code = CHILD.replace("WORDS", repr(words))
-    child = [sys.executable, "-c", code]
-    return subprocess.run(child, capture_output=True, text=True, env={**environment, "PYTHONPATH": str(SOURCE)}, check=False)
-
-
 def test_new_run_estimate_and_export_need_nothing_of_posix(tmp_path, monkeypatch):
     folder = tmp_path / "my logs"
     folder.mkdir()
@@ -46,18 +41,18 @@ def test_new_run_estimate_and_export_need_nothing_of_posix(tmp_path, monkeypatch
     columns = {"Time": drive.time, "Speed [km/h]": 3.6 * drive["vx"], "GyroZ [deg/s]": np.degrees(drive["yaw_rate"])}
     columns |= {"AccX [m/s2]": drive["ax"], "AccY [m/s2]": drive["ay"], "VelLat [m/s]": drive["vy_ref"]}
     pd.DataFrame(columns).to_csv(folder / "first lap.csv", index=False)
-    made = commands(("new", "my_car", "first lap.csv", "--yes"))
-    assert made.returncode == 0, made.stderr
-    file = folder / "pipelines" / "my_car.yaml"
-    pipeline = yaml.safe_load(file.read_text(encoding="utf-8"))
-    sweep = ["estimator=ksnn", "estimator.n_local=1", "estimator.n_hidden=0", "training.max_epochs=2"]
-    pipeline["parts"] = {"all": {**pipeline["parts"]["all"], "sweeps": [["estimator=zero,static_map"], sweep]}}  # for the sake of time
-    file.write_text(yaml.safe_dump(pipeline), encoding="utf-8")
-    ran = commands(
-        ("run", "my_car", "--jobs", "1", "tracking=none"),
+    sweeps = [["estimator=zero"], ["estimator=ksnn", "estimator.n_local=1", "estimator.n_hidden=0", "training.max_epochs=2"]]
+    parts = {"all": {"title": "All", "split": "my_car", "sweeps": sweeps}}  # fewer than the pipeline that is made
+    write_yaml(folder / "pipelines" / "short.yaml", {"study": "short", "title": "Short", "report": "own_car", "parts": parts})
+    words = (
+        ("new", "my_car", "first lap.csv", "--yes"),
+        ("run", "short", "--jobs", "1", "tracking=none"),
         ("estimate", "ksnn", "first lap.csv", "dataset=my_car", "-o", "my beta.csv"),
         ("export", "ksnn", "-o", "on the car", "--vectors", "first lap.csv", "dataset=my_car"),
     )
+    environment = {key: value for key, value in os.environ.items() if key not in ("VEHEST_DATA", "VEHEST_OUTPUT")}
+    child = [sys.executable, "-c", CHILD.replace("WORDS", repr(words))]
+    ran = subprocess.run(child, capture_output=True, text=True, env={**environment, "PYTHONPATH": str(SOURCE)}, check=False)
     assert ran.returncode == 0, ran.stderr
     assert ran.stdout.splitlines()[-1] == "[]"
     assert np.isfinite(pd.read_csv(folder / "my beta.csv")["vy"]).any()

@@ -2,9 +2,7 @@
 
 import json
 import math
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import replace
-from multiprocessing import get_context
 
 import numpy as np
 import pytest
@@ -19,7 +17,6 @@ from vehest.simulation.driving.car import car_of
 from vehest.simulation.driving.driver import Driver, draw_style, speed_profile
 from vehest.simulation.driving.manoeuvres import manoeuvre_from_config
 from vehest.simulation.errors import SimulationError
-from vehest.simulation.plant import compiled
 from vehest.simulation.plant.multi_body import MultiBodyPlant
 from vehest.simulation.plant.parameters import Vehicle
 from vehest.simulation.road.course import Compound, Corner, Layout, Straight, build_course, course_by_name
@@ -36,13 +33,6 @@ LAP_SEEDS = (0, 2)  # the fastest styles among seeds 0 to 4
 def drive(seed, duration=12.0, **options):
     manoeuvre = manoeuvre_from_config({"name": "laps", "course": "handling", "duration": duration})
     return simulate_drive(id=f"drive{seed}", vehicle=LOWERED, manoeuvre=manoeuvre, seed=seed, **options)
-
-
-def drive_counted(seed):
-    """A drive, and how many functions had to be compiled for it."""
-    recording = drive(seed)
-    misses = [function.dispatcher.stats.cache_misses for function in (compiled.advance, compiled.evaluate)]
-    return recording, sum(sum(miss.values()) for miss in misses)
 
 
 def trip(seed, course="handling", surface="dry", step=0.001, rate_hz=100.0, **options):
@@ -288,15 +278,6 @@ def test_wet_road_lowers_what_is_reached_and_patches_are_in_the_motion():
     apart = np.abs(patchy.motion.friction - np.interp(place, HANDLING.arc_length, expected))
     assert np.quantile(apart, 0.9) < 1e-9  # but at the edges of a patch
     assert np.ptp(patchy.motion.friction) > 0.3
-
-
-def test_same_seed_gives_the_same_samples_here_and_in_two_processes_at_once(recording):
-    with ProcessPoolExecutor(max_workers=2, mp_context=get_context("spawn")) as pool:
-        others = list(pool.map(drive_counted, [1, 1]))
-    for other in (drive(seed=1), *(other for other, _ in others)):
-        for name in recording.channels:
-            np.testing.assert_array_equal(recording[name], other[name])
-    assert [compilations for _, compilations in others] == [0, 0]  # machine code is kept on disk
 
 
 def test_recording_says_where_it_comes_from(recording):

@@ -215,19 +215,6 @@ def test_left_turn_and_braking_have_the_signs_of_iso_8855():
     np.testing.assert_allclose(np.gradient(motion.pitch, 0.01)[5:-1], motion.pitch_rate[5:-1], atol=2e-3)
 
 
-def test_right_is_the_mirror_image_of_left():
-    plant = MultiBodyPlant(FERRARI)
-    start = plant.initial_state(0.0, 0.0, 0.0, 30.0)
-    left, _ = drive(plant, start, lambda time, state: inputs_of(0.05 if time < 1.0 else -0.05, -2.0), 2.0)
-    right, _ = drive(plant, start, lambda time, state: inputs_of(-0.05 if time < 1.0 else 0.05, -2.0), 2.0)
-    for name in ("vx", "ax", "pitch"):
-        np.testing.assert_allclose(getattr(right, name), getattr(left, name), atol=1e-9)
-    for name in ("vy", "ay", "yaw_rate", "roll", "steer", "yaw"):
-        np.testing.assert_allclose(getattr(right, name), -getattr(left, name), atol=1e-9)
-    np.testing.assert_allclose(right.tyre_fz[:, [1, 0, 3, 2]], left.tyre_fz, rtol=1e-9)
-    np.testing.assert_allclose(right.tyre_fy[:, [1, 0, 3, 2]], -left.tyre_fy, atol=1e-6)
-
-
 def test_accelerations_are_consistent_with_velocities_in_every_regime(spin):
     plant = MultiBodyPlant(FERRARI)
     motion, states = drive(plant, plant.initial_state(0.0, 0.0, 0.0, 14.0), lane_change, 5.5, rate_hz=1000.0)

@@ -108,7 +108,6 @@ def test_ideal_and_switched_off_sensors_show_the_motion_itself_without_angles_of
     assert set(shown) <= set(CHANNELS)
     assert {"roll", "pitch", "handwheel"}.isdisjoint(shown)
     assert len(shown) == 2 + 5 + 4 + 12 + 2 + 4
-    motion = weaving()
     nothing = switched_off(PRESETS["race"], "tilt", "imu", "reference", *SENSORS)
     assert different(measure(motion, nothing, 0), measure(motion, ideal_sensors(), 1)) == set()
 
@@ -223,7 +222,6 @@ def test_specific_force_and_gyros_are_those_of_turned_axes():
         level = road @ np.array([motion.ax[k], motion.ay[k], 0.0]) - np.array([0.0, 0.0, -G])
         np.testing.assert_allclose(force[:, k], (road @ body).T @ level, atol=1e-12)
     # A turntable: the body's axes in the road's are R(t) = Rz(ψ)Ry(θ)Rx(φ), its angular velocity the skew matrix RᵀdR/dt.
-    motion = weaving()
     shown = body_rates(motion)
     t, h = 3.21, 1e-5
     k = 321
@@ -232,7 +230,6 @@ def test_specific_force_and_gyros_are_those_of_turned_axes():
     skew = at(t).T @ (at(t + h) - at(t - h)) / (2.0 * h)
     np.testing.assert_allclose(shown[:, k], [skew[2, 1], skew[0, 2], skew[1, 0]], atol=1e-8)
     assert measure(motion_of(1, roll=0.05, yaw_rate=0.6), only(tilt=Tilt()), 0)["pitch_rate"][0] == pytest.approx(0.6 * math.sin(0.05))
-    motion = weaving()
     straight = measure(motion, only(tilt=Tilt()), seed=0)
     turned = measure(motion, only(tilt=Tilt(), imu=Mounting(roll=0.1, pitch=-0.05, yaw=0.2)), seed=0)
     axes = _turn_z(0.2) @ _rotation(0.1, -0.05)

@@ -112,19 +112,6 @@ def test_lateral_load_transfer_balances_the_moments_of_inertia_and_lean(name):
 
 
 @each_vehicle
-def test_longitudinal_load_transfer_is_mass_times_acceleration_times_height_over_wheelbase(name):
-    plant = plant_of(name)
-    p, state, inputs = plant.parameters, plant.initial_state(0.0, 0.0, 0.0, 30.0), np.array([0.0, -3.0, 0.0, 0.0, 0.0])
-    states = [state, plant.advance(state, inputs, 2500)]  # the body's nod is over
-    motion = plant.motion(states, np.array([inputs, inputs]), 100.0)
-    front = motion.tyre_fz[:, :2].sum(axis=1)
-    # The equations let all longitudinal forces pitch the body, as if all of the mass were at its height (plant.py).
-    height = p.h_s - motion.tyre_fz.mean() / p.K_zt
-    assert front[1] - front[0] == pytest.approx(-p.m * motion.ax[1] * height / plant.wheelbase, rel=0.02)
-    assert motion.tyre_fz.sum(axis=1) == pytest.approx(p.m * GRAVITY, rel=1e-3)
-
-
-@each_vehicle
 def test_car_at_rest_has_its_weight_on_its_axles_and_settles_there(name):
     plant = plant_of(name)
     p, rest = plant.parameters, plant.initial_state(0.0, 0.0, 0.0, 0.0)
@@ -140,30 +127,6 @@ def test_car_at_rest_has_its_weight_on_its_axles_and_settles_there(name):
         height = (p.m_s * p.h_s + (p.m_uf + p.m_ur) * p.R_w) / p.m
         assert height == pytest.approx(p.h_cg, abs=2e-3)
     np.testing.assert_allclose(loads.sum(), p.m * GRAVITY, rtol=1e-4)
-
-
-@each_vehicle
-def test_body_bounces_at_a_plausible_frequency_and_damping(name):
-    plant = plant_of(name)
-    low, high = (2.0, 4.0) if name in ("corvette_grand_sport", "ferrari_250_lm", "jaguar_e_type") else (1.0, 2.0)
-    bounce = [mode for mode in suspension_modes(plant) if abs(mode) < 2.0 * math.pi * 5.0 and mode.imag > 0.0][:2]
-    assert len(bounce) == 2  # heave and pitch
-    for mode in bounce:
-        assert low < abs(mode) / (2.0 * math.pi) < high
-        assert 0.2 < -mode.real / abs(mode) < 0.6
-
-
-def suspension_modes(plant):
-    """Eigenvalues of heave, pitch and the axles' heave at rest, by central differences, slowest first."""
-    places = [8, 9, 11, 12, 16, 17, 21, 22]
-    rest, columns = plant.initial_state(0.0, 0.0, 0.0, 0.0).values, []
-    for place in places:
-        shifted = [rest.copy(), rest.copy()]
-        for values, shift in zip(shifted, (1e-6, -1e-6), strict=True):
-            values[place] += shift
-        derivatives, _ = plant.evaluate([PlantState(values, Regime.SLOW) for values in shifted], np.zeros((2, 5)))
-        columns.append((derivatives[0] - derivatives[1])[places] / 2e-6)
-    return sorted(np.linalg.eigvals(np.array(columns).T), key=abs)
 
 
 def test_ferrari_and_truck_have_the_axles_and_eigenvalues_that_were_published():

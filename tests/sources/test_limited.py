@@ -21,7 +21,7 @@ def file(tmp_path, monkeypatch):
 
 
 def test_arrays_and_summary_come_back_and_limits_go_along(file):
-    with use_limits(Limits(samples=77)):
+    with use_limits(Limits(samples=77, memory=1_000_000_000)):
         reading = read_limited("limited_readers:answers", file, factor=2.0)
     np.testing.assert_array_equal(reading.arrays["vx"], 2.0 * VALUES)
     np.testing.assert_array_equal(reading.arrays["n"], [0, 1, 2])
@@ -32,7 +32,7 @@ def test_arrays_and_summary_come_back_and_limits_go_along(file):
 @pytest.mark.parametrize(
     ("function", "kind", "said"),
     [
-        ("hangs", DataError, "takes more than 2 s to read, too long for its size"),
+        ("hangs", DataError, "takes more than 1 s to read, too long for its size"),
         ("takes_memory", DataError, "MB of memory; if that is meant, raise it: limits.memory=NUMBER"),
         ("crashes", DataError, "is damaged: reading it ends with status -6"),
         ("writes", DataError, "is damaged"),
@@ -41,7 +41,7 @@ def test_arrays_and_summary_come_back_and_limits_go_along(file):
     ],
 )
 def test_however_reading_ends_it_is_one_line_and_nothing_is_written(file, monkeypatch, function, kind, said):
-    monkeypatch.setattr("vehest.sources.limited.SECONDS", 2.0)
+    monkeypatch.setattr("vehest.sources.limited.SECONDS", 1.0)
     with use_limits(Limits(memory=1_000_000_000)), pytest.raises(VehestError) as error:
         read_limited(f"limited_readers:{function}", file)
     assert type(error.value) is kind

@@ -37,8 +37,8 @@ def test_more_than_the_limits_is_refused(tmp_path):
     savemat(tmp_path / "b.mat", {"insData": {"vxCG": {"value": stamps, "time": stamps}}}, do_compression=True)
     with use_limits(Limits(samples=49)):
         assert "raise it: limits.samples=NUMBER" in refused(tmp_path / "b.mat")
-    body = struct.pack("<IIII", 6, 8, 6, 0) + struct.pack("<IIii", 5, 8, 1, 125_000_000) + struct.pack("<HHcxxx", 1, 1, b"x")
-    body += struct.pack("<II", 9, 10**9) + bytes(10**9)
+    body = struct.pack("<IIII", 6, 8, 6, 0) + struct.pack("<IIii", 5, 8, 1, 50_000_000) + struct.pack("<HHcxxx", 1, 1, b"x")
+    body += struct.pack("<II", 9, 4 * 10**8) + bytes(4 * 10**8)
     packed = zlib.compress(struct.pack("<II", 14, len(body)) + body, 1)
     head = b"MATLAB 5.0 MAT-file".ljust(124) + struct.pack("<H", 0x0100) + b"IM"
     (tmp_path / "a.mat").write_bytes(head + struct.pack("<II", 15, len(packed)) + packed)

@@ -166,7 +166,6 @@ def test_bands_widen_with_the_excess_over_training_and_where_nothing_was_measure
     inside, outside = flat.half_widths(rows, np.zeros(2), np.full(2, np.nan))[:, 0]
     assert outside / inside == pytest.approx(1.7)
     assert flat.half_widths(rows, np.zeros(2), np.full(2, np.nan), elsewhere=True)[0, 0] == pytest.approx(OTHER_VEHICLE * inside)
-    bands = bands_of()
     rows = np.tile([0.0, 25.0, bands.largest["ay"], 0.0, 0.0], (2, 1))
     rows[1, 2] = np.nan
     half = bands.half_widths(rows, np.zeros(2), np.full(2, np.nan))

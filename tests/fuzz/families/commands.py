@@ -1,12 +1,8 @@
-"""Words after commands: overrides in Hydra's grammar and out of it, options of every command in any combination, completion."""
-
-import click
-import typer
+"""Words after commands: overrides in Hydra's grammar and out of it."""
 
 from fuzz.case import CANARY, Command, generator
 from fuzz.honest import KALMAN, KSNN, LUENBERGER
-from fuzz.mutations import CALL, WRITABLE_NAMES
-from vehest.cli import app
+from fuzz.mutations import CALL
 
 KEYS = (
     "seed", "output", "root", "estimator", "estimator.name", "estimator.rate_hz", "estimator.window", "estimator.n_local",
@@ -53,14 +49,6 @@ BASES = (
     ("data", "show", "mine"),
     ("data", "check", "lap.csv"),
 )
-OUTS = ("out.csv", "out.parquet", "out", "out.csv/x", "/dev/full", "/dev/null", "", "lap.csv", "raw", "OUT.CSV", "outputs/x.csv")
-TYPED = (("train", "estimator=k"), ("ingest", ""), ("estimate", ""), ("run", ""), ("sweep", "estimator.n_l"), ("eval", "--model", ""))
-SWEEPS = (
-    "seed=range(100000000)", "seed=range(1000) estimator.n_local=range(1000)", "seed=" + ",".join(map(str, range(20_000))),
-    "seed=0,1 estimator.n_local=range(2,4) estimator.bias=true,false", "seed=range(0,1,1e-9)", "seed=range(1000000) seed=range(1000000)",
-    "seed=choice(1,2) limits.jobs=1", "limits.jobs=1,2", "estimator=ksnn,gru,nothing", "estimator=glob(*)", "split=mine,mine", "seed=0,0,0",
-    "output=a,b", "seed=", "seed=range()", "+a=1,2", "seed=nan,inf", "seed=range(-5,5)", "seed=1e400,2",
-)  # fmt: skip
 
 
 @generator("drives", "steered", weight=10)
@@ -69,119 +57,3 @@ def overrides(case):
     case.copy("steered")
     more = () if case.honest else (_override(case.rng) for _ in range(case.rng.choice([1, 1, 1, 2, 3])))
     return Command((*case.rng.choice(BASES), *more))
-
-
-@generator("study", "steered", weight=5)
-def settings(case):
-    """A value far outside of what makes sense reaches a training or an evaluation that really runs, as small as it can be."""
-    case.copy("study")
-    case.copy("steered")
-    starts = ("estimator.", "seed", "split.", "downsample", "training.b", "training.l", "training.p", "training.d", "limits")
-    base = case.rng.choice([("train", *KSNN), ("train", *LUENBERGER), ("train", *KALMAN), ("eval", *KSNN)])
-    keys = [key for key in KEYS if key.startswith(("evaluation", "downsample") if base[0] == "eval" else starts)]
-    return Command((*base, *(() if case.honest else (f"{case.rng.choice(keys)}={case.rng.choice(VALUES[:30])}",))))
-
-
-@generator("drives", weight=3)
-def sweep(case):
-    case.copy("drives")
-    words = ("seed=0,1",) if case.honest else SWEEPS[case.visit % len(SWEEPS)].split()
-    name = () if case.honest or case.rng.random() < 0.5 else ("--name", case.rng.choice(WRITABLE_NAMES))
-    return Command(("sweep", *KSNN, *words, *name, "--dry-run"))
-
-
-def _commands():
-    """Every command of the application by its words."""
-    root = typer.main.get_command(app)
-    found = {}
-    pending = [((), root)]
-    while pending:
-        words, command = pending.pop()
-        if hasattr(command, "commands"):
-            pending += [((*words, name), inner) for name, inner in command.commands.items()]
-        else:
-            found[words] = command
-    return dict(sorted(found.items()))
-
-
-HONEST = {
-    ("ingest",): ("mine", "--quiet"),
-    ("simulate",): ("sim_small", "--dry-run"),
-    ("downsample",): ("mine", "rate_hz=20", "--json"),
-    ("train",): (*KSNN, "--dry-run"),
-    ("eval",): (*KSNN, "--json"),
-    ("estimate",): ("lap.csv", "-o", "out.csv"),
-    ("run",): ("small", "tracking=none", "--dry-run"),
-    ("report",): ("small", "tracking=none"),
-    ("sweep",): (*KSNN, "--dry-run"),
-    ("config",): ("train", "--json"),
-    ("doctor",): ("--json",),
-    ("data", "list"): (),
-    ("data", "channels"): ("--json",),
-    ("data", "show"): ("mine", "--json"),
-    ("data", "check"): ("lap.csv", "--json"),
-    ("data", "align"): ("lap.csv", "-e", "offsets,delay"),
-}
-
-
-@generator("study", weight=8)
-def options(case):
-    """Options of a command, in any combination and with any value; arguments that are missing, wrong or too many."""
-    case.copy("study")
-    words, command = case.rng.choice([one for one in _commands().items() if one[0] != ("data", "list") or case.rng.random() < 0.1])
-    if case.honest:
-        return Command((*words, *HONEST.get(words, ("--help",))))
-    chosen = []
-    for parameter in command.params:
-        if isinstance(parameter, click.Option):
-            if case.rng.random() < 0.35:
-                chosen += _option(parameter, case.rng)
-        elif case.rng.random() < 0.85:
-            chosen += _argument(parameter, words, case.rng)
-    if case.rng.random() < 0.25:
-        case.rng.shuffle(chosen)
-    if case.rng.random() < 0.15:
-        chosen.append(case.rng.choice(["--nothing", "-z", "--", "-", "--json=1", "--jobs", "-h", "--help", "--version", "-j-1"]))
-    safe = [word for word in chosen if word not in ("--install-completion", "--show-completion", "--download")]
-    dry = ["--dry-run"] if words[0] in ("train", "sweep", "run", "simulate") and "--dry-run" not in safe else []
-    return Command((*words, *safe[:1], *dry, *safe[1:]), targets=("out.csv", "out.parquet", "out"))
-
-
-def _option(option, rng):
-    name = rng.choice([*option.opts, *option.secondary_opts])
-    if option.is_flag:
-        return [name]
-    if "out" in (option.name or ""):
-        return [name, rng.choice(OUTS)]
-    value = rng.choice(
-        [*VALUES, *WRITABLE_NAMES, "0", "1", "2", "100", "0.5", "offsets", "lever_arm,mounting,delay,offsets,steering_ratio", "one"]
-    )
-    return rng.choice([[name, value], [f"{name}={value}"], [name]])
-
-
-def _argument(argument, words, rng):
-    sound = {"dataset": "mine", "source": "lap.csv", "pipeline": "small", "command": "train", "model": "lap.csv"}
-    if argument.name == "overrides":
-        return [_override(rng) for _ in range(rng.randrange(3))]
-    if rng.random() < 0.75 and argument.name in sound:
-        return [sound[argument.name]]
-    return [rng.choice([*WRITABLE_NAMES, "mine", "sim_small", "tabular", "lap.parquet", "raw", "conf", "quickstart", "one"])]
-
-
-@generator("study", weight=2)
-def completion(case):
-    """What a shell asks for while somebody types."""
-    case.copy("study")
-    words = ["vehest", *case.rng.choice(TYPED)]
-    if not case.honest:
-        words.append(case.rng.choice([*VALUES, _override(case.rng)]))
-        if case.visit % 4 == 0:
-            case.write(f"conf/dataset/{case.rng.choice(['odd', 'a b'])}.yaml", b"\xff\xfe: [")
-    line = " ".join(words)
-    environment = {
-        "_VEHEST_COMPLETE": f"complete_{case.rng.choice(['bash', 'zsh', 'fish'])}",
-        "COMP_WORDS": line,
-        "_TYPER_COMPLETE_ARGS": line,
-    }
-    environment |= {"COMP_CWORD": str(len(words) - 1), "_TYPER_COMPLETE_FISH_ACTION": "get-args"}
-    return Command((), environment=environment | {"_TYPER_COMPLETE_WORD_TO_COMPLETE": words[-1]})

@@ -1,7 +1,5 @@
 """./conf, which Hydra alone reads: files of every group, spoilt; tags, interpolations, other encodings. ./pipelines, bombs of aliases."""
 
-import os
-
 import yaml
 
 from fuzz.case import Command, generator
@@ -148,27 +146,6 @@ def root_file(case):
         case.write(f"conf/{group}/odd.yaml", yaml_of(tree).encode("utf-8", "replace"))
         return Command(("config", "train", f"{group}=odd"))
     return Command(commands[name])
-
-
-@generator("drives", weight=2)
-def odd_files(case):
-    """Names, links, pipes and sizes of files in ./conf."""
-    case.copy("drives")
-    file, how = case.place / "conf" / "dataset" / "odd.yaml", case.idea(6)
-    if how == 0:
-        os.mkfifo(file)
-    elif how in (1, 2):
-        file.symlink_to(("/dev/zero", "odd.yaml")[how - 1])
-    elif how == 3:
-        file.write_bytes(b"# " + b"x" * 30_000_000)
-    elif how == 4:
-        (case.place / "conf" / "dataset" / "mine.yaml").rename(file)
-        (case.place / "conf" / "dataset" / "mine.yaml").mkdir()
-    elif how == 5:
-        for name in (b"\xff\xfe", b"a\nb", b"\x1b[2J", b"a=b,c", b"-x", *(b"n%d" % k for k in range(1000))):
-            case.write(b"conf/dataset/" + name + b".yaml", "name: x\nsource: tabular\n")
-    commands = [("data", "show", "mine"), ("ingest", "--help"), ("ingest", "nothing"), ("config", "ingest", "dataset=mine")]
-    return Command(commands[0] if case.honest else case.rng.choice(commands))
 
 
 @generator("drives", "study", weight=8)

@@ -1,10 +1,9 @@
-"""Names of files, special files, links, rights, streams, variables, and where outcomes are written to."""
+"""Names of files that are read, and special files and links in their place."""
 
 import os
 import socket
 
 from fuzz.case import Command, generator
-from fuzz.honest import KSNN
 
 NAMES = (
     b"\xff\xfe.csv", b"lap\xe4.csv", b"a\nb.csv", b"\x1b[2J.csv", b" .csv", b"a b.csv", b"-x.csv", b"--out.csv", b"a=b.csv", b"~a.csv",
@@ -14,17 +13,6 @@ NAMES = (
 )  # fmt: skip
 LINKS = (*(f"/dev/{name}" for name in ("zero", "null", "full", "stdin", "urandom")), "/proc/self/mem", "/proc/self/environ")
 LINKS += ("gone.csv", "special.csv")
-TARGETS = (
-    "/dev/full", "/dev/null", "/dev/stdout", "out", "out.txt", "out.csv/", "raw", "raw/one.csv/x.csv", "", ".", "..", "/",
-    "x" * 300 + ".csv", "loop.csv", "pipe.csv", "zero.csv", "full.csv", "full.parquet", "lap.csv", "./lap.csv", "link.csv",
-    "a\nb.csv", "deep/er/out.csv", "/proc/x.csv", "-.csv",
-)  # fmt: skip
-ROOTS = ("/dev/null", "/dev/full/x", "outputs/" + "x" * 300, "''", "null", "[1]", "outputs/\x01", "3", "/proc/x", "/dev/stdin")
-VARIABLES = ("VEHEST_DATA", "VEHEST_OUTPUT", "MLFLOW_TRACKING_URI", "HOME", "COLUMNS", "TMPDIR", "VEHEST_DEBUG_X", "LANG", "TERM")
-VALUES = (
-    "", "/dev/null", "nothing", "raw/one.csv", "\udcff\udcfe", "${root}", "a\nb", "x" * 5000, "-1", "null", "[1]", "{", "http://[",
-    "file:///evil", "sqlite:////dev/full",
-)  # fmt: skip
 
 
 def _bind(path):
@@ -69,50 +57,3 @@ def files(case):
     lone = [("estimate", name, "-o", "out.csv"), ("data", "check", name), ("data", "show", name)]
     of_a_set = [("ingest", "mine"), ("data", "check", "mine"), ("data", "show", "mine")]
     return Command(case.rng.choice(lone if alone else of_a_set))
-
-
-@generator("study", weight=4)
-def targets(case):
-    """Where an estimate is written to, the output root, and standard output that takes nothing."""
-    case.copy("study")
-    place = case.place
-    how = case.idea(4)
-    if how == 0:
-        return Command(("ingest", "mine", f"output={case.rng.choice(ROOTS)}"))
-    if how == 1:
-        commands = [("data", "channels"), ("config", "train"), ("data", "show", "lap.csv", "--json"), ("--help",), ("train", "--help")]
-        commands += [("--version",), ("estimate", "lap.csv", "-o", "out.csv"), ("data", "align", "lap.csv", "-e", "offsets")]
-        return Command(case.rng.choice(commands), stdout="/dev/full")
-    links = {"loop.csv": "loop.csv", "zero.csv": "/dev/zero", "full.csv": "/dev/full", "full.parquet": "/dev/full", "link.csv": "lap.csv"}
-    for name, target in links.items():
-        (place / name).symlink_to(target)
-    os.mkfifo(place / "pipe.csv")
-    out = "out.csv" if case.honest else case.rng.choice(TARGETS)
-    named = ("out.csv", "deep", "a\nb.csv", "-.csv", "pipe.csv", *links)
-    return Command(("estimate", *case.rng.choice([(), ("ksnn",)]), "lap.csv", "--out", out), targets=named)
-
-
-@generator("study", weight=2)
-def environment(case):
-    """Variables that vehest reads, with values that make no sense."""
-    case.copy("study")
-    variable, value = case.rng.choice(VARIABLES), case.rng.choice(VALUES)
-    command = case.rng.choice([("ingest", "mine"), ("data", "show", "mine"), ("train", *KSNN, "--dry-run"), ("data", "channels")])
-    if variable == "MLFLOW_TRACKING_URI":
-        command = ("config", "train")
-    if case.honest:
-        return Command(command)
-    written = "file:" if value.startswith("file:") else value.strip("/") or "."
-    return Command(command, environment={variable: value}, targets=(written,) if variable == "VEHEST_OUTPUT" else ())
-
-
-@generator("drives")
-def rights(case):
-    """Folders and files that may not be read or written."""
-    case.copy("drives")
-    (case.place / "outputs").mkdir()
-    if not case.honest:
-        what = case.rng.choice(["outputs", "raw/one.csv", "raw", "conf", "conf/dataset/mine.yaml", "conf/dataset", "pipelines"])
-        os.chmod(case.place / what, case.rng.choice([0o000, 0o000, 0o444]))
-    commands = [("ingest", "mine"), ("data", "check", "mine"), ("data", "show", "mine"), ("run", "small", "--dry-run", "tracking=none")]
-    return Command(case.rng.choice(commands), unprivileged=True)
