@@ -224,7 +224,7 @@ def test_a_full_disk_names_its_target_in_every_stage_and_leaves_nothing(place):
         (3_000, "evaluate", ("eval", *trained)),
         (3_000, "out.parquet", ("estimate", "luenberger", "lap.csv", "-o", "out.parquet")),
         (3_000, "out.csv", ("estimate", "luenberger", "lap.csv", "-o", "out.csv")),
-        (3_000, "aligned", ("data", "align", "lap.csv", "-e", "offsets", "-o", "aligned")),
+        (1_000, "aligned", ("data", "align", "lap.csv", "-e", "offsets", "-o", "aligned")),
         (30_000, "outputs/report/small", ("run", "small", "tracking=none")),
     )
     for _, _, command in stages:  # what is compiled is cached in files, too
