@@ -185,6 +185,15 @@ def test_short_recordings_stay_whole_and_too_little_stops_with_what_to_record(lo
     assert "vehest run" not in out
 
 
+def test_short_recordings_beside_long_ones_are_for_training_and_pieces_for_nothing(log):
+    for name, rows in (("long", 2500), ("short", 400), ("piece", 100)):
+        log.write(f"{name}.csv", usual(drive()).iloc[:rows])
+    log.new("long.csv", "short.csv", "piece.csv", "--yes")
+    assert held(1)["train"] == [{"recording": "long", "start": "0 %", "stop": "50 %"}, {"recording": "short"}]
+    assert held(1)["tests"] == {"test": [{"recording": "long", "start": "70 %", "stop": "100 %"}]}
+    assert log("run", "my_car", "--dry-run")[0] == 0
+
+
 def test_an_estimator_of_ones_own_is_compared_too(log, monkeypatch):
     own = ("lap.csv", "--yes", "--with", "sliding_mode:SlidingMode")
     _, err = log.new(*own, code=2)

@@ -135,8 +135,8 @@ def _longest(logs: Sequence[Log]) -> Log:
     options = dict(longest.options)
     marks = sorted({mark for log in logs for mark in log.options.get("missing", ())})
     options |= {"missing": marks} if marks else {}
-    if "runs" not in options and any(log.options.get("time_restarts") for log in logs):
-        options["time_restarts"] = True
+    if "runs" not in options:
+        options |= {key: log.options[key] for log in logs for key in ("time_restarts", "max_gap") if key in log.options}
     return replace(longest, options=options, source="text_log" if any(log.source == "text_log" for log in logs) else longest.source)
 
 
@@ -151,6 +151,8 @@ def _notes(longest: Log, logs: Sequence[Log]) -> Iterator[str]:
     if len(longest.skipped) > MOST_LISTED:
         yield f"not read: {len(longest.skipped) - MOST_LISTED} more"
     for log in logs:
+        if "max_gap" in log.options:
+            yield f"'{log.file.name}' pauses for more than {log.options['max_gap']:g} s and makes {len(log.runs)} recordings"
         stamps_of_runs = [] if log.seconds is None else [log.seconds[run] for run in log.runs]
         for stamps in stamps_of_runs:
             steps = np.diff(stamps)

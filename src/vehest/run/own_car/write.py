@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import asdict, dataclass, field
 from importlib.metadata import entry_points
+from itertools import cycle, pairwise
 from typing import Any
 
 import yaml
@@ -28,7 +28,7 @@ from vehest.run.own_car.questions import Question
 from vehest.run.usable import SCORED, car_parameters, usability
 
 LEARNT = 0.7  # of the recordings: training and validation
-LEAST_BLOCK = 4.0  # s of a recording for validation; shorter ones are not cut
+LEAST_BLOCK = 4.0  # s of a recording for validation, or of a whole one; recordings for whose fifth it is too much are not cut
 LEAST_SECONDS = 30.0  # of all recordings, to train at all
 ROLES_OF_THREE = ("train", "validation", "test")
 ROLES = ("train", "test", "train", "validation", "train", "test", "train", "train", "validation", "test")  # of whole recordings, in turn
@@ -126,26 +126,38 @@ def write(
     return plain, [*lines, "next:", *(f"  {command}" for command in following)]
 
 
-def _are_short(made: Draft) -> bool:
-    return 0.2 * min(made.durations) < LEAST_BLOCK
+def _kept(made: Draft) -> list[str]:
+    """Recordings that a split takes; pieces that are too short even whole are left out."""
+    return [one.id for one, duration in zip(made.contents, made.durations, strict=True) if duration >= LEAST_BLOCK]
+
+
+def _cut(made: Draft) -> list[str]:
+    """Recordings that are long enough to be cut; none where most of the time is in short ones."""
+    long = {one.id: own for one, own in zip(made.contents, made.durations, strict=True) if 0.2 * own >= LEAST_BLOCK}
+    return list(long) if sum(long.values()) >= 0.5 * made.seconds else []
 
 
 def _is_too_short(made: Draft) -> bool:
-    return made.seconds < LEAST_SECONDS or (_are_short(made) and len(made.durations) < len(ROLES_OF_THREE))
+    return made.seconds < LEAST_SECONDS or (not _cut(made) and len(_kept(made)) < len(ROLES_OF_THREE))
 
 
 def _split_text(made: Draft) -> str:
-    """Blocks of each recording, or whole recordings where they are short."""
-    name, ids = made.examined.name, [one.id for one in made.contents]
-    if not _are_short(made):
+    """Blocks of each recording, whole recordings where they are short; short ones beside long ones are for training."""
+    name, ids, cut = made.examined.name, _kept(made), _cut(made)
+    if len(cut) == len(made.contents):
         blocks = {"name": name, "dataset": name, "train": "50 %", "validation": "20 %", "tests": {"test": "30 %"}}
         return _yaml(blocks, [f"{name}: {SPLIT_HEAD}"])
-    cycle = ROLES_OF_THREE if len(ids) == len(ROLES_OF_THREE) else ROLES
-    train, validation, test = (
-        [{"recording": own} for own, role in zip(ids, itertools.cycle(cycle), strict=False) if role == wanted] for wanted in ROLES_OF_THREE
-    )
+    if cut:
+        train, validation, test = (
+            [{"recording": own, "start": f"{start} %", "stop": f"{stop} %"} for own in cut] for start, stop in pairwise((0, 50, 70, 100))
+        )
+        train += [{"recording": own} for own in ids if own not in cut]
+    else:
+        order = ROLES_OF_THREE if len(ids) == len(ROLES_OF_THREE) else ROLES
+        roles = list(zip(ids, cycle(order), strict=False))
+        train, validation, test = ([{"recording": own} for own, role in roles if role == wanted] for wanted in ROLES_OF_THREE)
     split: dict[str, Any] = {"name": name, "dataset": name, "train": train, "validation": validation, "tests": {"test": test}}
-    return _yaml(split, [f"{name}: {WHOLE_HEAD}"])
+    return _yaml(split, [f"{name}: {SPLIT_HEAD if cut else WHOLE_HEAD}"])
 
 
 def _next_commands(made: Draft, plan: Plan) -> list[str]:
@@ -273,8 +285,8 @@ def _limits(own: Draft) -> list[str]:
             f"{lengths} are too short to train, stop and test on: record two minutes or more with bends, or three drives or more, "
             "with the reference; until then vehest estimate runs the filter that comes with vehest"
         ]
-    if not missing and _are_short(own):
-        return [f"the recordings are short, so the split takes whole recordings ({len(own.durations)}, {own.seconds:.0f} s in all)"]
+    if not missing and not _cut(own):
+        return [f"the recordings are short, so the split takes whole recordings ({len(_kept(own))}, {own.seconds:.0f} s in all)"]
     if not missing:
         text = f"{own.seconds:.0f} s in all, a third of it for tests, hardly rank estimators; record some minutes more"
         return [text] if own.seconds < SHORT else []

@@ -44,6 +44,9 @@ def survey(path: Path) -> Log:
 
 def _survey(path: Path) -> Log:
     ending = path.suffix.lower()
+    if ending == ".mat":
+        table = f"writetable(struct2table(load('{path.name}')), '{path.stem}.csv')"
+        raise DataError(f"'{path}' is MATLAB's; save its channels as columns of a table, in MATLAB by {table}")
     if ending == ".bag":
         raise DataError(f"'{path}' is a bag of ROS 1; convert it by 'rosbags-convert --src {path.name} --dst {path.stem}'")
     if path.is_dir() or ending in BAGS:
