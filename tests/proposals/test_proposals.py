@@ -319,7 +319,9 @@ def test_dates_of_a_parquet_table_are_its_clock(tmp_path):
 
 def test_a_pause_ends_a_recording_and_no_line_crosses_it(tmp_path):
     table = usual(drive()).rename(columns={"Speed": "Tempo"})
+    table.loc[np.arange(len(table)) % 5 != 0, "Beta"] = np.nan
     made = drafted(tmp_path, table[(table["Time [s]"] < 50.0) | (table["Time [s]"] >= 53.0)])
+    assert np.isfinite(open_source(made.dataset).read("lap_run_0")["sideslip_ref"]).all()
     assert (made.dataset["max_gap"], [round(own) for own in made.durations]) == (1.0, [50, 67])
     assert any("makes 2 recordings" in note for note in made.notes)
 

@@ -69,7 +69,7 @@ def test_late_stamps_of_even_rows_do_no_harm(tmp_path):
     assert errors[1] > 20 * errors[0]
     assert even.rate_hz == RATE
     for lost in (3, 20):
-        with pytest.raises(DataError, match=r"samples are missing.*; leave rows out by drop_rows or set clock: interpolate"):
+        with pytest.raises(DataError, match=r"samples are missing.*; leave rows out by drop_rows or set dataset.clock=interpolate"):
             read(table.drop(index=range(500, 500 + lost)), tmp_path, clock="uniform")
 
 

@@ -102,7 +102,7 @@ class TabularSource(FileSource):
         """Read a table wherever it is; raises `MissingError` without it, `DataError` where it cannot be read or lacks a column."""
         runs = list(self._runs_of(file))
         if len(runs) > 1:
-            raise DataError(f"'{file}' holds {len(runs)} runs ({listed([str(run) for run in runs])}); name one by dataset.run={runs[0]}")
+            raise DataError(f"'{file}' holds {len(runs)} runs ({listed([str(run) for run in runs])}); name one by +dataset.run={runs[0]}")
         return self._read(file, runs[0])
 
     def _read(self, file: Path, run: int | None) -> Recording:
@@ -114,7 +114,7 @@ class TabularSource(FileSource):
             columns = {name: Column(name, CHANNELS[name].unit) for name in names if name in CHANNELS}
         if not columns:
             what = f"has no column that is named like a channel (it has {listed(names)})"
-            raise DataError(f"'{file}' {what}; declare the columns in conf/dataset")
+            raise DataError(f"'{file}' {what}; describe them by 'vehest new NAME {file.name}', then add dataset=NAME")
         wanted = [column.column for column in (*columns.values(), *(self.pose.columns.values() if self.pose else ()))]
         extra = [self.time and self.time.column, self.options.runs, self.held and self.held.updated]
         values = self._values(file, list(dict.fromkeys([*wanted, *(str(name) for name in extra if name is not None)])))

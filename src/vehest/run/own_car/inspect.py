@@ -37,7 +37,7 @@ TABLES = ("tabular", "text_log")
 LAYOUT = {"delimiter": ",", "decimal": ".", "encoding": "utf8", "skip_rows": 0, "rows_below_names": 0, "runs": None}
 """Options of a table's layout with their defaults."""
 VEHICLE = {
-    "wheelbase": "wheelbase [m], if you know it (also gives the steering ratio by slow corners, and baselines from the data sheet)",
+    "wheelbase": "wheelbase [m], if you know it (for the filter without a reference, the steering ratio, and baselines of the data sheet)",
     "mass": "mass [kg], if you know it (with the wheelbase, filters over a single track)",
     "steering_ratio": "steering wheel's angle to the road wheels', if you know it (estimated from slow corners if the wheelbase is known)",
 }
