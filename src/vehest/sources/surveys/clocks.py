@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vehest.constants import FloatArray
+from vehest.sources.clocks import span_fault
 from vehest.sources.surveys.log import Stamps
 from vehest.sources.table_rows import stretches, timed_runs
 
@@ -62,7 +63,7 @@ def find_clock(columns: Mapping[str, FloatArray], units: Mapping[str, str]) -> F
     longest, max_gap = max(MAX_GAP, FEWEST_STEPS * step * UNITS[best.unit]), None
     gaps = (np.diff(seconds) > longest) & ~starts
     runs = stretches(starts, n_rows)
-    if not counted_by and gaps.any() and gaps.mean() <= MOST_RESTARTS:
+    if not counted_by and gaps.any() and gaps.mean() <= MOST_RESTARTS and not span_fault(seconds):
         cut = [*timed_runs(seconds, longest, restarts=True).values()]
         runs, max_gap = (cut, longest) if cut else (runs, None)
     return Found(best, seconds, tuple(sorted(runs, key=lambda rows: rows.start - rows.stop)), counted_by, max_gap)
