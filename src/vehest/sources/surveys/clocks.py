@@ -63,7 +63,8 @@ def find_clock(columns: Mapping[str, FloatArray], units: Mapping[str, str]) -> F
     longest, max_gap = max(MAX_GAP, FEWEST_STEPS * step * UNITS[best.unit]), None
     gaps = (np.diff(seconds) > longest) & ~starts
     runs = stretches(starts, n_rows)
-    if not counted_by and gaps.any() and gaps.mean() <= MOST_RESTARTS and not span_fault(seconds):
+    stray = any(span_fault(seconds[run]) for run in runs if run.stop - run.start > 1)
+    if not counted_by and gaps.any() and gaps.mean() <= MOST_RESTARTS and not stray:
         cut = [*timed_runs(seconds, longest, restarts=True).values()]
         runs, max_gap = (cut, longest) if cut else (runs, None)
     return Found(best, seconds, tuple(sorted(runs, key=lambda rows: rows.start - rows.stop)), counted_by, max_gap)
