@@ -92,7 +92,10 @@ def _scan(  # type: ignore[no-untyped-def]
     factor, weighted = np.empty((m, m)), np.empty((n, m))
     for k in range(steps):
         if k == 0:
-            prior_mean[0], prior_cov[0] = mean, cov
+            for i in range(n):  # a slice would double the time to compile
+                prior_mean[0, i] = mean[i]
+                for j in range(n):
+                    prior_cov[0, i, j] = cov[i, j]
         else:
             _multiply(A[k - 1], post_cov[k - 1], left)
             _multiply_transposed(left, A[k - 1], right)
