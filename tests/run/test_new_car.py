@@ -143,8 +143,8 @@ def test_what_cannot_be_done_is_one_line(log, monkeypatch):
     monkeypatch.setattr("sys.stdin", io.StringIO(""))
     for words, code, said in (
         (("my_car", "nowhere.csv", "--yes"), 4, "there is no file 'nowhere.csv'"),
+        (("tabular", "lap.csv", "--yes"), 2, "is a source that comes with vehest"),
         (("my car", "lap.csv", "--yes"), 2, "'my car' must be made of letters"),
-        (("f1tenth", "lap.csv", "--yes"), 2, "is a data set that comes with vehest"),
         (("my_car", "lap.csv", "--yes", "--answer", "left"), 2, "must be KEY=ANSWER"),
         (("my_car", "lap.csv", "--yes", "--answer", "gear=3"), 2, "no question has the key 'gear'"),
         (("my_car", "lap.csv"), 2, "no terminal for questions; add --yes"),

@@ -22,6 +22,7 @@ from vehest.data.splits import check_name
 from vehest.run.config import compose_config
 from vehest.run.config_files import choices
 from vehest.run.printing import counted
+from vehest.sources.base import source_names
 from vehest.sources.clocks import plain_rate
 from vehest.sources.surveys import Log, RawColumn, survey
 from vehest.sources.text_log import bridged
@@ -79,8 +80,8 @@ def inspect(name: str, files: Sequence[Path], vehicle: Mapping[str, float | None
     existing = [file for file in paths_of(name) if os.path.lexists(file)]
     if existing and not force:
         raise ConfigurationError(f"'{existing[0]}' is there already; take another name, or --force to write it anew")
-    if name in choices("dataset") and not paths_of(name)[0].exists():
-        raise ConfigurationError(f"'{name}' is a data set that comes with vehest; take another name")
+    if name in source_names():
+        raise ConfigurationError(f"'{name}' is a source that comes with vehest; take another name")
     with use_limits(limits_from_config(compose_config("estimate")["limits"])):
         logs = [survey(file) for file in files]
     longest = _longest(logs)
@@ -100,7 +101,8 @@ def inspect(name: str, files: Sequence[Path], vehicle: Mapping[str, float | None
     if not proposals.channels:
         names = counted([column.name for column in longest.columns])
         raise DataError(f"'{longest.file}': no column is recognised as a channel, by name or by motion, of {names}")
-    proposals = replace(proposals, notes=(*proposals.notes, *_notes(longest, logs)))
+    shadowed = [f"'{name}' is a data set that comes with vehest, too; in this folder it is yours"] if name in choices("dataset") else []
+    proposals = replace(proposals, notes=(*proposals.notes, *_notes(longest, logs), *(shadowed if not existing else [])))
     timed = longest.seconds is not None or any(column.stamps is not None for column in longest.columns)
     place, rate = _place(files, longest.source), None if timed else proposals.rate_hz
     return Examined(name, tuple(files), (longest, *others), proposals, place, rate, dict.fromkeys(VEHICLE) | dict(vehicle or {}))
