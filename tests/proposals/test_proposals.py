@@ -192,6 +192,7 @@ def test_a_reference_is_made_of_positions_and_yaw_where_there_is_no_other(tmp_pa
         ("lap.csv", b"t,v,v\n" + b"1,2,3\n2,3,4\n" * 20, "2 columns called 'v'"),
         ("lap.csv", b"t,v\n1,2\n", "1 row of numbers"),
         ("lap.mat", b"MATLAB 5.0 MAT-file", "writetable"),
+        ("lap.asc", b"base hex timestamps absolute", "of a CAN bus"),
         ("lap.csv", b"t,a,b\n" + b"".join(b"%.2f,1,1\n" % (0.01 * k) for k in range(300)), "no column is recognised"),
         *((f"lap.{ending}", b"junk\x00" * 1000, "") for ending in ("mf4", "vbo", "db3", "mcap", "parquet", "zip", "bag")),
     ],

@@ -198,7 +198,7 @@ def _decoded(head: bytes, file: Path) -> tuple[str, str]:
     if head.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
         return "utf-16", head.decode("utf-16", errors="replace")
     if b"\0" in head or len(CONTROLS.findall(head)) > MOST_CONTROLS * len(head):
-        raise DataError(f"'{file}' is no table of text (it holds control characters); is it of another format? its ending says which")
+        raise DataError(f"'{file}' is no table of text (it holds control characters); save its channels as CSV")
     try:
         return "utf8", codecs.getincrementaldecoder("utf-8-sig")().decode(head, final=len(head) < HEAD)
     except UnicodeDecodeError:
