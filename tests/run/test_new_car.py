@@ -188,10 +188,12 @@ def test_short_recordings_stay_whole_and_too_little_stops_with_what_to_record(lo
 
 
 def test_a_slow_log_and_one_whose_clock_is_a_millionth_off_are_written_as_run_takes_them(log):
-    table = usual(drive(rate_hz=10.0))
+    table = usual(drive(240.0, rate_hz=10.0))
     log.write("slow.csv", table)
-    log.new("slow.csv", "--yes")
+    log.new("slow.csv", "--yes", "--steering-ratio", "15")
     assert held(2)["evaluation"]["rate_hz"] == 10
+    words = [word for sweep in held(2)["parts"]["all"]["sweeps"] for word in sweep]
+    assert ("estimator=velocity_gru,velocity_lstm" in words, "estimator.rate_hz=20" in words) == (True, False)
     log.write("off.csv", usual(drive()).assign(**{"Time [s]": drive()["t"] * (1 - 1e-5)}).astype("float64"))
     log.new("off.csv", "--yes", "--force")
     assert held(0)["clock"] == "interpolate"

@@ -42,6 +42,7 @@ HEIGHT = 0.2  # of the centre of gravity over the wheelbase; assumed
 PRETRAINED = "training.start_from=pretrained"
 PRETRAINED_HZ = 20.0
 EVALUATED_HZ = 20  # that every estimate is scored at, where the recordings are sampled as fast
+RATE = "estimator.rate_hz="
 GIVEN = Trial(1, "given by --with")
 MINUTES = (0.5, 1.0, 2.0, 5.0)  # of reference, parts of the pipeline where there are more
 DATASET_COMMENTS = {
@@ -227,18 +228,19 @@ def _words(made: Draft, plan: Plan, left: Sequence[Question]) -> list[str]:
 def _plan_of(made: Draft, further: Sequence[str]) -> Plan:
     """Sweeps over the families that recordings and known values of the car allow; an empty plan where they allow none."""
     contents, vehicle = made.contents, made.examined.vehicle
-    plan, values, seconds = Plan(), _car(vehicle), _shortest_range(made)
+    plan, values, seconds, slowest = Plan(), _car(vehicle), _shortest_range(made), min(own.rate_hz for own in contents)
     own = [(GIVEN, name) for name in further if not estimator_class(name).trials]
     trials = sorted([*own, *((trial, name) for name in estimator_names() for trial in estimator_class(name).trials)])
     sweeps: dict[tuple[str, str, int], list[str]] = {}
     for trial, name in trials:
         sweeps.setdefault(trial[1:], []).append(name)
     for (about, overrides, samples), names in sweeps.items():
-        if PRETRAINED in overrides and min(own.rate_hz for own in contents) < PRETRAINED_HZ * (1 - 1e-9):
+        if PRETRAINED in overrides and slowest < PRETRAINED_HZ * (1 - 1e-9):
             continue  # the next entry trains the same family from scratch
         unknown = [name for name in ("wheelbase", "mass") if not vehicle[name] and ("{car}" in overrides or f"{{{name}}}" in overrides)]
         car = " ".join(f"{key}={{{key.rpartition('.')[2]}}}" for key in car_parameters(names[0]))
         words = overrides.replace("{car}", car).format(**values).split()
+        words = [word for word in words if not (word.startswith(RATE) and float(word.removeprefix(RATE)) > slowest)]
         of_car = f"the car's {' and '.join(unknown)}" if unknown else ""
         lacks = {name: of_car or _lack(name, words, contents, samples, seconds) for name in names}
         tried = [name for name in names if not lacks[name]]
