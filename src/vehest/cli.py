@@ -176,7 +176,8 @@ def new_car(
     """Begin with logs of your own car: `vehest new my_car lap*.csv`.
 
     Proposes for every column channel, unit, sign and delay, with its evidence, asks where the logs do not decide, and writes
-    conf/dataset, conf/split and pipelines/my_car.yaml. Reads tables, Parquet, MDF, VBO and ROS 2 bags. With --json nothing is asked.
+    conf/dataset, conf/split and pipelines/my_car.yaml; where the logs have no reference, conf/dataset alone, and the command that estimates
+    without one. Reads tables, Parquet, MDF, VBO and ROS 2 bags. With --json nothing is asked.
     """
     from vehest.run.own_car.inspect import inspect
 
@@ -353,9 +354,9 @@ def estimate(
     is the log, MDF 4, with these as channels of their own, a .mat the log's channels and these.
 
     For a car without a model of its own, leave the model out: `vehest estimate lap.csv estimator.wheelbase=2.7` takes the self-calibrating
-    filter, with a note; estimator.measured_ax=false where there is no ax, estimator.smoothed=true for the whole drive at once.
+    filter, with a note; estimator.smoothed=true makes it the whole drive's at once.
 
-    Columns named like channels, in SI units, need no more; for others, describe them in conf/dataset/NAME.yaml and add `dataset=NAME`.
+    Columns named like channels, in SI units, need no more; others are described once by `vehest new NAME lap.csv`, then add `dataset=NAME`.
     """
     from vehest.run.estimate import estimate_file
 

@@ -191,6 +191,8 @@ def test_a_reference_is_made_of_positions_and_yaw_where_there_is_no_other(tmp_pa
         ("lap.csv", b"1,2,3\n2,3,4\n3,4,5\n" * 20, "no line of names"),
         ("lap.csv", b"t,v,v\n" + b"1,2,3\n2,3,4\n" * 20, "2 columns called 'v'"),
         ("lap.csv", b"t,v\n1,2\n", "1 row of numbers"),
+        ("lap.mat", b"MATLAB 5.0 MAT-file", "writetable"),
+        ("lap.asc", b"base hex timestamps absolute", "of a CAN bus"),
         ("lap.csv", b"t,a,b\n" + b"".join(b"%.2f,1,1\n" % (0.01 * k) for k in range(300)), "no column is recognised"),
         *((f"lap.{ending}", b"junk\x00" * 1000, "") for ending in ("mf4", "vbo", "db3", "mcap", "parquet", "zip", "bag")),
     ],
@@ -303,6 +305,26 @@ def test_whole_nanoseconds_since_1970_are_read_and_a_column_that_counts_runs_mak
     assert (clock.column, clock.unit) == ("stamp", "ns")
     log = survey(write(tmp_path / "laps.csv", pd.concat([usual(drive(40.0, seed=seed)).assign(run=seed) for seed in (3, 4)])))
     assert (log.options["runs"], sorted((one.start, one.stop) for one in log.runs)) == ("run", [(0, 2000), (2000, 4000)])
+
+
+def test_dates_of_a_parquet_table_are_its_clock(tmp_path):
+    d = drive(60.0)
+    dates = pd.Timestamp("2024-05-03T10:59:30") + pd.to_timedelta(d["t"], unit="s").round("ms")
+    usual(d).assign(**{"Time [s]": dates}).to_parquet(tmp_path / "lap.parquet")
+    examined = inspect("my_car", [tmp_path / "lap.parquet"])
+    assert (examined.rate_hz, examined.log.clock.unit) == (None, "ns")
+    recording = read_back(draft(examined))
+    assert recording.rate_hz == pytest.approx(50.0)
+    np.testing.assert_allclose(recording["vx"], d["vx"], atol=1e-6)
+
+
+def test_a_pause_ends_a_recording_and_no_line_crosses_it(tmp_path):
+    table = usual(drive()).rename(columns={"Speed": "Tempo"})
+    table.loc[np.arange(len(table)) % 5 != 0, "Beta"] = np.nan
+    made = drafted(tmp_path, table[(table["Time [s]"] < 50.0) | (table["Time [s]"] >= 53.0)])
+    assert np.isfinite(open_source(made.dataset).read("lap_run_0")["sideslip_ref"]).all()
+    assert (made.dataset["max_gap"], [round(own) for own in made.durations]) == (1.0, [50, 67])
+    assert any("makes 2 recordings" in note for note in made.notes)
 
 
 def standing():

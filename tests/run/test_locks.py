@@ -9,6 +9,7 @@ from contextlib import contextmanager
 import pytest
 
 from processes import start
+from vehest.run import group
 from vehest.run.artefacts import StagePlan, read_artefact
 from vehest.run.group import _held
 from vehest.run.locks import Lock, held
@@ -53,6 +54,16 @@ def test_a_lock_ends_with_the_process_that_holds_it_and_waiting_says_once_for_wh
         holder.wait()
         assert lock.take()
     lock.release()
+
+
+def test_one_process_compiles_what_calibration_needs_and_others_wait(tmp_path, monkeypatch):
+    monkeypatch.setattr(group, "has_to_compile", lambda kernel: kernel == group.FLOOR_KERNEL)
+    asked = iter([False, False, True])
+    with held_elsewhere(tmp_path, "compile", "health"), group._compiled_by_one(tmp_path, lambda: next(asked)):
+        assert next(asked, "all") == "all"
+    monkeypatch.setattr(group, "has_to_compile", lambda kernel: False)
+    with held_elsewhere(tmp_path, "compile", "health"), group._compiled_by_one(tmp_path, pytest.fail):
+        pass
 
 
 def test_names_that_suit_no_file_are_locks_of_their_own(tmp_path):

@@ -143,8 +143,8 @@ def test_what_cannot_be_done_is_one_line(log, monkeypatch):
     monkeypatch.setattr("sys.stdin", io.StringIO(""))
     for words, code, said in (
         (("my_car", "nowhere.csv", "--yes"), 4, "there is no file 'nowhere.csv'"),
+        (("tabular", "lap.csv", "--yes"), 2, "is a source that comes with vehest"),
         (("my car", "lap.csv", "--yes"), 2, "'my car' must be made of letters"),
-        (("f1tenth", "lap.csv", "--yes"), 2, "is a data set that comes with vehest"),
         (("my_car", "lap.csv", "--yes", "--answer", "left"), 2, "must be KEY=ANSWER"),
         (("my_car", "lap.csv", "--yes", "--answer", "gear=3"), 2, "no question has the key 'gear'"),
         (("my_car", "lap.csv"), 2, "no terminal for questions; add --yes"),
@@ -168,7 +168,7 @@ def test_without_a_speed_no_pipeline_is_written_that_could_not_run_and_a_yaw_rat
     assert log("data", "check", "my_car")[0] == 0
     log.write("gyro.csv", usual(drive())[["Time [s]", "Gyro"]].assign(Voltage=12.0))
     out, err = log.new("gyro.csv", "--yes", "--force")
-    assert (err, "it lacks vx, ax, ay" in out) == ("", True)
+    assert (err, "lacks vx, ay" in out) == ("", True)
 
 
 def test_short_recordings_stay_whole_and_too_little_stops_with_what_to_record(log):
@@ -179,10 +179,33 @@ def test_short_recordings_stay_whole_and_too_little_stops_with_what_to_record(lo
     assert "whole recordings (10, 80 s in all)" in log.new(*files, "--yes")[0]
     parts = [held(1)["train"], held(1)["validation"], held(1)["tests"]["test"]]
     assert [len(own) for own in parts] == [5, 2, 3]
+    out, _ = log.new(*files, "--yes", "--force", "--steering-ratio", "15")
+    assert "left out: velocity_gru: 15 s in each range for validation (the shortest has 8 s)" in out
     assert sorted(one["recording"] for own in parts for one in own) == names
     out, _ = log.new(*files[:2], "--yes", "--force")
     assert "16 s in 2 recordings are too short to train, stop and test on: record two minutes or more" in out
     assert "vehest run" not in out
+
+
+def test_a_slow_log_and_one_whose_clock_is_a_millionth_off_are_written_as_run_takes_them(log):
+    table = usual(drive(240.0, rate_hz=10.0))
+    log.write("slow.csv", table)
+    log.new("slow.csv", "--yes", "--steering-ratio", "15")
+    assert held(2)["evaluation"]["rate_hz"] == 10
+    words = [word for sweep in held(2)["parts"]["all"]["sweeps"] for word in sweep]
+    assert ("estimator=velocity_gru,velocity_lstm" in words, "estimator.rate_hz=20" in words) == (True, False)
+    log.write("off.csv", usual(drive()).assign(**{"Time [s]": drive()["t"] * (1 - 1e-5)}).astype("float64"))
+    log.new("off.csv", "--yes", "--force")
+    assert held(0)["clock"] == "interpolate"
+
+
+def test_short_recordings_beside_long_ones_are_for_training_and_pieces_for_nothing(log):
+    for name, rows in (("long", 2500), ("short", 400), ("piece", 100)):
+        log.write(f"{name}.csv", usual(drive()).iloc[:rows])
+    log.new("long.csv", "short.csv", "piece.csv", "--yes")
+    assert held(1)["train"] == [{"recording": "long", "start": "0 %", "stop": "50 %"}, {"recording": "short"}]
+    assert held(1)["tests"] == {"test": [{"recording": "long", "start": "70 %", "stop": "100 %"}]}
+    assert log("run", "my_car", "--dry-run")[0] == 0
 
 
 def test_an_estimator_of_ones_own_is_compared_too(log, monkeypatch):

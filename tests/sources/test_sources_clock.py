@@ -50,10 +50,10 @@ def test_the_rate_survives_strong_jitter_and_gaps(rate, share):
 def test_jitter_beyond_a_hundredth_of_an_interval_and_gaps_need_interpolation():
     even, noise = np.arange(1000) / 100.0, np.random.default_rng(0).uniform(-1, 1, 1000)
     assert uniform_clock(even + 4e-5 * noise, "'file'").rate_hz == 100.0
-    assert "set clock: interpolate" in refusal(lambda: uniform_clock(even + 2e-3 * noise, "'file'"))
+    assert "set dataset.clock=interpolate" in refusal(lambda: uniform_clock(even + 2e-3 * noise, "'file'"))
     assert uniform_clock(even + 2e-3 * noise, "'file'", "interpolate").rate_hz == 100.0
     stamps = np.delete(even[:300], np.s_[100:200])
-    assert "cut the range out or set clock: interpolate" in refusal(lambda: uniform_clock(stamps, "'file'"))
+    assert "cut the range out or set dataset.clock=interpolate" in refusal(lambda: uniform_clock(stamps, "'file'"))
     clock = uniform_clock(stamps, "'file'", "interpolate")
     assert (clock.rate_hz, clock.n_samples) == (100.0, 300)
     np.testing.assert_allclose(clock.align(5.0 * stamps), 5.0 * even[:300], atol=1e-12)

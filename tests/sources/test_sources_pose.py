@@ -69,7 +69,7 @@ def test_late_stamps_of_even_rows_do_no_harm(tmp_path):
     assert errors[1] > 20 * errors[0]
     assert even.rate_hz == RATE
     for lost in (3, 20):
-        with pytest.raises(DataError, match=r"samples are missing.*; leave rows out by drop_rows or set clock: interpolate"):
+        with pytest.raises(DataError, match=r"samples are missing.*; leave rows out by drop_rows or set dataset.clock=interpolate"):
             read(table.drop(index=range(500, 500 + lost)), tmp_path, clock="uniform")
 
 
@@ -113,6 +113,17 @@ def test_time_that_restarts_begins_a_run_and_declared_rows_do_not_count(tmp_path
     assert recordings[1].start_time == pytest.approx(0.01)
     assert max(recording["vx"].max() for recording in recordings) < SPEED
     assert recordings[1].provenance["dropped_rows"] == [201, "501-"]
+
+
+def test_a_pause_begins_a_run_and_one_of_several_can_be_chosen(tmp_path):
+    table = pd.concat([circle(2.0), circle(0.5), circle(3.0)], ignore_index=True)
+    table["t"] += np.repeat([0.0, 10.0, 20.0], [200, 50, 300])
+    table.to_csv(tmp_path / "laps.csv", index=False)
+    recordings = list(source(tmp_path, max_gap=1.0).recordings())
+    assert [(own.id, len(own), own.start_time) for own in recordings] == [("laps_run_0", 200, 0.0), ("laps_run_1", 300, 20.0)]
+    assert source(tmp_path, max_gap=1.0, run=1).read_file(tmp_path / "laps.csv").start_time == 20.0
+    said = "holds no run 2 (0, 1)"
+    assert said in refusal(lambda: source(tmp_path, max_gap=1.0, run=2).read_file(tmp_path / "laps.csv"))
 
 
 def test_excluded_files_are_no_recordings(tmp_path):

@@ -149,7 +149,7 @@ def test_each_run_becomes_a_recording_with_its_own_start_and_runs_that_cannot_be
         assert f"'{tmp_path / 'lap.csv'}': {said}" in refusal(runs_csv(tmp_path, runs).ids)
     assert len(runs_csv(tmp_path, [4] * 9).read_file(tmp_path / "lap.csv")) == 9
     message = refusal(lambda: runs_csv(tmp_path, [4] * 9 + [5] * 9).read_file(tmp_path / "lap.csv"))
-    assert "holds 2 runs (4, 5); keep the rows of one" in message
+    assert "holds 2 runs (4, 5); name one by +dataset.run=4" in message
 
 
 def test_a_packed_table_is_read_and_unpacks_to_no_more_than_it_may(tmp_path):

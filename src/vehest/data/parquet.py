@@ -42,10 +42,13 @@ def parquet_file(path: Path) -> Iterator[pq.ParquetFile]:
 
 
 def read_numbers(path: Path, file: pq.ParquetFile, names: Sequence[str]) -> dict[str, NDArray[np.float64]]:
-    """Columns of numbers that are there once each, float64 of shape (T,), missing values NaN; `DataError` for anything else."""
+    """Columns of numbers or dates that are there once each, float64 of shape (T,), missing values NaN; `DataError` for anything else.
+
+    Dates with times count from 1970 in the file's unit, ``unit`` of their type.
+    """
     for name in names:
         kind = file.schema_arrow.field(name).type
-        if not (pa.types.is_floating(kind) or pa.types.is_integer(kind)):
+        if not (pa.types.is_floating(kind) or pa.types.is_integer(kind) or pa.types.is_timestamp(kind)):
             raise DataError(f"'{path}': column '{name}' is of type {str(kind)[:60]}; numbers are needed")
     n_rows = file.metadata.num_rows
     check_limit("samples", n_rows, f"'{path}' holds {n_rows} rows")
@@ -65,7 +68,8 @@ def numbers_of(column: pa.Array | pa.ChunkedArray) -> NDArray[np.float64]:
     """Numbers of a column, (T,), NaN where one is missing; not by ``to_numpy``, which imports pandas."""
     found = [np.empty(0)]
     for chunk in column.chunks if isinstance(column, pa.ChunkedArray) else [column]:
-        numbers = chunk if chunk.type == pa.float64() else chunk.cast(pa.float64(), safe=False)
+        counted = chunk.cast(pa.int64()) if pa.types.is_timestamp(chunk.type) else chunk
+        numbers = counted if counted.type == pa.float64() else counted.cast(pa.float64(), safe=False)
         values = np.frombuffer(numbers.buffers()[1], np.float64, len(numbers), 8 * numbers.offset) if len(numbers) else np.empty(0)
         found.append(np.where(np.from_dlpack(numbers.is_null().cast(pa.int8())), math.nan, values) if numbers.null_count else values)
     return np.concatenate(found)

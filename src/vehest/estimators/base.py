@@ -70,11 +70,13 @@ class Trial(NamedTuple):
         about: text for people.
         overrides: of settings and training; ``{wheelbase}`` and ``{mass}`` are those of the car, ``{car}`` all of its parameters that the
             family's settings have.
+        samples: that some range for training, and each for validation, has to have at the family's rate.
     """
 
     place: float
     about: str
     overrides: str = ""
+    samples: int = 0
 
 
 class Stepper(ABC):

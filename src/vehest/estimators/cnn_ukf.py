@@ -120,6 +120,7 @@ class CnnUkf(NetworkUkf):
             "training.identification.max_evaluations=40 training.identification.tyres_from='*' "
             "training.identification.restarts=1 training.identification.generations=60 "
             "training.end_to_end.max_epochs=20",
+            samples=256,
         ),
     )
     training_type = EndToEndSettings

@@ -110,6 +110,7 @@ class LearnedUkf(Network, SigmaPointEstimator):
             14,
             "filter with learnt dynamics, of electric cars; long",
             "estimator.car.mass={mass} estimator.car.wheelbase={wheelbase} training.through.max_epochs=50",
+            samples=500,
         ),
     )
     channels = ("vx", *MEASURED, *INPUTS)

@@ -89,7 +89,10 @@ def _scan(  # type: ignore[no-untyped-def]
     seen, room = np.empty((m, n)), scratch(m, n)
     for k in range(steps):
         if k == 0:
-            prior_mean[0], prior_cov[0] = mean, cov
+            for i in range(n):  # a slice would double the time to compile
+                prior_mean[0, i] = mean[i]
+                for j in range(n):
+                    prior_cov[0, i, j] = cov[i, j]
         else:
             move(A[k - 1], post_cov[k - 1], Q[k - 1], prior_cov[k], room)
             for i in range(n):

@@ -8,7 +8,7 @@ from __future__ import annotations
 import csv
 import hashlib
 import json
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -120,6 +120,10 @@ def estimate_file(words: Sequence[str], out: Path, *, strict: bool = False, car:
     settings, overrides = split_settings(overrides)
     config = compose_config("estimate", overrides)
     folder, model, trust = open_model(name, Path(config["output"]), note)
+    with use_limits(limits_from_config(config["limits"])):
+        drive = read_by(config, file)
+    if name == SELF_CALIBRATING:
+        settings |= _assumed(settings, drive, model.settings.wheelbase if car is None else None)
     if settings:
         model = with_settings(model, settings)
         if trust is not None and trust.health is not None and trust.health.channels != model.channels:
@@ -131,7 +135,6 @@ def estimate_file(words: Sequence[str], out: Path, *, strict: bool = False, car:
     if any(key_of(override).split(".")[0] == "downsample" for override in overrides):
         model.preparation = config["downsample"]
     with use_limits(limits_from_config(config["limits"])):
-        drive = read_by(config, file)
         findings = findings_of(drive, model, config["dataset"].get("accept") or ())
         if strict and findings:
             raise DataError(f"'{file}': {findings[0]}")
@@ -151,6 +154,16 @@ def estimate_file(words: Sequence[str], out: Path, *, strict: bool = False, car:
         "findings": findings,
         **({"note": pretrained_note(name)} if name in WITH_VEHEST else {}),
     }
+
+
+def _assumed(settings: Mapping[str, Any], drive: Recording, wheelbase: float | None) -> dict[str, Any]:
+    """Settings of the self-calibrating filter that a drive without ax needs; these and an assumed wheelbase [m] are remarked on."""
+    if wheelbase is not None and "wheelbase" not in settings:
+        note(f"the wheelbase is taken for {wheelbase:g} m; give your car's, such as estimator.wheelbase=2.9")
+    if "ax" in drive or "measured_ax" in settings:
+        return {}
+    note("there is no channel ax: estimator.measured_ax=false")
+    return {"measured_ax": False}
 
 
 def split_settings(overrides: Sequence[str]) -> tuple[dict[str, Any], list[str]]:
@@ -297,7 +310,8 @@ def _summary(estimate: Estimate) -> dict[str, Any]:
 def _verdict(estimate: Estimate, recording: Recording, trust: Trust | None) -> str:
     """The share of valid samples and what makes others invalid, in a line."""
     if trust is None or trust.health is None:
-        return "this model has no calibration: no band, and health from gaps and speeds alone"
+        bands = "its bands are its own" if "band_vy" in estimate.channels else "no band"
+        return f"this model has no calibration: {bands}, and health from gaps and speeds alone"
     estimated = ~np.isnan(estimate["vy"])
     status, reasons = estimate["health"][estimated], estimate["health_reason"][estimated]
     found, counts = np.unique(reasons[(status > 0) & (reasons > 0)], return_counts=True)

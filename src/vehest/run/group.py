@@ -15,14 +15,17 @@ import torch
 
 from vehest.data.splits import Split
 from vehest.estimators.kernels.blas import one_blas_thread
+from vehest.estimators.kernels.compiling import has_to_compile
 from vehest.run.artefacts import Artefact, StagePlan, Status, ensured, find, make
 from vehest.run.calibrate import plan_calibrate
 from vehest.run.evaluate import Evaluation, write_evaluation
-from vehest.run.locks import Waiting, held
+from vehest.run.locks import Lock, Waiting, held
 from vehest.run.train import STAGE, TrainJob, fit_jobs, write_model
 from vehest.training.checkpoints import drop_checkpoint, resume_epoch
 from vehest.training.context import FitContext, Progress
+from vehest.trust.health import SLOW_KERNEL
 
+FLOOR_KERNEL = "vehest.filters.kalman_scan:_scan"  # of the floors that an evaluation gives
 Report = Callable[[Progress | Waiting], None]
 
 
@@ -83,7 +86,11 @@ class Group:
                             break
                         models |= {artefact.key: artefact for artefact in _train(together, should_stop, on_progress)}
                 waiting = [job for job in waiting if job not in jobs]
-            return [_member(self, job, models[job.plan.key], made) for job in self.jobs]
+            members = []
+            for job in self.jobs:
+                with _compiled_by_one(job.plan.output, should_stop):
+                    members.append(_member(self, job, models[job.plan.key], made))
+            return members
 
     def existing(self, plan: StagePlan) -> Artefact | None:
         """The artefact of a plan, if it is there and not to be made anew."""
@@ -111,6 +118,16 @@ def _member(
         scoring = group.evaluation.of(model, calibration)
         evaluation = made(scoring.plan, partial(write_evaluation, scoring))
     return Member(job, model, evaluation, calibration, finished=group.evaluation is None or evaluation is not None)
+
+
+@contextmanager
+def _compiled_by_one(output: Path, should_stop: Callable[[], bool]) -> Iterator[None]:
+    """While kernels of calibration and evaluation are not in the compile cache, one process compiles them, and others wait for it."""
+    if any(map(has_to_compile, (SLOW_KERNEL, FLOOR_KERNEL))):
+        with held(Lock(output, "compile", "health"), should_stop):
+            yield
+    else:
+        yield
 
 
 def drop_finished_checkpoint(job: TrainJob) -> None:

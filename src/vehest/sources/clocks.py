@@ -30,7 +30,7 @@ MOST_DRIFT = 0.01  # of a step, over a whole recording, that may come from the r
 INTERPOLATED_TOLERANCE = 5e-3  # an interpolated clock may run at any rate: take a plain one this near
 SLACK = 1e-6  # of a step; times that are nearer are the same
 SORT = "repair, remove or sort the rows"
-BRIDGE = "cut the range out or set clock: interpolate"
+BRIDGE = "cut the range out or set dataset.clock=interpolate"
 
 FEWEST = 20  # samples behind which an even clock is looked for
 BLOCK_SECONDS = 1.0
@@ -170,7 +170,7 @@ def uniform_clock(stamps: FloatArray, where: str, policy: ClockPolicy = "strict"
     rate, deviation = len(steps) / elapsed, MOST_DRIFT
     if policy == "uniform":
         nominal, deviation = plain_rate(1.0 / float(np.median(steps)), INTERPOLATED_TOLERANCE), MOST_STRETCH
-        times, rate, _ = uniform_times(stamps, nominal, where, fix="leave rows out by drop_rows or set clock: interpolate")
+        times, rate, _ = uniform_times(stamps, nominal, where, fix="leave rows out by drop_rows or set dataset.clock=interpolate")
         start = float(times[0])
     elif uneven := unevenness(stamps):
         raise DataError(f"{where}: {uneven}; {fix}")

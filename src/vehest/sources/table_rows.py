@@ -55,6 +55,19 @@ def counted_runs(numbers: FloatArray, column: str, file: Path) -> dict[int | Non
     return runs
 
 
+def timed_runs(times: FloatArray, max_gap: float | None, *, restarts: bool) -> dict[int | None, slice]:
+    """Rows of each run, which begins where times [s], (N,), go backwards, if ``restarts``, or leave a gap longer than ``max_gap`` [s].
+
+    Pieces between gaps that last less than ``max_gap`` are left out.
+    """
+    steps = np.diff(times)
+    begins = (steps < 0) & restarts
+    if max_gap is None:
+        return {**dict(enumerate(stretches(begins, len(times))))}
+    runs = stretches(begins | (steps > max_gap), len(times))
+    return {**dict(enumerate(rows for rows in runs if times[rows.stop - 1] - times[rows.start] >= max_gap))}
+
+
 def stretches(begins: NDArray[np.bool_], n_rows: int) -> list[slice]:
     """Rows of uninterrupted runs in their order, of whether a run begins with the next row, (N - 1,)."""
     edges = np.concatenate([[0], np.flatnonzero(begins) + 1, [n_rows]]).tolist()

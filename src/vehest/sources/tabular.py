@@ -8,7 +8,6 @@ from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import Annotated, Any
 
-import numpy as np
 from pydantic import AfterValidator, Field
 
 from vehest.constants import FloatArray
@@ -22,7 +21,7 @@ from vehest.sources.columns import ChannelMap, ChannelNames, Column, ColumnName,
 from vehest.sources.file_source import FileSource
 from vehest.sources.sample_and_hold import held_from_config
 from vehest.sources.table_pose import table_pose_from_config
-from vehest.sources.table_rows import counted_runs, dropped_rows_from_config, kept_rows, stretches
+from vehest.sources.table_rows import counted_runs, dropped_rows_from_config, kept_rows, timed_runs
 from vehest.sources.tables import TextLayout, column_names, listed, read_columns
 
 
@@ -47,6 +46,8 @@ class TabularOptions:
     drop_rows: Annotated[dict[str, tuple[int | str, ...]], "a mapping from a file's stem to a list of rows"] | None = None
     runs: ColumnName | None = None
     time_restarts: bool = False
+    max_gap: Positive | None = None
+    run: Annotated[int, Field(ge=0)] | None = None
     time: dict[str, Any] | None = None
     rate_hz: Positive | None = None
     clock: ClockPolicy = "strict"
@@ -72,8 +73,9 @@ class TabularSource(FileSource):
         self.time = None if options.time is None else column_from_config(options.time, f"{where}: time", "s")
         if self.time is None and options.rate_hz is None:
             raise ConfigurationError(f"{where}: without a time column, rate_hz must be given")
-        if options.time_restarts and (options.runs is not None or self.time is None):
-            raise ConfigurationError(f"{where}: time_restarts needs a time column, and no column that counts runs")
+        self._cuts = options.time_restarts or options.max_gap is not None
+        if self._cuts and (options.runs is not None or self.time is None):
+            raise ConfigurationError(f"{where}: time_restarts and max_gap need a time column, and no column that counts runs")
         self.dropped = dropped_rows_from_config(options.drop_rows or {}, where)
         self.gappy = self._gappy_among(CHANNELS if self.columns is None else self.columns)
         self.held = None if options.held is None else held_from_config(options.held, list(self.columns or ()), f"{where}: held")
@@ -100,7 +102,7 @@ class TabularSource(FileSource):
         """Read a table wherever it is; raises `MissingError` without it, `DataError` where it cannot be read or lacks a column."""
         runs = list(self._runs_of(file))
         if len(runs) > 1:
-            raise DataError(f"'{file}' holds {len(runs)} runs ({listed([str(run) for run in runs])}); keep the rows of one")
+            raise DataError(f"'{file}' holds {len(runs)} runs ({listed([str(run) for run in runs])}); name one by +dataset.run={runs[0]}")
         return self._read(file, runs[0])
 
     def _read(self, file: Path, run: int | None) -> Recording:
@@ -112,7 +114,7 @@ class TabularSource(FileSource):
             columns = {name: Column(name, CHANNELS[name].unit) for name in names if name in CHANNELS}
         if not columns:
             what = f"has no column that is named like a channel (it has {listed(names)})"
-            raise DataError(f"'{file}' {what}; declare the columns in conf/dataset")
+            raise DataError(f"'{file}' {what}; describe them by 'vehest new NAME {file.name}', then add dataset=NAME")
         wanted = [column.column for column in (*columns.values(), *(self.pose.columns.values() if self.pose else ()))]
         extra = [self.time and self.time.column, self.options.runs, self.held and self.held.updated]
         values = self._values(file, list(dict.fromkeys([*wanted, *(str(name) for name in extra if name is not None)])))
@@ -174,16 +176,20 @@ class TabularSource(FileSource):
 
     def _runs_of(self, file: Path) -> Mapping[int | None, slice]:
         """Number of each run in a table -> its rows without those that are left out; all rows under None where no runs are counted."""
-        counter = self.time.column if self.time and self.options.time_restarts else self.options.runs
+        counter = self.time.column if self.time and self._cuts else self.options.runs
         if counter is None or is_stored_recording(file):
             return {None: slice(None)}
         if file not in self._known_runs:
             require_files([file], self.name)
             numbers = self._values(file, [counter])[counter]
-            if self.options.time_restarts:  # a run begins where time goes backwards
-                self._known_runs[file] = {**dict(enumerate(stretches(np.diff(numbers) < 0, len(numbers))))}
+            if self.time is not None and self._cuts:
+                runs = timed_runs(self.time.to_si(numbers, "s"), self.options.max_gap, restarts=self.options.time_restarts)
             else:
-                self._known_runs[file] = counted_runs(numbers, counter, file)
+                runs = counted_runs(numbers, counter, file)
+            wanted = self.options.run
+            if wanted is not None and wanted not in runs:
+                raise DataError(f"'{file}' holds no run {wanted} ({listed([str(run) for run in runs])})")
+            self._known_runs[file] = runs if wanted is None else {wanted: runs[wanted]}
         return self._known_runs[file]
 
 

@@ -60,7 +60,7 @@ def bridged(samples: FloatArray, times: FloatArray, longest: float) -> FloatArra
 
     Args:
         samples: NaN where there is none, (T,).
-        times: of the samples [s], (T,); where they go backwards a run begins, which no line reaches across.
+        times: of the samples [s], (T,); where they go backwards or leave a longer gap a run begins, which no line reaches across.
         longest: time between two samples that a line may bridge [s].
     """
     known = np.flatnonzero(np.isfinite(samples))
@@ -69,8 +69,13 @@ def bridged(samples: FloatArray, times: FloatArray, longest: float) -> FloatArra
     places = np.arange(len(samples))
     before = known[np.maximum(np.searchsorted(known, places, side="right") - 1, 0)]
     after = known[np.minimum(np.searchsorted(known, places, side="left"), len(known) - 1)]
-    near = (np.abs(times[after] - times[before]) <= longest * (1.0 + 1e-9)) & (np.abs(times - times[before]) <= longest * (1.0 + 1e-9))
-    return np.where(np.isfinite(samples) | near, np.interp(places, known, samples[known]), np.nan)
+    longest *= 1.0 + 1e-9
+    steps = np.diff(times, prepend=times[0])
+    run = np.cumsum((steps < 0.0) | (steps > longest))
+    before, after = np.where(run[before] == run, before, after), np.where(run[after] == run, after, before)
+    near = (run[before] == run) & (np.abs(times[after] - times[before]) <= longest) & (np.abs(times - times[before]) <= longest)
+    slope = (samples[after] - samples[before]) / np.maximum(after - before, 1)
+    return np.where(np.isfinite(samples) | near, slope * (places - before) + samples[before], np.nan)
 
 
 SOURCE = TextLogSource

@@ -275,7 +275,8 @@ def _test_set(artefacts: PartArtefacts, board: pd.DataFrame, test_set: str, line
     shown = _shown(finite, named)
     drive = _Drive.of(artefacts, shown, test_set, lines)
     if len(shown) < len(finite):
-        which = f"{chosen[named][0]} and those" if named is not None and named in chosen else "those"
+        first = dict.fromkeys([chosen[named][0], finite.iloc[0]["title"]]) if named is not None and named in chosen else ()
+        which = f"{', '.join(first)} and those" if first else "those"
         lowest = "with the lowest RMSE(v) on the validation range"
         blocks.append(f"The following figures show {len(shown)} of {len(finite)} estimators: {which} {lowest}.")
     in_bands = {name: chosen[name] for name in drive.estimates}
@@ -354,9 +355,11 @@ def _spread(artefacts: PartArtefacts, board: pd.DataFrame, test_set: str, name: 
 
 
 def _shown(board: pd.DataFrame, named: Name | None = None) -> pd.DataFrame:
-    """At most `MOST_SHOWN` rows, picked by validation; in the order of the board, but for the one that is ``named``, which comes first."""
+    """At most `MOST_SHOWN` rows in the order of the board, picked by validation; where one is ``named``, it comes first, and the lowest
+    error on the test is among them, since the verdict names both."""
     ours = (board["estimator"] == named[0]) & (board["variant"] == named[1]) if named else board["seed"].isna()
-    kept = board["rmse_vy_validation"].where(~ours, -math.inf).sort_values(kind="stable", na_position="last").index[:MOST_SHOWN]
+    sure = ours | (board.index == board.index[0]) if named else ours
+    kept = board["rmse_vy_validation"].where(~sure, -math.inf).sort_values(kind="stable", na_position="last").index[:MOST_SHOWN]
     return board.loc[sorted(kept, key=lambda row: (not ours[row], row))]
 
 

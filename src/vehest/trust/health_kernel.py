@@ -17,16 +17,18 @@ forgetting). Innovations count with at most `CLIP` deviations in it, and no samp
 from __future__ import annotations
 
 import math
+from functools import partial
 from typing import Annotated, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from vehest.constants import FloatArray
-from vehest.estimators.kernels.compiling import entry, part
+from vehest.estimators.kernels import compiling
 from vehest.trust.named_arrays import open_views
 
 IntArray = NDArray[np.int64]
+part = partial(compiling.part, _nrt=False)  # arrays are views without references, so none are counted: two thirds of the time to compile
 
 PLAUSIBLE = 1000.0  # times the largest size in training, beyond which a value counts as not measured
 CLIP = 4.0  # standard deviations
@@ -187,7 +189,7 @@ class State(NamedTuple):
     statistics: Statistics
 
 
-@entry(nogil=True)
+@compiling.entry(nogil=True, _nrt=False)
 def health_kernel(rows, measured, tables, memory, out, statistics):  # type: ignore[no-untyped-def]
     """Judge row after row.
 
@@ -210,8 +212,8 @@ def health_kernel(rows, measured, tables, memory, out, statistics):  # type: ign
         slow = _look_at_values(still, model, state)
         _look_at_relations(still, model, state)
         out[0, k], out[1, k], out[2, k] = _decide(absent, slow, model, state)
-        if statistics.shape[0] > 0:
-            statistics[k] = state.statistics.every
+        for j in range(statistics.shape[1] if statistics.shape[0] > 0 else 0):  # a slice would compile for seconds
+            statistics[k, j] = state.statistics.every[j]
         _remember(model, state)
 
 

@@ -127,16 +127,16 @@ def _speedometer(proposals: Proposals, turning: Turning, wheels: Wheels) -> tupl
         return proposals, []
     by_wheels = wheels_over_speed(wheels, proposals, turning.columns["vx"].slow * si_factor(own.unit, "vx"))
     if by_wheels is None or abs(by_wheels - turning.scale) > WHEELS_AGREE:
-        text = f"'{own.column}' reads {_excess(turning.scale)} by ay over yaw_rate, or ay too little; a factor in the data set corrects it"
-        return proposals, [text]
+        excess = _excess(turning.scale / abs(turning.correlation), turning.scale * abs(turning.correlation))  # by regression either way
+        return proposals, [f"'{own.column}' reads {excess} by ay over yaw_rate, or ay too little; a factor in the data set corrects it"]
     scaled = f"vx {own.unit} {own.sign:+d} {own.factor * by_wheels:.3f}"
     doubt = own.asked or f"it reads {_excess(by_wheels)} by the wheels and by ay over yaw_rate, as speedometers do; '{scaled}' corrects it"
     changed = replace(own, asked=doubt, others=(*own.others, scaled))
     return replace(proposals, channels=tuple(changed if one is own else one for one in proposals.channels)), []
 
 
-def _excess(scale: float) -> str:
-    return f"{100.0 * (1.0 / scale - 1.0):.0f} % too much"
+def _excess(*scales: float) -> str:
+    return f"{' to '.join(dict.fromkeys(f'{100.0 * (1.0 / scale - 1.0):.0f}' for scale in scales))} % too much"
 
 
 def _stands(columns: Sequence[Candidate]) -> bool:

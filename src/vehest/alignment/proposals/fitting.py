@@ -24,7 +24,7 @@ CLEAR = 0.6  # correlation that decides where nothing else comes near
 CLEAR_LATERAL = 0.45  # of relations with derivatives of noisy channels
 LEAST = 0.3
 NEAR = 2.0  # score within which another column comes near
-OF_REFERENCE = 2.5  # of score, for what the car is to measure itself
+OF_REFERENCE, BESIDE_BUS = 2.5, 8.0  # of score, for what the car is to measure itself; where its bus has a column of that name, more
 SECOND = 3.0 + STRONG  # score of a sideslip angle beside a lateral velocity
 CENTRED = 0.1  # of a command's range, by which straight ahead may lie beside nil
 HARDLY = "the motion hardly decides it"
@@ -134,7 +134,8 @@ def _as_ax(search: Search, column: Candidate) -> Offer | None:
     is_clear = best.strength >= CLEAR and (best.mismatch < 1.1 or bool(column.unit))
     asked = "" if is_clear or (column.hint("ax") == STRONG and column.unit) else HARDLY
     evidence = (best.in_words or "its name alone", *_name_evidence(column, "ax"))
-    score = _score(best.strength, CLEAR, column.hint("ax")) - OF_REFERENCE * column.is_reference
+    measured = any(one.is_of_bus and "ax" in one.hints for one in search.free)
+    score = _score(best.strength, CLEAR, column.hint("ax")) - (BESIDE_BUS if measured else OF_REFERENCE) * column.is_reference
     return Offer(score, column, Proposal(column.name, "ax", unit, best.sign, evidence, asked))
 
 

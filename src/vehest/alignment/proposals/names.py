@@ -8,7 +8,7 @@ from functools import cache
 STRONG, WEAK = 4.0, 2.0
 
 _STRONG = {  # over the name without blanks
-    "other": r"temp|oilp|gear|^gang|gang$|thrott|pedal|gaspe|drossel|volt|batt|sats?$|satel|qual|status|lapn|^lap|runde|"
+    "other": r"temp(?!o)|oilp|gear|^gang|gang$|thrott|pedal|gaspe|drossel|volt|batt|sats?$|satel|qual|status|lapn|^lap|runde|"
     r"dist|strecke|weg$|height|altit|hoehe|vertvel|cov|rms|std|jerk|ruck|fuel|tank|error|count|engn|engine|"
     r"motordreh|^drehzahl|^rpm$|^nmot|wind|susp|feder|damper|^id$|index|event|friction|accped|orientation|"
     r"magnet|flag|counter|zaehler|time|zeit|stamp|safety|yawa(ng)?acc|yawangular|gierbeschl|angularacc",
@@ -41,7 +41,7 @@ _WEAK = {
     "ay": r"quer$|^quer|lateral|^lat",
     "ax": r"laengs|langs|^longitudinal",
     "steer": r"^cmd$|^str$|steering",
-    "vx": r"^v$|^u$|spd|^vel|v$|wheelv|vwheel|omegawheels|^gs$|^sog$",
+    "vx": r"^v$|^u$|^tempo|spd|^vel|v$|wheelv|vwheel|omegawheels|^gs$|^sog$",
     "vy_ref": r"^v$|v$|quer",
     "sideslip_ref": r"slip",
     "heading": r"yaw|^phi$|head|^theta$",

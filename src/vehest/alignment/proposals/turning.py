@@ -235,6 +235,7 @@ def _separated(family: Sequence[Repeat], channel: str) -> list[Proposal]:
     """The car's own and the reference's of columns that measure the same; more than these two are left out."""
     plain = [one for one in family if not is_filtered(one.column.name)] or list(family)
     own = [one for one in plain if one.column.is_of_bus] or [one for one in plain if not one.column.is_reference]
+    own = own or [one for one in family if not one.column.is_reference]  # filtered, but the car's
     references = [one for one in plain if one.column.is_reference] or [one for one in plain if one not in own]
     text = f"agrees {min(abs(correlation(one.column.slow, family[0].column.slow)) for one in plain):.2f} with the other {channel}"
 

@@ -258,10 +258,11 @@ def scan(n, grips, start, prior, spread, decay, theta, state, samples, found, pa
         values[STEADY] = sample[0] * (n.rear - n.compliance * speed * speed)
         _judge(values, state.candidates, state.weights, lags, sample, yaw_rate, n, g_1, g_slow, moving)
         _combine(values, state.weights, parameters[t], sample, n, found[t])
-        window[:-1] = window[1:]
-        window[-1] = sample
+        for j in range(len(sample)):  # slices would compile for seconds
+            for i in range(len(window) - 1):
+                window[i, j] = window[i + 1, j]
+            window[-1, j] = last[j] = sample[j]
         lags[PREDICTED] = _network(theta, n.yaw_rate_max, window, n.dt)
-        last[:] = sample
 
 
 @part()

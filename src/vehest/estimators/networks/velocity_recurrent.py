@@ -33,6 +33,7 @@ TRIAL = Trial(
     11,
     "recurrent networks over all samples so far; minutes",
     "estimator.inputs=[yaw_rate,ax,ay,vx,steer] estimator.outputs=[vy] estimator.rate_hz=20 training.phase.max_epochs=100",
+    samples=300,
 )
 
 State = tuple[Tensor, ...]

@@ -288,8 +288,9 @@ class Explorer {
       }
       bands.push({ series: [1, 2], fill: band.fill });
     }
+    const gaps = (_plot, _series, _first, _last, found) => found.map(([from, to]) => [from - 1, to + 1]); // where points share a pixel, a line joins its ends
     for (const line of lines) {
-      series.push({ label: line.label, stroke: line.colour, width: line.width, dash: line.dash, points: { show: false } });
+      series.push({ label: line.label, stroke: line.colour, width: line.width, dash: line.dash, points: { show: false }, gaps });
       data.push(broken(line.values));
     }
     const settings = {

@@ -99,11 +99,13 @@ def draft(examined: Examined) -> Draft:
 
 
 def _read_strictest(dataset: dict[str, Any]) -> tuple[dict[str, Any], list[Recording]]:
-    """The data set with the strictest clock that all files keep, and its recordings."""
+    """The data set with the strictest clock that all files keep and that has a plain rate, as a downsampling needs; its recordings."""
     for policy in POLICIES.get(dataset["source"], ()):
         with suppress(DataError):
             own = dataset | {"clock": policy}
-            return own, _recordings(own)
+            recordings = _recordings(own)
+            if all(math.isclose(one.rate_hz, plain_rate(one.rate_hz, RATE_TOLERANCE)) for one in recordings):
+                return own, recordings
     return dataset, _recordings(dataset)
 
 

@@ -22,6 +22,7 @@ from vehest.data.splits import check_name
 from vehest.run.config import compose_config
 from vehest.run.config_files import choices
 from vehest.run.printing import counted
+from vehest.sources.base import source_names
 from vehest.sources.clocks import plain_rate
 from vehest.sources.surveys import Log, RawColumn, survey
 from vehest.sources.text_log import bridged
@@ -37,7 +38,7 @@ TABLES = ("tabular", "text_log")
 LAYOUT = {"delimiter": ",", "decimal": ".", "encoding": "utf8", "skip_rows": 0, "rows_below_names": 0, "runs": None}
 """Options of a table's layout with their defaults."""
 VEHICLE = {
-    "wheelbase": "wheelbase [m], if you know it (also gives the steering ratio by slow corners, and baselines from the data sheet)",
+    "wheelbase": "wheelbase [m], if you know it (for the filter without a reference, the steering ratio, and baselines of the data sheet)",
     "mass": "mass [kg], if you know it (with the wheelbase, filters over a single track)",
     "steering_ratio": "steering wheel's angle to the road wheels', if you know it (estimated from slow corners if the wheelbase is known)",
 }
@@ -79,8 +80,8 @@ def inspect(name: str, files: Sequence[Path], vehicle: Mapping[str, float | None
     existing = [file for file in paths_of(name) if os.path.lexists(file)]
     if existing and not force:
         raise ConfigurationError(f"'{existing[0]}' is there already; take another name, or --force to write it anew")
-    if name in choices("dataset") and not paths_of(name)[0].exists():
-        raise ConfigurationError(f"'{name}' is a data set that comes with vehest; take another name")
+    if name in source_names():
+        raise ConfigurationError(f"'{name}' is a source that comes with vehest; take another name")
     with use_limits(limits_from_config(compose_config("estimate")["limits"])):
         logs = [survey(file) for file in files]
     longest = _longest(logs)
@@ -100,7 +101,8 @@ def inspect(name: str, files: Sequence[Path], vehicle: Mapping[str, float | None
     if not proposals.channels:
         names = counted([column.name for column in longest.columns])
         raise DataError(f"'{longest.file}': no column is recognised as a channel, by name or by motion, of {names}")
-    proposals = replace(proposals, notes=(*proposals.notes, *_notes(longest, logs)))
+    shadowed = [f"'{name}' is a data set that comes with vehest, too; in this folder it is yours"] if name in choices("dataset") else []
+    proposals = replace(proposals, notes=(*proposals.notes, *_notes(longest, logs), *(shadowed if not existing else [])))
     timed = longest.seconds is not None or any(column.stamps is not None for column in longest.columns)
     place, rate = _place(files, longest.source), None if timed else proposals.rate_hz
     return Examined(name, tuple(files), (longest, *others), proposals, place, rate, dict.fromkeys(VEHICLE) | dict(vehicle or {}))
@@ -135,8 +137,8 @@ def _longest(logs: Sequence[Log]) -> Log:
     options = dict(longest.options)
     marks = sorted({mark for log in logs for mark in log.options.get("missing", ())})
     options |= {"missing": marks} if marks else {}
-    if "runs" not in options and any(log.options.get("time_restarts") for log in logs):
-        options["time_restarts"] = True
+    if "runs" not in options:
+        options |= {key: log.options[key] for log in logs for key in ("time_restarts", "max_gap") if key in log.options}
     return replace(longest, options=options, source="text_log" if any(log.source == "text_log" for log in logs) else longest.source)
 
 
@@ -151,6 +153,8 @@ def _notes(longest: Log, logs: Sequence[Log]) -> Iterator[str]:
     if len(longest.skipped) > MOST_LISTED:
         yield f"not read: {len(longest.skipped) - MOST_LISTED} more"
     for log in logs:
+        if "max_gap" in log.options:
+            yield f"'{log.file.name}' pauses for more than {log.options['max_gap']:g} s and makes {len(log.runs)} recordings"
         stamps_of_runs = [] if log.seconds is None else [log.seconds[run] for run in log.runs]
         for stamps in stamps_of_runs:
             steps = np.diff(stamps)

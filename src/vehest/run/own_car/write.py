@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-import itertools
+import math
 from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import asdict, dataclass, field
 from importlib.metadata import entry_points
+from itertools import cycle, pairwise
 from typing import Any
 
+import numpy as np
 import yaml
 
 from vehest.alignment.standstill import STANDSTILL_SPEED
@@ -28,16 +30,19 @@ from vehest.run.own_car.questions import Question
 from vehest.run.usable import SCORED, car_parameters, usability
 
 LEARNT = 0.7  # of the recordings: training and validation
-LEAST_BLOCK = 4.0  # s of a recording for validation; shorter ones are not cut
+LEAST_BLOCK = 4.0  # s of a recording for validation, or of a whole one; recordings for whose fifth it is too much are not cut
 LEAST_SECONDS = 30.0  # of all recordings, to train at all
 ROLES_OF_THREE = ("train", "validation", "test")
 ROLES = ("train", "test", "train", "validation", "train", "test", "train", "train", "validation", "test")  # of whole recordings, in turn
 SHORT = 120.0  # s of recordings; below, hardly any comparison separates estimators
-PRETRAINED_CHANNELS = ("vx", "yaw_rate", "ax", "ay")
+FILTER_CHANNELS = ("vx", "yaw_rate", "ay")  # of the self-calibrating filter, which does without ax
+ASSUMED_WHEELBASE = 2.7  # m, where it is not given
 STIFFNESS = 10.0  # cornering stiffness of an axle over its load [1/rad], as the baseline data_sheet assumes
 HEIGHT = 0.2  # of the centre of gravity over the wheelbase; assumed
 PRETRAINED = "training.start_from=pretrained"
 PRETRAINED_HZ = 20.0
+EVALUATED_HZ = 20  # that every estimate is scored at, where the recordings are sampled as fast
+RATE = "estimator.rate_hz="
 GIVEN = Trial(1, "given by --with")
 MINUTES = (0.5, 1.0, 2.0, 5.0)  # of reference, parts of the pipeline where there are more
 DATASET_COMMENTS = {
@@ -98,11 +103,11 @@ def write(
     name = examined.name
     with use_limits(limits_from_config(compose_config("estimate")["limits"])):
         made = draft(examined)
-    plan = _plan_of(made.contents, examined.vehicle, further) if "vy_ref" in made.channels and not _is_too_short(made) else Plan()
+    plan = _plan_of(made, further) if "vy_ref" in made.channels and not _is_too_short(made) else Plan()
     plan.lacking.update({own: "nothing can be compared on these recordings" for own in further if not plan.sweeps})
     texts = [_dataset_text(made, left)]
     if plan.sweeps:
-        texts += [_split_text(made), _pipeline_text(name, plan, LEARNT * made.seconds / 60.0)]
+        texts += [_split_text(made), _pipeline_text(name, plan, LEARNT * made.seconds / 60.0, made.contents)]
     files = dict(zip(paths_of(name), texts, strict=False))
     stale = [file for file in paths_of(name)[len(files) :] if file.exists()]  # of an earlier one, which these recordings do not allow
     if not dry_run:
@@ -126,36 +131,51 @@ def write(
     return plain, [*lines, "next:", *(f"  {command}" for command in following)]
 
 
-def _are_short(made: Draft) -> bool:
-    return 0.2 * min(made.durations) < LEAST_BLOCK
+def _kept(made: Draft) -> list[str]:
+    """Recordings that a split takes; pieces that are too short even whole are left out."""
+    return [one.id for one, duration in zip(made.contents, made.durations, strict=True) if duration >= LEAST_BLOCK]
+
+
+def _cut(made: Draft) -> list[str]:
+    """Recordings that are long enough to be cut; none where most of the time is in short ones."""
+    long = {one.id: own for one, own in zip(made.contents, made.durations, strict=True) if 0.2 * own >= LEAST_BLOCK}
+    return list(long) if sum(long.values()) >= 0.5 * made.seconds else []
 
 
 def _is_too_short(made: Draft) -> bool:
-    return made.seconds < LEAST_SECONDS or (_are_short(made) and len(made.durations) < len(ROLES_OF_THREE))
+    return made.seconds < LEAST_SECONDS or (not _cut(made) and len(_kept(made)) < len(ROLES_OF_THREE))
 
 
 def _split_text(made: Draft) -> str:
-    """Blocks of each recording, or whole recordings where they are short."""
-    name, ids = made.examined.name, [one.id for one in made.contents]
-    if not _are_short(made):
+    """Blocks of each recording, whole recordings where they are short; short ones beside long ones are for training."""
+    name, ids, cut = made.examined.name, _kept(made), _cut(made)
+    if len(cut) == len(made.contents):
         blocks = {"name": name, "dataset": name, "train": "50 %", "validation": "20 %", "tests": {"test": "30 %"}}
         return _yaml(blocks, [f"{name}: {SPLIT_HEAD}"])
-    cycle = ROLES_OF_THREE if len(ids) == len(ROLES_OF_THREE) else ROLES
-    train, validation, test = (
-        [{"recording": own} for own, role in zip(ids, itertools.cycle(cycle), strict=False) if role == wanted] for wanted in ROLES_OF_THREE
-    )
+    if cut:
+        train, validation, test = (
+            [{"recording": own, "start": f"{start} %", "stop": f"{stop} %"} for own in cut] for start, stop in pairwise((0, 50, 70, 100))
+        )
+        train += [{"recording": own} for own in ids if own not in cut]
+    else:
+        order = ROLES_OF_THREE if len(ids) == len(ROLES_OF_THREE) else ROLES
+        roles = list(zip(ids, cycle(order), strict=False))
+        train, validation, test = ([{"recording": own} for own, role in roles if role == wanted] for wanted in ROLES_OF_THREE)
     split: dict[str, Any] = {"name": name, "dataset": name, "train": train, "validation": validation, "tests": {"test": test}}
-    return _yaml(split, [f"{name}: {WHOLE_HEAD}"])
+    return _yaml(split, [f"{name}: {SPLIT_HEAD if cut else WHOLE_HEAD}"])
 
 
 def _next_commands(made: Draft, plan: Plan) -> list[str]:
-    name, file = made.examined.name, made.examined.files[0]
+    name, file, longest = made.examined.name, made.examined.files[0], made.contents[int(np.argmax(made.durations))]
     commands = [f"vehest data check {name}", f"vehest data usable {name}"]
     if plan.sweeps:
         return [*commands, f"vehest run {name} --minutes 15"]
-    if file.is_dir() or not made.contents[0].channels.issuperset(PRETRAINED_CHANNELS):
+    if file.is_dir() or not longest.channels.issuperset(FILTER_CHANNELS):
         return commands
-    return [*commands, f"vehest estimate {file} dataset={name} -o estimate.parquet"]
+    file = next((own for own in made.examined.files if longest.id in (own.stem, f"{own.stem}_run_{longest.id.rpartition('_')[2]}")), file)
+    run = [] if longest.id == file.stem else [f"+dataset.run={longest.id.rpartition('_')[2]}"]
+    settings = [f"estimator.wheelbase={made.examined.vehicle['wheelbase'] or ASSUMED_WHEELBASE:g}"]
+    return [*commands, " ".join(["vehest estimate", str(file), f"dataset={name}", *run, *settings, "-o estimate.parquet"])]
 
 
 def found_in(examined: Examined) -> dict[str, Any]:
@@ -205,21 +225,24 @@ def _words(made: Draft, plan: Plan, left: Sequence[Question]) -> list[str]:
     return [*lines, *_limits(made), *(f"left out: {name}: {lack}" for name, lack in plan.lacking.items())]
 
 
-def _plan_of(contents: Sequence[RecordingSummary], vehicle: Mapping[str, float | None], further: Sequence[str]) -> Plan:
+def _plan_of(made: Draft, further: Sequence[str]) -> Plan:
     """Sweeps over the families that recordings and known values of the car allow; an empty plan where they allow none."""
-    plan, values = Plan(), _car(vehicle)
+    contents, vehicle = made.contents, made.examined.vehicle
+    plan, values, seconds, slowest = Plan(), _car(vehicle), _shortest_range(made), min(own.rate_hz for own in contents)
     own = [(GIVEN, name) for name in further if not estimator_class(name).trials]
     trials = sorted([*own, *((trial, name) for name in estimator_names() for trial in estimator_class(name).trials)])
-    sweeps: dict[tuple[str, str], list[str]] = {}
+    sweeps: dict[tuple[str, str, int], list[str]] = {}
     for trial, name in trials:
         sweeps.setdefault(trial[1:], []).append(name)
-    for (about, overrides), names in sweeps.items():
-        if PRETRAINED in overrides and min(own.rate_hz for own in contents) < PRETRAINED_HZ * (1 - 1e-9):
+    for (about, overrides, samples), names in sweeps.items():
+        if PRETRAINED in overrides and slowest < PRETRAINED_HZ * (1 - 1e-9):
             continue  # the next entry trains the same family from scratch
         unknown = [name for name in ("wheelbase", "mass") if not vehicle[name] and ("{car}" in overrides or f"{{{name}}}" in overrides)]
         car = " ".join(f"{key}={{{key.rpartition('.')[2]}}}" for key in car_parameters(names[0]))
         words = overrides.replace("{car}", car).format(**values).split()
-        lacks = {name: f"the car's {' and '.join(unknown)}" if unknown else _lack(name, words, contents) for name in names}
+        words = [word for word in words if not (word.startswith(RATE) and float(word.removeprefix(RATE)) > slowest)]
+        of_car = f"the car's {' and '.join(unknown)}" if unknown else ""
+        lacks = {name: of_car or _lack(name, words, contents, samples, seconds) for name in names}
         tried = [name for name in names if not lacks[name]]
         plan.lacking.update({name: lack for name, lack in lacks.items() if lack})
         if tried:
@@ -240,16 +263,26 @@ def _car(vehicle: Mapping[str, float | None]) -> dict[str, str]:
     return {name: f"{value:.4g}" for name, value in values.items()} | {"wheelbase": f"{wheelbase:g}"}
 
 
-def _lack(name: str, words: Sequence[str], contents: Sequence[RecordingSummary]) -> str:
+def _shortest_range(made: Draft) -> float:
+    """Of the longest range for training and all those for validation, the shortest [s]."""
+    durations = dict(zip((one.id for one in made.contents), made.durations, strict=True))
+    if cut := _cut(made):
+        return 0.2 * min(durations[own] for own in cut)
+    return min((durations[own] for own in _kept(made)), default=0.0)
+
+
+def _lack(name: str, words: Sequence[str], contents: Sequence[RecordingSummary], samples: int, seconds: float) -> str:
     first = [word if "[" in word else word.split(",")[0] for word in words if not word.startswith("seed=")]
     try:
         found = usability(name, compose_config("train", [f"estimator={name}", *first]), contents)
     except VehestError as error:
         return str(error)
-    return ", ".join([*found.missing.in_words(), *(f"{channel} without gaps" for channel in found.gaps)]) or found.to_give
+    needed = samples / (found.rate_hz or math.inf)
+    short = [f"{needed:.3g} s in each range for validation (the shortest has {seconds:.3g} s)"] if needed > seconds else []
+    return ", ".join([*found.missing.in_words(), *(f"{channel} without gaps" for channel in found.gaps), *short]) or found.to_give
 
 
-def _pipeline_of(name: str, plan: Plan, minutes: float) -> dict[str, Any]:
+def _pipeline_of(name: str, plan: Plan, minutes: float, contents: Sequence[RecordingSummary]) -> dict[str, Any]:
     """A pipeline for study and split of a name: all recordings, then parts with less of the minutes of reference."""
     parts: dict[str, Any] = {"all": {"title": "all recordings", "split": name, "sweeps": [words for words, _ in plan.sweeps]}}
     scratch = ["estimator=ksnn", "estimator.n_local=2", "estimator.n_hidden=2", "training.max_epochs=100"]
@@ -260,8 +293,9 @@ def _pipeline_of(name: str, plan: Plan, minutes: float) -> dict[str, Any]:
             if any(PRETRAINED in words for words, _ in plan.sweeps):
                 tuned = {"title": f"{part['title']}, trained on", "sweeps": [[*scratch, PRETRAINED]]}
                 parts[f"minutes_{own:g}_tuned"] = part | tuned
+    evaluation = {"rate_hz": min([EVALUATED_HZ, *(one.rate_hz for one in contents)]), "least_speed": STANDSTILL_SPEED}
     study = {"study": name, "title": f"Which estimator to trust on {name}", "report": "own_car", "publish": False}
-    return study | {"evaluation": {"rate_hz": 20, "least_speed": STANDSTILL_SPEED}, "parts": parts}
+    return study | {"evaluation": evaluation, "parts": parts}
 
 
 def _limits(own: Draft) -> list[str]:
@@ -271,20 +305,29 @@ def _limits(own: Draft) -> list[str]:
         lengths = f"{own.seconds:.0f} s in {len(own.durations)} recording{'s' if len(own.durations) > 1 else ''}"
         return [
             f"{lengths} are too short to train, stop and test on: record two minutes or more with bends, or three drives or more, "
-            "with the reference; until then vehest estimate runs the filter that comes with vehest"
+            f"with the reference; until then {_without_reference(own)}"
         ]
-    if not missing and _are_short(own):
-        return [f"the recordings are short, so the split takes whole recordings ({len(own.durations)}, {own.seconds:.0f} s in all)"]
+    if not missing and not _cut(own):
+        return [f"the recordings are short, so the split takes whole recordings ({len(_kept(own))}, {own.seconds:.0f} s in all)"]
     if not missing:
         text = f"{own.seconds:.0f} s in all, a third of it for tests, hardly rank estimators; record some minutes more"
         return [text] if own.seconds < SHORT else []
     if "vy_ref" not in missing:
         return [f"every estimate is scored by {' and '.join(SCORED)}; {', '.join(missing)} is missing"]
-    lacking = ", ".join(name for name in PRETRAINED_CHANNELS if name not in own.contents[0].channels)
     return [
         "these recordings have no reference of lateral velocity or sideslip: nothing can be trained or ranked on them; "
-        f"the filter that comes with vehest can estimate, by vehest estimate{f'; it lacks {lacking}' if lacking else ''}"
+        + _without_reference(own)
     ]
+
+
+def _without_reference(own: Draft) -> str:
+    """What estimates without a reference."""
+    lacking = ", ".join(name for name in FILTER_CHANNELS if name not in own.channels)
+    if lacking:
+        return f"the self-calibrating filter, which needs no reference, lacks {lacking}"
+    wheelbase = own.examined.vehicle["wheelbase"]
+    unknown = "" if wheelbase else f", with your car's wheelbase [m] instead of {ASSUMED_WHEELBASE:g}"
+    return f"the self-calibrating filter needs none and estimates by the last command below{unknown}"
 
 
 def _dataset_text(made: Draft, left: Sequence[Question]) -> str:
@@ -307,12 +350,12 @@ def _dataset_text(made: Draft, left: Sequence[Question]) -> str:
     return _yaml({**dataset, "reference_point": "unknown", "imu_point": "unknown", "accept": []}, head, comments)
 
 
-def _pipeline_text(name: str, plan: Plan, minutes: float) -> str:
+def _pipeline_text(name: str, plan: Plan, minutes: float, contents: Sequence[RecordingSummary]) -> str:
     head = [f"Estimators tried on {name}: {PIPELINE_HEAD.format(name=name)}"]
     head += [ASSUMED] if any(".car." in word for words, _ in plan.sweeps for word in words) else []
     head += [f"  {words[0].removeprefix('estimator=')}: {about}" for words, about in plan.sweeps]
     head += ["Left out, and what each lacks:", *(f"  {own}: {lack}" for own, lack in plan.lacking.items())]
-    return _yaml(_pipeline_of(name, plan, minutes), head)
+    return _yaml(_pipeline_of(name, plan, minutes, contents), head)
 
 
 def _yaml(content: Mapping[str, Any], head: Sequence[str], comments: Mapping[str, str] | None = None) -> str:

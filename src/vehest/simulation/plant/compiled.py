@@ -239,7 +239,8 @@ def _evaluate(states, regimes, inputs, vector, frictions, helds):  # type: ignor
     derivatives, forces = np.empty((n_samples, N_STATES)), np.empty((n_samples, N_FORCES))
     for k in range(n_samples):
         p = _unpack(vector, frictions[k])
-        held[:4] = helds[k]
+        for i in range(4):
+            held[i] = helds[k, i]
         contact = (regimes[k], inputs[k], _sliding_friction(p.tire), _sliding_friction(p.tire_rear), lags, held)
         wheels = _right_hand_side(states[k].copy(), contact, p, derivatives[k])
         sine, cosine = math.sin(states[k, STEER]), math.cos(states[k, STEER])

@@ -46,7 +46,8 @@ def bag_files(path: Path) -> list[Path]:
     except OSError as error:
         raise MissingError(f"cannot read '{path}' ({error.strerror}); check its permissions") from None
     if not files:
-        raise MissingError(f"'{path}' holds no bag: neither {METADATA} nor a file ending in {' or '.join(STORAGES)}")
+        found = f"neither {METADATA} nor a file ending in {' or '.join(STORAGES)}"
+        raise MissingError(f"'{path}' holds no bag: {found}; of other logs name the files, such as {path / '*.csv'}")
     return files
 
 

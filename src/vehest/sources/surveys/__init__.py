@@ -21,7 +21,7 @@ from vehest.sources.vbo import SLIP_AT_A_POINT, read_log, require_slip_offsets
 
 __all__ = ["Log", "RawColumn", "Stamps", "survey"]
 
-MDF, BAGS = (".mf4", ".mdf", ".dat"), (".db3", ".mcap", ".zip")
+MDF, BAGS, CAN = (".mf4", ".mdf", ".dat"), (".db3", ".mcap", ".zip"), (".blf", ".asc", ".trc")
 DEGREES = {"heading": "deg"}  # of a VBOX, which does not say so: a compass's, clockwise from north
 
 
@@ -44,6 +44,11 @@ def survey(path: Path) -> Log:
 
 def _survey(path: Path) -> Log:
     ending = path.suffix.lower()
+    if ending == ".mat":
+        table = f"writetable(struct2table(load('{path.name}')), '{path.stem}.csv')"
+        raise DataError(f"'{path}' is MATLAB's; save its channels as columns of a table, in MATLAB by {table}")
+    if ending in CAN:
+        raise DataError(f"'{path}' is a log of a CAN bus; save its decoded signals as CSV or MDF, or declare them (docs/sources/can.md)")
     if ending == ".bag":
         raise DataError(f"'{path}' is a bag of ROS 1; convert it by 'rosbags-convert --src {path.name} --dst {path.stem}'")
     if path.is_dir() or ending in BAGS:

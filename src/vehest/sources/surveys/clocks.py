@@ -10,8 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vehest.constants import FloatArray
+from vehest.sources.clocks import span_fault
 from vehest.sources.surveys.log import Stamps
-from vehest.sources.table_rows import stretches
+from vehest.sources.table_rows import stretches, timed_runs
 
 NAMED = re.compile(
     r"^(t|ts|tm|time|zeit|timestamps?|stamp|sec|secs|seconds|sekunden|epoch|utc|clock|unix|temps|tiempo|tempo|elapsed|uhrzeit)\b"
@@ -26,6 +27,8 @@ SPELLINGS = {
 }
 RATES = (4.0, 2500.0)  # Hz that loggers write; the units' ranges do not meet
 LONG_GAP = 20.0  # steps; where a column counts on, too, a run ends
+MAX_GAP = 1.0  # s without a row, and at least some steps, in which a run ends even so
+FEWEST_STEPS = 5.0  # of such a gap
 REGULAR = 0.8  # share of the steps within half a median step
 MOST_RESTARTS = 0.01  # of the rows
 
@@ -38,6 +41,7 @@ class Found:
     seconds: FloatArray | None  # times of the rows [s], (N,)
     runs: tuple[slice, ...]  # rows of each run, the longest first
     counted_by: str = ""  # column that counts the runs; empty where none does
+    max_gap: float | None = None  # s without a row, in which a run ends; None where none does
 
 
 def find_clock(columns: Mapping[str, FloatArray], units: Mapping[str, str]) -> Found:
@@ -56,8 +60,14 @@ def find_clock(columns: Mapping[str, FloatArray], units: Mapping[str, str]) -> F
     values = columns[best.column]
     steps, seconds = np.diff(values), (values - values[0]) * UNITS[best.unit]
     starts, counted_by = _run_starts(columns, best.column, steps, step)
-    runs = sorted(stretches(starts, n_rows), key=lambda rows: rows.start - rows.stop)
-    return Found(best, seconds, tuple(runs), counted_by)
+    longest, max_gap = max(MAX_GAP, FEWEST_STEPS * step * UNITS[best.unit]), None
+    gaps = (np.diff(seconds) > longest) & ~starts
+    runs = stretches(starts, n_rows)
+    stray = any(span_fault(seconds[run]) for run in runs if run.stop - run.start > 1)
+    if not counted_by and gaps.any() and gaps.mean() <= MOST_RESTARTS and not stray:
+        cut = [*timed_runs(seconds, longest, restarts=True).values()]
+        runs, max_gap = (cut, longest) if cut else (runs, None)
+    return Found(best, seconds, tuple(sorted(runs, key=lambda rows: rows.start - rows.stop)), counted_by, max_gap)
 
 
 def plain_name(name: str) -> str:

@@ -58,9 +58,10 @@ def survey_table(file: Path) -> Log:
     """What a table holds; raises `DataError` where it is no table, has no names, or holds no numbers."""
     if is_parquet(file):
         with parquet_file(file) as table:
-            names = [field.name for field in table.schema_arrow if _is_numeric(field.type)]
+            dates = {field.name: field.type.unit for field in table.schema_arrow if pa.types.is_timestamp(field.type)}
+            names = [field.name for field in table.schema_arrow if field.name in dates or _is_numeric(field.type)]
             check_limit("columns", len(names), f"'{file}' has {len(names)} columns")
-            return _log(file, read_numbers(file, table, names), {}, {}, {}, [])
+            return _log(file, read_numbers(file, table, names), {}, dates, {}, [])
     shape = shape_of(file)
     values, clocks, marks, skipped = _columns(file, shape)
     always, plain = ("delimiter", "decimal"), asdict(TextLayout())
@@ -90,8 +91,12 @@ def _log(
         stamps = replace(stamps, unit=CLOCK, evidence=stamps.evidence.replace("unit in the header", "times of a clock"), asked=False)
     named = {name: times for name, times in values.items() if stamps is None and NAMED.match(plain_name(name))}
     faults = [_fault(name, times) for name, times in {**clocks, **named}.items() if stamps is None or name != stamps.column]
-    if len(found.runs) > 1:
-        options = {**options, "runs": found.counted_by} if found.counted_by else {**options, "time_restarts": True}
+    if found.max_gap is not None:
+        options = {**options, "max_gap": float(f"{found.max_gap:.3g}")}
+    if found.counted_by:
+        options = {**options, "runs": found.counted_by}
+    elif found.seconds is not None and (np.diff(found.seconds) < 0).any():
+        options = {**options, "time_restarts": True}
     beside = {stamps.column if stamps else None, found.counted_by or None}
     columns = [RawColumn(name, written[name], samples, {"column": name}) for name, samples in values.items() if name not in beside]
     plain = not {"rows_below_names", "missing"} & set(options) and (stamps is None or stamps.unit != CLOCK)
@@ -193,7 +198,7 @@ def _decoded(head: bytes, file: Path) -> tuple[str, str]:
     if head.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
         return "utf-16", head.decode("utf-16", errors="replace")
     if b"\0" in head or len(CONTROLS.findall(head)) > MOST_CONTROLS * len(head):
-        raise DataError(f"'{file}' is no table of text (it holds control characters); is it of another format? its ending says which")
+        raise DataError(f"'{file}' is no table of text (it holds control characters); save its channels as CSV")
     try:
         return "utf8", codecs.getincrementaldecoder("utf-8-sig")().decode(head, final=len(head) < HEAD)
     except UnicodeDecodeError:
