@@ -9,12 +9,12 @@ import numpy as np
 import torch
 
 from vehest.filters.noise_models import StateDependentNoise
-from vehest.filters.unscented_scan import Array, NoiseAt
+from vehest.filters.unscented_scan import CompiledNoise
 
 compiled = numba.njit(cache=True, nogil=True, error_model="numpy")
 
 
-def compiled_noise(noise: StateDependentNoise, least_entropy: float = -math.inf) -> NoiseAt:
+def compiled_noise(noise: StateDependentNoise, least_entropy: float = -math.inf) -> CompiledNoise:
     """What `StateDependentNoise` and `with_entropy` return, as a function of arrays of the noise's precision.
 
     Args:
@@ -25,18 +25,12 @@ def compiled_noise(noise: StateDependentNoise, least_entropy: float = -math.inf)
     parts = (noise.constant(noise.state_unit, noise.state_unit), noise.weight / noise.state_unit * unit[:, None], noise.offset * unit)
     constant, weight, offset = (part.detach().contiguous().numpy() for part in parts)
     scalar = constant.dtype.type
-    scale, least = scalar(noise.scale), scalar(least_entropy)
-
-    def at(states: Array, inputs: Array) -> Array:
-        out = np.empty((len(states), *constant.shape), states.dtype)
-        _covariances(states, constant, weight, offset, scale, least, out)
-        return out
-
-    return at
+    return CompiledNoise(_covariances, (constant, weight, offset, scalar(noise.scale), scalar(least_entropy)), len(constant))
 
 
 @compiled
-def _covariances(states, constant, weight, offset, scale, least, out):  # type: ignore[no-untyped-def]
+def _covariances(states, inputs, car, out):  # type: ignore[no-untyped-def]
+    constant, weight, offset, scale, least = car
     n = constant.shape[0]
     lower, factor = np.zeros_like(constant), np.zeros_like(constant)
     for b in range(states.shape[0]):

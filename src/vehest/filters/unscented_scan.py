@@ -9,7 +9,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager, nullcontext
-from dataclasses import dataclass
+from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -20,7 +20,7 @@ from torch import Tensor
 from vehest.filters.gating import Gate
 from vehest.filters.gaussian import Filtered, Gaussian
 from vehest.filters.sigma_points import SigmaRule
-from vehest.filters.unscented_steps import gate_of, moments_adjoint, moments_of, points_adjoint, points_of, update_adjoint, update_of
+from vehest.filters.unscented_loops import Setting, Tape, backward, by_address, forward
 
 MARGIN = 1e-6
 """Smallest eigenvalue of a repaired covariance, relative to its largest."""
@@ -128,75 +128,73 @@ class TorchModel(PointModel):
         return np.zeros_like(points) if own[0] is None else np.ascontiguousarray(own[0].numpy())
 
 
-@dataclass(frozen=True)
-class _Setting:
-    model: PointModel
-    rule: Array
-    lower: Array
-    margin: Any
-    repair: bool
-    gate: Gate | None
-    limit: Any
-
-    @classmethod
-    def of(cls, model: PointModel, rule: SigmaRule, n: int, dtype: Any, repair: bool, gate: Gate | None) -> _Setting:
-        lower = np.full(n, -np.inf, dtype) if model.lower is None else np.asarray(model.lower, dtype)
-        limit = None if gate is None else dtype(gate.deviations**2)
-        return cls(model, np.array(rule, dtype), lower, dtype(MARGIN), repair, gate, limit)
-
-
-class _Points:
-    """Sigma points of sequences, and room for them.
+class CompiledModel(PointModel):
+    """A model whose functions are compiled, so that the loop over samples runs without Python.
 
     Attributes:
-        values: (B, 2n + 1, n).
-        factor: that they are drawn with, (B, n, n).
-        lost: whether a covariance was not positive definite, (B,).
-        covariance: that they are drawn from, repaired where it had to be, (B, n, n).
+        entries: compiled transition and observation, called with (points, inputs, car, out), and their adjoints, called with (points, inputs,
+            car, upstream, out, gradients); arrays as in `PointModel`, ``out`` is written.
+        car: what all are given.
+        measured: number m of measurements.
     """
 
-    def __init__(self, setting: _Setting, sequences: int, n: int, dtype: Any) -> None:
-        self._setting = setting
-        self.values, self.factor = np.empty((sequences, 2 * n + 1, n), dtype), np.empty((sequences, n, n), dtype)
-        self.lost, self.covariance = np.zeros(sequences, np.bool_), np.empty((sequences, n, n), dtype)
+    entries: Sequence[Any]
+    car: tuple[Any, ...]
+    measured: int
 
-    def draw(self, mean: Array, covariance: Array) -> Array:
-        """Points of states."""
-        own = self._setting
-        self.covariance[:] = covariance
-        points_of(mean, self.covariance, own.rule, own.lower, own.margin, own.repair, self.factor, self.values, self.lost)
-        return self.values
+    def transition(self, points: Array, inputs: Array) -> Array:
+        """See `PointModel`."""
+        out = np.empty_like(points)
+        self.entries[0](points, inputs, self.car, out)
+        return out
 
-    def adjoint(self, mean: Array, points_bar: Array, mean_bar: Array, covariance_bar: Array) -> None:
-        """Add to the gradients of the states that points were last drawn of."""
-        points_adjoint(mean, self.factor, self._setting.rule, self._setting.lower, points_bar, mean_bar, covariance_bar)
+    def observation(self, points: Array, inputs: Array) -> Array:
+        """See `PointModel`."""
+        out = np.empty((*points.shape[:2], self.measured), points.dtype)
+        self.entries[1](points, inputs, self.car, out)
+        return out
+
+    def transition_adjoint(self, points: Array, inputs: Array, upstream: Array, gradients: Sequence[Array]) -> Array:
+        """See `PointModel`."""
+        out = np.empty_like(points)
+        self.entries[2](points, inputs, self.car, upstream, out, self.learnt(gradients))
+        return out
+
+    def observation_adjoint(self, points: Array, inputs: Array, upstream: Array, gradients: Sequence[Array]) -> Array:
+        """See `PointModel`."""
+        out = np.empty_like(points)
+        self.entries[3](points, inputs, self.car, upstream, out, self.learnt(gradients))
+        return out
+
+    def learnt(self, gradients: Sequence[Array]) -> tuple[Any, ...]:
+        """Gradients of the parameters as the adjoints take them."""
+        return tuple(gradients)
 
 
-class _Tape:
-    """What the steps leave behind, sample by sample."""
+class CompiledNoise(NamedTuple):
+    """A `NoiseAt` that is compiled.
 
-    def __init__(self, steps: int, sequences: int, n: int, m: int, dtype: Any) -> None:
-        def empty(*shape: int) -> Array:
-            return np.empty((steps, sequences, *shape), dtype)
+    Attributes:
+        entry: compiled, called with (states, inputs, car, out); writes covariances (B, k, k).
+        car: what else it is given.
+        size: k.
+    """
 
-        points = 2 * n + 1
-        self.prior_mean, self.prior_covariance = empty(n), empty(n, n)
-        self.post_mean, self.post_covariance = empty(n), empty(n, n)
-        self.moved, self.expected = empty(points, n), empty(points, m)
-        self.innovation, self.own, self.gain, self.likelihood, self.centre = empty(m), empty(m, m), empty(n, m), empty(), empty()
-        self.repaired, self.gone = np.zeros((steps, sequences), np.bool_), np.zeros((steps, sequences, m), np.bool_)
+    entry: Any
+    car: tuple[Any, ...]
+    size: int
 
-    def slice(self, first: int, end: int) -> _Tape:
-        """The same of some sequences, copied to lie together."""
-        part = _Tape.__new__(_Tape)
-        for name, values in vars(self).items():
-            setattr(part, name, np.ascontiguousarray(values[:, first:end]))
-        return part
+    def __call__(self, states: Array, inputs: Array) -> Array:
+        """Covariances at states."""
+        out = np.empty((len(states), self.size, self.size), states.dtype)
+        self.entry(states, inputs, self.car, out)
+        return out
 
-    def put(self, first: int, end: int, part: _Tape) -> None:
-        """Take what was computed for some sequences back."""
-        for name, values in vars(part).items():
-            getattr(self, name)[:, first:end] = values
+
+def _setting(model: PointModel, rule: SigmaRule, n: int, dtype: Any, repair: bool, gate: Gate | None) -> Setting:
+    lower = np.full(n, -np.inf, dtype) if model.lower is None else np.asarray(model.lower, dtype)
+    limit, patience = (0.0, 0) if gate is None else (gate.deviations**2, gate.patience)
+    return Setting(np.array(rule, dtype), lower, dtype(MARGIN), repair, gate is not None, dtype(limit), patience)
 
 
 def unscented_scan(
@@ -246,16 +244,16 @@ def unscented_scan(
         raise ValueError(f"the initial state, mean {tuple(initial.mean.shape)}, does not fit {sequences} sequences") from None
     dtype = measurements.dtype
     numpy_dtype = np.float32 if dtype == torch.float32 else np.float64
-    setting = _Setting.of(model, rule, n, numpy_dtype, repair, gate)
+    setting = _setting(model, rule, n, numpy_dtype, repair, gate)
     noises = [process_noise, observation_noise]
     functions = [noise if not isinstance(noise, Tensor) else None for noise in noises]
     tensors = [
-        noise.expand(sequences, steps, size, size) if isinstance(noise, Tensor) else measurements.new_empty(0)
+        noise.expand(sequences, steps, size, size) if isinstance(noise, Tensor) else measurements.new_empty(0, 0, 0, 0)
         for noise, size in zip(noises, (n, m), strict=True)
     ]
-    tape = _Tape(steps, sequences, n, m, numpy_dtype)
+    tape = Tape.of(steps, sequences, n, m, numpy_dtype)
     post_mean, post_covariance = _Scan.apply(  # type: ignore[no-untyped-call]
-        setting, share or _alone, tape, functions, measurements, inputs, mean, covariance, *tensors, *model.parameters
+        model, setting, share or _alone, tape, functions, measurements, inputs, mean, covariance, *tensors, *model.parameters
     )
     outside = [torch.from_numpy(values.swapaxes(0, 1)) for values in (tape.prior_mean, tape.prior_covariance, tape.innovation, tape.own)]
     filtered = Filtered(
@@ -297,12 +295,12 @@ class UnscentedStepper:
         gate: Gate | None = None,
     ) -> None:
         n, dtype = len(mean), mean.dtype.type
-        self._setting = _Setting.of(model, rule, n, dtype, repair, gate)
+        self._model, self._setting = model, _setting(model, rule, n, dtype, repair, gate)
         self._refused = np.zeros((1, measurements), np.int64)
-        self._points = _Points(self._setting, 1, n, dtype)
-        self._tape = tape = _Tape(1, 1, n, measurements, dtype)
+        self._tape = tape = Tape.of(1, 1, n, measurements, dtype)
         tape.prior_mean[0], tape.prior_covariance[0] = mean, covariance
         self._inputs: Array | None = None
+        self._runs: dict[NoiseAt | None, Callable[..., None]] = {}
         self.prior = Gaussian(tape.prior_mean[0, 0], tape.prior_covariance[0, 0])
         self.state = Gaussian(tape.post_mean[0, 0], tape.post_covariance[0, 0])
         self.innovation, self.innovation_covariance, self.gain = tape.innovation[0, 0], tape.own[0, 0], tape.gain[0, 0]
@@ -324,14 +322,19 @@ class UnscentedStepper:
 
     def predict(self, inputs: Array, process_noise: Array | NoiseAt) -> None:
         """Move the state to the next sample by inputs of this one."""
-        before = self._tape.post_mean[0].copy(), self._tape.post_covariance[0].copy()
-        with self._setting.model.working():
-            _predict(self._setting, self._tape, 0, self._points, *before, inputs[None], process_noise)
+        self._run(0, self._tape.innovation, inputs, process_noise)
 
     def update(self, measurement: Array, inputs: Array, observation_noise: Array | NoiseAt) -> None:
         """Take in the measurement."""
-        with self._setting.model.working():
-            _update(self._setting, self._tape, 0, self._points, measurement[None].copy(), inputs[None], observation_noise, self._refused)
+        self._run(1, measurement[None, None].copy(), inputs, observation_noise)
+
+    def _run(self, half: int, y: Array, inputs: Array, noise: Array | NoiseAt) -> None:
+        given, at = (noise[None], None) if isinstance(noise, np.ndarray) else (self._tape.own[:0], noise)
+        u, refused = np.ascontiguousarray(inputs)[None, None], self._refused
+        if at not in self._runs:
+            self._runs[at] = _forward_by(self._model, (at, at), self._tape, u)
+        with self._model.working():
+            self._runs[at](self._setting, self._tape, y, u, given, given, refused, (half, half + 1), 0, 1)
 
 
 def moved(model: PointModel, states: Tensor, inputs: Tensor) -> Tensor:
@@ -360,9 +363,10 @@ class _Scan(torch.autograd.Function):
     @staticmethod
     def forward(
         ctx: Any,
-        setting: _Setting,
+        model: PointModel,
+        setting: Setting,
         share: Share,
-        tape: _Tape,
+        tape: Tape,
         functions: Sequence[NoiseAt | None],
         measurements: Tensor,
         inputs: Tensor,
@@ -372,198 +376,77 @@ class _Scan(torch.autograd.Function):
         observation: Tensor,
         *parameters: Tensor,
     ) -> tuple[Tensor, Tensor]:
-        y, u = _by_time(measurements), _by_time(inputs)
-        if setting.gate is not None:
+        y, u, *noises = (_by_time(tensor) for tensor in (measurements, inputs, process, observation))
+        if setting.gated:
             y = y.copy()  # what is refused becomes NaN in it, and so is never measured for the adjoint either
-        first = [tensor.detach().contiguous().numpy() for tensor in (mean, covariance)]
-        noises: list[Any] = [
-            _by_time(noise) if function is None else function for noise, function in zip((process, observation), functions, strict=True)
-        ]
-
-        def work(start: int, end: int) -> None:
-            part = tape if end - start == y.shape[1] else tape.slice(start, end)
-            own = [noise[:, start:end] if isinstance(noise, np.ndarray) else noise for noise in noises]
-            _forward(setting, part, y[:, start:end], u[:, start:end], first[0][start:end], first[1][start:end], own)
-            if part is not tape:
-                tape.put(start, end, part)
-
-        with setting.model.working():
-            share(work, y.shape[1])
-        ctx.kept = (setting, share, tape, functions, y, u)
+        tape.prior_mean[0], tape.prior_covariance[0] = mean.detach().numpy(), covariance.detach().numpy()
+        rest = (np.zeros(y.shape[1:], np.int64), (1, 2 * len(y)))
+        run = _forward_by(model, functions, tape, u)
+        with model.working():
+            share(lambda first, end: run(setting, tape, y, u, *noises, *rest, first, end), y.shape[1])
+        ctx.kept = (model, setting, share, tape, functions, y, u)
         return torch.from_numpy(tape.post_mean), torch.from_numpy(tape.post_covariance)
 
     @staticmethod
     def backward(ctx: Any, *upstream: Tensor) -> tuple[Tensor | None, ...]:
-        setting, share, tape, functions, y, u = ctx.kept
+        model, setting, share, tape, functions, y, u = ctx.kept
         if any(function is not None for function in functions):
             raise RuntimeError("noise that is a function of the estimate has no gradients; give it as a tensor")
-        steps, sequences, n = tape.post_mean.shape
-        m = y.shape[2]
-        dtype = y.dtype
-        process, observation = np.zeros((steps, sequences, n, n), dtype), np.zeros((steps, sequences, m, m), dtype)
-        measured = np.zeros((steps, sequences, m), dtype)
-        mean, covariance = np.zeros((sequences, n), dtype), np.zeros((sequences, n, n), dtype)
-        mean_up, covariance_up = (np.ascontiguousarray(part.numpy()) for part in upstream)
+        noises = [np.zeros_like(tape.post_covariance), np.zeros_like(tape.own)]
+        measured, mean, covariance = (np.zeros_like(part) for part in (y, tape.post_mean[0], tape.post_covariance[0]))
+        bars = (*noises, measured, *(np.ascontiguousarray(part.numpy()) for part in upstream), mean, covariance)
         gradients: dict[int, list[Array]] = {}
 
-        def work(start: int, end: int) -> None:
-            whole = end - start == sequences
-            part = tape if whole else tape.slice(start, end)
-            own = [np.zeros(tuple(parameter.shape), dtype) for parameter in setting.model.parameters]
-            gradients[start] = own
-            wanted = (process, observation, measured)
-            bars = [piece if whole else np.ascontiguousarray(piece[:, start:end]) for piece in (*wanted, mean_up, covariance_up)]
-            data = (y[:, start:end], u[:, start:end])
-            mean[start:end], covariance[start:end] = _backward(setting, part, *data, bars, own)
-            if not whole:
-                for piece, bar in zip(wanted, bars, strict=False):
-                    piece[:, start:end] = bar
+        def work(first: int, end: int) -> None:
+            gradients[first] = [np.zeros(tuple(parameter.shape), y.dtype) for parameter in model.parameters]
+            run, own = _backward_by(model, tape, u, gradients[first])
+            run(setting, tape, y, u, bars, own, first, end)
 
-        with setting.model.working():
-            share(work, sequences)
+        with model.working():
+            share(work, y.shape[1])
         summed = [torch.from_numpy(np.asarray(sum(parts))) for parts in zip(*(gradients[key] for key in sorted(gradients)), strict=True)]
-        y_bar, *noise = (torch.from_numpy(bar).transpose(0, 1) for bar in (measured, process, observation))
-        return (None, None, None, None, y_bar, None, torch.from_numpy(mean), torch.from_numpy(covariance), *noise, *summed)
+        y_bar, *noise_bars = (torch.from_numpy(bar).transpose(0, 1) for bar in (measured, *noises))
+        return (None, None, None, None, None, y_bar, None, torch.from_numpy(mean), torch.from_numpy(covariance), *noise_bars, *summed)
 
 
-def _forward(
-    setting: _Setting,
-    tape: _Tape,
-    y: Array,
-    u: Array,
-    mean: Array,
-    covariance: Array,
-    noises: Sequence[Any],
-) -> None:
-    refused = np.zeros(y.shape[1:], np.int64)
-    points = _Points(setting, len(mean), mean.shape[1], y.dtype)
-    for k in range(len(y)):
-        now = np.ascontiguousarray(u[k])
-        if k == 0:
-            tape.prior_mean[0], tape.prior_covariance[0] = mean, covariance
-        else:
-            before = np.ascontiguousarray(u[k - 1])
-            _predict(setting, tape, k, points, tape.post_mean[k - 1], tape.post_covariance[k - 1], before, _noise(noises[0], k - 1))
-        seen = np.ascontiguousarray(y[k])
-        _update(setting, tape, k, points, seen, now, _noise(noises[1], k), refused)
-        if setting.gate is not None:
-            y[k] = seen
+def _forward_by(model: PointModel, functions: Sequence[NoiseAt | None], tape: Tape, u: Array) -> Callable[..., None]:
+    """The loop over samples with a model and noise: compiled where both are."""
+    if not isinstance(model, CompiledModel) or not all(at is None or isinstance(at, CompiledNoise) for at in functions):
+        wrapped = (_written(model.transition), _written(model.observation), None)
+        noises = [part for at in functions for part in ((None, None) if at is None else (_written(at), None))]
+        return partial(getattr(forward, "py_func", forward), *wrapped, *noises)
+    points, inputs, expected = tape.moved[0], u[0], tape.expected[0]
+    called = (by_address(model.entries[0], points, inputs, model.car, points), by_address(model.entries[1], points, inputs, model.car, expected))
+    noises = []
+    for at, state in zip(functions, (tape.post_mean[0], tape.prior_mean[0]), strict=True):
+        noises += [None, None] if at is None else [by_address(at.entry, state, inputs, at.car, tape.post_covariance[0]), at.car]
+    return partial(forward, *called, model.car, *noises)
 
 
-def _predict(
-    setting: _Setting, tape: _Tape, k: int, points: _Points, mean: Array, covariance: Array, inputs: Array, noise: Array | NoiseAt
-) -> None:
-    """Move states to sample ``k`` of the tape."""
-    tape.moved[k] = setting.model.transition(points.draw(mean, covariance), inputs)
-    tape.repaired[k] = points.lost
-    added = noise if isinstance(noise, np.ndarray) else noise(mean, inputs)
-    moments_of(tape.moved[k], added, setting.rule, setting.lower, tape.prior_mean[k], tape.prior_covariance[k])
+def _backward_by(model: PointModel, tape: Tape, u: Array, gradients: Sequence[Array]) -> tuple[Callable[..., None], Any]:
+    """The adjoint's loop with a model, and the gradients as it takes them."""
+    if not isinstance(model, CompiledModel):
+        return partial(getattr(backward, "py_func", backward), _added(model.transition_adjoint), _added(model.observation_adjoint), None), gradients
+    own, points, inputs = model.learnt(gradients), tape.moved[0], u[0]
+    called = [
+        by_address(entry, points, inputs, model.car, upstream, points, own)
+        for entry, upstream in zip(model.entries[2:], (points, tape.expected[0]), strict=True)
+    ]
+    return partial(backward, *called, model.car), own
 
 
-def _update(
-    setting: _Setting,
-    tape: _Tape,
-    k: int,
-    points: _Points,
-    y: Array,
-    inputs: Array,
-    noise: Array | NoiseAt,
-    refused: NDArray[np.int64],
-) -> None:
-    """Take in the measurement at sample ``k`` of the tape; what a gate refuses becomes NaN in ``y``."""
-    mean = tape.prior_mean[k]
-    tape.expected[k] = setting.model.observation(points.draw(mean, tape.prior_covariance[k]), inputs)
-    tape.repaired[k] |= points.lost
-    spread = noise if isinstance(noise, np.ndarray) else noise(mean, inputs)
-    if setting.gate is not None:
-        tape.gone[k] = False
-        gate_of(tape.expected[k], spread, setting.rule, setting.limit, setting.gate.patience, y, refused, tape.gone[k])
-    update_of(
-        mean,
-        points.covariance,
-        points.values,
-        tape.expected[k],
-        y,
-        spread,
-        setting.rule,
-        setting.lower,
-        setting.margin,
-        setting.repair,
-        tape.post_mean[k],
-        tape.post_covariance[k],
-        tape.innovation[k],
-        tape.own[k],
-        tape.gain[k],
-        tape.likelihood[k],
-        tape.repaired[k],
-        tape.centre[k],
-    )
+def _written(function: Callable[[Array, Array], Array]) -> Callable[..., None]:
+    def write(values: Array, inputs: Array, _: Any, out: Array) -> None:
+        out[:] = function(values, inputs)
+
+    return write
 
 
-def _backward(
-    setting: _Setting,
-    tape: _Tape,
-    y: Array,
-    u: Array,
-    bars: Sequence[Array],
-    gradients: Sequence[Array],
-) -> tuple[Array, Array]:
-    """Gradients of the initial mean and covariance; those of noise and measurements are written, those of the parameters added.
+def _added(function: Callable[..., Array]) -> Callable[..., None]:
+    def write(points: Array, inputs: Array, _: Any, upstream: Array, out: Array, gradients: Sequence[Array]) -> None:
+        out[:] = function(points, inputs, upstream, gradients)
 
-    Args:
-        bars: gradients of process noise, observation noise and measurements, which are written, and of filtered means and covariances.
-    """
-    process_bar, observation_bar, y_bar, mean_up, covariance_up = bars
-    model, rule, lower = setting.model, setting.rule, setting.lower
-    steps, sequences, n = tape.post_mean.shape
-    m = y.shape[2]
-    points = _Points(setting, sequences, n, y.dtype)
-    points_bar, expected_bar = np.empty_like(points.values), np.empty((sequences, 2 * n + 1, m), y.dtype)
-    moved_bar = np.empty_like(points.values)
-    post_mean_bar, post_covariance_bar = np.zeros((sequences, n), y.dtype), np.zeros((sequences, n, n), y.dtype)
-    mean_bar, covariance_bar = np.empty_like(post_mean_bar), np.empty_like(post_covariance_bar)
-    for k in range(steps - 1, -1, -1):
-        now = np.ascontiguousarray(u[k])
-        post_mean_bar += mean_up[k]
-        post_covariance_bar += covariance_up[k]
-        update_adjoint(
-            tape.prior_mean[k],
-            points.draw(tape.prior_mean[k], tape.prior_covariance[k]),
-            tape.expected[k],
-            np.ascontiguousarray(y[k]),
-            rule,
-            lower,
-            tape.innovation[k],
-            tape.own[k],
-            tape.gain[k],
-            tape.centre[k],
-            post_mean_bar,
-            post_covariance_bar,
-            mean_bar,
-            covariance_bar,
-            points_bar,
-            expected_bar,
-            observation_bar[k],
-            y_bar[k],
-        )
-        points_bar += model.observation_adjoint(points.values, now, expected_bar, gradients)
-        points.adjoint(tape.prior_mean[k], points_bar, mean_bar, covariance_bar)
-        if k == 0:
-            break
-        moments_adjoint(tape.moved[k], rule, lower, mean_bar, covariance_bar, moved_bar, process_bar[k - 1])
-        before = np.ascontiguousarray(u[k - 1])
-        points.draw(tape.post_mean[k - 1], tape.post_covariance[k - 1])
-        points_bar[:] = model.transition_adjoint(points.values, before, moved_bar, gradients)
-        post_mean_bar[:] = 0
-        post_covariance_bar[:] = 0
-        points.adjoint(tape.post_mean[k - 1], points_bar, post_mean_bar, post_covariance_bar)
-    return mean_bar, covariance_bar
-
-
-def _noise(noise: Any, k: int) -> Array | NoiseAt:
-    """That of sample k, or the function that it is."""
-    own: Array | NoiseAt = np.ascontiguousarray(noise[k]) if isinstance(noise, np.ndarray) else noise
-    return own
+    return write
 
 
 def _by_time(tensor: Tensor) -> Array:

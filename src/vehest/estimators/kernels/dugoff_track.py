@@ -6,14 +6,13 @@ A point's derivatives are those of two numbers by two others: they are written o
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 
 import numba
 import numpy as np
 import torch
 
 from vehest.constants import GRAVITY
-from vehest.filters.unscented_scan import Array, PointModel
+from vehest.filters.unscented_scan import CompiledModel
 from vehest.vehicle.dugoff import LARGEST_RATIO, LEAST_COSINE, LEAST_LOAD, LEAST_SHARE, DugoffTrack
 
 PLAIN, SMOOTH = LARGEST_RATIO["plain"], LARGEST_RATIO["smooth"]
@@ -21,7 +20,7 @@ PLAIN, SMOOTH = LARGEST_RATIO["plain"], LARGEST_RATIO["smooth"]
 compiled = numba.njit(cache=True, nogil=True, error_model="numpy")
 
 
-class CompiledDugoffTrack(PointModel):
+class CompiledDugoffTrack(CompiledModel):
     """A `DugoffTrack` for the unscented filter; nothing of the car is learnt.
 
     Args:
@@ -32,36 +31,11 @@ class CompiledDugoffTrack(PointModel):
     def __init__(self, track: DugoffTrack, dtype: torch.dtype = torch.float64) -> None:
         car = track.car
         scalar = np.float32 if dtype == torch.float32 else np.float64
-        self._car = np.array(
-            [car.mass, car.yaw_inertia, car.cg_to_front_axle, car.cg_to_rear_axle, car.cg_height, track.step, track.minimum_speed], scalar
-        )
+        numbers = [car.mass, car.yaw_inertia, car.cg_to_front_axle, car.cg_to_rear_axle, car.cg_height, track.step, track.minimum_speed]
         axles = [[axle.cornering_stiffness, axle.friction, axle.reduction] for axle in (track.front, track.rear)]
-        self._axles, self._smooth = np.array(axles, scalar), track.tyres == "smooth"
-        self._measured = 5 if track.sees_sideslip else 4
-
-    def transition(self, points: Array, inputs: Array) -> Array:
-        """See `PointModel`."""
-        out = np.empty_like(points)
-        _transition(points, inputs, self._car, self._axles, self._smooth, out)
-        return out
-
-    def observation(self, points: Array, inputs: Array) -> Array:
-        """See `PointModel`."""
-        out = np.empty((*points.shape[:2], self._measured), points.dtype)
-        _observation(points, inputs, self._car, self._axles, self._smooth, out)
-        return out
-
-    def transition_adjoint(self, points: Array, inputs: Array, upstream: Array, gradients: Sequence[Array]) -> Array:
-        """See `PointModel`."""
-        out = np.empty_like(points)
-        _transition_adjoint(points, inputs, self._car, self._axles, self._smooth, upstream, out)
-        return out
-
-    def observation_adjoint(self, points: Array, inputs: Array, upstream: Array, gradients: Sequence[Array]) -> Array:
-        """See `PointModel`."""
-        out = np.empty_like(points)
-        _observation_adjoint(points, inputs, self._car, self._axles, self._smooth, upstream, out)
-        return out
+        self.car = (np.array(numbers, scalar), np.array(axles, scalar), track.tyres == "smooth")
+        self.measured = 5 if track.sees_sideslip else 4
+        self.entries = (_transition, _observation, _transition_adjoint, _observation_adjoint)
 
 
 @compiled
@@ -117,7 +91,8 @@ def _forces(vy, yaw_rate, vx, turned, cosine, load_front, load_rear, front_arm, 
 
 
 @compiled
-def _transition(points, inputs, car, axles, smooth, out):  # type: ignore[no-untyped-def]
+def _transition(points, inputs, track, out):  # type: ignore[no-untyped-def]
+    car, axles, smooth = track
     mass, inertia, front_arm, rear_arm, _, step, minimum_speed = car
     for b in range(points.shape[0]):
         vx, turned, cosine, load_front, load_rear = _settled(inputs[b], car)
@@ -133,7 +108,8 @@ def _transition(points, inputs, car, axles, smooth, out):  # type: ignore[no-unt
 
 
 @compiled
-def _observation(points, inputs, car, axles, smooth, out):  # type: ignore[no-untyped-def]
+def _observation(points, inputs, track, out):  # type: ignore[no-untyped-def]
+    car, axles, smooth = track
     mass, _, front_arm, rear_arm, _, _, _ = car
     for b in range(points.shape[0]):
         vx, turned, cosine, load_front, load_rear = _settled(inputs[b], car)
@@ -147,7 +123,8 @@ def _observation(points, inputs, car, axles, smooth, out):  # type: ignore[no-un
 
 
 @compiled
-def _transition_adjoint(points, inputs, car, axles, smooth, upstream, out):  # type: ignore[no-untyped-def]
+def _transition_adjoint(points, inputs, track, upstream, out, gradients):  # type: ignore[no-untyped-def]
+    car, axles, smooth = track
     mass, inertia, front_arm, rear_arm, _, step, minimum_speed = car
     for b in range(points.shape[0]):
         vx, turned, cosine, load_front, load_rear = _settled(inputs[b], car)
@@ -165,7 +142,8 @@ def _transition_adjoint(points, inputs, car, axles, smooth, upstream, out):  # t
 
 
 @compiled
-def _observation_adjoint(points, inputs, car, axles, smooth, upstream, out):  # type: ignore[no-untyped-def]
+def _observation_adjoint(points, inputs, track, upstream, out, gradients):  # type: ignore[no-untyped-def]
+    car, axles, smooth = track
     mass, _, front_arm, rear_arm, _, _, _ = car
     for b in range(points.shape[0]):
         vx, turned, cosine, load_front, load_rear = _settled(inputs[b], car)

@@ -21,7 +21,7 @@ from vehest.constants import GRAVITY
 from vehest.estimators.kernels.activation import arctan, sigmoid, softplus, tanh
 from vehest.estimators.kernels.blas import one_blas_thread
 from vehest.estimators.kernels.compiling import entry, part
-from vehest.filters.unscented_scan import Array, PointModel
+from vehest.filters.unscented_scan import Array, CompiledModel
 from vehest.vehicle.dynamics import TURN, UNSCALED, Dynamics, NeuralCar, PacejkaCar, Perceptron, ResidualCar, TyreNetworkCar, physical_of
 from vehest.vehicle.tyres import STILL
 
@@ -41,7 +41,7 @@ def copy_rows(rows, out):  # type: ignore[no-untyped-def]
             out[i, p] = rows[i, p]
 
 
-class CompiledPlanarCar(PointModel):
+class CompiledPlanarCar(CompiledModel):
     """A planar car for the unscented filter.
 
     Args:
@@ -73,38 +73,18 @@ class CompiledPlanarCar(PointModel):
         scalar = arrays[0].dtype.type
         flat = 4.0 * np.finfo(scalar).eps
         numbers = [physical.mass, physical.wheelbase, physical.wheel_radius, step, TURN, UNSCALED, STILL, flat, GRAVITY]
-        self._car = (tuple(arrays[:6]), arrays[6], np.array(numbers, scalar), kind)
+        self.car = (tuple(arrays[:6]), arrays[6], np.array(numbers, scalar), kind)
+        self.measured = 4
+        self.entries = (_transition, _observation, _transition_adjoint, _observation_adjoint)
 
     def working(self) -> AbstractContextManager[object]:
         """With matrix products on their thread."""
         return one_blas_thread()
 
-    def transition(self, points: Array, inputs: Array) -> Array:
-        """See `PointModel`."""
-        out = np.empty_like(points)
-        _transition(points, inputs, self._car, BLOCK, out)
-        return out
-
-    def observation(self, points: Array, inputs: Array) -> Array:
-        """See `PointModel`."""
-        out = np.empty((*points.shape[:2], 4), points.dtype)
-        _observation(points, inputs, self._car, BLOCK, out)
-        return out
-
-    def transition_adjoint(self, points: Array, inputs: Array, upstream: Array, gradients: Sequence[Array]) -> Array:
-        """See `PointModel`."""
-        return self._adjoint(_transition_adjoint, points, inputs, upstream, gradients)
-
-    def observation_adjoint(self, points: Array, inputs: Array, upstream: Array, gradients: Sequence[Array]) -> Array:
-        """See `PointModel`."""
-        return self._adjoint(_observation_adjoint, points, inputs, upstream, gradients)
-
-    def _adjoint(self, adjoint: Any, points: Array, inputs: Array, upstream: Array, gradients: Sequence[Array]) -> Array:
-        out = np.empty_like(points)
+    def learnt(self, gradients: Sequence[Array]) -> tuple[Any, ...]:
+        """With whether they are wanted; those that are not are never written."""
         learning = bool(self.parameters)
-        own = tuple(gradients) if learning else (*self._car[0], self._car[1])  # never written to without learning
-        adjoint(points, inputs, self._car, BLOCK, upstream, out, learning, own)
-        return out
+        return (*(gradients if learning else (*self.car[0], self.car[1])), learning)
 
 
 def is_compilable(dynamics: Dynamics) -> bool:
@@ -495,9 +475,9 @@ def _rates(x, motion, rates):  # type: ignore[no-untyped-def]
 
 
 @piece
-def _block_of(sequences, count, block):  # type: ignore[no-untyped-def]
+def _block_of(sequences, count):  # type: ignore[no-untyped-def]
     """Sequences in a block, so that blocks are about equal."""
-    most = max(block // count, 1)
+    most = max(BLOCK // count, 1)
     pieces = (sequences + most - 1) // most
     return (sequences + pieces - 1) // pieces
 
@@ -540,10 +520,10 @@ def _stages(x0, u, car, x, rooms, rates):  # type: ignore[no-untyped-def]
 
 
 @compiled
-def _transition(points, inputs, car, block, out):  # type: ignore[no-untyped-def]
+def _transition(points, inputs, car, out):  # type: ignore[no-untyped-def]
     sequences, count, n = points.shape
     step = car[2][3]
-    size = _block_of(sequences, count, block)
+    size = _block_of(sequences, count)
     for first in range(0, sequences, size):
         end = min(first + size, sequences)
         columns = (end - first) * count
@@ -559,9 +539,9 @@ def _transition(points, inputs, car, block, out):  # type: ignore[no-untyped-def
 
 
 @compiled
-def _observation(points, inputs, car, block, out):  # type: ignore[no-untyped-def]
+def _observation(points, inputs, car, out):  # type: ignore[no-untyped-def]
     sequences, count, n = points.shape
-    size = _block_of(sequences, count, block)
+    size = _block_of(sequences, count)
     for first in range(0, sequences, size):
         end = min(first + size, sequences)
         columns = (end - first) * count
@@ -574,10 +554,11 @@ def _observation(points, inputs, car, block, out):  # type: ignore[no-untyped-de
 
 
 @compiled
-def _transition_adjoint(points, inputs, car, block, upstream, out, learning, gradients):  # type: ignore[no-untyped-def]
+def _transition_adjoint(points, inputs, car, upstream, out, gradients):  # type: ignore[no-untyped-def]
+    learning = gradients[7]
     sequences, count, n = points.shape
     step = car[2][3]
-    size = _block_of(sequences, count, block)
+    size = _block_of(sequences, count)
     for first in range(0, sequences, size):
         end = min(first + size, sequences)
         columns = (end - first) * count
@@ -609,9 +590,10 @@ def _transition_adjoint(points, inputs, car, block, upstream, out, learning, gra
 
 
 @compiled
-def _observation_adjoint(points, inputs, car, block, upstream, out, learning, gradients):  # type: ignore[no-untyped-def]
+def _observation_adjoint(points, inputs, car, upstream, out, gradients):  # type: ignore[no-untyped-def]
+    learning = gradients[7]
     sequences, count, n = points.shape
-    size = _block_of(sequences, count, block)
+    size = _block_of(sequences, count)
     for first in range(0, sequences, size):
         end = min(first + size, sequences)
         columns = (end - first) * count
