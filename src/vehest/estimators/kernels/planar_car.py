@@ -1,10 +1,13 @@
 """Sigma points through the planar cars of `vehicle.dynamics`, compiled, with the adjoint.
 
-Points lie side by side in columns, so that layers are matrix products and everything else runs along rows. The adjoint computes
-stages again instead of keeping them. Blocks of sequences are small enough for a core's own cache; matrix products stay on their thread.
+Points lie side by side in columns, so that what is computed of each runs along rows; columns are as many as fill whole vectors, and those
+beyond the points repeat the last one and have no gradient. A network sees a point a row, its units side by side: its matrix products are as
+fast for a few points as for many. The adjoint computes stages again instead of keeping them. Blocks of sequences are small enough for a
+core's own cache; matrix products stay on their thread.
 
-In the compiled code ``car`` is (layers, theta, constants, kind): weight and offset of the three layers, learnt numbers in the order of
-`PHYSICAL` and `PACEJKA`, known ones, and which car. ``room`` is what a motion leaves for its adjoint (`_room`).
+In the compiled code ``car`` is (layers, theta, constants, kind): layers are weight, offset and transposed weight of each of the three,
+learnt numbers are in the order of `PHYSICAL` and `PACEJKA`, then known ones, and which car. ``room`` is what a motion leaves for its adjoint
+(`_room`).
 """
 
 from __future__ import annotations
@@ -22,6 +25,7 @@ from vehest.estimators.kernels.activation import arctan, sigmoid, softplus, tanh
 from vehest.estimators.kernels.blas import one_blas_thread
 from vehest.estimators.kernels.compiling import entry, part
 from vehest.filters.unscented_scan import Array, CompiledModel
+from vehest.lanes import width
 from vehest.vehicle.dynamics import TURN, UNSCALED, Dynamics, NeuralCar, PacejkaCar, Perceptron, ResidualCar, TyreNetworkCar, physical_of
 from vehest.vehicle.tyres import STILL
 
@@ -61,7 +65,8 @@ class CompiledPlanarCar(CompiledModel):
             raise ValueError(f"there is no compiled code for this {type(dynamics).__name__}: {known}")
         network = getattr(dynamics, "network", None)
         if isinstance(network, Perceptron):
-            layers = [tensor for pair in network.layers() for tensor in pair]
+            (W1, b1), (W2, b2), (W3, b3) = network.layers()
+            layers = [W1.mT, b1, W2.mT, b2, W3, b3]  # as their gradients are fastest
         else:
             layers = [torch.zeros(0, 0), torch.zeros(0)] * 3
         physical = physical_of(dynamics)
@@ -73,7 +78,8 @@ class CompiledPlanarCar(CompiledModel):
         scalar = arrays[0].dtype.type
         flat = 4.0 * np.finfo(scalar).eps
         numbers = [physical.mass, physical.wheelbase, physical.wheel_radius, step, TURN, UNSCALED, STILL, flat, GRAVITY]
-        self.car = (tuple(arrays[:6]), arrays[6], np.array(numbers, scalar), kind)
+        matrices = tuple(np.ascontiguousarray(arrays[place].T) for place in (0, 2, 4))
+        self.car = ((*arrays[:6], *matrices), arrays[6], np.array(numbers, scalar), kind)
         self.measured = 4
         self.entries = (_transition, _observation, _transition_adjoint, _observation_adjoint)
 
@@ -84,7 +90,7 @@ class CompiledPlanarCar(CompiledModel):
     def learnt(self, gradients: Sequence[Array]) -> tuple[Any, ...]:
         """With whether they are wanted; those that are not are never written."""
         learning = bool(self.parameters)
-        return (*(gradients if learning else (*self.car[0], self.car[1])), learning)
+        return (*(gradients if learning else (*self.car[0][:6], self.car[1])), learning)
 
 
 def is_compilable(dynamics: Dynamics) -> bool:
@@ -106,15 +112,25 @@ def _kind_of(dynamics: Dynamics) -> int | None:
 
 
 @piece
-def _columns(points, inputs, first, end, x, u):  # type: ignore[no-untyped-def]
-    """Points of some sequences side by side; rows of u are steering angle, its sine and cosine, and current."""
+def _columns(points, first, end, rest, x):  # type: ignore[no-untyped-def]
+    """Points of some sequences side by side; columns beyond them are ``rest`` times the last one."""
     count, n = points.shape[1:]
     for b in range(first, end):
-        sine, cosine = math.sin(inputs[b, 0]), math.cos(inputs[b, 0])
         for s in range(count):
-            p = (b - first) * count + s
             for i in range(n):
-                x[i, p] = points[b, s, i]
+                x[i, (b - first) * count + s] = points[b, s, i]
+    last = (end - first) * count - 1
+    for i in range(n):
+        for p in range(last + 1, x.shape[1]):
+            x[i, p] = rest * x[i, last]
+
+
+@piece
+def _driven(inputs, first, end, count, u):  # type: ignore[no-untyped-def]
+    """Inputs at those columns; rows of u are steering angle, its sine and cosine, and current."""
+    for b in range(first, end):
+        sine, cosine = math.sin(inputs[b, 0]), math.cos(inputs[b, 0])
+        for p in range((b - first) * count, (b + 1 - first) * count if b + 1 < end else u.shape[1]):
             u[0, p], u[1, p], u[2, p], u[3, p] = inputs[b, 0], sine, cosine, inputs[b, 1]
 
 
@@ -129,21 +145,11 @@ def _put(rows, points, first, end):  # type: ignore[no-untyped-def]
 
 
 @piece
-def _layer(weight, offset, below, above):  # type: ignore[no-untyped-def]
-    np.dot(weight, below, above)
-    for i in range(above.shape[0]):
-        row = above[i]
-        value = offset[i]
-        for p in range(row.shape[0]):
-            row[p] += value
-
-
-@piece
-def _squash(rows):  # type: ignore[no-untyped-def]
-    for i in range(rows.shape[0]):
-        row = rows[i]
-        for p in range(row.shape[0]):
-            row[p] = sigmoid(row[p])
+def _hidden(below, transposed, offset, above):  # type: ignore[no-untyped-def]
+    np.dot(below, transposed, above)
+    for p in range(above.shape[0]):
+        for i in range(above.shape[1]):
+            above[p, i] = sigmoid(above[p, i] + offset[i])
 
 
 @piece
@@ -157,46 +163,62 @@ def _rise(above, below, flat):  # type: ignore[no-untyped-def]
 
 @piece
 def _network(layers, f, h1, h2, o):  # type: ignore[no-untyped-def]
-    W1, b1, W2, b2, W3, b3 = layers
-    _layer(W1, b1, f, h1)
-    _squash(h1)
-    _layer(W2, b2, h1, h2)
-    _squash(h2)
-    _layer(W3, b3, h2, o)
+    T1, b1, T2, b2, _, b3, _, _, T3 = layers
+    _hidden(f, T1, b1, h1)
+    _hidden(h1, T2, b2, h2)
+    out = np.empty((f.shape[0], 4), f.dtype)
+    np.dot(h2, T3, out)
+    for k in range(4):
+        for p in range(f.shape[0]):
+            o[k, p] = out[p, k] + b3[k]
+        for p in range(f.shape[0], o.shape[1]):
+            o[k, p] = 0
 
 
 @piece
 def _network_adjoint(layers, flat, f, h1, h2, o_bar, f_bar, learning, gradients):  # type: ignore[no-untyped-def]
     """Writes ``f_bar``, and adds to the gradients when learning."""
-    W1, _, W2, _, W3, _ = layers
-    h2_bar, h1_bar = np.empty_like(h2), np.empty_like(h1)
-    np.dot(W3.T, o_bar, h2_bar)
-    for i in range(h2.shape[0]):
-        for p in range(h2.shape[1]):
-            h2_bar[i, p] *= _rise(h2[i, p], 1 - h2[i, p], flat)
-    np.dot(W2.T, h2_bar, h1_bar)
-    for i in range(h1.shape[0]):
-        for p in range(h1.shape[1]):
-            h1_bar[i, p] *= _rise(h1[i, p], 1 - h1[i, p], flat)
-    np.dot(W1.T, h1_bar, f_bar)
+    _, _, _, _, W3, _, W1, W2, _ = layers
+    h2_bar, h1_bar, out_bar = np.empty_like(h2), np.empty_like(h1), np.empty((f.shape[0], 4), f.dtype)
+    for p in range(f.shape[0]):
+        for k in range(4):
+            out_bar[p, k] = o_bar[k, p]
+    np.dot(out_bar, W3, h2_bar)
+    _through_hidden(h2, flat, h2_bar)
+    np.dot(h2_bar, W2, h1_bar)
+    _through_hidden(h1, flat, h1_bar)
+    np.dot(h1_bar, W1, f_bar)
     if learning:
-        dW1, db1, dW2, db2, dW3, db3 = gradients[:6]
-        _add_layer(o_bar, h2, dW3, db3)
-        _add_layer(h2_bar, h1, dW2, db2)
-        _add_layer(h1_bar, f, dW1, db1)
+        dT1, db1, dT2, db2, dW3, db3 = gradients[:6]
+        _add_product(out_bar, h2, dW3)
+        _add_product(h1, h2_bar, dT2)
+        _add_product(f, h1_bar, dT1)
+        _add_rows(out_bar, db3)
+        _add_rows(h2_bar, db2)
+        _add_rows(h1_bar, db1)
 
 
 @piece
-def _add_layer(above_bar, below, dW, db):  # type: ignore[no-untyped-def]
-    product = np.empty_like(dW)
-    np.dot(above_bar, below.T, product)
-    for i in range(dW.shape[0]):
-        for j in range(dW.shape[1]):
-            dW[i, j] += product[i, j]
-        total = db[i] * 0
-        for p in range(above_bar.shape[1]):
-            total += above_bar[i, p]
-        db[i] += total
+def _through_hidden(rows, flat, rows_bar):  # type: ignore[no-untyped-def]
+    for p in range(rows.shape[0]):
+        for i in range(rows.shape[1]):
+            rows_bar[p, i] *= _rise(rows[p, i], 1 - rows[p, i], flat)
+
+
+@piece
+def _add_product(one, other, out):  # type: ignore[no-untyped-def]
+    product = np.empty_like(out)
+    np.dot(one.T, other, product)
+    for i in range(out.shape[0]):
+        for j in range(out.shape[1]):
+            out[i, j] += product[i, j]
+
+
+@piece
+def _add_rows(rows, out):  # type: ignore[no-untyped-def]
+    for p in range(rows.shape[0]):
+        for i in range(rows.shape[1]):
+            out[i] += rows[p, i]
 
 
 @piece
@@ -211,15 +233,19 @@ def _seen(x, u, car, f, slips):  # type: ignore[no-untyped-def]
         slips[1, p] = arctan((x[1, p] - lr * x[2, p]) / along)
         slips[2, p] = (x[3, p] - x[0, p]) / along
     if kind in (FRICTION_SCALED, UNSCALED_FORCES):
-        copy_rows(x[:5], f)
-        copy_rows(u[:1], f[5:])
-        copy_rows(slips[:3], f[6:])
-        if kind == UNSCALED_FORCES:
-            copy_rows(u[3:], f[9:])
+        for p in range(f.shape[0]):
+            for i in range(5):
+                f[p, i] = x[i, p]
+            f[p, 5] = u[0, p]
+            for i in range(3):
+                f[p, 6 + i] = slips[i, p]
+            if kind == UNSCALED_FORCES:
+                f[p, 9] = u[3, p]
     elif kind in (PACEJKA_AND_RATES, RATES):
-        copy_rows(x[:4], f)
-        copy_rows(u[:1], f[4:])
-        copy_rows(u[3:], f[5:])
+        for p in range(f.shape[0]):
+            for i in range(4):
+                f[p, i] = x[i, p]
+            f[p, 4], f[p, 5] = u[0, p], u[3, p]
 
 
 @piece
@@ -424,16 +450,15 @@ def _motion_adjoint(x, u, car, room, out_bar, x_bar, learning, gradients):  # ty
     if kind != PACEJKA_FORCES:
         _network_adjoint(layers, constants[7], f, h1, h2, o_bar, f_bar, learning, gradients)
     if kind in (FRICTION_SCALED, UNSCALED_FORCES):
-        for i in range(5):
-            for p in range(points):
-                x_bar[i, p] += f_bar[i, p]
-        for i in range(3):
-            for p in range(points):
-                slips_bar[i, p] += f_bar[6 + i, p]
+        for p in range(f.shape[0]):
+            for i in range(5):
+                x_bar[i, p] += f_bar[p, i]
+            for i in range(3):
+                slips_bar[i, p] += f_bar[p, 6 + i]
     elif kind in (PACEJKA_AND_RATES, RATES):
-        for i in range(4):
-            for p in range(points):
-                x_bar[i, p] += f_bar[i, p]
+        for p in range(f.shape[0]):
+            for i in range(4):
+                x_bar[i, p] += f_bar[p, i]
     if kind == RATES:
         for p in range(points):
             x_bar[0, p] += out_bar[1, p] * x[2, p]
@@ -483,14 +508,21 @@ def _block_of(sequences, count):  # type: ignore[no-untyped-def]
 
 
 @piece
-def _room(columns, car, dtype):  # type: ignore[no-untyped-def]
+def _filling(points, like):  # type: ignore[no-untyped-def]
+    """Columns for so many points, as many as fill whole vectors."""
+    lanes = width(like)
+    return (points + lanes - 1) // lanes * lanes
+
+
+@piece
+def _room(points, columns, car, dtype):  # type: ignore[no-untyped-def]
     """For what the network sees, slips, both hidden layers, the network's outputs, forces, and rates without what a network adds."""
-    W1, _, W2, _, _, _ = car[0]
+    T1, _, T2 = car[0][:3]
     return (
-        np.empty((W1.shape[1], columns), dtype),
+        np.empty((points, T1.shape[0]), dtype),
         np.empty((3, columns), dtype),
-        np.empty((W1.shape[0], columns), dtype),
-        np.empty((W2.shape[0], columns), dtype),
+        np.empty((points, T1.shape[1]), dtype),
+        np.empty((points, T2.shape[1]), dtype),
         np.empty((4, columns), dtype),
         np.empty((6, columns), dtype),
         np.empty((4, columns), dtype),
@@ -498,8 +530,13 @@ def _room(columns, car, dtype):  # type: ignore[no-untyped-def]
 
 
 @piece
-def _four_rooms(columns, car, dtype):  # type: ignore[no-untyped-def]
-    return _room(columns, car, dtype), _room(columns, car, dtype), _room(columns, car, dtype), _room(columns, car, dtype)
+def _four_rooms(points, columns, car, dtype):  # type: ignore[no-untyped-def]
+    return (
+        _room(points, columns, car, dtype),
+        _room(points, columns, car, dtype),
+        _room(points, columns, car, dtype),
+        _room(points, columns, car, dtype),
+    )
 
 
 @piece
@@ -526,11 +563,13 @@ def _transition(points, inputs, car, out):  # type: ignore[no-untyped-def]
     size = _block_of(sequences, count)
     for first in range(0, sequences, size):
         end = min(first + size, sequences)
-        columns = (end - first) * count
+        own = (end - first) * count
+        columns = _filling(own, points)
         x0, u = np.empty((n, columns), points.dtype), np.empty((4, columns), points.dtype)
         x, rates = np.empty((4, n, columns), points.dtype), np.empty((4, n, columns), points.dtype)
-        room = _room(columns, car, points.dtype)
-        _columns(points, inputs, first, end, x0, u)
+        room = _room(own, columns, car, points.dtype)
+        _columns(points, first, end, 1, x0)
+        _driven(inputs, first, end, count, u)
         _stages(x0, u, car, x, (room, room, room, room), rates)
         for i in range(n):
             for p in range(columns):
@@ -544,10 +583,12 @@ def _observation(points, inputs, car, out):  # type: ignore[no-untyped-def]
     size = _block_of(sequences, count)
     for first in range(0, sequences, size):
         end = min(first + size, sequences)
-        columns = (end - first) * count
+        own = (end - first) * count
+        columns = _filling(own, points)
         x, u, expected = np.empty((n, columns), points.dtype), np.empty((4, columns), points.dtype), np.empty((4, columns), points.dtype)
-        _columns(points, inputs, first, end, x, u)
-        _motion(x, u, car, _room(columns, car, points.dtype), expected)
+        _columns(points, first, end, 1, x)
+        _driven(inputs, first, end, count, u)
+        _motion(x, u, car, _room(own, columns, car, points.dtype), expected)
         for p in range(columns):
             expected[2, p], expected[3, p] = x[2, p], x[3, p]
         _put(expected, out, first, end)
@@ -561,21 +602,23 @@ def _transition_adjoint(points, inputs, car, upstream, out, gradients):  # type:
     size = _block_of(sequences, count)
     for first in range(0, sequences, size):
         end = min(first + size, sequences)
-        columns = (end - first) * count
+        own = (end - first) * count
+        columns = _filling(own, points)
         x0, u, up = np.empty((n, columns), points.dtype), np.empty((4, columns), points.dtype), np.empty((n, columns), points.dtype)
         x, rates = np.empty((4, n, columns), points.dtype), np.empty((4, n, columns), points.dtype)
-        rooms = _four_rooms(columns, car, points.dtype)
-        _columns(points, inputs, first, end, x0, u)
+        rooms = _four_rooms(own, columns, car, points.dtype)
+        _columns(points, first, end, 1, x0)
+        _driven(inputs, first, end, count, u)
         _stages(x0, u, car, x, rooms, rates)
-        _columns(upstream, inputs, first, end, up, u)
+        _columns(upstream, first, end, 0, up)
         total, stage_bar, rates_bar = up.copy(), np.zeros_like(up), np.empty((4, columns), points.dtype)
         for k in range(4):
             at = 3 - k
-            own = step / 3 if at in (1, 2) else step / 6
+            weight = step / 3 if at in (1, 2) else step / 6
             later = step if at == 2 else step / 2
             for i in range(4):
                 for p in range(columns):
-                    rates_bar[i, p] = own * up[i, p] + (later * stage_bar[i, p] if at < 3 else 0)
+                    rates_bar[i, p] = weight * up[i, p] + (later * stage_bar[i, p] if at < 3 else 0)
             for p in range(columns):
                 stage_bar[0, p] = -rates_bar[1, p] * x[at, 2, p]
                 stage_bar[1, p] = rates_bar[0, p] * x[at, 2, p]
@@ -596,12 +639,14 @@ def _observation_adjoint(points, inputs, car, upstream, out, gradients):  # type
     size = _block_of(sequences, count)
     for first in range(0, sequences, size):
         end = min(first + size, sequences)
-        columns = (end - first) * count
+        own = (end - first) * count
+        columns = _filling(own, points)
         x, u, up = np.empty((n, columns), points.dtype), np.empty((4, columns), points.dtype), np.empty((4, columns), points.dtype)
-        room = _room(columns, car, points.dtype)
-        _columns(points, inputs, first, end, x, u)
+        room = _room(own, columns, car, points.dtype)
+        _columns(points, first, end, 1, x)
+        _driven(inputs, first, end, count, u)
         _motion(x, u, car, room, np.empty((4, columns), points.dtype))
-        _columns(upstream, inputs, first, end, up, u)
+        _columns(upstream, first, end, 0, up)
         x_bar = np.zeros_like(x)
         for p in range(columns):
             x_bar[2, p], x_bar[3, p] = up[2, p], up[3, p]
