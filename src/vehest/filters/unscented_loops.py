@@ -1,6 +1,7 @@
 """The loop over samples of the unscented filter and that of its adjoint, compiled with any compiled model; without compilation, with any model.
 
-Arrays by time lie (T, B, ...); a loop works on the sequences from ``first`` to ``end``, so that several may run side by side.
+Arrays by time lie (T, ..., B), followed by room for a vector (`room`); a loop works on the sequences from ``first`` to ``end``, so that several
+may run side by side.
 """
 
 from __future__ import annotations
@@ -18,6 +19,7 @@ from vehest.filters.unscented_steps import (
     moments_of,
     points_adjoint,
     points_of,
+    room,
     update_adjoint,
     update_of,
 )
@@ -36,7 +38,7 @@ class Setting(NamedTuple):
 
 
 class Tape(NamedTuple):
-    """What the steps leave behind, sample by sample, (T, B, ...)."""
+    """What the steps leave behind, sample by sample, (T, ..., B)."""
 
     prior_mean: Any
     prior_covariance: Any
@@ -57,8 +59,24 @@ class Tape(NamedTuple):
         """Of n states and m measurements."""
         points = 2 * n + 1
         shapes: list[tuple[int, ...]] = [(n,), (n, n), (n,), (n, n), (points, n), (points, m), (m,), (m, m), (n, m), (), ()]
-        made = [np.empty((steps, sequences, *shape), dtype) for shape in shapes]
-        return cls(*made, np.zeros((steps, sequences), np.bool_), np.zeros((steps, sequences, m), np.bool_))
+        made = [room((steps, *shape, sequences), dtype) for shape in shapes]
+        return cls(*made, np.zeros((steps, sequences), np.bool_), np.zeros((steps, m, sequences), np.bool_))
+
+
+def forward_scratch(tape: Tape) -> tuple[Any, ...]:
+    """What `forward` works with."""
+    points, covariance, spread = tape.moved[0], tape.prior_covariance[0], tape.own[0]
+    lost = np.empty(points.shape[-1:], np.bool_)
+    points, factor, own, made, made_spread = (room(part.shape, part.dtype) for part in (points, *[covariance] * 3, spread))
+    return points, factor, own, lost, made, made_spread
+
+
+def backward_scratch(tape: Tape) -> tuple[Any, ...]:
+    """What `backward` works with."""
+    points, expected, mean, covariance = tape.moved[0], tape.expected[0], tape.post_mean[0], tape.post_covariance[0]
+    shapes = [part.shape for part in (points, covariance, covariance, points, points, points, expected, mean, covariance)]
+    made = [room(shape, points.dtype) for shape in shapes]
+    return (*made[:3], np.empty(points.shape[-1:], np.bool_), *made[3:])
 
 
 def by_address(function: Any, *arguments: Any) -> CompileResultWAP:
@@ -84,129 +102,125 @@ def forward(  # type: ignore[no-untyped-def]
     process,
     spread,
     refused,
+    scratch,
     halves,
     first,
     end,
 ):
     """Halves of steps: half 2k moves the states to sample k of the tape, half 2k + 1 takes in the measurement there.
 
-    Noise is ``process`` and ``spread``, (T, B, k, k), or where there is a function, what it writes: ``at(states, inputs, car, out)``. What a
-    gate refuses becomes NaN in ``y`` and counts in ``refused``, (B, m).
+    Noise is ``process`` and ``spread``, (T, k, k, B), or where there is a function, what it writes: ``at(states, inputs, car, out, first,
+    end)``. What a gate refuses becomes NaN in ``y`` and counts in ``refused``, (B, m).
     """
-    n, count, m = tape.post_mean.shape[2], tape.moved.shape[2], y.shape[2]
-    sequences = end - first
-    points, factor = np.empty((sequences, count, n), y.dtype), np.empty((sequences, n, n), y.dtype)
-    covariance, lost = np.empty_like(factor), np.empty(sequences, np.bool_)
-    made_process, made_spread = np.empty_like(factor), np.empty((sequences, m, m), y.dtype)
     rule, lower = setting.rule, setting.lower
+    points, factor, covariance, lost, made_process, made_spread = scratch
     for half in range(halves[0], halves[1]):
         k = half // 2
-        repaired = tape.repaired[k, first:end]
         if half % 2 == 0:
-            mean, inputs = tape.post_mean[k - 1, first:end], u[k - 1, first:end]
-            covariance[:] = tape.post_covariance[k - 1, first:end]
-            points_of(mean, covariance, rule, lower, setting.margin, setting.repair, factor, points, repaired)
-            moved = tape.moved[k, first:end]
-            transition(points, inputs, car, moved)
+            mean, given, inputs, moved, repaired = tape.post_mean[k - 1], tape.post_covariance[k - 1], u[k - 1], tape.moved[k], tape.repaired[k]
+            points_of(mean, given, rule, lower, setting.margin, setting.repair, covariance, factor, points, repaired, first, end)
+            transition(points, inputs, car, moved, first, end)
             if process_at is None:
-                added = process[k - 1, first:end]
+                added = process[k - 1]
             else:
-                process_at(mean, inputs, process_car, made_process)
+                process_at(mean, inputs, process_car, made_process, first, end)
                 added = made_process
-            moments_of(moved, added, rule, lower, tape.prior_mean[k, first:end], tape.prior_covariance[k, first:end])
+            moments_of(moved, added, rule, lower, tape.prior_mean[k], tape.prior_covariance[k], first, end)
         else:
-            mean, inputs, expected = tape.prior_mean[k, first:end], u[k, first:end], tape.expected[k, first:end]
-            covariance[:] = tape.prior_covariance[k, first:end]
-            points_of(mean, covariance, rule, lower, setting.margin, setting.repair, factor, points, lost)
-            repaired |= lost
-            observation(points, inputs, car, expected)
+            mean, given, inputs, expected, repaired = tape.prior_mean[k], tape.prior_covariance[k], u[k], tape.expected[k], tape.repaired[k]
+            points_of(mean, given, rule, lower, setting.margin, setting.repair, covariance, factor, points, lost, first, end)
+            for b in range(first, end):
+                repaired[b] |= lost[b]
+            observation(points, inputs, car, expected, first, end)
             if spread_at is None:
-                noise = spread[k, first:end]
+                noise = spread[k]
             else:
-                spread_at(mean, inputs, spread_car, made_spread)
+                spread_at(mean, inputs, spread_car, made_spread, first, end)
                 noise = made_spread
-            measured = y[k, first:end]
             if setting.gated:
-                gone = tape.gone[k, first:end]
-                gone[:] = False
-                gate_of(expected, noise, rule, setting.limit, setting.patience, measured, refused[first:end], gone)
+                gate_of(expected, noise, rule, setting.limit, setting.patience, y[k], refused, tape.gone[k], first, end)
             update_of(
                 mean,
                 covariance,
                 points,
                 expected,
-                measured,
+                y[k],
                 noise,
                 rule,
                 lower,
                 setting.margin,
                 setting.repair,
-                tape.post_mean[k, first:end],
-                tape.post_covariance[k, first:end],
-                tape.innovation[k, first:end],
-                tape.own[k, first:end],
-                tape.gain[k, first:end],
-                tape.likelihood[k, first:end],
+                tape.post_mean[k],
+                tape.post_covariance[k],
+                tape.innovation[k],
+                tape.own[k],
+                tape.gain[k],
+                tape.likelihood[k],
                 repaired,
-                tape.centre[k, first:end],
+                tape.centre[k],
+                first,
+                end,
             )
 
 
 @compiled
-def backward(transition_adjoint, observation_adjoint, car, setting, tape, y, u, bars, gradients, first, end):  # type: ignore[no-untyped-def]
+def backward(transition_adjoint, observation_adjoint, car, setting, tape, y, u, bars, scratch, gradients, first, end):  # type: ignore[no-untyped-def]
     """The adjoint of `forward` over all samples.
 
     Args:
-        bars: gradients of process noise, observation noise and measurements, which are written, of filtered means and covariances, and of
+        bars: gradients of process noise, observation noise and measurements, which are written; of filtered means and covariances; and of
             the initial mean and covariance, which are written.
         gradients: those of the model's parameters are added.
     """
-    process_bar, spread_bar, y_bar, mean_up, covariance_up, first_mean_bar, first_covariance_bar = bars
-    n, count, m = tape.post_mean.shape[2], tape.moved.shape[2], y.shape[2]
-    sequences = end - first
-    points, factor = np.empty((sequences, count, n), y.dtype), np.empty((sequences, n, n), y.dtype)
-    covariance, lost = np.empty_like(factor), np.empty(sequences, np.bool_)
-    points_bar, through, moved_bar = np.empty_like(points), np.empty_like(points), np.empty_like(points)
-    expected_bar = np.empty((sequences, count, m), y.dtype)
-    post_mean_bar, post_covariance_bar = np.zeros((sequences, n), y.dtype), np.zeros_like(factor)
-    mean_bar, covariance_bar = first_mean_bar[first:end], first_covariance_bar[first:end]
-    rule, lower = setting.rule, setting.lower
+    process_bar, spread_bar, y_bar, mean_up, covariance_up, mean_bar, covariance_bar = bars
+    points, factor, covariance, lost, points_bar, through, moved_bar, expected_bar, post_mean_bar, post_covariance_bar = scratch
+    margin, repair, rule, lower = setting.margin, setting.repair, setting.rule, setting.lower
+    post_mean_bar[:, first:end] = 0
+    post_covariance_bar[:, :, first:end] = 0
     for k in range(len(y) - 1, -1, -1):
-        post_mean_bar += mean_up[k, first:end]
-        post_covariance_bar += covariance_up[k, first:end]
-        mean = tape.prior_mean[k, first:end]
-        covariance[:] = tape.prior_covariance[k, first:end]
-        points_of(mean, covariance, rule, lower, setting.margin, setting.repair, factor, points, lost)
+        _add(post_mean_bar, mean_up[k], first, end)
+        _add(post_covariance_bar, covariance_up[k], first, end)
+        mean = tape.prior_mean[k]
+        points_of(mean, tape.prior_covariance[k], rule, lower, margin, repair, covariance, factor, points, lost, first, end)
         update_adjoint(
             mean,
             points,
-            tape.expected[k, first:end],
-            y[k, first:end],
+            tape.expected[k],
+            y[k],
             rule,
             lower,
-            tape.innovation[k, first:end],
-            tape.own[k, first:end],
-            tape.gain[k, first:end],
-            tape.centre[k, first:end],
+            tape.innovation[k],
+            tape.own[k],
+            tape.gain[k],
+            tape.centre[k],
             post_mean_bar,
             post_covariance_bar,
             mean_bar,
             covariance_bar,
             points_bar,
             expected_bar,
-            spread_bar[k, first:end],
-            y_bar[k, first:end],
+            spread_bar[k],
+            y_bar[k],
+            first,
+            end,
         )
-        observation_adjoint(points, u[k, first:end], car, expected_bar, through, gradients)
-        points_bar += through
-        points_adjoint(mean, factor, rule, lower, points_bar, mean_bar, covariance_bar)
+        observation_adjoint(points, u[k], car, expected_bar, through, gradients, first, end)
+        _add(points_bar, through, first, end)
+        points_adjoint(mean, factor, rule, lower, points_bar, mean_bar, covariance_bar, first, end)
         if k == 0:
             break
-        moments_adjoint(tape.moved[k, first:end], rule, lower, mean_bar, covariance_bar, moved_bar, process_bar[k - 1, first:end])
-        mean = tape.post_mean[k - 1, first:end]
-        covariance[:] = tape.post_covariance[k - 1, first:end]
-        points_of(mean, covariance, rule, lower, setting.margin, setting.repair, factor, points, lost)
-        transition_adjoint(points, u[k - 1, first:end], car, moved_bar, points_bar, gradients)
-        post_mean_bar[:] = 0
-        post_covariance_bar[:] = 0
-        points_adjoint(mean, factor, rule, lower, points_bar, post_mean_bar, post_covariance_bar)
+        moments_adjoint(tape.moved[k], rule, lower, mean_bar, covariance_bar, moved_bar, process_bar[k - 1], first, end)
+        mean = tape.post_mean[k - 1]
+        points_of(mean, tape.post_covariance[k - 1], rule, lower, margin, repair, covariance, factor, points, lost, first, end)
+        transition_adjoint(points, u[k - 1], car, moved_bar, points_bar, gradients, first, end)
+        post_mean_bar[:, first:end] = 0
+        post_covariance_bar[:, :, first:end] = 0
+        points_adjoint(mean, factor, rule, lower, points_bar, post_mean_bar, post_covariance_bar, first, end)
+
+
+@compiled
+def _add(total, values, first, end):  # type: ignore[no-untyped-def]
+    rows, added = total.reshape(-1, total.shape[total.ndim - 1]), values.reshape(-1, total.shape[total.ndim - 1])
+    for row in range(rows.shape[0]):
+        for b in range(first, end):
+            rows[row, b] += added[row, b]

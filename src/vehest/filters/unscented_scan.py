@@ -20,7 +20,8 @@ from torch import Tensor
 from vehest.filters.gating import Gate
 from vehest.filters.gaussian import Filtered, Gaussian
 from vehest.filters.sigma_points import SigmaRule
-from vehest.filters.unscented_loops import Setting, Tape, backward, by_address, forward
+from vehest.filters.unscented_loops import Setting, Tape, backward, backward_scratch, by_address, forward, forward_scratch
+from vehest.filters.unscented_steps import room
 
 MARGIN = 1e-6
 """Smallest eigenvalue of a repaired covariance, relative to its largest."""
@@ -132,8 +133,9 @@ class CompiledModel(PointModel):
     """A model whose functions are compiled, so that the loop over samples runs without Python.
 
     Attributes:
-        entries: compiled transition and observation, called with (points, inputs, car, out), and their adjoints, called with (points, inputs,
-            car, upstream, out, gradients); arrays as in `PointModel`, ``out`` is written.
+        entries: compiled transition and observation, called with (points, inputs, car, out, first, end), and their adjoints, called with
+            (points, inputs, car, upstream, out, gradients, first, end). Points (S, n, B), inputs (p, B), what is expected (S, m, B) and
+            their gradients lie sequence beside sequence, followed by room for a vector; ``out`` is written from sequence ``first`` to ``end``.
         car: what all are given.
         measured: number m of measurements.
     """
@@ -144,27 +146,26 @@ class CompiledModel(PointModel):
 
     def transition(self, points: Array, inputs: Array) -> Array:
         """See `PointModel`."""
-        out = np.empty_like(points)
-        self.entries[0](points, inputs, self.car, out)
-        return out
+        return self._called(0, points, inputs, points.shape[2])
 
     def observation(self, points: Array, inputs: Array) -> Array:
         """See `PointModel`."""
-        out = np.empty((*points.shape[:2], self.measured), points.dtype)
-        self.entries[1](points, inputs, self.car, out)
-        return out
+        return self._called(1, points, inputs, self.measured)
 
     def transition_adjoint(self, points: Array, inputs: Array, upstream: Array, gradients: Sequence[Array]) -> Array:
         """See `PointModel`."""
-        out = np.empty_like(points)
-        self.entries[2](points, inputs, self.car, upstream, out, self.learnt(gradients))
-        return out
+        return self._called(2, points, inputs, points.shape[2], upstream, gradients)
 
     def observation_adjoint(self, points: Array, inputs: Array, upstream: Array, gradients: Sequence[Array]) -> Array:
         """See `PointModel`."""
-        out = np.empty_like(points)
-        self.entries[3](points, inputs, self.car, upstream, out, self.learnt(gradients))
-        return out
+        return self._called(3, points, inputs, points.shape[2], upstream, gradients)
+
+    def _called(self, entry: int, points: Array, inputs: Array, size: int, upstream: Array | None = None, gradients: Any = None) -> Array:
+        given = [_beside(part) for part in (points, inputs)]
+        out = room((points.shape[1], size, points.shape[0]), points.dtype)
+        ups, learnt = ([], []) if upstream is None else ([_beside(upstream)], [self.learnt(gradients)])
+        self.entries[entry](*given, self.car, *ups, out, *learnt, 0, len(points))
+        return _apart(out)
 
     def learnt(self, gradients: Sequence[Array]) -> tuple[Any, ...]:
         """Gradients of the parameters as the adjoints take them."""
@@ -175,7 +176,8 @@ class CompiledNoise(NamedTuple):
     """A `NoiseAt` that is compiled.
 
     Attributes:
-        entry: compiled, called with (states, inputs, car, out); writes covariances (B, k, k).
+        entry: compiled, called with (states (n, B), inputs (p, B), car, out, first, end); writes covariances (k, k, B) from sequence
+            ``first`` to ``end``.
         car: what else it is given.
         size: k.
     """
@@ -186,9 +188,9 @@ class CompiledNoise(NamedTuple):
 
     def __call__(self, states: Array, inputs: Array) -> Array:
         """Covariances at states."""
-        out = np.empty((len(states), self.size, self.size), states.dtype)
-        self.entry(states, inputs, self.car, out)
-        return out
+        out = room((self.size, self.size, len(states)), states.dtype)
+        self.entry(_beside(states), _beside(inputs), self.car, out, 0, len(states))
+        return _apart(out)
 
 
 def _setting(model: PointModel, rule: SigmaRule, n: int, dtype: Any, repair: bool, gate: Gate | None) -> Setting:
@@ -255,16 +257,16 @@ def unscented_scan(
     post_mean, post_covariance = _Scan.apply(  # type: ignore[no-untyped-call]
         model, setting, share or _alone, tape, functions, measurements, inputs, mean, covariance, *tensors, *model.parameters
     )
-    outside = [torch.from_numpy(values.swapaxes(0, 1)) for values in (tape.prior_mean, tape.prior_covariance, tape.innovation, tape.own)]
+    outside = [_by_sequence(values) for values in (tape.prior_mean, tape.prior_covariance, tape.innovation, tape.own)]
     filtered = Filtered(
         Gaussian(outside[0], outside[1]),
-        Gaussian(post_mean.transpose(0, 1), post_covariance.transpose(0, 1)),
+        Gaussian(post_mean, post_covariance),
         outside[2],
         outside[3],
-        ~(torch.isnan(measurements) | torch.from_numpy(tape.gone.swapaxes(0, 1))),
-        torch.from_numpy(tape.likelihood.swapaxes(0, 1)),
+        ~(torch.isnan(measurements) | _by_sequence(tape.gone)),
+        _by_sequence(tape.likelihood),
     )
-    return NonlinearFiltered(filtered, torch.from_numpy(tape.repaired.swapaxes(0, 1)))
+    return NonlinearFiltered(filtered, _by_sequence(tape.repaired))
 
 
 class UnscentedStepper:
@@ -298,12 +300,13 @@ class UnscentedStepper:
         self._model, self._setting = model, _setting(model, rule, n, dtype, repair, gate)
         self._refused = np.zeros((1, measurements), np.int64)
         self._tape = tape = Tape.of(1, 1, n, measurements, dtype)
-        tape.prior_mean[0], tape.prior_covariance[0] = mean, covariance
+        self.prior = Gaussian(tape.prior_mean[0, :, 0], tape.prior_covariance[0, :, :, 0])
+        self.state = Gaussian(tape.post_mean[0, :, 0], tape.post_covariance[0, :, :, 0])
+        self.prior.mean[:], self.prior.covariance[:] = mean, covariance
         self._inputs: Array | None = None
         self._runs: dict[NoiseAt | None, Callable[..., None]] = {}
-        self.prior = Gaussian(tape.prior_mean[0, 0], tape.prior_covariance[0, 0])
-        self.state = Gaussian(tape.post_mean[0, 0], tape.post_covariance[0, 0])
-        self.innovation, self.innovation_covariance, self.gain = tape.innovation[0, 0], tape.own[0, 0], tape.gain[0, 0]
+        self._scratch = forward_scratch(tape)
+        self.innovation, self.innovation_covariance, self.gain = tape.innovation[0, :, 0], tape.own[0, :, :, 0], tape.gain[0, :, :, 0]
 
     def step(self, measurement: Array, inputs: Array, process_noise: Array | NoiseAt, observation_noise: Array | NoiseAt) -> Array:
         """The filtered mean, (n,), valid until the next step.
@@ -322,19 +325,19 @@ class UnscentedStepper:
 
     def predict(self, inputs: Array, process_noise: Array | NoiseAt) -> None:
         """Move the state to the next sample by inputs of this one."""
-        self._run(0, self._tape.innovation, inputs, process_noise)
+        self._run(0, self.innovation, inputs, process_noise)
 
     def update(self, measurement: Array, inputs: Array, observation_noise: Array | NoiseAt) -> None:
         """Take in the measurement."""
-        self._run(1, measurement[None, None].copy(), inputs, observation_noise)
+        self._run(1, measurement, inputs, observation_noise)
 
-    def _run(self, half: int, y: Array, inputs: Array, noise: Array | NoiseAt) -> None:
-        given, at = (noise[None], None) if isinstance(noise, np.ndarray) else (self._tape.own[:0], noise)
-        u, refused = np.ascontiguousarray(inputs)[None, None], self._refused
+    def _run(self, half: int, measurement: Array, inputs: Array, noise: Array | NoiseAt) -> None:
+        given, at = (noise, None) if isinstance(noise, np.ndarray) else (self._tape.own[0, :, :, 0][None], noise)
+        y, u, given = (_beside(part[None])[None] for part in (measurement, inputs, given[0]))
         if at not in self._runs:
             self._runs[at] = _forward_by(self._model, (at, at), self._tape, u)
         with self._model.working():
-            self._runs[at](self._setting, self._tape, y, u, given, given, refused, (half, half + 1), 0, 1)
+            self._runs[at](self._setting, self._tape, y, u, given, given, self._refused, self._scratch, (half, half + 1), 0, 1)
 
 
 def moved(model: PointModel, states: Tensor, inputs: Tensor) -> Tensor:
@@ -377,36 +380,37 @@ class _Scan(torch.autograd.Function):
         *parameters: Tensor,
     ) -> tuple[Tensor, Tensor]:
         y, u, *noises = (_by_time(tensor) for tensor in (measurements, inputs, process, observation))
-        if setting.gated:
-            y = y.copy()  # what is refused becomes NaN in it, and so is never measured for the adjoint either
-        tape.prior_mean[0], tape.prior_covariance[0] = mean.detach().numpy(), covariance.detach().numpy()
-        rest = (np.zeros(y.shape[1:], np.int64), (1, 2 * len(y)))
+        tape.prior_mean[0], tape.prior_covariance[0] = _beside(mean.detach().numpy()), _beside(covariance.detach().numpy())
+        rest = (np.zeros(measurements.shape[::2], np.int64), forward_scratch(tape), (1, 2 * len(y)))
         run = _forward_by(model, functions, tape, u)
         with model.working():
-            share(lambda first, end: run(setting, tape, y, u, *noises, *rest, first, end), y.shape[1])
+            share(lambda first, end: run(setting, tape, y, u, *noises, *rest, first, end), len(measurements))
         ctx.kept = (model, setting, share, tape, functions, y, u)
-        return torch.from_numpy(tape.post_mean), torch.from_numpy(tape.post_covariance)
+        return _by_sequence(tape.post_mean), _by_sequence(tape.post_covariance)
 
     @staticmethod
     def backward(ctx: Any, *upstream: Tensor) -> tuple[Tensor | None, ...]:
         model, setting, share, tape, functions, y, u = ctx.kept
         if any(function is not None for function in functions):
             raise RuntimeError("noise that is a function of the estimate has no gradients; give it as a tensor")
-        noises = [np.zeros_like(tape.post_covariance), np.zeros_like(tape.own)]
-        measured, mean, covariance = (np.zeros_like(part) for part in (y, tape.post_mean[0], tape.post_covariance[0]))
-        bars = (*noises, measured, *(np.ascontiguousarray(part.numpy()) for part in upstream), mean, covariance)
+        like = (tape.post_covariance, tape.own, tape.innovation)
+        written = [room(part.shape, part.dtype) for part in (*like, tape.post_mean[0], tape.post_covariance[0])]
+        written[0][-1] = 0  # no step leads on from the last sample
+        bars = (*written[:3], *(_by_time(part) for part in upstream), *written[3:])
+        scratch = backward_scratch(tape)
         gradients: dict[int, list[Array]] = {}
 
         def work(first: int, end: int) -> None:
             gradients[first] = [np.zeros(tuple(parameter.shape), y.dtype) for parameter in model.parameters]
             run, own = _backward_by(model, tape, u, gradients[first])
-            run(setting, tape, y, u, bars, own, first, end)
+            run(setting, tape, y, u, bars, scratch, own, first, end)
 
         with model.working():
-            share(work, y.shape[1])
+            share(work, y.shape[-1])
         summed = [torch.from_numpy(np.asarray(sum(parts))) for parts in zip(*(gradients[key] for key in sorted(gradients)), strict=True)]
-        y_bar, *noise_bars = (torch.from_numpy(bar).transpose(0, 1) for bar in (measured, *noises))
-        return (None, None, None, None, None, y_bar, None, torch.from_numpy(mean), torch.from_numpy(covariance), *noise_bars, *summed)
+        process, observation, measured = (_by_sequence(part) for part in written[:3])
+        mean, covariance = (torch.from_numpy(_apart(part)) for part in written[3:])
+        return (None, None, None, None, None, measured, None, mean, covariance, process, observation, *summed)
 
 
 def _forward_by(model: PointModel, functions: Sequence[NoiseAt | None], tape: Tape, u: Array) -> Callable[..., None]:
@@ -415,44 +419,72 @@ def _forward_by(model: PointModel, functions: Sequence[NoiseAt | None], tape: Ta
         wrapped = (_written(model.transition), _written(model.observation), None)
         noises = [part for at in functions for part in ((None, None) if at is None else (_written(at), None))]
         return partial(getattr(forward, "py_func", forward), *wrapped, *noises)
-    points, inputs, expected = tape.moved[0], u[0], tape.expected[0]
-    called = (by_address(model.entries[0], points, inputs, model.car, points), by_address(model.entries[1], points, inputs, model.car, expected))
+    points, inputs, expected, ends = tape.moved[0], u[0], tape.expected[0], (0, 0)
+    called = [by_address(entry, points, inputs, model.car, out, *ends) for entry, out in zip(model.entries[:2], (points, expected), strict=True)]
     noises = []
-    for at, state in zip(functions, (tape.post_mean[0], tape.prior_mean[0]), strict=True):
-        noises += [None, None] if at is None else [by_address(at.entry, state, inputs, at.car, tape.post_covariance[0]), at.car]
+    for at in functions:
+        state, out = tape.post_mean[0], tape.post_covariance[0]
+        noises += [None, None] if at is None else [by_address(at.entry, state, inputs, at.car, out, *ends), at.car]
     return partial(forward, *called, model.car, *noises)
 
 
 def _backward_by(model: PointModel, tape: Tape, u: Array, gradients: Sequence[Array]) -> tuple[Callable[..., None], Any]:
     """The adjoint's loop with a model, and the gradients as it takes them."""
     if not isinstance(model, CompiledModel):
-        return partial(getattr(backward, "py_func", backward), _added(model.transition_adjoint), _added(model.observation_adjoint), None), gradients
+        adjoints = (_added(model.transition_adjoint), _added(model.observation_adjoint))
+        return partial(getattr(backward, "py_func", backward), *adjoints, None), gradients
     own, points, inputs = model.learnt(gradients), tape.moved[0], u[0]
     called = [
-        by_address(entry, points, inputs, model.car, upstream, points, own)
+        by_address(entry, points, inputs, model.car, upstream, points, own, 0, 0)
         for entry, upstream in zip(model.entries[2:], (points, tape.expected[0]), strict=True)
     ]
     return partial(backward, *called, model.car), own
 
 
 def _written(function: Callable[[Array, Array], Array]) -> Callable[..., None]:
-    def write(values: Array, inputs: Array, _: Any, out: Array) -> None:
-        out[:] = function(values, inputs)
+    """A function of arrays that lie sequence by sequence, as the loop calls it."""
+
+    def write(values: Array, inputs: Array, _: Any, out: Array, first: int, end: int) -> None:
+        out[..., first:end] = _beside(function(_apart(values, first, end), _apart(inputs, first, end)))
 
     return write
 
 
 def _added(function: Callable[..., Array]) -> Callable[..., None]:
-    def write(points: Array, inputs: Array, _: Any, upstream: Array, out: Array, gradients: Sequence[Array]) -> None:
-        out[:] = function(points, inputs, upstream, gradients)
+    """The same of an adjoint."""
+
+    def write(
+        points: Array, inputs: Array, _: Any, upstream: Array, out: Array, gradients: Sequence[Array], first: int, end: int
+    ) -> None:
+        out[..., first:end] = _beside(function(*(_apart(part, first, end) for part in (points, inputs, upstream)), gradients))
 
     return write
 
 
+def _beside(values: Array) -> Array:
+    """(B, ...) -> (..., B), followed by room for a vector."""
+    moved = np.moveaxis(values, 0, -1)
+    out: Array = room(moved.shape, values.dtype)
+    out[:] = moved
+    return out
+
+
+def _apart(values: Array, first: int = 0, end: int | None = None) -> Array:
+    """(..., B) -> (B, ...) of some sequences, together in memory."""
+    return np.ascontiguousarray(np.moveaxis(values[..., first:end], -1, 0))
+
+
 def _by_time(tensor: Tensor) -> Array:
-    """(B, T, ...) -> (T, B, ...), together in memory."""
-    values: Array = tensor.detach().transpose(0, 1).contiguous().numpy()
-    return values
+    """(B, T, ...) -> (T, ..., B), followed by room for a vector."""
+    moved = tensor.detach().movedim(0, -1)
+    out: Array = room(tuple(moved.shape), moved.numpy().dtype)
+    torch.from_numpy(out).copy_(moved)
+    return out
+
+
+def _by_sequence(values: Array) -> Tensor:
+    """(T, ..., B) -> (B, T, ...), in memory by time."""
+    return torch.from_numpy(values).movedim(-1, 1).contiguous().transpose(0, 1)
 
 
 def _alone(work: Callable[[int, int], None], sequences: int) -> None:

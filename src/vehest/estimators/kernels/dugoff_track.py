@@ -39,16 +39,16 @@ class CompiledDugoffTrack(CompiledModel):
 
 
 @compiled
-def _settled(inputs, car):  # type: ignore[no-untyped-def]
+def _settled(speed, steer, ax, car):  # type: ignore[no-untyped-def]
     """Of one sample: speed, tangent and cosine of the steering angle, loads of both axles."""
     mass, _, front_arm, rear_arm, height, _, minimum_speed = car
     wheelbase = front_arm + rear_arm
-    transfer = inputs[2] * (height / wheelbase)
+    transfer = ax * (height / wheelbase)
     gravity = car.dtype.type(GRAVITY)
     front, rear = gravity * rear_arm / wheelbase, gravity * front_arm / wheelbase
     least = car.dtype.type(LEAST_LOAD)
     load_front, load_rear = mass * max(front - transfer, least * front), mass * max(rear + transfer, least * rear)
-    return max(inputs[0], minimum_speed), math.tan(inputs[1]), math.cos(inputs[1]), load_front, load_rear
+    return max(speed, minimum_speed), math.tan(steer), math.cos(steer), load_front, load_rear
 
 
 @compiled
@@ -91,68 +91,68 @@ def _forces(vy, yaw_rate, vx, turned, cosine, load_front, load_rear, front_arm, 
 
 
 @compiled
-def _transition(points, inputs, track, out):  # type: ignore[no-untyped-def]
+def _transition(points, inputs, track, out, first, end):  # type: ignore[no-untyped-def]
     car, axles, smooth = track
     mass, inertia, front_arm, rear_arm, _, step, minimum_speed = car
-    for b in range(points.shape[0]):
-        vx, turned, cosine, load_front, load_rear = _settled(inputs[b], car)
-        turn = inputs[b, 0] * inputs[b, 1] / (front_arm + rear_arm)
-        for s in range(points.shape[1]):
-            vy, yaw_rate = points[b, s, 0], points[b, s, 1]
-            if inputs[b, 0] < minimum_speed:
-                out[b, s, 0], out[b, s, 1] = rear_arm * turn, turn
+    for b in range(first, end):
+        vx, turned, cosine, load_front, load_rear = _settled(inputs[0, b], inputs[1, b], inputs[2, b], car)
+        turn = inputs[0, b] * inputs[1, b] / (front_arm + rear_arm)
+        for s in range(points.shape[0]):
+            vy, yaw_rate = points[s, 0, b], points[s, 1, b]
+            if inputs[0, b] < minimum_speed:
+                out[s, 0, b], out[s, 1, b] = rear_arm * turn, turn
                 continue
             front, rear, _, _ = _forces(vy, yaw_rate, vx, turned, cosine, load_front, load_rear, front_arm, rear_arm, axles, smooth)
-            out[b, s, 0] = vy + step * ((front + rear) / mass - vx * yaw_rate)
-            out[b, s, 1] = yaw_rate + step * (front_arm * front - rear_arm * rear) / inertia
+            out[s, 0, b] = vy + step * ((front + rear) / mass - vx * yaw_rate)
+            out[s, 1, b] = yaw_rate + step * (front_arm * front - rear_arm * rear) / inertia
 
 
 @compiled
-def _observation(points, inputs, track, out):  # type: ignore[no-untyped-def]
+def _observation(points, inputs, track, out, first, end):  # type: ignore[no-untyped-def]
     car, axles, smooth = track
     mass, _, front_arm, rear_arm, _, _, _ = car
-    for b in range(points.shape[0]):
-        vx, turned, cosine, load_front, load_rear = _settled(inputs[b], car)
-        for s in range(points.shape[1]):
-            vy, yaw_rate = points[b, s, 0], points[b, s, 1]
+    for b in range(first, end):
+        vx, turned, cosine, load_front, load_rear = _settled(inputs[0, b], inputs[1, b], inputs[2, b], car)
+        for s in range(points.shape[0]):
+            vy, yaw_rate = points[s, 0, b], points[s, 1, b]
             front, rear, _, _ = _forces(vy, yaw_rate, vx, turned, cosine, load_front, load_rear, front_arm, rear_arm, axles, smooth)
-            out[b, s, 0], out[b, s, 1] = (front + rear) / mass, yaw_rate
-            out[b, s, 2], out[b, s, 3] = front, rear
-            if out.shape[2] == 5:
-                out[b, s, 4] = math.atan(vy / vx)
+            out[s, 0, b], out[s, 1, b] = (front + rear) / mass, yaw_rate
+            out[s, 2, b], out[s, 3, b] = front, rear
+            if out.shape[1] == 5:
+                out[s, 4, b] = math.atan(vy / vx)
 
 
 @compiled
-def _transition_adjoint(points, inputs, track, upstream, out, gradients):  # type: ignore[no-untyped-def]
+def _transition_adjoint(points, inputs, track, upstream, out, gradients, first, end):  # type: ignore[no-untyped-def]
     car, axles, smooth = track
     mass, inertia, front_arm, rear_arm, _, step, minimum_speed = car
-    for b in range(points.shape[0]):
-        vx, turned, cosine, load_front, load_rear = _settled(inputs[b], car)
-        for s in range(points.shape[1]):
-            if inputs[b, 0] < minimum_speed:
-                out[b, s, 0], out[b, s, 1] = 0, 0
+    for b in range(first, end):
+        vx, turned, cosine, load_front, load_rear = _settled(inputs[0, b], inputs[1, b], inputs[2, b], car)
+        for s in range(points.shape[0]):
+            if inputs[0, b] < minimum_speed:
+                out[s, 0, b], out[s, 1, b] = 0, 0
                 continue
-            vy, yaw_rate = points[b, s, 0], points[b, s, 1]
+            vy, yaw_rate = points[s, 0, b], points[s, 1, b]
             _, _, by_front, by_rear = _forces(vy, yaw_rate, vx, turned, cosine, load_front, load_rear, front_arm, rear_arm, axles, smooth)
-            across, turning = upstream[b, s, 0], upstream[b, s, 1]
+            across, turning = upstream[s, 0, b], upstream[s, 1, b]
             front_bar = step * (across / mass + turning * front_arm / inertia) * by_front
             rear_bar = step * (across / mass - turning * rear_arm / inertia) * by_rear
-            out[b, s, 0] = across + front_bar + rear_bar
-            out[b, s, 1] = turning - step * vx * across + front_arm * front_bar - rear_arm * rear_bar
+            out[s, 0, b] = across + front_bar + rear_bar
+            out[s, 1, b] = turning - step * vx * across + front_arm * front_bar - rear_arm * rear_bar
 
 
 @compiled
-def _observation_adjoint(points, inputs, track, upstream, out, gradients):  # type: ignore[no-untyped-def]
+def _observation_adjoint(points, inputs, track, upstream, out, gradients, first, end):  # type: ignore[no-untyped-def]
     car, axles, smooth = track
     mass, _, front_arm, rear_arm, _, _, _ = car
-    for b in range(points.shape[0]):
-        vx, turned, cosine, load_front, load_rear = _settled(inputs[b], car)
-        for s in range(points.shape[1]):
-            vy, yaw_rate = points[b, s, 0], points[b, s, 1]
+    for b in range(first, end):
+        vx, turned, cosine, load_front, load_rear = _settled(inputs[0, b], inputs[1, b], inputs[2, b], car)
+        for s in range(points.shape[0]):
+            vy, yaw_rate = points[s, 0, b], points[s, 1, b]
             _, _, by_front, by_rear = _forces(vy, yaw_rate, vx, turned, cosine, load_front, load_rear, front_arm, rear_arm, axles, smooth)
-            front_bar = (upstream[b, s, 0] / mass + upstream[b, s, 2]) * by_front
-            rear_bar = (upstream[b, s, 0] / mass + upstream[b, s, 3]) * by_rear
-            out[b, s, 0] = front_bar + rear_bar
-            out[b, s, 1] = upstream[b, s, 1] + front_arm * front_bar - rear_arm * rear_bar
-            if upstream.shape[2] == 5:
-                out[b, s, 0] += upstream[b, s, 4] * vx / (vx * vx + vy * vy)
+            front_bar = (upstream[s, 0, b] / mass + upstream[s, 2, b]) * by_front
+            rear_bar = (upstream[s, 0, b] / mass + upstream[s, 3, b]) * by_rear
+            out[s, 0, b] = front_bar + rear_bar
+            out[s, 1, b] = upstream[s, 1, b] + front_arm * front_bar - rear_arm * rear_bar
+            if upstream.shape[1] == 5:
+                out[s, 0, b] += upstream[s, 4, b] * vx / (vx * vx + vy * vy)

@@ -114,11 +114,11 @@ def _kind_of(dynamics: Dynamics) -> int | None:
 @piece
 def _columns(points, first, end, rest, x):  # type: ignore[no-untyped-def]
     """Points of some sequences side by side; columns beyond them are ``rest`` times the last one."""
-    count, n = points.shape[1:]
+    count, n = points.shape[:2]
     for b in range(first, end):
         for s in range(count):
             for i in range(n):
-                x[i, (b - first) * count + s] = points[b, s, i]
+                x[i, (b - first) * count + s] = points[s, i, b]
     last = (end - first) * count - 1
     for i in range(n):
         for p in range(last + 1, x.shape[1]):
@@ -129,19 +129,19 @@ def _columns(points, first, end, rest, x):  # type: ignore[no-untyped-def]
 def _driven(inputs, first, end, count, u):  # type: ignore[no-untyped-def]
     """Inputs at those columns; rows of u are steering angle, its sine and cosine, and current."""
     for b in range(first, end):
-        sine, cosine = math.sin(inputs[b, 0]), math.cos(inputs[b, 0])
+        sine, cosine = math.sin(inputs[0, b]), math.cos(inputs[0, b])
         for p in range((b - first) * count, (b + 1 - first) * count if b + 1 < end else u.shape[1]):
-            u[0, p], u[1, p], u[2, p], u[3, p] = inputs[b, 0], sine, cosine, inputs[b, 1]
+            u[0, p], u[1, p], u[2, p], u[3, p] = inputs[0, b], sine, cosine, inputs[1, b]
 
 
 @piece
 def _put(rows, points, first, end):  # type: ignore[no-untyped-def]
     """Rows back into points of some sequences."""
-    count = points.shape[1]
+    count = points.shape[0]
     for b in range(first, end):
         for s in range(count):
-            for i in range(points.shape[2]):
-                points[b, s, i] = rows[i, (b - first) * count + s]
+            for i in range(points.shape[1]):
+                points[s, i, b] = rows[i, (b - first) * count + s]
 
 
 @piece
@@ -557,12 +557,12 @@ def _stages(x0, u, car, x, rooms, rates):  # type: ignore[no-untyped-def]
 
 
 @compiled
-def _transition(points, inputs, car, out):  # type: ignore[no-untyped-def]
-    sequences, count, n = points.shape
+def _transition(points, inputs, car, out, start, stop):  # type: ignore[no-untyped-def]
+    count, n, _ = points.shape
     step = car[2][3]
-    size = _block_of(sequences, count)
-    for first in range(0, sequences, size):
-        end = min(first + size, sequences)
+    size = _block_of(stop - start, count)
+    for first in range(start, stop, size):
+        end = min(first + size, stop)
         own = (end - first) * count
         columns = _filling(own, points)
         x0, u = np.empty((n, columns), points.dtype), np.empty((4, columns), points.dtype)
@@ -578,11 +578,11 @@ def _transition(points, inputs, car, out):  # type: ignore[no-untyped-def]
 
 
 @compiled
-def _observation(points, inputs, car, out):  # type: ignore[no-untyped-def]
-    sequences, count, n = points.shape
-    size = _block_of(sequences, count)
-    for first in range(0, sequences, size):
-        end = min(first + size, sequences)
+def _observation(points, inputs, car, out, start, stop):  # type: ignore[no-untyped-def]
+    count, n, _ = points.shape
+    size = _block_of(stop - start, count)
+    for first in range(start, stop, size):
+        end = min(first + size, stop)
         own = (end - first) * count
         columns = _filling(own, points)
         x, u, expected = np.empty((n, columns), points.dtype), np.empty((4, columns), points.dtype), np.empty((4, columns), points.dtype)
@@ -595,13 +595,13 @@ def _observation(points, inputs, car, out):  # type: ignore[no-untyped-def]
 
 
 @compiled
-def _transition_adjoint(points, inputs, car, upstream, out, gradients):  # type: ignore[no-untyped-def]
+def _transition_adjoint(points, inputs, car, upstream, out, gradients, start, stop):  # type: ignore[no-untyped-def]
     learning = gradients[7]
-    sequences, count, n = points.shape
+    count, n, _ = points.shape
     step = car[2][3]
-    size = _block_of(sequences, count)
-    for first in range(0, sequences, size):
-        end = min(first + size, sequences)
+    size = _block_of(stop - start, count)
+    for first in range(start, stop, size):
+        end = min(first + size, stop)
         own = (end - first) * count
         columns = _filling(own, points)
         x0, u, up = np.empty((n, columns), points.dtype), np.empty((4, columns), points.dtype), np.empty((n, columns), points.dtype)
@@ -633,12 +633,12 @@ def _transition_adjoint(points, inputs, car, upstream, out, gradients):  # type:
 
 
 @compiled
-def _observation_adjoint(points, inputs, car, upstream, out, gradients):  # type: ignore[no-untyped-def]
+def _observation_adjoint(points, inputs, car, upstream, out, gradients, start, stop):  # type: ignore[no-untyped-def]
     learning = gradients[7]
-    sequences, count, n = points.shape
-    size = _block_of(sequences, count)
-    for first in range(0, sequences, size):
-        end = min(first + size, sequences)
+    count, n, _ = points.shape
+    size = _block_of(stop - start, count)
+    for first in range(start, stop, size):
+        end = min(first + size, stop)
         own = (end - first) * count
         columns = _filling(own, points)
         x, u, up = np.empty((n, columns), points.dtype), np.empty((4, columns), points.dtype), np.empty((4, columns), points.dtype)
