@@ -6,6 +6,7 @@ may run side by side.
 
 from __future__ import annotations
 
+from functools import cache
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -20,6 +21,7 @@ from vehest.filters.unscented_steps import (
     points_adjoint,
     points_of,
     room,
+    types_of,
     update_adjoint,
     update_of,
 )
@@ -81,13 +83,29 @@ def backward_scratch(tape: Tape) -> tuple[Any, ...]:
 
 def by_address(function: Any, *arguments: Any) -> CompileResultWAP:
     """A compiled function for arguments of these types, as a loop takes it: the loop calls it where it is, and compiles no copy of it."""
-    types = tuple(typeof(argument) for argument in arguments)
-    function.compile(types)
-    return CompileResultWAP(function.overloads[types])
+    return _of_types(function, tuple(typeof(argument) for argument in arguments))
+
+
+def _of_types(function: Any, kinds: tuple[Any, ...]) -> CompileResultWAP:
+    function.compile(kinds)
+    return CompileResultWAP(function.overloads[kinds])
+
+
+FORWARD, BACKWARD = (points_of, moments_of, gate_of, update_of), (points_of, update_adjoint, points_adjoint, moments_adjoint)
+
+
+@cache
+def steps_by_address(steps: tuple[Any, ...], dtype: Any) -> tuple[CompileResultWAP, ...]:
+    """The steps of a loop, `FORWARD` or `BACKWARD`, for arrays of a precision, as it takes them where it is compiled."""
+    return tuple(_of_types(step, types_of(step, dtype)) for step in steps)
 
 
 @compiled
 def forward(  # type: ignore[no-untyped-def]
+    points_of,
+    moments_of,
+    gate_of,
+    update_of,
     transition,
     observation,
     car,
@@ -164,7 +182,24 @@ def forward(  # type: ignore[no-untyped-def]
 
 
 @compiled
-def backward(transition_adjoint, observation_adjoint, car, setting, tape, y, u, bars, scratch, gradients, first, end):  # type: ignore[no-untyped-def]
+def backward(  # type: ignore[no-untyped-def]
+    points_of,
+    update_adjoint,
+    points_adjoint,
+    moments_adjoint,
+    transition_adjoint,
+    observation_adjoint,
+    car,
+    setting,
+    tape,
+    y,
+    u,
+    bars,
+    scratch,
+    gradients,
+    first,
+    end,
+):
     """The adjoint of `forward` over all samples.
 
     Args:
@@ -175,8 +210,8 @@ def backward(transition_adjoint, observation_adjoint, car, setting, tape, y, u, 
     process_bar, spread_bar, y_bar, mean_up, covariance_up, mean_bar, covariance_bar = bars
     points, factor, covariance, lost, points_bar, through, moved_bar, expected_bar, post_mean_bar, post_covariance_bar = scratch
     margin, repair, rule, lower = setting.margin, setting.repair, setting.rule, setting.lower
-    post_mean_bar[:, first:end] = 0
-    post_covariance_bar[:, :, first:end] = 0
+    _clear(post_mean_bar, first, end)
+    _clear(post_covariance_bar, first, end)
     for k in range(len(y) - 1, -1, -1):
         _add(post_mean_bar, mean_up[k], first, end)
         _add(post_covariance_bar, covariance_up[k], first, end)
@@ -213,8 +248,8 @@ def backward(transition_adjoint, observation_adjoint, car, setting, tape, y, u, 
         mean = tape.post_mean[k - 1]
         points_of(mean, tape.post_covariance[k - 1], rule, lower, margin, repair, covariance, factor, points, lost, first, end)
         transition_adjoint(points, u[k - 1], car, moved_bar, points_bar, gradients, first, end)
-        post_mean_bar[:, first:end] = 0
-        post_covariance_bar[:, :, first:end] = 0
+        _clear(post_mean_bar, first, end)
+        _clear(post_covariance_bar, first, end)
         points_adjoint(mean, factor, rule, lower, points_bar, post_mean_bar, post_covariance_bar, first, end)
 
 
@@ -224,3 +259,11 @@ def _add(total, values, first, end):  # type: ignore[no-untyped-def]
     for row in range(rows.shape[0]):
         for b in range(first, end):
             rows[row, b] += added[row, b]
+
+
+@compiled
+def _clear(values, first, end):  # type: ignore[no-untyped-def]
+    rows = values.reshape(-1, values.shape[values.ndim - 1])
+    for row in range(rows.shape[0]):
+        for b in range(first, end):
+            rows[row, b] = 0

@@ -20,7 +20,18 @@ from torch import Tensor
 from vehest.filters.gating import Gate
 from vehest.filters.gaussian import Filtered, Gaussian
 from vehest.filters.sigma_points import SigmaRule
-from vehest.filters.unscented_loops import Setting, Tape, backward, backward_scratch, by_address, forward, forward_scratch
+from vehest.filters.unscented_loops import (
+    BACKWARD,
+    FORWARD,
+    Setting,
+    Tape,
+    backward,
+    backward_scratch,
+    by_address,
+    forward,
+    forward_scratch,
+    steps_by_address,
+)
 from vehest.filters.unscented_steps import room
 
 MARGIN = 1e-6
@@ -418,27 +429,27 @@ def _forward_by(model: PointModel, functions: Sequence[NoiseAt | None], tape: Ta
     if not isinstance(model, CompiledModel) or not all(at is None or isinstance(at, CompiledNoise) for at in functions):
         wrapped = (_written(model.transition), _written(model.observation), None)
         noises = [part for at in functions for part in ((None, None) if at is None else (_written(at), None))]
-        return partial(getattr(forward, "py_func", forward), *wrapped, *noises)
+        return partial(getattr(forward, "py_func", forward), *FORWARD, *wrapped, *noises)
     points, inputs, expected, ends = tape.moved[0], u[0], tape.expected[0], (0, 0)
     called = [by_address(entry, points, inputs, model.car, out, *ends) for entry, out in zip(model.entries[:2], (points, expected), strict=True)]
     noises = []
     for at in functions:
         state, out = tape.post_mean[0], tape.post_covariance[0]
         noises += [None, None] if at is None else [by_address(at.entry, state, inputs, at.car, out, *ends), at.car]
-    return partial(forward, *called, model.car, *noises)
+    return partial(forward, *steps_by_address(FORWARD, points.dtype), *called, model.car, *noises)
 
 
 def _backward_by(model: PointModel, tape: Tape, u: Array, gradients: Sequence[Array]) -> tuple[Callable[..., None], Any]:
     """The adjoint's loop with a model, and the gradients as it takes them."""
     if not isinstance(model, CompiledModel):
         adjoints = (_added(model.transition_adjoint), _added(model.observation_adjoint))
-        return partial(getattr(backward, "py_func", backward), *adjoints, None), gradients
+        return partial(getattr(backward, "py_func", backward), *BACKWARD, *adjoints, None), gradients
     own, points, inputs = model.learnt(gradients), tape.moved[0], u[0]
     called = [
         by_address(entry, points, inputs, model.car, upstream, points, own, 0, 0)
         for entry, upstream in zip(model.entries[2:], (points, tape.expected[0]), strict=True)
     ]
-    return partial(backward, *called, model.car), own
+    return partial(backward, *steps_by_address(BACKWARD, points.dtype), *called, model.car), own
 
 
 def _written(function: Callable[[Array, Array], Array]) -> Callable[..., None]:

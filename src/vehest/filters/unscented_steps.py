@@ -13,11 +13,20 @@ from typing import Any
 
 import numba
 import numpy as np
+from numba import types
 
 from vehest.filters.gating import refuses
 from vehest.lanes import BYTES, choose, load_unfused, most, root, store, store_some, width
 
 compiled = numba.njit(cache=True, nogil=True, error_model="numpy", boundscheck=False)
+DIMENSIONS = {"rule": 1, "lower": 1, "likelihood": 1, "centre": 1} | dict.fromkeys(
+    ("mean", "mean_bar", "post_mean", "post_mean_bar", "y", "y_bar", "innovation"), 2
+)
+OTHERS = {"margin": None, "limit": None, "first": types.intp, "end": types.intp, "patience": types.intp, "repair": types.boolean} | {
+    "repaired": types.boolean[::1],
+    "gone": types.boolean[:, ::1],
+    "refused": types.int64[:, ::1],
+}
 piece = numba.njit(forceinline=True, no_cpython_wrapper=True, no_cfunc_wrapper=True, error_model="numpy", boundscheck=False)
 
 
@@ -25,6 +34,13 @@ def room(shape: tuple[int, ...], dtype: Any) -> Any:
     """An array, not filled, that vectors may be read beyond."""
     count, size = int(np.prod(shape)), np.dtype(dtype).itemsize
     return np.empty(count + BYTES // size, dtype)[:count].reshape(shape)
+
+
+def types_of(step: Any, dtype: Any) -> tuple[Any, ...]:
+    """Types of a step's arguments for arrays of a precision: those named in `DIMENSIONS` and `OTHERS`, else of three dimensions."""
+    number = numba.from_dtype(np.dtype(dtype))
+    names = step.py_func.__code__.co_varnames[: step.py_func.__code__.co_argcount]
+    return tuple((OTHERS[name] or number) if name in OTHERS else types.Array(number, DIMENSIONS.get(name, 3), "C") for name in names)
 
 
 @piece
@@ -81,12 +97,7 @@ def points_of(mean, given, rule, lower, margin, repair, covariance, factor, poin
         if _any(lost, b, end, flags):
             for lane in range(min(lanes, end - b)):
                 if flags[0, lane] > 0:
-                    own, lower_factor = A[:, lane].copy().reshape(n, n), np.empty((n, n), mean.dtype)
-                    repaired[b + lane] = _all_finite(own)
-                    if not (repair and repaired[b + lane] and _lifted(own, lower_factor, margin)):
-                        lower_factor[:] = np.nan
-                        own[:] = np.nan
-                    A[:, lane], L[:, lane] = own.ravel(), lower_factor.ravel()
+                    repaired[b + lane] = _repaired(A, L, lane, n, margin, repair)
         nothing = _own(L, 0) - _own(L, 0)  # NaN where a sequence is lost
         for i in range(n):
             c = _at(mean, i, b)
@@ -258,35 +269,31 @@ def update_of(  # type: ignore[no-untyped-def]
     whitened = np.empty(m, mean.dtype)
     for b in range(first, end, lanes):
         _spread(expected, points, mean, y, b, rule, error, spread, deviation)
-        around = _at(mean, 0, b) * 0 + rule[2]
-        definite = _joint(spread, deviation, around, rule, y, noise, b, n, cross, S, factor)
-        _posterior(covariance, b, cross, factor, K, A)
-        if repair and rule[2] < 0:
-            lost = 1 - definite * _cholesky(A, tried, n)
-            if _any(lost, b, end, flags):
-                nothing = lost * 0
-                for row in range(m * m):
-                    nothing += _own(S, row) * 0
-                for row in range(n * n):
-                    nothing += _at(covariance, row, b) * 0
-                lost = choose(nothing == 0, lost, 0.0)
+        around, definite, lifted = _at(mean, 0, b) * 0 + rule[2], _at(mean, 0, b) * 0, False
+        for attempt in range(3):  # as it is, without a negative weight, lifted
+            if not lifted:
+                definite = _joint(spread, deviation, around, rule, y, noise, b, n, cross, S, factor)
+            _posterior(covariance, b, cross, factor, K, A)
+            if attempt == 0 and repair and rule[2] < 0:
+                lost = 1 - definite * _cholesky(A, tried, n)
                 if _any(lost, b, end, flags):
-                    for lane in range(min(lanes, end - b)):
-                        repaired[b + lane] |= flags[0, lane] > 0
-                    around = choose(lost > 0, around * 0, around)
-                    definite = _joint(spread, deviation, around, rule, y, noise, b, n, cross, S, factor)
-                    _posterior(covariance, b, cross, factor, K, A)
-        if _any(1 - definite, b, end, flags):
+                    nothing = lost * 0
+                    for row in range(m * m):
+                        nothing += _own(S, row) * 0
+                    for row in range(n * n):
+                        nothing += _at(covariance, row, b) * 0
+                    lost = choose(nothing == 0, lost, 0.0)
+                    if _any(lost, b, end, flags):
+                        for lane in range(min(lanes, end - b)):
+                            repaired[b + lane] |= flags[0, lane] > 0
+                        around = choose(lost > 0, around * 0, around)
+                        continue
+            if lifted or not _any(1 - definite, b, end, flags):
+                break
+            lifted = True
             for lane in range(min(lanes, end - b)):
                 if flags[0, lane] > 0:
-                    lifted, lower_factor = S[:, lane].copy().reshape(m, m), np.empty((m, m), mean.dtype)
-                    finite = _all_finite(lifted)
-                    repaired[b + lane] |= finite
-                    if not (repair and finite and _lifted(lifted, lower_factor, margin)):
-                        lower_factor[:] = np.nan
-                        lifted[:] = np.nan
-                    S[:, lane], factor[:, lane] = lifted.ravel(), lower_factor.ravel()
-            _posterior(covariance, b, cross, factor, K, A)
+                    repaired[b + lane] |= _repaired(S, factor, lane, m, margin, repair)
         _put(weight, 0, around)
         for i in range(n):
             _put(x, i, most(_moved(mean, K, error, i, m, b), lower[i]))
@@ -519,6 +526,22 @@ def _cholesky(A, L, n):  # type: ignore[no-untyped-def]
             nothing += left * 0
             _put(L, i * n + j, left)
     return choose(nothing == 0, definite, 0.0)
+
+
+@compiled
+def _repaired(A, L, lane, n, margin, repair):  # type: ignore[no-untyped-def]
+    """Lift the matrix (n · n, W) of a lane and write its factor, or NaN where that fails; whether its values were finite."""
+    own, factor = np.empty((n, n), A.dtype), np.empty((n, n), A.dtype)
+    for i in range(n):
+        for j in range(n):
+            own[i, j] = A[i * n + j, lane]
+    finite = _all_finite(own)
+    sound = repair and finite and _lifted(own, factor, margin)
+    for i in range(n):
+        for j in range(n):
+            A[i * n + j, lane] = own[i, j] if sound else np.nan
+            L[i * n + j, lane] = factor[i, j] if sound else np.nan
+    return finite
 
 
 @compiled

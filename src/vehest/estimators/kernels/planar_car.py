@@ -546,7 +546,7 @@ def _stages(x0, u, car, x, rooms, rates):  # type: ignore[no-untyped-def]
     motion = np.empty((4, x0.shape[1]), x0.dtype)
     for stage in range(4):
         if stage == 0:
-            x[0] = x0
+            copy_rows(x0, x[0])
         else:
             share = step if stage == 3 else step / 2
             for i in range(5):
