@@ -13,11 +13,13 @@ import torch
 
 from vehest.constants import GRAVITY
 from vehest.filters.unscented_scan import CompiledModel
+from vehest.lanes import choose, each, load_unfused, most, store_some, width
 from vehest.vehicle.dugoff import LARGEST_RATIO, LEAST_COSINE, LEAST_LOAD, LEAST_SHARE, DugoffTrack
 
 PLAIN, SMOOTH = LARGEST_RATIO["plain"], LARGEST_RATIO["smooth"]
 
-compiled = numba.njit(cache=True, nogil=True, error_model="numpy")
+compiled = numba.njit(cache=True, nogil=True, error_model="numpy", boundscheck=False)
+piece = numba.njit(forceinline=True, no_cpython_wrapper=True, no_cfunc_wrapper=True, error_model="numpy", boundscheck=False)
 
 
 class CompiledDugoffTrack(CompiledModel):
@@ -38,121 +40,130 @@ class CompiledDugoffTrack(CompiledModel):
         self.entries = (_transition, _observation, _transition_adjoint, _observation_adjoint)
 
 
-@compiled
-def _settled(speed, steer, ax, car):  # type: ignore[no-untyped-def]
+@piece
+def _at(values, row, b):  # type: ignore[no-untyped-def]
+    """Vector of a row (the indices before the last one, as one) from sequence b on."""
+    return load_unfused(values, row * values.shape[values.ndim - 1] + b)
+
+
+@piece
+def _put(values, row, b, vector, end):  # type: ignore[no-untyped-def]
+    store_some(values, row * values.shape[values.ndim - 1] + b, vector, end - b)
+
+
+@piece
+def _settled(inputs, b, car):  # type: ignore[no-untyped-def]
     """Of one sample: speed, tangent and cosine of the steering angle, loads of both axles."""
     mass, _, front_arm, rear_arm, height, _, minimum_speed = car
     wheelbase = front_arm + rear_arm
-    transfer = ax * (height / wheelbase)
+    transfer = _at(inputs, 2, b) * (height / wheelbase)
     gravity = car.dtype.type(GRAVITY)
     front, rear = gravity * rear_arm / wheelbase, gravity * front_arm / wheelbase
-    least = car.dtype.type(LEAST_LOAD)
-    load_front, load_rear = mass * max(front - transfer, least * front), mass * max(rear + transfer, least * rear)
-    return max(speed, minimum_speed), math.tan(steer), math.cos(steer), load_front, load_rear
+    least, steer = car.dtype.type(LEAST_LOAD), _at(inputs, 1, b)
+    load_front, load_rear = mass * most(front - transfer, least * front), mass * most(rear + transfer, least * rear)
+    return most(_at(inputs, 0, b), minimum_speed), each(math.tan, steer), each(math.cos, steer), load_front, load_rear
 
 
-@compiled
+@piece
 def _axle(tangent, load, vx, axle, smooth):  # type: ignore[no-untyped-def]
     """Force and its derivative by the tangent of the slip angle."""
     stiffness, friction, reduction = axle
     one, least = axle.dtype.type(1.0), axle.dtype.type(LEAST_SHARE)
     slide = abs(tangent)
-    share, per_slide = one - reduction * vx * slide, -reduction * vx
-    if share < least:
-        share, per_slide = least, one * 0
+    share = one - reduction * vx * slide
+    per_slide = choose(share < least, 0.0, -reduction * vx)
+    share = choose(share < least, least, share)
     half = friction * share * load / (2 * stiffness)
     largest = axle.dtype.type(SMOOTH if smooth else PLAIN)
-    if half >= largest * slide:
-        return stiffness * tangent, stiffness
+    linear = half >= largest * slide
     ratio = half / slide
     by_slide = per_slide / share * ratio - ratio / slide
     if smooth:
-        used = math.tanh(2 * ratio)
+        used = each(math.tanh, choose(linear, 0.0, 2 * ratio))
         by_ratio = 2 * (one - used * used)
     else:
         used = ratio * (2 - ratio)
         by_ratio = 2 - 2 * ratio
-    return stiffness * tangent * used, stiffness * (used + slide * by_ratio * by_slide)
+    force, slope = stiffness * tangent, stiffness * (used + slide * by_ratio * by_slide)
+    return choose(linear, force, force * used), choose(linear, stiffness, slope)
 
 
-@compiled
-def _forces(vy, yaw_rate, vx, turned, cosine, load_front, load_rear, front_arm, rear_arm, axles, smooth):  # type: ignore[no-untyped-def]
-    """Forces across the body, front and rear, and the derivative of each by the lateral velocity of its axle."""
-    course_front, course_rear = (vy + front_arm * yaw_rate) / vx, (vy - rear_arm * yaw_rate) / vx
+@piece
+def _forces(points, s, b, settled, track):  # type: ignore[no-untyped-def]
+    """Forces across the body at point s, front and rear, and the derivative of each by the lateral velocity of its axle."""
+    vx, turned, cosine, load_front, load_rear = settled
+    car, axles, smooth = track
+    vy, yaw_rate = _at(points, 2 * s, b), _at(points, 2 * s + 1, b)
+    course_front, course_rear = (vy + car[2] * yaw_rate) / vx, (vy - car[3] * yaw_rate) / vx
     across = 1 + turned * course_front
     least = axles.dtype.type(LEAST_COSINE)
-    if across > least:
-        tangent, by_course = (turned - course_front) / across, -(1 + turned * turned) / (across * across)
-    else:
-        tangent, by_course = (turned - course_front) / least, -1 / least
+    tangent = (turned - course_front) / choose(across > least, across, least)
+    by_course = choose(across > least, -(1 + turned * turned) / (across * across), -1 / least)
     front, front_slope = _axle(tangent, load_front, vx, axles[0], smooth)
     rear, rear_slope = _axle(-course_rear, load_rear, vx, axles[1], smooth)
-    return front * cosine, rear, front_slope * cosine * by_course / vx, -rear_slope / vx
+    return vy, yaw_rate, front * cosine, rear, front_slope * cosine * by_course / vx, -rear_slope / vx
 
 
 @compiled
 def _transition(points, inputs, track, out, first, end):  # type: ignore[no-untyped-def]
-    car, axles, smooth = track
+    car = track[0]
     mass, inertia, front_arm, rear_arm, _, step, minimum_speed = car
-    for b in range(first, end):
-        vx, turned, cosine, load_front, load_rear = _settled(inputs[0, b], inputs[1, b], inputs[2, b], car)
-        turn = inputs[0, b] * inputs[1, b] / (front_arm + rear_arm)
+    for b in range(first, end, width(points)):
+        settled, rolls = _settled(inputs, b, car), _at(inputs, 0, b) < minimum_speed
+        turn = _at(inputs, 0, b) * _at(inputs, 1, b) / (front_arm + rear_arm)
         for s in range(points.shape[0]):
-            vy, yaw_rate = points[s, 0, b], points[s, 1, b]
-            if inputs[0, b] < minimum_speed:
-                out[s, 0, b], out[s, 1, b] = rear_arm * turn, turn
-                continue
-            front, rear, _, _ = _forces(vy, yaw_rate, vx, turned, cosine, load_front, load_rear, front_arm, rear_arm, axles, smooth)
-            out[s, 0, b] = vy + step * ((front + rear) / mass - vx * yaw_rate)
-            out[s, 1, b] = yaw_rate + step * (front_arm * front - rear_arm * rear) / inertia
+            vy, yaw_rate, front, rear, _, _ = _forces(points, s, b, settled, track)
+            across = vy + step * ((front + rear) / mass - settled[0] * yaw_rate)
+            turning = yaw_rate + step * (front_arm * front - rear_arm * rear) / inertia
+            _put(out, 2 * s, b, choose(rolls, rear_arm * turn, across), end)
+            _put(out, 2 * s + 1, b, choose(rolls, turn, turning), end)
 
 
 @compiled
 def _observation(points, inputs, track, out, first, end):  # type: ignore[no-untyped-def]
-    car, axles, smooth = track
-    mass, _, front_arm, rear_arm, _, _, _ = car
-    for b in range(first, end):
-        vx, turned, cosine, load_front, load_rear = _settled(inputs[0, b], inputs[1, b], inputs[2, b], car)
+    car, m = track[0], out.shape[1]
+    for b in range(first, end, width(points)):
+        settled = _settled(inputs, b, car)
         for s in range(points.shape[0]):
-            vy, yaw_rate = points[s, 0, b], points[s, 1, b]
-            front, rear, _, _ = _forces(vy, yaw_rate, vx, turned, cosine, load_front, load_rear, front_arm, rear_arm, axles, smooth)
-            out[s, 0, b], out[s, 1, b] = (front + rear) / mass, yaw_rate
-            out[s, 2, b], out[s, 3, b] = front, rear
-            if out.shape[1] == 5:
-                out[s, 4, b] = math.atan(vy / vx)
+            vy, yaw_rate, front, rear, _, _ = _forces(points, s, b, settled, track)
+            _put(out, m * s, b, (front + rear) / car[0], end)
+            _put(out, m * s + 1, b, yaw_rate, end)
+            _put(out, m * s + 2, b, front, end)
+            _put(out, m * s + 3, b, rear, end)
+            if m == 5:
+                _put(out, m * s + 4, b, each(math.atan, vy / settled[0]), end)
 
 
 @compiled
 def _transition_adjoint(points, inputs, track, upstream, out, gradients, first, end):  # type: ignore[no-untyped-def]
-    car, axles, smooth = track
+    car = track[0]
     mass, inertia, front_arm, rear_arm, _, step, minimum_speed = car
-    for b in range(first, end):
-        vx, turned, cosine, load_front, load_rear = _settled(inputs[0, b], inputs[1, b], inputs[2, b], car)
+    for b in range(first, end, width(points)):
+        settled, rolls = _settled(inputs, b, car), _at(inputs, 0, b) < minimum_speed
         for s in range(points.shape[0]):
-            if inputs[0, b] < minimum_speed:
-                out[s, 0, b], out[s, 1, b] = 0, 0
-                continue
-            vy, yaw_rate = points[s, 0, b], points[s, 1, b]
-            _, _, by_front, by_rear = _forces(vy, yaw_rate, vx, turned, cosine, load_front, load_rear, front_arm, rear_arm, axles, smooth)
-            across, turning = upstream[s, 0, b], upstream[s, 1, b]
+            _, _, _, _, by_front, by_rear = _forces(points, s, b, settled, track)
+            across, turning = _at(upstream, 2 * s, b), _at(upstream, 2 * s + 1, b)
             front_bar = step * (across / mass + turning * front_arm / inertia) * by_front
             rear_bar = step * (across / mass - turning * rear_arm / inertia) * by_rear
-            out[s, 0, b] = across + front_bar + rear_bar
-            out[s, 1, b] = turning - step * vx * across + front_arm * front_bar - rear_arm * rear_bar
+            spun = turning - step * settled[0] * across + front_arm * front_bar - rear_arm * rear_bar
+            _put(out, 2 * s, b, choose(rolls, 0.0, across + front_bar + rear_bar), end)
+            _put(out, 2 * s + 1, b, choose(rolls, 0.0, spun), end)
 
 
 @compiled
 def _observation_adjoint(points, inputs, track, upstream, out, gradients, first, end):  # type: ignore[no-untyped-def]
-    car, axles, smooth = track
+    car, m = track[0], upstream.shape[1]
     mass, _, front_arm, rear_arm, _, _, _ = car
-    for b in range(first, end):
-        vx, turned, cosine, load_front, load_rear = _settled(inputs[0, b], inputs[1, b], inputs[2, b], car)
+    for b in range(first, end, width(points)):
+        settled = _settled(inputs, b, car)
+        vx = settled[0]
         for s in range(points.shape[0]):
-            vy, yaw_rate = points[s, 0, b], points[s, 1, b]
-            _, _, by_front, by_rear = _forces(vy, yaw_rate, vx, turned, cosine, load_front, load_rear, front_arm, rear_arm, axles, smooth)
-            front_bar = (upstream[s, 0, b] / mass + upstream[s, 2, b]) * by_front
-            rear_bar = (upstream[s, 0, b] / mass + upstream[s, 3, b]) * by_rear
-            out[s, 0, b] = front_bar + rear_bar
-            out[s, 1, b] = upstream[s, 1, b] + front_arm * front_bar - rear_arm * rear_bar
-            if upstream.shape[1] == 5:
-                out[s, 0, b] += upstream[s, 4, b] * vx / (vx * vx + vy * vy)
+            vy, _, _, _, by_front, by_rear = _forces(points, s, b, settled, track)
+            across = _at(upstream, m * s, b) / mass
+            front_bar = (across + _at(upstream, m * s + 2, b)) * by_front
+            rear_bar = (across + _at(upstream, m * s + 3, b)) * by_rear
+            bar = front_bar + rear_bar
+            if m == 5:
+                bar += _at(upstream, m * s + 4, b) * vx / (vx * vx + vy * vy)
+            _put(out, 2 * s, b, bar, end)
+            _put(out, 2 * s + 1, b, _at(upstream, m * s + 1, b) + front_arm * front_bar - rear_arm * rear_bar, end)
