@@ -153,12 +153,12 @@ def _hidden(below, transposed, offset, above):  # type: ignore[no-untyped-def]
 
 
 @piece
-def _rise(above, below, flat):  # type: ignore[no-untyped-def]
+def _rise(above, below, flat, nothing):  # type: ignore[no-untyped-def]
     """Slope of a squashed value, its distances from both ends multiplied; none where it has reached one but for rounding.
 
     At a crawl slips change by a million per m/s, and rounding would count.
     """
-    return above * below if min(above, below) > flat else above * 0
+    return above * below if min(above, below) > flat else nothing
 
 
 @piece
@@ -200,9 +200,10 @@ def _network_adjoint(layers, flat, f, h1, h2, o_bar, f_bar, learning, gradients)
 
 @piece
 def _through_hidden(rows, flat, rows_bar):  # type: ignore[no-untyped-def]
+    one, nothing = rows.dtype.type(1), rows.dtype.type(0)
     for p in range(rows.shape[0]):
         for i in range(rows.shape[1]):
-            rows_bar[p, i] *= _rise(rows[p, i], 1 - rows[p, i], flat)
+            rows_bar[p, i] *= _rise(rows[p, i], one - rows[p, i], flat, nothing)
 
 
 @piece
@@ -249,11 +250,11 @@ def _seen(x, u, car, f, slips):  # type: ignore[no-untyped-def]
 
 
 @piece
-def _curve(slip, stiffness, shape):  # type: ignore[no-untyped-def]
+def _curve(slip, stiffness, shape, one):  # type: ignore[no-untyped-def]
     """Pacejka's curve for a peak of 1, and its slopes along slip, stiffness and shape."""
     angle = arctan(stiffness * slip)
     slope = math.cos(shape * angle)
-    steep = slope * shape / (1 + stiffness * slip * stiffness * slip)
+    steep = slope * shape / (one + stiffness * slip * stiffness * slip)
     return math.sin(shape * angle), steep * stiffness, steep * slip, slope * angle
 
 
@@ -269,7 +270,7 @@ def _forces(x, car, slips, o, forces):  # type: ignore[no-untyped-def]
     """Rows are the forces rear x, front x, rear y, front y, then what else the adjoint needs."""
     _, theta, constants, kind = car
     points = x.shape[1]
-    turn, unscaled = constants[4], constants[5]
+    turn, unscaled, one = constants[4], constants[5], theta.dtype.type(1)
     if kind == FRICTION_SCALED:
         for k in range(2):
             for p in range(points):
@@ -284,10 +285,10 @@ def _forces(x, car, slips, o, forces):  # type: ignore[no-untyped-def]
         _, front_load, rear_load = _loads(theta, constants)
         friction, Bx, Cx, Dx, Bf, Cf, Df, Br, Cr, Dr = theta[9:]
         for p in range(points):
-            along = friction * Dx * _curve(slips[2, p], Bx, Cx)[0]
+            along = friction * Dx * _curve(slips[2, p], Bx, Cx, one)[0]
             forces[0, p], forces[1, p] = rear_load * along, front_load * along
-            forces[2, p] = -friction * Dr * rear_load * _curve(slips[1, p], Br, Cr)[0]
-            forces[3, p] = -friction * Df * front_load * _curve(slips[0, p], Bf, Cf)[0]
+            forces[2, p] = -friction * Dr * rear_load * _curve(slips[1, p], Br, Cr, one)[0]
+            forces[3, p] = -friction * Df * front_load * _curve(slips[0, p], Bf, Cf, one)[0]
 
 
 @piece
@@ -296,6 +297,7 @@ def _forces_adjoint(x, car, slips, o, forces, slope, o_bar, slips_bar, x_bar, le
     _, theta, constants, kind = car
     points = x.shape[1]
     turn, unscaled, flat = constants[4], constants[5], constants[7]
+    one, nothing = theta.dtype.type(1), theta.dtype.type(0)
     slips_bar[:] = 0
     if kind == FRICTION_SCALED:
         for k in range(2):
@@ -306,7 +308,7 @@ def _forces_adjoint(x, car, slips, o, forces, slope, o_bar, slips_bar, x_bar, le
                 size = softplus(value)
                 through = -slope[2 + k, p] * x[4, p]
                 o_bar[2 + k, p] = through * direction * sigmoid(value)
-                slips_bar[1 - k, p] = through * size * turn * _rise(1 - direction, 1 + direction, flat)
+                slips_bar[1 - k, p] = through * size * turn * _rise(one - direction, one + direction, flat, nothing)
                 x_bar[4, p] += slope[k, p] * o[k, p] - slope[2 + k, p] * size * direction
     elif kind == UNSCALED_FORCES:
         for k in range(4):
@@ -317,7 +319,7 @@ def _forces_adjoint(x, car, slips, o, forces, slope, o_bar, slips_bar, x_bar, le
         friction, Bx, Cx, Dx, Bf, Cf, Df, Br, Cr, Dr = theta[9:]
         total = np.zeros_like(theta)
         for p in range(points):
-            peak, rise, stiffer, rounder = _curve(slips[2, p], Bx, Cx)
+            peak, rise, stiffer, rounder = _curve(slips[2, p], Bx, Cx, one)
             up = slope[0, p] * rear_load + slope[1, p] * front_load
             slips_bar[2, p] = up * friction * Dx * rise
             total[0] += (slope[1, p] - slope[0, p]) * weight * friction * Dx * peak
@@ -325,7 +327,7 @@ def _forces_adjoint(x, car, slips, o, forces, slope, o_bar, slips_bar, x_bar, le
             total[10] += up * friction * Dx * stiffer
             total[11] += up * friction * Dx * rounder
             total[12] += up * friction * peak
-            peak, rise, stiffer, rounder = _curve(slips[0, p], Bf, Cf)
+            peak, rise, stiffer, rounder = _curve(slips[0, p], Bf, Cf, one)
             up = -slope[3, p] * front_load
             slips_bar[0, p] = up * friction * Df * rise
             total[0] -= slope[3, p] * weight * friction * Df * peak
@@ -333,7 +335,7 @@ def _forces_adjoint(x, car, slips, o, forces, slope, o_bar, slips_bar, x_bar, le
             total[13] += up * friction * Df * stiffer
             total[14] += up * friction * Df * rounder
             total[15] += up * friction * peak
-            peak, rise, stiffer, rounder = _curve(slips[1, p], Br, Cr)
+            peak, rise, stiffer, rounder = _curve(slips[1, p], Br, Cr, one)
             up = -slope[2, p] * rear_load
             slips_bar[1, p] = up * friction * Dr * rise
             total[0] += slope[2, p] * weight * friction * Dr * peak
@@ -372,7 +374,7 @@ def _chassis_adjoint(x, u, car, forces, out, out_bar, slope, x_bar, learning, dt
     mass, wheelbase, radius = constants[:3]
     lr, inertia, _, drag1, drag2, powertrain, _, viscous, _ = theta[:9]
     lf = wheelbase - lr
-    zero = x[0, 0] * 0
+    zero, two = x.dtype.type(0), x.dtype.type(2)
     d_lf, d_lr, d_inertia, d_drag0, d_drag1, d_drag2 = zero, zero, zero, zero, zero, zero
     d_powertrain, d_torque, d_viscous, d_coulomb = zero, zero, zero, zero
     for p in range(x.shape[1]):
@@ -386,7 +388,7 @@ def _chassis_adjoint(x, u, car, forces, out, out_bar, slope, x_bar, learning, dt
         slope[1, p] = along - radius * twisting
         slope[2, p] = ay - turning * lr
         slope[3, p] = across
-        x_bar[0, p] -= ax * (drag1 + 2 * drag2 * vx)
+        x_bar[0, p] -= ax * (drag1 + two * drag2 * vx)
         x_bar[3, p] -= viscous * twisting
         d_lf += turning * (front_x * sine + front_y * cosine)
         d_lr -= turning * rear_y
@@ -426,9 +428,11 @@ def _motion(x, u, car, room, out):  # type: ignore[no-untyped-def]
         return
     _forces(x, car, slips, o, forces)
     _chassis(x, u, car, forces, plain)
-    for i in range(4):
-        for p in range(x.shape[1]):
-            out[i, p] = plain[i, p] + (o[i, p] if kind == PACEJKA_AND_RATES else 0)
+    copy_rows(plain, out)
+    if kind == PACEJKA_AND_RATES:
+        for i in range(4):
+            for p in range(x.shape[1]):
+                out[i, p] += o[i, p]
 
 
 @piece
@@ -471,15 +475,15 @@ def _motion_adjoint(x, u, car, room, out_bar, x_bar, learning, gradients):  # ty
 @piece
 def _slips_adjoint(x, lr, constants, slips_bar, x_bar, learning, dtheta):  # type: ignore[no-untyped-def]
     lf, still = constants[1] - lr, constants[6]
-    d_lf, d_lr = lr * 0, lr * 0
+    one, d_lf, d_lr = x.dtype.type(1), x.dtype.type(0), x.dtype.type(0)
     for p in range(x.shape[1]):
         vx, vy, yaw_rate, rim = x[0, p], x[1, p], x[2, p], x[3, p]
         along = vx + still
         front, rear = (vy + lf * yaw_rate) / along, (vy - lr * yaw_rate) / along
-        front_bar = slips_bar[0, p] / (1 + front * front) / along
-        rear_bar = slips_bar[1, p] / (1 + rear * rear) / along
+        front_bar = slips_bar[0, p] / (one + front * front) / along
+        rear_bar = slips_bar[1, p] / (one + rear * rear) / along
         ratio_bar = slips_bar[2, p] / along
-        x_bar[0, p] -= front_bar * front + rear_bar * rear + ratio_bar * ((rim - vx) / along + 1)
+        x_bar[0, p] -= front_bar * front + rear_bar * rear + ratio_bar * ((rim - vx) / along + one)
         x_bar[1, p] += front_bar + rear_bar
         x_bar[2, p] += front_bar * lf - rear_bar * lr
         x_bar[3, p] += ratio_bar
@@ -542,13 +546,13 @@ def _four_rooms(points, columns, car, dtype):  # type: ignore[no-untyped-def]
 @piece
 def _stages(x0, u, car, x, rooms, rates):  # type: ignore[no-untyped-def]
     """The four stages of the Runge-Kutta method."""
-    step = car[2][3]
+    step, half = car[2][3], x0.dtype.type(0.5)
     motion = np.empty((4, x0.shape[1]), x0.dtype)
     for stage in range(4):
         if stage == 0:
             copy_rows(x0, x[0])
         else:
-            share = step if stage == 3 else step / 2
+            share = step if stage == 3 else step * half
             for i in range(5):
                 for p in range(x0.shape[1]):
                     x[stage, i, p] = x0[i, p] + share * rates[stage - 1, i, p]
@@ -559,7 +563,7 @@ def _stages(x0, u, car, x, rooms, rates):  # type: ignore[no-untyped-def]
 @compiled
 def _transition(points, inputs, car, out, start, stop):  # type: ignore[no-untyped-def]
     count, n, _ = points.shape
-    step = car[2][3]
+    sixth, two = points.dtype.type(car[2][3] / 6), points.dtype.type(2)
     size = _block_of(stop - start, count)
     for first in range(start, stop, size):
         end = min(first + size, stop)
@@ -573,7 +577,7 @@ def _transition(points, inputs, car, out, start, stop):  # type: ignore[no-untyp
         _stages(x0, u, car, x, (room, room, room, room), rates)
         for i in range(n):
             for p in range(columns):
-                x0[i, p] += step / 6 * (rates[0, i, p] + 2 * rates[1, i, p] + 2 * rates[2, i, p] + rates[3, i, p])
+                x0[i, p] += sixth * (rates[0, i, p] + two * rates[1, i, p] + two * rates[2, i, p] + rates[3, i, p])
         _put(x0, out, first, end)
 
 
@@ -598,7 +602,7 @@ def _observation(points, inputs, car, out, start, stop):  # type: ignore[no-unty
 def _transition_adjoint(points, inputs, car, upstream, out, gradients, start, stop):  # type: ignore[no-untyped-def]
     learning = gradients[7]
     count, n, _ = points.shape
-    step = car[2][3]
+    step, nothing = car[2][3], points.dtype.type(0)
     size = _block_of(stop - start, count)
     for first in range(start, stop, size):
         end = min(first + size, stop)
@@ -614,11 +618,11 @@ def _transition_adjoint(points, inputs, car, upstream, out, gradients, start, st
         total, stage_bar, rates_bar = up.copy(), np.zeros_like(up), np.empty((4, columns), points.dtype)
         for k in range(4):
             at = 3 - k
-            weight = step / 3 if at in (1, 2) else step / 6
-            later = step if at == 2 else step / 2
+            weight = points.dtype.type(step / 3 if at in (1, 2) else step / 6)
+            later = points.dtype.type(step if at == 2 else step / 2)
             for i in range(4):
                 for p in range(columns):
-                    rates_bar[i, p] = weight * up[i, p] + (later * stage_bar[i, p] if at < 3 else 0)
+                    rates_bar[i, p] = weight * up[i, p] + (later * stage_bar[i, p] if at < 3 else nothing)
             for p in range(columns):
                 stage_bar[0, p] = -rates_bar[1, p] * x[at, 2, p]
                 stage_bar[1, p] = rates_bar[0, p] * x[at, 2, p]
