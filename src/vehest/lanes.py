@@ -1,7 +1,8 @@
 """Vectors in registers for compiled code: what reads like code for one window or sequence runs on many at once.
 
 `load` makes a vector of 64 bytes of an array. Operators, comparisons, `abs` and the functions below work on it lane by lane, with a number
-as the same in every lane; a product and a sum are fused where the processor can, but for vectors of `load_unfused`. Without compilation vectors are arrays.
+as the same in every lane; a product and a sum are fused where the processor can, but not of vectors from `load_unfused`. Without
+compilation vectors are arrays.
 """
 
 from __future__ import annotations
@@ -41,8 +42,10 @@ def width(array: Any) -> int:
 
 
 def load(array: Any, at: int) -> Any:
-    """The vector that begins at index ``at`` of a contiguous array, (N,)."""
-    return array[at : at + width(array)].copy()
+    """The vector that begins at index ``at`` of a contiguous array, (N,), or of one of more dimensions as if it were flat."""
+    vector, there = np.zeros(width(array), array.dtype), array.reshape(-1)[at : at + width(array)]
+    vector[: len(there)] = there
+    return vector
 
 
 def load_unfused(array: Any, at: int) -> Any:
@@ -52,13 +55,13 @@ def load_unfused(array: Any, at: int) -> Any:
 
 def store(array: Any, at: int, vector: Any) -> None:
     """Write a vector to where `load` reads it."""
-    array[at : at + width(array)] = vector
+    array.reshape(-1)[at : at + width(array)] = vector
 
 
 def store_some(array: Any, at: int, vector: Any, count: int) -> None:
     """Write the first lanes of a vector, ``count`` of them, or all if it has no more."""
     count = min(count, width(array))
-    array[at : at + count] = vector[:count]
+    array.reshape(-1)[at : at + count] = vector[:count]
 
 
 def choose(condition: Any, one: Any, other: Any) -> Any:
@@ -258,7 +261,9 @@ def _compiled_width(array):  # type: ignore[no-untyped-def]
 overload(load, inline="always")(lambda array, at: lambda array, at: _load(array, at))
 overload(load_unfused, inline="always")(lambda array, at: lambda array, at: _load_unfused(array, at))
 overload(store, inline="always")(lambda array, at, vector: lambda array, at, vector: _store(array, at, vector))
-overload(store_some, inline="always")(lambda array, at, vector, count: lambda array, at, vector, count: _store_some(array, at, vector, count))
+overload(store_some, inline="always")(
+    lambda array, at, vector, count: lambda array, at, vector, count: _store_some(array, at, vector, count)
+)
 overload(choose, inline="always")(lambda condition, one, other: lambda condition, one, other: _choose(condition, one, other))
 overload(least)(lambda one, other: None if _pair(one, other) else lambda one, other: min(one, other))
 overload(most)(lambda one, other: None if _pair(one, other) else lambda one, other: max(one, other))

@@ -1,7 +1,7 @@
-"""The loop over samples of the unscented filter and that of its adjoint, compiled with any compiled model; without compilation, with any model.
+"""The loop over samples of the unscented filter and that of its adjoint, compiled for compiled models; uncompiled they run with any model.
 
-Arrays by time lie (T, ..., B), followed by room for a vector (`room`); a loop works on the sequences from ``first`` to ``end``, so that several
-may run side by side.
+Arrays by time lie (T, ..., B), followed by room for a vector (`room`); a loop works on the sequences from ``first`` to ``end``, so that
+several may run side by side. It calls models and steps by their addresses, so that it compiles once, and in a second.
 """
 
 from __future__ import annotations
@@ -56,13 +56,13 @@ class Tape(NamedTuple):
     repaired: Any
     gone: Any
 
-    @classmethod
-    def of(cls, steps: int, sequences: int, n: int, m: int, dtype: Any) -> Tape:
-        """Of n states and m measurements."""
-        points = 2 * n + 1
-        shapes: list[tuple[int, ...]] = [(n,), (n, n), (n,), (n, n), (points, n), (points, m), (m,), (m, m), (n, m), (), ()]
-        made = [room((steps, *shape, sequences), dtype) for shape in shapes]
-        return cls(*made, np.zeros((steps, sequences), np.bool_), np.zeros((steps, m, sequences), np.bool_))
+
+def tape_of(steps: int, sequences: int, n: int, m: int, dtype: Any) -> Tape:
+    """A tape for n states and m measurements."""
+    points = 2 * n + 1
+    shapes: list[tuple[int, ...]] = [(n,), (n, n), (n,), (n, n), (points, n), (points, m), (m,), (m, m), (n, m), (), ()]
+    made = [room((steps, *shape, sequences), dtype) for shape in shapes]
+    return Tape(*made, np.zeros((steps, sequences), np.bool_), np.zeros((steps, m, sequences), np.bool_))  # type: ignore[call-arg]
 
 
 def forward_scratch(tape: Tape) -> tuple[Any, ...]:
@@ -135,7 +135,13 @@ def forward(  # type: ignore[no-untyped-def]
     for half in range(halves[0], halves[1]):
         k = half // 2
         if half % 2 == 0:
-            mean, given, inputs, moved, repaired = tape.post_mean[k - 1], tape.post_covariance[k - 1], u[k - 1], tape.moved[k], tape.repaired[k]
+            mean, given, inputs, moved, repaired = (
+                tape.post_mean[k - 1],
+                tape.post_covariance[k - 1],
+                u[k - 1],
+                tape.moved[k],
+                tape.repaired[k],
+            )
             points_of(mean, given, rule, lower, setting.margin, setting.repair, covariance, factor, points, repaired, first, end)
             transition(points, inputs, car, moved, first, end)
             if process_at is None:

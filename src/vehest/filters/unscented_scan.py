@@ -9,11 +9,13 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager, nullcontext
+from dataclasses import dataclass
 from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
 import torch
+from numba import config
 from numpy.typing import NDArray
 from torch import Tensor
 
@@ -31,6 +33,7 @@ from vehest.filters.unscented_loops import (
     forward,
     forward_scratch,
     steps_by_address,
+    tape_of,
 )
 from vehest.filters.unscented_steps import room
 
@@ -145,8 +148,8 @@ class CompiledModel(PointModel):
 
     Attributes:
         entries: compiled transition and observation, called with (points, inputs, car, out, first, end), and their adjoints, called with
-            (points, inputs, car, upstream, out, gradients, first, end). Points (S, n, B), inputs (p, B), what is expected (S, m, B) and
-            their gradients lie sequence beside sequence, followed by room for a vector; ``out`` is written from sequence ``first`` to ``end``.
+            (points, inputs, car, upstream, out, gradients, first, end). Sequences lie side by side in points (S, n, B), inputs (p, B), what
+            is expected (S, m, B) and gradients, each followed by room for a vector; ``out`` is written from ``first`` to ``end``.
         car: what all are given.
         measured: number m of measurements.
     """
@@ -183,7 +186,8 @@ class CompiledModel(PointModel):
         return tuple(gradients)
 
 
-class CompiledNoise(NamedTuple):
+@dataclass(frozen=True, eq=False)
+class CompiledNoise:
     """A `NoiseAt` that is compiled.
 
     Attributes:
@@ -264,7 +268,7 @@ def unscented_scan(
         noise.expand(sequences, steps, size, size) if isinstance(noise, Tensor) else measurements.new_empty(0, 0, 0, 0)
         for noise, size in zip(noises, (n, m), strict=True)
     ]
-    tape = Tape.of(steps, sequences, n, m, numpy_dtype)
+    tape = tape_of(steps, sequences, n, m, numpy_dtype)
     post_mean, post_covariance = _Scan.apply(  # type: ignore[no-untyped-call]
         model, setting, share or _alone, tape, functions, measurements, inputs, mean, covariance, *tensors, *model.parameters
     )
@@ -310,7 +314,7 @@ class UnscentedStepper:
         n, dtype = len(mean), mean.dtype.type
         self._model, self._setting = model, _setting(model, rule, n, dtype, repair, gate)
         self._refused = np.zeros((1, measurements), np.int64)
-        self._tape = tape = Tape.of(1, 1, n, measurements, dtype)
+        self._tape = tape = tape_of(1, 1, n, measurements, dtype)
         self.prior = Gaussian(tape.prior_mean[0, :, 0], tape.prior_covariance[0, :, :, 0])
         self.state = Gaussian(tape.post_mean[0, :, 0], tape.post_covariance[0, :, :, 0])
         self.prior.mean[:], self.prior.covariance[:] = mean, covariance
@@ -426,14 +430,17 @@ class _Scan(torch.autograd.Function):
 
 def _forward_by(model: PointModel, functions: Sequence[NoiseAt | None], tape: Tape, u: Array) -> Callable[..., None]:
     """The loop over samples with a model and noise: compiled where both are."""
-    if not isinstance(model, CompiledModel) or not all(at is None or isinstance(at, CompiledNoise) for at in functions):
+    compiled = [at for at in functions if at is None or isinstance(at, CompiledNoise)]
+    if not isinstance(model, CompiledModel) or len(compiled) < len(functions) or config.DISABLE_JIT:
         wrapped = (_written(model.transition), _written(model.observation), None)
-        noises = [part for at in functions for part in ((None, None) if at is None else (_written(at), None))]
+        noises: list[Any] = [part for at in functions for part in ((None, None) if at is None else (_written(at), None))]
         return partial(getattr(forward, "py_func", forward), *FORWARD, *wrapped, *noises)
     points, inputs, expected, ends = tape.moved[0], u[0], tape.expected[0], (0, 0)
-    called = [by_address(entry, points, inputs, model.car, out, *ends) for entry, out in zip(model.entries[:2], (points, expected), strict=True)]
+    called = [
+        by_address(entry, points, inputs, model.car, out, *ends) for entry, out in zip(model.entries[:2], (points, expected), strict=True)
+    ]
     noises = []
-    for at in functions:
+    for at in compiled:
         state, out = tape.post_mean[0], tape.post_covariance[0]
         noises += [None, None] if at is None else [by_address(at.entry, state, inputs, at.car, out, *ends), at.car]
     return partial(forward, *steps_by_address(FORWARD, points.dtype), *called, model.car, *noises)
@@ -441,7 +448,7 @@ def _forward_by(model: PointModel, functions: Sequence[NoiseAt | None], tape: Ta
 
 def _backward_by(model: PointModel, tape: Tape, u: Array, gradients: Sequence[Array]) -> tuple[Callable[..., None], Any]:
     """The adjoint's loop with a model, and the gradients as it takes them."""
-    if not isinstance(model, CompiledModel):
+    if not isinstance(model, CompiledModel) or config.DISABLE_JIT:
         adjoints = (_added(model.transition_adjoint), _added(model.observation_adjoint))
         return partial(getattr(backward, "py_func", backward), *BACKWARD, *adjoints, None), gradients
     own, points, inputs = model.learnt(gradients), tape.moved[0], u[0]
@@ -464,9 +471,7 @@ def _written(function: Callable[[Array, Array], Array]) -> Callable[..., None]:
 def _added(function: Callable[..., Array]) -> Callable[..., None]:
     """The same of an adjoint."""
 
-    def write(
-        points: Array, inputs: Array, _: Any, upstream: Array, out: Array, gradients: Sequence[Array], first: int, end: int
-    ) -> None:
+    def write(points: Array, inputs: Array, _: Any, upstream: Array, out: Array, gradients: Sequence[Array], first: int, end: int) -> None:
         out[..., first:end] = _beside(function(*(_apart(part, first, end) for part in (points, inputs, upstream)), gradients))
 
     return write

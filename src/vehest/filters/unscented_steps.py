@@ -1,10 +1,10 @@
 """One step of the unscented filter over many sequences, compiled, and its adjoint.
 
-Sequences lie side by side: means (n, B), covariances (n, n, B), sigma points (2n + 1, n, B), what is expected at them (2n + 1, m, B). A step
-works on those from ``first`` to ``end``, as many at once as fill a vector of `vehest.lanes`; vectors are read beyond ``end``, so that arrays
-are followed by room for one (`room`), and never written there. Every adjoint takes what its step was given, and adds to (``_bar``) gradients
-unless it says otherwise. A rule is the row [spread, centre_mean, centre_covariance, other] of a `SigmaRule`; ``lower`` holds the smallest
-possible value of each state. Sums are rounded as those of single numbers, so that a sequence has the same digits beside any other.
+Sequences lie side by side: means (n, B), covariances (n, n, B), sigma points (2n + 1, n, B), what is expected at them (2n + 1, m, B). A
+step works on those from ``first`` to ``end``, as many at once as fill a vector of `vehest.lanes`; vectors are read beyond ``end``, so that
+arrays are followed by room for one (`room`), and never written there. Every adjoint takes what its step was given, and adds to (``_bar``)
+gradients unless it says otherwise. A rule is the row [spread, centre_mean, centre_covariance, other] of a `SigmaRule`; ``lower`` holds the
+smallest possible value of each state. Sums are rounded as those of single numbers, so that a sequence has the same digits beside any other.
 """
 
 from __future__ import annotations

@@ -5,8 +5,8 @@ beyond the points repeat the last one and have no gradient. A network sees a poi
 fast for a few points as for many. The adjoint computes stages again instead of keeping them. Blocks of sequences are small enough for a
 core's own cache; matrix products stay on their thread.
 
-In the compiled code ``car`` is (layers, theta, constants, kind): layers are weight, offset and transposed weight of each of the three,
-learnt numbers are in the order of `PHYSICAL` and `PACEJKA`, then known ones, and which car. ``room`` is what a motion leaves for its adjoint
+In the compiled code ``car`` is (layers, theta, constants, kind): weights and offsets of the three layers, then their weights transposed;
+learnt numbers in the order of `PHYSICAL` and `PACEJKA`; known ones; and which car. ``room`` is what a motion leaves for its adjoint
 (`_room`).
 """
 
