@@ -66,7 +66,7 @@ def tape_of(steps: int, sequences: int, n: int, m: int, dtype: Any) -> Tape:
 
 
 def forward_scratch(tape: Tape) -> tuple[Any, ...]:
-    """What `forward` works with."""
+    """What `forward` works with: each call has its own, so that no two threads write to one line of a cache at every step."""
     points, covariance, spread = tape.moved[0], tape.prior_covariance[0], tape.own[0]
     lost = np.empty(points.shape[-1:], np.bool_)
     points, factor, own, made, made_spread = (room(part.shape, part.dtype) for part in (points, *[covariance] * 3, spread))
@@ -74,9 +74,10 @@ def forward_scratch(tape: Tape) -> tuple[Any, ...]:
 
 
 def backward_scratch(tape: Tape) -> tuple[Any, ...]:
-    """What `backward` works with."""
+    """What `backward` works with, likewise; the last two become the gradients of the initial mean and covariance."""
     points, expected, mean, covariance = tape.moved[0], tape.expected[0], tape.post_mean[0], tape.post_covariance[0]
-    shapes = [part.shape for part in (points, covariance, covariance, points, points, points, expected, mean, covariance)]
+    states = (mean, covariance)
+    shapes = [part.shape for part in (points, covariance, covariance, points, points, points, expected, *states, *states)]
     made = [room(shape, points.dtype) for shape in shapes]
     return (*made[:3], np.empty(points.shape[-1:], np.bool_), *made[3:])
 
@@ -209,12 +210,13 @@ def backward(  # type: ignore[no-untyped-def]
     """The adjoint of `forward` over all samples.
 
     Args:
-        bars: gradients of process noise, observation noise and measurements, which are written; of filtered means and covariances; and of
-            the initial mean and covariance, which are written.
+        bars: gradients of process noise, observation noise and measurements, which are written, and of filtered means and covariances.
+        scratch: see `backward_scratch`.
         gradients: those of the model's parameters are added.
     """
-    process_bar, spread_bar, y_bar, mean_up, covariance_up, mean_bar, covariance_bar = bars
-    points, factor, covariance, lost, points_bar, through, moved_bar, expected_bar, post_mean_bar, post_covariance_bar = scratch
+    process_bar, spread_bar, y_bar, mean_up, covariance_up = bars
+    points, factor, covariance, lost, points_bar, through, moved_bar, expected_bar = scratch[:8]
+    post_mean_bar, post_covariance_bar, mean_bar, covariance_bar = scratch[8:]
     margin, repair, rule, lower = setting.margin, setting.repair, setting.rule, setting.lower
     _clear(post_mean_bar, first, end)
     _clear(post_covariance_bar, first, end)

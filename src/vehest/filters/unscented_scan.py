@@ -396,10 +396,10 @@ class _Scan(torch.autograd.Function):
     ) -> tuple[Tensor, Tensor]:
         y, u, *noises = (_by_time(tensor) for tensor in (measurements, inputs, process, observation))
         tape.prior_mean[0], tape.prior_covariance[0] = _beside(mean.detach().numpy()), _beside(covariance.detach().numpy())
-        rest = (np.zeros(measurements.shape[::2], np.int64), forward_scratch(tape), (1, 2 * len(y)))
+        refused, halves = np.zeros(measurements.shape[::2], np.int64), (1, 2 * len(y))
         run = _forward_by(model, functions, tape, u)
         with model.working():
-            share(lambda first, end: run(setting, tape, y, u, *noises, *rest, first, end), len(measurements))
+            share(lambda *own: run(setting, tape, y, u, *noises, refused, forward_scratch(tape), halves, *own), len(measurements))
         ctx.kept = (model, setting, share, tape, functions, y, u)
         return _by_sequence(tape.post_mean), _by_sequence(tape.post_covariance)
 
@@ -408,24 +408,25 @@ class _Scan(torch.autograd.Function):
         model, setting, share, tape, functions, y, u = ctx.kept
         if any(function is not None for function in functions):
             raise RuntimeError("noise that is a function of the estimate has no gradients; give it as a tensor")
-        like = (tape.post_covariance, tape.own, tape.innovation)
-        written = [room(part.shape, part.dtype) for part in (*like, tape.post_mean[0], tape.post_covariance[0])]
-        written[0][-1] = 0  # no step leads on from the last sample
-        bars = (*written[:3], *(_by_time(part) for part in upstream), *written[3:])
-        scratch = backward_scratch(tape)
+        noises = [room(part.shape, part.dtype) for part in (tape.post_covariance, tape.own)]
+        noises[0][-1] = 0  # no step leads on from the last sample
+        measured, mean, covariance = (np.empty_like(part) for part in (tape.innovation, tape.post_mean[0], tape.post_covariance[0]))
+        bars = (*noises, measured, *(_by_time(part) for part in upstream))
         gradients: dict[int, list[Array]] = {}
 
         def work(first: int, end: int) -> None:
             gradients[first] = [np.zeros(tuple(parameter.shape), y.dtype) for parameter in model.parameters]
             run, own = _backward_by(model, tape, u, gradients[first])
+            scratch = backward_scratch(tape)
             run(setting, tape, y, u, bars, scratch, own, first, end)
+            mean[:, first:end], covariance[:, :, first:end] = (part[..., first:end] for part in scratch[-2:])
 
         with model.working():
             share(work, y.shape[-1])
         summed = [torch.from_numpy(np.asarray(sum(parts))) for parts in zip(*(gradients[key] for key in sorted(gradients)), strict=True)]
-        process, observation, measured = (_by_sequence(part) for part in written[:3])
-        mean, covariance = (torch.from_numpy(_apart(part)) for part in written[3:])
-        return (None, None, None, None, None, measured, None, mean, covariance, process, observation, *summed)
+        y_bar, *noise_bars = (_by_sequence(part) for part in (measured, *noises))
+        first_bars = (torch.from_numpy(_apart(part)) for part in (mean, covariance))
+        return (None, None, None, None, None, y_bar, None, *first_bars, *noise_bars, *summed)
 
 
 def _forward_by(model: PointModel, functions: Sequence[NoiseAt | None], tape: Tape, u: Array) -> Callable[..., None]:
