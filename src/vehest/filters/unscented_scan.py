@@ -347,10 +347,10 @@ class UnscentedStepper:
         self._run(1, measurement, inputs, observation_noise)
 
     def _run(self, half: int, measurement: Array, inputs: Array, noise: Array | NoiseAt) -> None:
-        given, at = (noise, None) if isinstance(noise, np.ndarray) else (self._tape.own[0, :, :, 0][None], noise)
-        y, u, given = (_beside(part[None])[None] for part in (measurement, inputs, given[0]))
+        given, at = (noise[0], None) if isinstance(noise, np.ndarray) else (self.innovation_covariance, noise)
+        y, u, given = (_alone_by_time(part) for part in (measurement, inputs, given))
         if at not in self._runs:
-            self._runs[at] = _forward_by(self._model, (at, at), self._tape, u)
+            self._runs[at] = _forward_by(self._model, (at, at))
         with self._model.working():
             self._runs[at](self._setting, self._tape, y, u, given, given, self._refused, self._scratch, (half, half + 1), 0, 1)
 
@@ -397,7 +397,7 @@ class _Scan(torch.autograd.Function):
         y, u, *noises = (_by_time(tensor) for tensor in (measurements, inputs, process, observation))
         tape.prior_mean[0], tape.prior_covariance[0] = _beside(mean.detach().numpy()), _beside(covariance.detach().numpy())
         refused, halves = np.zeros(measurements.shape[::2], np.int64), (1, 2 * len(y))
-        run = _forward_by(model, functions, tape, u)
+        run = _compiled_forward_by(model, functions, tape, u)
         with model.working():
             share(lambda *own: run(setting, tape, y, u, *noises, refused, forward_scratch(tape), halves, *own), len(measurements))
         ctx.kept = (model, setting, share, tape, functions, y, u)
@@ -429,18 +429,29 @@ class _Scan(torch.autograd.Function):
         return (None, None, None, None, None, y_bar, None, *first_bars, *noise_bars, *summed)
 
 
-def _forward_by(model: PointModel, functions: Sequence[NoiseAt | None], tape: Tape, u: Array) -> Callable[..., None]:
-    """The loop over samples with a model and noise: compiled where both are."""
+def _forward_by(model: PointModel, functions: Sequence[NoiseAt | None]) -> Callable[..., None]:
+    """The loop over samples with a model and noise, uncompiled."""
+    called = (
+        (*model.entries[:2], model.car)
+        if isinstance(model, CompiledModel)
+        else (_written(model.transition), _written(model.observation), None)
+    )
+    noises: list[Any] = []
+    for at in functions:
+        noises += [at.entry, at.car] if isinstance(at, CompiledNoise) else [at and _written(at), None]
+    return partial(getattr(forward, "py_func", forward), *FORWARD, *called, *noises)
+
+
+def _compiled_forward_by(model: PointModel, functions: Sequence[NoiseAt | None], tape: Tape, u: Array) -> Callable[..., None]:
+    """The same, compiled where model and noise are."""
     compiled = [at for at in functions if at is None or isinstance(at, CompiledNoise)]
     if not isinstance(model, CompiledModel) or len(compiled) < len(functions) or config.DISABLE_JIT:
-        wrapped = (_written(model.transition), _written(model.observation), None)
-        noises: list[Any] = [part for at in functions for part in ((None, None) if at is None else (_written(at), None))]
-        return partial(getattr(forward, "py_func", forward), *FORWARD, *wrapped, *noises)
+        return _forward_by(model, functions)
     points, inputs, expected, ends = tape.moved[0], u[0], tape.expected[0], (0, 0)
     called = [
         by_address(entry, points, inputs, model.car, out, *ends) for entry, out in zip(model.entries[:2], (points, expected), strict=True)
     ]
-    noises = []
+    noises: list[Any] = []
     for at in compiled:
         state, out = tape.post_mean[0], tape.post_covariance[0]
         noises += [None, None] if at is None else [by_address(at.entry, state, inputs, at.car, out, *ends), at.car]
@@ -489,6 +500,13 @@ def _beside(values: Array) -> Array:
 def _apart(values: Array, first: int = 0, end: int | None = None) -> Array:
     """(..., B) -> (B, ...) of some sequences, together in memory."""
     return np.ascontiguousarray(np.moveaxis(values[..., first:end], -1, 0))
+
+
+def _alone_by_time(values: Array) -> Array:
+    """Values of one sequence at one sample as the loop takes them."""
+    out: Array = room((1, *values.shape, 1), values.dtype)
+    out[0, ..., 0] = values
+    return out
 
 
 def _by_time(tensor: Tensor) -> Array:

@@ -9,6 +9,7 @@ smallest possible value of each state. Sums are rounded as those of single numbe
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import numba
@@ -32,7 +33,7 @@ piece = numba.njit(forceinline=True, no_cpython_wrapper=True, no_cfunc_wrapper=T
 
 def room(shape: tuple[int, ...], dtype: Any) -> Any:
     """An array, not filled, that vectors may be read beyond."""
-    count, size = int(np.prod(shape)), np.dtype(dtype).itemsize
+    count, size = math.prod(shape), np.dtype(dtype).itemsize
     return np.empty(count + BYTES // size, dtype)[:count].reshape(shape)
 
 
