@@ -1,7 +1,8 @@
 """Vectors in registers for compiled code: what reads like code for one window or sequence runs on many at once.
 
 `load` makes a vector of 64 bytes of an array. Operators, comparisons, `abs` and the functions below work on it lane by lane, with a number
-as the same in every lane; a product and a sum are fused where the processor can. Without compilation vectors are arrays.
+as the same in every lane; a product and a sum are fused where the processor can, but not of vectors from `load_unfused`. Without
+compilation vectors are arrays.
 """
 
 from __future__ import annotations
@@ -12,6 +13,7 @@ from typing import Any
 import numpy as np
 from llvmlite import ir
 from numba import types
+from numba.core import cgutils
 from numba.core.typing.templates import AbstractTemplate, infer_global, signature
 from numba.extending import intrinsic, lower_builtin, models, overload, register_model
 
@@ -22,9 +24,9 @@ _FUSED = ("contract",)
 class Lanes(types.Type):  # type: ignore[misc]
     """Type of a vector of numbers, or of truth values."""
 
-    def __init__(self, dtype: Any, count: int) -> None:
-        super().__init__(f"lanes({dtype}, {count})")
-        self.dtype, self.count = dtype, count
+    def __init__(self, dtype: Any, count: int, fused: bool = True) -> None:
+        super().__init__(f"lanes({dtype}, {count}, {fused})")
+        self.dtype, self.count, self.fused = dtype, count, fused
 
 
 @register_model(Lanes)
@@ -40,13 +42,26 @@ def width(array: Any) -> int:
 
 
 def load(array: Any, at: int) -> Any:
-    """The vector that begins at index ``at`` of a contiguous array, (N,)."""
-    return array[at : at + width(array)].copy()
+    """The vector that begins at index ``at`` of a contiguous array, (N,), or of one of more dimensions as if it were flat."""
+    vector, there = np.zeros(width(array), array.dtype), array.reshape(-1)[at : at + width(array)]
+    vector[: len(there)] = there
+    return vector
+
+
+def load_unfused(array: Any, at: int) -> Any:
+    """The same vector, of which products and sums are rounded one by one, as those of numbers."""
+    return load(array, at)
 
 
 def store(array: Any, at: int, vector: Any) -> None:
     """Write a vector to where `load` reads it."""
-    array[at : at + width(array)] = vector
+    array.reshape(-1)[at : at + width(array)] = vector
+
+
+def store_some(array: Any, at: int, vector: Any, count: int) -> None:
+    """Write the first lanes of a vector, ``count`` of them, or all if it has no more."""
+    count = min(count, width(array))
+    array.reshape(-1)[at : at + count] = vector[:count]
 
 
 def choose(condition: Any, one: Any, other: Any) -> Any:
@@ -67,6 +82,11 @@ def most(one: Any, other: Any) -> Any:
 def total(vector: Any) -> Any:
     """Sum over the lanes."""
     return vector.sum()
+
+
+def root(vector: Any) -> Any:
+    """Square root."""
+    return np.sqrt(vector)
 
 
 def each(function: Any, vector: Any) -> Any:
@@ -92,7 +112,7 @@ def _pair(one: Any, other: Any) -> Lanes | None:
 
 
 def _between(function: Any, write: Any, truth: bool = False) -> None:
-    """Let compiled code apply a function of two operands to vectors; ``write(builder, one, other)`` writes its instruction."""
+    """Let compiled code apply a function of two operands to vectors; ``write(builder, one, other, flags)`` writes its instruction."""
 
     @infer_global(function)
     class _Typing(AbstractTemplate):  # type: ignore[misc]
@@ -102,34 +122,42 @@ def _between(function: Any, write: Any, truth: bool = False) -> None:
 
     def lower(context: Any, builder: Any, sig: Any, args: Any) -> Any:
         kind = _pair(*sig.args)
-        return write(builder, *(_vector(context, builder, value, own, kind) for value, own in zip(args, sig.args, strict=True)))
+        one, other = (_vector(context, builder, value, own, kind) for value, own in zip(args, sig.args, strict=True))
+        return write(builder, one, other, _FUSED if kind and kind.fused else ())
 
     for one, other in ((Lanes, Lanes), (Lanes, types.Number), (types.Number, Lanes)):
         lower_builtin(function, one, other)(lower)
 
 
 for _function, _name in ((operator.add, "fadd"), (operator.sub, "fsub"), (operator.mul, "fmul"), (operator.truediv, "fdiv")):
-    _between(_function, lambda builder, one, other, name=_name: getattr(builder, name)(one, other, flags=_FUSED))
+    _between(_function, lambda builder, one, other, flags, name=_name: getattr(builder, name)(one, other, flags=flags))
 for _function, _name in ((operator.iadd, "fadd"), (operator.isub, "fsub"), (operator.imul, "fmul")):
-    _between(_function, lambda builder, one, other, name=_name: getattr(builder, name)(one, other, flags=_FUSED))
+    _between(_function, lambda builder, one, other, flags, name=_name: getattr(builder, name)(one, other, flags=flags))
 for _function, _sign in ((operator.lt, "<"), (operator.le, "<="), (operator.gt, ">"), (operator.ge, ">="), (operator.eq, "==")):
-    _between(_function, lambda builder, one, other, sign=_sign: builder.fcmp_ordered(sign, one, other), truth=True)
+    _between(_function, lambda builder, one, other, flags, sign=_sign: builder.fcmp_ordered(sign, one, other), truth=True)
 # `one` where the two are not ordered, so that a NaN stays
-_between(least, lambda builder, one, other: builder.select(builder.fcmp_ordered(">", one, other), other, one))
-_between(most, lambda builder, one, other: builder.select(builder.fcmp_ordered("<", one, other), other, one))
+_between(least, lambda builder, one, other, flags: builder.select(builder.fcmp_ordered(">", one, other), other, one))
+_between(most, lambda builder, one, other, flags: builder.select(builder.fcmp_ordered("<", one, other), other, one))
 
 
 @infer_global(abs)
+@infer_global(root)
 @infer_global(operator.neg)
 class _Own(AbstractTemplate):  # type: ignore[misc]
     def generic(self, args: Any, kws: Any) -> Any:
         return signature(args[0], *args) if isinstance(args[0], Lanes) else None
 
 
-@lower_builtin(abs, Lanes)  # type: ignore[untyped-decorator]
-def _abs(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-    own = args[0].type
-    return builder.call(builder.module.declare_intrinsic(f"llvm.fabs.{_name_of(sig.args[0])}", (), ir.FunctionType(own, [own])), args)
+def _by_llvm(name: str) -> Any:
+    def lower(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+        own = args[0].type
+        return builder.call(builder.module.declare_intrinsic(f"llvm.{name}.{_name_of(sig.args[0])}", (), ir.FunctionType(own, [own])), args)
+
+    return lower
+
+
+lower_builtin(abs, Lanes)(_by_llvm("fabs"))
+lower_builtin(root, Lanes)(_by_llvm("sqrt"))
 
 
 @lower_builtin(operator.neg, Lanes)  # type: ignore[untyped-decorator]
@@ -146,16 +174,21 @@ def _name_of(vector: Lanes) -> str:
     return f"v{vector.count}f{vector.dtype.bitwidth}"
 
 
-def _of(array: Any) -> Lanes:
-    return Lanes(array.dtype, BYTES * 8 // array.dtype.bitwidth)
+def _of(array: Any, fused: bool = True) -> Lanes:
+    return Lanes(array.dtype, BYTES * 8 // array.dtype.bitwidth, fused)
 
 
-@intrinsic  # type: ignore[untyped-decorator]
-def _load(typing: Any, array: Any, at: Any) -> Any:
-    def lower(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-        return builder.load(_pointer(context, builder, array, args, _of(array)), align=array.dtype.bitwidth // 8)
+def _loading(fused: bool) -> Any:
+    def load(typing: Any, array: Any, at: Any) -> Any:
+        def lower(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+            return builder.load(_pointer(context, builder, array, args, _of(array)), align=array.dtype.bitwidth // 8)
 
-    return _of(array)(array, types.intp), lower
+        return _of(array, fused)(array, types.intp), lower
+
+    return intrinsic(load)
+
+
+_load, _load_unfused = _loading(True), _loading(False)
 
 
 @intrinsic  # type: ignore[untyped-decorator]
@@ -166,6 +199,22 @@ def _store(typing: Any, array: Any, at: Any, vector: Any) -> Any:
         return context.get_dummy_value()
 
     return types.void(array, types.intp, vector), lower
+
+
+@intrinsic  # type: ignore[untyped-decorator]
+def _store_some(typing: Any, array: Any, at: Any, vector: Any, count: Any) -> Any:
+    def lower(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+        place, lane, lanes = _pointer(context, builder, array, args, _of(array)), ir.IntType(64), vector.count
+        splat = builder.insert_element(ir.Constant(ir.VectorType(lane, lanes), ir.Undefined), args[3], ir.Constant(ir.IntType(32), 0))
+        splat = builder.shuffle_vector(splat, splat, ir.Constant(ir.VectorType(ir.IntType(32), lanes), [0] * lanes))
+        wanted = builder.icmp_signed("<", ir.Constant(splat.type, list(range(lanes))), splat)
+        kinds = [args[2].type, place.type, ir.IntType(32), wanted.type]
+        name = f"llvm.masked.store.{_name_of(vector)}.p0"
+        function = cgutils.get_or_insert_function(builder.module, ir.FunctionType(ir.VoidType(), kinds), name)
+        builder.call(function, [args[2], place, ir.Constant(ir.IntType(32), array.dtype.bitwidth // 8), wanted])
+        return context.get_dummy_value()
+
+    return types.void(array, types.intp, vector, types.intp), lower
 
 
 @intrinsic  # type: ignore[untyped-decorator]
@@ -210,7 +259,11 @@ def _compiled_width(array):  # type: ignore[no-untyped-def]
 
 
 overload(load, inline="always")(lambda array, at: lambda array, at: _load(array, at))
+overload(load_unfused, inline="always")(lambda array, at: lambda array, at: _load_unfused(array, at))
 overload(store, inline="always")(lambda array, at, vector: lambda array, at, vector: _store(array, at, vector))
+overload(store_some, inline="always")(
+    lambda array, at, vector, count: lambda array, at, vector, count: _store_some(array, at, vector, count)
+)
 overload(choose, inline="always")(lambda condition, one, other: lambda condition, one, other: _choose(condition, one, other))
 overload(least)(lambda one, other: None if _pair(one, other) else lambda one, other: min(one, other))
 overload(most)(lambda one, other: None if _pair(one, other) else lambda one, other: max(one, other))

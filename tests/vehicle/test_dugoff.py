@@ -105,3 +105,27 @@ def test_gradients_through_the_filter_reach_measurements_and_both_noises():
         assert torch.isfinite(found).all()
         scale = float((expected * size).abs().max())
         torch.testing.assert_close(found * size, expected * size, rtol=0.0, atol=1e-8 * scale)
+
+
+def test_a_sequence_has_the_same_digits_alone_as_beside_others():
+    """Eleven sequences fill one vector of eight and a part of another; one of them is repaired, one not measured."""
+    track, count = dugoff_track("smooth", sees_sideslip=True), 11
+    inputs = torch.tensor([20.0, 0.05, 0.0]) + drawn(count, 6, 3) * torch.tensor([2.0, 0.03, 0.5])
+    sizes = torch.tensor([0.3, 0.02, 300.0, 300.0, 0.02])
+    measurements = torch.tensor([3.0, 0.2, 3000.0, 3000.0, -0.01]) + drawn(count, 6, 5, seed=3) * sizes
+    measurements[2, 3] = torch.nan
+    process = torch.diag_embed((torch.tensor([0.05, 0.02]) * (1.0 + drawn(count, 6, 2, seed=4).abs())).square())
+    process[9, 2] *= -100.0
+
+    def outcome(rows):
+        leaves = [part[rows].clone().requires_grad_() for part in (measurements, process)]
+        filtered = TrackFilter(track).filtered(leaves[0], inputs[rows], leaves[1], sizes.double().square().diag())
+        found = filtered.steps.filtered
+        (found.mean.square().sum() + found.covariance.sum()).backward()
+        return [found.mean.detach(), found.covariance.detach(), filtered.repaired, *(leaf.grad for leaf in leaves)]
+
+    together = outcome(slice(None))
+    assert together[2].any()
+    for row in range(count):
+        for own, beside in zip(outcome(slice(row, row + 1)), together, strict=True):
+            assert torch.equal(own[0].nan_to_num(), beside[row].nan_to_num()), row

@@ -10,17 +10,32 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
+from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
 import torch
+from numba import config
 from numpy.typing import NDArray
 from torch import Tensor
 
 from vehest.filters.gating import Gate
 from vehest.filters.gaussian import Filtered, Gaussian
 from vehest.filters.sigma_points import SigmaRule
-from vehest.filters.unscented_steps import gate_of, moments_adjoint, moments_of, points_adjoint, points_of, update_adjoint, update_of
+from vehest.filters.unscented_loops import (
+    BACKWARD,
+    FORWARD,
+    Setting,
+    Tape,
+    backward,
+    backward_scratch,
+    by_address,
+    forward,
+    forward_scratch,
+    steps_by_address,
+    tape_of,
+)
+from vehest.filters.unscented_steps import room
 
 MARGIN = 1e-6
 """Smallest eigenvalue of a repaired covariance, relative to its largest."""
@@ -128,75 +143,75 @@ class TorchModel(PointModel):
         return np.zeros_like(points) if own[0] is None else np.ascontiguousarray(own[0].numpy())
 
 
-@dataclass(frozen=True)
-class _Setting:
-    model: PointModel
-    rule: Array
-    lower: Array
-    margin: Any
-    repair: bool
-    gate: Gate | None
-    limit: Any
-
-    @classmethod
-    def of(cls, model: PointModel, rule: SigmaRule, n: int, dtype: Any, repair: bool, gate: Gate | None) -> _Setting:
-        lower = np.full(n, -np.inf, dtype) if model.lower is None else np.asarray(model.lower, dtype)
-        limit = None if gate is None else dtype(gate.deviations**2)
-        return cls(model, np.array(rule, dtype), lower, dtype(MARGIN), repair, gate, limit)
-
-
-class _Points:
-    """Sigma points of sequences, and room for them.
+class CompiledModel(PointModel):
+    """A model whose functions are compiled, so that the loop over samples runs without Python.
 
     Attributes:
-        values: (B, 2n + 1, n).
-        factor: that they are drawn with, (B, n, n).
-        lost: whether a covariance was not positive definite, (B,).
-        covariance: that they are drawn from, repaired where it had to be, (B, n, n).
+        entries: compiled transition and observation, called with (points, inputs, car, out, first, end), and their adjoints, called with
+            (points, inputs, car, upstream, out, gradients, first, end). Sequences lie side by side in points (S, n, B), inputs (p, B), what
+            is expected (S, m, B) and gradients, each followed by room for a vector; ``out`` is written from ``first`` to ``end``.
+        car: what all are given.
+        measured: number m of measurements.
     """
 
-    def __init__(self, setting: _Setting, sequences: int, n: int, dtype: Any) -> None:
-        self._setting = setting
-        self.values, self.factor = np.empty((sequences, 2 * n + 1, n), dtype), np.empty((sequences, n, n), dtype)
-        self.lost, self.covariance = np.zeros(sequences, np.bool_), np.empty((sequences, n, n), dtype)
+    entries: Sequence[Any]
+    car: tuple[Any, ...]
+    measured: int
 
-    def draw(self, mean: Array, covariance: Array) -> Array:
-        """Points of states."""
-        own = self._setting
-        self.covariance[:] = covariance
-        points_of(mean, self.covariance, own.rule, own.lower, own.margin, own.repair, self.factor, self.values, self.lost)
-        return self.values
+    def transition(self, points: Array, inputs: Array) -> Array:
+        """See `PointModel`."""
+        return self._called(0, points, inputs, points.shape[2])
 
-    def adjoint(self, mean: Array, points_bar: Array, mean_bar: Array, covariance_bar: Array) -> None:
-        """Add to the gradients of the states that points were last drawn of."""
-        points_adjoint(mean, self.factor, self._setting.rule, self._setting.lower, points_bar, mean_bar, covariance_bar)
+    def observation(self, points: Array, inputs: Array) -> Array:
+        """See `PointModel`."""
+        return self._called(1, points, inputs, self.measured)
+
+    def transition_adjoint(self, points: Array, inputs: Array, upstream: Array, gradients: Sequence[Array]) -> Array:
+        """See `PointModel`."""
+        return self._called(2, points, inputs, points.shape[2], upstream, gradients)
+
+    def observation_adjoint(self, points: Array, inputs: Array, upstream: Array, gradients: Sequence[Array]) -> Array:
+        """See `PointModel`."""
+        return self._called(3, points, inputs, points.shape[2], upstream, gradients)
+
+    def _called(self, entry: int, points: Array, inputs: Array, size: int, upstream: Array | None = None, gradients: Any = None) -> Array:
+        given = [_beside(part) for part in (points, inputs)]
+        out = room((points.shape[1], size, points.shape[0]), points.dtype)
+        ups, learnt = ([], []) if upstream is None else ([_beside(upstream)], [self.learnt(gradients)])
+        self.entries[entry](*given, self.car, *ups, out, *learnt, 0, len(points))
+        return _apart(out)
+
+    def learnt(self, gradients: Sequence[Array]) -> tuple[Any, ...]:
+        """Gradients of the parameters as the adjoints take them."""
+        return tuple(gradients)
 
 
-class _Tape:
-    """What the steps leave behind, sample by sample."""
+@dataclass(frozen=True, eq=False)
+class CompiledNoise:
+    """A `NoiseAt` that is compiled.
 
-    def __init__(self, steps: int, sequences: int, n: int, m: int, dtype: Any) -> None:
-        def empty(*shape: int) -> Array:
-            return np.empty((steps, sequences, *shape), dtype)
+    Attributes:
+        entry: compiled, called with (states (n, B), inputs (p, B), car, out, first, end); writes covariances (k, k, B) from sequence
+            ``first`` to ``end``.
+        car: what else it is given.
+        size: k.
+    """
 
-        points = 2 * n + 1
-        self.prior_mean, self.prior_covariance = empty(n), empty(n, n)
-        self.post_mean, self.post_covariance = empty(n), empty(n, n)
-        self.moved, self.expected = empty(points, n), empty(points, m)
-        self.innovation, self.own, self.gain, self.likelihood, self.centre = empty(m), empty(m, m), empty(n, m), empty(), empty()
-        self.repaired, self.gone = np.zeros((steps, sequences), np.bool_), np.zeros((steps, sequences, m), np.bool_)
+    entry: Any
+    car: tuple[Any, ...]
+    size: int
 
-    def slice(self, first: int, end: int) -> _Tape:
-        """The same of some sequences, copied to lie together."""
-        part = _Tape.__new__(_Tape)
-        for name, values in vars(self).items():
-            setattr(part, name, np.ascontiguousarray(values[:, first:end]))
-        return part
+    def __call__(self, states: Array, inputs: Array) -> Array:
+        """Covariances at states."""
+        out = room((self.size, self.size, len(states)), states.dtype)
+        self.entry(_beside(states), _beside(inputs), self.car, out, 0, len(states))
+        return _apart(out)
 
-    def put(self, first: int, end: int, part: _Tape) -> None:
-        """Take what was computed for some sequences back."""
-        for name, values in vars(part).items():
-            getattr(self, name)[:, first:end] = values
+
+def _setting(model: PointModel, rule: SigmaRule, n: int, dtype: Any, repair: bool, gate: Gate | None) -> Setting:
+    lower = np.full(n, -np.inf, dtype) if model.lower is None else np.asarray(model.lower, dtype)
+    limit, patience = (0.0, 0) if gate is None else (gate.deviations**2, gate.patience)
+    return Setting(np.array(rule, dtype), lower, dtype(MARGIN), repair, gate is not None, dtype(limit), patience)
 
 
 def unscented_scan(
@@ -246,27 +261,27 @@ def unscented_scan(
         raise ValueError(f"the initial state, mean {tuple(initial.mean.shape)}, does not fit {sequences} sequences") from None
     dtype = measurements.dtype
     numpy_dtype = np.float32 if dtype == torch.float32 else np.float64
-    setting = _Setting.of(model, rule, n, numpy_dtype, repair, gate)
+    setting = _setting(model, rule, n, numpy_dtype, repair, gate)
     noises = [process_noise, observation_noise]
     functions = [noise if not isinstance(noise, Tensor) else None for noise in noises]
     tensors = [
-        noise.expand(sequences, steps, size, size) if isinstance(noise, Tensor) else measurements.new_empty(0)
+        noise.expand(sequences, steps, size, size) if isinstance(noise, Tensor) else measurements.new_empty(0, 0, 0, 0)
         for noise, size in zip(noises, (n, m), strict=True)
     ]
-    tape = _Tape(steps, sequences, n, m, numpy_dtype)
+    tape = tape_of(steps, sequences, n, m, numpy_dtype)
     post_mean, post_covariance = _Scan.apply(  # type: ignore[no-untyped-call]
-        setting, share or _alone, tape, functions, measurements, inputs, mean, covariance, *tensors, *model.parameters
+        model, setting, share or _alone, tape, functions, measurements, inputs, mean, covariance, *tensors, *model.parameters
     )
-    outside = [torch.from_numpy(values.swapaxes(0, 1)) for values in (tape.prior_mean, tape.prior_covariance, tape.innovation, tape.own)]
+    outside = [_by_sequence(values) for values in (tape.prior_mean, tape.prior_covariance, tape.innovation, tape.own)]
     filtered = Filtered(
         Gaussian(outside[0], outside[1]),
-        Gaussian(post_mean.transpose(0, 1), post_covariance.transpose(0, 1)),
+        Gaussian(post_mean, post_covariance),
         outside[2],
         outside[3],
-        ~(torch.isnan(measurements) | torch.from_numpy(tape.gone.swapaxes(0, 1))),
-        torch.from_numpy(tape.likelihood.swapaxes(0, 1)),
+        ~(torch.isnan(measurements) | _by_sequence(tape.gone)),
+        _by_sequence(tape.likelihood),
     )
-    return NonlinearFiltered(filtered, torch.from_numpy(tape.repaired.swapaxes(0, 1)))
+    return NonlinearFiltered(filtered, _by_sequence(tape.repaired))
 
 
 class UnscentedStepper:
@@ -297,15 +312,16 @@ class UnscentedStepper:
         gate: Gate | None = None,
     ) -> None:
         n, dtype = len(mean), mean.dtype.type
-        self._setting = _Setting.of(model, rule, n, dtype, repair, gate)
+        self._model, self._setting = model, _setting(model, rule, n, dtype, repair, gate)
         self._refused = np.zeros((1, measurements), np.int64)
-        self._points = _Points(self._setting, 1, n, dtype)
-        self._tape = tape = _Tape(1, 1, n, measurements, dtype)
-        tape.prior_mean[0], tape.prior_covariance[0] = mean, covariance
+        self._tape = tape = tape_of(1, 1, n, measurements, dtype)
+        self.prior = Gaussian(tape.prior_mean[0, :, 0], tape.prior_covariance[0, :, :, 0])
+        self.state = Gaussian(tape.post_mean[0, :, 0], tape.post_covariance[0, :, :, 0])
+        self.prior.mean[:], self.prior.covariance[:] = mean, covariance
         self._inputs: Array | None = None
-        self.prior = Gaussian(tape.prior_mean[0, 0], tape.prior_covariance[0, 0])
-        self.state = Gaussian(tape.post_mean[0, 0], tape.post_covariance[0, 0])
-        self.innovation, self.innovation_covariance, self.gain = tape.innovation[0, 0], tape.own[0, 0], tape.gain[0, 0]
+        self._runs: dict[NoiseAt | None, Callable[..., None]] = {}
+        self._scratch = forward_scratch(tape)
+        self.innovation, self.innovation_covariance, self.gain = tape.innovation[0, :, 0], tape.own[0, :, :, 0], tape.gain[0, :, :, 0]
 
     def step(self, measurement: Array, inputs: Array, process_noise: Array | NoiseAt, observation_noise: Array | NoiseAt) -> Array:
         """The filtered mean, (n,), valid until the next step.
@@ -324,14 +340,19 @@ class UnscentedStepper:
 
     def predict(self, inputs: Array, process_noise: Array | NoiseAt) -> None:
         """Move the state to the next sample by inputs of this one."""
-        before = self._tape.post_mean[0].copy(), self._tape.post_covariance[0].copy()
-        with self._setting.model.working():
-            _predict(self._setting, self._tape, 0, self._points, *before, inputs[None], process_noise)
+        self._run(0, self.innovation, inputs, process_noise)
 
     def update(self, measurement: Array, inputs: Array, observation_noise: Array | NoiseAt) -> None:
         """Take in the measurement."""
-        with self._setting.model.working():
-            _update(self._setting, self._tape, 0, self._points, measurement[None].copy(), inputs[None], observation_noise, self._refused)
+        self._run(1, measurement, inputs, observation_noise)
+
+    def _run(self, half: int, measurement: Array, inputs: Array, noise: Array | NoiseAt) -> None:
+        given, at = (noise[0], None) if isinstance(noise, np.ndarray) else (self.innovation_covariance, noise)
+        y, u, given = (_alone_by_time(part) for part in (measurement, inputs, given))
+        if at not in self._runs:
+            self._runs[at] = _forward_by(self._model, (at, at))
+        with self._model.working():
+            self._runs[at](self._setting, self._tape, y, u, given, given, self._refused, self._scratch, (half, half + 1), 0, 1)
 
 
 def moved(model: PointModel, states: Tensor, inputs: Tensor) -> Tensor:
@@ -360,9 +381,10 @@ class _Scan(torch.autograd.Function):
     @staticmethod
     def forward(
         ctx: Any,
-        setting: _Setting,
+        model: PointModel,
+        setting: Setting,
         share: Share,
-        tape: _Tape,
+        tape: Tape,
         functions: Sequence[NoiseAt | None],
         measurements: Tensor,
         inputs: Tensor,
@@ -372,204 +394,132 @@ class _Scan(torch.autograd.Function):
         observation: Tensor,
         *parameters: Tensor,
     ) -> tuple[Tensor, Tensor]:
-        y, u = _by_time(measurements), _by_time(inputs)
-        if setting.gate is not None:
-            y = y.copy()  # what is refused becomes NaN in it, and so is never measured for the adjoint either
-        first = [tensor.detach().contiguous().numpy() for tensor in (mean, covariance)]
-        noises: list[Any] = [
-            _by_time(noise) if function is None else function for noise, function in zip((process, observation), functions, strict=True)
-        ]
-
-        def work(start: int, end: int) -> None:
-            part = tape if end - start == y.shape[1] else tape.slice(start, end)
-            own = [noise[:, start:end] if isinstance(noise, np.ndarray) else noise for noise in noises]
-            _forward(setting, part, y[:, start:end], u[:, start:end], first[0][start:end], first[1][start:end], own)
-            if part is not tape:
-                tape.put(start, end, part)
-
-        with setting.model.working():
-            share(work, y.shape[1])
-        ctx.kept = (setting, share, tape, functions, y, u)
-        return torch.from_numpy(tape.post_mean), torch.from_numpy(tape.post_covariance)
+        y, u, *noises = (_by_time(tensor) for tensor in (measurements, inputs, process, observation))
+        tape.prior_mean[0], tape.prior_covariance[0] = _beside(mean.detach().numpy()), _beside(covariance.detach().numpy())
+        refused, halves = np.zeros(measurements.shape[::2], np.int64), (1, 2 * len(y))
+        run = _compiled_forward_by(model, functions, tape, u)
+        with model.working():
+            share(lambda *own: run(setting, tape, y, u, *noises, refused, forward_scratch(tape), halves, *own), len(measurements))
+        ctx.kept = (model, setting, share, tape, functions, y, u)
+        return _by_sequence(tape.post_mean), _by_sequence(tape.post_covariance)
 
     @staticmethod
     def backward(ctx: Any, *upstream: Tensor) -> tuple[Tensor | None, ...]:
-        setting, share, tape, functions, y, u = ctx.kept
+        model, setting, share, tape, functions, y, u = ctx.kept
         if any(function is not None for function in functions):
             raise RuntimeError("noise that is a function of the estimate has no gradients; give it as a tensor")
-        steps, sequences, n = tape.post_mean.shape
-        m = y.shape[2]
-        dtype = y.dtype
-        process, observation = np.zeros((steps, sequences, n, n), dtype), np.zeros((steps, sequences, m, m), dtype)
-        measured = np.zeros((steps, sequences, m), dtype)
-        mean, covariance = np.zeros((sequences, n), dtype), np.zeros((sequences, n, n), dtype)
-        mean_up, covariance_up = (np.ascontiguousarray(part.numpy()) for part in upstream)
+        noises = [room(part.shape, part.dtype) for part in (tape.post_covariance, tape.own)]
+        noises[0][-1] = 0  # no step leads on from the last sample
+        measured, mean, covariance = (np.empty_like(part) for part in (tape.innovation, tape.post_mean[0], tape.post_covariance[0]))
+        bars = (*noises, measured, *(_by_time(part) for part in upstream))
         gradients: dict[int, list[Array]] = {}
 
-        def work(start: int, end: int) -> None:
-            whole = end - start == sequences
-            part = tape if whole else tape.slice(start, end)
-            own = [np.zeros(tuple(parameter.shape), dtype) for parameter in setting.model.parameters]
-            gradients[start] = own
-            wanted = (process, observation, measured)
-            bars = [piece if whole else np.ascontiguousarray(piece[:, start:end]) for piece in (*wanted, mean_up, covariance_up)]
-            data = (y[:, start:end], u[:, start:end])
-            mean[start:end], covariance[start:end] = _backward(setting, part, *data, bars, own)
-            if not whole:
-                for piece, bar in zip(wanted, bars, strict=False):
-                    piece[:, start:end] = bar
+        def work(first: int, end: int) -> None:
+            gradients[first] = [np.zeros(tuple(parameter.shape), y.dtype) for parameter in model.parameters]
+            run, own = _backward_by(model, tape, u, gradients[first])
+            scratch = backward_scratch(tape)
+            run(setting, tape, y, u, bars, scratch, own, first, end)
+            mean[:, first:end], covariance[:, :, first:end] = (part[..., first:end] for part in scratch[-2:])
 
-        with setting.model.working():
-            share(work, sequences)
+        with model.working():
+            share(work, y.shape[-1])
         summed = [torch.from_numpy(np.asarray(sum(parts))) for parts in zip(*(gradients[key] for key in sorted(gradients)), strict=True)]
-        y_bar, *noise = (torch.from_numpy(bar).transpose(0, 1) for bar in (measured, process, observation))
-        return (None, None, None, None, y_bar, None, torch.from_numpy(mean), torch.from_numpy(covariance), *noise, *summed)
+        y_bar, *noise_bars = (_by_sequence(part) for part in (measured, *noises))
+        first_bars = (torch.from_numpy(_apart(part)) for part in (mean, covariance))
+        return (None, None, None, None, None, y_bar, None, *first_bars, *noise_bars, *summed)
 
 
-def _forward(
-    setting: _Setting,
-    tape: _Tape,
-    y: Array,
-    u: Array,
-    mean: Array,
-    covariance: Array,
-    noises: Sequence[Any],
-) -> None:
-    refused = np.zeros(y.shape[1:], np.int64)
-    points = _Points(setting, len(mean), mean.shape[1], y.dtype)
-    for k in range(len(y)):
-        now = np.ascontiguousarray(u[k])
-        if k == 0:
-            tape.prior_mean[0], tape.prior_covariance[0] = mean, covariance
-        else:
-            before = np.ascontiguousarray(u[k - 1])
-            _predict(setting, tape, k, points, tape.post_mean[k - 1], tape.post_covariance[k - 1], before, _noise(noises[0], k - 1))
-        seen = np.ascontiguousarray(y[k])
-        _update(setting, tape, k, points, seen, now, _noise(noises[1], k), refused)
-        if setting.gate is not None:
-            y[k] = seen
-
-
-def _predict(
-    setting: _Setting, tape: _Tape, k: int, points: _Points, mean: Array, covariance: Array, inputs: Array, noise: Array | NoiseAt
-) -> None:
-    """Move states to sample ``k`` of the tape."""
-    tape.moved[k] = setting.model.transition(points.draw(mean, covariance), inputs)
-    tape.repaired[k] = points.lost
-    added = noise if isinstance(noise, np.ndarray) else noise(mean, inputs)
-    moments_of(tape.moved[k], added, setting.rule, setting.lower, tape.prior_mean[k], tape.prior_covariance[k])
-
-
-def _update(
-    setting: _Setting,
-    tape: _Tape,
-    k: int,
-    points: _Points,
-    y: Array,
-    inputs: Array,
-    noise: Array | NoiseAt,
-    refused: NDArray[np.int64],
-) -> None:
-    """Take in the measurement at sample ``k`` of the tape; what a gate refuses becomes NaN in ``y``."""
-    mean = tape.prior_mean[k]
-    tape.expected[k] = setting.model.observation(points.draw(mean, tape.prior_covariance[k]), inputs)
-    tape.repaired[k] |= points.lost
-    spread = noise if isinstance(noise, np.ndarray) else noise(mean, inputs)
-    if setting.gate is not None:
-        tape.gone[k] = False
-        gate_of(tape.expected[k], spread, setting.rule, setting.limit, setting.gate.patience, y, refused, tape.gone[k])
-    update_of(
-        mean,
-        points.covariance,
-        points.values,
-        tape.expected[k],
-        y,
-        spread,
-        setting.rule,
-        setting.lower,
-        setting.margin,
-        setting.repair,
-        tape.post_mean[k],
-        tape.post_covariance[k],
-        tape.innovation[k],
-        tape.own[k],
-        tape.gain[k],
-        tape.likelihood[k],
-        tape.repaired[k],
-        tape.centre[k],
+def _forward_by(model: PointModel, functions: Sequence[NoiseAt | None]) -> Callable[..., None]:
+    """The loop over samples with a model and noise, uncompiled."""
+    called = (
+        (*model.entries[:2], model.car)
+        if isinstance(model, CompiledModel)
+        else (_written(model.transition), _written(model.observation), None)
     )
+    noises: list[Any] = []
+    for at in functions:
+        noises += [at.entry, at.car] if isinstance(at, CompiledNoise) else [at and _written(at), None]
+    return partial(getattr(forward, "py_func", forward), *FORWARD, *called, *noises)
 
 
-def _backward(
-    setting: _Setting,
-    tape: _Tape,
-    y: Array,
-    u: Array,
-    bars: Sequence[Array],
-    gradients: Sequence[Array],
-) -> tuple[Array, Array]:
-    """Gradients of the initial mean and covariance; those of noise and measurements are written, those of the parameters added.
-
-    Args:
-        bars: gradients of process noise, observation noise and measurements, which are written, and of filtered means and covariances.
-    """
-    process_bar, observation_bar, y_bar, mean_up, covariance_up = bars
-    model, rule, lower = setting.model, setting.rule, setting.lower
-    steps, sequences, n = tape.post_mean.shape
-    m = y.shape[2]
-    points = _Points(setting, sequences, n, y.dtype)
-    points_bar, expected_bar = np.empty_like(points.values), np.empty((sequences, 2 * n + 1, m), y.dtype)
-    moved_bar = np.empty_like(points.values)
-    post_mean_bar, post_covariance_bar = np.zeros((sequences, n), y.dtype), np.zeros((sequences, n, n), y.dtype)
-    mean_bar, covariance_bar = np.empty_like(post_mean_bar), np.empty_like(post_covariance_bar)
-    for k in range(steps - 1, -1, -1):
-        now = np.ascontiguousarray(u[k])
-        post_mean_bar += mean_up[k]
-        post_covariance_bar += covariance_up[k]
-        update_adjoint(
-            tape.prior_mean[k],
-            points.draw(tape.prior_mean[k], tape.prior_covariance[k]),
-            tape.expected[k],
-            np.ascontiguousarray(y[k]),
-            rule,
-            lower,
-            tape.innovation[k],
-            tape.own[k],
-            tape.gain[k],
-            tape.centre[k],
-            post_mean_bar,
-            post_covariance_bar,
-            mean_bar,
-            covariance_bar,
-            points_bar,
-            expected_bar,
-            observation_bar[k],
-            y_bar[k],
-        )
-        points_bar += model.observation_adjoint(points.values, now, expected_bar, gradients)
-        points.adjoint(tape.prior_mean[k], points_bar, mean_bar, covariance_bar)
-        if k == 0:
-            break
-        moments_adjoint(tape.moved[k], rule, lower, mean_bar, covariance_bar, moved_bar, process_bar[k - 1])
-        before = np.ascontiguousarray(u[k - 1])
-        points.draw(tape.post_mean[k - 1], tape.post_covariance[k - 1])
-        points_bar[:] = model.transition_adjoint(points.values, before, moved_bar, gradients)
-        post_mean_bar[:] = 0
-        post_covariance_bar[:] = 0
-        points.adjoint(tape.post_mean[k - 1], points_bar, post_mean_bar, post_covariance_bar)
-    return mean_bar, covariance_bar
+def _compiled_forward_by(model: PointModel, functions: Sequence[NoiseAt | None], tape: Tape, u: Array) -> Callable[..., None]:
+    """The same, compiled where model and noise are."""
+    compiled = [at for at in functions if at is None or isinstance(at, CompiledNoise)]
+    if not isinstance(model, CompiledModel) or len(compiled) < len(functions) or config.DISABLE_JIT:
+        return _forward_by(model, functions)
+    points, inputs, expected, ends = tape.moved[0], u[0], tape.expected[0], (0, 0)
+    called = [
+        by_address(entry, points, inputs, model.car, out, *ends) for entry, out in zip(model.entries[:2], (points, expected), strict=True)
+    ]
+    noises: list[Any] = []
+    for at in compiled:
+        state, out = tape.post_mean[0], tape.post_covariance[0]
+        noises += [None, None] if at is None else [by_address(at.entry, state, inputs, at.car, out, *ends), at.car]
+    return partial(forward, *steps_by_address(FORWARD, points.dtype), *called, model.car, *noises)
 
 
-def _noise(noise: Any, k: int) -> Array | NoiseAt:
-    """That of sample k, or the function that it is."""
-    own: Array | NoiseAt = np.ascontiguousarray(noise[k]) if isinstance(noise, np.ndarray) else noise
-    return own
+def _backward_by(model: PointModel, tape: Tape, u: Array, gradients: Sequence[Array]) -> tuple[Callable[..., None], Any]:
+    """The adjoint's loop with a model, and the gradients as it takes them."""
+    if not isinstance(model, CompiledModel) or config.DISABLE_JIT:
+        adjoints = (_added(model.transition_adjoint), _added(model.observation_adjoint))
+        return partial(getattr(backward, "py_func", backward), *BACKWARD, *adjoints, None), gradients
+    own, points, inputs = model.learnt(gradients), tape.moved[0], u[0]
+    called = [
+        by_address(entry, points, inputs, model.car, upstream, points, own, 0, 0)
+        for entry, upstream in zip(model.entries[2:], (points, tape.expected[0]), strict=True)
+    ]
+    return partial(backward, *steps_by_address(BACKWARD, points.dtype), *called, model.car), own
+
+
+def _written(function: Callable[[Array, Array], Array]) -> Callable[..., None]:
+    """A function of arrays that lie sequence by sequence, as the loop calls it."""
+
+    def write(values: Array, inputs: Array, _: Any, out: Array, first: int, end: int) -> None:
+        out[..., first:end] = _beside(function(_apart(values, first, end), _apart(inputs, first, end)))
+
+    return write
+
+
+def _added(function: Callable[..., Array]) -> Callable[..., None]:
+    """The same of an adjoint."""
+
+    def write(points: Array, inputs: Array, _: Any, upstream: Array, out: Array, gradients: Sequence[Array], first: int, end: int) -> None:
+        out[..., first:end] = _beside(function(*(_apart(part, first, end) for part in (points, inputs, upstream)), gradients))
+
+    return write
+
+
+def _beside(values: Array) -> Array:
+    """(B, ...) -> (..., B), followed by room for a vector."""
+    moved = np.moveaxis(values, 0, -1)
+    out: Array = room(moved.shape, values.dtype)
+    out[:] = moved
+    return out
+
+
+def _apart(values: Array, first: int = 0, end: int | None = None) -> Array:
+    """(..., B) -> (B, ...) of some sequences, together in memory."""
+    return np.ascontiguousarray(np.moveaxis(values[..., first:end], -1, 0))
+
+
+def _alone_by_time(values: Array) -> Array:
+    """Values of one sequence at one sample as the loop takes them."""
+    out: Array = room((1, *values.shape, 1), values.dtype)
+    out[0, ..., 0] = values
+    return out
 
 
 def _by_time(tensor: Tensor) -> Array:
-    """(B, T, ...) -> (T, B, ...), together in memory."""
-    values: Array = tensor.detach().transpose(0, 1).contiguous().numpy()
-    return values
+    """(B, T, ...) -> (T, ..., B), followed by room for a vector."""
+    moved = tensor.detach().movedim(0, -1)
+    out: Array = room(tuple(moved.shape), moved.numpy().dtype)
+    torch.from_numpy(out).copy_(moved)
+    return out
+
+
+def _by_sequence(values: Array) -> Tensor:
+    """(T, ..., B) -> (B, T, ...), in memory by time."""
+    return torch.from_numpy(values).movedim(-1, 1).contiguous().transpose(0, 1)
 
 
 def _alone(work: Callable[[int, int], None], sequences: int) -> None:

@@ -1,152 +1,237 @@
 """One step of the unscented filter over many sequences, compiled, and its adjoint.
 
-Arrays lie sequence by sequence: means (B, n), covariances (B, n, n), sigma points (B, 2n + 1, n), what is expected at them (B, 2n + 1, m).
-Every adjoint takes what its step was given, and adds to (``_bar``) gradients unless it says otherwise. A rule is the row
-[spread, centre_mean, centre_covariance, other] of a `SigmaRule`; ``lower`` holds the smallest possible value of each state.
+Sequences lie side by side: means (n, B), covariances (n, n, B), sigma points (2n + 1, n, B), what is expected at them (2n + 1, m, B). A
+step works on those from ``first`` to ``end``, as many at once as fill a vector of `vehest.lanes`; vectors are read beyond ``end``, so that
+arrays are followed by room for one (`room`), and never written there. Every adjoint takes what its step was given, and adds to (``_bar``)
+gradients unless it says otherwise. A rule is the row [spread, centre_mean, centre_covariance, other] of a `SigmaRule`; ``lower`` holds the
+smallest possible value of each state. Sums are rounded as those of single numbers, so that a sequence has the same digits beside any other.
 """
 
 from __future__ import annotations
 
+import math
+from typing import Any
+
 import numba
 import numpy as np
+from numba import types
 
 from vehest.filters.gating import refuses
+from vehest.lanes import BYTES, choose, load_unfused, most, root, store, store_some, width
 
 compiled = numba.njit(cache=True, nogil=True, error_model="numpy", boundscheck=False)
+DIMENSIONS = {"rule": 1, "lower": 1, "likelihood": 1, "centre": 1} | dict.fromkeys(
+    ("mean", "mean_bar", "post_mean", "post_mean_bar", "y", "y_bar", "innovation"), 2
+)
+OTHERS = {"margin": None, "limit": None, "first": types.intp, "end": types.intp, "patience": types.intp, "repair": types.boolean} | {
+    "repaired": types.boolean[::1],
+    "gone": types.boolean[:, ::1],
+    "refused": types.int64[:, ::1],
+}
+piece = numba.njit(forceinline=True, no_cpython_wrapper=True, no_cfunc_wrapper=True, error_model="numpy", boundscheck=False)
+
+
+def room(shape: tuple[int, ...], dtype: Any) -> Any:
+    """An array, not filled, that vectors may be read beyond."""
+    count, size = math.prod(shape), np.dtype(dtype).itemsize
+    return np.empty(count + BYTES // size, dtype)[:count].reshape(shape)
+
+
+def types_of(step: Any, dtype: Any) -> tuple[Any, ...]:
+    """Types of a step's arguments for arrays of a precision: those named in `DIMENSIONS` and `OTHERS`, else of three dimensions."""
+    number = numba.from_dtype(np.dtype(dtype))
+    names = step.py_func.__code__.co_varnames[: step.py_func.__code__.co_argcount]
+    return tuple((OTHERS[name] or number) if name in OTHERS else types.Array(number, DIMENSIONS.get(name, 3), "C") for name in names)
+
+
+@piece
+def _at(values, row, b):  # type: ignore[no-untyped-def]
+    """Vector of a row (the indices before the last one, as one) from sequence b on."""
+    return load_unfused(values, row * values.shape[values.ndim - 1] + b)
+
+
+@piece
+def _own(rows, row):  # type: ignore[no-untyped-def]
+    """Vector of a row of scratch, (R, W)."""
+    return load_unfused(rows, row * rows.shape[1])
+
+
+@piece
+def _put(rows, row, vector):  # type: ignore[no-untyped-def]
+    store(rows, row * rows.shape[1], vector)
+
+
+@piece
+def _rows(count, like):  # type: ignore[no-untyped-def]
+    return np.empty((count, width(like)), like.dtype)
+
+
+@piece
+def _write(rows, out, b, end):  # type: ignore[no-untyped-def]
+    """Scratch to the sequences from b to ``end``, as many as there are."""
+    stride = out.shape[out.ndim - 1]
+    for row in range(rows.shape[0]):
+        store_some(out, row * stride + b, _own(rows, row), end - b)
+
+
+@piece
+def _any(condition, b, end, scratch):  # type: ignore[no-untyped-def]
+    """Whether a vector is positive for a sequence from b to ``end``; ``scratch`` (1, W) becomes the vector."""
+    store(scratch, 0, condition)
+    found = False
+    for lane in range(min(end - b, scratch.shape[1])):
+        found |= scratch[0, lane] > 0
+    return found
 
 
 @compiled
-def points_of(mean, covariance, rule, lower, margin, repair, factor, points, repaired):  # type: ignore[no-untyped-def]
-    """Sigma points and the factors they are drawn with; repairs what is not positive definite, in ``covariance`` too."""
-    sequences, n = mean.shape
-    spread = rule[0]
-    for b in range(sequences):
-        repaired[b] = False
-        if not _cholesky(covariance[b], factor[b]):
-            repaired[b] = _all_finite(covariance[b])
-            if not (repair and repaired[b] and _lifted(covariance[b], factor[b], margin)):
-                factor[b] = np.nan
-                covariance[b] = np.nan
+def points_of(mean, given, rule, lower, margin, repair, covariance, factor, points, repaired, first, end):  # type: ignore[no-untyped-def]
+    """Sigma points of ``given`` covariances, which become ``covariance`` where what is not positive definite is repaired, and factors."""
+    n, count, lanes = mean.shape[0], points.shape[0], width(mean)
+    A, L, P, flags = _rows(n * n, mean), _rows(n * n, mean), _rows(count * n, mean), _rows(1, mean)
+    for b in range(first, end, lanes):
+        for row in range(n * n):
+            _put(A, row, _at(given, row, b))
+        lost = 1 - _cholesky(A, L, n)
+        for lane in range(min(lanes, end - b)):
+            repaired[b + lane] = False
+        if _any(lost, b, end, flags):
+            for lane in range(min(lanes, end - b)):
+                if flags[0, lane] > 0:
+                    repaired[b + lane] = _repaired(A, L, lane, n, margin, repair)
+        nothing = _own(L, 0) - _own(L, 0)  # NaN where a sequence is lost
         for i in range(n):
-            centre = mean[b, i]
-            points[b, 0, i] = max(centre, lower[i]) if centre == centre else centre
+            c = _at(mean, i, b)
+            _put(P, i, choose(nothing == 0, most(c, lower[i]), nothing))
             for j in range(n):
-                offset = spread * factor[b, i, j] if j <= i else factor[b, i, j] * 0
-                points[b, 1 + j, i] = max(centre + offset, lower[i])
-                points[b, 1 + n + j, i] = max(centre - offset, lower[i])
-            if not np.isfinite(factor[b, 0, 0]):
-                points[b, :, i] = np.nan
+                offset = rule[0] * _own(L, i * n + j) if j <= i else nothing
+                _put(P, (1 + j) * n + i, choose(nothing == 0, most(c + offset, lower[i]), nothing))
+                _put(P, (1 + n + j) * n + i, choose(nothing == 0, most(c - offset, lower[i]), nothing))
+        _write(A, covariance, b, end)
+        _write(L, factor, b, end)
+        _write(P, points, b, end)
 
 
 @compiled
-def points_adjoint(mean, factor, rule, lower, points_bar, mean_bar, covariance_bar):  # type: ignore[no-untyped-def]
+def points_adjoint(mean, factor, rule, lower, points_bar, mean_bar, covariance_bar, first, end):  # type: ignore[no-untyped-def]
     """Adjoint of `points_of`; what a repair added counts as constant."""
-    sequences, n = mean.shape
-    spread = rule[0]
-    below = np.empty((n, n), mean.dtype)
-    for b in range(sequences):
-        L = factor[b]
-        below[:] = 0
+    n = mean.shape[0]
+    L, below, inner, x_bar, A_bar = _rows(n * n, mean), _rows(n * n, mean), _rows(n * n, mean), _rows(n, mean), _rows(n * n, mean)
+    for b in range(first, end, width(mean)):
+        for row in range(n * n):
+            _put(L, row, _at(factor, row, b))
+            _put(A_bar, row, _at(covariance_bar, row, b))
+        nothing = _own(L, 0) * 0
         for i in range(n):
-            if mean[b, i] >= lower[i]:
-                mean_bar[b, i] += points_bar[b, 0, i]
+            c, bar = _at(mean, i, b), _at(mean_bar, i, b)
+            bar = choose(c >= lower[i], bar + _at(points_bar, i, b), bar)
             for j in range(n):
-                offset = spread * L[i, j] if j <= i else L[i, j] * 0
-                up = points_bar[b, 1 + j, i] if mean[b, i] + offset >= lower[i] else L[i, j] * 0
-                down = points_bar[b, 1 + n + j, i] if mean[b, i] - offset >= lower[i] else L[i, j] * 0
-                mean_bar[b, i] += up + down
-                if j <= i:
-                    below[i, j] = spread * (up - down)
-        _cholesky_adjoint(L, below, covariance_bar[b])
+                offset = rule[0] * _own(L, i * n + j) if j <= i else nothing
+                up = choose(c + offset >= lower[i], _at(points_bar, (1 + j) * n + i, b), nothing)
+                down = choose(c - offset >= lower[i], _at(points_bar, (1 + n + j) * n + i, b), nothing)
+                bar += up + down
+                _put(below, i * n + j, rule[0] * (up - down) if j <= i else nothing)
+            _put(x_bar, i, bar)
+        _cholesky_adjoint(L, below, inner, A_bar, n)
+        _write(x_bar, mean_bar, b, end)
+        _write(A_bar, covariance_bar, b, end)
+
+
+@piece
+def _deviations(values, b, m, rule, deviation, i):  # type: ignore[no-untyped-def]
+    """Write how far values (S, m, B) lie from their weighted mean in i, which is returned, into scratch (S · m, W)."""
+    count = values.shape[0]
+    around = _at(values, 0, b) * 0
+    for s in range(1, count):
+        around += _at(values, s * m + i, b)
+    centre = rule[1] * _at(values, i, b) + rule[3] * around
+    for s in range(count):
+        _put(deviation, s * m + i, _at(values, s * m + i, b) - centre)
+    return centre
+
+
+@piece
+def _weighted(one, i, n, other, j, m, rule, centre):  # type: ignore[no-untyped-def]
+    """Weighted product of deviations, i of (S · n, W) with j of (S · m, W); the mean point has the weight ``centre``."""
+    result = _own(one, 0) * 0
+    for s in range(1, one.shape[0] // n):
+        result += _own(one, s * n + i) * _own(other, s * m + j)
+    return rule[3] * result + centre * _own(one, i) * _own(other, j)
 
 
 @compiled
-def moments_of(values, noise, rule, lower, mean, covariance):  # type: ignore[no-untyped-def]
+def moments_of(values, noise, rule, lower, mean, covariance, first, end):  # type: ignore[no-untyped-def]
     """Weighted mean and covariance of what became of the points, plus noise."""
-    sequences, count, n = values.shape
-    _, centre_mean, centre_covariance, other = rule
-    deviation = np.empty((count, n), values.dtype)
-    for b in range(sequences):
+    count, n = values.shape[:2]
+    half = rule.dtype.type(0.5)
+    deviation, x, A = _rows(count * n, values), _rows(n, values), _rows(n * n, values)
+    for b in range(first, end, width(values)):
         for i in range(n):
-            total = values[b, 0, i] * 0
-            for s in range(1, count):
-                total += values[b, s, i]
-            centre = centre_mean * values[b, 0, i] + other * total
-            for s in range(count):
-                deviation[s, i] = values[b, s, i] - centre
-            mean[b, i] = max(centre, lower[i]) if centre == centre else centre
+            _put(x, i, most(_deviations(values, b, n, rule, deviation, i), lower[i]))
         for i in range(n):
             for j in range(i + 1):
-                total = values[b, 0, 0] * 0
-                for s in range(1, count):
-                    total += deviation[s, i] * deviation[s, j]
-                total = other * total + centre_covariance * deviation[0, i] * deviation[0, j]
-                total += rule.dtype.type(0.5) * (noise[b, i, j] + noise[b, j, i])
-                covariance[b, i, j] = total
-                covariance[b, j, i] = total
+                spread = _weighted(deviation, i, n, deviation, j, n, rule, rule[2])
+                spread += half * (_at(noise, i * n + j, b) + _at(noise, j * n + i, b))
+                _put(A, i * n + j, spread)
+                _put(A, j * n + i, spread)
+        _write(x, mean, b, end)
+        _write(A, covariance, b, end)
 
 
 @compiled
-def moments_adjoint(values, rule, lower, mean_bar, covariance_bar, values_bar, noise_bar):  # type: ignore[no-untyped-def]
+def moments_adjoint(values, rule, lower, mean_bar, covariance_bar, values_bar, noise_bar, first, end):  # type: ignore[no-untyped-def]
     """Adjoint of `moments_of`; writes ``values_bar`` and ``noise_bar``."""
-    sequences, count, n = values.shape
-    _, centre_mean, centre_covariance, other = rule
-    half = rule.dtype.type(0.5)
-    two = rule.dtype.type(2.0)
-    deviation = np.empty((count, n), values.dtype)
-    whole = np.empty((n, n), values.dtype)
-    through = np.empty(n, values.dtype)
-    for b in range(sequences):
+    count, n = values.shape[:2]
+    half, two = rule.dtype.type(0.5), rule.dtype.type(2.0)
+    deviation, V_bar = _rows(count * n, values), _rows(count * n, values)
+    through, whole = _rows(n, values), _rows(n * n, values)
+    for b in range(first, end, width(values)):
         for i in range(n):
-            total = values[b, 0, i] * 0
-            for s in range(1, count):
-                total += values[b, s, i]
-            centre = centre_mean * values[b, 0, i] + other * total
-            through[i] = mean_bar[b, i] if centre >= lower[i] else total * 0
-            for s in range(count):
-                deviation[s, i] = values[b, s, i] - centre
+            centre = _deviations(values, b, n, rule, deviation, i)
+            _put(through, i, choose(centre >= lower[i], _at(mean_bar, i, b), centre * 0))
             for j in range(n):
-                whole[i, j] = half * (covariance_bar[b, i, j] + covariance_bar[b, j, i])
-                noise_bar[b, i, j] = whole[i, j]
+                _put(whole, i * n + j, half * (_at(covariance_bar, i * n + j, b) + _at(covariance_bar, j * n + i, b)))
         for s in range(count):
-            weight = centre_covariance if s == 0 else other
+            weight = two * (rule[2] if s == 0 else rule[3])
             for i in range(n):
-                total = values[b, 0, 0] * 0
+                bar = _own(through, 0) * 0
                 for j in range(n):
-                    total += whole[i, j] * deviation[s, j]
-                values_bar[b, s, i] = two * weight * total
+                    bar += _own(whole, i * n + j) * _own(deviation, s * n + j)
+                _put(V_bar, s * n + i, weight * bar)
         for i in range(n):
-            total = through[i]
+            left = _own(through, i)
             for s in range(count):
-                total -= values_bar[b, s, i]
-            values_bar[b, 0, i] += centre_mean * total
-            for s in range(1, count):
-                values_bar[b, s, i] += other * total
+                left -= _own(V_bar, s * n + i)
+            for s in range(count):
+                _put(V_bar, s * n + i, _own(V_bar, s * n + i) + (rule[1] if s == 0 else rule[3]) * left)
+        _write(V_bar, values_bar, b, end)
+        _write(whole, noise_bar, b, end)
 
 
 @compiled
-def gate_of(expected, noise, rule, limit, patience, y, refused, gone):  # type: ignore[no-untyped-def]
-    """What the gate refuses becomes NaN in ``y`` and true in ``gone``, (B, m); counts in ``refused``, (B, m); see `Gate`.
+def gate_of(expected, noise, rule, limit, patience, y, refused, gone, first, end):  # type: ignore[no-untyped-def]
+    """What the gate refuses becomes NaN in ``y`` and true in ``gone``, (m, B); counts in ``refused``, (B, m); see `Gate`.
 
     A negative weight of the mean point cannot make a variance smaller than that of the noise.
     """
-    sequences, count, m = expected.shape
+    count, m = expected.shape[:2]
     _, centre_mean, centre_covariance, other = rule
-    for b in range(sequences):
+    for b in range(first, end):
         for i in range(m):
-            if y[b, i] != y[b, i]:
+            gone[i, b] = False
+            if y[i, b] != y[i, b]:
                 continue
-            total = expected[b, 0, i] * 0
+            total = expected[0, i, b] * 0
             for s in range(1, count):
-                total += expected[b, s, i]
-            centre = centre_mean * expected[b, 0, i] + other * total
+                total += expected[s, i, b]
+            centre = centre_mean * expected[0, i, b] + other * total
             total = centre * 0
             for s in range(1, count):
-                total += (expected[b, s, i] - centre) * (expected[b, s, i] - centre)
-            total = other * total + centre_covariance * (expected[b, 0, i] - centre) * (expected[b, 0, i] - centre)
-            if refuses(y[b, i] - centre, max(total, centre * 0) + noise[b, i, i], limit, patience, refused[b], i):
-                y[b, i] = np.nan
-                gone[b, i] = True
+                total += (expected[s, i, b] - centre) * (expected[s, i, b] - centre)
+            total = other * total + centre_covariance * (expected[0, i, b] - centre) * (expected[0, i, b] - centre)
+            if refuses(y[i, b] - centre, max(total, centre * 0) + noise[i, i, b], limit, patience, refused[b], i):
+                y[i, b] = np.nan
+                gone[i, b] = True
 
 
 @compiled
@@ -169,108 +254,137 @@ def update_of(  # type: ignore[no-untyped-def]
     likelihood,
     repaired,
     centre,
+    first,
+    end,
 ):
     """The state given a measurement; what is NaN was not measured. ``repaired`` keeps what it was where nothing is repaired.
 
     ``centre`` becomes the weight that the mean point had in covariances, (B,): 0 where a negative one took their definiteness.
     """
-    sequences, count, m = expected.shape
-    n = mean.shape[1]
-    _, _, centre_covariance, other = rule
-    half = rule.dtype.type(0.5)
-    log_two_pi = rule.dtype.type(np.log(2.0 * np.pi))
-    spread, deviation = np.empty((count, m), mean.dtype), np.empty((count, n), mean.dtype)
-    cross, factor, whitened = np.empty((n, m), mean.dtype), np.empty((m, m), mean.dtype), np.empty(m, mean.dtype)
-    tried = np.empty((n, n), mean.dtype)
-    for b in range(sequences):
-        _spread(expected[b], points[b], mean[b], y[b], rule, innovation[b], spread, deviation)
-        centre[b] = centre_covariance
-        definite = _joint(spread, deviation, centre_covariance, other, y[b], noise[b], cross, own[b], factor)
-        if definite:
-            _posterior(covariance[b], cross, factor, gain[b], post_covariance[b])
-        lost = repair and centre_covariance < 0 and not (definite and _cholesky(post_covariance[b], tried))
-        if lost and _all_finite(own[b]) and _all_finite(covariance[b]):
-            repaired[b] = True
-            centre[b] = 0
-            definite = _joint(spread, deviation, centre[b], other, y[b], noise[b], cross, own[b], factor)
-            if definite:
-                _posterior(covariance[b], cross, factor, gain[b], post_covariance[b])
-        if not definite:
-            lost = _all_finite(own[b])
-            repaired[b] = repaired[b] or lost
-            if not (repair and lost and _lifted(own[b], factor, margin)):
-                factor[:] = np.nan
-                own[b] = np.nan
-            _posterior(covariance[b], cross, factor, gain[b], post_covariance[b])
-        log_determinant = mean[b, 0] * 0
-        squared = mean[b, 0] * 0
-        measured = 0
-        for i in range(m):
-            measured += y[b, i] == y[b, i]
-            total = innovation[b, i]
-            for c in range(i):
-                total -= factor[i, c] * whitened[c]
-            whitened[i] = total / factor[i, i]
-            squared += whitened[i] * whitened[i]
-            log_determinant += np.log(factor[i, i])
-        likelihood[b] = -half * (squared + 2 * log_determinant + measured * log_two_pi)
+    count, m = expected.shape[:2]
+    n, lanes = mean.shape[0], width(mean)
+    half, log_two_pi = rule.dtype.type(0.5), rule.dtype.type(np.log(2.0 * np.pi))
+    error, spread, deviation = _rows(m, mean), _rows(count * m, mean), _rows(count * n, mean)
+    cross, factor, K, S, flags = _rows(n * m, mean), _rows(m * m, mean), _rows(n * m, mean), _rows(m * m, mean), _rows(1, mean)
+    x, A, tried, weight = _rows(n, mean), _rows(n * n, mean), _rows(n * n, mean), _rows(1, mean)
+    whitened = np.empty(m, mean.dtype)
+    for b in range(first, end, lanes):
+        _spread(expected, points, mean, y, b, rule, error, spread, deviation)
+        around, definite, lifted = _at(mean, 0, b) * 0 + rule[2], _at(mean, 0, b) * 0, False
+        for attempt in range(3):  # as it is, without a negative weight, lifted
+            if not lifted:
+                definite = _joint(spread, deviation, around, rule, y, noise, b, n, cross, S, factor)
+            _posterior(covariance, b, cross, factor, K, A)
+            if attempt == 0 and repair and rule[2] < 0:
+                lost = 1 - definite * _cholesky(A, tried, n)
+                if _any(lost, b, end, flags):
+                    nothing = lost * 0
+                    for row in range(m * m):
+                        nothing += _own(S, row) * 0
+                    for row in range(n * n):
+                        nothing += _at(covariance, row, b) * 0
+                    lost = choose(nothing == 0, lost, 0.0)
+                    if _any(lost, b, end, flags):
+                        for lane in range(min(lanes, end - b)):
+                            repaired[b + lane] |= flags[0, lane] > 0
+                        around = choose(lost > 0, around * 0, around)
+                        continue
+            if lifted or not _any(1 - definite, b, end, flags):
+                break
+            lifted = True
+            for lane in range(min(lanes, end - b)):
+                if flags[0, lane] > 0:
+                    repaired[b + lane] |= _repaired(S, factor, lane, m, margin, repair)
+        _put(weight, 0, around)
         for i in range(n):
-            total = mean[b, i]
-            for c in range(m):
-                total += gain[b, i, c] * innovation[b, c]
-            post_mean[b, i] = max(total, lower[i]) if total == total else total
+            _put(x, i, most(_moved(mean, K, error, i, m, b), lower[i]))
+        for lane in range(min(lanes, end - b)):
+            log_determinant, squared, measured = mean[0, b] * 0, mean[0, b] * 0, 0
+            for i in range(m):
+                measured += y[i, b + lane] == y[i, b + lane]
+                left = error[i, lane]
+                for c in range(i):
+                    left -= factor[i * m + c, lane] * whitened[c]
+                whitened[i] = left / factor[i * m + i, lane]
+                squared += whitened[i] * whitened[i]
+                log_determinant += np.log(factor[i * m + i, lane])
+            likelihood[b + lane] = -half * (squared + 2 * log_determinant + measured * log_two_pi)
+        _write(x, post_mean, b, end)
+        _write(A, post_covariance, b, end)
+        _write(error, innovation, b, end)
+        _write(S, own, b, end)
+        _write(K, gain, b, end)
+        _write(weight, centre, b, end)
 
 
-@compiled
-def _joint(spread, deviation, centre, other, y, noise, cross, own, factor):  # type: ignore[no-untyped-def]
-    """Covariance of states with what is expected, and of that with noise, with its factor; whether it is positive definite."""
-    count, m = spread.shape
-    half = own.dtype.type(0.5)
-    for i in range(deviation.shape[1]):
+@piece
+def _moved(mean, K, error, i, m, b):  # type: ignore[no-untyped-def]
+    state = _at(mean, i, b)
+    for c in range(m):
+        state += _own(K, i * m + c) * _own(error, c)
+    return state
+
+
+@piece
+def _spread(expected, points, mean, y, b, rule, error, spread, deviation):  # type: ignore[no-untyped-def]
+    """Innovation, and how far points lie from the mean and what is expected at them from its own; 0 where not measured."""
+    count, m = expected.shape[:2]
+    n = mean.shape[0]
+    for i in range(m):
+        z, centre = _at(y, i, b), _deviations(expected, b, m, rule, spread, i)
+        _put(error, i, choose(z == z, z - centre, 0.0))
+        for s in range(count):
+            _put(spread, s * m + i, choose(z == z, _own(spread, s * m + i), 0.0))
+    for s in range(count):
+        for i in range(n):
+            _put(deviation, s * n + i, _at(points, s * n + i, b) - _at(mean, i, b))
+
+
+@piece
+def _joint(spread, deviation, centre, rule, y, noise, b, n, cross, own, factor):  # type: ignore[no-untyped-def]
+    """Covariance of states with what is expected, and of that with noise, with its factor; 1 where it is positive definite, else 0."""
+    m = y.shape[0]
+    half = rule.dtype.type(0.5)
+    for i in range(n):
         for j in range(m):
-            total = spread[0, 0] * 0
-            for s in range(1, count):
-                total += deviation[s, i] * spread[s, j]
-            cross[i, j] = other * total + centre * deviation[0, i] * spread[0, j]
+            _put(cross, i * m + j, _weighted(deviation, i, n, spread, j, m, rule, centre))
     for i in range(m):
         for j in range(i + 1):
-            total = spread[0, 0] * 0
-            for s in range(1, count):
-                total += spread[s, i] * spread[s, j]
-            total = other * total + centre * spread[0, i] * spread[0, j]
-            if y[i] == y[i] and y[j] == y[j]:
-                total += half * (noise[i, j] + noise[j, i])
-            elif i == j:
-                total += 1.0
-            own[i, j] = total
-            own[j, i] = total
-    return _cholesky(own, factor)
+            one, other = _at(y, i, b), _at(y, j, b)
+            bare = _weighted(spread, i, m, spread, j, m, rule, centre)
+            noisy = bare + half * (_at(noise, i * m + j, b) + _at(noise, j * m + i, b))
+            alone = bare + 1 if i == j else bare
+            value = choose(one == one, choose(other == other, noisy, alone), alone)
+            _put(own, i * m + j, value)
+            _put(own, j * m + i, value)
+    return _cholesky(own, factor, m)
 
 
-@compiled
-def _posterior(covariance, cross, factor, gain, post_covariance):  # type: ignore[no-untyped-def]
+@piece
+def _posterior(covariance, b, cross, factor, gain, post_covariance):  # type: ignore[no-untyped-def]
     """Gain cross S⁻¹, by the factor of S, and the covariance that is left."""
-    n, m = cross.shape
+    n = covariance.shape[0]
+    m = cross.shape[0] // n
     half = cross.dtype.type(0.5)
-    whitened = np.empty(m, cross.dtype)
     for i in range(n):
         for j in range(m):
-            total = cross[i, j]
+            left = _own(cross, i * m + j)
             for c in range(j):
-                total -= factor[j, c] * whitened[c]
-            whitened[j] = total / factor[j, j]
+                left -= _own(factor, j * m + c) * _own(gain, i * m + c)
+            _put(gain, i * m + j, left / _own(factor, j * m + j))
         for j in range(m - 1, -1, -1):
-            total = whitened[j]
+            left = _own(gain, i * m + j)
             for c in range(j + 1, m):
-                total -= factor[c, j] * gain[i, c]
-            gain[i, j] = total / factor[j, j]
+                left -= _own(factor, c * m + j) * _own(gain, i * m + c)
+            _put(gain, i * m + j, left / _own(factor, j * m + j))
     for i in range(n):
         for j in range(i + 1):
-            total = half * (covariance[i, j] + covariance[j, i])
+            left = half * (_at(covariance, i * n + j, b) + _at(covariance, j * n + i, b))
             for c in range(m):
-                total -= half * (gain[i, c] * cross[j, c] + gain[j, c] * cross[i, c])
-            post_covariance[i, j] = total
-            post_covariance[j, i] = total
+                taken = _own(gain, i * m + c) * _own(cross, j * m + c) + _own(gain, j * m + c) * _own(cross, i * m + c)
+                left -= half * taken
+            _put(post_covariance, i * n + j, left)
+            _put(post_covariance, j * n + i, left)
 
 
 @compiled
@@ -293,108 +407,147 @@ def update_adjoint(  # type: ignore[no-untyped-def]
     expected_bar,
     noise_bar,
     y_bar,
+    first,
+    end,
 ):
     """Adjoint of `update_of`; writes ``mean_bar``, ``covariance_bar``, ``points_bar``, ``expected_bar``, ``noise_bar`` and ``y_bar``."""
-    sequences, count, m = expected.shape
-    n = mean.shape[1]
-    _, centre_mean, _, other = rule
+    count, m = expected.shape[:2]
+    n = mean.shape[0]
     half, two = rule.dtype.type(0.5), rule.dtype.type(2.0)
-    spread, deviation = np.empty((count, m), mean.dtype), np.empty((count, n), mean.dtype)
-    P, K = np.empty((n, n), mean.dtype), np.empty((n, m), mean.dtype)
-    factor, solved, pulled = np.empty((m, m), mean.dtype), np.empty(m, mean.dtype), np.empty(m, mean.dtype)
-    through, cross_bar, own_bar = np.empty(n, mean.dtype), np.empty((n, m), mean.dtype), np.empty((m, m), mean.dtype)
-    off = np.empty(m, mean.dtype)
-    for b in range(sequences):
-        _spread(expected[b], points[b], mean[b], y[b], rule, off, spread, deviation)
+    off, spread, deviation, error = _rows(m, mean), _rows(count * m, mean), _rows(count * n, mean), _rows(m, mean)
+    P, S, K, factor, solved, pulled = (
+        _rows(n * n, mean),
+        _rows(m * m, mean),
+        _rows(n * m, mean),
+        _rows(m * m, mean),
+        _rows(m, mean),
+        _rows(m, mean),
+    )
+    through, cross_bar, own_bar, R_bar = _rows(n, mean), _rows(n * m, mean), _rows(m * m, mean), _rows(m * m, mean)
+    x_bar, z_bar, V_bar, E_bar = _rows(n, mean), _rows(m, mean), _rows(count * n, mean), _rows(count * m, mean)
+    for b in range(first, end, width(mean)):
+        _spread(expected, points, mean, y, b, rule, off, spread, deviation)
+        for row in range(m):
+            _put(error, row, _at(innovation, row, b))
+        for row in range(m * m):
+            _put(S, row, _at(own, row, b))
+        for row in range(n * m):
+            _put(K, row, _at(gain, row, b))
+        around = _at(centre, 0, b)
         for i in range(n):
-            total = mean[b, i]
-            for c in range(m):
-                K[i, c] = gain[b, i, c]
-                total += K[i, c] * innovation[b, c]
-            through[i] = post_mean_bar[b, i] if total >= lower[i] else total * 0
+            state = _moved(mean, K, error, i, m, b)
+            _put(through, i, choose(state >= lower[i], _at(post_mean_bar, i, b), state * 0))
             for j in range(n):
-                P[i, j] = half * (post_covariance_bar[b, i, j] + post_covariance_bar[b, j, i])
-                covariance_bar[b, i, j] = P[i, j]
-        _cholesky(own[b], factor)
+                _put(P, i * n + j, half * (_at(post_covariance_bar, i * n + j, b) + _at(post_covariance_bar, j * n + i, b)))
+        _cholesky(S, factor, m)
         for i in range(m):  # solved = S⁻¹ e
-            total = innovation[b, i]
+            left = _own(error, i)
             for c in range(i):
-                total -= factor[i, c] * solved[c]
-            solved[i] = total / factor[i, i]
+                left -= _own(factor, i * m + c) * _own(solved, c)
+            _put(solved, i, left / _own(factor, i * m + i))
         for i in range(m - 1, -1, -1):
-            total = solved[i]
+            left = _own(solved, i)
             for c in range(i + 1, m):
-                total -= factor[c, i] * solved[c]
-            solved[i] = total / factor[i, i]
+                left -= _own(factor, c * m + i) * _own(solved, c)
+            _put(solved, i, left / _own(factor, i * m + i))
         for c in range(m):  # pulled = Kᵀ m̄, the gradient of the innovation
-            total = through[0] * 0
+            pull, known = _own(through, 0) * 0, _at(y, c, b)
             for i in range(n):
-                total += K[i, c] * through[i]
-            pulled[c] = total
-            y_bar[b, c] = total if y[b, c] == y[b, c] else total * 0
+                pull += _own(K, i * m + c) * _own(through, i)
+            _put(pulled, c, pull)
+            _put(z_bar, c, choose(known == known, pull, pull * 0))
         for i in range(n):
             for c in range(m):
-                total = through[i] * solved[c]
+                bar = _own(through, i) * _own(solved, c)
                 for j in range(n):
-                    total -= two * P[i, j] * K[j, c]
-                cross_bar[i, c] = total
+                    bar -= two * _own(P, i * n + j) * _own(K, j * m + c)
+                _put(cross_bar, i * m + c, bar)
         for c in range(m):
             for d in range(m):
-                total = -half * (pulled[c] * solved[d] + pulled[d] * solved[c])
+                bar = -half * (_own(pulled, c) * _own(solved, d) + _own(pulled, d) * _own(solved, c))
                 for i in range(n):
                     for j in range(n):
-                        total += K[i, c] * P[i, j] * K[j, d]
-                own_bar[c, d] = total
-                noise_bar[b, c, d] = total if y[b, c] == y[b, c] and y[b, d] == y[b, d] else total * 0
+                        bar += _own(K, i * m + c) * _own(P, i * n + j) * _own(K, j * m + d)
+                _put(own_bar, c * m + d, bar)
+                one, other = _at(y, c, b), _at(y, d, b)
+                _put(R_bar, c * m + d, choose(one == one, choose(other == other, bar, bar * 0), bar * 0))
         for i in range(n):
-            total = through[i]
+            left = _own(through, i)
             for s in range(count):
-                weight = centre[b] if s == 0 else other
-                part = total * 0
+                bar = _own(through, i) * 0
                 for c in range(m):
-                    part += cross_bar[i, c] * spread[s, c]
-                points_bar[b, s, i] = weight * part
-                total -= weight * part
-            mean_bar[b, i] = total
+                    bar += _own(cross_bar, i * m + c) * _own(spread, s * m + c)
+                bar = around * bar if s == 0 else rule[3] * bar
+                _put(V_bar, s * n + i, bar)
+                left -= bar
+            _put(x_bar, i, left)
         for c in range(m):
-            known = y[b, c] == y[b, c]
-            total = -pulled[c] if known else pulled[c] * 0
+            known = _at(y, c, b)
+            left = choose(known == known, -_own(pulled, c), _own(pulled, c) * 0)
             for s in range(count):
-                weight = centre[b] if s == 0 else other
-                part = total * 0
+                bar = _own(pulled, c) * 0
                 for i in range(n):
-                    part += cross_bar[i, c] * deviation[s, i]
+                    bar += _own(cross_bar, i * m + c) * _own(deviation, s * n + i)
                 for d in range(m):
-                    part += two * own_bar[c, d] * spread[s, d]
-                expected_bar[b, s, c] = weight * part if known else 0.0
-                total -= expected_bar[b, s, c]
-            expected_bar[b, 0, c] += centre_mean * total
-            for s in range(1, count):
-                expected_bar[b, s, c] += other * total
+                    bar += two * _own(own_bar, c * m + d) * _own(spread, s * m + d)
+                bar = choose(known == known, around * bar if s == 0 else rule[3] * bar, 0.0)
+                _put(E_bar, s * m + c, bar)
+                left -= bar
+            for s in range(count):
+                _put(E_bar, s * m + c, _own(E_bar, s * m + c) + (rule[1] if s == 0 else rule[3]) * left)
+        _write(x_bar, mean_bar, b, end)
+        _write(P, covariance_bar, b, end)
+        _write(V_bar, points_bar, b, end)
+        _write(E_bar, expected_bar, b, end)
+        _write(R_bar, noise_bar, b, end)
+        _write(z_bar, y_bar, b, end)
+
+
+@piece
+def _cholesky(A, L, n):  # type: ignore[no-untyped-def]
+    """Lower factors of matrices (n · n, W) into L; 1 in lanes where one is positive definite, else 0."""
+    nothing = _own(A, 0) * 0
+    definite = choose(nothing == 0, nothing + 1, 0.0)
+    nothing = definite * 0
+    for j in range(n):
+        left = _own(A, j * n + j)
+        for k in range(j):
+            left -= _own(L, j * n + k) * _own(L, j * n + k)
+        definite = choose(left > 0, definite, 0.0)
+        pivot = root(left)
+        nothing += pivot * 0
+        _put(L, j * n + j, pivot)
+        for i in range(j):
+            _put(L, i * n + j, nothing * 0)
+        for i in range(j + 1, n):
+            left = _own(A, i * n + j)
+            for k in range(j):
+                left -= _own(L, i * n + k) * _own(L, j * n + k)
+            left = left / pivot
+            nothing += left * 0
+            _put(L, i * n + j, left)
+    return choose(nothing == 0, definite, 0.0)
 
 
 @compiled
-def _spread(expected, points, mean, y, rule, innovation, spread, deviation):  # type: ignore[no-untyped-def]
-    """Of one sequence: innovation, and how far points lie from the mean and what is expected at them from its own; 0 where not measured."""
-    count, m = expected.shape
-    _, centre_mean, _, other = rule
-    for i in range(m):
-        total = expected[0, i] * 0
-        for s in range(1, count):
-            total += expected[s, i]
-        centre = centre_mean * expected[0, i] + other * total
-        known = y[i] == y[i]
-        innovation[i] = y[i] - centre if known else 0.0
-        for s in range(count):
-            spread[s, i] = expected[s, i] - centre if known else 0.0
-    for i in range(mean.shape[0]):
-        for s in range(count):
-            deviation[s, i] = points[s, i] - mean[i]
+def _repaired(A, L, lane, n, margin, repair):  # type: ignore[no-untyped-def]
+    """Lift the matrix (n · n, W) of a lane and write its factor, or NaN where that fails; whether its values were finite."""
+    own, factor = np.empty((n, n), A.dtype), np.empty((n, n), A.dtype)
+    for i in range(n):
+        for j in range(n):
+            own[i, j] = A[i * n + j, lane]
+    finite = _all_finite(own)
+    sound = repair and finite and _lifted(own, factor, margin)
+    for i in range(n):
+        for j in range(n):
+            A[i * n + j, lane] = own[i, j] if sound else np.nan
+            L[i * n + j, lane] = factor[i, j] if sound else np.nan
+    return finite
 
 
 @compiled
-def _cholesky(A, L):  # type: ignore[no-untyped-def]
-    """Lower factor of A into L; whether A is positive definite."""
+def _cholesky_of_one(A, L):  # type: ignore[no-untyped-def]
+    """Lower factor of a matrix into L; whether it is positive definite."""
     n = A.shape[0]
     for j in range(n):
         total = A[j, j]
@@ -431,33 +584,32 @@ def _lifted(A, L, margin):  # type: ignore[no-untyped-def]
     lift = margin * np.abs(eigenvalues).max() - eigenvalues[0]
     for i in range(A.shape[0]):
         A[i, i] += lift
-    return _cholesky(A, L)
+    return _cholesky_of_one(A, L)
 
 
-@compiled
-def _cholesky_adjoint(L, L_bar, A_bar):  # type: ignore[no-untyped-def]
+@piece
+def _cholesky_adjoint(L, L_bar, inner, A_bar, n):  # type: ignore[no-untyped-def]
     """A_bar += sym(L⁻ᵀ Φ(Lᵀ L_bar) L⁻¹), Φ the lower triangle with half the diagonal (Murray 2016, Eq. 10)."""
-    n = L.shape[0]
-    inner = np.zeros((n, n), L.dtype)
     half = L.dtype.type(0.5)
     for i in range(n):
-        for j in range(i + 1):
-            total = L[0, 0] * 0
-            for k in range(i, n):
-                total += L[k, i] * L_bar[k, j]
-            inner[i, j] = total * half if i == j else total
+        for j in range(n):
+            bar = _own(L, 0) * 0
+            if j <= i:
+                for k in range(i, n):
+                    bar += _own(L, k * n + i) * _own(L_bar, k * n + j)
+            _put(inner, i * n + j, bar * half if i == j else bar)
     for j in range(n):  # Lᵀ X = Φ
         for i in range(n - 1, -1, -1):
-            total = inner[i, j]
+            bar = _own(inner, i * n + j)
             for k in range(i + 1, n):
-                total -= L[k, i] * inner[k, j]
-            inner[i, j] = total / L[i, i]
+                bar -= _own(L, k * n + i) * _own(inner, k * n + j)
+            _put(inner, i * n + j, bar / _own(L, i * n + i))
     for i in range(n):  # Y L = X
         for j in range(n - 1, -1, -1):
-            total = inner[i, j]
+            bar = _own(inner, i * n + j)
             for k in range(j + 1, n):
-                total -= inner[i, k] * L[k, j]
-            inner[i, j] = total / L[j, j]
+                bar -= _own(inner, i * n + k) * _own(L, k * n + j)
+            _put(inner, i * n + j, bar / _own(L, j * n + j))
     for i in range(n):
         for j in range(n):
-            A_bar[i, j] += half * (inner[i, j] + inner[j, i])
+            _put(A_bar, i * n + j, _own(A_bar, i * n + j) + half * (_own(inner, i * n + j) + _own(inner, j * n + i)))

@@ -6,22 +6,23 @@ A point's derivatives are those of two numbers by two others: they are written o
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 
 import numba
 import numpy as np
 import torch
 
 from vehest.constants import GRAVITY
-from vehest.filters.unscented_scan import Array, PointModel
+from vehest.filters.unscented_scan import CompiledModel
+from vehest.lanes import choose, each, load_unfused, most, store_some, width
 from vehest.vehicle.dugoff import LARGEST_RATIO, LEAST_COSINE, LEAST_LOAD, LEAST_SHARE, DugoffTrack
 
 PLAIN, SMOOTH = LARGEST_RATIO["plain"], LARGEST_RATIO["smooth"]
 
-compiled = numba.njit(cache=True, nogil=True, error_model="numpy")
+compiled = numba.njit(cache=True, nogil=True, error_model="numpy", boundscheck=False)
+piece = numba.njit(forceinline=True, no_cpython_wrapper=True, no_cfunc_wrapper=True, error_model="numpy", boundscheck=False)
 
 
-class CompiledDugoffTrack(PointModel):
+class CompiledDugoffTrack(CompiledModel):
     """A `DugoffTrack` for the unscented filter; nothing of the car is learnt.
 
     Args:
@@ -32,149 +33,137 @@ class CompiledDugoffTrack(PointModel):
     def __init__(self, track: DugoffTrack, dtype: torch.dtype = torch.float64) -> None:
         car = track.car
         scalar = np.float32 if dtype == torch.float32 else np.float64
-        self._car = np.array(
-            [car.mass, car.yaw_inertia, car.cg_to_front_axle, car.cg_to_rear_axle, car.cg_height, track.step, track.minimum_speed], scalar
-        )
+        numbers = [car.mass, car.yaw_inertia, car.cg_to_front_axle, car.cg_to_rear_axle, car.cg_height, track.step, track.minimum_speed]
         axles = [[axle.cornering_stiffness, axle.friction, axle.reduction] for axle in (track.front, track.rear)]
-        self._axles, self._smooth = np.array(axles, scalar), track.tyres == "smooth"
-        self._measured = 5 if track.sees_sideslip else 4
-
-    def transition(self, points: Array, inputs: Array) -> Array:
-        """See `PointModel`."""
-        out = np.empty_like(points)
-        _transition(points, inputs, self._car, self._axles, self._smooth, out)
-        return out
-
-    def observation(self, points: Array, inputs: Array) -> Array:
-        """See `PointModel`."""
-        out = np.empty((*points.shape[:2], self._measured), points.dtype)
-        _observation(points, inputs, self._car, self._axles, self._smooth, out)
-        return out
-
-    def transition_adjoint(self, points: Array, inputs: Array, upstream: Array, gradients: Sequence[Array]) -> Array:
-        """See `PointModel`."""
-        out = np.empty_like(points)
-        _transition_adjoint(points, inputs, self._car, self._axles, self._smooth, upstream, out)
-        return out
-
-    def observation_adjoint(self, points: Array, inputs: Array, upstream: Array, gradients: Sequence[Array]) -> Array:
-        """See `PointModel`."""
-        out = np.empty_like(points)
-        _observation_adjoint(points, inputs, self._car, self._axles, self._smooth, upstream, out)
-        return out
+        self.car = (np.array(numbers, scalar), np.array(axles, scalar), track.tyres == "smooth")
+        self.measured = 5 if track.sees_sideslip else 4
+        self.entries = (_transition, _observation, _transition_adjoint, _observation_adjoint)
 
 
-@compiled
-def _settled(inputs, car):  # type: ignore[no-untyped-def]
+@piece
+def _at(values, row, b):  # type: ignore[no-untyped-def]
+    """Vector of a row (the indices before the last one, as one) from sequence b on."""
+    return load_unfused(values, row * values.shape[values.ndim - 1] + b)
+
+
+@piece
+def _put(values, row, b, vector, end):  # type: ignore[no-untyped-def]
+    store_some(values, row * values.shape[values.ndim - 1] + b, vector, end - b)
+
+
+@piece
+def _settled(inputs, b, car):  # type: ignore[no-untyped-def]
     """Of one sample: speed, tangent and cosine of the steering angle, loads of both axles."""
     mass, _, front_arm, rear_arm, height, _, minimum_speed = car
     wheelbase = front_arm + rear_arm
-    transfer = inputs[2] * (height / wheelbase)
+    transfer = _at(inputs, 2, b) * (height / wheelbase)
     gravity = car.dtype.type(GRAVITY)
     front, rear = gravity * rear_arm / wheelbase, gravity * front_arm / wheelbase
-    least = car.dtype.type(LEAST_LOAD)
-    load_front, load_rear = mass * max(front - transfer, least * front), mass * max(rear + transfer, least * rear)
-    return max(inputs[0], minimum_speed), math.tan(inputs[1]), math.cos(inputs[1]), load_front, load_rear
+    least, steer = car.dtype.type(LEAST_LOAD), _at(inputs, 1, b)
+    load_front, load_rear = mass * most(front - transfer, least * front), mass * most(rear + transfer, least * rear)
+    return most(_at(inputs, 0, b), minimum_speed), each(math.tan, steer), each(math.cos, steer), load_front, load_rear
 
 
-@compiled
+@piece
 def _axle(tangent, load, vx, axle, smooth):  # type: ignore[no-untyped-def]
     """Force and its derivative by the tangent of the slip angle."""
     stiffness, friction, reduction = axle
     one, least = axle.dtype.type(1.0), axle.dtype.type(LEAST_SHARE)
     slide = abs(tangent)
-    share, per_slide = one - reduction * vx * slide, -reduction * vx
-    if share < least:
-        share, per_slide = least, one * 0
+    share = one - reduction * vx * slide
+    per_slide = choose(share < least, 0.0, -reduction * vx)
+    share = choose(share < least, least, share)
     half = friction * share * load / (2 * stiffness)
     largest = axle.dtype.type(SMOOTH if smooth else PLAIN)
-    if half >= largest * slide:
-        return stiffness * tangent, stiffness
+    linear = half >= largest * slide
     ratio = half / slide
     by_slide = per_slide / share * ratio - ratio / slide
     if smooth:
-        used = math.tanh(2 * ratio)
+        used = each(math.tanh, choose(linear, 0.0, 2 * ratio))
         by_ratio = 2 * (one - used * used)
     else:
         used = ratio * (2 - ratio)
         by_ratio = 2 - 2 * ratio
-    return stiffness * tangent * used, stiffness * (used + slide * by_ratio * by_slide)
+    force, slope = stiffness * tangent, stiffness * (used + slide * by_ratio * by_slide)
+    return choose(linear, force, force * used), choose(linear, stiffness, slope)
 
 
-@compiled
-def _forces(vy, yaw_rate, vx, turned, cosine, load_front, load_rear, front_arm, rear_arm, axles, smooth):  # type: ignore[no-untyped-def]
-    """Forces across the body, front and rear, and the derivative of each by the lateral velocity of its axle."""
-    course_front, course_rear = (vy + front_arm * yaw_rate) / vx, (vy - rear_arm * yaw_rate) / vx
+@piece
+def _forces(points, s, b, settled, track):  # type: ignore[no-untyped-def]
+    """Forces across the body at point s, front and rear, and the derivative of each by the lateral velocity of its axle."""
+    vx, turned, cosine, load_front, load_rear = settled
+    car, axles, smooth = track
+    vy, yaw_rate = _at(points, 2 * s, b), _at(points, 2 * s + 1, b)
+    course_front, course_rear = (vy + car[2] * yaw_rate) / vx, (vy - car[3] * yaw_rate) / vx
     across = 1 + turned * course_front
     least = axles.dtype.type(LEAST_COSINE)
-    if across > least:
-        tangent, by_course = (turned - course_front) / across, -(1 + turned * turned) / (across * across)
-    else:
-        tangent, by_course = (turned - course_front) / least, -1 / least
+    tangent = (turned - course_front) / choose(across > least, across, least)
+    by_course = choose(across > least, -(1 + turned * turned) / (across * across), -1 / least)
     front, front_slope = _axle(tangent, load_front, vx, axles[0], smooth)
     rear, rear_slope = _axle(-course_rear, load_rear, vx, axles[1], smooth)
-    return front * cosine, rear, front_slope * cosine * by_course / vx, -rear_slope / vx
+    return vy, yaw_rate, front * cosine, rear, front_slope * cosine * by_course / vx, -rear_slope / vx
 
 
 @compiled
-def _transition(points, inputs, car, axles, smooth, out):  # type: ignore[no-untyped-def]
+def _transition(points, inputs, track, out, first, end):  # type: ignore[no-untyped-def]
+    car = track[0]
     mass, inertia, front_arm, rear_arm, _, step, minimum_speed = car
-    for b in range(points.shape[0]):
-        vx, turned, cosine, load_front, load_rear = _settled(inputs[b], car)
-        turn = inputs[b, 0] * inputs[b, 1] / (front_arm + rear_arm)
-        for s in range(points.shape[1]):
-            vy, yaw_rate = points[b, s, 0], points[b, s, 1]
-            if inputs[b, 0] < minimum_speed:
-                out[b, s, 0], out[b, s, 1] = rear_arm * turn, turn
-                continue
-            front, rear, _, _ = _forces(vy, yaw_rate, vx, turned, cosine, load_front, load_rear, front_arm, rear_arm, axles, smooth)
-            out[b, s, 0] = vy + step * ((front + rear) / mass - vx * yaw_rate)
-            out[b, s, 1] = yaw_rate + step * (front_arm * front - rear_arm * rear) / inertia
+    for b in range(first, end, width(points)):
+        settled, rolls = _settled(inputs, b, car), _at(inputs, 0, b) < minimum_speed
+        turn = _at(inputs, 0, b) * _at(inputs, 1, b) / (front_arm + rear_arm)
+        for s in range(points.shape[0]):
+            vy, yaw_rate, front, rear, _, _ = _forces(points, s, b, settled, track)
+            across = vy + step * ((front + rear) / mass - settled[0] * yaw_rate)
+            turning = yaw_rate + step * (front_arm * front - rear_arm * rear) / inertia
+            _put(out, 2 * s, b, choose(rolls, rear_arm * turn, across), end)
+            _put(out, 2 * s + 1, b, choose(rolls, turn, turning), end)
 
 
 @compiled
-def _observation(points, inputs, car, axles, smooth, out):  # type: ignore[no-untyped-def]
-    mass, _, front_arm, rear_arm, _, _, _ = car
-    for b in range(points.shape[0]):
-        vx, turned, cosine, load_front, load_rear = _settled(inputs[b], car)
-        for s in range(points.shape[1]):
-            vy, yaw_rate = points[b, s, 0], points[b, s, 1]
-            front, rear, _, _ = _forces(vy, yaw_rate, vx, turned, cosine, load_front, load_rear, front_arm, rear_arm, axles, smooth)
-            out[b, s, 0], out[b, s, 1] = (front + rear) / mass, yaw_rate
-            out[b, s, 2], out[b, s, 3] = front, rear
-            if out.shape[2] == 5:
-                out[b, s, 4] = math.atan(vy / vx)
+def _observation(points, inputs, track, out, first, end):  # type: ignore[no-untyped-def]
+    car, m = track[0], out.shape[1]
+    for b in range(first, end, width(points)):
+        settled = _settled(inputs, b, car)
+        for s in range(points.shape[0]):
+            vy, yaw_rate, front, rear, _, _ = _forces(points, s, b, settled, track)
+            _put(out, m * s, b, (front + rear) / car[0], end)
+            _put(out, m * s + 1, b, yaw_rate, end)
+            _put(out, m * s + 2, b, front, end)
+            _put(out, m * s + 3, b, rear, end)
+            if m == 5:
+                _put(out, m * s + 4, b, each(math.atan, vy / settled[0]), end)
 
 
 @compiled
-def _transition_adjoint(points, inputs, car, axles, smooth, upstream, out):  # type: ignore[no-untyped-def]
+def _transition_adjoint(points, inputs, track, upstream, out, gradients, first, end):  # type: ignore[no-untyped-def]
+    car = track[0]
     mass, inertia, front_arm, rear_arm, _, step, minimum_speed = car
-    for b in range(points.shape[0]):
-        vx, turned, cosine, load_front, load_rear = _settled(inputs[b], car)
-        for s in range(points.shape[1]):
-            if inputs[b, 0] < minimum_speed:
-                out[b, s, 0], out[b, s, 1] = 0, 0
-                continue
-            vy, yaw_rate = points[b, s, 0], points[b, s, 1]
-            _, _, by_front, by_rear = _forces(vy, yaw_rate, vx, turned, cosine, load_front, load_rear, front_arm, rear_arm, axles, smooth)
-            across, turning = upstream[b, s, 0], upstream[b, s, 1]
+    for b in range(first, end, width(points)):
+        settled, rolls = _settled(inputs, b, car), _at(inputs, 0, b) < minimum_speed
+        for s in range(points.shape[0]):
+            _, _, _, _, by_front, by_rear = _forces(points, s, b, settled, track)
+            across, turning = _at(upstream, 2 * s, b), _at(upstream, 2 * s + 1, b)
             front_bar = step * (across / mass + turning * front_arm / inertia) * by_front
             rear_bar = step * (across / mass - turning * rear_arm / inertia) * by_rear
-            out[b, s, 0] = across + front_bar + rear_bar
-            out[b, s, 1] = turning - step * vx * across + front_arm * front_bar - rear_arm * rear_bar
+            spun = turning - step * settled[0] * across + front_arm * front_bar - rear_arm * rear_bar
+            _put(out, 2 * s, b, choose(rolls, 0.0, across + front_bar + rear_bar), end)
+            _put(out, 2 * s + 1, b, choose(rolls, 0.0, spun), end)
 
 
 @compiled
-def _observation_adjoint(points, inputs, car, axles, smooth, upstream, out):  # type: ignore[no-untyped-def]
+def _observation_adjoint(points, inputs, track, upstream, out, gradients, first, end):  # type: ignore[no-untyped-def]
+    car, m = track[0], upstream.shape[1]
     mass, _, front_arm, rear_arm, _, _, _ = car
-    for b in range(points.shape[0]):
-        vx, turned, cosine, load_front, load_rear = _settled(inputs[b], car)
-        for s in range(points.shape[1]):
-            vy, yaw_rate = points[b, s, 0], points[b, s, 1]
-            _, _, by_front, by_rear = _forces(vy, yaw_rate, vx, turned, cosine, load_front, load_rear, front_arm, rear_arm, axles, smooth)
-            front_bar = (upstream[b, s, 0] / mass + upstream[b, s, 2]) * by_front
-            rear_bar = (upstream[b, s, 0] / mass + upstream[b, s, 3]) * by_rear
-            out[b, s, 0] = front_bar + rear_bar
-            out[b, s, 1] = upstream[b, s, 1] + front_arm * front_bar - rear_arm * rear_bar
-            if upstream.shape[2] == 5:
-                out[b, s, 0] += upstream[b, s, 4] * vx / (vx * vx + vy * vy)
+    for b in range(first, end, width(points)):
+        settled = _settled(inputs, b, car)
+        vx = settled[0]
+        for s in range(points.shape[0]):
+            vy, _, _, _, by_front, by_rear = _forces(points, s, b, settled, track)
+            across = _at(upstream, m * s, b) / mass
+            front_bar = (across + _at(upstream, m * s + 2, b)) * by_front
+            rear_bar = (across + _at(upstream, m * s + 3, b)) * by_rear
+            bar = front_bar + rear_bar
+            if m == 5:
+                bar += _at(upstream, m * s + 4, b) * vx / (vx * vx + vy * vy)
+            _put(out, 2 * s, b, bar, end)
+            _put(out, 2 * s + 1, b, _at(upstream, m * s + 1, b) + front_arm * front_bar - rear_arm * rear_bar, end)

@@ -1,10 +1,13 @@
 """Sigma points through the planar cars of `vehicle.dynamics`, compiled, with the adjoint.
 
-Points lie side by side in columns, so that layers are matrix products and everything else runs along rows. The adjoint computes
-stages again instead of keeping them. Blocks of sequences are small enough for a core's own cache; matrix products stay on their thread.
+Points lie side by side in columns, so that what is computed of each runs along rows; columns are as many as fill whole vectors, and those
+beyond the points repeat the last one and have no gradient. A network sees a point a row, its units side by side: its matrix products are as
+fast for a few points as for many. The adjoint computes stages again instead of keeping them. Blocks of sequences are small enough for a
+core's own cache; matrix products stay on their thread.
 
-In the compiled code ``car`` is (layers, theta, constants, kind): weight and offset of the three layers, learnt numbers in the order of
-`PHYSICAL` and `PACEJKA`, known ones, and which car. ``room`` is what a motion leaves for its adjoint (`_room`).
+In the compiled code ``car`` is (layers, theta, constants, kind): weights and offsets of the three layers, then their weights transposed;
+learnt numbers in the order of `PHYSICAL` and `PACEJKA`; known ones; and which car. ``room`` is what a motion leaves for its adjoint
+(`_room`).
 """
 
 from __future__ import annotations
@@ -21,7 +24,8 @@ from vehest.constants import GRAVITY
 from vehest.estimators.kernels.activation import arctan, sigmoid, softplus, tanh
 from vehest.estimators.kernels.blas import one_blas_thread
 from vehest.estimators.kernels.compiling import entry, part
-from vehest.filters.unscented_scan import Array, PointModel
+from vehest.filters.unscented_scan import Array, CompiledModel
+from vehest.lanes import width
 from vehest.vehicle.dynamics import TURN, UNSCALED, Dynamics, NeuralCar, PacejkaCar, Perceptron, ResidualCar, TyreNetworkCar, physical_of
 from vehest.vehicle.tyres import STILL
 
@@ -41,7 +45,7 @@ def copy_rows(rows, out):  # type: ignore[no-untyped-def]
             out[i, p] = rows[i, p]
 
 
-class CompiledPlanarCar(PointModel):
+class CompiledPlanarCar(CompiledModel):
     """A planar car for the unscented filter.
 
     Args:
@@ -61,7 +65,8 @@ class CompiledPlanarCar(PointModel):
             raise ValueError(f"there is no compiled code for this {type(dynamics).__name__}: {known}")
         network = getattr(dynamics, "network", None)
         if isinstance(network, Perceptron):
-            layers = [tensor for pair in network.layers() for tensor in pair]
+            (W1, b1), (W2, b2), (W3, b3) = network.layers()
+            layers = [W1.mT, b1, W2.mT, b2, W3, b3]  # as their gradients are fastest
         else:
             layers = [torch.zeros(0, 0), torch.zeros(0)] * 3
         physical = physical_of(dynamics)
@@ -73,38 +78,19 @@ class CompiledPlanarCar(PointModel):
         scalar = arrays[0].dtype.type
         flat = 4.0 * np.finfo(scalar).eps
         numbers = [physical.mass, physical.wheelbase, physical.wheel_radius, step, TURN, UNSCALED, STILL, flat, GRAVITY]
-        self._car = (tuple(arrays[:6]), arrays[6], np.array(numbers, scalar), kind)
+        matrices = tuple(np.ascontiguousarray(arrays[place].T) for place in (0, 2, 4))
+        self.car = ((*arrays[:6], *matrices), arrays[6], np.array(numbers, scalar), kind)
+        self.measured = 4
+        self.entries = (_transition, _observation, _transition_adjoint, _observation_adjoint)
 
     def working(self) -> AbstractContextManager[object]:
         """With matrix products on their thread."""
         return one_blas_thread()
 
-    def transition(self, points: Array, inputs: Array) -> Array:
-        """See `PointModel`."""
-        out = np.empty_like(points)
-        _transition(points, inputs, self._car, BLOCK, out)
-        return out
-
-    def observation(self, points: Array, inputs: Array) -> Array:
-        """See `PointModel`."""
-        out = np.empty((*points.shape[:2], 4), points.dtype)
-        _observation(points, inputs, self._car, BLOCK, out)
-        return out
-
-    def transition_adjoint(self, points: Array, inputs: Array, upstream: Array, gradients: Sequence[Array]) -> Array:
-        """See `PointModel`."""
-        return self._adjoint(_transition_adjoint, points, inputs, upstream, gradients)
-
-    def observation_adjoint(self, points: Array, inputs: Array, upstream: Array, gradients: Sequence[Array]) -> Array:
-        """See `PointModel`."""
-        return self._adjoint(_observation_adjoint, points, inputs, upstream, gradients)
-
-    def _adjoint(self, adjoint: Any, points: Array, inputs: Array, upstream: Array, gradients: Sequence[Array]) -> Array:
-        out = np.empty_like(points)
+    def learnt(self, gradients: Sequence[Array]) -> tuple[Any, ...]:
+        """With whether they are wanted; those that are not are never written."""
         learning = bool(self.parameters)
-        own = tuple(gradients) if learning else (*self._car[0], self._car[1])  # never written to without learning
-        adjoint(points, inputs, self._car, BLOCK, upstream, out, learning, own)
-        return out
+        return (*(gradients if learning else (*self.car[0][:6], self.car[1])), learning)
 
 
 def is_compilable(dynamics: Dynamics) -> bool:
@@ -126,97 +112,114 @@ def _kind_of(dynamics: Dynamics) -> int | None:
 
 
 @piece
-def _columns(points, inputs, first, end, x, u):  # type: ignore[no-untyped-def]
-    """Points of some sequences side by side; rows of u are steering angle, its sine and cosine, and current."""
-    count, n = points.shape[1:]
+def _columns(points, first, end, rest, x):  # type: ignore[no-untyped-def]
+    """Points of some sequences side by side; columns beyond them are ``rest`` times the last one."""
+    count, n = points.shape[:2]
     for b in range(first, end):
-        sine, cosine = math.sin(inputs[b, 0]), math.cos(inputs[b, 0])
         for s in range(count):
-            p = (b - first) * count + s
             for i in range(n):
-                x[i, p] = points[b, s, i]
-            u[0, p], u[1, p], u[2, p], u[3, p] = inputs[b, 0], sine, cosine, inputs[b, 1]
+                x[i, (b - first) * count + s] = points[s, i, b]
+    last = (end - first) * count - 1
+    for i in range(n):
+        for p in range(last + 1, x.shape[1]):
+            x[i, p] = rest * x[i, last]
+
+
+@piece
+def _driven(inputs, first, end, count, u):  # type: ignore[no-untyped-def]
+    """Inputs at those columns; rows of u are steering angle, its sine and cosine, and current."""
+    for b in range(first, end):
+        sine, cosine = math.sin(inputs[0, b]), math.cos(inputs[0, b])
+        for p in range((b - first) * count, (b + 1 - first) * count if b + 1 < end else u.shape[1]):
+            u[0, p], u[1, p], u[2, p], u[3, p] = inputs[0, b], sine, cosine, inputs[1, b]
 
 
 @piece
 def _put(rows, points, first, end):  # type: ignore[no-untyped-def]
     """Rows back into points of some sequences."""
-    count = points.shape[1]
+    count = points.shape[0]
     for b in range(first, end):
         for s in range(count):
-            for i in range(points.shape[2]):
-                points[b, s, i] = rows[i, (b - first) * count + s]
+            for i in range(points.shape[1]):
+                points[s, i, b] = rows[i, (b - first) * count + s]
 
 
 @piece
-def _layer(weight, offset, below, above):  # type: ignore[no-untyped-def]
-    np.dot(weight, below, above)
-    for i in range(above.shape[0]):
-        row = above[i]
-        value = offset[i]
-        for p in range(row.shape[0]):
-            row[p] += value
+def _hidden(below, transposed, offset, above):  # type: ignore[no-untyped-def]
+    np.dot(below, transposed, above)
+    for p in range(above.shape[0]):
+        for i in range(above.shape[1]):
+            above[p, i] = sigmoid(above[p, i] + offset[i])
 
 
 @piece
-def _squash(rows):  # type: ignore[no-untyped-def]
-    for i in range(rows.shape[0]):
-        row = rows[i]
-        for p in range(row.shape[0]):
-            row[p] = sigmoid(row[p])
-
-
-@piece
-def _rise(above, below, flat):  # type: ignore[no-untyped-def]
+def _rise(above, below, flat, nothing):  # type: ignore[no-untyped-def]
     """Slope of a squashed value, its distances from both ends multiplied; none where it has reached one but for rounding.
 
     At a crawl slips change by a million per m/s, and rounding would count.
     """
-    return above * below if min(above, below) > flat else above * 0
+    return above * below if min(above, below) > flat else nothing
 
 
 @piece
 def _network(layers, f, h1, h2, o):  # type: ignore[no-untyped-def]
-    W1, b1, W2, b2, W3, b3 = layers
-    _layer(W1, b1, f, h1)
-    _squash(h1)
-    _layer(W2, b2, h1, h2)
-    _squash(h2)
-    _layer(W3, b3, h2, o)
+    T1, b1, T2, b2, _, b3, _, _, T3 = layers
+    _hidden(f, T1, b1, h1)
+    _hidden(h1, T2, b2, h2)
+    out = np.empty((f.shape[0], 4), f.dtype)
+    np.dot(h2, T3, out)
+    for k in range(4):
+        for p in range(f.shape[0]):
+            o[k, p] = out[p, k] + b3[k]
+        for p in range(f.shape[0], o.shape[1]):
+            o[k, p] = 0
 
 
 @piece
 def _network_adjoint(layers, flat, f, h1, h2, o_bar, f_bar, learning, gradients):  # type: ignore[no-untyped-def]
     """Writes ``f_bar``, and adds to the gradients when learning."""
-    W1, _, W2, _, W3, _ = layers
-    h2_bar, h1_bar = np.empty_like(h2), np.empty_like(h1)
-    np.dot(W3.T, o_bar, h2_bar)
-    for i in range(h2.shape[0]):
-        for p in range(h2.shape[1]):
-            h2_bar[i, p] *= _rise(h2[i, p], 1 - h2[i, p], flat)
-    np.dot(W2.T, h2_bar, h1_bar)
-    for i in range(h1.shape[0]):
-        for p in range(h1.shape[1]):
-            h1_bar[i, p] *= _rise(h1[i, p], 1 - h1[i, p], flat)
-    np.dot(W1.T, h1_bar, f_bar)
+    _, _, _, _, W3, _, W1, W2, _ = layers
+    h2_bar, h1_bar, out_bar = np.empty_like(h2), np.empty_like(h1), np.empty((f.shape[0], 4), f.dtype)
+    for p in range(f.shape[0]):
+        for k in range(4):
+            out_bar[p, k] = o_bar[k, p]
+    np.dot(out_bar, W3, h2_bar)
+    _through_hidden(h2, flat, h2_bar)
+    np.dot(h2_bar, W2, h1_bar)
+    _through_hidden(h1, flat, h1_bar)
+    np.dot(h1_bar, W1, f_bar)
     if learning:
-        dW1, db1, dW2, db2, dW3, db3 = gradients[:6]
-        _add_layer(o_bar, h2, dW3, db3)
-        _add_layer(h2_bar, h1, dW2, db2)
-        _add_layer(h1_bar, f, dW1, db1)
+        dT1, db1, dT2, db2, dW3, db3 = gradients[:6]
+        _add_product(out_bar, h2, dW3)
+        _add_product(h1, h2_bar, dT2)
+        _add_product(f, h1_bar, dT1)
+        _add_rows(out_bar, db3)
+        _add_rows(h2_bar, db2)
+        _add_rows(h1_bar, db1)
 
 
 @piece
-def _add_layer(above_bar, below, dW, db):  # type: ignore[no-untyped-def]
-    product = np.empty_like(dW)
-    np.dot(above_bar, below.T, product)
-    for i in range(dW.shape[0]):
-        for j in range(dW.shape[1]):
-            dW[i, j] += product[i, j]
-        total = db[i] * 0
-        for p in range(above_bar.shape[1]):
-            total += above_bar[i, p]
-        db[i] += total
+def _through_hidden(rows, flat, rows_bar):  # type: ignore[no-untyped-def]
+    one, nothing = rows.dtype.type(1), rows.dtype.type(0)
+    for p in range(rows.shape[0]):
+        for i in range(rows.shape[1]):
+            rows_bar[p, i] *= _rise(rows[p, i], one - rows[p, i], flat, nothing)
+
+
+@piece
+def _add_product(one, other, out):  # type: ignore[no-untyped-def]
+    product = np.empty_like(out)
+    np.dot(one.T, other, product)
+    for i in range(out.shape[0]):
+        for j in range(out.shape[1]):
+            out[i, j] += product[i, j]
+
+
+@piece
+def _add_rows(rows, out):  # type: ignore[no-untyped-def]
+    for p in range(rows.shape[0]):
+        for i in range(rows.shape[1]):
+            out[i] += rows[p, i]
 
 
 @piece
@@ -231,23 +234,27 @@ def _seen(x, u, car, f, slips):  # type: ignore[no-untyped-def]
         slips[1, p] = arctan((x[1, p] - lr * x[2, p]) / along)
         slips[2, p] = (x[3, p] - x[0, p]) / along
     if kind in (FRICTION_SCALED, UNSCALED_FORCES):
-        copy_rows(x[:5], f)
-        copy_rows(u[:1], f[5:])
-        copy_rows(slips[:3], f[6:])
-        if kind == UNSCALED_FORCES:
-            copy_rows(u[3:], f[9:])
+        for p in range(f.shape[0]):
+            for i in range(5):
+                f[p, i] = x[i, p]
+            f[p, 5] = u[0, p]
+            for i in range(3):
+                f[p, 6 + i] = slips[i, p]
+            if kind == UNSCALED_FORCES:
+                f[p, 9] = u[3, p]
     elif kind in (PACEJKA_AND_RATES, RATES):
-        copy_rows(x[:4], f)
-        copy_rows(u[:1], f[4:])
-        copy_rows(u[3:], f[5:])
+        for p in range(f.shape[0]):
+            for i in range(4):
+                f[p, i] = x[i, p]
+            f[p, 4], f[p, 5] = u[0, p], u[3, p]
 
 
 @piece
-def _curve(slip, stiffness, shape):  # type: ignore[no-untyped-def]
+def _curve(slip, stiffness, shape, one):  # type: ignore[no-untyped-def]
     """Pacejka's curve for a peak of 1, and its slopes along slip, stiffness and shape."""
     angle = arctan(stiffness * slip)
     slope = math.cos(shape * angle)
-    steep = slope * shape / (1 + stiffness * slip * stiffness * slip)
+    steep = slope * shape / (one + stiffness * slip * stiffness * slip)
     return math.sin(shape * angle), steep * stiffness, steep * slip, slope * angle
 
 
@@ -263,7 +270,7 @@ def _forces(x, car, slips, o, forces):  # type: ignore[no-untyped-def]
     """Rows are the forces rear x, front x, rear y, front y, then what else the adjoint needs."""
     _, theta, constants, kind = car
     points = x.shape[1]
-    turn, unscaled = constants[4], constants[5]
+    turn, unscaled, one = constants[4], constants[5], theta.dtype.type(1)
     if kind == FRICTION_SCALED:
         for k in range(2):
             for p in range(points):
@@ -278,10 +285,10 @@ def _forces(x, car, slips, o, forces):  # type: ignore[no-untyped-def]
         _, front_load, rear_load = _loads(theta, constants)
         friction, Bx, Cx, Dx, Bf, Cf, Df, Br, Cr, Dr = theta[9:]
         for p in range(points):
-            along = friction * Dx * _curve(slips[2, p], Bx, Cx)[0]
+            along = friction * Dx * _curve(slips[2, p], Bx, Cx, one)[0]
             forces[0, p], forces[1, p] = rear_load * along, front_load * along
-            forces[2, p] = -friction * Dr * rear_load * _curve(slips[1, p], Br, Cr)[0]
-            forces[3, p] = -friction * Df * front_load * _curve(slips[0, p], Bf, Cf)[0]
+            forces[2, p] = -friction * Dr * rear_load * _curve(slips[1, p], Br, Cr, one)[0]
+            forces[3, p] = -friction * Df * front_load * _curve(slips[0, p], Bf, Cf, one)[0]
 
 
 @piece
@@ -290,6 +297,7 @@ def _forces_adjoint(x, car, slips, o, forces, slope, o_bar, slips_bar, x_bar, le
     _, theta, constants, kind = car
     points = x.shape[1]
     turn, unscaled, flat = constants[4], constants[5], constants[7]
+    one, nothing = theta.dtype.type(1), theta.dtype.type(0)
     slips_bar[:] = 0
     if kind == FRICTION_SCALED:
         for k in range(2):
@@ -300,7 +308,7 @@ def _forces_adjoint(x, car, slips, o, forces, slope, o_bar, slips_bar, x_bar, le
                 size = softplus(value)
                 through = -slope[2 + k, p] * x[4, p]
                 o_bar[2 + k, p] = through * direction * sigmoid(value)
-                slips_bar[1 - k, p] = through * size * turn * _rise(1 - direction, 1 + direction, flat)
+                slips_bar[1 - k, p] = through * size * turn * _rise(one - direction, one + direction, flat, nothing)
                 x_bar[4, p] += slope[k, p] * o[k, p] - slope[2 + k, p] * size * direction
     elif kind == UNSCALED_FORCES:
         for k in range(4):
@@ -311,7 +319,7 @@ def _forces_adjoint(x, car, slips, o, forces, slope, o_bar, slips_bar, x_bar, le
         friction, Bx, Cx, Dx, Bf, Cf, Df, Br, Cr, Dr = theta[9:]
         total = np.zeros_like(theta)
         for p in range(points):
-            peak, rise, stiffer, rounder = _curve(slips[2, p], Bx, Cx)
+            peak, rise, stiffer, rounder = _curve(slips[2, p], Bx, Cx, one)
             up = slope[0, p] * rear_load + slope[1, p] * front_load
             slips_bar[2, p] = up * friction * Dx * rise
             total[0] += (slope[1, p] - slope[0, p]) * weight * friction * Dx * peak
@@ -319,7 +327,7 @@ def _forces_adjoint(x, car, slips, o, forces, slope, o_bar, slips_bar, x_bar, le
             total[10] += up * friction * Dx * stiffer
             total[11] += up * friction * Dx * rounder
             total[12] += up * friction * peak
-            peak, rise, stiffer, rounder = _curve(slips[0, p], Bf, Cf)
+            peak, rise, stiffer, rounder = _curve(slips[0, p], Bf, Cf, one)
             up = -slope[3, p] * front_load
             slips_bar[0, p] = up * friction * Df * rise
             total[0] -= slope[3, p] * weight * friction * Df * peak
@@ -327,7 +335,7 @@ def _forces_adjoint(x, car, slips, o, forces, slope, o_bar, slips_bar, x_bar, le
             total[13] += up * friction * Df * stiffer
             total[14] += up * friction * Df * rounder
             total[15] += up * friction * peak
-            peak, rise, stiffer, rounder = _curve(slips[1, p], Br, Cr)
+            peak, rise, stiffer, rounder = _curve(slips[1, p], Br, Cr, one)
             up = -slope[2, p] * rear_load
             slips_bar[1, p] = up * friction * Dr * rise
             total[0] += slope[2, p] * weight * friction * Dr * peak
@@ -366,7 +374,7 @@ def _chassis_adjoint(x, u, car, forces, out, out_bar, slope, x_bar, learning, dt
     mass, wheelbase, radius = constants[:3]
     lr, inertia, _, drag1, drag2, powertrain, _, viscous, _ = theta[:9]
     lf = wheelbase - lr
-    zero = x[0, 0] * 0
+    zero, two = x.dtype.type(0), x.dtype.type(2)
     d_lf, d_lr, d_inertia, d_drag0, d_drag1, d_drag2 = zero, zero, zero, zero, zero, zero
     d_powertrain, d_torque, d_viscous, d_coulomb = zero, zero, zero, zero
     for p in range(x.shape[1]):
@@ -380,7 +388,7 @@ def _chassis_adjoint(x, u, car, forces, out, out_bar, slope, x_bar, learning, dt
         slope[1, p] = along - radius * twisting
         slope[2, p] = ay - turning * lr
         slope[3, p] = across
-        x_bar[0, p] -= ax * (drag1 + 2 * drag2 * vx)
+        x_bar[0, p] -= ax * (drag1 + two * drag2 * vx)
         x_bar[3, p] -= viscous * twisting
         d_lf += turning * (front_x * sine + front_y * cosine)
         d_lr -= turning * rear_y
@@ -420,9 +428,11 @@ def _motion(x, u, car, room, out):  # type: ignore[no-untyped-def]
         return
     _forces(x, car, slips, o, forces)
     _chassis(x, u, car, forces, plain)
-    for i in range(4):
-        for p in range(x.shape[1]):
-            out[i, p] = plain[i, p] + (o[i, p] if kind == PACEJKA_AND_RATES else 0)
+    copy_rows(plain, out)
+    if kind == PACEJKA_AND_RATES:
+        for i in range(4):
+            for p in range(x.shape[1]):
+                out[i, p] += o[i, p]
 
 
 @piece
@@ -444,16 +454,15 @@ def _motion_adjoint(x, u, car, room, out_bar, x_bar, learning, gradients):  # ty
     if kind != PACEJKA_FORCES:
         _network_adjoint(layers, constants[7], f, h1, h2, o_bar, f_bar, learning, gradients)
     if kind in (FRICTION_SCALED, UNSCALED_FORCES):
-        for i in range(5):
-            for p in range(points):
-                x_bar[i, p] += f_bar[i, p]
-        for i in range(3):
-            for p in range(points):
-                slips_bar[i, p] += f_bar[6 + i, p]
+        for p in range(f.shape[0]):
+            for i in range(5):
+                x_bar[i, p] += f_bar[p, i]
+            for i in range(3):
+                slips_bar[i, p] += f_bar[p, 6 + i]
     elif kind in (PACEJKA_AND_RATES, RATES):
-        for i in range(4):
-            for p in range(points):
-                x_bar[i, p] += f_bar[i, p]
+        for p in range(f.shape[0]):
+            for i in range(4):
+                x_bar[i, p] += f_bar[p, i]
     if kind == RATES:
         for p in range(points):
             x_bar[0, p] += out_bar[1, p] * x[2, p]
@@ -466,15 +475,15 @@ def _motion_adjoint(x, u, car, room, out_bar, x_bar, learning, gradients):  # ty
 @piece
 def _slips_adjoint(x, lr, constants, slips_bar, x_bar, learning, dtheta):  # type: ignore[no-untyped-def]
     lf, still = constants[1] - lr, constants[6]
-    d_lf, d_lr = lr * 0, lr * 0
+    one, d_lf, d_lr = x.dtype.type(1), x.dtype.type(0), x.dtype.type(0)
     for p in range(x.shape[1]):
         vx, vy, yaw_rate, rim = x[0, p], x[1, p], x[2, p], x[3, p]
         along = vx + still
         front, rear = (vy + lf * yaw_rate) / along, (vy - lr * yaw_rate) / along
-        front_bar = slips_bar[0, p] / (1 + front * front) / along
-        rear_bar = slips_bar[1, p] / (1 + rear * rear) / along
+        front_bar = slips_bar[0, p] / (one + front * front) / along
+        rear_bar = slips_bar[1, p] / (one + rear * rear) / along
         ratio_bar = slips_bar[2, p] / along
-        x_bar[0, p] -= front_bar * front + rear_bar * rear + ratio_bar * ((rim - vx) / along + 1)
+        x_bar[0, p] -= front_bar * front + rear_bar * rear + ratio_bar * ((rim - vx) / along + one)
         x_bar[1, p] += front_bar + rear_bar
         x_bar[2, p] += front_bar * lf - rear_bar * lr
         x_bar[3, p] += ratio_bar
@@ -495,22 +504,29 @@ def _rates(x, motion, rates):  # type: ignore[no-untyped-def]
 
 
 @piece
-def _block_of(sequences, count, block):  # type: ignore[no-untyped-def]
+def _block_of(sequences, count):  # type: ignore[no-untyped-def]
     """Sequences in a block, so that blocks are about equal."""
-    most = max(block // count, 1)
+    most = max(BLOCK // count, 1)
     pieces = (sequences + most - 1) // most
     return (sequences + pieces - 1) // pieces
 
 
 @piece
-def _room(columns, car, dtype):  # type: ignore[no-untyped-def]
+def _filling(points, like):  # type: ignore[no-untyped-def]
+    """Columns for so many points, as many as fill whole vectors."""
+    lanes = width(like)
+    return (points + lanes - 1) // lanes * lanes
+
+
+@piece
+def _room(points, columns, car, dtype):  # type: ignore[no-untyped-def]
     """For what the network sees, slips, both hidden layers, the network's outputs, forces, and rates without what a network adds."""
-    W1, _, W2, _, _, _ = car[0]
+    T1, _, T2 = car[0][:3]
     return (
-        np.empty((W1.shape[1], columns), dtype),
+        np.empty((points, T1.shape[0]), dtype),
         np.empty((3, columns), dtype),
-        np.empty((W1.shape[0], columns), dtype),
-        np.empty((W2.shape[0], columns), dtype),
+        np.empty((points, T1.shape[1]), dtype),
+        np.empty((points, T2.shape[1]), dtype),
         np.empty((4, columns), dtype),
         np.empty((6, columns), dtype),
         np.empty((4, columns), dtype),
@@ -518,20 +534,25 @@ def _room(columns, car, dtype):  # type: ignore[no-untyped-def]
 
 
 @piece
-def _four_rooms(columns, car, dtype):  # type: ignore[no-untyped-def]
-    return _room(columns, car, dtype), _room(columns, car, dtype), _room(columns, car, dtype), _room(columns, car, dtype)
+def _four_rooms(points, columns, car, dtype):  # type: ignore[no-untyped-def]
+    return (
+        _room(points, columns, car, dtype),
+        _room(points, columns, car, dtype),
+        _room(points, columns, car, dtype),
+        _room(points, columns, car, dtype),
+    )
 
 
 @piece
 def _stages(x0, u, car, x, rooms, rates):  # type: ignore[no-untyped-def]
     """The four stages of the Runge-Kutta method."""
-    step = car[2][3]
+    step, half = car[2][3], x0.dtype.type(0.5)
     motion = np.empty((4, x0.shape[1]), x0.dtype)
     for stage in range(4):
         if stage == 0:
-            x[0] = x0
+            copy_rows(x0, x[0])
         else:
-            share = step if stage == 3 else step / 2
+            share = step if stage == 3 else step * half
             for i in range(5):
                 for p in range(x0.shape[1]):
                     x[stage, i, p] = x0[i, p] + share * rates[stage - 1, i, p]
@@ -540,61 +561,68 @@ def _stages(x0, u, car, x, rooms, rates):  # type: ignore[no-untyped-def]
 
 
 @compiled
-def _transition(points, inputs, car, block, out):  # type: ignore[no-untyped-def]
-    sequences, count, n = points.shape
-    step = car[2][3]
-    size = _block_of(sequences, count, block)
-    for first in range(0, sequences, size):
-        end = min(first + size, sequences)
-        columns = (end - first) * count
+def _transition(points, inputs, car, out, start, stop):  # type: ignore[no-untyped-def]
+    count, n, _ = points.shape
+    sixth, two = points.dtype.type(car[2][3] / 6), points.dtype.type(2)
+    size = _block_of(stop - start, count)
+    for first in range(start, stop, size):
+        end = min(first + size, stop)
+        own = (end - first) * count
+        columns = _filling(own, points)
         x0, u = np.empty((n, columns), points.dtype), np.empty((4, columns), points.dtype)
         x, rates = np.empty((4, n, columns), points.dtype), np.empty((4, n, columns), points.dtype)
-        room = _room(columns, car, points.dtype)
-        _columns(points, inputs, first, end, x0, u)
+        room = _room(own, columns, car, points.dtype)
+        _columns(points, first, end, 1, x0)
+        _driven(inputs, first, end, count, u)
         _stages(x0, u, car, x, (room, room, room, room), rates)
         for i in range(n):
             for p in range(columns):
-                x0[i, p] += step / 6 * (rates[0, i, p] + 2 * rates[1, i, p] + 2 * rates[2, i, p] + rates[3, i, p])
+                x0[i, p] += sixth * (rates[0, i, p] + two * rates[1, i, p] + two * rates[2, i, p] + rates[3, i, p])
         _put(x0, out, first, end)
 
 
 @compiled
-def _observation(points, inputs, car, block, out):  # type: ignore[no-untyped-def]
-    sequences, count, n = points.shape
-    size = _block_of(sequences, count, block)
-    for first in range(0, sequences, size):
-        end = min(first + size, sequences)
-        columns = (end - first) * count
+def _observation(points, inputs, car, out, start, stop):  # type: ignore[no-untyped-def]
+    count, n, _ = points.shape
+    size = _block_of(stop - start, count)
+    for first in range(start, stop, size):
+        end = min(first + size, stop)
+        own = (end - first) * count
+        columns = _filling(own, points)
         x, u, expected = np.empty((n, columns), points.dtype), np.empty((4, columns), points.dtype), np.empty((4, columns), points.dtype)
-        _columns(points, inputs, first, end, x, u)
-        _motion(x, u, car, _room(columns, car, points.dtype), expected)
+        _columns(points, first, end, 1, x)
+        _driven(inputs, first, end, count, u)
+        _motion(x, u, car, _room(own, columns, car, points.dtype), expected)
         for p in range(columns):
             expected[2, p], expected[3, p] = x[2, p], x[3, p]
         _put(expected, out, first, end)
 
 
 @compiled
-def _transition_adjoint(points, inputs, car, block, upstream, out, learning, gradients):  # type: ignore[no-untyped-def]
-    sequences, count, n = points.shape
-    step = car[2][3]
-    size = _block_of(sequences, count, block)
-    for first in range(0, sequences, size):
-        end = min(first + size, sequences)
-        columns = (end - first) * count
+def _transition_adjoint(points, inputs, car, upstream, out, gradients, start, stop):  # type: ignore[no-untyped-def]
+    learning = gradients[7]
+    count, n, _ = points.shape
+    step, nothing = car[2][3], points.dtype.type(0)
+    size = _block_of(stop - start, count)
+    for first in range(start, stop, size):
+        end = min(first + size, stop)
+        own = (end - first) * count
+        columns = _filling(own, points)
         x0, u, up = np.empty((n, columns), points.dtype), np.empty((4, columns), points.dtype), np.empty((n, columns), points.dtype)
         x, rates = np.empty((4, n, columns), points.dtype), np.empty((4, n, columns), points.dtype)
-        rooms = _four_rooms(columns, car, points.dtype)
-        _columns(points, inputs, first, end, x0, u)
+        rooms = _four_rooms(own, columns, car, points.dtype)
+        _columns(points, first, end, 1, x0)
+        _driven(inputs, first, end, count, u)
         _stages(x0, u, car, x, rooms, rates)
-        _columns(upstream, inputs, first, end, up, u)
+        _columns(upstream, first, end, 0, up)
         total, stage_bar, rates_bar = up.copy(), np.zeros_like(up), np.empty((4, columns), points.dtype)
         for k in range(4):
             at = 3 - k
-            own = step / 3 if at in (1, 2) else step / 6
-            later = step if at == 2 else step / 2
+            weight = points.dtype.type(step / 3 if at in (1, 2) else step / 6)
+            later = points.dtype.type(step if at == 2 else step / 2)
             for i in range(4):
                 for p in range(columns):
-                    rates_bar[i, p] = own * up[i, p] + (later * stage_bar[i, p] if at < 3 else 0)
+                    rates_bar[i, p] = weight * up[i, p] + (later * stage_bar[i, p] if at < 3 else nothing)
             for p in range(columns):
                 stage_bar[0, p] = -rates_bar[1, p] * x[at, 2, p]
                 stage_bar[1, p] = rates_bar[0, p] * x[at, 2, p]
@@ -609,17 +637,20 @@ def _transition_adjoint(points, inputs, car, block, upstream, out, learning, gra
 
 
 @compiled
-def _observation_adjoint(points, inputs, car, block, upstream, out, learning, gradients):  # type: ignore[no-untyped-def]
-    sequences, count, n = points.shape
-    size = _block_of(sequences, count, block)
-    for first in range(0, sequences, size):
-        end = min(first + size, sequences)
-        columns = (end - first) * count
+def _observation_adjoint(points, inputs, car, upstream, out, gradients, start, stop):  # type: ignore[no-untyped-def]
+    learning = gradients[7]
+    count, n, _ = points.shape
+    size = _block_of(stop - start, count)
+    for first in range(start, stop, size):
+        end = min(first + size, stop)
+        own = (end - first) * count
+        columns = _filling(own, points)
         x, u, up = np.empty((n, columns), points.dtype), np.empty((4, columns), points.dtype), np.empty((4, columns), points.dtype)
-        room = _room(columns, car, points.dtype)
-        _columns(points, inputs, first, end, x, u)
+        room = _room(own, columns, car, points.dtype)
+        _columns(points, first, end, 1, x)
+        _driven(inputs, first, end, count, u)
         _motion(x, u, car, room, np.empty((4, columns), points.dtype))
-        _columns(upstream, inputs, first, end, up, u)
+        _columns(upstream, first, end, 0, up)
         x_bar = np.zeros_like(x)
         for p in range(columns):
             x_bar[2, p], x_bar[3, p] = up[2, p], up[3, p]
