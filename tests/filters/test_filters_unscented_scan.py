@@ -155,6 +155,7 @@ def test_without_repair_a_sequence_is_lost_and_leaves_the_others_alone():
     assert torch.isfinite(mean[0, :first]).all()
     tame = sharply_scanned(Gaussian(initial.mean, initial.covariance))
     assert torch.equal(mean[1], tame.steps.filtered.mean[1])
+    assert torch.equal(left.steps.log_likelihood[1], tame.steps.log_likelihood[1])
     mean[1].square().sum().backward()
     assert torch.isfinite(start.grad[1]).all()
 

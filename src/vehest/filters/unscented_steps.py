@@ -299,7 +299,7 @@ def update_of(  # type: ignore[no-untyped-def]
         for i in range(n):
             _put(x, i, most(_moved(mean, K, error, i, m, b), lower[i]))
         for lane in range(min(lanes, end - b)):
-            log_determinant, squared, measured = mean[0, b] * 0, mean[0, b] * 0, 0
+            log_determinant, squared, measured = mean[0, b + lane] * 0, mean[0, b + lane] * 0, 0
             for i in range(m):
                 measured += y[i, b + lane] == y[i, b + lane]
                 left = error[i, lane]
