@@ -182,7 +182,7 @@ class Place:
         before = self.files()
         found, _, err = self(*arguments)
         assert found != 0
-        lines = [line for line in err.splitlines() if not line.startswith(("done", "skipped"))]
+        lines = [line for line in err.splitlines() if not line.startswith(("done", "skipped", "once"))]
         assert len(lines) == 1, err
         assert lines[0].startswith("error: ")
         assert {name for name in self.files() - before if "/ingest/" not in name and "/downsample/" not in name} == set()

@@ -160,13 +160,13 @@ def test_compiled_observer_equals_the_readable_one_and_resets_below_the_threshol
     assert (vx == 20.0).all()
 
 
-def test_a_group_of_jobs_keeps_matrix_products_on_one_thread(monkeypatch):
+def test_a_group_of_jobs_keeps_matrix_products_on_one_thread(monkeypatch, tmp_path):
     seen = []
 
     def threads():
         return [pool["num_threads"] for pool in threadpool_info() if pool["user_api"] == "blas"]
 
-    job = SimpleNamespace(plan=SimpleNamespace(key="", stage="train"))
+    job = SimpleNamespace(plan=SimpleNamespace(key="", stage="train", output=tmp_path))
     monkeypatch.setattr(group, "find", lambda _: seen.extend(threads()) or job)
     monkeypatch.setattr(group, "_member", lambda *_: None)
     with threadpool_limits(2, "blas"):  # what a process on two cores starts with

@@ -67,6 +67,13 @@ def _rows(count, like):  # type: ignore[no-untyped-def]
 
 
 @piece
+def _read(values, rows, b):  # type: ignore[no-untyped-def]
+    """Sequences from b on to scratch."""
+    for row in range(rows.shape[0]):
+        _put(rows, row, _at(values, row, b))
+
+
+@piece
 def _write(rows, out, b, end):  # type: ignore[no-untyped-def]
     """Scratch to the sequences from b to ``end``, as many as there are."""
     stride = out.shape[out.ndim - 1]
@@ -90,8 +97,7 @@ def points_of(mean, given, rule, lower, margin, repair, covariance, factor, poin
     n, count, lanes = mean.shape[0], points.shape[0], width(mean)
     A, L, P, flags = _rows(n * n, mean), _rows(n * n, mean), _rows(count * n, mean), _rows(1, mean)
     for b in range(first, end, lanes):
-        for row in range(n * n):
-            _put(A, row, _at(given, row, b))
+        _read(given, A, b)
         lost = 1 - _cholesky(A, L, n)
         for lane in range(min(lanes, end - b)):
             repaired[b + lane] = False
@@ -118,9 +124,8 @@ def points_adjoint(mean, factor, rule, lower, points_bar, mean_bar, covariance_b
     n = mean.shape[0]
     L, below, inner, x_bar, A_bar = _rows(n * n, mean), _rows(n * n, mean), _rows(n * n, mean), _rows(n, mean), _rows(n * n, mean)
     for b in range(first, end, width(mean)):
-        for row in range(n * n):
-            _put(L, row, _at(factor, row, b))
-            _put(A_bar, row, _at(covariance_bar, row, b))
+        _read(factor, L, b)
+        _read(covariance_bar, A_bar, b)
         nothing = _own(L, 0) * 0
         for i in range(n):
             c, bar = _at(mean, i, b), _at(mean_bar, i, b)
@@ -367,16 +372,7 @@ def _posterior(covariance, b, cross, factor, gain, post_covariance):  # type: ig
     m = cross.shape[0] // n
     half = cross.dtype.type(0.5)
     for i in range(n):
-        for j in range(m):
-            left = _own(cross, i * m + j)
-            for c in range(j):
-                left -= _own(factor, j * m + c) * _own(gain, i * m + c)
-            _put(gain, i * m + j, left / _own(factor, j * m + j))
-        for j in range(m - 1, -1, -1):
-            left = _own(gain, i * m + j)
-            for c in range(j + 1, m):
-                left -= _own(factor, c * m + j) * _own(gain, i * m + c)
-            _put(gain, i * m + j, left / _own(factor, j * m + j))
+        _solve(factor, cross, i * m, m, gain)
     for i in range(n):
         for j in range(i + 1):
             left = half * (_at(covariance, i * n + j, b) + _at(covariance, j * n + i, b))
@@ -385,6 +381,21 @@ def _posterior(covariance, b, cross, factor, gain, post_covariance):  # type: ig
                 left -= half * taken
             _put(post_covariance, i * n + j, left)
             _put(post_covariance, j * n + i, left)
+
+
+@piece
+def _solve(factor, given, at, m, solved):  # type: ignore[no-untyped-def]
+    """S⁻¹ times the m rows of ``given`` from ``at`` on, by the factor of S, into those of ``solved``."""
+    for j in range(m):
+        left = _own(given, at + j)
+        for c in range(j):
+            left -= _own(factor, j * m + c) * _own(solved, at + c)
+        _put(solved, at + j, left / _own(factor, j * m + j))
+    for j in range(m - 1, -1, -1):
+        left = _own(solved, at + j)
+        for c in range(j + 1, m):
+            left -= _own(factor, c * m + j) * _own(solved, at + c)
+        _put(solved, at + j, left / _own(factor, j * m + j))
 
 
 @compiled
@@ -415,24 +426,15 @@ def update_adjoint(  # type: ignore[no-untyped-def]
     n = mean.shape[0]
     half, two = rule.dtype.type(0.5), rule.dtype.type(2.0)
     off, spread, deviation, error = _rows(m, mean), _rows(count * m, mean), _rows(count * n, mean), _rows(m, mean)
-    P, S, K, factor, solved, pulled = (
-        _rows(n * n, mean),
-        _rows(m * m, mean),
-        _rows(n * m, mean),
-        _rows(m * m, mean),
-        _rows(m, mean),
-        _rows(m, mean),
-    )
+    P, S, K = _rows(n * n, mean), _rows(m * m, mean), _rows(n * m, mean)
+    factor, solved, pulled = _rows(m * m, mean), _rows(m, mean), _rows(m, mean)
     through, cross_bar, own_bar, R_bar = _rows(n, mean), _rows(n * m, mean), _rows(m * m, mean), _rows(m * m, mean)
     x_bar, z_bar, V_bar, E_bar = _rows(n, mean), _rows(m, mean), _rows(count * n, mean), _rows(count * m, mean)
     for b in range(first, end, width(mean)):
         _spread(expected, points, mean, y, b, rule, off, spread, deviation)
-        for row in range(m):
-            _put(error, row, _at(innovation, row, b))
-        for row in range(m * m):
-            _put(S, row, _at(own, row, b))
-        for row in range(n * m):
-            _put(K, row, _at(gain, row, b))
+        _read(innovation, error, b)
+        _read(own, S, b)
+        _read(gain, K, b)
         around = _at(centre, 0, b)
         for i in range(n):
             state = _moved(mean, K, error, i, m, b)
@@ -440,16 +442,7 @@ def update_adjoint(  # type: ignore[no-untyped-def]
             for j in range(n):
                 _put(P, i * n + j, half * (_at(post_covariance_bar, i * n + j, b) + _at(post_covariance_bar, j * n + i, b)))
         _cholesky(S, factor, m)
-        for i in range(m):  # solved = S⁻¹ e
-            left = _own(error, i)
-            for c in range(i):
-                left -= _own(factor, i * m + c) * _own(solved, c)
-            _put(solved, i, left / _own(factor, i * m + i))
-        for i in range(m - 1, -1, -1):
-            left = _own(solved, i)
-            for c in range(i + 1, m):
-                left -= _own(factor, c * m + i) * _own(solved, c)
-            _put(solved, i, left / _own(factor, i * m + i))
+        _solve(factor, error, 0, m, solved)
         for c in range(m):  # pulled = Kᵀ m̄, the gradient of the innovation
             pull, known = _own(through, 0) * 0, _at(y, c, b)
             for i in range(n):

@@ -122,8 +122,10 @@ def estimate_file(words: Sequence[str], out: Path, *, strict: bool = False, car:
     folder, model, trust = open_model(name, Path(config["output"]), note)
     with use_limits(limits_from_config(config["limits"])):
         drive = read_by(config, file)
+    remarks: list[str] = []
     if name == SELF_CALIBRATING:
-        settings |= _assumed(settings, drive, model.settings.wheelbase if car is None else None)
+        assumed, remarks = _assumed(settings, drive, model.settings.wheelbase if car is None else None)
+        settings |= assumed
     if settings:
         model = with_settings(model, settings)
         if trust is not None and trust.health is not None and trust.health.channels != model.channels:
@@ -139,12 +141,14 @@ def estimate_file(words: Sequence[str], out: Path, *, strict: bool = False, car:
         if strict and findings:
             raise DataError(f"'{file}': {findings[0]}")
         result = estimate_recording(model, drive, trust)
-    for finding in findings:
-        complain(f"warning: {finding}")
     if out.suffix.lower() in LOGS:
         write_log(result, drive, file, out)
     else:
         write_estimate_table(result, out)
+    for remark in remarks:
+        note(remark)
+    for finding in findings:
+        complain(f"warning: {finding}")
     return {
         "out": str(out),
         "model": name if name in WITH_VEHEST else str(folder),
@@ -156,14 +160,14 @@ def estimate_file(words: Sequence[str], out: Path, *, strict: bool = False, car:
     }
 
 
-def _assumed(settings: Mapping[str, Any], drive: Recording, wheelbase: float | None) -> dict[str, Any]:
-    """Settings of the self-calibrating filter that a drive without ax needs; these and an assumed wheelbase [m] are remarked on."""
+def _assumed(settings: Mapping[str, Any], drive: Recording, wheelbase: float | None) -> tuple[dict[str, Any], list[str]]:
+    """Settings of the self-calibrating filter that a drive without ax needs, and remarks on these and on an assumed wheelbase [m]."""
+    remarks = []
     if wheelbase is not None and "wheelbase" not in settings:
-        note(f"the wheelbase is taken for {wheelbase:g} m; give your car's, such as estimator.wheelbase=2.9")
+        remarks.append(f"the wheelbase is taken for {wheelbase:g} m; give your car's, such as estimator.wheelbase=2.9")
     if "ax" in drive or "measured_ax" in settings:
-        return {}
-    note("there is no channel ax: estimator.measured_ax=false")
-    return {"measured_ax": False}
+        return {}, remarks
+    return {"measured_ax": False}, [*remarks, "there is no channel ax: estimator.measured_ax=false"]
 
 
 def split_settings(overrides: Sequence[str]) -> tuple[dict[str, Any], list[str]]:
