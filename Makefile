@@ -42,10 +42,10 @@ endif
 	$(BIN)/python -m pip install -q $(LOCKED) -e ".[dev]"
 	touch $@
 
-run: $(INSTALLED) ## train and compare four families on simulated drives (a few minutes)
+run: $(INSTALLED) ## train and compare four families on simulated drives (a minute, after installing)
 	$(BIN)/vehest run pipelines/quickstart.yaml
 
-test: $(INSTALLED) ## tests (9 minutes on two cores, 7 from the second time on); `make lint` has style, types and layers
+test: $(INSTALLED) ## tests (6 minutes on two cores, 5 from the second time on); `make lint` has style, types and layers
 	$(TESTS)
 
 test-durations: $(INSTALLED) ## the same, with the 50 that take longest
