@@ -241,8 +241,8 @@ def git(*words: str) -> str:
 
 def open_cars(cars: Sequence[str]) -> None:
     """Append what is scored to openings.csv; raises SystemExit where the choices are not committed."""
-    if git("status", "--porcelain", "--", CHOICES, "src/vehest/estimators"):
-        raise SystemExit(f"{CHOICES} or the estimators have changes that are not committed; commit them, then open the cars")
+    if git("status", "--porcelain", "--", CHOICES, "src/vehest/estimators", "src/vehest/run"):
+        raise SystemExit(f"{CHOICES}, the estimators or identify have changes that are not committed; commit them, then open the cars")
     file, commit = TARGET / "openings.csv", git("rev-parse", "HEAD")
     rows = list(csv.DictReader(file.open(encoding="utf-8"))) if file.exists() else []
     changed = git("diff", "-U0", rows[-1]["commit"], commit, "--", CHOICES).splitlines() if rows else []

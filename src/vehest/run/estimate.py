@@ -231,8 +231,8 @@ def findings_of(recording: Recording, model: Estimator, accepted: Sequence[str])
         if finding.check in CONTRADICTIONS and finding.check not in accepted:
             what = f"channels contradict each other: {finding.message}"
             raise DataError(f"recording '{recording.id}': {what} (or dataset.accept=[{finding.check}])")
-    told = [f"{finding.channel}: {finding.message}" if finding.channel else finding.message for finding in findings]
-    return told + wheelbase_findings(recording, getattr(model.settings, "wheelbase", None))
+    found = [f"{finding.channel}: {finding.message}" if finding.channel else finding.message for finding in findings]
+    return found + wheelbase_findings(recording, getattr(model.settings, "wheelbase", None))
 
 
 def wheelbase_findings(recording: Recording, wheelbase: float | None) -> list[str]:

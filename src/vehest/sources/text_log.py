@@ -33,6 +33,7 @@ class TextLogSource(TabularSource):
     """Tables of text, a recording each."""
 
     options_type = TextLogOptions
+    version = "2"
 
     def __init__(self, dataset: Mapping[str, Any]) -> None:
         time, clock = dataset.get("time"), None
