@@ -208,7 +208,14 @@ def test_transforms_are_built_from_plain_values():
 
 
 @pytest.mark.parametrize(
-    ("config", "what"), [({"name": "high_pass"}, "'high_pass' is not one of: resample"), ({"name": "low_pass"}, "cutoff_hz")]
+    ("config", "what"),
+    [
+        ({"name": "high_pass"}, "'high_pass' is not one of: resample"),
+        ({"name": "low_pass"}, "transform 'low_pass': cutoff_hz"),
+        ({"name": "low_pass", "cutoff_hz": "5"}, "transform 'low_pass': cutoff_hz"),
+        ({"name": "low_pass", "cutoff_hz": 5, "direction": "sideways"}, "transform 'low_pass': direction"),
+        ({"name": "low_pass", "cutoff_hz": 5, "zero": 1}, "transform 'low_pass': "),
+    ],
 )
 def test_a_misspelt_transform_is_refused_in_one_line(config, what):
     with pytest.raises(ConfigurationError) as error:

@@ -213,8 +213,6 @@ TESTED = [{"recording": "three"}]
     [
         ({}, ("ingest", "mine", "root=/no/such/folder"), 4, "there is no folder '/no/such/folder'; give root=FOLDER or set VEHEST_DATA"),
         ({}, ("ingest", "mine", "dataset.colour=red"), 2, ""),
-        ({}, ("train", "estimator=transformer"), 2, "choices"),
-        ({}, ("train", "estimator.depth=3"), 2, "unknown option 'estimator.depth'"),
         ({}, ("eval", "split=mine", "tracking=none"), 4, ""),
         ({}, ("estimate", "nothing", "lap.csv"), 4, ""),
         ({}, (*TRAIN, "split.train=[{recording: four}]"), None, "has no recording 'four'"),
