@@ -27,29 +27,6 @@ class Inner:
 
 
 @dataclass(frozen=True)
-class Outer:
-    name: str
-    inner: Inner
-    many: dict[str, Inner]
-    bounds: tuple[float, float] | None = None
-    on: bool = False
-
-
-GOOD = {"name": "a", "inner": {"gain": 1}, "many": {"x": {"gain": 0.5, "steps": 4.0}}, "bounds": [0, 1.5]}
-
-
-def test_plain_values_become_dataclasses_that_may_take_further_keys():
-    assert validated(Outer, GOOD, "'f'") == Outer("a", Inner(1.0), {"x": Inner(0.5, 4)}, (0.0, 1.5))
-
-    @dataclass(frozen=True)
-    class Loose:
-        __pydantic_config__ = FURTHER_KEYS
-        name: str
-
-    assert validated(Loose, {"name": "a", "more": 1}, "") == Loose("a")
-
-
-@dataclass(frozen=True)
 class Kinds:
     names: Annotated[tuple[str, ...], "a list of names"] = ()
     inner: tuple[Inner | None, ...] = ()
@@ -59,6 +36,18 @@ class Kinds:
     values: dict[str, int | float | bool | str | None] | None = None
     rate: Annotated[float, "a number up to 5"] | None = None
     maps: dict[str, dict[str, Inner]] | None = None
+
+
+def test_plain_values_become_dataclasses_that_may_take_further_keys():
+    given = {"names": ["a"], "inner": [{"gain": 1}, None], "pair": [0, "b"], "maps": {"c": {"d": {"gain": 0.5, "steps": 4.0}}}}
+    assert validated(Kinds, given, "'f'") == Kinds(("a",), (Inner(1.0), None), pair=(0.0, "b"), maps={"c": {"d": Inner(0.5, 4)}})
+
+    @dataclass(frozen=True)
+    class Loose:
+        __pydantic_config__ = FURTHER_KEYS
+        name: str
+
+    assert validated(Loose, {"name": "a", "more": 1}, "") == Loose("a")
 
 
 @pytest.mark.parametrize(
