@@ -77,14 +77,6 @@ def test_train_validation_and_tests_never_share_samples(parts, rate_hz):
             Split("drive", train, validation, {"test": test})
 
 
-@PROPERTY
-@given(spans(), spans())
-def test_overlap_goes_both_ways_and_is_that_of_the_times(one, other):
-    assert one.overlaps(other) is other.overlaps(one)
-    common = one.recording == other.recording and max(one.start, other.start) < min(one.stop, other.stop)
-    assert one.overlaps(other) is common
-
-
 def test_equal_ranges_elsewhere_and_test_sets_that_overlap_share_nothing():
     Split("s", (Span("d", "r1"),), (Span("d", "r2"),), {"test": (Span("e", "r1"),)})
     Split("s", (Span("d", "r", 0, 1),), (Span("d", "r", 1, 2),), {"all": (Span("d", "r", 2, 4),), "fast": (Span("d", "r", 3, 4),)})
