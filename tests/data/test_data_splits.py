@@ -80,6 +80,8 @@ def test_train_validation_and_tests_never_share_samples(parts, rate_hz):
 def test_equal_ranges_elsewhere_and_test_sets_that_overlap_share_nothing():
     Split("s", (Span("d", "r1"),), (Span("d", "r2"),), {"test": (Span("e", "r1"),)})
     Split("s", (Span("d", "r", 0, 1),), (Span("d", "r", 1, 2),), {"all": (Span("d", "r", 2, 4),), "fast": (Span("d", "r", 3, 4),)})
+    with pytest.raises(ConfigurationError, match=r"train and test 'wet' share samples of recording 'r' \(r \[0, 10\) s and r \[5, 6\) s\)"):
+        Split("s", (Span("d", "r", 0, 10),), (Span("d", "v"),), {"wet": (Span("d", "r", 5, 6),)})
 
 
 @pytest.mark.parametrize(("start", "stop"), [(2.0, 1.0), (1.0, 1.0), (math.nan, 1.0), (0.0, math.nan)])
