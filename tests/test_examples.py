@@ -17,8 +17,7 @@ from vehest.data.recording import Recording
 from vehest.estimators.base import FitData
 from vehest.estimators.registry import estimator_class, estimator_names
 from vehest.run.artefacts import read_artefact
-from vehest.training.context import FitContext, NoTraining
-from vehest.training.supervised import SupervisedSettings
+from vehest.training.context import NoTraining
 
 pytestmark = pytest.mark.apart
 
@@ -164,12 +163,6 @@ def test_python_trains_what_the_command_trains(examples):
         assert np.array_equal(values, own.weights()[name])
 
 
-def test_sliding_mode_observer_follows_exact_kinematics(examples):
-    train, test = (planar_drive(40.0, 100.0, seed=seed) for seed in (1, 3))
-    model = vehest.train("sliding_mode", [train], [train])
-    assert vehest.score(model, [test])["fvu"] < 0.1 * vehest.score(vehest.train("zero", [], []), [test])["fvu"]
-
-
 def test_sliding_mode_decays_as_its_gain_says(examples):
     """d(v - v̂)/dt = -λ|ω|(v - v̂) in a steady turn, once û slides."""
     model = estimator_class("sliding_mode").from_config({"rate_hz": 2000.0, "layer": 0.02})
@@ -179,21 +172,6 @@ def test_sliding_mode_decays_as_its_gain_says(examples):
     drive = Recording("turn", "car", 2000.0, 0.0, {name: np.full(len(time), value) for name, value in steady.items()}, "simulated")
     error = 1.5 - model.estimate([drive])[0]["vy"]
     assert np.polyfit(time[1000:], np.log(error[1000:]), 1)[0] == pytest.approx(-4.0 * 0.25, rel=0.02)
-
-
-def test_transformers_train_as_members(examples):
-    kind = estimator_class("window_transformer")
-    data = FitData([planar_drive(20.0, seed=1, noise=0.02)], [planar_drive(10.0, seed=2, noise=0.02)])
-    training = SupervisedSettings(max_epochs=3, dtype="float64")
-    members = [kind.from_config({"dropout": 0.1}) for _ in range(3)]
-    for seed, member in enumerate(members):
-        member.seed(seed)
-    kind.fit_members(members, data, training, FitContext())
-    alone = kind.from_config({"dropout": 0.1})
-    alone.seed(2)
-    alone.fit(data, training)
-    for name, values in alone.weights().items():
-        assert np.allclose(values, members[2].weights()[name], rtol=0, atol=1e-8)
 
 
 def test_ekf_finds_the_motion_of_a_car_on_linear_tyres(examples):

@@ -7,7 +7,7 @@ import signal
 import pytest
 from pretended_slurm import install, scancel, states
 from test_two_nodes import FORTY, LONGER, Alone, alone, folder  # noqa: F401
-from two_nodes import Driver, manifests, metrics, under_way, weights, with_recordings
+from two_nodes import Driver, metrics, under_way, weights, with_recordings
 
 pytestmark = [
     pytest.mark.cluster,
@@ -60,18 +60,6 @@ def test_ctrl_c_takes_jobs_back_and_the_next_call_goes_on(folder, alone, queue, 
     again = Driver(folder, output, "sweep", *LONGER, "--launcher", "slurm", **environment)
     assert again.ended() == 0, again.said
     assert metrics(output) == metrics(alone["longer"])
-
-
-def test_a_queue_that_takes_no_jobs_is_an_error_of_one_line(folder, alone, queue, tmp_path):  # noqa: F811
-    output = with_recordings(alone["forty"], tmp_path / "out")
-    environment = install(queue)
-    (queue / "bin" / "sbatch").write_text("#!/bin/sh\necho 'sbatch: error: invalid partition specified: none' >&2\nexit 1\n")
-    driver = Driver(folder, output, "sweep", *FORTY, "--launcher", "slurm", "--slurm", "partition=none", **environment)
-    assert driver.ended() == 4, driver.said
-    assert "error: SLURM takes no jobs" in driver.said
-    assert "invalid partition" in driver.said
-    assert "Traceback" not in driver.said
-    assert not manifests(output)
 
 
 def test_a_queue_that_takes_no_more_jobs_ends_the_command_and_the_next_call_goes_on(folder, alone, queue, tmp_path):  # noqa: F811

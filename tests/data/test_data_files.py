@@ -59,12 +59,6 @@ def test_a_folder_that_is_not_to_be_replaced_stays(tmp_path):
     assert [path.relative_to(tmp_path).as_posix() for path in sorted(tmp_path.rglob("*"))] == ["folder", "folder/old"]
 
 
-def test_a_name_too_long_for_the_disk_is_refused_in_one_line(tmp_path):
-    with pytest.raises(MissingError, match="cannot write") as error, written_aside(tmp_path / ("x" * 300)) as aside:
-        aside.write_text("new")
-    assert "\n" not in str(error.value)
-
-
 def test_what_a_dead_writer_left_is_swept_and_what_a_living_one_writes_stays(tmp_path):
     dead = subprocess.Popen([sys.executable, "-c", ""])
     dead.wait()

@@ -175,17 +175,15 @@ def check(library, estimator, rows, largest):
     np.testing.assert_allclose(said[:, 3], wanted[:, 3], rtol=3e-3 if library.precision == "float" else 1e-7, atol=largest * 1e-2)
 
 
-@each_variant
-def test_double_agrees_with_python_in_float64(variant, tmp_path):
-    case = case_of(*variant)
-    check(built(case.estimator, "double", tmp_path), case.in_float64, case.rows, DOUBLE)
+each_precision = pytest.mark.parametrize(("precision", "largest"), [("double", DOUBLE), ("float", FLOAT)])
 
 
 @each_variant
-def test_float_agrees_with_python_in_the_precision_of_its_training(variant, tmp_path):
-    """Networks: float32. Filters have no float32 in Python but in networks, so that float in C is held against float64."""
+@each_precision
+def test_it_agrees_with_python_in_the_same_precision(variant, precision, largest, tmp_path):
+    """Filters have no float32 in Python but in networks, so that float in C is held against float64."""
     case = case_of(*variant)
-    check(built(case.estimator, "float", tmp_path), case.estimator, case.rows, FLOAT)
+    check(built(case.estimator, precision, tmp_path), case.in_float64 if precision == "double" else case.estimator, case.rows, largest)
 
 
 @pytest.mark.skipif("clang" not in COMPILERS, reason="there is no clang")
@@ -222,12 +220,6 @@ def test_what_cannot_be_exported_is_said_in_one_line():
 
 
 CURVES = {"c1_front": 0.1, "c2_front": 0.7e5, "c1_rear": 0.1, "c2_rear": 1.2e5}
-
-
-def test_every_file_of_a_ksnn_names_the_patent():
-    estimator = case_of("ksnn", {}).estimator
-    source = method_source(estimator, "double")
-    assert all("PCT/IT2023/050058" in text for text in (source.header, source.source, " ".join(estimator.notice)))
 
 
 def test_a_value_that_float_cannot_hold_is_refused():
@@ -278,6 +270,7 @@ def ferrari_rows(data_root, estimator, first=550.0, last=700.0):
 
 
 REAL = {  # as they were fitted to the rest of the recording
+    "luenberger": {},
     "kalman": {"noise": {"yaw_rate": 0.00445, "ay": 0.995, "steer": 7.17e-4}},
     "rational_ekf": {
         "noise": {"yaw_rate": 0.01355, "ay": 0.835, "steer": 0.0243, "tyres": 1e-4},
@@ -293,18 +286,13 @@ REAL = {  # as they were fitted to the rest of the recording
 
 
 @pytest.mark.parametrize("name", list(REAL))
-@pytest.mark.parametrize(("precision", "largest"), [("double", DOUBLE), ("float", FLOAT)])
+@each_precision
 def test_filters_agree_over_the_real_ferraris_test_range(name, precision, largest, data_root, tmp_path):
     estimator = estimator_class(name).from_config(REAL[name])
+    if name == "luenberger":
+        estimator.load_weights({"gain": np.array([5.0]), "threshold": np.array([0.05])})
     rows = ferrari_rows(data_root, estimator)
     check(built(estimator, precision, tmp_path), estimator, rows, largest)
-
-
-@pytest.mark.parametrize(("precision", "largest"), [("double", DOUBLE), ("float", FLOAT)])
-def test_the_observer_agrees_over_the_real_ferraris_test_range(precision, largest, data_root, tmp_path):
-    estimator = estimator_class("luenberger").from_config({})
-    estimator.load_weights({"gain": np.array([5.0]), "threshold": np.array([0.05])})
-    check(built(estimator, precision, tmp_path), estimator, ferrari_rows(data_root, estimator), largest)
 
 
 @cache

@@ -4,10 +4,12 @@ import numba
 import numpy as np
 import pytest
 import torch
+from readable_filters import extended_filter
 from test_filters_kalman import example
-from test_filters_nonlinear import STEP, pendulum_with_radar
+from test_filters_nonlinear import STEP, measured_pendulum, pendulum_with_radar
 
 from vehest.filters.extended_scan import CompiledModel, extended_scan, with_jacobian
+from vehest.filters.gaussian import Gaussian
 from vehest.filters.kalman_scan import kalman_scan
 
 
@@ -69,6 +71,15 @@ def test_on_a_linear_model_it_is_the_kalman_filter_also_where_noise_changes_with
         extended_scan(compiled._replace(observation_noise=np.eye(3)), y, offsets, initial)
     with pytest.raises(np.linalg.LinAlgError, match="not positive definite at sample 0"):
         extended_scan(compiled._replace(observation_noise=-1e3 * np.eye(2)), y, offsets, initial)
+
+
+def test_on_a_nonlinear_model_it_is_the_readable_filter_through_gaps():
+    measurements, inputs, initial = measured_pendulum(60)
+    measurements[0, 5:9, 0] = measurements[0, 12:15] = measurements[0, 20:40] = torch.nan
+    theirs = extended_filter(pendulum_with_radar(), measurements[0], inputs[0], initial)
+    ours = extended_scan(compiled_pendulum(), measurements[0].numpy(), inputs[0].numpy(), Gaussian(*(part.numpy() for part in initial)))
+    for found, expected in zip(ours.filtered, theirs.filtered, strict=True):
+        assert np.abs(found - expected.numpy()).max() < 1e-9
 
 
 @numba.njit

@@ -179,19 +179,6 @@ def test_luenberger_sensitivity_is_the_transform_of_the_observers_impulse_respon
         np.testing.assert_allclose(response, _transform(measured, rate_hz), rtol=0, atol=1e-8)  # 3000 rounded differences add up
 
 
-def test_printed_order_of_the_luenberger_gains_disagrees_with_appendix_b():
-    """With f₁ = 2α|ω|e and f₂ = (α² - 1)ωe, as Eq. 17 prints them, the denominator is another one than that of Eq. 18."""
-    gain, omega, tau = 7.0, 0.3, 0.01
-    of_paper = luenberger_sensitivity(_luenberger(gain), omega).denominator
-    corrected = np.array([[0.0, -omega - (gain**2 - 1.0) * omega], [omega, -2.0 * gain * omega]])
-    printed = np.array([[0.0, -omega - 2.0 * gain * omega], [omega, -(gain**2 - 1.0) * omega]])
-    characteristic = [
-        np.linalg.det(np.eye(2) - tau * matrix) * np.poly(np.linalg.inv(np.eye(2) - tau * matrix)) for matrix in (corrected, printed)
-    ]
-    np.testing.assert_allclose(characteristic[0], of_paper, rtol=1e-9)
-    assert np.abs(characteristic[1] - of_paper).max() > 0.01
-
-
 def test_observer_passes_nothing_where_it_is_reset():
     closed = luenberger_sensitivity(_luenberger(threshold=0.1), 0.05)
     assert np.abs(np.stack(closed.response(FREQUENCY))).max() == 0.0

@@ -49,14 +49,6 @@ def test_what_was_finished_before_a_failure_is_not_made_again(place, slow, monke
     assert [item.name for item in (place.folder / "outputs" / "ingest").iterdir()] == [folder.name], "nothing is left beside it"
 
 
-def test_an_interruption_keeps_what_is_done(place, slow, monkeypatch):
-    with monkeypatch.context() as broken:
-        failing(broken, "three", KeyboardInterrupt())
-        assert place("ingest", "mine")[0] == 130
-    ingested(place)
-    assert slow == ["one", "three", "two"], "each is read once"
-
-
 def test_a_part_of_other_settings_is_not_used(place, slow, monkeypatch):
     with monkeypatch.context() as broken:
         failing(broken, "three", DataError("unwell"))

@@ -1,4 +1,4 @@
-"""Rows of errors with the best lever arm in a study's metrics: where the reference's point is unknown, and nowhere else."""
+"""Rows of errors with the best lever arm in a study's metrics, where the reference's point is unknown."""
 
 import numpy as np
 import pandas as pd
@@ -7,16 +7,11 @@ import pytest
 from vehest.data.store import read_recording
 
 
-def run(place, point):
-    place.change("conf/dataset/mine.yaml", **({} if point is None else {"reference_point": point}))
-    place.change("pipelines/levers.yaml", study="levers", report="drive", split="mine", sweeps=[["estimator=zero"]])
-    outcome = place.told("run", "levers", "tracking=none", "output=out")
-    metrics = next((place.folder / "out" / "evaluate").glob("zero-*")) / "metrics.csv"
-    return pd.read_csv(metrics), outcome
-
-
 def test_where_the_point_is_unknown_errors_are_given_with_the_best_lever_arm_too(place):
-    table, shown = run(place, "unknown")
+    place.change("conf/dataset/mine.yaml", reference_point="unknown")
+    place.change("pipelines/levers.yaml", study="levers", report="drive", split="mine", sweeps=[["estimator=zero"]])
+    shown = place.told("run", "levers", "tracking=none", "output=out")
+    table = pd.read_csv(next((place.folder / "out" / "evaluate").glob("zero-*")) / "metrics.csv")
     tests = table[(table["test_set"] == "test") & (table["subset"] == "all")]
     levers, nominal = (tests[tests["condition"] == name].set_index("metric")["value"] for name in ("best_lever_arm", "nominal"))
     assert set(levers.index) == {"rmse_vy", "rmse_sideslip", "fvu", "lever_arm"}
@@ -26,9 +21,3 @@ def test_where_the_point_is_unknown_errors_are_given_with_the_best_lever_arm_too
     rest = recording["vy_ref"][late] + 0.5 * recording["yaw_rate"][late]
     assert levers["rmse_vy"] == pytest.approx(np.sqrt(np.mean(rest**2)), rel=1e-9)
     assert [row["rmse_sideslip"] for row in shown["leaderboard"]] == [pytest.approx(nominal["rmse_sideslip"])]
-
-
-@pytest.mark.parametrize("point", [None, {"x": 0.0, "y": 0.0}])
-def test_where_the_point_is_known_or_undeclared_there_are_none(place, point):
-    table, _ = run(place, point)
-    assert set(table["condition"]) == {"nominal"}

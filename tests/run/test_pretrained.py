@@ -11,7 +11,6 @@ import pandas as pd
 import yaml
 
 import vehest
-from conftest import planar_drive
 from place import write_csv
 from vehest.cli import _complete_model_or_file
 from vehest.estimators.model_files import load_model, save_model
@@ -102,9 +101,3 @@ def test_the_documentation_tells_what_the_pretrained_bands_are_worth_on_real_car
     assert [told[1], told[2], told[3]] == [f"{100 * inside:.0f}", f"{median:.1f}", f"{100 * valid:.0f}"]
     assert "hardly a sample is valid" in text
     assert bands_on("roboracer", data_root)[2] < 0.01
-
-
-def test_python_interface_loads_the_pretrained_model_by_default():
-    recording = planar_drive(20.0, 100.0, seed=4)
-    estimate = vehest.estimate(vehest.load_model(), recording)
-    assert np.isfinite(estimate["vy"]).sum() == 400 - 30

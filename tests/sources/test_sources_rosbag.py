@@ -247,7 +247,8 @@ def test_absent_or_empty_topics_other_layouts_long_gaps_and_more_than_the_limits
         ("other", (topics, "mcap", other), "the bag's own layout of 'car_msgs/msg/Motor' is not the declared one"),
     ):
         assert said in refused(write_bag(tmp_path / name, *how).parent)
-    gap = topic_options("motor", max_gap=0.009)
+    gap, whole = topic_options("motor", max_gap=0.009), topic_options("servo", type="std_msgs/msg/Int64")
+    assert "topic '/servo' carries 'std_msgs/msg/Float64', not 'std_msgs/msg/Int64'" in refused(bags, topics=whole)
     assert "topic '/motor': field 'motor.rpm' has a gap of 0.01 s" in refused(bags, topics=gap)
     with use_limits(Limits(samples=250)):
         assert "raise it: limits.samples=NUMBER" in refused(bags)

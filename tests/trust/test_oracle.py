@@ -62,22 +62,6 @@ def test_noise_that_grows_with_the_speed_is_found():
     np.testing.assert_allclose(levels_at(levels, np.array([15.0, 30.0, 45.0]))[:, 0], [0.5, 1.0, 1.5], rtol=0.05)
 
 
-def test_delay_of_a_step_in_white_noise_is_that_of_the_closed_form():
-    """Wald: the drift of the log-likelihood ratio is Δ²/(2 σ²) a sample, so that log A takes 2 log A σ²/Δ² samples on average."""
-    generator = np.random.default_rng(1)
-    step, deviation, threshold, drives = 0.3, 1.5, 6.0, 400
-    signature = np.full((6000, 1), step)
-    delays = [
-        likelihood_ratio_delay(signature, deviation * generator.standard_normal((6000, 1)), np.array([[deviation**2]]), threshold)
-        for _ in range(drives)
-    ]
-    assert None not in delays
-    found = np.array(delays, np.float64)
-    expected = 2.0 * threshold * deviation**2 / step**2
-    overshoot = 0.583 * step / deviation / (0.5 * (step / deviation) ** 2)  # Siegmund, Sequential Analysis, 1985, Section 8.5
-    assert abs(found.mean() - expected - overshoot) < 3.0 * found.std() / math.sqrt(drives)
-
-
 def test_a_correlated_channel_shortens_the_delay_as_the_information_says():
     generator = np.random.default_rng(2)
     covariance = np.array([[1.0, 0.9], [0.9, 1.0]])

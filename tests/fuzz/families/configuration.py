@@ -9,13 +9,22 @@ from place import DATASET
 from vehest.run.config_files import packaged
 
 HEAD = "# @package _global_\n"
-ESTIMATORS = (
-    "ksnn", "gru", "lstm", "luenberger", "kalman", "learned_ukf", "rational_ekf", "dugoff_ukf", "cnn_ukf", "factor_graph", "ensemble_ukf",
-)  # fmt: skip
-DATASETS = (
-    "tum", "f1tenth", "f1tenth_bag", "ferrari_250lm", "revs_targa_2014", "mdf", "sim_quickstart", "sim_small", "sim_fleet", "sim_bmw",
-    "sim_two_cars", "sim_heavy", "sim_fleet_real",
-)  # fmt: skip
+ESTIMATORS = ["ksnn", "gru", "luenberger", "kalman", "learned_ukf", "rational_ekf", "dugoff_ukf", "cnn_ukf", "factor_graph", "ensemble_ukf"]
+DATASETS = ["tum", "f1tenth", "f1tenth_bag", "ferrari_250lm", "revs_targa_2014", "mdf", "sim_quickstart", "sim_fleet", "sim_heavy"]
+CARS = {"bmw_320i_low": "sim_quickstart", "f1tenth": "sim_tyre_sets", "heavy_truck": "sim_heavy", "bmw_545i": "sim_bmw"}
+PACKAGED = {  # file of the packaged configuration -> commands that read it, of which the first succeeds
+    "training/supervised": [("train", *KSNN, "--dry-run")],
+    "training/nelder_mead": [("train", *LUENBERGER, "--dry-run")],
+    "common": [("ingest", "mine")],
+    "train": [("train", *KSNN, "--dry-run")],
+    "eval": [("config", "eval"), ("eval", *KSNN, "--dry-run")],
+    "downsample": [("downsample", "mine", "rate_hz=20")],
+    "estimate": [("estimate", "lap.csv", "-o", "out.csv")],
+}
+DRY = ("split=steered", "tracking=none", "--dry-run")
+PACKAGED |= {f"estimator/{own}": [("config", "train", f"estimator={own}"), ("train", f"estimator={own}", *DRY)] for own in ESTIMATORS}
+PACKAGED |= {f"dataset/{own}": [("config", "ingest", f"dataset={own}"), ("ingest", own, "--dry-run", "--download")] for own in DATASETS}
+PACKAGED |= {f"vehicle/{own}": [("simulate", dataset, "--dry-run")] for own, dataset in CARS.items()}
 DERIVED = DATASET | {
     "transforms": [{"name": "acceleration_from_speed", "cutoff_hz": 5.0}, {"name": "sideslip_from_velocity"}],
     "reference_point": {"x": 0.4, "y": -0.1},
@@ -59,12 +68,6 @@ def _write(case, name, tree, head=""):
         case.write(name, head.encode() + spoil_yaml(tree, case.rng, bombs=name.startswith("pipelines/")))
 
 
-def _write_packaged(case, group, name, **changes):
-    """A packaged file, with the line that it must begin with, in ./conf."""
-    text = (packaged("conf") / group / f"{name}.yaml").read_text(encoding="utf-8")
-    _write(case, f"conf/{group}/{name}.yaml", yaml.safe_load(text) | changes, HEAD if text.startswith(HEAD) else "")
-
-
 @generator("drives", weight=8)
 def dataset(case):
     """A table's channels, transforms, points, poses, held channels, rows that are dropped, time that restarts."""
@@ -79,20 +82,6 @@ def dataset(case):
     return Command(case.rng.choice([*commands, *([] if case.honest else [("estimate", "lap.csv", "dataset=mine", "-o", "out.csv")])]))
 
 
-@generator(weight=6)
-def packaged_dataset(case):
-    """The data sets that come with vehest, whose files are not here, and the vehicles of the simulated ones."""
-    name = case.rng.choice(DATASETS)
-    if name.startswith("sim_") and case.rng.random() < 0.3:
-        _write_packaged(case, "vehicle", case.rng.choice(["bmw_320i_low", "f1tenth", "ferrari_250_lm", "heavy_truck", "bmw_545i"]))
-    else:
-        _write_packaged(case, "dataset", name)
-    (case.place / "raw").mkdir()
-    commands = [("config", "ingest", f"dataset={name}"), ("simulate", name, "--dry-run")][: 2 if name.startswith("sim_") else 1]
-    more = [("ingest", name, "--dry-run"), ("ingest", name, "--dry-run", "--download")]
-    return Command(case.rng.choice(commands if case.honest else commands + more))
-
-
 @generator("drives", weight=6)
 def split(case):
     """Recordings, percentages, laps and folds; honest drives of half a minute have no laps."""
@@ -104,48 +93,20 @@ def split(case):
     return Command((case.rng.choice(["eval"] if case.honest else ["train", "eval"]), *KSNN, "--dry-run"))
 
 
-@generator("drives", "steered", weight=8)
-def estimator(case):
-    """conf/estimator and conf/training of every method."""
+@generator("drives", "steered", weight=20)
+def packaged_file(case):
+    """A file that comes with vehest, of any group or at the root, stands spoilt in ./conf; or one that holds any value at all."""
     case.copy("drives")
     case.copy("steered")
-    name = case.rng.choice(ESTIMATORS)
-    if case.rng.random() < 0.3:
-        (name, base), ends = case.rng.choice([("supervised", KSNN), ("nelder_mead", LUENBERGER)]), {"grid": 1, "max_evaluations": 3}
-        _write_packaged(case, "training", name, **({"max_epochs": 1} if name == "supervised" else ends))
-        words = (word for word in base if case.honest or not word.startswith("training."))
-        return Command(("train", *words, *(() if case.honest else ("--dry-run",) * case.rng.randrange(2))))
-    _write_packaged(case, "estimator", name)
-    if case.honest:
-        return Command(("config", "train", f"estimator={name}"))
-    of = "mine" if name in ("ksnn", "gru", "lstm", "luenberger") else "steered"
-    short = {"kalman": (), "ksnn": ("training.max_epochs=1",)}.get(name, ("--dry-run",))
-    return Command(("train", f"estimator={name}", f"split={of}", "tracking=none", *short))
-
-
-@generator("drives", weight=5)
-def root_file(case):
-    """./conf/common.yaml, train.yaml and the like stand before the packaged ones; files of ./conf that hold any value at all."""
-    case.copy("drives")
-    commands = {"common": ("ingest", "mine"), "ingest": ("ingest", "mine"), "estimate": ("estimate", "lap.csv", "-o", "out.csv")}
-    commands |= {
-        "downsample": ("downsample", "mine", "rate_hz=20"),
-        "eval": ("config", "eval") if case.honest else ("eval", *KSNN, "--dry-run"),
-    }
-    commands |= {"train": ("train", *KSNN, "--dry-run"), "tracking": ("train", *KSNN[:-1], "tracking=mine", "--dry-run")}
-    name = case.rng.choice(list(commands))
-    if name == "tracking":
-        _write(
-            case, "conf/tracking/mine.yaml", {"name": "none"} if case.honest else {"name": "mlflow", "uri": None, "experiment": "vehest"}
-        )
-    elif case.honest or case.rng.random() < 0.8:
-        _write(case, f"conf/{name}.yaml", yaml.safe_load((packaged("conf") / f"{name}.yaml").read_text(encoding="utf-8")))
-    else:
+    if not case.honest and case.rng.random() < 0.1:
         group = case.rng.choice(["split", "estimator", "training", "tracking"])
         tree = {"name": "odd", case.rng.choice(["a", *NAMES[:10]]): hostile(case.rng), "defaults": hostile(case.rng)}
         case.write(f"conf/{group}/odd.yaml", yaml_of(tree).encode("utf-8", "replace"))
         return Command(("config", "train", f"{group}=odd"))
-    return Command(commands[name])
+    name = case.rng.choice(list(PACKAGED))
+    text = (packaged("conf") / f"{name}.yaml").read_text(encoding="utf-8")
+    _write(case, f"conf/{name}.yaml", yaml.safe_load(text), HEAD if text.startswith(HEAD) else "")
+    return Command(PACKAGED[name][0] if case.honest else case.rng.choice(PACKAGED[name]))
 
 
 @generator("drives", "study", weight=8)

@@ -66,11 +66,6 @@ def formula(file):
     return {"x": np.full(3, eval(file.read_text().splitlines()[1]))}, {}
 
 
-def shell(_):
-    os.system("true")
-    return {}, {}
-
-
 def write(_):
     os.mkdir("beside")
     return {}, {}
@@ -84,12 +79,10 @@ MISDEEDS = {
     "finishes": ("ok", _finish),
     "refuses_in_one_line": ("ok", lambda: _leave(3, "warning something else\nerror: 'raw/given.csv' holds nothing\n")),
     "evaluates": ("executed", lambda: eval("1 + 1")),
-    "runs_a_shell": ("executed", lambda: os.system("true")),
     "starts_a_program": ("executed", lambda: subprocess.run(["true"], check=True)),
     "imports_a_module": ("executed", _import_a_module),
     "makes_the_canary": ("executed", lambda: Path(CANARY).write_text("")),
     "writes_beside_the_output_root": ("outside", lambda: Path("evil").write_text("")),
-    "writes_above_the_place": ("outside", lambda: Path("../../evil").write_text("")),
     "writes_far_away": ("outside", lambda: Path("/tmp/vehest-fuzz-far-away").write_text("")),
     "changes_an_input": ("outside", lambda: Path("raw/given.csv").write_text("time\n1\n")),
     "sleeps": ("slow", lambda: time.sleep(60)),
@@ -99,12 +92,10 @@ MISDEEDS = {
     "calls_itself_a_defect": ("exit1", lambda: _leave(1, "error: this is a defect of vehest (KeyError: 'a')\n")),
     "says_nothing": ("silent", lambda: _leave(2)),
     "says_too_much": ("several lines", lambda: _leave(2, "Usage: vehest\n\nerror: no such command\n")),
-    "says_it_otherwise": ("several lines", lambda: _leave(2, "no such command\n")),
     "colours_the_terminal": ("escapes", lambda: _leave(3, "error: no column '\x1b[31mvx'\n")),
     "leaves_half_a_file": ("leftovers", _leave_half_a_file),
     "reads_in_a_process": ("ok", lambda: _read_by("answer")),
     "evaluates_while_reading": ("executed", lambda: _read_by("formula")),
-    "runs_a_shell_while_reading": ("executed", lambda: _read_by("shell")),
     "writes_while_reading": ("outside", lambda: _read_by("write")),
     "allocates_while_reading": ("memory", lambda: _read_by("much")),
 }
