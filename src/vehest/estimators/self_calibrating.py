@@ -113,7 +113,7 @@ class SelfCalibrating(Recursive):
     slow_time: float = setting(20.0, "high-pass of the residuals", unit="s", positive=True)
     residual_floor: float = setting(0.03, "residual below which candidates are alike", unit="m/s", positive=True)
     largest_leakage: float = setting(0.05, "of κ that residuals of the candidates are freed of", least=0.0)
-    lateral_power: float = setting(10.0, "power by which the residual of v' counts", least=0.0)
+    lateral_power: float = setting(5.0, "power by which the residual of v' counts", least=0.0)
     longitudinal_power: float = setting(7.0, "power by which the residual of u' counts", least=0.0)
     network_odds: float = setting(1.0, "weight of the network over the bank's at the start", positive=True)
     decision_time: float = setting(5.0, "driving after which residuals count half", unit="s", positive=True)
