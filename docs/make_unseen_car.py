@@ -318,8 +318,8 @@ def report(found: Mapping[Car, Sequence[Errors]], changed: Mapping[Car, Sequence
             "",
             *table(["car", *ABLATIONS], ablated),
             "",
-            "Small cars are seen at their wheelbase: times and speeds scale with its root, the network does not count, and",
-            "steady cornering counts the more the smaller they are.",
+            "Small cars are seen at their wheelbase: times and speeds scale with its root, tyres slip more, the network does not count,",
+            "and steady cornering counts the more the smaller they are.",
             "",
             *[line for car, own in changed.items() for line in changed_table(car, own)],
         ]

@@ -41,8 +41,8 @@ NAMES = (
     "rate_hz wheelbase measured_ax grip grip_deviation grip_excess exponent largest_share compliance compliance_deviation "
     "leakage leakage_deviation rear_deviation imu_deviation rear_share offset_ay offset_ay_time offset_ax offset_ax_time "
     "noise_vy noise_delay noise_vx noise_speed axle_lag axle_error_time axle_constant axle_per_speed axle_per_slip "
-    "axle_per_bend axle_per_slope axle_white axle_white_share gate memory minimum_speed variance_share residual_share angle_floor residual_time "
-    "slow_time residual_floor largest_leakage lateral_power longitudinal_power network_odds steady_odds decision_time "
+    "axle_per_bend axle_per_slope axle_white axle_white_share gate memory minimum_speed variance_share residual_share angle_floor "
+    "residual_time slow_time residual_floor largest_leakage lateral_power longitudinal_power network_odds steady_odds decision_time "
     "network_start dt point rear rear_known yaw_rate_max without_ax"
 )
 Numbers: Any = namedtuple("Numbers", NAMES)  # type: ignore[misc]  # importable by its name, else compiled code is not found again
