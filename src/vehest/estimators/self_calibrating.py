@@ -28,10 +28,7 @@ SCALED = {
     **dict.fromkeys(("minimum_speed", "noise_speed", "axle_constant", "axle_white", "residual_floor"), 0.5),
     **{"noise_vy": 0.25, "noise_vx": 0.25, "noise_delay": 0.75, "compliance": -0.5},
 }
-"""Powers of the wheelbase over the typical one that scale settings.
-
-Times and speeds go with its root, accelerations are alike; tyres of small cars slip more, 0.018 rad s²/m at 1:10 (F1TENTH Gym).
-"""
+"""Powers of the wheelbase over the typical one that scale settings: times and speeds go with its root, tyres of small cars slip more."""
 WINDOW, NETWORK_HZ = 30, 20.0  # samples that the network sees, and their rate
 UNLIKELY = 1e-300  # weight of what does not count
 PARAMETERS = slice(kernel.LEAKAGE, kernel.ERROR)  # among the states
@@ -219,10 +216,9 @@ class SelfCalibrating(Recursive):
     def trace(self, samples: FloatArray, state: kernel.State) -> tuple[FloatArray, FloatArray, kernel.State]:
         """vy and its variance, (T, 2), means and variances of the states over the bank, (T, 16), and the state after the last sample."""
         state = kernel.State(*(part.copy() for part in state))
-        mean, deviation = self.prior
         found, parameters = np.empty((len(samples), 2)), np.empty((len(samples), 2 * kernel.STATES))
         rows = self.with_ax(samples)
-        kernel.scan(self.numbers(), *self.bank_arrays, mean, deviation, self.decay, self.network, state, rows, found, parameters)
+        kernel.scan(self.numbers(), *self.bank_arrays, *self.prior, self.decay, self.network, state, rows, found, parameters)
         return found, parameters, state
 
     def with_ax(self, samples: FloatArray) -> FloatArray:

@@ -169,10 +169,7 @@ def _advance_lags(lags, sample, last, n, g, g_1, g_slow):  # type: ignore[no-unt
 
 @part()
 def _judge(found, own, weights, left, lags, sample, yaw_rate, n, g_1, g_slow, moving):  # type: ignore[no-untyped-def]
-    """Weights of the candidates by how well each v explains v' = (1 - κ) ay - ω u and u' = ax + ω v, both high-passed, with κ its best.
-
-    ``left`` receives the mean squares of what each leaves of v'. They count the more the longer the drive.
-    """
+    """Weights of the candidates by what each v leaves of v' = (1 - κ) ay - ω u, its mean square in ``left``, and of u' = ax + ω v."""
     keep = 1.0 - n.dt / n.memory
     ay = lags[SUM_AY_1] - lags[SLOW_AY]
     if moving:
@@ -292,9 +289,7 @@ def _combine(values, weights, left, parameters, sample, n, found):  # type: igno
     """vy at the reference point and its variance: candidates by their weights, without the network where the car rolls slowly."""
     of_network = weights[NETWORK] * min(max(sample[1] / n.minimum_speed - 1.0, 0.0), 1.0)
     own = (1.0 - of_network - weights[STEADY], of_network, weights[STEADY])
-    mean, spread, unexplained = 0.0, 0.0, 0.0
-    for c in range(CANDIDATES):
-        mean += own[c] * values[c]
+    mean, spread, unexplained = own[0] * values[0] + own[1] * values[1] + own[2] * values[2], 0.0, 0.0
     for c in range(CANDIDATES):
         spread += own[c] * (values[c] - mean) ** 2
         unexplained += own[c] * left[c]
