@@ -45,7 +45,7 @@ PLAIN = {"method": "polyphase", "transforms": []}
 ABLATIONS: dict[str, dict[str, Any]] = {
     "cold": {},
     "car not given": {"wheelbase": TYPICAL_WHEELBASE, "cg_to_rear_axle": None},
-    "bank alone": {"network_odds": 1e-9, "steady_odds": 1e-9, "decision_time": 1e9},
+    "bank alone": {"network_odds": 1e-9, "steady_odds": 1e-9},
     "no filter with the network's axle": {"network_start": 1e-300},
     "no saturation": {"grips": [1000.0], "network_start": 1e-300},
     "no longitudinal equation": {"measured_ax": False},
@@ -318,8 +318,8 @@ def report(found: Mapping[Car, Sequence[Errors]], changed: Mapping[Car, Sequence
             "",
             *table(["car", *ABLATIONS], ablated),
             "",
-            "Small cars are seen at their wheelbase: times and speeds scale with its root, the network does not count, and",
-            "steady cornering counts the more the smaller they are.",
+            "Small cars are seen at their wheelbase: times and speeds scale with its root, tyres slip more, the network does not count,",
+            "and steady cornering counts the more the smaller they are.",
             "",
             *[line for car, own in changed.items() for line in changed_table(car, own)],
         ]

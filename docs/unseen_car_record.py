@@ -111,7 +111,8 @@ def started(model: Estimator, record: CarRecord, names: Sequence[str], widening:
     for name in ("compliance", "grip"):
         if own[name].identified_on:
             deviation = min(widening * own[name].deviation / own[name].value, getattr(new, f"{name}_deviation"))
-            changed |= {name: own[name].value, f"{name}_deviation": deviation}
+            scale = getattr(new.numbers(), name) / getattr(new, name)  # by the wheelbase
+            changed |= {name: own[name].value / scale, f"{name}_deviation": deviation}
     return with_settings(new, changed)
 
 

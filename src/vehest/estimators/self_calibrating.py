@@ -26,9 +26,9 @@ TYPICAL_REAR = 0.48  # of the wheelbase, where the centre of gravity is not give
 SCALED = {
     **dict.fromkeys(("axle_lag", "residual_time", "slow_time", "memory", "decision_time"), 0.5),
     **dict.fromkeys(("minimum_speed", "noise_speed", "axle_constant", "axle_white", "residual_floor"), 0.5),
-    **{"noise_vy": 0.25, "noise_vx": 0.25, "noise_delay": 0.75},
+    **{"noise_vy": 0.25, "noise_vx": 0.25, "noise_delay": 0.75, "compliance": -0.5},
 }
-"""Powers of the wheelbase over the typical one that scale settings: times and speeds go with its root, accelerations are alike."""
+"""Powers of the wheelbase over the typical one that scale settings: times and speeds go with its root, tyres of small cars slip more."""
 WINDOW, NETWORK_HZ = 30, 20.0  # samples that the network sees, and their rate
 UNLIKELY = 1e-300  # weight of what does not count
 PARAMETERS = slice(kernel.LEAKAGE, kernel.ERROR)  # among the states
@@ -38,8 +38,8 @@ NAMES = (
     "rate_hz wheelbase measured_ax grip grip_deviation grip_excess exponent largest_share compliance compliance_deviation "
     "leakage leakage_deviation rear_deviation imu_deviation rear_share offset_ay offset_ay_time offset_ax offset_ax_time "
     "noise_vy noise_delay noise_vx noise_speed axle_lag axle_error_time axle_constant axle_per_speed axle_per_slip "
-    "axle_per_bend axle_per_slope axle_white axle_white_share gate memory minimum_speed variance_share angle_floor residual_time "
-    "slow_time residual_floor largest_leakage lateral_power longitudinal_power network_odds steady_odds decision_time "
+    "axle_per_bend axle_per_slope axle_white axle_white_share gate memory minimum_speed variance_share residual_share angle_floor "
+    "residual_time slow_time residual_floor largest_leakage lateral_power longitudinal_power network_odds steady_odds decision_time "
     "network_start dt point rear rear_known yaw_rate_max without_ax"
 )
 Numbers: Any = namedtuple("Numbers", NAMES)  # type: ignore[misc]  # importable by its name, else compiled code is not found again
@@ -56,7 +56,7 @@ class SelfCalibrating(Recursive):
     v = ω (b - C u²) with the priors of b and C count by how well each explains v' and u' on the drive so far, which needs no reference.
     """
 
-    name, title, version = "self_calibrating", "Self-calibrating filter", "2"
+    name, title, version = "self_calibrating", "Self-calibrating filter", "3"
     covariance_of = ("vy",)
     channels: tuple[str, ...] = ("yaw_rate", "vx", "ay", "ax")  # type: ignore[misc]  # ax may be absent
     notice = Ksnn.notice
@@ -74,8 +74,8 @@ class SelfCalibrating(Recursive):
     grip_excess: float = setting(2.0, "deviation over a second of accelerations beyond a grip limit", unit="m/s²", positive=True)
     exponent: float = setting(0.25, "p of the axle's curve", above=0.0, most=1.0)
     largest_share: float = setting(0.98, "of the grip limit at which the curve is cut off", above=0.0, below=1.0)
-    compliance: float = setting(0.0051, "prior of C", unit="rad s²/m", positive=True)
-    compliance_deviation: float = setting(0.4, "its deviation over C", positive=True)
+    compliance: float = setting(0.0045, "prior of C of a car of 2.7 m", unit="rad s²/m", positive=True)
+    compliance_deviation: float = setting(0.5, "its deviation over C", positive=True)
     leakage: float = setting(0.015, "prior of κ", least=-0.5, most=0.5)
     leakage_deviation: float = setting(0.03, "its deviation", positive=True)
     rear_deviation: float = setting(0.1, "deviation of b over the wheelbase where the centre of gravity is not given", positive=True)
@@ -92,11 +92,11 @@ class SelfCalibrating(Recursive):
     noise_vx: float = setting(0.1, "process noise of u over a second", unit="m/s", positive=True)
     noise_speed: float = setting(0.15, "deviation of the measured speed", unit="m/s", positive=True)
     axle_lag: float = setting(0.3, "low-pass of v, ω and ay in the axle's equation", unit="s", positive=True)
-    axle_error_time: float = setting(1.0, "time constant of e", unit="s", positive=True)
+    axle_error_time: float = setting(2.0, "time constant of e", unit="s", positive=True)
     axle_constant: float = setting(0.007, "size s of the axle's error: constant", unit="m/s", positive=True)
     axle_per_speed: float = setting(0.0009, "size over speed", least=0.0)
     axle_per_slip: float = setting(0.03, "size over speed, prior of C and |φ|", least=0.0)
-    axle_per_bend: float = setting(1.5, "size over speed and prior of C, times φ' - 1", unit="m/s²", least=0.0)
+    axle_per_bend: float = setting(2.0, "size over speed and prior of C, times φ' - 1", unit="m/s²", least=0.0)
     axle_per_slope: float = setting(0.05, "size over speed and prior of C, times φ'", unit="m/s²", least=0.0)
     axle_white: float = setting(0.03, "white error of the axle", unit="m/s", positive=True)
     axle_white_share: float = setting(0.3, "white share of its variance", least=0.0)
@@ -104,17 +104,18 @@ class SelfCalibrating(Recursive):
     memory: float = setting(150.0, "time after which the drive counts e times less in all weights", unit="s", positive=True)
     minimum_speed: float = setting(3.0, "speed below which v = b ω and parameters stay", unit="m/s", positive=True)
     variance_share: float = setting(0.5, "share of the filters' and candidates' variance that is reported", positive=True)
+    residual_share: float = setting(0.1, "share of the mean square that is left of v' that is reported, too", least=0.0)
     angle_floor: float = setting(0.0025, "least deviation of the sideslip angle", unit="rad", least=0.0)
     residual_time: float = setting(1.0, "high-pass of v in the candidates' residuals", unit="s", positive=True)
     slow_time: float = setting(20.0, "high-pass of the residuals", unit="s", positive=True)
     residual_floor: float = setting(0.03, "residual below which candidates are alike", unit="m/s", positive=True)
     largest_leakage: float = setting(0.05, "of κ that residuals of the candidates are freed of", least=0.0)
-    lateral_power: float = setting(10.0, "power by which the residual of v' counts", least=0.0)
+    lateral_power: float = setting(5.0, "power by which the residual of v' counts", least=0.0)
     longitudinal_power: float = setting(7.0, "power by which the residual of u' counts", least=0.0)
-    network_odds: float = setting(5.0, "weight of the network over the bank's at the start", positive=True)
-    decision_time: float = setting(25.0, "driving after which they differ e times less", unit="s", positive=True)
+    network_odds: float = setting(1.0, "weight of the network over the bank's at the start", positive=True)
+    decision_time: float = setting(5.0, "driving after which residuals count half", unit="s", positive=True)
     steady_odds: float = setting(0.4, "weight of steady cornering over the bank's at the start", positive=True)
-    steady_power: float = setting(4.0, "power of the typical wheelbase over the car's by which it grows", least=0.0)
+    steady_power: float = setting(3.0, "power of the typical wheelbase over the car's by which it grows", least=0.0)
     network_start: float = setting(0.7, "weight at the start of the filter with the network's axle", positive=True)
     network_wheelbase: float = setting(1.5, "shortest wheelbase of cars for which the network counts", unit="m", least=0.0)
 
@@ -166,8 +167,9 @@ class SelfCalibrating(Recursive):
     def prior(self) -> tuple[FloatArray, FloatArray]:
         """Mean and standard deviation of the states at the start, (8,) each."""
         rear_deviation = self.rear_deviation if self.cg_to_rear_axle is None else self.imu_deviation
-        mean = np.array([0.0, 0.0, 0.0, 0.0, self.leakage, self.rear, self.compliance, 0.0])
-        own = (self.leakage_deviation, rear_deviation * self.wheelbase, self.compliance_deviation * self.compliance, 1.0)
+        compliance = self.numbers().compliance
+        mean = np.array([0.0, 0.0, 0.0, 0.0, self.leakage, self.rear, compliance, 0.0])
+        own = (self.leakage_deviation, rear_deviation * self.wheelbase, self.compliance_deviation * compliance, 1.0)
         return mean, np.array([0.3, self.noise_speed, self.offset_ay, self.offset_ax, *own])
 
     @property
@@ -183,7 +185,7 @@ class SelfCalibrating(Recursive):
         own["point"] = 0.0 if self.cg_to_rear_axle is not None else self.imu_deviation * self.wheelbase  # m: of the point of v
         own |= {"yaw_rate_max": self._width, "without_ax": float(not self.measured_ax)}
         if self.rate_hz != NETWORK_HZ or self.wheelbase < self.network_wheelbase:
-            own |= {"network_odds": UNLIKELY, "decision_time": 1e9, "network_start": UNLIKELY}  # its weights hold for its own steps alone
+            own |= {"network_odds": UNLIKELY, "network_start": UNLIKELY}  # its weights hold for its own steps alone
         powers = SCALED | {"steady_odds": -self.steady_power}
         own |= {name: own[name] * (self.wheelbase / TYPICAL_WHEELBASE) ** power for name, power in powers.items()}
         if not self.measured_ax:
@@ -197,7 +199,7 @@ class SelfCalibrating(Recursive):
         lags = np.zeros(kernel.LAGS)
         first = self.with_ax(sample[None])[0]
         lags[[kernel.YAW_RATE, kernel.AY, kernel.AX, kernel.SPEED, kernel.AX_OF_SPEED]] = *first[[0, 2, 3]], sample[1], sample[1]
-        lags[kernel.PREDICTED] = first[0] * (self.rear - self.compliance * first[1] ** 2)
+        lags[kernel.PREDICTED] = first[0] * (self.rear - mean[kernel.COMPLIANCE] * first[1] ** 2)
         weights = self.bank_arrays[1]
         means, covariances = np.tile(mean, (len(weights), 1)), np.tile(np.diag(np.square(deviation)), (len(weights), 1, 1))
         candidates = np.zeros((kernel.CANDIDATES, 8)), np.ones(kernel.CANDIDATES)
@@ -214,10 +216,9 @@ class SelfCalibrating(Recursive):
     def trace(self, samples: FloatArray, state: kernel.State) -> tuple[FloatArray, FloatArray, kernel.State]:
         """vy and its variance, (T, 2), means and variances of the states over the bank, (T, 16), and the state after the last sample."""
         state = kernel.State(*(part.copy() for part in state))
-        mean, deviation = self.prior
         found, parameters = np.empty((len(samples), 2)), np.empty((len(samples), 2 * kernel.STATES))
         rows = self.with_ax(samples)
-        kernel.scan(self.numbers(), *self.bank_arrays, mean, deviation, self.decay, self.network, state, rows, found, parameters)
+        kernel.scan(self.numbers(), *self.bank_arrays, *self.prior, self.decay, self.network, state, rows, found, parameters)
         return found, parameters, state
 
     def with_ax(self, samples: FloatArray) -> FloatArray:

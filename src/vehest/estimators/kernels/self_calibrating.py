@@ -168,14 +168,14 @@ def _advance_lags(lags, sample, last, n, g, g_1, g_slow):  # type: ignore[no-unt
 
 
 @part()
-def _judge(found, own, weights, lags, sample, yaw_rate, n, g_1, g_slow, moving):  # type: ignore[no-untyped-def]
-    """Weights of the candidates by how well each v explains v' = (1 - κ) ay - ω u and u' = ax + ω v, both high-passed, with κ its best."""
+def _judge(found, own, weights, left, lags, sample, yaw_rate, n, g_1, g_slow, moving):  # type: ignore[no-untyped-def]
+    """Weights of the candidates by what each v leaves of v' = (1 - κ) ay - ω u, its mean square in ``left``, and of u' = ax + ω v."""
     keep = 1.0 - n.dt / n.memory
     ay = lags[SUM_AY_1] - lags[SLOW_AY]
     if moving:
         lags[TIME] = lags[TIME] * keep + n.dt
         lags[POWER] = lags[POWER] * keep + ay * ay * n.dt
-    odds = (0.0, math.log(n.network_odds) * math.exp(-lags[TIME] / n.decision_time), math.log(n.steady_odds))
+    odds, floor = (0.0, math.log(n.network_odds), math.log(n.steady_odds)), n.residual_floor**2
     for c in range(CANDIDATES):
         one, v = own[c], found[c]
         one[SMOOTH] += g_1 * (v - one[SMOOTH])
@@ -192,10 +192,9 @@ def _judge(found, own, weights, lags, sample, yaw_rate, n, g_1, g_slow, moving):
             one[SQUARE_X] = one[SQUARE_X] * keep + x * x * n.dt
         time = max(lags[TIME], n.dt)
         leakage = min(max(one[CROSS_Y] / (lags[POWER] + 1e-9), -n.largest_leakage), n.largest_leakage)
-        of_y = max(one[SQUARE_Y] - 2.0 * leakage * one[CROSS_Y] + leakage**2 * lags[POWER], 0.0) / time
-        of_x = one[SQUARE_X] / time
-        score = n.lateral_power * math.log(of_y + n.residual_floor**2) + n.longitudinal_power * math.log(of_x + n.residual_floor**2)
-        weights[c] = odds[c] - 0.5 * score
+        left[c] = max(one[SQUARE_Y] - 2.0 * leakage * one[CROSS_Y] + leakage**2 * lags[POWER], 0.0) / time
+        score = n.lateral_power * math.log(left[c] + floor) + n.longitudinal_power * math.log(one[SQUARE_X] / time + floor)
+        weights[c] = odds[c] - 0.5 * score * lags[TIME] / (lags[TIME] + n.decision_time)
     _normalise(weights, weights)
 
 
@@ -217,7 +216,7 @@ def scan(n, grips, start, prior, spread, decay, theta, state, samples, found, pa
     """
     g, g_1, g_slow = -math.expm1(-n.dt / n.axle_lag), -math.expm1(-n.dt / n.residual_time), -math.expm1(-n.dt / n.slow_time)
     means, lags, last, window = state.means, state.lags, state.last, state.window
-    row, scratch, values = np.zeros(STATES), np.zeros(STATES), np.zeros(CANDIDATES)
+    row, scratch, values, left = np.zeros(STATES), np.zeros(STATES), np.zeros(CANDIDATES), np.zeros(CANDIDATES)
     weights = np.empty(len(grips))
     for t in range(len(samples)):
         sample = samples[t].copy()
@@ -256,8 +255,8 @@ def scan(n, grips, start, prior, spread, decay, theta, state, samples, found, pa
         for j in range(len(grips)):
             values[BANK] += weights[j] * (means[j, V] + n.rear_known * (n.rear - means[j, REAR]) * sample[0])
         values[STEADY] = sample[0] * (n.rear - n.compliance * speed * speed)
-        _judge(values, state.candidates, state.weights, lags, sample, yaw_rate, n, g_1, g_slow, moving)
-        _combine(values, state.weights, parameters[t], sample, n, found[t])
+        _judge(values, state.candidates, state.weights, left, lags, sample, yaw_rate, n, g_1, g_slow, moving)
+        _combine(values, state.weights, left, parameters[t], sample, n, found[t])
         for j in range(len(sample)):  # slices would compile for seconds
             for i in range(len(window) - 1):
                 window[i, j] = window[i + 1, j]
@@ -286,14 +285,14 @@ def _mixture(means, covariances, log_weights, weights, found):  # type: ignore[n
 
 
 @part()
-def _combine(values, weights, parameters, sample, n, found):  # type: ignore[no-untyped-def]
+def _combine(values, weights, left, parameters, sample, n, found):  # type: ignore[no-untyped-def]
     """vy at the reference point and its variance: candidates by their weights, without the network where the car rolls slowly."""
     of_network = weights[NETWORK] * min(max(sample[1] / n.minimum_speed - 1.0, 0.0), 1.0)
     own = (1.0 - of_network - weights[STEADY], of_network, weights[STEADY])
-    mean, spread = 0.0, 0.0
-    for c in range(CANDIDATES):
-        mean += own[c] * values[c]
+    mean, spread, unexplained = own[0] * values[0] + own[1] * values[1] + own[2] * values[2], 0.0, 0.0
     for c in range(CANDIDATES):
         spread += own[c] * (values[c] - mean) ** 2
+        unexplained += own[c] * left[c]
     found[0] = mean
-    found[1] = n.variance_share * (parameters[STATES + V] + spread) + (n.angle_floor * sample[1]) ** 2 + (n.point * sample[0]) ** 2
+    found[1] = n.variance_share * (parameters[STATES + V] + spread) + n.residual_share * unexplained
+    found[1] += (n.angle_floor * sample[1]) ** 2 + (n.point * sample[0]) ** 2
