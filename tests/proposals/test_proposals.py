@@ -8,8 +8,10 @@ import pandas as pd
 import pytest
 import yaml
 from dressed_logs import LOGS, write_log
+from mdf_log import write_mdf
 from own_car_proposals import ANSWERS, rows_of
 from planted_logs import RADIUS, drive, usual, write
+from vbo_log import clock
 
 from vehest.alignment.proposals.names import hints
 from vehest.alignment.proposals.proposal import Proposal, Proposals
@@ -323,6 +325,27 @@ def test_a_pause_ends_a_recording_and_no_line_crosses_it(tmp_path):
     table.loc[np.arange(len(table)) % 5 != 0, "Beta"] = np.nan
     made = drafted(tmp_path, table[(table["Time [s]"] < 50.0) | (table["Time [s]"] >= 53.0)])
     assert np.isfinite(open_source(made.dataset).read("lap_run_0")["sideslip_ref"]).all()
+    assert (made.dataset["max_gap"], [round(own) for own in made.durations]) == (1.0, [50, 67])
+    assert any("makes 2 recordings" in note for note in made.notes)
+
+
+@pytest.mark.parametrize("suffix", [".vbo", ".mf4"])
+def test_pauses_of_a_vbox_and_of_a_measurement_end_recordings_too(tmp_path, suffix):
+    table = usual(drive())
+    table, file = table[(table["Time [s]"] < 50.0) | (table["Time [s]"] >= 53.0)], tmp_path / f"lap{suffix}"
+    t, units = table.pop("Time [s]").to_numpy(), dict(zip(table.columns, ("km/h", "deg/s", "g", "g", "deg", "deg"), strict=True))
+    if suffix == ".vbo":
+        rows = pd.DataFrame({"time": clock(36_000.0 + t)}).join(table.round(5).reset_index(drop=True))
+        text = rows.to_csv(None, sep=" ", header=False, index=False)
+        head = ["[channel units]", *units.values(), "", "[column names]", " ".join(rows), "", "[data]", ""]
+        file.write_text("\n".join(head) + text)
+    else:
+        asammdf = pytest.importorskip("asammdf")
+        signals = [asammdf.Signal(table[name].to_numpy(), t, name=name, unit=unit) for name, unit in units.items()]
+        write_mdf(file, {"All": signals})
+    examined = inspect("my_car", [file])
+    made = draft(examined)
+    assert {"vx", "yaw_rate", "ay"} <= made.channels
     assert (made.dataset["max_gap"], [round(own) for own in made.durations]) == (1.0, [50, 67])
     assert any("makes 2 recordings" in note for note in made.notes)
 

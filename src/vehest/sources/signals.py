@@ -7,13 +7,16 @@ file -> a `Signal` each channel -> ticks on which all that are not gappy have va
 
 from __future__ import annotations
 
+import math
 from abc import abstractmethod
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import lru_cache
 from pathlib import Path
-from typing import Any, ClassVar, Literal
+from typing import Annotated, Any, ClassVar, Literal
 
 import numpy as np
+from pydantic import Field
 
 from vehest.constants import FloatArray
 from vehest.data.channels import channel
@@ -23,6 +26,7 @@ from vehest.sources.base import require_files
 from vehest.sources.clocks import SLACK, Clock, at_ticks, common_span, on_nearest, require_samples, ticks_within, uniform_clock
 from vehest.sources.columns import ChannelMap, ChannelNames, Column, Positive, Rate, columns_from_config
 from vehest.sources.file_source import FileSource
+from vehest.sources.table_rows import timed_runs
 from vehest.sources.unit_spellings import require_unit
 
 GAP = 3.0  # median intervals that are interpolated where max_gap is not declared
@@ -51,6 +55,12 @@ class Signal:
         """Rate behind the median interval [Hz]."""
         return float(1.0 / np.median(np.diff(self.stamps)))
 
+    def within(self, begin: float, end: float) -> Signal:
+        """The samples between two times [s], with the one before and the one after; all of them where these are fewer than two."""
+        first, last = int(np.searchsorted(self.stamps, begin, side="right")) - 1, int(np.searchsorted(self.stamps, end)) + 1
+        rows = slice(max(first, 0), last)
+        return replace(self, stamps=self.stamps[rows], values=self.values[rows]) if last - rows.start > 1 else self
+
 
 @dataclass(frozen=True)
 class SignalOptions:
@@ -61,12 +71,14 @@ class SignalOptions:
     files: str = "*"
     rate_hz: Rate | None = None
     raster: str | None = None
+    max_gap: Positive | None = None
+    run: Annotated[int, Field(ge=0)] | None = None
     gappy: ChannelNames | None = None
     file_units: Literal["check", "ignore"] = "check"
 
 
 class SignalSource(FileSource):
-    """Files of signals, a recording each."""
+    """Files of signals, a recording each, or one for each part between pauses of any signal that is not gappy."""
 
     options_type = SignalOptions
     options: SignalOptions
@@ -82,13 +94,33 @@ class SignalSource(FileSource):
             raise ConfigurationError(f"{self.where}: channels must map a channel to its column and unit")
         if (options.rate_hz is None) == (options.raster is None):
             raise ConfigurationError(f"{self.where}: give either rate_hz, or as raster the channel whose clock is taken")
+        self._signals = lru_cache(1)(self._read_signals)
         if options.raster is not None and options.raster not in set(self.channels) - self.gappy:
             raise ConfigurationError(f"{self.where}: raster must name one of its channels that is not gappy, not '{options.raster}'")
 
-    def read_raw_file(self, file: Path) -> Recording:
-        """Read a file of signals wherever it is; raises `MissingError` without it, `DataError` where it or its clocks are unusable."""
+    def _runs(self, file: Path) -> Mapping[int | None, slice]:
+        """Rows of the times at which no signal pauses."""
         require_files([file], self.name)
-        signals, provenance = self._read_signals(file)
+        longest = self.options.max_gap
+        return super()._runs(file) if longest is None else timed_runs(self._covered(file, longest), longest, restarts=False)
+
+    def _covered(self, file: Path, longest: float) -> FloatArray:
+        """Times of all samples [s], (T,), but for those at which one that is not gappy has no sample for longer than ``longest`` [s]."""
+        known = [one.stamps[~np.isnan(one.values)] for name, one in self._signals(file)[0].items() if name not in self.gappy]
+        times = np.unique(np.concatenate(known))
+        for stamps in known:
+            edges = np.concatenate([[-np.inf], stamps, [np.inf]])
+            after, before = np.searchsorted(edges, times), np.searchsorted(edges, times, side="right") - 1
+            times = times[edges[after] - edges[before] <= longest]
+        return times
+
+    def _read(self, file: Path, run: int | None) -> Recording:
+        """Read a file of signals; raises `MissingError` without it, `DataError` where it or its clocks are unusable."""
+        rows = self._runs_of(file)[run]
+        signals, provenance = self._signals(file)
+        if run is not None:
+            times, provenance = self._covered(file, self.options.max_gap or math.inf)[rows], {"run": run, **provenance}
+            signals = {name: one.within(times[0], times[-1]) for name, one in signals.items()}
         if self.options.file_units == "check":
             for name, signal in signals.items():
                 where = self._signal_name(name, signal, file)
@@ -99,7 +131,7 @@ class SignalSource(FileSource):
             values = self._at_ticks(name, signal, stamps, ticks, rate_hz, self._signal_name(name, signal, file))
             channels[name] = self.channels[name].to_si(values, channel(name).unit)
         clock = Clock(float(ticks[0]), rate_hz, len(ticks))
-        return self._recording(file.stem, f"'{file}'", clock, channels, {"file": file.name, **provenance})
+        return self._recording(self._name_of(file, run), f"'{file}'", clock, channels, {"file": file.name, **provenance})
 
     @abstractmethod
     def _read_signals(self, file: Path) -> tuple[dict[str, Signal], dict[str, Any]]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
@@ -25,6 +26,7 @@ from vehest.run.printing import counted
 from vehest.sources.base import open_source
 from vehest.sources.clocks import plain_rate
 from vehest.sources.surveys import RawColumn
+from vehest.sources.surveys.clocks import FEWEST_STEPS, MAX_GAP
 
 POLICIES = {"vbo": ("strict", "interpolate"), **dict.fromkeys(TABLES, ("strict", "interpolate", "uniform"))}
 """Source -> clocks of its data sets, the strictest first; other sources make their own."""
@@ -80,6 +82,9 @@ def draft(examined: Examined) -> Draft:
             ratio = (found.value, found.uncertainty)
         except VehestError as error:
             notes.append(f"the steering ratio could not be estimated: {error}")
+    if pause := dataset.get("max_gap"):
+        of_file = Counter(str(one.provenance.get("file")) for one in recordings)
+        notes += [f"'{file}' pauses for more than {pause:g} s and makes {n} recordings" for file, n in of_file.items() if n > 1]
     dataset |= {"transforms": _transforms(examined, longest, late, speed, vehicle["steering_ratio"] or (ratio[0] if ratio else None))}
     recordings = _recordings(dataset)
     channels = tuple(
@@ -187,15 +192,17 @@ def _longest_gap(examined: Examined, column: str) -> float:
 
 
 def _mdf_options(columns: Mapping[str, RawColumn], proposals: Sequence[Proposal]) -> dict[str, Any]:
-    channels, rates = {}, []
+    channels, rates, paused = {}, [], False
     for one in proposals:
-        rate, gap = _rate_and_gap(columns[one.column])
+        rate, gap = _rate_and_gap(columns[one.column], LONGEST_GAP)
         rates.append(rate)
+        paused |= gap < _rate_and_gap(columns[one.column])[1]
         channels[one.channel] = _entry(one, columns[one.column].place)
-        if 3.0 / rate < gap <= LONGEST_GAP:
+        if 3.0 / rate < gap:
             channels[one.channel]["max_gap"] = math.ceil(100.0 * gap) / 100.0
     gappy = [one.channel for one in proposals if one.gappy]
-    return {"rate_hz": plain_rate(max(rates), RATE_TOLERANCE), "channels": channels, "gappy": gappy}
+    pause = {"max_gap": float(f"{max(MAX_GAP, FEWEST_STEPS / min(rates)):.3g}")} if paused else {}
+    return {"rate_hz": plain_rate(max(rates), RATE_TOLERANCE), **pause, "channels": channels, "gappy": gappy}
 
 
 def _bag_options(columns: Mapping[str, RawColumn], proposals: Sequence[Proposal]) -> dict[str, Any]:
@@ -215,10 +222,11 @@ def _bag_options(columns: Mapping[str, RawColumn], proposals: Sequence[Proposal]
     return {"rate_hz": plain_rate(min(max(rates), BAG_HZ), RATE_TOLERANCE), "topics": topics, "channels": channels}
 
 
-def _rate_and_gap(column: RawColumn) -> tuple[float, float]:
-    """Median rate [Hz] and longest gap [s] of a column with times of its own."""
+def _rate_and_gap(column: RawColumn, shorter: float = math.inf) -> tuple[float, float]:
+    """Median rate [Hz] and longest gap [s], of those up to ``shorter``, of a column with times of its own."""
     assert column.stamps is not None
-    return rate_of(column.stamps), float(np.diff(column.stamps).max())
+    gaps = np.diff(column.stamps)
+    return rate_of(column.stamps), float(gaps[gaps <= shorter].max(initial=0.0))
 
 
 def _transforms(

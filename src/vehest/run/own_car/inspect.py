@@ -25,6 +25,7 @@ from vehest.run.printing import counted
 from vehest.sources.base import source_names
 from vehest.sources.clocks import plain_rate
 from vehest.sources.surveys import Log, RawColumn, survey
+from vehest.sources.surveys.clocks import between_pauses
 from vehest.sources.text_log import bridged
 from vehest.sources.unit_spellings import plain_unit
 
@@ -148,13 +149,11 @@ def _layout(log: Log) -> dict[str, Any]:
 
 
 def _notes(longest: Log, logs: Sequence[Log]) -> Iterator[str]:
-    """Parts of the files that were not read, and long gaps."""
+    """Parts of the files that were not read, and gaps that lines bridge."""
     yield from (f"not read: {text}" for text in longest.skipped[:MOST_LISTED])
     if len(longest.skipped) > MOST_LISTED:
         yield f"not read: {len(longest.skipped) - MOST_LISTED} more"
     for log in logs:
-        if "max_gap" in log.options:
-            yield f"'{log.file.name}' pauses for more than {log.options['max_gap']:g} s and makes {len(log.runs)} recordings"
         stamps_of_runs = [] if log.seconds is None else [log.seconds[run] for run in log.runs]
         for stamps in stamps_of_runs:
             steps = np.diff(stamps)
@@ -208,7 +207,10 @@ def _evidence(log: Log) -> tuple[list[tuple[str, str, FloatArray]], float | None
 def _on_one_clock(log: Log, columns: Sequence[RawColumn]) -> tuple[FloatArray, float | None]:
     timed = [(column.values, column.stamps) for column in columns if column.stamps is not None]
     if timed:
-        begin, end = (float(np.median([stamps[edge] for _, stamps in timed])) for edge in (0, -1))
+        sampled = np.unique(np.concatenate([stamps for _, stamps in timed]))
+        runs, _ = between_pauses(sampled, 1.0 / max(rate_of(stamps) for _, stamps in timed))
+        longest = sampled[max(runs, key=lambda run: sampled[run.stop - 1] - sampled[run.start])]
+        begin, end = (float(np.median(np.clip([stamps[edge] for _, stamps in timed], longest[0], longest[-1]))) for edge in (0, -1))
         rate = plain_rate(min(max(rate_of(stamps) for _, stamps in timed), EVIDENCE_HZ), RATE_TOLERANCE)
         check_limit("samples", (end - begin) * rate, f"'{log.file}' lasts {(end - begin) * rate:.0f} samples at {rate:g} Hz")
         grid = np.arange(begin, end, 1.0 / rate)
