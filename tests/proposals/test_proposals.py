@@ -135,6 +135,7 @@ def test_two_speeds_that_no_name_tells_apart_are_asked_and_that_of_the_bus_is_th
         found = proposed(tmp_path, table)
         assert (found["vx"].column, found["vx_ref"].column) == (own, reference)
         assert asked(tmp_path, table) == ["left_right"]
+    assert asked(tmp_path, of_bus.rename(columns={"Velocity": "Rad_1"})) == ["Rad_1", "left_right"]
     table = usual(d).rename(columns={"Gyro": "Gyro [rad/s]", "Speed": "Speed [km/h]", "LatAcc": "LatAcc [g]"})
     assert "Gyro [rad/s]" in asked(tmp_path, table), "a unit of the header that contradicts the motion"
 
@@ -235,6 +236,7 @@ def test_mirroring_turns_lateral_channels_alone():
 ROLES = {
     "Querbeschleunigung": "ay", "Gierrate": "yaw_rate", "Lenkradwinkel": "handwheel", "Schwimmwinkel": "sideslip_ref", "v_Fzg": "vx",
     "WheelSpeedFL": "wheel_speed_fl", "n_HR": "wheel_speed_rr", "FLwhlspd": "wheel_speed_fl", "angular_velocity.z": "yaw_rate",
+    "Geschwindigkeit": "vx", "imu_ax": "ax", "ins.velocity_body.y": "vy_ref", "VelForward": "vx", "AccelLateral": "ay",
     "linear_acceleration.x": "ax", "Drehzahl": "other", "Lenkradwinkelgeschwindigkeit": "other", "yawAngAcc": "other",
 }  # fmt: skip
 
@@ -410,6 +412,18 @@ def test_a_yaw_rate_that_is_named_as_made_of_yaw_is_the_references(tmp_path):
     found = proposed(tmp_path, usual(drive()).assign(yaw_rate_from_yaw=np.degrees(drive()["r"]) + 0.01))
     assert (found["yaw_rate"].column, found["yaw_rate_ref"].column) == ("Gyro", "yaw_rate_from_yaw")
     assert not found["yaw_rate"].asked
+
+
+def test_an_acceleration_that_is_the_difference_of_the_references_speed_is_not_the_cars(tmp_path):
+    """Though it agrees better with the speed than the inertial unit does, and one row is corrupt."""
+    d = drive(rate_hz=20.0)
+    table = pd.DataFrame({"t": d["t"], "speed": d["vx"], "gyro_z": d["r"], "imu_ay": d["ay"], "mocap_speed": d["vx"] + 0.001})
+    table["acc_vehicle_x"] = np.diff(table["mocap_speed"], prepend=0.0) / 0.05
+    table["imu_ax"] = d["ax"] + 0.4 * np.random.default_rng(5).standard_normal(len(table))
+    table.loc[700, "mocap_speed"] = 4000.0
+    examined = inspect("my_car", [write(tmp_path / "lap.csv", table)])
+    assert examined.proposals.by_channel["ax"].column == "imu_ax"
+    assert "'acc_vehicle_x' is left out: the difference of 'mocap_speed' from row to row, and no measurement" in examined.proposals.notes
 
 
 def test_samples_that_rows_repeat_are_told_of(tmp_path):

@@ -11,7 +11,7 @@ import numpy as np
 from scipy.optimize import linear_sum_assignment
 
 from vehest.alignment.motion import Motion
-from vehest.alignment.proposals.columns import Candidate, correlation, si_factor, slow_of
+from vehest.alignment.proposals.columns import COMPUTED, Candidate, correlation, si_factor, slow_of
 from vehest.alignment.proposals.names import STRONG
 from vehest.alignment.proposals.proposal import Proposal
 from vehest.alignment.proposals.turning import Search
@@ -123,7 +123,7 @@ def _with_rivals(chosen: Offer, rivals: Sequence[Offer]) -> Proposal:
 
 def may_be_ax(column: Candidate) -> bool:
     """Whether unit and name allow a longitudinal acceleration."""
-    return column.measures("ax") and column.hint("ax") >= 0.0
+    return column.measures("ax") and column.hint("ax") >= 0.0 and column.device != COMPUTED
 
 
 def _as_ax(search: Search, column: Candidate) -> Offer | None:

@@ -8,12 +8,15 @@ import os
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from fnmatch import filter as matching
+from itertools import product
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from vehest.alignment.proposals.assign import possible, propose
+from vehest.alignment.proposals.columns import COMPUTED
+from vehest.alignment.proposals.names import hints
 from vehest.alignment.proposals.proposal import Proposals
 from vehest.constants import FloatArray
 from vehest.data.errors import ConfigurationError, DataError
@@ -34,6 +37,7 @@ LONGEST_EVIDENCE = 1200.0  # s
 ENDS = 1.0  # s at either end of a longer drive that do not count
 BRIDGED = 1.0  # s without a sample that straight lines bridge
 MOST_LISTED = 5
+MOST_COMPARED, USUAL, EXACT = 20_000, 0.99, 0.999  # rows, share of them, and correlation of a column with another's difference
 RATE_TOLERANCE = 5e-3  # of rates of unknown clocks
 TABLES = ("tabular", "text_log")
 LAYOUT = {"delimiter": ",", "decimal": ".", "encoding": "utf8", "skip_rows": 0, "rows_below_names": 0, "runs": None}
@@ -89,7 +93,8 @@ def inspect(name: str, files: Sequence[Path], vehicle: Mapping[str, float | None
     others = [log for log in logs if log.file != longest.file]
     columns, rate = _evidence(longest)
     is_vbo = longest.source == "vbo"  # whose headings count clockwise, and longitudes to the west
-    devices = {column.name: column.device for column in longest.columns}
+    differences = _differences(longest)
+    devices = {column.name: COMPUTED if column.name in differences else column.device for column in longest.columns}
     proposals = propose(columns, rate, devices=devices, compass="heading" if is_vbo else "", west_positive=is_vbo)
     if longest.source not in TABLES:  # other sources make no reference of positions
         proposals = replace(proposals, pose=())
@@ -102,8 +107,9 @@ def inspect(name: str, files: Sequence[Path], vehicle: Mapping[str, float | None
     if not proposals.channels:
         names = counted([column.name for column in longest.columns])
         raise DataError(f"'{longest.file}': no column is recognised as a channel, by name or by motion, of {names}")
+    computed = [f"'{own}' is left out: the difference of '{of}' from row to row, and no measurement" for own, of in differences.items()]
     shadowed = [f"'{name}' is a data set that comes with vehest, too; in this folder it is yours"] if name in choices("dataset") else []
-    proposals = replace(proposals, notes=(*proposals.notes, *_notes(longest, logs), *(shadowed if not existing else [])))
+    proposals = replace(proposals, notes=(*proposals.notes, *computed, *_notes(longest, logs), *(shadowed if not existing else [])))
     timed = longest.seconds is not None or any(column.stamps is not None for column in longest.columns)
     place, rate = _place(files, longest.source), None if timed else proposals.rate_hz
     return Examined(name, tuple(files), (longest, *others), proposals, place, rate, dict.fromkeys(VEHICLE) | dict(vehicle or {}))
@@ -202,6 +208,21 @@ def _evidence(log: Log) -> tuple[list[tuple[str, str, FloatArray]], float | None
         samples, rate = samples[:, cut : cut + whole].reshape(len(columns), -1, factor).mean(axis=2), rate / factor
         samples = _busiest(samples, round(LONGEST_EVIDENCE * rate), max(round(60.0 * rate), 1))
     return [(own.name, plain_unit(own.unit) or "", values) for own, values in zip(columns, samples, strict=True)], rate
+
+
+def _differences(log: Log) -> dict[str, str]:
+    """Columns that are the difference of another from row to row -> that one, a velocity by its name; no acceleration was measured."""
+    own = [column for column in log.columns if column.stamps is None]
+    rows = np.array([column.values[log.runs[0]][:MOST_COMPARED] for column in own])
+    velocities = [k for k, column in enumerate(own) if {"vx", "vy_ref"} & set(hints(column.name))]
+    found = {}
+    for k, (first, last) in product(velocities, ((0, -1), (1, None))):
+        steps = np.diff(rows[k])
+        usual = np.abs(steps) <= np.nanquantile(np.abs(steps), USUAL)
+        with np.errstate(all="ignore"):
+            agreeing = np.abs(np.corrcoef(steps[usual], rows[:, first:last][:, usual])[0, 1:])
+        found |= {own[j].name: own[k].name for j in np.flatnonzero(agreeing > EXACT) if j != k}
+    return found
 
 
 def _on_one_clock(log: Log, columns: Sequence[RawColumn]) -> tuple[FloatArray, float | None]:
