@@ -42,7 +42,7 @@ def saloon(data, stem="S90__038"):
         "ay": ("ALat1", "m/s²", 1),
         "ax": ("ALgt1", "m/s²", 1),
         "hand": ("SWA", "rad", 1),
-        "vy": ("Lat._Vel.", "km/h", -1),
+        "vy": ("Lat._Vel.", "km/h", 1),
         "u": ("Lng._Vel.", "km/h", 1),
         **{f"w{c}": (f"{c.upper()}whlspd", "m/s", 1) for c in ("fl", "fr", "rl", "rr")},
     }
@@ -131,7 +131,7 @@ def tabs_utf16_units_below(data, folder):
         lines += ["\t".join(f"{value:.4f}" for value in row) for row in zip(*(own for _, own in names.values()), strict=True)]
         (folder / f"{stem}.txt").write_text("\r\n".join(lines), encoding="utf-16")
         if stem == "S90__038":
-            found = truth(d, handwheel=d["hand"], sideslip_ref=np.arctan2(d["vy"], np.maximum(d["u"], 0.5)))
+            found = truth(d, handwheel=d["hand"], sideslip_ref=np.arctan2(d["vy"], np.maximum(d["u"], 0.5)), file=stem)
     return found
 
 
@@ -411,7 +411,8 @@ def without_labels(data, folder):
         (folder / file.name).write_bytes(file.read_bytes())
     own = pd.read_csv(data / "revs_250lm_unlabelled" / "telemetry_test_0.csv")
     found = {"t": own["time"], "vx": own["vxCG"], "yaw_rate": own["yawRate"] / DEG, "ay": own["ayCG"], "ax": own["axCG"]}
-    return {name: series.to_numpy() for name, series in found.items()} | {"handwheel": own["handwheelAngle"].to_numpy() / DEG}
+    found |= {"handwheel": own["handwheelAngle"] / DEG}
+    return {name: series.to_numpy() for name, series in found.items()} | {"file": "telemetry_test_0"}
 
 
 MADE = (
@@ -448,7 +449,8 @@ LATERAL = ("yaw_rate", "ay", "vy_ref", "sideslip_ref", "steer", "handwheel", "ya
 
 def compared(recordings, true, mirrored):
     """Channels that are not the motion's in the longest recording that it covers; ``mirrored``: which way is left is asked."""
-    own = max(recordings, key=lambda one: one.duration if true["t"][0] - 0.1 <= one.start_time <= true["t"][-1] else 0.0)
+    own = max(recordings, key=lambda one: one.duration if one.provenance["file"].startswith(true.get("file", "")) else 0.0)
+    true = {name: samples for name, samples in true.items() if name != "file"}
     wrong = []
     for name in own.channels:
         if name not in true:

@@ -426,6 +426,39 @@ def test_an_acceleration_that_is_the_difference_of_the_references_speed_is_not_t
     assert "'acc_vehicle_x' is left out: the difference of 'mocap_speed' from row to row, and no measurement" in examined.proposals.notes
 
 
+def test_a_torque_is_no_acceleration_and_a_speed_in_an_unknown_unit_is_told_of(tmp_path):
+    d = drive()
+    table = pd.DataFrame({"t": d["t"], "speed": d["vx"] / 0.3048, "gyro_z": np.degrees(d["r"]), "acc_y": d["ay"], "Tq": 130.0 * d["ax"]})
+    found = inspect("my_car", [write(tmp_path / "lap.csv", table)]).proposals
+    assert (found.by_channel["vx"].unit, "ax" in found.by_channel) == ("km/h", False)
+    assert any("'speed' reads" in note and "% too little" in note for note in found.notes)
+
+
+def test_a_sign_that_the_motion_does_not_decide_is_asked_and_taken_as_most_of_the_others_count(tmp_path):
+    """Hardly any sideslip; the wheels tell which way is left."""
+    d = drive()
+    table = usual(d).rename(columns={"Beta": "Beta [deg]"}) * np.array([1.0, 1.0, -1.0, 1.0, 1.0, 1.0, 1.0])
+    table["Beta [deg]"] = 0.01 * np.random.default_rng(3).standard_normal(len(table))
+    table = table.assign(WheelSpeedFL=d["wheel_fl"], WheelSpeedFR=d["wheel_fr"])
+    examined = inspect("my_car", [write(tmp_path / "lap.csv", table)])
+    found = examined.proposals.by_channel
+    assert [found[name].sign for name in ("yaw_rate", "ay", "handwheel", "sideslip_ref")] == [-1, 1, 1, 1]
+    assert found["sideslip_ref"].asked.startswith("sign")
+
+
+def test_rows_without_a_sample_for_longer_than_lines_bridge_are_left_out_and_end_a_recording(tmp_path):
+    """Satellites that come late and are lost once; every other cell of a slow signal is bridged, in Parquet, too."""
+    table = usual(drive()).astype(float)
+    lost = (table["Time [s]"] < 10.0) | ((table["Time [s]"] > 50.0) & (table["Time [s]"] < 53.0))
+    table.loc[lost, "Beta"] = np.nan
+    table.loc[::2, "LongAcc"] = np.nan
+    table.to_parquet(tmp_path / "lap.parquet")
+    for made in (drafted(tmp_path, table), draft(inspect("other", [tmp_path / "lap.parquet"]))):
+        assert made.dataset["drop_rows"] == {"lap": ["1-500", "2502-2650"]}
+        assert ([round(own) for own in made.durations], made.dataset["gappy"], made.dataset["max_gap"]) == ([40, 67], [], 1.0)
+        assert any("1-500" in note for note in made.notes)
+
+
 def test_samples_that_rows_repeat_are_told_of(tmp_path):
     table = usual(drive())
     assert not drafted(tmp_path, table).remarks

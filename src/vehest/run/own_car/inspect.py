@@ -214,11 +214,11 @@ def _differences(log: Log) -> dict[str, str]:
     """Columns that are the difference of another from row to row -> that one, a velocity by its name; no acceleration was measured."""
     own = [column for column in log.columns if column.stamps is None]
     rows = np.array([column.values[log.runs[0]][:MOST_COMPARED] for column in own])
-    velocities = [k for k, column in enumerate(own) if {"vx", "vy_ref"} & set(hints(column.name))]
+    velocities = [k for k, column in enumerate(own) if {"vx", "vy_ref"} & set(hints(column.name)) and np.isfinite(rows[k]).all()]
     found = {}
     for k, (first, last) in product(velocities, ((0, -1), (1, None))):
         steps = np.diff(rows[k])
-        usual = np.abs(steps) <= np.nanquantile(np.abs(steps), USUAL)
+        usual = np.abs(steps) <= np.quantile(np.abs(steps), USUAL)
         with np.errstate(all="ignore"):
             agreeing = np.abs(np.corrcoef(steps[usual], rows[:, first:last][:, usual])[0, 1:])
         found |= {own[j].name: own[k].name for j in np.flatnonzero(agreeing > EXACT) if j != k}
