@@ -331,7 +331,7 @@ def test_report_warns_of_tests_without_sideslip_and_of_trainings_cut_short(artef
 def test_links_of_the_markdown_report_resolve_its_tables_have_even_rows_and_its_figures_name_no_date(written):
     text = (written / "report.md").read_text(encoding="utf-8")
     targets = re.findall(r"\]\(([^)]+)\)", text)
-    assert len(targets) == 5 + 2 * 6
+    assert len(targets) == 5 + 2 * 5
     assert all((written / target).stat().st_size > 0 for target in targets)
     assert {path.relative_to(written).as_posix() for path in written.rglob("*.*")} == {*targets, "report.md", "report.html"}
     lines = text.splitlines()
@@ -372,7 +372,7 @@ def test_two_processes_draw_the_same_bytes_whatever_the_order_of_their_sets(arte
     made, report = tmp_path / artefacts.references["toy", "lap"].parent.name, tmp_path / written.name
     subprocess.run([sys.executable, "-c", DRAWN_ELSEWHERE, str(made), str(report), *places], env=environment, check=True)
     files = [path.relative_to(written) for path in written.rglob("*.*")]
-    assert (len(files), sum(file.suffix in (".png", ".svg") for file in files)) == (2 + 5 + 2 * 6, 2 * 6)
+    assert (len(files), sum(file.suffix in (".png", ".svg") for file in files)) == (2 + 5 + 2 * 5, 2 * 5)
     for file in files:
         assert (report / file).read_bytes() == (written / file).read_bytes(), file
 
@@ -464,7 +464,7 @@ def test_page_shows_the_numbers_of_the_leaderboard_and_the_static_figures(artefa
     assert all(fixed(best["rmse_sideslip"], 3) in row for row in rows[:2])
     assert any(row[0].splitlines()[0] == "GRU | 5 <states>" for row in page.rows)
     images = [base64.b64decode(target.split(",", 1)[1]) for tag, target in page.loads if tag == "img"]
-    assert len(images) == 6
+    assert len(images) == 5
     assert all(b"<svg" in image and b"prefers-color-scheme" in image for image in images)
 
 

@@ -7,10 +7,9 @@ file -> a `Signal` each channel -> ticks on which all that are not gappy have va
 
 from __future__ import annotations
 
-import math
 from abc import abstractmethod
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal
@@ -54,12 +53,6 @@ class Signal:
     def rate_hz(self) -> float:
         """Rate behind the median interval [Hz]."""
         return float(1.0 / np.median(np.diff(self.stamps)))
-
-    def within(self, begin: float, end: float) -> Signal:
-        """The samples between two times [s], with the one before and the one after; all of them where these are fewer than two."""
-        first, last = int(np.searchsorted(self.stamps, begin, side="right")) - 1, int(np.searchsorted(self.stamps, end)) + 1
-        rows = slice(max(first, 0), last)
-        return replace(self, stamps=self.stamps[rows], values=self.values[rows]) if last - rows.start > 1 else self
 
 
 @dataclass(frozen=True)
@@ -116,28 +109,24 @@ class SignalSource(FileSource):
 
     def _read(self, file: Path, run: int | None) -> Recording:
         """Read a file of signals; raises `MissingError` without it, `DataError` where it or its clocks are unusable."""
-        rows = self._runs_of(file)[run]
-        signals, provenance = self._signals(file)
-        if run is not None:
-            times, provenance = self._covered(file, self.options.max_gap or math.inf)[rows], {"run": run, **provenance}
-            signals = {name: one.within(times[0], times[-1]) for name, one in signals.items()}
+        (signals, provenance), number = self._signals(file), {} if run is None else {"run": run}
         if self.options.file_units == "check":
             for name, signal in signals.items():
                 where = self._signal_name(name, signal, file)
                 require_unit(signal.unit, self.channels[name], channel(name).unit, where, "set file_units: ignore")
-        stamps, ticks, rate_hz = self._clock(signals, file)
+        stamps, ticks, rate_hz = self._clock(signals, file, run)
         channels = {}
         for name, signal in signals.items():
             values = self._at_ticks(name, signal, stamps, ticks, rate_hz, self._signal_name(name, signal, file))
             channels[name] = self.channels[name].to_si(values, channel(name).unit)
         clock = Clock(float(ticks[0]), rate_hz, len(ticks))
-        return self._recording(self._name_of(file, run), f"'{file}'", clock, channels, {"file": file.name, **provenance})
+        return self._recording(self._name_of(file, run), f"'{file}'", clock, channels, {"file": file.name, **number, **provenance})
 
     @abstractmethod
     def _read_signals(self, file: Path) -> tuple[dict[str, Signal], dict[str, Any]]:
         """The signal of each channel, with stamps that pass `require_clock`, and an entry for the provenance."""
 
-    def _clock(self, signals: Mapping[str, Signal], file: Path) -> tuple[FloatArray, FloatArray, float]:
+    def _clock(self, signals: Mapping[str, Signal], file: Path, run: int | None) -> tuple[FloatArray, FloatArray, float]:
         """Stamps [s] at which every signal that is not gappy has values, the even clock behind them [s], and its rate [Hz]."""
         spanning = {name: signal for name, signal in signals.items() if name not in self.gappy} or signals
         spans = {}
@@ -147,6 +136,8 @@ class SignalSource(FileSource):
                 raise DataError(f"{self._signal_name(name, signal, file)} holds no valid sample; leave the channel out")
             spans[f"channel '{name}' ({signal.origin})"] = float(valid[0]), float(valid[-1])
         begin, end = common_span(spans, f"'{file}'")
+        if run is not None and self.options.max_gap is not None:
+            begin, *_, end = self._covered(file, self.options.max_gap)[self._runs_of(file)[run]].tolist()
         if self.options.rate_hz is not None:
             ticks = ticks_within(begin, end, self.options.rate_hz, f"'{file}'")
             return ticks, ticks, self.options.rate_hz

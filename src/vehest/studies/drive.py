@@ -276,7 +276,6 @@ def _test_set(artefacts: PartArtefacts, board: pd.DataFrame, test_set: str, line
     by_regime = regime_table(artefacts, test_set, chosen, f"regimes_{file}")
     if by_regime is not None:
         blocks.append(by_regime)
-    blocks.append(_spread(artefacts, finite, test_set, f"spread_{file}", lines))
     shown = _shown(finite, named)
     drive = _Drive.of(artefacts, shown, test_set, lines)
     if len(shown) < len(finite):
@@ -354,20 +353,6 @@ def _links(artefacts: PartArtefacts, board: pd.DataFrame) -> list[ModelLink]:
     folders = {(model.estimator, model.variant, model.seed): model.model_folder for model in artefacts.models}
     rows = [folders[row["estimator"], row["variant"], row["seed"]] for row in board.to_dict("records")]
     return [ModelLink(f"../../{own.parent.name}/{own.name}/", f"vehest estimate {own.name} lap.csv -o out.parquet") for own in rows]
-
-
-def _spread(artefacts: PartArtefacts, board: pd.DataFrame, test_set: str, name: str, lines: dict[Name, Line]) -> Figure:
-    runs, groups = runs_of(artefacts), by_name(artefacts.models)
-    rows = []
-    for row in board.to_dict("records"):
-        own = (row["estimator"], row["variant"])
-        values = values_of(runs, own, [model.seed for model in groups[own]], test_set, "rmse_sideslip")
-        rows.append(figures.Spread(row["title"], lines[own], values, row["rmse_sideslip_chosen"]))
-    return Figure(
-        name,
-        f"Sideslip error of every seed on test set `{test_set}`. Diamonds: the seed chosen on validation.",
-        figures.spread_figure(rows, "RMSE(β) [deg]"),
-    )
 
 
 def _shown(board: pd.DataFrame, named: Name | None = None) -> pd.DataFrame:
