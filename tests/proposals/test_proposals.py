@@ -459,6 +459,14 @@ def test_rows_without_a_sample_for_longer_than_lines_bridge_are_left_out_and_end
         assert any("1-500" in note for note in made.notes)
 
 
+def test_course_and_heading_without_another_reference_are_told_of(tmp_path):
+    d = drive()
+    yaw = np.cumsum(d["r"]) / 50.0
+    table = usual(d).drop(columns="Beta").assign(Heading=-np.degrees(yaw) % 360.0, Course=-np.degrees(yaw + d["sideslip"]) % 360.0)
+    notes = inspect("my_car", [write(tmp_path / "lap.csv", table)]).proposals.notes
+    assert "'Heading' less 'Course' may be the sideslip angle that is missing as a reference; save it as a column" in notes
+
+
 def test_samples_that_rows_repeat_are_told_of(tmp_path):
     table = usual(drive())
     assert not drafted(tmp_path, table).remarks

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
+from itertools import combinations
 
 import numpy as np
 
@@ -39,6 +40,7 @@ DECIDING = 0.5  # correlation by which wheels or a compass decide which way is l
 RATES = (5.0, 10.0, 20.0, 25.0, 40.0, 50.0, 60.0, 100.0, 125.0, 200.0, 250.0, 400.0, 500.0, 1000.0, 2000.0)
 NOMINAL_RATE = 50.0  # Hz, where there are no times
 FEWEST = 50  # samples of a course
+SIDESLIP = (0.01, 1.0)  # rad, nearly the whole range of a sideslip angle
 MOST_BEYOND = 0.002  # share of samples that may lie beyond what a vehicle can do, as spikes
 USUAL = {  # 99th percentile of the motion's channels, SI
     "vx": (1.0, 90.0),
@@ -89,6 +91,7 @@ def propose(
         named = [f"'{one.name}'" for one in named_pose(found)]
         if len(named) == 3 and not proposals.pose:
             notes.append(f"no reference is made of {', '.join(named)}: their derivatives are not the speed and the yaw rate")
+        notes += [] if known is None or proposals.pose else _sideslip_to_save(found, known)
     if stands:
         notes.append("the car stands all the time, by its speed; names alone suggest channels")
     if search is not None:
@@ -301,6 +304,16 @@ def _left_and_right(
         return proposals if turning_of(yaw, unit, known) >= 0.0 else proposals.mirrored()
     counts = [one.sign for one in proposals.channels if one.channel in LATERAL]
     return proposals.mirrored() if sum(counts) < 0 else proposals
+
+
+def _sideslip_to_save(columns: Sequence[Candidate], known: Motion) -> Iterator[str]:
+    """Notes of two angles, such as course and heading, whose difference may be a sideslip angle."""
+    for one, other in combinations((column for column in columns if "heading" in column.hints), 2):
+        apart = one.values - other.values
+        apart = np.angle(np.exp(1j * (np.radians(apart) if np.ptp(one.values) > 2.1 * math.pi else apart)))[known.moving]
+        low, high = np.quantile(apart, [0.02, 0.98]) if len(apart) else (0.0, 0.0)
+        if SIDESLIP[0] < high - low < SIDESLIP[1]:
+            yield f"'{one.name}' less '{other.name}' may be the sideslip angle that is missing as a reference; save it as a column"
 
 
 def _as_most_count(proposals: Proposals) -> Proposals:

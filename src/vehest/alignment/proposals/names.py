@@ -23,7 +23,7 @@ _STRONG = {  # over the name without blanks
     "vy_ref": r"^vy|vyc?g?$|vlat|latvel|velocitylat|lateralvel|latera?lspeed|vellat|vquer|quergeschw|velocityy|"
     r"linear_?y$|latspeed|velocityvehicley|speedlat|vely",
     "sideslip_ref": r"sideslip|slipang|slipcog|slipcg|^beta|beta$|schwimm|driftang|floatang|^slip$",
-    "heading": r"heading|truehead|course|yawang|gierwinkel|^psi$|azimuth|^yaw$|kurswinkel|headimu",
+    "heading": r"heading|truehead|course|angletrack|yawang|gierwinkel|^psi$|azimuth|^yaw$|kurswinkel|headimu",
     "latitude": r"latitude|gpslat$|^lat$|breitengrad",
     "longitude": r"longitude|gpslong?$|^long?$|^lng$|laengengrad",
     "position_x": r"^x$|posx$|positionx$|posex$|xpos$|viconx$|^xm$",

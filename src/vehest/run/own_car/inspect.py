@@ -120,18 +120,13 @@ def paths_of(name: str) -> tuple[Path, Path, Path]:
     return Path("conf") / "dataset" / f"{name}.yaml", Path("conf") / "split" / f"{name}.yaml", Path("pipelines") / f"{name}.yaml"
 
 
-def is_parquet(log: Log) -> bool:
-    """Whether a table is no text."""
-    return log.file.suffix.lower() in (".parquet", ".pq")
-
-
 def rate_of(stamps: FloatArray) -> float:
     """Median rate of time stamps [Hz]."""
     return 1.0 / max(float(np.median(np.diff(stamps))), 1e-6)
 
 
 def _longest(logs: Sequence[Log]) -> Log:
-    formats = {"text" if log.source in TABLES and not is_parquet(log) else log.source for log in logs}
+    formats = {"text" if log.source in TABLES and log.file.suffix.lower() not in (".parquet", ".pq") else log.source for log in logs}
     if len(formats) > 1:
         raise ConfigurationError(f"the files are of several formats ({', '.join(sorted(formats))}); make a data set of each")
     longest = max(logs, key=lambda log: log.runs[0].stop - log.runs[0].start if log.runs else max(len(one.values) for one in log.columns))
@@ -215,7 +210,7 @@ def _differences(log: Log) -> dict[str, str]:
     own = [column for column in log.columns if column.stamps is None]
     rows = np.array([column.values[log.runs[0]][:MOST_COMPARED] for column in own])
     velocities = [k for k, column in enumerate(own) if {"vx", "vy_ref"} & set(hints(column.name)) and np.isfinite(rows[k]).all()]
-    found = {}
+    found: dict[str, str] = {}
     for k, (first, last) in product(velocities, ((0, -1), (1, None))):
         steps = np.diff(rows[k])
         usual = np.abs(steps) <= np.quantile(np.abs(steps), USUAL)
