@@ -99,7 +99,9 @@ class SignalSource(FileSource):
 
     def _covered(self, file: Path, longest: float) -> FloatArray:
         """Times of all samples [s], (T,), but for those at which one that is not gappy has no sample for longer than ``longest`` [s]."""
-        known = [one.stamps[~np.isnan(one.values)] for name, one in self._signals(file)[0].items() if name not in self.gappy]
+        signals = self._signals(file)[0]
+        spanning = {name: one for name, one in signals.items() if name not in self.gappy} or signals
+        known = [one.stamps[~np.isnan(one.values)] for one in spanning.values()]
         times = np.unique(np.concatenate(known))
         for stamps in known:
             edges = np.concatenate([[-np.inf], stamps, [np.inf]])

@@ -37,7 +37,7 @@ LONGEST_EVIDENCE = 1200.0  # s
 ENDS = 1.0  # s at either end of a longer drive that do not count
 BRIDGED = 1.0  # s without a sample that straight lines bridge
 MOST_LISTED = 5
-MOST_COMPARED, USUAL, EXACT = 20_000, 0.99, 0.999  # rows, share of them, and correlation of a column with another's difference
+MOST_COMPARED, USUAL, EXACT = 4_000, 0.99, 0.999  # rows, share of them, and correlation of a column with another's difference
 RATE_TOLERANCE = 5e-3  # of rates of unknown clocks
 TABLES = ("tabular", "text_log")
 LAYOUT = {"delimiter": ",", "decimal": ".", "encoding": "utf8", "skip_rows": 0, "rows_below_names": 0, "runs": None}
@@ -208,14 +208,17 @@ def _evidence(log: Log) -> tuple[list[tuple[str, str, FloatArray]], float | None
 def _differences(log: Log) -> dict[str, str]:
     """Columns that are the difference of another from row to row -> that one, a velocity by its name; no acceleration was measured."""
     own = [column for column in log.columns if column.stamps is None]
-    rows = np.array([column.values[log.runs[0]][:MOST_COMPARED] for column in own])
+    middle = log.runs[0].start + max((log.runs[0].stop - log.runs[0].start - MOST_COMPARED) // 2, 0) if own else 0
+    rows = np.array([column.values[middle : min(middle + MOST_COMPARED, log.runs[0].stop)] for column in own])
     velocities = [k for k, column in enumerate(own) if {"vx", "vy_ref"} & set(hints(column.name)) and np.isfinite(rows[k]).all()]
     found: dict[str, str] = {}
     for k, (first, last) in product(velocities, ((0, -1), (1, None))):
         steps = np.diff(rows[k])
         usual = np.abs(steps) <= np.quantile(np.abs(steps), USUAL)
+        steps, others = steps[usual] - steps[usual].mean(), rows[:, first:last][:, usual]
+        others -= others.mean(axis=1, keepdims=True)
         with np.errstate(all="ignore"):
-            agreeing = np.abs(np.corrcoef(steps[usual], rows[:, first:last][:, usual])[0, 1:])
+            agreeing = np.abs(others @ steps) / np.sqrt((others * others).sum(axis=1) * (steps @ steps))
         found |= {own[j].name: own[k].name for j in np.flatnonzero(agreeing > EXACT) if j != k}
     return found
 
