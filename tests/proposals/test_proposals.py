@@ -8,8 +8,10 @@ import pandas as pd
 import pytest
 import yaml
 from dressed_logs import LOGS, write_log
+from mdf_log import write_mdf
 from own_car_proposals import ANSWERS, rows_of
 from planted_logs import RADIUS, drive, usual, write
+from vbo_log import clock
 
 from vehest.alignment.proposals.names import hints
 from vehest.alignment.proposals.proposal import Proposal, Proposals
@@ -133,6 +135,7 @@ def test_two_speeds_that_no_name_tells_apart_are_asked_and_that_of_the_bus_is_th
         found = proposed(tmp_path, table)
         assert (found["vx"].column, found["vx_ref"].column) == (own, reference)
         assert asked(tmp_path, table) == ["left_right"]
+    assert asked(tmp_path, of_bus.rename(columns={"Velocity": "Rad_1"})) == ["Rad_1", "left_right"]
     table = usual(d).rename(columns={"Gyro": "Gyro [rad/s]", "Speed": "Speed [km/h]", "LatAcc": "LatAcc [g]"})
     assert "Gyro [rad/s]" in asked(tmp_path, table), "a unit of the header that contradicts the motion"
 
@@ -233,6 +236,7 @@ def test_mirroring_turns_lateral_channels_alone():
 ROLES = {
     "Querbeschleunigung": "ay", "Gierrate": "yaw_rate", "Lenkradwinkel": "handwheel", "Schwimmwinkel": "sideslip_ref", "v_Fzg": "vx",
     "WheelSpeedFL": "wheel_speed_fl", "n_HR": "wheel_speed_rr", "FLwhlspd": "wheel_speed_fl", "angular_velocity.z": "yaw_rate",
+    "Geschwindigkeit": "vx", "imu_ax": "ax", "ins.velocity_body.y": "vy_ref", "VelForward": "vx", "AccelLateral": "ay",
     "linear_acceleration.x": "ax", "Drehzahl": "other", "Lenkradwinkelgeschwindigkeit": "other", "yawAngAcc": "other",
 }  # fmt: skip
 
@@ -327,6 +331,27 @@ def test_a_pause_ends_a_recording_and_no_line_crosses_it(tmp_path):
     assert any("makes 2 recordings" in note for note in made.notes)
 
 
+@pytest.mark.parametrize("suffix", [".vbo", ".mf4"])
+def test_pauses_of_a_vbox_and_of_a_measurement_end_recordings_too(tmp_path, suffix):
+    table = usual(drive())
+    table, file = table[(table["Time [s]"] < 50.0) | (table["Time [s]"] >= 53.0)], tmp_path / f"lap{suffix}"
+    t, units = table.pop("Time [s]").to_numpy(), dict(zip(table.columns, ("km/h", "deg/s", "g", "g", "deg", "deg"), strict=True))
+    if suffix == ".vbo":
+        rows = pd.DataFrame({"time": clock(36_000.0 + t)}).join(table.round(5).reset_index(drop=True))
+        text = rows.to_csv(None, sep=" ", header=False, index=False)
+        head = ["[channel units]", *units.values(), "", "[column names]", " ".join(rows), "", "[data]", ""]
+        file.write_text("\n".join(head) + text)
+    else:
+        asammdf = pytest.importorskip("asammdf")
+        signals = [asammdf.Signal(table[name].to_numpy(), t, name=name, unit=unit) for name, unit in units.items()]
+        write_mdf(file, {"All": signals})
+    examined = inspect("my_car", [file])
+    made = draft(examined)
+    assert {"vx", "yaw_rate", "ay"} <= made.channels
+    assert (made.dataset["max_gap"], [round(own) for own in made.durations]) == (1.0, [50, 67])
+    assert any("makes 2 recordings" in note for note in made.notes)
+
+
 def standing():
     random, names = np.random.default_rng(0), ("Speed [km/h]", "Gyro [deg/s]", "LatAcc [m/s^2]")
     return pd.DataFrame({"Time [s]": np.arange(3000) / 50.0} | {name: 0.02 * random.standard_normal(3000) for name in names})
@@ -387,6 +412,59 @@ def test_a_yaw_rate_that_is_named_as_made_of_yaw_is_the_references(tmp_path):
     found = proposed(tmp_path, usual(drive()).assign(yaw_rate_from_yaw=np.degrees(drive()["r"]) + 0.01))
     assert (found["yaw_rate"].column, found["yaw_rate_ref"].column) == ("Gyro", "yaw_rate_from_yaw")
     assert not found["yaw_rate"].asked
+
+
+def test_an_acceleration_that_is_the_difference_of_the_references_speed_is_not_the_cars(tmp_path):
+    """Though it agrees better with the speed than the inertial unit does, and one row is corrupt."""
+    d = drive(rate_hz=20.0)
+    table = pd.DataFrame({"t": d["t"], "speed": d["vx"], "gyro_z": d["r"], "imu_ay": d["ay"], "mocap_speed": d["vx"] + 0.001})
+    table["acc_vehicle_x"] = np.diff(table["mocap_speed"], prepend=0.0) / 0.05
+    table["imu_ax"] = d["ax"] + 0.4 * np.random.default_rng(5).standard_normal(len(table))
+    table.loc[700, "mocap_speed"] = 4000.0
+    examined = inspect("my_car", [write(tmp_path / "lap.csv", table)])
+    assert examined.proposals.by_channel["ax"].column == "imu_ax"
+    assert "'acc_vehicle_x' is left out: the difference of 'mocap_speed' from row to row, and no measurement" in examined.proposals.notes
+
+
+def test_a_torque_is_no_acceleration_and_a_speed_in_an_unknown_unit_is_told_of(tmp_path):
+    d = drive()
+    table = pd.DataFrame({"t": d["t"], "speed": d["vx"] / 0.3048, "gyro_z": np.degrees(d["r"]), "acc_y": d["ay"], "Tq": 130.0 * d["ax"]})
+    found = inspect("my_car", [write(tmp_path / "lap.csv", table)]).proposals
+    assert (found.by_channel["vx"].unit, "ax" in found.by_channel) == ("km/h", False)
+    assert any("'speed' reads" in note and "% too little" in note for note in found.notes)
+
+
+def test_a_sign_that_the_motion_does_not_decide_is_asked_and_taken_as_most_of_the_others_count(tmp_path):
+    """Hardly any sideslip; the wheels tell which way is left."""
+    d = drive()
+    table = usual(d).rename(columns={"Beta": "Beta [deg]"}) * np.array([1.0, 1.0, -1.0, 1.0, 1.0, 1.0, 1.0])
+    table["Beta [deg]"] = 0.01 * np.random.default_rng(3).standard_normal(len(table))
+    table = table.assign(WheelSpeedFL=d["wheel_fl"], WheelSpeedFR=d["wheel_fr"])
+    examined = inspect("my_car", [write(tmp_path / "lap.csv", table)])
+    found = examined.proposals.by_channel
+    assert [found[name].sign for name in ("yaw_rate", "ay", "handwheel", "sideslip_ref")] == [-1, 1, 1, 1]
+    assert found["sideslip_ref"].asked.startswith("sign")
+
+
+def test_rows_without_a_sample_for_longer_than_lines_bridge_are_left_out_and_end_a_recording(tmp_path):
+    """Satellites that come late and are lost once; every other cell of a slow signal is bridged, in Parquet, too."""
+    table = usual(drive()).astype(float)
+    lost = (table["Time [s]"] < 10.0) | ((table["Time [s]"] > 50.0) & (table["Time [s]"] < 53.0))
+    table.loc[lost, "Beta"] = np.nan
+    table.loc[::2, "LongAcc"] = np.nan
+    table.to_parquet(tmp_path / "lap.parquet")
+    for made in (drafted(tmp_path, table), draft(inspect("other", [tmp_path / "lap.parquet"]))):
+        assert made.dataset["drop_rows"] == {"lap": ["1-500", "2502-2650"]}
+        assert ([round(own) for own in made.durations], made.dataset["gappy"], made.dataset["max_gap"]) == ([40, 67], [], 1.0)
+        assert any("1-500" in note for note in made.notes)
+
+
+def test_course_and_heading_without_another_reference_are_told_of(tmp_path):
+    d = drive()
+    yaw = np.cumsum(d["r"]) / 50.0
+    table = usual(d).drop(columns="Beta").assign(Heading=-np.degrees(yaw) % 360.0, Course=-np.degrees(yaw + d["sideslip"]) % 360.0)
+    notes = inspect("my_car", [write(tmp_path / "lap.csv", table)]).proposals.notes
+    assert "'Heading' less 'Course' may be the sideslip angle that is missing as a reference; save it as a column" in notes
 
 
 def test_samples_that_rows_repeat_are_told_of(tmp_path):

@@ -85,7 +85,7 @@ def test_errors_over_filtered_rows_are_those_computed_from_the_signals_and_over_
     shown = board(chromium)
     assert len(shown) == len(FAMILIES)
     for row in ranked.to_dict("records"):
-        assert shown[row["title"]] == pytest.approx((row["rmse_sideslip"], row["rmse_vy"]), abs=1e-3)
+        assert shown[row["title"]] == pytest.approx((row["rmse_sideslip_chosen"], row["rmse_vy"]), abs=1e-3)
 
 
 def test_browser_unpacks_what_was_packed(chromium, toy):

@@ -177,6 +177,21 @@ def test_a_long_gap_must_be_declared(tmp_path):
     np.testing.assert_allclose(bridged["vx"], 3.0 * bridged.time, rtol=0, atol=1e-12)
 
 
+def test_a_pause_of_one_group_ends_a_recording_of_all_where_max_gap_says_so(tmp_path):
+    """The other group goes on, and a sample on either side of the pause still serves to interpolate."""
+    slow = np.delete(SLOW, np.s_[(SLOW > 5.0) & (SLOW < 8.0)])
+    groups = {"Fast": [signal("v", FAST, 3.0 * FAST, "m/s")], "Slow": [signal("r", slow, 0.01 * slow, "rad/s")]}
+    file = write_mdf(tmp_path / "a.mf4", groups)
+    options = {"channels": {**ONE, "yaw_rate": {"column": "r", "unit": "rad/s"}}, "max_gap": 1.0}
+    first, second = (read_mdf(file, run=run, **options) for run in (0, 1))
+    assert (first.time[-1], second.start_time) == (pytest.approx(5.0, abs=0.03), pytest.approx(8.0, abs=0.03))
+    assert (first.provenance["run"], second.provenance["run"]) == (0, 1)
+    for recording in (first, second):
+        np.testing.assert_allclose(recording["vx"], 3.0 * recording.time, rtol=0, atol=1e-9)
+        np.testing.assert_allclose(recording["yaw_rate"], 0.01 * recording.time, rtol=0, atol=1e-9)
+    assert "a gap of" in refused(file, **options | {"max_gap": None})
+
+
 def test_invalid_samples_are_missing_values(tmp_path):
     bits = (np.arange(2001) >= 500) & (np.arange(2001) < 520)
     values = np.where(bits, 1e6, 10.0 + FAST)  # what stands at an invalid sample must never be seen

@@ -39,6 +39,22 @@ def test_time_goes_on_past_midnight_and_a_last_row_that_is_cut_off_or_late_is_le
     assert recording.provenance["rows_dropped_at_the_end"] == dropped
 
 
+def test_a_pause_ends_a_recording_where_max_gap_says_so_and_a_run_can_be_named(tmp_path):
+    write_log(tmp_path / "lap.vbo")
+    head, mark, rows = (tmp_path / "lap.vbo").read_bytes().partition(b"[data]\r\n")
+    lines = rows.splitlines(keepends=True)
+    (tmp_path / "lap.vbo").write_bytes(b"".join([head, mark, *lines[:400], *lines[650:]]))
+    assert "gaps, the longest of 2.51 s" in refusal(lambda: read(tmp_path))
+    first, second = open_source(dataset(tmp_path, max_gap=1.0)).recordings()
+    assert (first.id, second.id, second.provenance["run"], second.start_time) == ("lap_run_0", "lap_run_1", 1, pytest.approx(38_876.95))
+    np.testing.assert_allclose(np.concatenate([first["yaw_rate"], second["yaw_rate"]]), np.delete(drive()["yaw_rate"], np.s_[400:650]))
+    alone = open_source(dataset(tmp_path, max_gap=1.0, run=1)).read_file(tmp_path / "lap.vbo")
+    assert (len(alone), alone.start_time) == (350, second.start_time)
+    assert "name one by +dataset.run=0" in refusal(lambda: open_source(dataset(tmp_path, max_gap=1.0)).read_file(tmp_path / "lap.vbo"))
+    assert "no run between its pauses" in refusal(lambda: read(tmp_path, max_gap=100.0))
+    assert survey(tmp_path / "lap.vbo").runs == (slice(0, 400), slice(400, 750))
+
+
 def test_units_belong_to_the_last_columns_and_must_not_contradict_the_declaration(tmp_path):
     write_log(tmp_path / "lap.vbo")
     known = {"velocity": "km/h", "vert-vel": "km/h", "Longacc": "g", "Latacc": "g"}

@@ -1,8 +1,9 @@
-"""Base of sources whose files are a recording each."""
+"""Base of sources whose files are a recording each, or one for each uninterrupted run in it."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +16,7 @@ from vehest.sources.tables import listed
 
 
 class FileSource(Source):
-    """Files that match the option ``files`` in the folder ``path``, a recording each; a file's stem is the recording's name.
+    """Files that match the option ``files`` in the folder ``path``; a file's stem is the recording's name, ``STEM_run_N`` that of a run.
 
     Attributes:
         gappy: channels in which NaN means "not measured".
@@ -23,20 +24,51 @@ class FileSource(Source):
 
     gappy: frozenset[str] = frozenset()
 
+    def __init__(self, dataset: Mapping[str, Any]) -> None:
+        super().__init__(dataset)
+        self._runs_of = lru_cache(None)(self._wanted_runs)
+
     def ids(self) -> list[str]:
-        """Names of the files, in alphabetical order."""
-        return [self._id_of(file) for file in self._files()]
+        """Names of the recordings, in alphabetical order of the files and in that of a file's runs."""
+        return list(self._found())
 
     def inputs(self) -> dict[str, str | Path]:
         """The files."""
         return {file.name: file for file in self._files()}
 
     def read_raw(self, recording_id: str) -> Recording:
-        """Read one file by its name; raises `MissingError` where there is none, `DataError` where it cannot be used."""
-        for file in self._files():
-            if self._id_of(file) == recording_id:
-                return self.read_raw_file(file)
-        raise self._no_recording(recording_id)
+        """Read one recording by its name; raises `MissingError` where there is none, `DataError` where it cannot be used."""
+        found = self._found()
+        if recording_id not in found:
+            raise MissingError(f"{self.where} has no recording '{recording_id}' (it has {listed(list(found))})")
+        return self._read(*found[recording_id])
+
+    def read_raw_file(self, file: Path) -> Recording:
+        """Read a file wherever it is; raises `MissingError` without it, `DataError` where it cannot be used or holds several runs."""
+        runs = list(self._runs_of(file))
+        if len(runs) > 1:
+            raise DataError(f"'{file}' holds {len(runs)} runs ({listed([str(run) for run in runs])}); name one by +dataset.run={runs[0]}")
+        return self._read(file, runs[0])
+
+    def _read(self, file: Path, run: int | None) -> Recording:
+        """A file, or one run of it."""
+        return super().read_raw_file(file)
+
+    def _found(self) -> dict[str, tuple[Path, int | None]]:
+        """Name of each recording -> its file and run."""
+        return {self._name_of(file, run): (file, run) for file in self._files() for run in self._runs_of(file)}
+
+    def _runs(self, file: Path) -> Mapping[int | None, slice]:
+        """Number of each run in a file -> its rows; all rows under None where runs are not told apart."""
+        return {None: slice(None)}
+
+    def _wanted_runs(self, file: Path) -> Mapping[int | None, slice]:
+        """All runs, or the one that the option ``run`` names; a source has them in the cache ``_runs_of``."""
+        runs, wanted = self._runs(file), getattr(self.options, "run", None)
+        if not runs or (wanted is not None and wanted not in runs):
+            named = "between its pauses" if wanted is None else wanted
+            raise DataError(f"'{file}' holds no run {named} ({listed([str(run) for run in runs])})")
+        return runs if wanted is None else {wanted: runs[wanted]}
 
     def _files(self) -> list[Path]:
         folder = existing_folder(self.dataset.get("path"), self.name)
@@ -54,8 +86,8 @@ class FileSource(Source):
     def _id_of(self, file: Path) -> str:
         return file.stem
 
-    def _no_recording(self, recording_id: str) -> MissingError:
-        return MissingError(f"{self.where} has no recording '{recording_id}' (it has {listed(self.ids())})")
+    def _name_of(self, file: Path, run: int | None) -> str:
+        return self._id_of(file) if run is None else f"{self._id_of(file)}_run_{run}"
 
     def _require_pattern(self) -> None:
         """See that ``files`` is a pattern inside the folder."""

@@ -10,10 +10,12 @@ from __future__ import annotations
 from abc import abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path
-from typing import Any, ClassVar, Literal
+from typing import Annotated, Any, ClassVar, Literal
 
 import numpy as np
+from pydantic import Field
 
 from vehest.constants import FloatArray
 from vehest.data.channels import channel
@@ -23,6 +25,7 @@ from vehest.sources.base import require_files
 from vehest.sources.clocks import SLACK, Clock, at_ticks, common_span, on_nearest, require_samples, ticks_within, uniform_clock
 from vehest.sources.columns import ChannelMap, ChannelNames, Column, Positive, Rate, columns_from_config
 from vehest.sources.file_source import FileSource
+from vehest.sources.table_rows import timed_runs
 from vehest.sources.unit_spellings import require_unit
 
 GAP = 3.0  # median intervals that are interpolated where max_gap is not declared
@@ -61,12 +64,14 @@ class SignalOptions:
     files: str = "*"
     rate_hz: Rate | None = None
     raster: str | None = None
+    max_gap: Positive | None = None
+    run: Annotated[int, Field(ge=0)] | None = None
     gappy: ChannelNames | None = None
     file_units: Literal["check", "ignore"] = "check"
 
 
 class SignalSource(FileSource):
-    """Files of signals, a recording each."""
+    """Files of signals, a recording each, or one for each part between pauses of any signal that is not gappy."""
 
     options_type = SignalOptions
     options: SignalOptions
@@ -82,30 +87,48 @@ class SignalSource(FileSource):
             raise ConfigurationError(f"{self.where}: channels must map a channel to its column and unit")
         if (options.rate_hz is None) == (options.raster is None):
             raise ConfigurationError(f"{self.where}: give either rate_hz, or as raster the channel whose clock is taken")
+        self._signals = lru_cache(1)(self._read_signals)
         if options.raster is not None and options.raster not in set(self.channels) - self.gappy:
             raise ConfigurationError(f"{self.where}: raster must name one of its channels that is not gappy, not '{options.raster}'")
 
-    def read_raw_file(self, file: Path) -> Recording:
-        """Read a file of signals wherever it is; raises `MissingError` without it, `DataError` where it or its clocks are unusable."""
+    def _runs(self, file: Path) -> Mapping[int | None, slice]:
+        """Rows of the times at which no signal pauses."""
         require_files([file], self.name)
-        signals, provenance = self._read_signals(file)
+        longest = self.options.max_gap
+        return super()._runs(file) if longest is None else timed_runs(self._covered(file, longest), longest, restarts=False)
+
+    def _covered(self, file: Path, longest: float) -> FloatArray:
+        """Times of all samples [s], (T,), but for those at which one that is not gappy has no sample for longer than ``longest`` [s]."""
+        signals = self._signals(file)[0]
+        spanning = {name: one for name, one in signals.items() if name not in self.gappy} or signals
+        known = [one.stamps[~np.isnan(one.values)] for one in spanning.values()]
+        times = np.unique(np.concatenate(known))
+        for stamps in known:
+            edges = np.concatenate([[-np.inf], stamps, [np.inf]])
+            after, before = np.searchsorted(edges, times), np.searchsorted(edges, times, side="right") - 1
+            times = times[edges[after] - edges[before] <= longest]
+        return times
+
+    def _read(self, file: Path, run: int | None) -> Recording:
+        """Read a file of signals; raises `MissingError` without it, `DataError` where it or its clocks are unusable."""
+        (signals, provenance), number = self._signals(file), {} if run is None else {"run": run}
         if self.options.file_units == "check":
             for name, signal in signals.items():
                 where = self._signal_name(name, signal, file)
                 require_unit(signal.unit, self.channels[name], channel(name).unit, where, "set file_units: ignore")
-        stamps, ticks, rate_hz = self._clock(signals, file)
+        stamps, ticks, rate_hz = self._clock(signals, file, run)
         channels = {}
         for name, signal in signals.items():
             values = self._at_ticks(name, signal, stamps, ticks, rate_hz, self._signal_name(name, signal, file))
             channels[name] = self.channels[name].to_si(values, channel(name).unit)
         clock = Clock(float(ticks[0]), rate_hz, len(ticks))
-        return self._recording(file.stem, f"'{file}'", clock, channels, {"file": file.name, **provenance})
+        return self._recording(self._name_of(file, run), f"'{file}'", clock, channels, {"file": file.name, **number, **provenance})
 
     @abstractmethod
     def _read_signals(self, file: Path) -> tuple[dict[str, Signal], dict[str, Any]]:
         """The signal of each channel, with stamps that pass `require_clock`, and an entry for the provenance."""
 
-    def _clock(self, signals: Mapping[str, Signal], file: Path) -> tuple[FloatArray, FloatArray, float]:
+    def _clock(self, signals: Mapping[str, Signal], file: Path, run: int | None) -> tuple[FloatArray, FloatArray, float]:
         """Stamps [s] at which every signal that is not gappy has values, the even clock behind them [s], and its rate [Hz]."""
         spanning = {name: signal for name, signal in signals.items() if name not in self.gappy} or signals
         spans = {}
@@ -115,6 +138,8 @@ class SignalSource(FileSource):
                 raise DataError(f"{self._signal_name(name, signal, file)} holds no valid sample; leave the channel out")
             spans[f"channel '{name}' ({signal.origin})"] = float(valid[0]), float(valid[-1])
         begin, end = common_span(spans, f"'{file}'")
+        if run is not None and self.options.max_gap is not None:
+            begin, *_, end = self._covered(file, self.options.max_gap)[self._runs_of(file)[run]].tolist()
         if self.options.rate_hz is not None:
             ticks = ticks_within(begin, end, self.options.rate_hz, f"'{file}'")
             return ticks, ticks, self.options.rate_hz

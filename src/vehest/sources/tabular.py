@@ -85,25 +85,6 @@ class TabularSource(FileSource):
             raise ConfigurationError(f"{where}: channel '{doubled[0]}' comes both from channels and from pose; leave one out")
         self._require_pattern()
         self.layout = TextLayout(options.delimiter, options.decimal, options.encoding, options.skip_rows)
-        self._known_runs: dict[Path, dict[int | None, slice]] = {}
-
-    def ids(self) -> list[str]:
-        """Stems of the files, in alphabetical order; where a column counts runs, ``STEM_run_N`` in the order of the file."""
-        return list(self._found())
-
-    def read_raw(self, recording_id: str) -> Recording:
-        """Read one recording by its name."""
-        found = self._found()
-        if recording_id not in found:
-            raise self._no_recording(recording_id)
-        return self._read(*found[recording_id])
-
-    def read_raw_file(self, file: Path) -> Recording:
-        """Read a table wherever it is; raises `MissingError` without it, `DataError` where it cannot be read or lacks a column."""
-        runs = list(self._runs_of(file))
-        if len(runs) > 1:
-            raise DataError(f"'{file}' holds {len(runs)} runs ({listed([str(run) for run in runs])}); name one by +dataset.run={runs[0]}")
-        return self._read(file, runs[0])
 
     def _read(self, file: Path, run: int | None) -> Recording:
         require_files([file], self.name)
@@ -155,7 +136,7 @@ class TabularSource(FileSource):
             channels = {name: samples[inside] for name, samples in {**channels, **lines}.items()}
             clock = replace(clock, start_time=float(clock.ticks()[inside.start]), n_samples=inside.stop - inside.start, stamps=None)
             provenance["held"] = self.held.description(rate)
-        return self._recording(_name_of(file, run), f"'{file}'", clock, channels, provenance)
+        return self._recording(self._name_of(file, run), f"'{file}'", clock, channels, provenance)
 
     def _files(self) -> list[Path]:
         """Tables of the data set, without those that it excludes."""
@@ -170,27 +151,16 @@ class TabularSource(FileSource):
             raise MissingError(f"{self.where}: exclude leaves none of its files")
         return kept
 
-    def _found(self) -> dict[str, tuple[Path, int | None]]:
-        """Name of each recording -> its file and run."""
-        return {_name_of(file, run): (file, run) for file in self._files() for run in self._runs_of(file)}
-
-    def _runs_of(self, file: Path) -> Mapping[int | None, slice]:
-        """Number of each run in a table -> its rows without those that are left out; all rows under None where no runs are counted."""
+    def _runs(self, file: Path) -> Mapping[int | None, slice]:
+        """Rows of each run without those that are left out."""
         counter = self.time.column if self.time and self._cuts else self.options.runs
         if counter is None or is_stored_recording(file):
-            return {None: slice(None)}
-        if file not in self._known_runs:
-            require_files([file], self.name)
-            numbers = self._values(file, [counter])[counter]
-            if self.time is not None and self._cuts:
-                runs = timed_runs(self.time.to_si(numbers, "s"), self.options.max_gap, restarts=self.options.time_restarts)
-            else:
-                runs = counted_runs(numbers, counter, file)
-            wanted = self.options.run
-            if wanted is not None and wanted not in runs:
-                raise DataError(f"'{file}' holds no run {wanted} ({listed([str(run) for run in runs])})")
-            self._known_runs[file] = runs if wanted is None else {wanted: runs[wanted]}
-        return self._known_runs[file]
+            return super()._runs(file)
+        require_files([file], self.name)
+        numbers = self._values(file, [counter])[counter]
+        if self.time is not None and self._cuts:
+            return timed_runs(self.time.to_si(numbers, "s"), self.options.max_gap, restarts=self.options.time_restarts)
+        return counted_runs(numbers, counter, file)
 
 
 def unused_columns(dataset: Mapping[str, Any], file: Path | None = None) -> list[str]:
@@ -204,10 +174,6 @@ def unused_columns(dataset: Mapping[str, Any], file: Path | None = None) -> list
     channels = CHANNELS if source.columns is None else [column.column for column in source.columns.values()]
     used = {"", source.options.runs, source.time and source.time.column, *channels}
     return [name for name in column_names(table, source.layout) if name not in used]
-
-
-def _name_of(file: Path, run: int | None) -> str:
-    return file.stem if run is None else f"{file.stem}_run_{run}"
 
 
 SOURCE = TabularSource

@@ -1,4 +1,4 @@
-"""Logs of Racelogic VBOX (.vbo): text in Latin-1, in sections; a recording a file.
+"""Logs of Racelogic VBOX (.vbo): text in Latin-1, in sections; a recording a file, or one for each part between pauses.
 
 The format as its files have it: ``[header]`` and ``[column names]`` name the columns, ``[channel units]`` the units of the last of them,
 ``[comments]`` hold the logger's settings, ``[data]`` rows of numbers, whose time is a clock time, hhmmss.ss.
@@ -9,10 +9,12 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
+from pydantic import Field
 
 from vehest.constants import FloatArray
 from vehest.data.channels import channel
@@ -22,8 +24,9 @@ from vehest.data.recording import Recording
 from vehest.sources.base import require_files
 from vehest.sources.clock_times import past_midnight
 from vehest.sources.clocks import ClockPolicy, uniform_clock
-from vehest.sources.columns import ChannelMap, ChannelNames, columns_from_config
+from vehest.sources.columns import ChannelMap, ChannelNames, Positive, columns_from_config
 from vehest.sources.file_source import FileSource
+from vehest.sources.table_rows import timed_runs
 from vehest.sources.tables import TextLayout, read_columns, require_columns
 from vehest.sources.unit_spellings import require_unit
 
@@ -46,6 +49,8 @@ class VboOptions:
     channels: ChannelMap
     path: str | None = None
     files: str = "*.[vV][bB][oO]"
+    max_gap: Positive | None = None
+    run: Annotated[int, Field(ge=0)] | None = None
     clock: ClockPolicy = "strict"
     gappy: ChannelNames | None = None
 
@@ -74,21 +79,28 @@ class VboSource(FileSource):
             raise ConfigurationError(f"{self.where}: channels must map a channel to its column and unit")
         self.gappy = self._gappy_among(self.columns)
         self._require_pattern()
+        self._log = lru_cache(1)(read_log)
 
-    def read_raw_file(self, file: Path) -> Recording:
-        """Read a log wherever it is; raises `MissingError` without it, `DataError` for damage or a wrong column, unit, clock or offset."""
+    def _runs(self, file: Path) -> Mapping[int | None, slice]:
+        """Rows between pauses."""
         require_files([file], self.name)
-        log = read_log(file)
+        longest = self.options.max_gap
+        return super()._runs(file) if longest is None else timed_runs(self._log(file).seconds, longest, restarts=False)
+
+    def _read(self, file: Path, run: int | None) -> Recording:
+        """Read a log; raises `MissingError` without it, `DataError` for damage or a wrong column, unit, clock or offset."""
+        log, rows, number = self._log(file), self._runs_of(file)[run], {} if run is None else {"run": run}
         used = [column.column for column in self.columns.values()]
         require_columns(file, list(log.columns), used)
         if any(map(SLIP_AT_A_POINT.fullmatch, used)) and SLIP_CHECK not in (self.dataset.get("accept") or []):
             require_slip_offsets(log, f"'{file}'")
-        clock, channels = uniform_clock(log.seconds, f"'{file}'", self.options.clock), {}
+        clock, channels = uniform_clock(log.seconds[rows], f"'{file}'", self.options.clock), {}
         for name, column in self.columns.items():
             unit, where = channel(name).unit, f"'{file}': column '{column.column}', for channel '{name}',"
             require_unit(log.units.get(column.column, ""), column, unit, where, "declare a factor")
-            channels[name] = clock.align(column.to_si(log.columns[column.column], unit), gappy=name in self.gappy)
-        return self._recording(file.stem, f"'{file}'", clock, channels, {"file": file.name, **log.provenance})
+            channels[name] = clock.align(column.to_si(log.columns[column.column][rows], unit), gappy=name in self.gappy)
+        provenance = {"file": file.name, **number, **log.provenance}
+        return self._recording(self._name_of(file, run), f"'{file}'", clock, channels, provenance)
 
 
 def read_log(file: Path) -> Log:

@@ -35,7 +35,7 @@ ZOOM_SECONDS = 20.0
 MOST_SHOWN = 8
 EARLIEST_UNIX = 1e8  # s, from which on times count from 1970
 
-VERSION = "2"
+VERSION = "3"
 _ACCURACY = ("rmse_sideslip", "rmse_vy", "fvu", "p99_sideslip", "max_error_sideslip")
 _OF_MODEL = ("n_parameters", "epochs")
 _BOUND = "floor_cramer_rao"
@@ -48,7 +48,7 @@ def documents(artefacts: StudyArtefacts) -> dict[str, Document]:
 
 
 def comparison(artefacts: PartArtefacts, named: Mapping[str, Name] | None = None) -> Document:
-    """The report of a comparison: headline, then each test set, then the training; how it was made is the appendix.
+    """The report of a comparison: errors as bars and traces of the first test set, headline, each test set, training; the appendix is how.
 
     Args:
         named: test set -> estimator that its traces begin with.
@@ -61,6 +61,9 @@ def comparison(artefacts: PartArtefacts, named: Mapping[str, Name] | None = None
     blocks: list[Block] = [*_headline(artefacts)]
     for test_set in artefacts.split.tests:
         blocks += _test_set(artefacts, board[board["test_set"] == test_set], test_set, lines, (named or {}).get(test_set))
+    first = next(iter(artefacts.split.tests))
+    traces = [block for block in blocks if isinstance(block, Figure) and block.name == f"traces_{file_of(first)}"]
+    blocks = [_bars(artefacts, board[board["test_set"] == first], first), *traces, *(block for block in blocks if block not in traces)]
     blocks += [*_training(artefacts, board, lines), *how_it_was_made(artefacts)]
     if any(model.estimator == "ksnn" for model in artefacts.models):
         blocks.append(PATENT_NOTE)
@@ -70,10 +73,10 @@ def comparison(artefacts: PartArtefacts, named: Mapping[str, Name] | None = None
 def leaderboard(artefacts: PartArtefacts) -> pd.DataFrame:
     """One row per test set and (estimator, variant), the lowest RMSE(β) over all seeds of a test set first.
 
-    The figures are those of the seed with the lowest rmse_vy on the validation range (the lower seed of two equals): test
-    data choose nothing. ``rmse_sideslip_median``, ``_min``, ``_max`` and ``_std`` (sample standard deviation) are taken
-    over all seeds with a finite value; ``_std`` is NaN if there are fewer than two. ``_low`` and ``_high`` are the 95 % interval over
-    blocks of the drive and seeds; ``beats_zero``, ``beats_static_map`` and ``against_best`` (difference to the lowest error) are
+    ``rmse_sideslip`` is taken over all seeds together, with ``_low`` and ``_high`` as its 95 % interval over blocks of the drive and seeds;
+    ``_median``, ``_min``, ``_max`` and ``_std`` (sample standard deviation, NaN with fewer than two) are those of single seeds. The other
+    figures, ``rmse_sideslip_chosen`` among them, are those of the seed with the lowest rmse_vy on the validation range (the lower seed of
+    two equals): test data choose nothing. ``beats_zero``, ``beats_static_map`` and ``against_best`` (difference to the lowest error) are
     corrected by Holm (`ranking_of`). ``floor_cramer_rao`` is the bound for what the estimator reads, NaN where there is none.
     ``epochs`` is NaN for a method without. ``start`` is ``reference`` if the protocol hands the true
     initial state over, else ``own``.
@@ -89,13 +92,15 @@ def leaderboard(artefacts: PartArtefacts) -> pd.DataFrame:
             own = {metric: values_of(runs, name, seeds, test_set, metric) for metric in _ACCURACY}
             shown = {metric: values[seeds.index(seed)] for metric, values in own.items()}
             row: dict[str, object] = {"estimator": name[0], "variant": name[1], "title": models[0].title, "test_set": test_set}
-            row |= {"seed": seed, "n_seeds": len(seeds), "start": start, "rmse_sideslip": shown["rmse_sideslip"]}
+            row |= {"seed": seed, "n_seeds": len(seeds), "start": start}
+            chosen = shown.pop("rmse_sideslip")
+            finite = name in ranking.order and math.isfinite(chosen)
+            row |= {"rmse_sideslip": ranking.rmse[name] if finite else math.nan, "rmse_sideslip_chosen": chosen}
             row |= {**standing_columns(ranking, name), **_spread_of(own["rmse_sideslip"])}
             row |= {f"rmse_sideslip_{role}": values_of(runs, name, [seed], role, "rmse_sideslip")[0] for role in (TRAINING, VALIDATION)}
             row |= {"rmse_vy": shown["rmse_vy"], "rmse_vy_validation": values_of(runs, name, [seed], VALIDATION, "rmse_vy")[0]}
             row |= {**shown, _BOUND: values_of(runs, name, [seed], test_set, _BOUND)[0]}
             row |= {metric: of_model(runs, name, seed, metric) for metric in _OF_MODEL}
-            finite = name in ranking.order and math.isfinite(shown["rmse_sideslip"])
             row["_place"] = ranking.order.index(name) if finite else math.inf
             rows.append(row)
     board = pd.DataFrame(rows)
@@ -271,7 +276,6 @@ def _test_set(artefacts: PartArtefacts, board: pd.DataFrame, test_set: str, line
     by_regime = regime_table(artefacts, test_set, chosen, f"regimes_{file}")
     if by_regime is not None:
         blocks.append(by_regime)
-    blocks.append(_spread(artefacts, finite, test_set, f"spread_{file}", lines))
     shown = _shown(finite, named)
     drive = _Drive.of(artefacts, shown, test_set, lines)
     if len(shown) < len(finite):
@@ -283,6 +287,16 @@ def _test_set(artefacts: PartArtefacts, board: pd.DataFrame, test_set: str, line
     return [*blocks, *band_blocks(artefacts, test_set, in_bands, lines, file), *_figures_of(drive, shown, file, lines)]
 
 
+_INTERVAL = Column("95 % interval [deg]", bar=("rmse_sideslip", "rmse_sideslip_low", "rmse_sideslip_high"))
+
+
+def _bars(artefacts: PartArtefacts, board: pd.DataFrame, test_set: str) -> Table:
+    interval = [interval_in_words(row, decimals_for(board["rmse_sideslip"].tolist())) for row in board.to_dict("records")]
+    caption = f"RMSE(β) of every estimator over all its seeds, with its 95 % interval, on {_where(artefacts, test_set)}."
+    columns = {"title": Column("estimator"), "rmse_sideslip": Column("RMSE(β) [deg]"), "interval": _INTERVAL}
+    return Table(f"bars_{file_of(test_set)}", caption, board.assign(interval=interval), columns)
+
+
 def _leaderboard_table(artefacts: PartArtefacts, board: pd.DataFrame, name: str, test_set: str) -> list[Block]:
     single = board["n_seeds"] < 2
     frame = board.assign(**{column: board[column].mask(single) for column in _SPREAD})
@@ -290,17 +304,17 @@ def _leaderboard_table(artefacts: PartArtefacts, board: pd.DataFrame, name: str,
     frame["interval"] = [interval_in_words(row, decimals) for row in frame.to_dict("records")]
     standing = Table(
         name,
-        f"Estimators on test set `{test_set}`, the lowest RMSE(β) over all seeds first; figures of the seed chosen on validation. "
-        "Interval: 95 % of RMSE(β) over all seeds, for another stretch of such a drive and another training. The difference to the lowest, "
-        "and whether v = 0 and the static map are beaten: paired over blocks and seeds, corrected by Holm. FVU is the fraction of the "
-        "variance of v that is left unexplained."
+        f"Estimators on test set `{test_set}`. RMSE(β) is taken over all seeds together, the lowest first, with its 95 % interval for "
+        "another stretch of such a drive and another training; training, validation, RMSE(v) and FVU are those of the seed chosen on "
+        "validation. The difference to the lowest, and whether v = 0 and the static map are beaten: paired over blocks and seeds, "
+        "corrected by Holm. FVU is the fraction of the variance of v that is left unexplained."
         f"{_BOUND_SENTENCE if frame[_BOUND].notna().any() else ''}",
         frame,
         {
             "title": Column("estimator"),
             "n_parameters": Column("params", decimals=0),
             "rmse_sideslip": Column("RMSE(β) [deg]", decimals=decimals),
-            "interval": Column("95 % interval [deg]", bar=("rmse_sideslip", "rmse_sideslip_low", "rmse_sideslip_high")),
+            "interval": _INTERVAL,
             "against_best": Column("to the lowest [deg]"),
             "beats_zero": Column("beats v = 0"),
             "beats_static_map": Column("beats static map"),
@@ -314,13 +328,14 @@ def _leaderboard_table(artefacts: PartArtefacts, board: pd.DataFrame, name: str,
     )
     seeds = Table(
         f"{name}_seeds",
-        "RMSE(β) over all seeds: median, lowest, highest and sample standard deviation (s.d.); p99 and peak are the 99th percentile and "
-        "the maximum of the absolute error of β of the chosen seed.",
+        "RMSE(β) of single seeds: the one chosen on validation, median, lowest, highest and sample standard deviation (s.d.); p99 and peak "
+        "are the 99th percentile and the maximum of the absolute error of β of the chosen one.",
         frame,
         {
             "title": Column("estimator"),
             "seed": Column("seed"),
             "n_seeds": Column("seeds"),
+            "rmse_sideslip_chosen": Column("chosen [deg]", decimals=decimals),
             "rmse_sideslip_median": Column("median [deg]", decimals=decimals),
             "rmse_sideslip_min": Column("min [deg]", decimals=decimals),
             "rmse_sideslip_max": Column("max [deg]", decimals=decimals),
@@ -338,20 +353,6 @@ def _links(artefacts: PartArtefacts, board: pd.DataFrame) -> list[ModelLink]:
     folders = {(model.estimator, model.variant, model.seed): model.model_folder for model in artefacts.models}
     rows = [folders[row["estimator"], row["variant"], row["seed"]] for row in board.to_dict("records")]
     return [ModelLink(f"../../{own.parent.name}/{own.name}/", f"vehest estimate {own.name} lap.csv -o out.parquet") for own in rows]
-
-
-def _spread(artefacts: PartArtefacts, board: pd.DataFrame, test_set: str, name: str, lines: dict[Name, Line]) -> Figure:
-    runs, groups = runs_of(artefacts), by_name(artefacts.models)
-    rows = []
-    for row in board.to_dict("records"):
-        own = (row["estimator"], row["variant"])
-        values = values_of(runs, own, [model.seed for model in groups[own]], test_set, "rmse_sideslip")
-        rows.append(figures.Spread(row["title"], lines[own], values, row["rmse_sideslip"]))
-    return Figure(
-        name,
-        f"Sideslip error of every seed on test set `{test_set}`. Diamonds: the seed chosen on validation.",
-        figures.spread_figure(rows, "RMSE(β) [deg]"),
-    )
 
 
 def _shown(board: pd.DataFrame, named: Name | None = None) -> pd.DataFrame:
@@ -448,7 +449,8 @@ def _figures_of(drive: _Drive, board: pd.DataFrame, file: str, lines: dict[Name,
     return [
         Figure(
             f"traces_{file}",
-            "Lateral velocity and sideslip over the whole test set: measured (black, white on a dark page) and estimated (coloured).",
+            "Lateral velocity and sideslip over the whole test set: measured (black, white on a dark page) and estimated "
+            "(coloured), of each estimator the seed chosen on validation.",
             figures.traces_figure(drive.time, reference, traces, drive.time_label),
             drive.explorer,
         ),

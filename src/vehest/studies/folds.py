@@ -15,22 +15,23 @@ import pandas as pd
 from vehest.data.errors import DataError
 from vehest.evaluation.blocks import Segments, joined
 from vehest.evaluation.ranking import Name, Ranking, rank
-from vehest.report import figures
-from vehest.report.document import PATENT_NOTE, REPORT, Block, Column, Document, Figure, Table, as_text
-from vehest.report.style import decimals_for, lines_of, listed
+from vehest.report.document import PATENT_NOTE, REPORT, Block, Column, Document, Table, as_text
+from vehest.report.style import decimals_for, listed
 from vehest.studies.artefacts import PartArtefacts, StudyArtefacts
 from vehest.studies.drive import budget_sentence, data_sentence, how_it_was_made
 from vehest.studies.kit.runs import by_name
-from vehest.studies.kit.standing import standing_columns, verdict_sentences
+from vehest.studies.kit.standing import interval_in_words, standing_columns, verdict_sentences
 from vehest.studies.kit.warnings import warnings_of
 
 TAKES = "folds"
 SHOWS_FAILED = True
 TEST = "test"
 
+VERSION = "2"
+
 
 def documents(artefacts: StudyArtefacts) -> dict[str, Document]:
-    """The report: verdict over all folds, the table, errors of each fold; ranges and budgets are the appendix; raises `DataError`."""
+    """The report: the table, with the errors of each fold, the verdict, and ranges and budgets as the appendix; raises `DataError`."""
     parts = artefacts.parts
     folds = segments_of_folds(parts)
     first = next(iter(parts.values()))
@@ -39,15 +40,15 @@ def documents(artefacts: StudyArtefacts) -> dict[str, Document]:
     kinds = " and ".join(sorted(set(first.kinds.values())))
     number = f"all {len(parts)} folds" if set(artefacts.titles) <= set(parts) else f"{len(parts)} of {len(artefacts.titles)} folds"
     where = f"{number} ({kinds} data), each estimated by models that had not seen it"
-    blocks: list[Block] = [artefacts.about] if artefacts.about.strip() else []
+    board = overview(ranking, folds, titles, list(parts))
+    blocks: list[Block] = [_table(board, list(parts)), *([artefacts.about] if artefacts.about.strip() else [])]
     blocks.append("\n\n".join([data_sentence(first), verdict_sentences(ranking, titles, where), f"In each fold: {budget_sentence(first)}"]))
     left_out = _left_out(parts, folds, titles)
     lost = [as_text(title) for name, title in artefacts.titles.items() if name not in parts]
     left_out += [f"{title} is not here: nothing could be trained or scored on it." for title in lost]
     if left_out:
         blocks.append("**Mind:**\n\n" + "\n".join(f"- {line}" for line in left_out))
-    board = overview(ranking, folds, titles, list(parts))
-    blocks += ["## All folds", _table(board, list(parts)), _figure(board, list(parts)), *how_it_was_made(first)[:1]]
+    blocks += how_it_was_made(first)[:1]
     for name, part in parts.items():
         warned = [line for line in warnings_of(part) if "is left out" not in line]
         blocks.append(f"## Appendix: {as_text(part.title)}\n\n" + "\n".join(f"- {line}" for line in warned))
@@ -100,8 +101,7 @@ def _table(board: pd.DataFrame, parts: Sequence[str]) -> Table:
         "title": Column("estimator"),
         "n_seeds": Column("seeds"),
         "rmse_sideslip": Column("RMSE(β) [deg]", decimals=decimals),
-        "rmse_sideslip_low": Column("95 % from", decimals=decimals),
-        "rmse_sideslip_high": Column("to", decimals=decimals),
+        "interval": Column("95 % interval [deg]", bar=("rmse_sideslip", "rmse_sideslip_low", "rmse_sideslip_high")),
         "against_best": Column("to the lowest [deg]"),
         "beats_zero": Column("beats v = 0"),
         "beats_static_map": Column("beats static map"),
@@ -111,19 +111,7 @@ def _table(board: pd.DataFrame, parts: Sequence[str]) -> Table:
         "Errors over all folds together, and of each fold, over all seeds. Interval: 95 % over blocks of the drives and seeds. The "
         "difference to the lowest, and whether v = 0 and the static map are beaten: paired, corrected by Holm."
     )
-    return Table("overview", caption, board[list(columns)], columns)
-
-
-def _figure(board: pd.DataFrame, parts: Sequence[str]) -> Figure:
-    lines = lines_of([(row["estimator"], row["variant"]) for row in board.to_dict("records")])
-    rows = [
-        figures.Spread(
-            row["title"],
-            lines[row["estimator"], row["variant"]],
-            np.array([row["rmse_sideslip"], *(row[part] for part in parts)]),
-            row["rmse_sideslip"],
-        )
-        for row in board.to_dict("records")
-    ]
-    caption = "Sideslip error of each fold (dots) and of all folds together (diamonds), over all seeds."
-    return Figure("folds", caption, figures.spread_figure(rows, "RMSE(β) [deg]"))
+    frame = board.drop(columns=["estimator", "variant"]).assign(
+        interval=[interval_in_words(row, decimals) for row in board.to_dict("records")]
+    )
+    return Table("overview", caption, frame, columns)

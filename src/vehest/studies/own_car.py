@@ -21,7 +21,7 @@ from vehest.estimators.registry import estimator_class, estimator_names
 from vehest.evaluation.blocks import LEAST_BLOCKS
 from vehest.evaluation.metrics import pieces_of, scored_range
 from vehest.evaluation.ranking import BASELINES, Ranking
-from vehest.report.document import REPORT, Block, Column, Document, Figure, Table, as_code, as_text
+from vehest.report.document import REPORT, Block, Document, as_code, as_text
 from vehest.report.style import fixed, listed
 from vehest.studies import drive
 from vehest.studies.artefacts import EvaluatedModel, PartArtefacts, StudyArtefacts
@@ -35,7 +35,7 @@ SHOWS_FAILED = True
 HARD = 4.0  # m/s², from which on driving says something of the tyres
 PLAIN = (*BASELINES, "kinematic", "data_sheet")  # estimators that others have to beat
 
-VERSION = "4"
+VERSION = "5"
 leaderboard = drive.leaderboard
 
 
@@ -53,8 +53,8 @@ def documents(artefacts: StudyArtefacts) -> dict[str, Document]:
     models = {name: verdict_of(part, name).model for name in part.split.tests}
     compared = drive.comparison(part, {name: (own.estimator, own.variant) for name, own in models.items() if own is not None})
     verdicts = [f"{'**On test set ' + as_code(name) + ':** ' if len(part.split.tests) > 1 else ''}{text}" for name, text in _verdicts(part)]
-    first, rest = _first_screen(compared.blocks, part, next(iter(part.split.tests)))
-    blocks: list[Block] = ["## Verdict\n\n" + "\n\n".join(verdicts), *first]
+    opening = next(n for n, block in enumerate(compared.blocks) if isinstance(block, str))  # bars, and traces where there are any
+    blocks: list[Block] = ["## Verdict\n\n" + "\n\n".join(verdicts), *compared.blocks[:opening]]
     commands = "\n".join(_commands(part, artefacts.study))
     if commands:
         blocks.append(f"What to do next:\n\n```sh\n{commands}\n```")
@@ -64,22 +64,8 @@ def documents(artefacts: StudyArtefacts) -> dict[str, Document]:
     learnt = [block for curve in curves for block in blocks_of_curve(curve, file_name(curve.test_set.lower()))]
     needed: list[Block] = ["## How much reference is needed", *learnt] if learnt else []
     further = [block for name, other in list(artefacts.parts.items())[1:] for block in drive.appendix_of(name, other)]
-    whole = [*blocks, *folded, *needed, "## The comparison", *rest, *further]
+    whole = [*blocks, *folded, *needed, "## The comparison", *compared.blocks[opening:], *further]
     return {REPORT: replace(compared, title=artefacts.title, blocks=whole, open_blocks=len(blocks))}
-
-
-def _first_screen(blocks: Sequence[Block], part: PartArtefacts, test_set: str) -> tuple[list[Block], list[Block]]:
-    """Errors as bars and traces of a test set, taken out of a comparison's blocks, and the others."""
-    file, rmse = drive.file_of(test_set), ranking_of(part, test_set).rmse
-    bars: list[Block] = []
-    traces = [block for block in blocks if isinstance(block, Figure) and block.name == f"traces_{file}"]
-    for board in (block for block in blocks if isinstance(block, Table) and block.name == f"leaderboard_{file}"):
-        names = zip(board.frame["estimator"], board.frame["variant"], strict=True)
-        frame = board.frame.assign(rmse=[rmse.get(name, math.nan) for name in names])
-        bar = Column("95 % interval [deg]", bar=("rmse", "rmse_sideslip_low", "rmse_sideslip_high"))
-        columns = {"title": Column("estimator"), "rmse": Column("RMSE(β) [deg]"), "interval": bar}
-        bars = [Table(f"bars_{file}", "RMSE(β) of every estimator over all its seeds, with its 95 % interval.", frame, columns)]
-    return [*bars, *traces], [block for block in blocks if block not in traces]
 
 
 def verdict(artefacts: StudyArtefacts) -> list[str]:

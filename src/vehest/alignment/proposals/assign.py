@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
+from itertools import combinations
 
 import numpy as np
 
@@ -33,12 +34,13 @@ from vehest.data.channels import CHANNELS
 STANDING = 0.5  # m/s; the car did not move
 NEAR_SCORE = 4.0  # of the best triple, within which others are compared with it
 MOST_COMPARED = 40  # columns
-TOO_FAST = (0.9, 0.97)  # of ay over vx·yaw_rate, where a speed reads too much
+FITTING_SPEED, MISREAD = (0.97, 1.08), (0.9, 1.35)  # of ay over vx·yaw_rate: where a speed is right, and where it is not, but in its unit
 WHEELS_AGREE = 0.02
 DECIDING = 0.5  # correlation by which wheels or a compass decide which way is left
 RATES = (5.0, 10.0, 20.0, 25.0, 40.0, 50.0, 60.0, 100.0, 125.0, 200.0, 250.0, 400.0, 500.0, 1000.0, 2000.0)
 NOMINAL_RATE = 50.0  # Hz, where there are no times
 FEWEST = 50  # samples of a course
+SIDESLIP = (0.01, 1.0)  # rad, nearly the whole range of a sideslip angle
 MOST_BEYOND = 0.002  # share of samples that may lie beyond what a vehicle can do, as spikes
 USUAL = {  # 99th percentile of the motion's channels, SI
     "vx": (1.0, 90.0),
@@ -89,13 +91,14 @@ def propose(
         named = [f"'{one.name}'" for one in named_pose(found)]
         if len(named) == 3 and not proposals.pose:
             notes.append(f"no reference is made of {', '.join(named)}: their derivatives are not the speed and the yaw rate")
+        notes += [] if known is None or proposals.pose else _sideslip_to_save(found, known)
     if stands:
         notes.append("the car stands all the time, by its speed; names alone suggest channels")
     if search is not None:
         proposals, more = _speedometer(proposals, search.turning, wheels)
         notes += more
     clues = () if known is None else _clues(found, wheels, known, compass, west_positive)
-    proposals = _left_and_right(replace(proposals, notes=tuple(notes)), found, known, clues)
+    proposals = _as_most_count(_left_and_right(replace(proposals, notes=tuple(notes)), found, known, clues))
     proposals = possible(proposals, {column.name: column.values for column in found})
     used = {one.column for one in proposals.channels} | {column for _, column, _ in proposals.pose}
     unused = tuple(name for name, _, _ in columns if name not in used)
@@ -121,14 +124,16 @@ def possible(proposals: Proposals, columns: Mapping[str, FloatArray]) -> Proposa
 
 
 def _speedometer(proposals: Proposals, turning: Turning, wheels: Wheels) -> tuple[Proposals, list[str]]:
-    """The speed asked where ay over the yaw rate and the wheels agree that it reads too much; a note where ay alone says so."""
+    """The speed asked where ay over the yaw rate and the wheels agree that it misreads; a note where ay alone says so."""
     own = proposals.by_channel.get("vx")
-    if "ay" not in turning.columns or own is None or not TOO_FAST[0] < turning.scale < TOO_FAST[1]:
+    is_right = FITTING_SPEED[0] <= turning.scale <= FITTING_SPEED[1]
+    if "ay" not in turning.columns or own is None or is_right or not MISREAD[0] < turning.scale < MISREAD[1]:
         return proposals, []
     by_wheels = wheels_over_speed(wheels, proposals, turning.columns["vx"].slow * si_factor(own.unit, "vx"))
     if by_wheels is None or abs(by_wheels - turning.scale) > WHEELS_AGREE:
         excess = _excess(turning.scale / abs(turning.correlation), turning.scale * abs(turning.correlation))  # by regression either way
-        return proposals, [f"'{own.column}' reads {excess} by ay over yaw_rate, or ay too little; a factor in the data set corrects it"]
+        other = "little" if turning.scale < 1.0 else "much, as in a body that rolls"
+        return proposals, [f"'{own.column}' reads {excess} by ay over yaw_rate, or ay too {other}; a factor in the data set corrects it"]
     scaled = f"vx {own.unit} {own.sign:+d} {own.factor * by_wheels:.3f}"
     doubt = own.asked or f"it reads {_excess(by_wheels)} by the wheels and by ay over yaw_rate, as speedometers do; '{scaled}' corrects it"
     changed = replace(own, asked=doubt, others=(*own.others, scaled))
@@ -136,7 +141,8 @@ def _speedometer(proposals: Proposals, turning: Turning, wheels: Wheels) -> tupl
 
 
 def _excess(*scales: float) -> str:
-    return f"{' to '.join(dict.fromkeys(f'{100.0 * (1.0 / scale - 1.0):.0f}' for scale in scales))} % too much"
+    size = " to ".join(dict.fromkeys(f"{abs(100.0 * (1.0 / scale - 1.0)):.0f}" for scale in scales))
+    return f"{size} % too {'much' if scales[0] < 1.0 else 'little'}"
 
 
 def _stands(columns: Sequence[Candidate]) -> bool:
@@ -298,6 +304,24 @@ def _left_and_right(
         return proposals if turning_of(yaw, unit, known) >= 0.0 else proposals.mirrored()
     counts = [one.sign for one in proposals.channels if one.channel in LATERAL]
     return proposals.mirrored() if sum(counts) < 0 else proposals
+
+
+def _sideslip_to_save(columns: Sequence[Candidate], known: Motion) -> Iterator[str]:
+    """Notes of two angles, such as course and heading, whose difference may be a sideslip angle."""
+    for one, other in combinations((column for column in columns if "heading" in column.hints), 2):
+        apart = one.values - other.values
+        apart = np.angle(np.exp(1j * (np.radians(apart) if np.ptp(one.values) > 2.1 * math.pi else apart)))[known.moving]
+        low, high = np.quantile(apart, [0.02, 0.98]) if len(apart) else (0.0, 0.0)
+        if SIDESLIP[0] < high - low < SIDESLIP[1]:
+            yield f"'{one.name}' less '{other.name}' may be the sideslip angle that is missing as a reference; save it as a column"
+
+
+def _as_most_count(proposals: Proposals) -> Proposals:
+    """With channels whose sign nothing but a name suggests counting to the side to which most of the others do."""
+    by_name = [one for one in proposals.channels if one.channel in LATERAL - {"yaw_rate", "ay"} and one.evidence[0].startswith("its name")]
+    others = [one.sign for one in proposals.channels if one.channel in LATERAL and one not in by_name]
+    changed = {one.channel: replace(one, sign=1 if sum(others) >= 0 else -1) for one in by_name} if others else {}
+    return replace(proposals, channels=tuple(changed.get(one.channel, one) for one in proposals.channels))
 
 
 def _clues(columns: Sequence[Candidate], wheels: Wheels, known: Motion, compass: str, west_positive: bool) -> Iterator[tuple[str, float]]:

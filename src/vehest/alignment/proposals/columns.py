@@ -25,6 +25,8 @@ MOST_STRAY = 0.002
 LONG = 1000  # samples
 FEWEST_LEVELS = 9  # values that a motion takes; a gear or a flag takes fewer
 
+COMPUTED = "computed"
+
 UNITS = {  # where the header is silent, the likeliest first
     "vx": ("m/s", "km/h", "mph", "knots"),
     "yaw_rate": ("rad/s", "deg/s"),
@@ -48,7 +50,7 @@ class Candidate:
     hints: Mapping[str, float]  # role -> strength with which the name suggests it
     gappy: bool = False  # whether samples were missing
     is_made: bool = False  # whether it is the mean of wheels, and no column of the log
-    device: str = ""  # ``car`` or ``reference`` where the file says which of them measured it
+    device: str = ""  # ``car`` or ``reference`` where the file says which of them measured it, `COMPUTED` where nothing did
 
     @property
     def is_wheel(self) -> bool:

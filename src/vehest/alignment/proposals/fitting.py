@@ -11,7 +11,7 @@ import numpy as np
 from scipy.optimize import linear_sum_assignment
 
 from vehest.alignment.motion import Motion
-from vehest.alignment.proposals.columns import Candidate, correlation, si_factor, slow_of
+from vehest.alignment.proposals.columns import COMPUTED, Candidate, correlation, si_factor, slow_of
 from vehest.alignment.proposals.names import STRONG
 from vehest.alignment.proposals.proposal import Proposal
 from vehest.alignment.proposals.turning import Search
@@ -24,6 +24,7 @@ CLEAR = 0.6  # correlation that decides where nothing else comes near
 CLEAR_LATERAL = 0.45  # of relations with derivatives of noisy channels
 LEAST = 0.3
 NEAR = 2.0  # score within which another column comes near
+FITTING = 1.1  # logarithm of the scale of an acceleration over d(vx)/dt, within which pitch, grade and slip explain it
 OF_REFERENCE, BESIDE_BUS = 2.5, 8.0  # of score, for what the car is to measure itself; where its bus has a column of that name, more
 SECOND = 3.0 + STRONG  # score of a sideslip angle beside a lateral velocity
 CENTRED = 0.1  # of a command's range, by which straight ahead may lie beside nil
@@ -123,7 +124,7 @@ def _with_rivals(chosen: Offer, rivals: Sequence[Offer]) -> Proposal:
 
 def may_be_ax(column: Candidate) -> bool:
     """Whether unit and name allow a longitudinal acceleration."""
-    return column.measures("ax") and column.hint("ax") >= 0.0
+    return column.measures("ax") and column.hint("ax") >= 0.0 and column.device != COMPUTED
 
 
 def _as_ax(search: Search, column: Candidate) -> Offer | None:
@@ -131,7 +132,10 @@ def _as_ax(search: Search, column: Candidate) -> Offer | None:
         return None
     best = longitudinal(search.known, column)
     unit = best.unit if best.strength else column.unit or search.turning.units.get("ay", "m/s²")
-    is_clear = best.strength >= CLEAR and (best.mismatch < 1.1 or bool(column.unit))
+    fits = best.mismatch < FITTING or bool(column.unit)
+    if not fits and "ax" not in column.hints:  # a torque follows d(vx)/dt as well
+        return None
+    is_clear = best.strength >= CLEAR and fits
     asked = "" if is_clear or (column.hint("ax") == STRONG and column.unit) else HARDLY
     evidence = (best.in_words or "its name alone", *_name_evidence(column, "ax"))
     measured = any(one.is_of_bus and "ax" in one.hints for one in search.free)
@@ -191,10 +195,10 @@ def _as_lateral(search: Search, column: Candidate) -> Offer | None:
     best = max(found, key=lambda one: 4.0 * one.strength - 0.6 * min(one.mismatch, 5.0) + hints[one.channel])
     hint = hints[best.channel]
     rivals = [one for one in found if one.channel != best.channel and one.strength > best.strength - 0.05 and not hint]
-    is_clear = best.strength >= CLEAR_LATERAL or (best.strength >= LEAST and hint > 0.0) or (hint == STRONG and column.unit)
+    is_clear = best.strength >= CLEAR_LATERAL or (best.strength >= LEAST and hint > 0.0)
     asked = f"could be {rivals[0].channel} in {rivals[0].unit} as well" if rivals else "" if is_clear else HARDLY
-    if not best.strength and not column.unit:
-        asked = f"sign and unit: {HARDLY}"
+    if not rivals and not is_clear and hint == STRONG:
+        asked = f"sign: {HARDLY}" if column.unit else f"sign and unit: {HARDLY}"
     if not asked and column.hint(best.channel) < 0.0:
         asked = "the motion contradicts its name"
     evidence = (best.in_words or "its name alone", *_name_evidence(column, *REFERENCES))

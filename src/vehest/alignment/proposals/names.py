@@ -10,26 +10,26 @@ STRONG, WEAK = 4.0, 2.0
 _STRONG = {  # over the name without blanks
     "other": r"temp(?!o)|oilp|gear|^gang|gang$|thrott|pedal|gaspe|drossel|volt|batt|sats?$|satel|qual|status|lapn|^lap|runde|"
     r"dist|strecke|weg$|height|altit|hoehe|vertvel|cov|rms|std|jerk|ruck|fuel|tank|error|count|engn|engine|"
-    r"motordreh|^drehzahl|^rpm$|^nmot|wind|susp|feder|damper|^id$|index|event|friction|accped|orientation|"
+    r"motordreh|^drehzahl|^rpm$|^nmot|wind(?!igkeit)|susp|feder|damper|^id$|index|event|friction|accped|orientation|"
     r"magnet|flag|counter|zaehler|time|zeit|stamp|safety|yawa(ng)?acc|yawangular|gierbeschl|angularacc",
-    "yaw_rate": r"yawra?te?|gierrate|giergeschw|gierwinkelgeschw|dpsi|psidot|psip|yawvel|rateyaw|yawspeed|omegaz|"
+    "yaw_rate": r"yawra?te?|ang(ular)?ratez|gierrate|giergeschw|gierwinkelgeschw|dpsi|psidot|psip|yawvel|rateyaw|yawspeed|omegaz|"
     r"angular(velocity)?z|gyr(o)?z|^(imu)?[gw]z$|^rimu$|psistrich|vgier",
     "ay": r"latac|latera?lac|acclat|acc(el|eleration)?y|querb|^ay(cg|imu|mps2|v)?$|alat$|^alat|linearaccelerationy|yacc|glat|^gy$|quera|"
-    r"accquer|laterala|beschl(eunigung)?(y|quer)|latg$|gforcelat|ayvehicle",
+    r"accquer|accel?lat|laterala|beschl(eunigung)?(y|quer)|latg$|gforcelat|ayvehicle",
     "ax": r"longac|longitudinalac|acclong|acc(el|eleration)?x|laengsb|langsb|lengthacc|^ax(cg|imu|mps2|v)?$|along$|^along|algt|"
-    r"linearaccelerationx|xacc|glong|^gx$|accl(a|ae)ngs|beschl(eunigung)?(x|l(a|ae)ngs)|longg$|lonacc|acclon|gforcelon|axvehicle",
+    r"linearaccelerationx|xacc|glong|^gx$|accl(a|ae)ngs|beschl(eunigung)?(x|l(a|ae)ngs)|longg$|lonacc|acclon|gforcelon|axvehicle|accel?forward",
     "handwheel": r"lenkrad|^lrw|swa$|^swa|st(ee)?r?wh(ee)?l|steeringwheel|handwheel|handlenk|sas(ang)|stwhl|volant",
     "steer": r"roadwheel|radeinschlag|deltaw|frontwheelangle|^delta|steer|lenk|whlang|servo",
     "vy_ref": r"^vy|vyc?g?$|vlat|latvel|velocitylat|lateralvel|latera?lspeed|vellat|vquer|quergeschw|velocityy|"
     r"linear_?y$|latspeed|velocityvehicley|speedlat|vely",
     "sideslip_ref": r"sideslip|slipang|slipcog|slipcg|^beta|beta$|schwimm|driftang|floatang|^slip$",
-    "heading": r"heading|truehead|course|yawang|gierwinkel|^psi$|azimuth|^yaw$|kurswinkel|headimu",
+    "heading": r"heading|truehead|course|angletrack|yawang|gierwinkel|^psi$|azimuth|^yaw$|kurswinkel|headimu",
     "latitude": r"latitude|gpslat$|^lat$|breitengrad",
     "longitude": r"longitude|gpslong?$|^long?$|^lng$|laengengrad",
     "position_x": r"^x$|posx$|positionx$|posex$|xpos$|viconx$|^xm$",
     "position_y": r"^y$|posy$|positiony$|posey$|ypos$|vicony$|^ym$",
     "vx": r"speed|velocity|geschw|vehspd|^vx|vxc?g?$|vlong|vellong|longvel|vfzg|tacho|velocityx|linearx$|^kmh$|^mph$|"
-    r"velx|vlaengs|longitudinalvel|lngvel|fahrzeugv|vehv|groundspd|vehicles?pd|encoder",
+    r"velx|vlaengs|longitudinalvel|lngvel|velforward|fahrzeugv|vehv|groundspd|vehicles?pd|encoder",
     "roll_rate": r"rollra?te?|wankrate|angularvelocityx|omegax|gyr(o)?x|^[gw]x$",
     "pitch_rate": r"pitchrate|nickrate|angularvelocityy|omegay|gyr(o)?y|^[gw]y$",
     "roll": r"^roll|rollang|wankwinkel|^wank",
@@ -54,6 +54,7 @@ _REFERENCE = re.compile(
 _BUS = re.compile(r"\bcan\d?\b|\besp\b|\babs\b|\besc\b|\bobd|^veh(icle)?(spd|speed|sp)|^tacho|spdlgt|^alat\d|^algt\d")
 _STEERING_RATE = re.compile(r"deltadelta|steer(ing)?(wheel)?(angle)?(rate|speed|vel)|lenk\w*geschw|swarate|anglerate|deltadot|ddelta")
 _FILTERED = re.compile(r"filt|smooth|\blp\b|avg|mittel|gemittelt")
+_UNTELLING = re.compile(r"\b(body|frame|chassis)\b")
 _CORNERS = {
     "fl": r"fl|vl|lf|front ?left|vorne? ?links|left ?front",
     "fr": r"fr|vr|rf|front ?right|vorne? ?rechts|right ?front",
@@ -92,7 +93,7 @@ def bare(name: str) -> str:
 @cache
 def hints(name: str) -> dict[str, float]:
     """Role -> `STRONG` or `WEAK`, for each role that a name suggests."""
-    words = _FILTERED.sub("", bare(name)).strip()
+    words = re.sub(r" {2,}", " ", _UNTELLING.sub("", _FILTERED.sub("", bare(name)))).strip()
     compact = words.replace(" ", "")
     if is_filtered(name):
         compact = compact.removesuffix("ered")
@@ -107,7 +108,7 @@ def hints(name: str) -> dict[str, float]:
         for role, pattern in _WEAK.items()
         if re.search(pattern, compact) or re.search(rf"^(?:{pattern})$", words.rpartition(" ")[2])
     }
-    found |= {role: STRONG for role, pattern in _STRONG.items() if re.search(pattern, compact)}
+    found |= {role: STRONG for role, pattern in _STRONG.items() if re.search(pattern, compact) or role in words.split()}
     strong = {role for role, strength in found.items() if strength == STRONG}
     is_other = "other" in strong and not strong & {"yaw_rate", "ay", "ax", "sideslip_ref", "vy_ref", "handwheel"}
     if is_other or (_STEERING_RATE.search(compact) and "yaw_rate" not in strong):

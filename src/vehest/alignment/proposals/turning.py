@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 
 from vehest.alignment.motion import Motion, rms
-from vehest.alignment.proposals.columns import Candidate, correlation, largest, si_factor
+from vehest.alignment.proposals.columns import COMPUTED, Candidate, correlation, largest, si_factor
 from vehest.alignment.proposals.names import STRONG, is_filtered, is_pair, is_reference
 from vehest.alignment.proposals.proposal import Proposal
 from vehest.constants import FloatArray
@@ -112,7 +112,11 @@ def _centred(rows: FloatArray) -> tuple[FloatArray, FloatArray]:
 def _pool(columns: Sequence[Candidate], channel: str) -> list[Candidate]:
     """Columns that could be a channel, those whose names suggest it first."""
     own = [one for one in columns if one.measures(channel) and "other" not in one.hints and not one.is_wheel]
-    own = [one for one in own if channel in one.hints or all(one.hints.get(other) != STRONG for other in FOLLOWING)]
+    own = [
+        one
+        for one in own
+        if one.device != COMPUTED and (channel in one.hints or all(one.hints.get(other) != STRONG for other in FOLLOWING))
+    ]
     own = [one for one in own if channel != "vx" or _is_forward(one.slow)]
     return sorted(own, key=lambda one: -(one.hints.get(channel) or (-1.0 if one.hints else NAMELESS)))[:MOST_COLUMNS]
 
@@ -247,8 +251,10 @@ def _separated(family: Sequence[Repeat], channel: str) -> list[Proposal]:
         own.sort(key=lambda one: -max(one.column.hints.values(), default=0.0))
         asked = f"{len(own)} columns could be the car's own {channel}" if len(own) > 1 else ""
         first = proposal(own[0], channel, asked=asked, others=tuple(one.column.name for one in own[1:]))
-        why = "named as a reference" if is_reference(references[0].column.name) else "the other one is of the car's own bus"
-        return [first, proposal(references[0], reference, why)]
+        other = references[0].column
+        why = "named as a reference" if other.is_reference else "the other one is of the car's own bus"
+        asked = "" if other.is_reference or channel in other.hints else f"whether it is the reference's {channel}: no name says so"
+        return [first, proposal(references[0], reference, why, asked=asked)]
     if len(plain) < 2:
         return [Proposal(one.column.name, channel, one.unit, one.sign, ("the others are filtered",)) for one in plain]
     asked = f"which is the car's own {channel}, and which the reference's: no name decides"

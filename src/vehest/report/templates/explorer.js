@@ -81,7 +81,7 @@ class Explorer {
 
   build() {
     this.table = element("tbody");
-    const head = ["", "estimator", "RMSE(β) [deg]", "", "RMSE(v) [m/s]", "band, map"];
+    const head = ["", "estimator (chosen seed)", "RMSE(β) [deg]", "", "RMSE(v) [m/s]", "band, map"];
     const kinds = ["", "", "number", "length", "number second", ""];
     const headers = head.map((text, i) => element(text ? "th" : "td", { textContent: text, className: kinds[i], ...(text ? { scope: "col" } : {}) }));
     const table = element("table", {}, element("thead", {}, element("tr", {}, ...headers)), this.table);

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
@@ -15,16 +16,19 @@ from vehest.alignment.checks import checks_of_recording
 from vehest.alignment.delays import Late, late_channels
 from vehest.alignment.proposals.proposal import Proposal
 from vehest.alignment.settings import AlignmentSettings
+from vehest.constants import FloatArray
 from vehest.data.channels import CHANNELS
 from vehest.data.derivable_channels import derivation_of
 from vehest.data.errors import ConfigurationError, DataError, VehestError
 from vehest.data.recording import Recording
 from vehest.data.recording_summary import RecordingSummary, common_channels, summary_of
-from vehest.run.own_car.inspect import BRIDGED, EVIDENCE_HZ, RATE_TOLERANCE, TABLES, Examined, is_parquet, rate_of
+from vehest.data.runs import true_runs
+from vehest.run.own_car.inspect import BRIDGED, EVIDENCE_HZ, RATE_TOLERANCE, TABLES, Examined, rate_of
 from vehest.run.printing import counted
 from vehest.sources.base import open_source
 from vehest.sources.clocks import plain_rate
-from vehest.sources.surveys import RawColumn
+from vehest.sources.surveys import Log, RawColumn
+from vehest.sources.surveys.clocks import FEWEST_STEPS, MAX_GAP
 
 POLICIES = {"vbo": ("strict", "interpolate"), **dict.fromkeys(TABLES, ("strict", "interpolate", "uniform"))}
 """Source -> clocks of its data sets, the strictest first; other sources make their own."""
@@ -33,7 +37,7 @@ LEAST_GAP = 0.05  # s
 LONGEST_GAP = 1.0  # s that signals of a measurement may be missing
 MOST_STRAY = 0.002  # of the rows
 POSE_SECONDS = 0.15  # of the filter that differentiates poses
-CONTRADICTIONS = ("sign", "unit", "impossible")  # checks that contradict a proposal
+CONTRADICTIONS = ("sign", "unit", "impossible", "kinematics")  # checks that contradict a proposal
 REMARKS = (*CONTRADICTIONS, "dropout", "stuck", "held")
 
 
@@ -72,14 +76,17 @@ def draft(examined: Examined) -> Draft:
     longest = max(recordings, key=lambda own: own.duration)
     late, ratio, notes = late_channels(longest), None, [*proposals.notes]
     for stem, rows in dataset.get("drop_rows", {}).items():
-        listed = counted([str(row) for row in rows])
-        notes.append(f"left out of '{stem}' by drop_rows, beyond what a vehicle can do: data rows: {listed}")
+        why = f"beyond what a vehicle can do, or {BRIDGED:g} s and more without a sample"
+        notes.append(f"left out of '{stem}' by drop_rows, {why}: data rows: {counted([str(row) for row in rows])}")
     if vehicle["wheelbase"] and vehicle["steering_ratio"] is None and "handwheel" in longest:
         try:
             found = align(longest, AlignmentSettings(("steering_ratio",), wheelbase=vehicle["wheelbase"]))["steering_ratio"]
             ratio = (found.value, found.uncertainty)
         except VehestError as error:
             notes.append(f"the steering ratio could not be estimated: {error}")
+    if pause := dataset.get("max_gap"):
+        of_file = Counter(str(one.provenance.get("file")) for one in recordings)
+        notes += [f"'{file}' pauses for more than {pause:g} s and makes {n} recordings" for file, n in of_file.items() if n > 1]
     dataset |= {"transforms": _transforms(examined, longest, late, speed, vehicle["steering_ratio"] or (ratio[0] if ratio else None))}
     recordings = _recordings(dataset)
     channels = tuple(
@@ -137,16 +144,21 @@ def _dataset(examined: Examined) -> dict[str, Any]:
     if log.source != "vbo":
         dataset["time"] = None if log.clock is None else {"column": log.clock.column, "unit": log.clock.unit}
         dataset |= {"rate_hz": examined.rate_hz} if log.clock is None else {}
-    if log.source in TABLES and log.clock is not None and (stray := _stray_rows(examined)):
-        dataset["drop_rows"] = stray
     dataset["clock"] = "strict"
-    gaps = {one.channel: _longest_gap(examined, one.column) for one in proposals.channels}
-    short = [gap for gap in gaps.values() if 0.0 < gap <= BRIDGED]
-    if short and log.source in TABLES and not is_parquet(log):
-        dataset |= {"source": "text_log", "bridge": math.ceil(100.0 * max(short) * 1.05) / 100.0}
-        gaps = {name: gap for name, gap in gaps.items() if gap > BRIDGED}
+    gaps = {one.channel: [_gaps(examined, own, one.column) for own in examined.logs] for one in proposals.channels}
+    longest = {name: max(float(own.max()) for own in of_files) for name, of_files in gaps.items()}
+    if log.source in TABLES:
+        short = max((float(own[own <= BRIDGED].max(initial=0.0)) for of_files in gaps.values() for own in of_files), default=0.0)
+        dataset |= {"source": "text_log", "bridge": math.ceil(100.0 * short * 1.05) / 100.0} if short else {}
+    if log.source in TABLES and log.clock is not None:
+        holes = {own.file.stem: _holes([of_files[k] for of_files in gaps.values()]) for k, own in enumerate(examined.logs)}
+        dropped = {stem: [*rows, *stray] for stem, stray in _stray_rows(examined).items() if (rows := holes[stem]) or stray}
+        dataset |= {"drop_rows": dropped} if dropped else {}
+        if any(holes.values()) and "runs" not in log.options:
+            dataset["max_gap"] = log.options.get("max_gap", MAX_GAP)
+        longest = {}
     dataset["channels"] = {one.channel: _entry(one, columns[one.column].place) for one in proposals.channels}
-    dataset["gappy"] = [name for name, gap in gaps.items() if gap > 0.0]
+    dataset["gappy"] = [name for name, gap in longest.items() if gap > (BRIDGED if log.source in TABLES else 0.0)]
     if proposals.pose:
         rate = rate_of(log.seconds) if log.seconds is not None else float(examined.rate_hz or EVIDENCE_HZ)
         parts = {part: {"column": column, "unit": unit} for part, column, unit in proposals.pose}
@@ -166,36 +178,40 @@ def _stray_rows(examined: Examined) -> dict[str, list[int]]:
     for log in examined.logs:
         columns = {column.name: column.values for column in log.columns}
         beyond = np.any([one.beyond(columns[one.column]) for one in examined.proposals.channels], axis=0)
-        if 0.0 < beyond.mean() <= MOST_STRAY:
-            found[log.file.stem] = (np.flatnonzero(beyond) + 1).tolist()
+        found[log.file.stem] = (np.flatnonzero(beyond) + 1).tolist() if beyond.mean() <= MOST_STRAY else []
     return found
 
 
-def _longest_gap(examined: Examined, column: str) -> float:
-    """Longest time without a sample in any file [s]; infinite where there are no times, 0 where none is missing."""
-    longest = 0.0
-    for log in examined.logs:
-        values = next(own.values for own in log.columns if own.name == column)
-        known = np.isfinite(values)
-        if known.all():
-            continue
-        seconds = log.seconds if log.seconds is not None else np.arange(len(values)) / float(examined.rate_hz or EVIDENCE_HZ)
-        for run in log.runs:
-            edges = np.concatenate([seconds[run][:1], seconds[run][known[run]], seconds[run][-1:]])
-            longest = max(longest, float(np.diff(edges).max(initial=0.0))) if known[run].any() else math.inf
-    return longest
+def _holes(gaps: Sequence[FloatArray]) -> list[str]:
+    """Ranges of rows, from 1, in which a channel has no sample for longer than lines bridge."""
+    return [f"{first + 1}-{last}" for first, last in true_runs(np.any([own > BRIDGED for own in gaps], axis=0))]
+
+
+def _gaps(examined: Examined, log: Log, column: str) -> FloatArray:
+    """How long the time is that a row without a sample lies in [s], (N,): infinite in a run without any, 0 in a row with one."""
+    values = next(own.values for own in log.columns if own.name == column)
+    seconds = log.seconds if log.seconds is not None else np.arange(len(values)) / float(examined.rate_hz or EVIDENCE_HZ)
+    found = np.zeros(len(values))
+    for run in log.runs:
+        times, known = seconds[run], np.isfinite(values[run])
+        edges = np.concatenate([times[:1], times[known], times[-1:]])
+        lengths = np.diff(edges) if known.any() else np.array([math.inf])
+        found[run] = np.where(known, 0.0, lengths[np.clip(np.searchsorted(edges, times) - 1, 0, len(lengths) - 1)])
+    return found
 
 
 def _mdf_options(columns: Mapping[str, RawColumn], proposals: Sequence[Proposal]) -> dict[str, Any]:
-    channels, rates = {}, []
+    channels, rates, paused = {}, [], False
     for one in proposals:
-        rate, gap = _rate_and_gap(columns[one.column])
+        rate, gap = _rate_and_gap(columns[one.column], LONGEST_GAP)
         rates.append(rate)
+        paused |= gap < _rate_and_gap(columns[one.column])[1]
         channels[one.channel] = _entry(one, columns[one.column].place)
-        if 3.0 / rate < gap <= LONGEST_GAP:
+        if 3.0 / rate < gap:
             channels[one.channel]["max_gap"] = math.ceil(100.0 * gap) / 100.0
     gappy = [one.channel for one in proposals if one.gappy]
-    return {"rate_hz": plain_rate(max(rates), RATE_TOLERANCE), "channels": channels, "gappy": gappy}
+    pause = {"max_gap": float(f"{max(MAX_GAP, FEWEST_STEPS / min(rates)):.3g}")} if paused else {}
+    return {"rate_hz": plain_rate(max(rates), RATE_TOLERANCE), **pause, "channels": channels, "gappy": gappy}
 
 
 def _bag_options(columns: Mapping[str, RawColumn], proposals: Sequence[Proposal]) -> dict[str, Any]:
@@ -215,10 +231,11 @@ def _bag_options(columns: Mapping[str, RawColumn], proposals: Sequence[Proposal]
     return {"rate_hz": plain_rate(min(max(rates), BAG_HZ), RATE_TOLERANCE), "topics": topics, "channels": channels}
 
 
-def _rate_and_gap(column: RawColumn) -> tuple[float, float]:
-    """Median rate [Hz] and longest gap [s] of a column with times of its own."""
+def _rate_and_gap(column: RawColumn, shorter: float = math.inf) -> tuple[float, float]:
+    """Median rate [Hz] and longest gap [s], of those up to ``shorter``, of a column with times of its own."""
     assert column.stamps is not None
-    return rate_of(column.stamps), float(np.diff(column.stamps).max())
+    gaps = np.diff(column.stamps)
+    return rate_of(column.stamps), float(gaps[gaps <= shorter].max(initial=0.0))
 
 
 def _transforms(

@@ -8,12 +8,15 @@ import os
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from fnmatch import filter as matching
+from itertools import product
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from vehest.alignment.proposals.assign import possible, propose
+from vehest.alignment.proposals.columns import COMPUTED
+from vehest.alignment.proposals.names import hints
 from vehest.alignment.proposals.proposal import Proposals
 from vehest.constants import FloatArray
 from vehest.data.errors import ConfigurationError, DataError
@@ -25,6 +28,7 @@ from vehest.run.printing import counted
 from vehest.sources.base import source_names
 from vehest.sources.clocks import plain_rate
 from vehest.sources.surveys import Log, RawColumn, survey
+from vehest.sources.surveys.clocks import between_pauses
 from vehest.sources.text_log import bridged
 from vehest.sources.unit_spellings import plain_unit
 
@@ -33,6 +37,7 @@ LONGEST_EVIDENCE = 1200.0  # s
 ENDS = 1.0  # s at either end of a longer drive that do not count
 BRIDGED = 1.0  # s without a sample that straight lines bridge
 MOST_LISTED = 5
+MOST_COMPARED, USUAL, EXACT = 4_000, 0.99, 0.999  # rows, share of them, and correlation of a column with another's difference
 RATE_TOLERANCE = 5e-3  # of rates of unknown clocks
 TABLES = ("tabular", "text_log")
 LAYOUT = {"delimiter": ",", "decimal": ".", "encoding": "utf8", "skip_rows": 0, "rows_below_names": 0, "runs": None}
@@ -88,7 +93,8 @@ def inspect(name: str, files: Sequence[Path], vehicle: Mapping[str, float | None
     others = [log for log in logs if log.file != longest.file]
     columns, rate = _evidence(longest)
     is_vbo = longest.source == "vbo"  # whose headings count clockwise, and longitudes to the west
-    devices = {column.name: column.device for column in longest.columns}
+    differences = _differences(longest)
+    devices = {column.name: COMPUTED if column.name in differences else column.device for column in longest.columns}
     proposals = propose(columns, rate, devices=devices, compass="heading" if is_vbo else "", west_positive=is_vbo)
     if longest.source not in TABLES:  # other sources make no reference of positions
         proposals = replace(proposals, pose=())
@@ -101,8 +107,9 @@ def inspect(name: str, files: Sequence[Path], vehicle: Mapping[str, float | None
     if not proposals.channels:
         names = counted([column.name for column in longest.columns])
         raise DataError(f"'{longest.file}': no column is recognised as a channel, by name or by motion, of {names}")
+    computed = [f"'{own}' is left out: the difference of '{of}' from row to row, and no measurement" for own, of in differences.items()]
     shadowed = [f"'{name}' is a data set that comes with vehest, too; in this folder it is yours"] if name in choices("dataset") else []
-    proposals = replace(proposals, notes=(*proposals.notes, *_notes(longest, logs), *(shadowed if not existing else [])))
+    proposals = replace(proposals, notes=(*proposals.notes, *computed, *_notes(longest, logs), *(shadowed if not existing else [])))
     timed = longest.seconds is not None or any(column.stamps is not None for column in longest.columns)
     place, rate = _place(files, longest.source), None if timed else proposals.rate_hz
     return Examined(name, tuple(files), (longest, *others), proposals, place, rate, dict.fromkeys(VEHICLE) | dict(vehicle or {}))
@@ -113,18 +120,13 @@ def paths_of(name: str) -> tuple[Path, Path, Path]:
     return Path("conf") / "dataset" / f"{name}.yaml", Path("conf") / "split" / f"{name}.yaml", Path("pipelines") / f"{name}.yaml"
 
 
-def is_parquet(log: Log) -> bool:
-    """Whether a table is no text."""
-    return log.file.suffix.lower() in (".parquet", ".pq")
-
-
 def rate_of(stamps: FloatArray) -> float:
     """Median rate of time stamps [Hz]."""
     return 1.0 / max(float(np.median(np.diff(stamps))), 1e-6)
 
 
 def _longest(logs: Sequence[Log]) -> Log:
-    formats = {"text" if log.source in TABLES and not is_parquet(log) else log.source for log in logs}
+    formats = {"text" if log.source in TABLES and log.file.suffix.lower() not in (".parquet", ".pq") else log.source for log in logs}
     if len(formats) > 1:
         raise ConfigurationError(f"the files are of several formats ({', '.join(sorted(formats))}); make a data set of each")
     longest = max(logs, key=lambda log: log.runs[0].stop - log.runs[0].start if log.runs else max(len(one.values) for one in log.columns))
@@ -148,13 +150,11 @@ def _layout(log: Log) -> dict[str, Any]:
 
 
 def _notes(longest: Log, logs: Sequence[Log]) -> Iterator[str]:
-    """Parts of the files that were not read, and long gaps."""
+    """Parts of the files that were not read, and gaps that lines bridge."""
     yield from (f"not read: {text}" for text in longest.skipped[:MOST_LISTED])
     if len(longest.skipped) > MOST_LISTED:
         yield f"not read: {len(longest.skipped) - MOST_LISTED} more"
     for log in logs:
-        if "max_gap" in log.options:
-            yield f"'{log.file.name}' pauses for more than {log.options['max_gap']:g} s and makes {len(log.runs)} recordings"
         stamps_of_runs = [] if log.seconds is None else [log.seconds[run] for run in log.runs]
         for stamps in stamps_of_runs:
             steps = np.diff(stamps)
@@ -205,10 +205,31 @@ def _evidence(log: Log) -> tuple[list[tuple[str, str, FloatArray]], float | None
     return [(own.name, plain_unit(own.unit) or "", values) for own, values in zip(columns, samples, strict=True)], rate
 
 
+def _differences(log: Log) -> dict[str, str]:
+    """Columns that are the difference of another from row to row -> that one, a velocity by its name; no acceleration was measured."""
+    own = [column for column in log.columns if column.stamps is None]
+    middle = log.runs[0].start + max((log.runs[0].stop - log.runs[0].start - MOST_COMPARED) // 2, 0) if own else 0
+    rows = np.array([column.values[middle : min(middle + MOST_COMPARED, log.runs[0].stop)] for column in own])
+    velocities = [k for k, column in enumerate(own) if {"vx", "vy_ref"} & set(hints(column.name)) and np.isfinite(rows[k]).all()]
+    found: dict[str, str] = {}
+    for k, (first, last) in product(velocities, ((0, -1), (1, None))):
+        steps = np.diff(rows[k])
+        usual = np.abs(steps) <= np.quantile(np.abs(steps), USUAL)
+        steps, others = steps[usual] - steps[usual].mean(), rows[:, first:last][:, usual]
+        others -= others.mean(axis=1, keepdims=True)
+        with np.errstate(all="ignore"):
+            agreeing = np.abs(others @ steps) / np.sqrt((others * others).sum(axis=1) * (steps @ steps))
+        found |= {own[j].name: own[k].name for j in np.flatnonzero(agreeing > EXACT) if j != k}
+    return found
+
+
 def _on_one_clock(log: Log, columns: Sequence[RawColumn]) -> tuple[FloatArray, float | None]:
     timed = [(column.values, column.stamps) for column in columns if column.stamps is not None]
     if timed:
-        begin, end = (float(np.median([stamps[edge] for _, stamps in timed])) for edge in (0, -1))
+        sampled = np.unique(np.concatenate([stamps for _, stamps in timed]))
+        runs, _ = between_pauses(sampled, 1.0 / max(rate_of(stamps) for _, stamps in timed))
+        longest = sampled[max(runs, key=lambda run: sampled[run.stop - 1] - sampled[run.start])]
+        begin, end = (float(np.median(np.clip([stamps[edge] for _, stamps in timed], longest[0], longest[-1]))) for edge in (0, -1))
         rate = plain_rate(min(max(rate_of(stamps) for _, stamps in timed), EVIDENCE_HZ), RATE_TOLERANCE)
         check_limit("samples", (end - begin) * rate, f"'{log.file}' lasts {(end - begin) * rate:.0f} samples at {rate:g} Hz")
         grid = np.arange(begin, end, 1.0 / rate)

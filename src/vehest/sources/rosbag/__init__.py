@@ -66,8 +66,8 @@ class RosbagSource(FileSource):
         """Archives and files of bags."""
         return {file.name if file == bag else f"{bag.name}/{file.name}": file for bag in self._files() for file in bag_files(bag)}
 
-    def read_raw_file(self, file: Path) -> Recording:
-        """Read a bag, a file or a folder, wherever it is; raises as `read_bag` does, and `DataError` for topics of no recording."""
+    def _read(self, file: Path, run: int | None) -> Recording:
+        """Read a bag, a file or a folder; raises as `read_bag` does, and `DataError` for topics of no recording."""
         wanted = [[topic.topic, topic.type, self.fields[name]] for name, topic in self.topics.items()]
         most_bytes, layouts = int(1e9 * self.options.unpacked_limit), self.options.messages or {}
         reading = read_bag(file, "read_topics", most_bytes, topics=wanted, layouts=layouts)

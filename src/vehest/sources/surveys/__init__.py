@@ -9,11 +9,14 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Literal
 
+import numpy as np
+
 from vehest.data.errors import DataError, MissingError
 from vehest.data.store import is_stored_recording
 from vehest.sources.base import require_no_spreadsheet
 from vehest.sources.clocks import clock_fault, span_fault
 from vehest.sources.surveys.bags import survey_bag
+from vehest.sources.surveys.clocks import between_pauses
 from vehest.sources.surveys.log import Log, RawColumn, Stamps
 from vehest.sources.surveys.mdf import survey_mdf
 from vehest.sources.surveys.tables import survey_table
@@ -80,8 +83,10 @@ def _survey_vbo(file: Path) -> Log:
     columns = tuple(
         RawColumn(name, units.get(name, ""), samples, {"column": name}, None, devices.get(name, "")) for name, samples in wanted.items()
     )
-    clock = Stamps("time", "s", "clock time of the format")
-    return Log(file, "vbo", columns, {}, clock, log.seconds - log.seconds[0], (slice(0, len(log.seconds)),), skipped)
+    clock, seconds = Stamps("time", "s", "clock time of the format"), log.seconds - log.seconds[0]
+    runs, max_gap = between_pauses(seconds, float(np.median(np.diff(seconds))))
+    runs.sort(key=lambda rows: rows.start - rows.stop)
+    return Log(file, "vbo", columns, {} if max_gap is None else {"max_gap": max_gap}, clock, seconds, tuple(runs), skipped)
 
 
 def _begins_as_mdf(path: Path) -> bool:

@@ -60,14 +60,17 @@ def find_clock(columns: Mapping[str, FloatArray], units: Mapping[str, str]) -> F
     values = columns[best.column]
     steps, seconds = np.diff(values), (values - values[0]) * UNITS[best.unit]
     starts, counted_by = _run_starts(columns, best.column, steps, step)
-    longest, max_gap = max(MAX_GAP, FEWEST_STEPS * step * UNITS[best.unit]), None
-    gaps = (np.diff(seconds) > longest) & ~starts
-    runs = stretches(starts, n_rows)
-    stray = any(span_fault(seconds[run]) for run in runs if run.stop - run.start > 1)
-    if not counted_by and gaps.any() and gaps.mean() <= MOST_RESTARTS and not stray:
-        cut = [*timed_runs(seconds, longest, restarts=True).values()]
-        runs, max_gap = (cut, longest) if cut else (runs, None)
+    runs, max_gap = (stretches(starts, n_rows), None) if counted_by else between_pauses(seconds, step * UNITS[best.unit])
     return Found(best, seconds, tuple(sorted(runs, key=lambda rows: rows.start - rows.stop)), counted_by, max_gap)
+
+
+def between_pauses(seconds: FloatArray, step: float) -> tuple[list[slice], float | None]:
+    """Rows of each run of times [s], (N,), which ends where they restart or pause, and the shortest pause [s], if there is one."""
+    steps, longest = np.diff(seconds), float(f"{max(MAX_GAP, FEWEST_STEPS * step):.3g}")
+    runs, pauses = stretches(steps < 0, len(seconds)), steps > longest
+    stray = any(span_fault(seconds[run]) for run in runs if run.stop - run.start > 1)
+    cut = timed_runs(seconds, longest, restarts=True) if pauses.any() and pauses.mean() <= MOST_RESTARTS and not stray else {}
+    return ([*cut.values()], longest) if cut else (runs, None)
 
 
 def plain_name(name: str) -> str:

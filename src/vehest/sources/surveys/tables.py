@@ -92,7 +92,7 @@ def _log(
     named = {name: times for name, times in values.items() if stamps is None and NAMED.match(plain_name(name))}
     faults = [_fault(name, times) for name, times in {**clocks, **named}.items() if stamps is None or name != stamps.column]
     if found.max_gap is not None:
-        options = {**options, "max_gap": float(f"{found.max_gap:.3g}")}
+        options = {**options, "max_gap": found.max_gap}
     if found.counted_by:
         options = {**options, "runs": found.counted_by}
     elif found.seconds is not None and (np.diff(found.seconds) < 0).any():

@@ -62,13 +62,13 @@ def verdict_sentences(ranking: Ranking, titles: Mapping[Name, str], where: str) 
     if not ranking.order:
         return f"On {where} no estimator gave a finite error."
     best = ranking.order[0]
-    figure = f"RMSE(β) {fixed(ranking.rmse[best], 3)}°"
+    figure = f"RMSE(β) over all seeds {fixed(ranking.rmse[best], 3)}°"
     if best in ranking.intervals:
         low, high = ranking.intervals[best]
         figure += f" [{fixed(low, 3)}, {fixed(high, 3)}]"
     if ranking.winner is not None:
         return (
-            f"On {where} **{titles[best]}** has the lowest sideslip error, **{figure}** over its seeds: below every other candidate, "
+            f"On {where} **{titles[best]}** has the lowest sideslip error, **{figure}**: below every other candidate, "
             f"v = 0 and the static map, each by more than chance.{_blocks_sentence(ranking)}"
         )
     if ranking.n_blocks < LEAST_BLOCKS:
