@@ -24,7 +24,7 @@ from vehest.run.artefacts import Artefact, StagePlan, Status, ensured, find
 from vehest.run.config import Config, compose_config, missing_keys
 from vehest.run.console import Bars, Messages
 from vehest.run.downsample import plan_downsample, write_downsample
-from vehest.run.evaluate import Evaluation, protocol_from_config
+from vehest.run.evaluate import Evaluation, protocol_from_config, rmse_of_tests
 from vehest.run.evaluate_faults import FaultSettings
 from vehest.run.failures import Failure
 from vehest.run.group import Group, Member, drop_finished_checkpoint, existing
@@ -33,7 +33,7 @@ from vehest.run.launchers.base import Launcher, LaunchProgress
 from vehest.run.launchers.local import LocalLauncher
 from vehest.run.locks import Waiting
 from vehest.run.signals import DryRunStop, StopSignals, TimeLimit
-from vehest.run.tracking import Tracker, log_member, rmse_of_tests
+from vehest.run.tracking import Tracker
 from vehest.run.train import STAGE as TRAIN
 from vehest.run.train import read_fit_metrics
 from vehest.run.weights import PublishedWeights
@@ -195,7 +195,7 @@ class Runner:
                         members |= self._received(group, outcome)
                         for member in outcome:
                             if member.evaluation is not None:
-                                bars.stands(member.job.plan.label, rmse_of_tests(member.evaluation))
+                                bars.stands(member.job.plan.label, rmse_of_tests(member.evaluation.folder))
                     elif outcome.exit_code != DataError.exit_code or len(group.jobs) == 1:
                         failures |= {job.plan.key: outcome for job in group.jobs}
                         self.messages.line("fail", "train", group.name, outcome.message)
@@ -247,7 +247,7 @@ class Runner:
                     status, detail = _in_words(made)
                     self.messages.line(status, made.stage, made.label, detail)
             if self.tracker is not None:
-                log_member(self.tracker, member, group.evaluation)
+                self.tracker.log(member.model, member.calibration, member.evaluation)
         return {member.job.plan.key: member for member in outcome}
 
     def _report(self, groups: Sequence[Group], of_all: LaunchProgress, bars: Bars, at: int, news: Progress | Waiting | None) -> None:
@@ -275,7 +275,7 @@ def _in_words(made: Artefact) -> tuple[str, str]:
         epochs = f"{fit['epochs']:.0f} epochs, " if fit.get("epochs") else ""
         return "done", epochs + (f"{fit['n_parameters']:.0f} parameters" if loss is None else f"validation loss {loss:.4g}")
     if made.stage == "evaluate":
-        return "done", ", ".join(f"{name} {value:.3f}°" for name, value in rmse_of_tests(made).items())
+        return "done", ", ".join(f"{name} {value:.3f}°" for name, value in rmse_of_tests(made.folder).items())
     trust = read_trust(made.folder)
     if trust.bands is None:
         return "note", f"no bands: {trust.about.note}"
