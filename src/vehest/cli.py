@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import os
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, NoReturn
@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Any, NoReturn
 import typer
 
 from vehest.data.errors import ConfigurationError, VehestError, printable
-from vehest.run.config_files import GROUPS, choices, is_simulated, pipeline_names, summary
+from vehest.run.config_files import GROUPS, choices, pipeline_names
 from vehest.run.launchers.base import LAUNCHERS, LauncherOptions
 from vehest.run.printing import OutputClosed, TerminalTable, as_json_text, complain, counted, echo, emit, note, open_streams, silence
 from vehest.version import __version__
@@ -41,6 +41,7 @@ LONGEST_LINE = 4_000
 STAGES = "Single stages, which `run` goes through by itself"
 CLUSTER = "On a cluster"
 COMMANDS = ("ingest", "downsample", "train", "eval", "estimate")
+OUTPUT = os.environ.get("VEHEST_OUTPUT", "outputs")
 
 
 def _offered(*groups: str) -> str:
@@ -48,64 +49,22 @@ def _offered(*groups: str) -> str:
     return "\n\n".join(f"**{group}**: {', '.join(choices(group))}" for group in groups)
 
 
-def _completing(command: str) -> Callable[[typer.Context, str], list[tuple[str, str]]]:
-    """Completion of a command's overrides."""
-
-    def complete(context: typer.Context, incomplete: str) -> list[tuple[str, str]]:
-        from vehest.run.config_files import complete_override
-
-        given = [str(word) for word in context.params.get("overrides") or []]
-        if context.params.get("check"):
-            return [(name, "") for name in _complete_pipeline(incomplete)]
-        own = str(context.params.get("command") or command)
-        dataset = context.params.get("dataset")
-        chosen = [f"dataset={dataset}"] if dataset else []
-        if own == "simulate":
-            short = [("seed=0", "short for dataset.seed")] if "seed=0".startswith(incomplete) else []
-            return short + complete_override("ingest", chosen + given, incomplete)
-        return complete_override(own, chosen + given, incomplete)
-
-    return complete
+def _offer(names: Callable[[], Iterable[str]]) -> Callable[[str], list[str]]:
+    """Completion of a word by names that begin with it."""
+    return lambda incomplete: [name for name in names() if name.startswith(incomplete)]
 
 
-def _complete_dataset(incomplete: str) -> list[tuple[str, str]]:
-    return [(name, summary("dataset", name)) for name in choices("dataset") if name.startswith(incomplete)]
-
-
-def _complete_simulated(incomplete: str) -> list[tuple[str, str]]:
-    return [(name, note) for name, note in _complete_dataset(incomplete) if is_simulated(name)]
-
-
-def _complete_pipeline(incomplete: str) -> list[str]:
-    return [name for name in pipeline_names() if name.startswith(incomplete)]
-
-
-def _complete_command(incomplete: str) -> list[str]:
-    return [name for name in COMMANDS if name.startswith(incomplete)]
-
-
-def _complete_model(incomplete: str) -> list[str]:
-    output = Path(os.environ.get("VEHEST_OUTPUT", "outputs"))
-    shipped = [name for name in ("pretrained", "self_calibrating") if name.startswith(incomplete)]
-    own = sorted((output / "train").glob(f"{Path(incomplete).name}*"))
-    return [*shipped, *(folder.name for folder in own if not folder.name.startswith("."))]
-
-
-def _complete_file(incomplete: str) -> list[str]:
-    before = incomplete[: incomplete.rfind("/") + 1]
-    files = [f"{before}{file.name}" for file in sorted(Path(before).glob("*")) if file.suffix.lower() in (".csv", ".parquet")]
-    return [file for file in files if file.startswith(incomplete)]
-
-
-def _complete_model_or_file(incomplete: str) -> list[str]:
-    return _complete_model(incomplete) + _complete_file(incomplete)
+DATASETS = _offer(lambda: choices("dataset"))
+MODELS = _offer(lambda: ["pretrained", "self_calibrating", *(own.name for own in Path(OUTPUT, "train").glob("[!.]*"))])
+OVERRIDES = _offer(lambda: [f"{group}={choice}" for group in GROUPS for choice in choices(group)])
+PIPELINES = _offer(pipeline_names)
 
 
 DryRun = Annotated[bool, typer.Option("--dry-run", help="List the stages that would run or be skipped; run nothing.")]
 Force = Annotated[bool, typer.Option("--force", help="Run although the outcome exists.")]
 DatasetOrFile = Annotated[
     str,
-    typer.Argument(help="A data set, or a file: a table, or with dataset=NAME one of its format.", autocompletion=_complete_dataset),
+    typer.Argument(help="A data set, or a file: a table, or with dataset=NAME one of its format.", autocompletion=DATASETS),
 ]
 AsJson = Annotated[bool, typer.Option("--json", help="Print the outcome as one JSON object on standard output.")]
 Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="Print only warnings and the outcome.")]
@@ -115,7 +74,7 @@ LauncherName = Annotated[
     typer.Option(
         "--launcher",
         help="Where trainings run: local, on this machine's cores; ray, on a Ray cluster; slurm, as SLURM jobs (docs/many_machines.md).",
-        autocompletion=lambda incomplete: [name for name in LAUNCHERS if name.startswith(incomplete)],
+        autocompletion=_offer(lambda: LAUNCHERS),
         rich_help_panel=CLUSTER,
     ),
 ]
@@ -139,11 +98,12 @@ Slurm = Annotated[
         rich_help_panel=CLUSTER,
     ),
 ]
-Dataset = Annotated[str, typer.Argument(help="Name of a file in conf/dataset.", autocompletion=_complete_dataset)]
+Dataset = Annotated[str, typer.Argument(help="Name of a file in conf/dataset.", autocompletion=DATASETS)]
 
 
-def _overrides(command: str) -> Any:
-    return typer.Argument(help="key=value …, in Hydra's grammar.", autocompletion=_completing(command), show_default=False)
+Overrides = Annotated[
+    list[str] | None, typer.Argument(help="key=value …, in Hydra's grammar.", autocompletion=OVERRIDES, show_default=False)
+]
 
 
 @app.callback(invoke_without_command=True)
@@ -200,7 +160,7 @@ def new_car(
 @app.command(epilog=_offered("dataset"), rich_help_panel=STAGES)
 def ingest(
     dataset: Dataset,
-    overrides: Annotated[list[str] | None, _overrides("ingest")] = None,
+    overrides: Overrides = None,
     download: Annotated[
         bool, typer.Option("--download", help="First fetch missing files, and compare checksums; resumes an interrupted download.")
     ] = False,
@@ -225,8 +185,8 @@ def ingest(
 
 @app.command(rich_help_panel=STAGES)
 def simulate(
-    dataset: Annotated[str, typer.Argument(help="Name of a simulated data set in conf/dataset.", autocompletion=_complete_simulated)],
-    overrides: Annotated[list[str] | None, _overrides("simulate")] = None,
+    dataset: Annotated[str, typer.Argument(help="Name of a simulated data set in conf/dataset.", autocompletion=DATASETS)],
+    overrides: Overrides = None,
     dry_run: DryRun = False,
     force: Force = False,
     as_json: AsJson = False,
@@ -254,7 +214,7 @@ def simulate(
 @app.command(epilog=_offered("dataset"), rich_help_panel=STAGES)
 def downsample(
     dataset: Dataset,
-    overrides: Annotated[list[str] | None, _overrides("downsample")] = None,
+    overrides: Overrides = None,
     dry_run: DryRun = False,
     force: Force = False,
     as_json: AsJson = False,
@@ -274,7 +234,7 @@ def downsample(
 
 @app.command(epilog=_offered("split", "estimator", "training", "tracking"), rich_help_panel=STAGES)
 def train(
-    overrides: Annotated[list[str] | None, _overrides("train")] = None,
+    overrides: Overrides = None,
     dry_run: DryRun = False,
     force: Force = False,
     as_json: AsJson = False,
@@ -292,14 +252,14 @@ def train(
 
 @app.command("eval", epilog=_offered("split", "estimator", "fault"), rich_help_panel=STAGES)
 def evaluate(
-    overrides: Annotated[list[str] | None, _overrides("eval")] = None,
+    overrides: Overrides = None,
     model: Annotated[
         str | None,
         typer.Option(
             "--model",
             "-m",
             help="A model's folder, or the start of its name, `pretrained` or `self_calibrating`; by default what the overrides train.",
-            autocompletion=_complete_model,
+            autocompletion=MODELS,
         ),
     ] = None,
     dry_run: DryRun = False,
@@ -325,7 +285,7 @@ def estimate(
         typer.Argument(
             metavar="MODEL|FILE",
             help="A model's folder, or the start of its name; or the recording at once, for the filter that comes with vehest.",
-            autocompletion=_complete_model_or_file,
+            autocompletion=MODELS,
         ),
     ],
     recording: Annotated[
@@ -336,7 +296,7 @@ def estimate(
             show_default=False,
         ),
     ] = None,
-    overrides: Annotated[list[str] | None, _overrides("estimate")] = None,
+    overrides: Overrides = None,
     out: Annotated[
         Path, typer.Option("--out", "-o", help="Where to write the estimate: .parquet, .csv, or the log with it: .mf4, .mat.")
     ] = Path("estimate.parquet"),
@@ -371,7 +331,6 @@ def identify(
         typer.Argument(
             metavar="FILE... [OVERRIDES]...",
             help="Drives of a car; then estimator.wheelbase=2.7 and the like.",
-            autocompletion=_complete_file,
         ),
     ],
     out: Annotated[Path, typer.Option("--out", "-o", help="The car's record to write, .yaml.")] = Path("my_car.yaml"),
@@ -391,20 +350,20 @@ def identify(
 @app.command()
 def replay(
     log: Annotated[Path, typer.Argument(metavar="LOG", help="Frames of a bus: .asc, .blf, or .log of candump.")],
-    overrides: Annotated[list[str] | None, _overrides("estimate")] = None,
+    overrides: Overrides = None,
     model: Annotated[
         str,
         typer.Option(
             "--model",
             "-m",
             help="A model's folder, or the start of its name, `self_calibrating`; by default the pre-trained one.",
-            autocompletion=_complete_model,
+            autocompletion=MODELS,
         ),
     ] = "pretrained",
     dbc: Annotated[Path | None, typer.Option("--dbc", help="What describes the bus; by default the data set's.")] = None,
     dataset: Annotated[
         str | None,
-        typer.Option("--dataset", help="A data set of the source can, which maps signals to channels.", autocompletion=_complete_dataset),
+        typer.Option("--dataset", help="A data set of the source can, which maps signals to channels.", autocompletion=DATASETS),
     ] = None,
     signals: Annotated[
         str,
@@ -470,7 +429,7 @@ def export(
         str,
         typer.Argument(
             help="A model's folder, or the start of its name; or pretrained, or self_calibrating.",
-            autocompletion=_complete_model,
+            autocompletion=MODELS,
             show_default=False,
         ),
     ],
@@ -487,7 +446,7 @@ def export(
         Path | None,
         typer.Option("--vectors", metavar="LOG", help="Recording for the test vectors, read as by `vehest estimate`.", show_default=False),
     ] = None,
-    overrides: Annotated[list[str] | None, _overrides("estimate")] = None,
+    overrides: Overrides = None,
     onnx: Annotated[
         bool,
         typer.Option("--onnx", help="Write a network as one step in ONNX instead, with its state going in and out; -o names the file."),
@@ -530,9 +489,7 @@ def compare(
     ] = None,
     models: Annotated[
         list[str] | None,
-        typer.Option(
-            "--model", "-m", help="A model to run on the recording and compare too; may be repeated.", autocompletion=_complete_model
-        ),
+        typer.Option("--model", "-m", help="A model to run on the recording and compare too; may be repeated.", autocompletion=MODELS),
     ] = None,
     as_json: AsJson = False,
 ) -> None:
@@ -549,8 +506,8 @@ def compare(
 
 @app.command()
 def run(
-    pipeline: Annotated[str, typer.Argument(help="A file in pipelines/, or its name.", autocompletion=_complete_pipeline)],
-    overrides: Annotated[list[str] | None, _overrides("eval")] = None,
+    pipeline: Annotated[str, typer.Argument(help="A file in pipelines/, or its name.", autocompletion=PIPELINES)],
+    overrides: Overrides = None,
     dry_run: DryRun = False,
     force: Force = False,
     as_json: AsJson = False,
@@ -583,11 +540,11 @@ def report(
         str | None,
         typer.Argument(
             help="A file in pipelines/, or its name; with --check studies or pipelines, or none for all.",
-            autocompletion=_complete_pipeline,
+            autocompletion=PIPELINES,
             show_default=False,
         ),
     ] = None,
-    overrides: Annotated[list[str] | None, _overrides("eval")] = None,
+    overrides: Overrides = None,
     check: Annotated[
         bool,
         typer.Option(
@@ -629,7 +586,7 @@ def _check_published(words: list[str], as_json: bool) -> None:
 
 @app.command(epilog=_offered("split", "estimator", "training", "fault", "tracking"))
 def sweep(
-    overrides: Annotated[list[str] | None, _overrides("eval")] = None,
+    overrides: Overrides = None,
     name: Annotated[
         str | None, typer.Option("--name", help="Start of the folder's name; by default the estimators and the split.", show_default=False)
     ] = None,
@@ -655,8 +612,8 @@ def sweep(
 
 @app.command("config", rich_help_panel=STAGES)
 def show_config(
-    command: Annotated[str, typer.Argument(help="ingest, downsample, train, eval or estimate.", autocompletion=_complete_command)],
-    overrides: Annotated[list[str] | None, _overrides("train")] = None,
+    command: Annotated[str, typer.Argument(help="ingest, downsample, train, eval or estimate.", autocompletion=_offer(lambda: COMMANDS))],
+    overrides: Overrides = None,
     as_json: AsJson = False,
 ) -> None:
     """Print the resolved configuration of a command: `vehest config train estimator=gru`."""
@@ -670,7 +627,7 @@ def show_config(
 
 @app.command(rich_help_panel=STAGES)
 def prune(
-    overrides: Annotated[list[str] | None, _overrides("estimate")] = None,
+    overrides: Overrides = None,
     yes: Annotated[bool, typer.Option("--yes", "-y", help="Remove without asking.")] = False,
     dry_run: Annotated[bool, typer.Option("--dry-run", help="List what would be removed; remove nothing.")] = False,
     as_json: AsJson = False,
@@ -729,8 +686,8 @@ def data_channels(as_json: AsJson = False) -> None:
 
 @data_app.command("show")
 def data_show(
-    source: Annotated[str, typer.Argument(help="A data set, or a CSV or Parquet file.", autocompletion=_complete_dataset)],
-    overrides: Annotated[list[str] | None, _overrides("ingest")] = None,
+    source: Annotated[str, typer.Argument(help="A data set, or a CSV or Parquet file.", autocompletion=DATASETS)],
+    overrides: Overrides = None,
     as_json: AsJson = False,
 ) -> None:
     """Show recordings: channels, rate, duration, ranges."""
@@ -742,7 +699,7 @@ def data_show(
 @data_app.command("check")
 def data_check(
     source: DatasetOrFile,
-    overrides: Annotated[list[str] | None, _overrides("ingest")] = None,
+    overrides: Overrides = None,
     as_json: AsJson = False,
 ) -> None:
     """Look for gaps, bad clocks, NaN, stuck and saturated channels, impossible values, wrong units and signs; exit code 3 on errors."""
@@ -757,7 +714,7 @@ def data_check(
 @data_app.command("usable")
 def data_usable(
     source: DatasetOrFile,
-    overrides: Annotated[list[str] | None, _overrides("ingest")] = None,
+    overrides: Overrides = None,
     as_json: AsJson = False,
 ) -> None:
     """List for every estimator whether these recordings suffice, which channels are missing, and how to supply them."""
@@ -768,8 +725,8 @@ def data_usable(
 
 @data_app.command("align")
 def data_align(
-    source: Annotated[str, typer.Argument(help="A data set, or a CSV or Parquet file.", autocompletion=_complete_dataset)],
-    overrides: Annotated[list[str] | None, _overrides("ingest")] = None,
+    source: Annotated[str, typer.Argument(help="A data set, or a CSV or Parquet file.", autocompletion=DATASETS)],
+    overrides: Overrides = None,
     estimate: Annotated[
         str,
         typer.Option(

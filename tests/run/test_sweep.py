@@ -16,7 +16,6 @@ from vehest.data.splits import Span, Split
 from vehest.evaluation.metrics import Protocol
 from vehest.report.heat_map import Panel, heat_map
 from vehest.run.artefacts import StagePlan
-from vehest.run.config_files import complete_override
 from vehest.run.study import sweep_of
 from vehest.run.train import TrainJob
 from vehest.studies.sweep import SweepArtefacts, build, heat_maps, interval, summary, table_of
@@ -206,7 +205,6 @@ def test_dry_run_tells_and_makes_nothing_and_the_same_training_twice_is_refused(
 def test_sweeps_that_make_no_sense_are_refused(place, overrides, message):
     with pytest.raises(ConfigurationError, match=message):
         sweep_of(["split=mine" if not overrides[0].startswith("split") else "tracking=none", *overrides])
-    assert ("estimator.n_local=2", "default") in complete_override("eval", ["estimator=ksnn"], "estimator.n_l")
 
 
 def test_jobs_group_by_training_settings_that_come_in_groups():
