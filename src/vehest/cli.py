@@ -456,7 +456,7 @@ def export(
     """Write a model as C99 for a control unit: `vehest export MODEL -o c --precision float`.
 
     One step with explicit state: the method with the checks of its samples, band and health; a Makefile, a program that runs a drive from a
-    file, test vectors, and a README with units and the bytes that it takes.
+    file, test vectors, and a README with units.
     """
     from vehest.export.folder import export_model
     from vehest.run.estimate import open_model, prepared_recording, read_table
@@ -470,10 +470,9 @@ def export(
         from vehest.export.onnx_model import write_onnx
 
         write_onnx(fitted, out)
-        emit(as_json, {"out": str(out), "model": str(folder)})
-        return
-    found = export_model(fitted, trust, out, precision, bus_rate, elsewhere=elsewhere, drive=drive)
-    emit(as_json, {"out": str(out), "model": str(folder), **{name: value for own in found for name, value in own.figures().items()}})
+    else:
+        export_model(fitted, trust, out, precision, bus_rate, elsewhere=elsewhere, drive=drive)
+    emit(as_json, {"out": str(out), "model": str(folder)})
 
 
 @app.command()
