@@ -7,18 +7,19 @@ Student's t distribution. The combination is chosen on the validation range; tes
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 import pandas as pd
 
 from vehest.constants import FloatArray
-from vehest.data.splits import VALIDATION, Span, Split
-from vehest.evaluation.metrics import Protocol
-from vehest.report.document import PATENT_NOTE, Block, Column, Document, Figure, Table, as_code, as_text
+from vehest.data.splits import VALIDATION
+from vehest.report.document import PATENT_NOTE, Block, Column, Document, Figure, Table
 from vehest.report.heat_map import Panel, heat_map
 from vehest.report.style import decimals_for, fixed
+from vehest.studies.artefacts import PartArtefacts
+from vehest.studies.drive import data_sentence, how_it_was_made
 
 CONFIDENCE = 0.95
 METRIC = "rmse_sideslip"
@@ -31,41 +32,33 @@ Value = bool | int | float | str
 class SweepArtefacts:
     """Everything that tables and figures of a sweep are made from."""
 
-    name: str  # name of the sweep
-    command: str  # the command that makes it
+    part: PartArtefacts  # the comparison of all combinations
     keys: Sequence[str]  # those that take several values, the seed aside, in the order of the command
     # a row a job: ``combination`` (counted from 0), ``title``, the keys, ``seed``, ``status`` (``done`` or ``failed``), ``error``,
     # ``n_parameters``, ``epochs``, and ``rmse_sideslip.SET``, ``rmse_vy.SET`` and ``fvu.SET`` for each set of `sets`; those of a
     # combination with a fault count the samples while it lasts
     jobs: pd.DataFrame
-    split: Split  # training, validation and test ranges
-    protocol: Protocol  # how estimates are scored
-    kinds: Mapping[str, str]  # data set -> ``real`` or ``simulated``
-    data_titles: Mapping[str, str]  # data set -> title, for people
-    facts: Sequence[str]  # lines on how it was made: budget, resampling
-    failures: Mapping[str, str] = field(default_factory=dict)  # what failed -> why
-    patented: bool = False  # whether a KS-NN is among the estimators
 
     @property
     def sets(self) -> list[str]:
         """What is scored: the validation range, where there is one, and each test set."""
-        return [*([VALIDATION] if self.split.validation else []), *self.split.tests]
+        return [*([VALIDATION] if self.part.split.validation else []), *self.part.split.tests]
 
 
 def build(artefacts: SweepArtefacts) -> Document:
-    """The report of a sweep: what was chosen, how it was made, all combinations, what failed, heat maps."""
-    table = summary(artefacts.jobs, artefacts.keys, artefacts.sets)
-    blocks: list[Block] = [_kind_sentence(artefacts), _chosen_sentence(artefacts, table), _how_it_was_made(artefacts)]
-    blocks += ["## Combinations", _table(artefacts, table)]
-    if artefacts.failures:
-        listed = "\n".join(f"- {name}: {reason}" for name, reason in artefacts.failures.items())
+    """The report of a sweep: what was chosen, all combinations, what failed, heat maps, how it was made."""
+    part, table = artefacts.part, summary(artefacts.jobs, artefacts.keys, artefacts.sets)
+    blocks: list[Block] = [data_sentence(part), _chosen_sentence(artefacts, table), "## Combinations", _table(artefacts, table)]
+    if part.failed:
+        listed = "\n".join(f"- {name}: {reason}" for name, reason in part.failed.items())
         blocks.append(f"## What failed\n\n{listed}")
     maps = heat_maps(artefacts, table)
     if maps:
         blocks += ["## Heat maps", *maps]
-    if artefacts.patented:
+    blocks += how_it_was_made(part, (_budget(artefacts.jobs), *INTERVAL_AND_CHOICE))
+    if any(model.estimator == "ksnn" for model in part.models):
         blocks.append(PATENT_NOTE)
-    return Document(f"Sweep {artefacts.name}", blocks)
+    return Document(f"Sweep {part.study}", blocks)
 
 
 def summary(jobs: pd.DataFrame, keys: Sequence[str], sets: Sequence[str]) -> pd.DataFrame:
@@ -194,21 +187,9 @@ def _panel(
 
 
 def _kinds(artefacts: SweepArtefacts, name: str) -> str:
-    spans = artefacts.split.validation if name == VALIDATION else artefacts.split.tests[name]
-    return " and ".join(sorted({_shouted(artefacts.kinds[span.dataset]) for span in spans}))
-
-
-def _shouted(kind: str) -> str:
-    """Simulated data must not be overlooked."""
-    return kind.upper() if kind == "simulated" else kind
-
-
-def _kind_sentence(artefacts: SweepArtefacts) -> str:
-    parts = "; ".join(f"{as_text(artefacts.data_titles[name])} ({_shouted(kind)})" for name, kind in artefacts.kinds.items())
-    kinds = set(artefacts.kinds.values())
-    if len(kinds) == 1:
-        return f"**{_shouted(kinds.pop())} data:** every number here comes from {parts}."
-    return f"**Real and SIMULATED data:** {parts}."
+    part = artefacts.part
+    spans = part.split.validation if name == VALIDATION else part.split.tests[name]
+    return " and ".join(sorted({part.kinds[span.dataset] for span in spans}))
 
 
 def _chosen_sentence(artefacts: SweepArtefacts, table: pd.DataFrame) -> str:
@@ -244,35 +225,22 @@ def mean_and_half(mean: float, half: float, decimals: int) -> str:
     return f"{fixed(mean, decimals)} ± {fixed(half, decimals)}" if math.isfinite(half) else fixed(mean, decimals)
 
 
-def _how_it_was_made(artefacts: SweepArtefacts) -> str:
-    jobs, protocol = artefacts.jobs, artefacts.protocol
+def _budget(jobs: pd.DataFrame) -> str:
     done = jobs[jobs["status"] == DONE]
     seeds = sorted({int(seed) for seed in jobs["seed"]})
     epochs = done["epochs"][done["epochs"] > 0]
     fewest, most = (f"{epochs.min():.0f}", f"{epochs.max():.0f}") if len(epochs) else ("", "")
     took = f"; training took {fewest if fewest == most else f'{fewest} to {most}'} epochs" if len(epochs) else ""
     counts = f"{jobs['combination'].nunique()} combinations, seeds {', '.join(map(str, seeds))}: {len(done)} of {len(jobs)} jobs done"
-    split = artefacts.split
-    ranges = [_ranges("training", split.train), _ranges("validation", split.validation)]
-    ranges += [_ranges(f"test `{name}`", spans) for name, spans in split.tests.items()]
-    lines = [
-        f"Command: {as_code(artefacts.command)}",
-        f"Budget: {counts}{took}",
-        *artefacts.facts,
-        f"Split `{split.name}`: {'; '.join(ranges)}",
-        f"Evaluation: every estimate is read at {protocol.rate_hz:g} Hz, held; up to {protocol.warm_up_seconds:g} s of warm-up before a "
-        f"{protocol.piece}, whose first {protocol.skip_seconds:g} s are not scored{'.' * bool(protocol.start_in_words)}"
-        f"{protocol.start_in_words.rstrip('.')}",
-        "Interval: mean ± half the two-sided 95 % confidence interval of the mean over seeds, t₀.₉₇₅ s/√n, from Student's t distribution "
-        "with n − 1 degrees of freedom; one seed has none. It covers what the seed changes, not what another drive or car would",
-        "Choice: the lowest mean RMSE(β) on the validation range, of the combinations without a failed seed. Test data choose nothing",
-        "Every job: [sweep.csv](sweep.csv). Every combination: [summary.csv](summary.csv)",
-    ]
-    return "## How it was made\n\n" + "\n".join(f"- {line}" for line in lines)
+    return f"Budget: {counts}{took}"
 
 
-def _ranges(role: str, spans: Sequence[Span]) -> str:
-    return f"{role} {', '.join(span.describe() for span in spans)}" if spans else f"no {role}"
+INTERVAL_AND_CHOICE = (
+    "Interval: mean ± half the two-sided 95 % confidence interval of the mean over seeds, t₀.₉₇₅ s/√n, from Student's t distribution "
+    "with n − 1 degrees of freedom; one seed has none. It covers what the seed changes, not what another drive or car would",
+    "Choice: the lowest mean RMSE(β) on the validation range, of the combinations without a failed seed. Test data choose nothing",
+    "Every job: [sweep.csv](sweep.csv). Every combination: [summary.csv](summary.csv)",
+)
 
 
 def _table(artefacts: SweepArtefacts, table: pd.DataFrame) -> Table:
