@@ -14,14 +14,12 @@ import typer
 
 from vehest.data.errors import ConfigurationError, VehestError, printable
 from vehest.run.config_files import GROUPS, choices, pipeline_names
-from vehest.run.launchers.base import LAUNCHERS, LauncherOptions
+from vehest.run.launchers.base import LAUNCHERS, LauncherOptions, RunOptions
 from vehest.run.printing import OutputClosed, TerminalTable, as_json_text, complain, counted, echo, emit, note, open_streams, silence
 from vehest.version import __version__
 
 if TYPE_CHECKING:
     from vehest.run.config import Config
-    from vehest.run.run_cache import RunOptions
-
 app = typer.Typer(
     name="vehest",
     no_args_is_help=True,
@@ -172,7 +170,6 @@ def ingest(
 ) -> None:
     """Bring raw files, or a simulation, into the store: `vehest ingest ferrari_250lm root=FOLDER`."""
     from vehest.run.ingest import download_files
-    from vehest.run.run_cache import RunOptions
     from vehest.run.study_run import open_runner
 
     config = _compose("ingest", [f"dataset={dataset}", *(overrides or [])])
@@ -199,7 +196,6 @@ def simulate(
     that spin or leave the road are kept, flagged in their provenance, and counted.
     """
     from vehest.run.ingest import outcome_of, simulation_config
-    from vehest.run.run_cache import RunOptions
     from vehest.run.study_run import open_runner
 
     config = simulation_config(dataset, overrides or [])
@@ -222,7 +218,6 @@ def downsample(
 ) -> None:
     """Bring a data set to another rate, anti-aliased: `vehest downsample ferrari_250lm rate_hz=20`."""
     from vehest.run.config import positive_rate
-    from vehest.run.run_cache import RunOptions
     from vehest.run.study_run import open_runner
 
     config = _compose("downsample", [f"dataset={dataset}", *(overrides or [])])
@@ -244,7 +239,6 @@ def train(
 
     Ctrl-C keeps the best so far; the same command goes on from there.
     """
-    from vehest.run.run_cache import RunOptions
     from vehest.run.study_run import train_one
 
     emit(as_json, train_one(overrides or [], RunOptions(force, dry_run, quiet, track=True)))
@@ -272,7 +266,6 @@ def evaluate(
     Or name the model: `vehest eval --model ksnn-linear_bias_p2-seed2 split=ferrari_drive`. With a sensor's fault as a further condition:
     `vehest eval estimator=ksnn fault=frozen fault.channel=yaw_rate fault.severity=severe`.
     """
-    from vehest.run.run_cache import RunOptions
     from vehest.run.study_run import evaluate_one
 
     emit(as_json, evaluate_one(overrides or [], model, RunOptions(force, dry_run, quiet, track=True), note))
@@ -526,8 +519,6 @@ def run(
     Existing artefacts are skipped, and trained weights that the study has published are taken where their keys are the same. Overrides
     apply to every sweep that has their key. Sweeps are worked off in the order of the file.
     """
-    from vehest.run.run_cache import RunOptions
-
     chosen = LauncherOptions(launcher, address, tuple(slurm or ()))
     options = RunOptions(force, dry_run, quiet, jobs, minutes=minutes, launcher=chosen, retrain=retrain)
     _run_study(pipeline, overrides or [], options, as_json)
@@ -567,8 +558,6 @@ def report(
         return
     if pipeline is None:
         raise ConfigurationError(f"no pipeline is named; there are: {', '.join(pipeline_names())}; or use --check")
-    from vehest.run.run_cache import RunOptions
-
     _run_study(pipeline, overrides or [], RunOptions(force, dry_run, quiet, 1), as_json, only_report=True)
 
 
@@ -603,8 +592,6 @@ def sweep(
     Prints the mean RMSE(β) of each combination over its seeds with a 95 % confidence interval (Student's t), and marks the one that is best
     on the validation range. Existing artefacts are skipped, a failed job stops no other, the same command finishes what is missing.
     """
-    from vehest.run.run_cache import RunOptions
-
     options = RunOptions(force, dry_run, quiet, jobs, launcher=LauncherOptions(launcher, address, tuple(slurm or ())))
     _run_study(name, overrides or [], options, as_json, sweep=True)
 
@@ -746,7 +733,7 @@ def data_align(
         float, typer.Option("--max-ay", help="For the steering ratio: lateral acceleration up to which it is used [m/s²].")
     ] = 3.0,
     min_speed: Annotated[float, typer.Option("--min-speed", help="For the steering ratio: speed from which it is used [m/s].")] = 5.0,
-    out: Annotated[Path | None, typer.Option("--out", "-o", help="Folder for report, table, transforms and figure.")] = None,
+    out: Annotated[Path | None, typer.Option("--out", "-o", help="Folder for report, table and transforms.")] = None,
     as_json: AsJson = False,
 ) -> None:
     """Estimate lever arm, rotation, delay and offsets of the sensors, and the steering ratio: `vehest data align lap.csv -e delay,offsets`.

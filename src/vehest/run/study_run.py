@@ -27,13 +27,13 @@ from vehest.run.evaluate_faults import check_channels, faults_of
 from vehest.run.group import Group
 from vehest.run.ingest import STAGE as INGEST
 from vehest.run.ingest import plan_ingest
-from vehest.run.launchers.base import LauncherOptions, chosen_launcher
+from vehest.run.launchers.base import LauncherOptions, RunOptions, chosen_launcher
 from vehest.run.launchers.local import default_jobs
 from vehest.run.published import keys_of_study
 from vehest.run.publishing import RESULTS, Publication, publish_study
 from vehest.run.report import STAGE as REPORT
 from vehest.run.report import SWEEP, draw_report, draw_sweep
-from vehest.run.run_cache import Ran, RunCache, RunOptions, stamps_of
+from vehest.run.run_cache import Ran, RunCache, stamps_of
 from vehest.run.runner import Runner
 from vehest.run.signals import DryRunStop, StopSignals
 from vehest.run.study import Job, Jobs, Study, content_overrides, jobs_of, read_study, sweep_of
