@@ -105,10 +105,13 @@ def test_darker_is_larger_and_a_missing_cell_is_grey():
     figure = heat_map(
         [Panel("", np.array([[0.1, 0.4, np.nan]]), np.full((1, 3), np.nan), (0, 0))], ["2", "3", "4"], ["0"], "P", "Q", "RMSE"
     )
-    faces = [sum(patch.get_facecolor()[:3]) for patch in figure.axes[0].patches[:3]]
-    assert faces[0] > faces[1]
+    mesh = figure.axes[0].collections[0]
+    mesh.update_scalarmappable()
+    first, second, missing = mesh.get_facecolor()
+    assert sum(first[:3]) > sum(second[:3])
+    assert missing[3] == 0.0
     assert [text.get_text() for text in figure.axes[0].texts] == ["0.100", "0.400", "–"]
-    red, green, blue, _ = figure.axes[0].patches[2].get_facecolor()
+    red, green, blue, _ = figure.axes[0].get_facecolor()
     assert red == green == blue
 
 

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from vehest.constants import FloatArray
-from vehest.report.style import DOUBLE_COLUMN, MISSING, SINGLE_COLUMN, MatplotlibFigure, decimals_for, fixed, new_figure
+from vehest.report.style import DOUBLE_COLUMN, SINGLE_COLUMN, MatplotlibFigure, decimals_for, fixed, new_figure
 
 LOGARITHMIC_FROM = 20.0
 MOST_COLUMNS_SIDE_BY_SIDE = 6
@@ -35,20 +35,21 @@ def heat_map(
     """Panels, (R, C) each, on one scale of colours, the darker the larger; logarithmic where the largest value is 20 times the smallest."""
     import matplotlib
     from matplotlib.cm import ScalarMappable
-    from matplotlib.colors import LinearSegmentedColormap
+    from matplotlib.colors import LinearSegmentedColormap, LogNorm, Normalize
 
     values = np.concatenate([panel.mean.ravel() for panel in panels])
-    finite = values[np.isfinite(values)]
+    finite = values[np.isfinite(values)] if np.isfinite(values).any() else np.zeros(1)
+    low, high = float(finite.min()), float(finite.max())
+    scale = LogNorm(low, high) if low > 0 and high / low > LOGARITHMIC_FROM else Normalize(low, high if high > low else low + 1.0)
     across = 1 if len(columns) > MOST_COLUMNS_SIDE_BY_SIDE else min(len(panels), 2)
     down = math.ceil(len(panels) / across)
     width = SINGLE_COLUMN if across == 1 and len(columns) <= MOST_COLUMNS_SIDE_BY_SIDE else DOUBLE_COLUMN
     with new_figure(width, down * (0.75 + CELL_HEIGHT * len(rows))) as figure:
         grid = figure.subplots(down, across, sharex=True, sharey=True, squeeze=False)
         shades = LinearSegmentedColormap.from_list("shades", matplotlib.colormaps["Blues"](np.linspace(0.1, 0.95, 64)))
-        colours = ScalarMappable(_scale(finite), shades)
-        decimals = decimals_for(finite.tolist())
+        colours = ScalarMappable(scale, shades)
         for axes, panel in zip(grid.flat, panels, strict=False):
-            _draw(axes, panel, colours, decimals)
+            _draw(axes, panel, colours, decimals_for(finite.tolist()))
             axes.set_title(panel.title, loc="left")
             axes.set_xticks(range(len(columns)), columns)
             axes.set_yticks(range(len(rows)), rows)
@@ -58,41 +59,24 @@ def heat_map(
             axes.set_xlabel(column_label)
         for axes in grid[:, 0]:
             axes.set_ylabel(row_label)
-        if len(finite):
-            figure.colorbar(colours, ax=list(grid.flat), label=quantity, pad=0.02, aspect=25).outline.set_visible(False)
+        figure.colorbar(colours, ax=list(grid.flat), label=quantity, pad=0.02, aspect=25).outline.set_visible(False)
     return figure
-
-
-def _scale(finite: FloatArray) -> Any:
-    from matplotlib.colors import LogNorm, Normalize
-
-    if not len(finite):
-        return Normalize(0.0, 1.0)
-    low, high = float(finite.min()), float(finite.max())
-    if low > 0 and high / low > LOGARITHMIC_FROM:
-        return LogNorm(low, high)
-    return Normalize(low, high if high > low else low + 1.0)
 
 
 def _draw(axes: Any, panel: Panel, colours: Any, decimals: int) -> None:
     from matplotlib.patches import Rectangle
 
+    edges = [np.arange(number + 1) - 0.5 for number in panel.mean.T.shape]
+    axes.pcolormesh(*edges, panel.mean, cmap=colours.cmap, norm=colours.norm, edgecolors="white", linewidth=0.8)
+    axes.set_facecolor(NO_VALUE)
     for row, column in np.ndindex(panel.mean.shape):
-        mean = float(panel.mean[row, column])
-        colour = colours.to_rgba(mean) if math.isfinite(mean) else NO_VALUE
-        axes.add_patch(Rectangle((column - 0.5, row - 0.5), 1.0, 1.0, facecolor=colour, edgecolor="white", linewidth=0.8))
-        half = float(panel.half[row, column])
-        words = fixed(mean, decimals) if math.isfinite(mean) else MISSING
-        if math.isfinite(mean) and math.isfinite(half):
-            words += f"\n±{fixed(half, decimals)}"
-        ink = "white" if math.isfinite(mean) and float(np.dot(LUMINANCE, colour[:3])) < 0.45 else "#111111"
+        mean, half = float(panel.mean[row, column]), float(panel.half[row, column])
+        words = fixed(mean, decimals) + (f"\n±{fixed(half, decimals)}" if math.isfinite(half) else "")
+        ink = "white" if math.isfinite(mean) and float(np.dot(LUMINANCE, colours.to_rgba(mean)[:3])) < 0.45 else "#111111"
         axes.text(column, row, words, ha="center", va="center", fontsize=6.5, color=ink, linespacing=1.1)
     if panel.marked is not None:
         row, column = panel.marked
         axes.add_patch(Rectangle((column - 0.46, row - 0.46), 0.92, 0.92, fill=False, edgecolor="#d6336c", linewidth=1.8))
-    n_rows, n_columns = panel.mean.shape
-    axes.set_xlim(-0.5, n_columns - 0.5)
-    axes.set_ylim(-0.5, n_rows - 0.5)
     axes.grid(visible=False)
     axes.tick_params(length=0)
     axes.spines[:].set_visible(False)

@@ -22,17 +22,11 @@ from vehest.training.sequences import Phase, PhaseSettings
 
 
 class Drive(NamedTuple):
-    """An uninterrupted drive, sampled, or several of one length.
+    """An uninterrupted drive, sampled, or several of one length."""
 
-    Attributes:
-        states: true ones, (..., T, n).
-        inputs: (..., T, p).
-        measurements: (..., T, m); NaN where nothing was measured.
-    """
-
-    states: Tensor
-    inputs: Tensor
-    measurements: Tensor
+    states: Tensor  # true ones, (..., T, n)
+    inputs: Tensor  # (..., T, p)
+    measurements: Tensor  # (..., T, m); NaN where nothing was measured
 
 
 class Filtering(nn.Module):
