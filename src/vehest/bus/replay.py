@@ -42,9 +42,7 @@ SWITCH_SECONDS = 2e-4  # that another thread of Python may go on when the receiv
 def survey(log: Frames, signals: BusSignals, rate_hz: float | None = None) -> Timing:
     """Timing of a bus from the first seconds of a log, and from further on for signals that come later.
 
-    Raises:
-        DataError: it cannot be used, or a signal never occurs.
-        ConfigurationError: the rate is none.
+    Raises `DataError`: it cannot be used, or a signal never occurs. Raises `ConfigurationError`: the rate is none.
     """
     stamps = {name: array("d") for name in signals.wanted}
     first = math.inf
@@ -76,8 +74,7 @@ class Bus:
     def ends(self, messages: Iterable[tuple[int, bool]]) -> Iterator[tuple[Any, Any]]:
         """The sender's end of the bus, and the control unit's, which hears the messages only.
 
-        Raises:
-            MissingError: it cannot be opened.
+        Raises `MissingError`: it cannot be opened.
         """
         import can
 
@@ -132,9 +129,7 @@ class Replay:
     def run(self, make_stepper: Callable[[], GuardedStepper], out: Path | None, view: View) -> Figures:
         """Estimate at the rate of the samples; the first stepper is for warming up.
 
-        Raises:
-            DataError: the log is damaged.
-            MissingError: the bus cannot be opened, or ``out`` not be written.
+        Raises `DataError`: the log is damaged. Raises `MissingError`: the bus cannot be opened, or ``out`` not be written.
         """
         names = warmed_up(make_stepper(), self.timing.rate_hz, tuple(self.signals.wanted))
         self.stepper, self.view = make_stepper(), view

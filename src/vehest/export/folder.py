@@ -93,8 +93,7 @@ def readme(stepper: GuardedStepper, precision: Precision, drive: Recording | Non
 def refuse_unresolved(trust: Trust | None) -> None:
     """Health of a channel that follows the others to the last digits, as one that was computed from them does, is not for float.
 
-    Raises:
-        ConfigurationError: there is one.
+    Raises `ConfigurationError`: there is one.
     """
     if trust is None or trust.health is None:
         return

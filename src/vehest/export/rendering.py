@@ -61,8 +61,7 @@ def typed(source: str, precision: Precision) -> str:
 def literal(value: float, precision: Precision) -> str:
     """A C literal, without suffix, that reads back to the same double or to the float nearest to the value.
 
-    Raises:
-        ConfigurationError: the value is not finite in this precision.
+    Raises `ConfigurationError`: the value is not finite in this precision.
     """
     with np.errstate(over="ignore"):
         number = float(np.float32(value)) if precision == "float" else float(value)

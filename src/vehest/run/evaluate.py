@@ -28,9 +28,8 @@ from vehest.estimators.base import Estimator
 from vehest.estimators.model_files import load_model, read_description
 from vehest.estimators.registry import estimator_class
 from vehest.evaluation.bands import band_figures, banded, coverage_intervals, figures_by_regime
-from vehest.evaluation.blocks import segments_of, write_segments
+from vehest.evaluation.blocks import figure_intervals, segments_of, write_segments
 from vehest.evaluation.floors import cramer_rao_floor, drives_of, inputs_of, reference_floor
-from vehest.evaluation.intervals import figure_intervals
 from vehest.evaluation.lever_arm import CONDITION, lever_arm_figures
 from vehest.evaluation.metrics import UNITS, Protocol, Scored, accuracy, pieces_of, reference_state, score_all, scored_range, sequences
 from vehest.evaluation.regimes import errors_by_regime, regimes_of

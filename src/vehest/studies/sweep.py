@@ -130,22 +130,22 @@ def heat_maps(artefacts: SweepArtefacts, table: pd.DataFrame) -> list[Figure]:
     numeric = [key for key in varied if key not in switches and all(_is_number(value) for value in table[key])]
     if len(numeric) != 2 or len(numeric) + len(switches) != len(varied):
         return []
-    across, up = numeric
-    columns, rows = sorted(table[across].unique()), sorted(table[up].unique())
+    cells = [sorted(table[key].unique()) for key in numeric]
     names = short_names(artefacts.keys)
+    across, up = (names[key] for key in numeric)
     maps = []
     for name in artefacts.sets:
-        panels = [
-            _panel(own, key, name, [names[switch] for switch in switches], (across, columns), (up, rows))
-            for key, own in (table.groupby(switches, sort=False) if switches else [((), table)])
-        ]
+        panels = []
+        for key, own in table.groupby(switches, sort=False) if switches else [((), table)]:
+            title = ", ".join(f"{names[switch]} = {shown_value(value)}" for switch, value in zip(switches, key, strict=True))
+            panels.append(_panel(own, title, name, numeric, cells))
         where = "the validation range" if name == VALIDATION else f"test set `{name}`"
         caption = (
-            f"RMSE(β) on {where} over {names[across]} and {names[up]} ({_kinds(artefacts, name)}). In each cell the mean over seeds and, "
+            f"RMSE(β) on {where} over {across} and {up} ({_kinds(artefacts, name)}). In each cell the mean over seeds and, "
             f"below it, half its 95 % confidence interval. The frame marks the combination chosen on the validation range."
         )
-        ticks = [[str(value) for value in values] for values in (columns, rows)]
-        figure = heat_map(panels, ticks[0], ticks[1], names[across], names[up], f"RMSE(β), {name} [deg]")
+        ticks = [[str(value) for value in values] for values in cells]
+        figure = heat_map(panels, *ticks, across, up, f"RMSE(β), {name} [deg]")
         maps.append(Figure(f"heat_map_{name.lower()}", caption, figure))
     return maps
 
@@ -165,22 +165,13 @@ def _is_number(value: object) -> bool:
     return isinstance(value, int | float | np.integer | np.floating) and not isinstance(value, bool | np.bool_)
 
 
-def _panel(
-    table: pd.DataFrame,
-    values: tuple[object, ...],
-    name: str,
-    switches: Sequence[str],
-    across: tuple[str, list[float]],
-    up: tuple[str, list[float]],
-) -> Panel:
-    mean, half = (np.full((len(up[1]), len(across[1])), np.nan) for _ in range(2))
-    marked = None
-    for row in table.to_dict("records"):
-        cell = up[1].index(row[up[0]]), across[1].index(row[across[0]])
-        mean[cell], half[cell] = row[f"{METRIC}.{name}"], row[f"{METRIC}_half.{name}"]
-        marked = cell if row["chosen"] else marked
-    title = ", ".join(f"{switch} = {shown_value(value)}" for switch, value in zip(switches, values, strict=True))
-    return Panel(title, mean, half, marked)
+def _panel(table: pd.DataFrame, title: str, name: str, numeric: Sequence[str], cells: Sequence[Sequence[float]]) -> Panel:
+    """Combinations with two numeric keys of these values, across and up."""
+    shown = [f"{METRIC}.{name}", f"{METRIC}_half.{name}", "chosen"]
+    grid = table.pivot(index=numeric[1], columns=numeric[0], values=shown)
+    mean, half, chosen = (grid[column].reindex(index=cells[1], columns=cells[0]).to_numpy(dtype=float) for column in shown)
+    marked = np.argwhere(chosen == 1.0)
+    return Panel(title, mean, half, tuple(marked[0]) if len(marked) else None)
 
 
 # The words
