@@ -145,7 +145,7 @@ def heat_maps(artefacts: SweepArtefacts, table: pd.DataFrame) -> list[Figure]:
             f"below it, half its 95 % confidence interval. The frame marks the combination chosen on the validation range."
         )
         ticks = [[str(value) for value in values] for values in cells]
-        figure = heat_map(panels, *ticks, across, up, f"RMSE(β), {name} [deg]")
+        figure = heat_map(panels, ticks[0], ticks[1], across, up, f"RMSE(β), {name} [deg]")
         maps.append(Figure(f"heat_map_{name.lower()}", caption, figure))
     return maps
 
@@ -165,13 +165,15 @@ def _is_number(value: object) -> bool:
     return isinstance(value, int | float | np.integer | np.floating) and not isinstance(value, bool | np.bool_)
 
 
-def _panel(table: pd.DataFrame, title: str, name: str, numeric: Sequence[str], cells: Sequence[Sequence[float]]) -> Panel:
+def _panel(table: pd.DataFrame, title: str, name: str, numeric: Sequence[str], cells: list[list[float]]) -> Panel:
     """Combinations with two numeric keys of these values, across and up."""
-    shown = [f"{METRIC}.{name}", f"{METRIC}_half.{name}", "chosen"]
-    grid = table.pivot(index=numeric[1], columns=numeric[0], values=shown)
-    mean, half, chosen = (grid[column].reindex(index=cells[1], columns=cells[0]).to_numpy(dtype=float) for column in shown)
-    marked = np.argwhere(chosen == 1.0)
-    return Panel(title, mean, half, tuple(marked[0]) if len(marked) else None)
+    across, up = numeric
+    mean, half, chosen = (
+        table.pivot(index=up, columns=across, values=shown).reindex(index=cells[1], columns=cells[0]).to_numpy(dtype=float)
+        for shown in (f"{METRIC}.{name}", f"{METRIC}_half.{name}", "chosen")
+    )
+    marked = np.argwhere(chosen == 1.0).tolist()
+    return Panel(title, mean, half, (marked[0][0], marked[0][1]) if marked else None)
 
 
 # The words
