@@ -14,12 +14,11 @@ from scipy import stats
 from vehest.data.errors import ConfigurationError
 from vehest.data.splits import Span, Split
 from vehest.evaluation.metrics import Protocol
-from vehest.report.heat_map import Panel, heat_map
 from vehest.run.artefacts import StagePlan
 from vehest.run.study import sweep_of
 from vehest.run.train import TrainJob
 from vehest.studies.artefacts import PartArtefacts
-from vehest.studies.sweep import SweepArtefacts, build, heat_maps, interval, summary, table_of
+from vehest.studies.sweep import Panel, SweepArtefacts, build, heat_map, heat_maps, interval, summary, table_of
 
 QUICK = ("split=mine", "estimator=ksnn", "training.max_epochs=1", "training.batch_size=256", "tracking=none")
 GRID = (*QUICK, "estimator.n_local=2,3", "estimator.n_hidden=0,1", "seed=range(2)")

@@ -132,11 +132,6 @@ def new_figure(width: float = DOUBLE_COLUMN, height: float = 3.0) -> Iterator[Ma
         yield Figure(figsize=(width, height), layout="constrained")
 
 
-def with_unit(quantity: str, unit: str) -> str:
-    """Header of a column or label of an axis: ``RMSE(β) [deg]``; no brackets where there is no unit."""
-    return quantity if unit in {"", "1"} else f"{quantity} [{unit}]"
-
-
 def significant(value: float, digits: int = 3) -> str:
     """A number to some significant digits, never in exponents between 1e-4 and 1e6; `MISSING` if it is not finite."""
     if not math.isfinite(value):

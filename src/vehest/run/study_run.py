@@ -27,7 +27,7 @@ from vehest.run.evaluate_faults import check_channels, faults_of
 from vehest.run.group import Group
 from vehest.run.ingest import STAGE as INGEST
 from vehest.run.ingest import plan_ingest
-from vehest.run.launchers.base import LauncherOptions, RunOptions, chosen_launcher
+from vehest.run.launchers.base import RunOptions, chosen_launcher
 from vehest.run.launchers.local import default_jobs
 from vehest.run.published import keys_of_study
 from vehest.run.publishing import RESULTS, Publication, publish_study
@@ -50,7 +50,7 @@ def open_runner(config: Config, options: RunOptions, stages: Collection[str], st
     messages, stop, output = Messages(quiet=options.quiet), StopSignals(), Path(config["output"])
     tracker = Tracker(config["tracking"], output, messages.warn, stop.requested, study) if options.track or study else None
     forced = frozenset(stages if options.force else ())
-    launcher = chosen_launcher(options.launcher or LauncherOptions(), options.jobs, output, messages)
+    launcher = chosen_launcher(options.launcher, options.jobs, output, messages)
     runner = Runner(output, messages, stop, options.jobs or default_jobs(), forced, options.dry_run, tracker, launcher)
     with closing(launcher), use_limits(limits_from_config(config["limits"])), stop.installed():
         yield runner

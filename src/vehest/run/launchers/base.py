@@ -41,7 +41,7 @@ class RunOptions:
     jobs: int | None = None
     track: bool = False
     minutes: float | None = None
-    launcher: LauncherOptions | None = None
+    launcher: LauncherOptions = LauncherOptions()
     retrain: bool = False
 
 
