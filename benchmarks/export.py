@@ -24,6 +24,7 @@ import pandas as pd
 import torch
 
 ROOT = Path(__file__).parents[1]
+sys.path.insert(0, str(ROOT / "tests" / "export"))
 PASSES = 3
 DRIVES = {
     "ferrari_250lm": ("20140222_01_01_03_250lm", 550.0, 700.0),
@@ -111,7 +112,7 @@ def rows_of(model: Any, folder: Path, dataset: str, root: str, output: Path) -> 
 
 def sizes(files: dict[str, str], target: Any, folder: Path, prefix: str) -> dict[str, int]:
     """Bytes that an export takes on a target, and those of the method's instructions alone; none where its compiler is missing."""
-    from vehest.export.measure import STRICT, footprint
+    from footprint import STRICT, footprint
 
     own = footprint(files, target)
     if own is None:
@@ -125,10 +126,11 @@ def sizes(files: dict[str, str], target: Any, folder: Path, prefix: str) -> dict
 
 def measured(dataset: str, folder: Path, output: Path, root: str) -> list[dict[str, Any]]:
     """A row for each precision."""
+    from footprint import CORTEX_M4F, HOST
+
     from vehest.data.errors import ConfigurationError
     from vehest.estimators.model_files import load_model
     from vehest.export.folder import refuse_unresolved
-    from vehest.export.measure import CORTEX_M4F, HOST
     from vehest.export.program import program_files
     from vehest.export.vectors import COLUMNS, in_float64, replayed, table_text
     from vehest.run.calibrate import trust_of

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import os
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, NoReturn
@@ -13,15 +13,13 @@ from typing import TYPE_CHECKING, Annotated, Any, NoReturn
 import typer
 
 from vehest.data.errors import ConfigurationError, VehestError, printable
-from vehest.run.config_files import GROUPS, choices, is_simulated, pipeline_names, summary
-from vehest.run.launchers.base import LAUNCHERS, LauncherOptions
+from vehest.run.config_files import GROUPS, choices, pipeline_names
+from vehest.run.launchers.base import LAUNCHERS, LauncherOptions, RunOptions
 from vehest.run.printing import OutputClosed, TerminalTable, as_json_text, complain, counted, echo, emit, note, open_streams, silence
 from vehest.version import __version__
 
 if TYPE_CHECKING:
     from vehest.run.config import Config
-    from vehest.run.run_cache import RunOptions
-
 app = typer.Typer(
     name="vehest",
     no_args_is_help=True,
@@ -41,6 +39,7 @@ LONGEST_LINE = 4_000
 STAGES = "Single stages, which `run` goes through by itself"
 CLUSTER = "On a cluster"
 COMMANDS = ("ingest", "downsample", "train", "eval", "estimate")
+OUTPUT = os.environ.get("VEHEST_OUTPUT", "outputs")
 
 
 def _offered(*groups: str) -> str:
@@ -48,64 +47,22 @@ def _offered(*groups: str) -> str:
     return "\n\n".join(f"**{group}**: {', '.join(choices(group))}" for group in groups)
 
 
-def _completing(command: str) -> Callable[[typer.Context, str], list[tuple[str, str]]]:
-    """Completion of a command's overrides."""
-
-    def complete(context: typer.Context, incomplete: str) -> list[tuple[str, str]]:
-        from vehest.run.config_files import complete_override
-
-        given = [str(word) for word in context.params.get("overrides") or []]
-        if context.params.get("check"):
-            return [(name, "") for name in _complete_pipeline(incomplete)]
-        own = str(context.params.get("command") or command)
-        dataset = context.params.get("dataset")
-        chosen = [f"dataset={dataset}"] if dataset else []
-        if own == "simulate":
-            short = [("seed=0", "short for dataset.seed")] if "seed=0".startswith(incomplete) else []
-            return short + complete_override("ingest", chosen + given, incomplete)
-        return complete_override(own, chosen + given, incomplete)
-
-    return complete
+def _offer(names: Callable[[], Iterable[str]]) -> Callable[[str], list[str]]:
+    """Completion of a word by names that begin with it."""
+    return lambda incomplete: [name for name in names() if name.startswith(incomplete)]
 
 
-def _complete_dataset(incomplete: str) -> list[tuple[str, str]]:
-    return [(name, summary("dataset", name)) for name in choices("dataset") if name.startswith(incomplete)]
-
-
-def _complete_simulated(incomplete: str) -> list[tuple[str, str]]:
-    return [(name, note) for name, note in _complete_dataset(incomplete) if is_simulated(name)]
-
-
-def _complete_pipeline(incomplete: str) -> list[str]:
-    return [name for name in pipeline_names() if name.startswith(incomplete)]
-
-
-def _complete_command(incomplete: str) -> list[str]:
-    return [name for name in COMMANDS if name.startswith(incomplete)]
-
-
-def _complete_model(incomplete: str) -> list[str]:
-    output = Path(os.environ.get("VEHEST_OUTPUT", "outputs"))
-    shipped = [name for name in ("pretrained", "self_calibrating") if name.startswith(incomplete)]
-    own = sorted((output / "train").glob(f"{Path(incomplete).name}*"))
-    return [*shipped, *(folder.name for folder in own if not folder.name.startswith("."))]
-
-
-def _complete_file(incomplete: str) -> list[str]:
-    before = incomplete[: incomplete.rfind("/") + 1]
-    files = [f"{before}{file.name}" for file in sorted(Path(before).glob("*")) if file.suffix.lower() in (".csv", ".parquet")]
-    return [file for file in files if file.startswith(incomplete)]
-
-
-def _complete_model_or_file(incomplete: str) -> list[str]:
-    return _complete_model(incomplete) + _complete_file(incomplete)
+DATASETS = _offer(lambda: choices("dataset"))
+MODELS = _offer(lambda: ["pretrained", "self_calibrating", *(own.name for own in Path(OUTPUT, "train").glob("[!.]*"))])
+OVERRIDES = _offer(lambda: [f"{group}={choice}" for group in GROUPS for choice in choices(group)])
+PIPELINES = _offer(pipeline_names)
 
 
 DryRun = Annotated[bool, typer.Option("--dry-run", help="List the stages that would run or be skipped; run nothing.")]
 Force = Annotated[bool, typer.Option("--force", help="Run although the outcome exists.")]
 DatasetOrFile = Annotated[
     str,
-    typer.Argument(help="A data set, or a file: a table, or with dataset=NAME one of its format.", autocompletion=_complete_dataset),
+    typer.Argument(help="A data set, or a file: a table, or with dataset=NAME one of its format.", autocompletion=DATASETS),
 ]
 AsJson = Annotated[bool, typer.Option("--json", help="Print the outcome as one JSON object on standard output.")]
 Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="Print only warnings and the outcome.")]
@@ -115,7 +72,7 @@ LauncherName = Annotated[
     typer.Option(
         "--launcher",
         help="Where trainings run: local, on this machine's cores; ray, on a Ray cluster; slurm, as SLURM jobs (docs/many_machines.md).",
-        autocompletion=lambda incomplete: [name for name in LAUNCHERS if name.startswith(incomplete)],
+        autocompletion=_offer(lambda: LAUNCHERS),
         rich_help_panel=CLUSTER,
     ),
 ]
@@ -139,11 +96,12 @@ Slurm = Annotated[
         rich_help_panel=CLUSTER,
     ),
 ]
-Dataset = Annotated[str, typer.Argument(help="Name of a file in conf/dataset.", autocompletion=_complete_dataset)]
+Dataset = Annotated[str, typer.Argument(help="Name of a file in conf/dataset.", autocompletion=DATASETS)]
 
 
-def _overrides(command: str) -> Any:
-    return typer.Argument(help="key=value …, in Hydra's grammar.", autocompletion=_completing(command), show_default=False)
+Overrides = Annotated[
+    list[str] | None, typer.Argument(help="key=value …, in Hydra's grammar.", autocompletion=OVERRIDES, show_default=False)
+]
 
 
 @app.callback(invoke_without_command=True)
@@ -200,7 +158,7 @@ def new_car(
 @app.command(epilog=_offered("dataset"), rich_help_panel=STAGES)
 def ingest(
     dataset: Dataset,
-    overrides: Annotated[list[str] | None, _overrides("ingest")] = None,
+    overrides: Overrides = None,
     download: Annotated[
         bool, typer.Option("--download", help="First fetch missing files, and compare checksums; resumes an interrupted download.")
     ] = False,
@@ -212,7 +170,6 @@ def ingest(
 ) -> None:
     """Bring raw files, or a simulation, into the store: `vehest ingest ferrari_250lm root=FOLDER`."""
     from vehest.run.ingest import download_files
-    from vehest.run.run_cache import RunOptions
     from vehest.run.study_run import open_runner
 
     config = _compose("ingest", [f"dataset={dataset}", *(overrides or [])])
@@ -225,8 +182,8 @@ def ingest(
 
 @app.command(rich_help_panel=STAGES)
 def simulate(
-    dataset: Annotated[str, typer.Argument(help="Name of a simulated data set in conf/dataset.", autocompletion=_complete_simulated)],
-    overrides: Annotated[list[str] | None, _overrides("simulate")] = None,
+    dataset: Annotated[str, typer.Argument(help="Name of a simulated data set in conf/dataset.", autocompletion=DATASETS)],
+    overrides: Overrides = None,
     dry_run: DryRun = False,
     force: Force = False,
     as_json: AsJson = False,
@@ -239,7 +196,6 @@ def simulate(
     that spin or leave the road are kept, flagged in their provenance, and counted.
     """
     from vehest.run.ingest import outcome_of, simulation_config
-    from vehest.run.run_cache import RunOptions
     from vehest.run.study_run import open_runner
 
     config = simulation_config(dataset, overrides or [])
@@ -254,7 +210,7 @@ def simulate(
 @app.command(epilog=_offered("dataset"), rich_help_panel=STAGES)
 def downsample(
     dataset: Dataset,
-    overrides: Annotated[list[str] | None, _overrides("downsample")] = None,
+    overrides: Overrides = None,
     dry_run: DryRun = False,
     force: Force = False,
     as_json: AsJson = False,
@@ -262,7 +218,6 @@ def downsample(
 ) -> None:
     """Bring a data set to another rate, anti-aliased: `vehest downsample ferrari_250lm rate_hz=20`."""
     from vehest.run.config import positive_rate
-    from vehest.run.run_cache import RunOptions
     from vehest.run.study_run import open_runner
 
     config = _compose("downsample", [f"dataset={dataset}", *(overrides or [])])
@@ -274,7 +229,7 @@ def downsample(
 
 @app.command(epilog=_offered("split", "estimator", "training", "tracking"), rich_help_panel=STAGES)
 def train(
-    overrides: Annotated[list[str] | None, _overrides("train")] = None,
+    overrides: Overrides = None,
     dry_run: DryRun = False,
     force: Force = False,
     as_json: AsJson = False,
@@ -284,7 +239,6 @@ def train(
 
     Ctrl-C keeps the best so far; the same command goes on from there.
     """
-    from vehest.run.run_cache import RunOptions
     from vehest.run.study_run import train_one
 
     emit(as_json, train_one(overrides or [], RunOptions(force, dry_run, quiet, track=True)))
@@ -292,14 +246,14 @@ def train(
 
 @app.command("eval", epilog=_offered("split", "estimator", "fault"), rich_help_panel=STAGES)
 def evaluate(
-    overrides: Annotated[list[str] | None, _overrides("eval")] = None,
+    overrides: Overrides = None,
     model: Annotated[
         str | None,
         typer.Option(
             "--model",
             "-m",
             help="A model's folder, or the start of its name, `pretrained` or `self_calibrating`; by default what the overrides train.",
-            autocompletion=_complete_model,
+            autocompletion=MODELS,
         ),
     ] = None,
     dry_run: DryRun = False,
@@ -312,7 +266,6 @@ def evaluate(
     Or name the model: `vehest eval --model ksnn-linear_bias_p2-seed2 split=ferrari_drive`. With a sensor's fault as a further condition:
     `vehest eval estimator=ksnn fault=frozen fault.channel=yaw_rate fault.severity=severe`.
     """
-    from vehest.run.run_cache import RunOptions
     from vehest.run.study_run import evaluate_one
 
     emit(as_json, evaluate_one(overrides or [], model, RunOptions(force, dry_run, quiet, track=True), note))
@@ -325,7 +278,7 @@ def estimate(
         typer.Argument(
             metavar="MODEL|FILE",
             help="A model's folder, or the start of its name; or the recording at once, for the filter that comes with vehest.",
-            autocompletion=_complete_model_or_file,
+            autocompletion=MODELS,
         ),
     ],
     recording: Annotated[
@@ -336,7 +289,7 @@ def estimate(
             show_default=False,
         ),
     ] = None,
-    overrides: Annotated[list[str] | None, _overrides("estimate")] = None,
+    overrides: Overrides = None,
     out: Annotated[
         Path, typer.Option("--out", "-o", help="Where to write the estimate: .parquet, .csv, or the log with it: .mf4, .mat.")
     ] = Path("estimate.parquet"),
@@ -371,7 +324,6 @@ def identify(
         typer.Argument(
             metavar="FILE... [OVERRIDES]...",
             help="Drives of a car; then estimator.wheelbase=2.7 and the like.",
-            autocompletion=_complete_file,
         ),
     ],
     out: Annotated[Path, typer.Option("--out", "-o", help="The car's record to write, .yaml.")] = Path("my_car.yaml"),
@@ -391,20 +343,20 @@ def identify(
 @app.command()
 def replay(
     log: Annotated[Path, typer.Argument(metavar="LOG", help="Frames of a bus: .asc, .blf, or .log of candump.")],
-    overrides: Annotated[list[str] | None, _overrides("estimate")] = None,
+    overrides: Overrides = None,
     model: Annotated[
         str,
         typer.Option(
             "--model",
             "-m",
             help="A model's folder, or the start of its name, `self_calibrating`; by default the pre-trained one.",
-            autocompletion=_complete_model,
+            autocompletion=MODELS,
         ),
     ] = "pretrained",
     dbc: Annotated[Path | None, typer.Option("--dbc", help="What describes the bus; by default the data set's.")] = None,
     dataset: Annotated[
         str | None,
-        typer.Option("--dataset", help="A data set of the source can, which maps signals to channels.", autocompletion=_complete_dataset),
+        typer.Option("--dataset", help="A data set of the source can, which maps signals to channels.", autocompletion=DATASETS),
     ] = None,
     signals: Annotated[
         str,
@@ -470,7 +422,7 @@ def export(
         str,
         typer.Argument(
             help="A model's folder, or the start of its name; or pretrained, or self_calibrating.",
-            autocompletion=_complete_model,
+            autocompletion=MODELS,
             show_default=False,
         ),
     ],
@@ -487,7 +439,7 @@ def export(
         Path | None,
         typer.Option("--vectors", metavar="LOG", help="Recording for the test vectors, read as by `vehest estimate`.", show_default=False),
     ] = None,
-    overrides: Annotated[list[str] | None, _overrides("estimate")] = None,
+    overrides: Overrides = None,
     onnx: Annotated[
         bool,
         typer.Option("--onnx", help="Write a network as one step in ONNX instead, with its state going in and out; -o names the file."),
@@ -497,7 +449,7 @@ def export(
     """Write a model as C99 for a control unit: `vehest export MODEL -o c --precision float`.
 
     One step with explicit state: the method with the checks of its samples, band and health; a Makefile, a program that runs a drive from a
-    file, test vectors, and a README with units and the bytes that it takes.
+    file, test vectors, and a README with units.
     """
     from vehest.export.folder import export_model
     from vehest.run.estimate import open_model, prepared_recording, read_table
@@ -511,10 +463,9 @@ def export(
         from vehest.export.onnx_model import write_onnx
 
         write_onnx(fitted, out)
-        emit(as_json, {"out": str(out), "model": str(folder)})
-        return
-    found = export_model(fitted, trust, out, precision, bus_rate, elsewhere=elsewhere, drive=drive)
-    emit(as_json, {"out": str(out), "model": str(folder), **{name: value for own in found for name, value in own.figures().items()}})
+    else:
+        export_model(fitted, trust, out, precision, bus_rate, elsewhere=elsewhere, drive=drive)
+    emit(as_json, {"out": str(out), "model": str(folder)})
 
 
 @app.command()
@@ -530,9 +481,7 @@ def compare(
     ] = None,
     models: Annotated[
         list[str] | None,
-        typer.Option(
-            "--model", "-m", help="A model to run on the recording and compare too; may be repeated.", autocompletion=_complete_model
-        ),
+        typer.Option("--model", "-m", help="A model to run on the recording and compare too; may be repeated.", autocompletion=MODELS),
     ] = None,
     as_json: AsJson = False,
 ) -> None:
@@ -549,8 +498,8 @@ def compare(
 
 @app.command()
 def run(
-    pipeline: Annotated[str, typer.Argument(help="A file in pipelines/, or its name.", autocompletion=_complete_pipeline)],
-    overrides: Annotated[list[str] | None, _overrides("eval")] = None,
+    pipeline: Annotated[str, typer.Argument(help="A file in pipelines/, or its name.", autocompletion=PIPELINES)],
+    overrides: Overrides = None,
     dry_run: DryRun = False,
     force: Force = False,
     as_json: AsJson = False,
@@ -570,8 +519,6 @@ def run(
     Existing artefacts are skipped, and trained weights that the study has published are taken where their keys are the same. Overrides
     apply to every sweep that has their key. Sweeps are worked off in the order of the file.
     """
-    from vehest.run.run_cache import RunOptions
-
     chosen = LauncherOptions(launcher, address, tuple(slurm or ()))
     options = RunOptions(force, dry_run, quiet, jobs, minutes=minutes, launcher=chosen, retrain=retrain)
     _run_study(pipeline, overrides or [], options, as_json)
@@ -583,11 +530,11 @@ def report(
         str | None,
         typer.Argument(
             help="A file in pipelines/, or its name; with --check studies or pipelines, or none for all.",
-            autocompletion=_complete_pipeline,
+            autocompletion=PIPELINES,
             show_default=False,
         ),
     ] = None,
-    overrides: Annotated[list[str] | None, _overrides("eval")] = None,
+    overrides: Overrides = None,
     check: Annotated[
         bool,
         typer.Option(
@@ -611,8 +558,6 @@ def report(
         return
     if pipeline is None:
         raise ConfigurationError(f"no pipeline is named; there are: {', '.join(pipeline_names())}; or use --check")
-    from vehest.run.run_cache import RunOptions
-
     _run_study(pipeline, overrides or [], RunOptions(force, dry_run, quiet, 1), as_json, only_report=True)
 
 
@@ -629,7 +574,7 @@ def _check_published(words: list[str], as_json: bool) -> None:
 
 @app.command(epilog=_offered("split", "estimator", "training", "fault", "tracking"))
 def sweep(
-    overrides: Annotated[list[str] | None, _overrides("eval")] = None,
+    overrides: Overrides = None,
     name: Annotated[
         str | None, typer.Option("--name", help="Start of the folder's name; by default the estimators and the split.", show_default=False)
     ] = None,
@@ -647,16 +592,14 @@ def sweep(
     Prints the mean RMSE(β) of each combination over its seeds with a 95 % confidence interval (Student's t), and marks the one that is best
     on the validation range. Existing artefacts are skipped, a failed job stops no other, the same command finishes what is missing.
     """
-    from vehest.run.run_cache import RunOptions
-
     options = RunOptions(force, dry_run, quiet, jobs, launcher=LauncherOptions(launcher, address, tuple(slurm or ())))
     _run_study(name, overrides or [], options, as_json, sweep=True)
 
 
 @app.command("config", rich_help_panel=STAGES)
 def show_config(
-    command: Annotated[str, typer.Argument(help="ingest, downsample, train, eval or estimate.", autocompletion=_complete_command)],
-    overrides: Annotated[list[str] | None, _overrides("train")] = None,
+    command: Annotated[str, typer.Argument(help="ingest, downsample, train, eval or estimate.", autocompletion=_offer(lambda: COMMANDS))],
+    overrides: Overrides = None,
     as_json: AsJson = False,
 ) -> None:
     """Print the resolved configuration of a command: `vehest config train estimator=gru`."""
@@ -670,7 +613,7 @@ def show_config(
 
 @app.command(rich_help_panel=STAGES)
 def prune(
-    overrides: Annotated[list[str] | None, _overrides("estimate")] = None,
+    overrides: Overrides = None,
     yes: Annotated[bool, typer.Option("--yes", "-y", help="Remove without asking.")] = False,
     dry_run: Annotated[bool, typer.Option("--dry-run", help="List what would be removed; remove nothing.")] = False,
     as_json: AsJson = False,
@@ -729,8 +672,8 @@ def data_channels(as_json: AsJson = False) -> None:
 
 @data_app.command("show")
 def data_show(
-    source: Annotated[str, typer.Argument(help="A data set, or a CSV or Parquet file.", autocompletion=_complete_dataset)],
-    overrides: Annotated[list[str] | None, _overrides("ingest")] = None,
+    source: Annotated[str, typer.Argument(help="A data set, or a CSV or Parquet file.", autocompletion=DATASETS)],
+    overrides: Overrides = None,
     as_json: AsJson = False,
 ) -> None:
     """Show recordings: channels, rate, duration, ranges."""
@@ -742,7 +685,7 @@ def data_show(
 @data_app.command("check")
 def data_check(
     source: DatasetOrFile,
-    overrides: Annotated[list[str] | None, _overrides("ingest")] = None,
+    overrides: Overrides = None,
     as_json: AsJson = False,
 ) -> None:
     """Look for gaps, bad clocks, NaN, stuck and saturated channels, impossible values, wrong units and signs; exit code 3 on errors."""
@@ -757,7 +700,7 @@ def data_check(
 @data_app.command("usable")
 def data_usable(
     source: DatasetOrFile,
-    overrides: Annotated[list[str] | None, _overrides("ingest")] = None,
+    overrides: Overrides = None,
     as_json: AsJson = False,
 ) -> None:
     """List for every estimator whether these recordings suffice, which channels are missing, and how to supply them."""
@@ -768,8 +711,8 @@ def data_usable(
 
 @data_app.command("align")
 def data_align(
-    source: Annotated[str, typer.Argument(help="A data set, or a CSV or Parquet file.", autocompletion=_complete_dataset)],
-    overrides: Annotated[list[str] | None, _overrides("ingest")] = None,
+    source: Annotated[str, typer.Argument(help="A data set, or a CSV or Parquet file.", autocompletion=DATASETS)],
+    overrides: Overrides = None,
     estimate: Annotated[
         str,
         typer.Option(
@@ -790,7 +733,7 @@ def data_align(
         float, typer.Option("--max-ay", help="For the steering ratio: lateral acceleration up to which it is used [m/s²].")
     ] = 3.0,
     min_speed: Annotated[float, typer.Option("--min-speed", help="For the steering ratio: speed from which it is used [m/s].")] = 5.0,
-    out: Annotated[Path | None, typer.Option("--out", "-o", help="Folder for report, table, transforms and figure.")] = None,
+    out: Annotated[Path | None, typer.Option("--out", "-o", help="Folder for report, table and transforms.")] = None,
     as_json: AsJson = False,
 ) -> None:
     """Estimate lever arm, rotation, delay and offsets of the sensors, and the steering ratio: `vehest data align lap.csv -e delay,offsets`.

@@ -19,8 +19,8 @@ from vehest.evaluation.bands import (
     proportion_interval,
 )
 from vehest.evaluation.consistency import COVERAGE, coverage, normalised_error_squared, normalised_innovation_squared
-from vehest.evaluation.integrity import detection_delay, error_while_undetected
 from vehest.evaluation.metrics import UNITS, Protocol, Scored, accuracy, score
+from vehest.evaluation.under_fault import detection_delay, error_while_undetected
 from vehest.trust.bands import LEVELS, Bands, Quantity, intraclass_correlation
 
 GAUSSIAN = stats.norm.ppf([0.5 + 0.5 * level for level in LEVELS])

@@ -4,8 +4,8 @@ import re
 
 import pytest
 from exports import FAMILIES, STRICT, Export, command, tool
+from footprint import CORTEX_M4F, HOST, TARGETS, footprint, worst_stack
 
-from vehest.export.measure import CORTEX_M4F, HOST, TARGETS, footprint, worst_stack
 from vehest.export.program import TOLERANCES, program_files
 
 pytestmark = pytest.mark.export

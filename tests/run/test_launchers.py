@@ -17,7 +17,7 @@ from vehest.run.artefacts import MANIFEST, StagePlan, find, make, read_artefact
 from vehest.run.console import Messages
 from vehest.run.failures import Failure
 from vehest.run.group import Group
-from vehest.run.launchers.base import LauncherOptions, LaunchProgress, chosen_launcher
+from vehest.run.launchers.base import LauncherOptions, chosen_launcher
 from vehest.run.launchers.clusters import NotShared, pack, run_task, slurm_parameters, task_of, unpack, versions_here
 from vehest.run.launchers.local import LocalLauncher
 from vehest.run.signals import StopSignals
@@ -37,15 +37,7 @@ def made_in(output):
     return make(job(output).plan, lambda folder: (folder / "model.safetensors").write_text("weights") and None)
 
 
-def test_progress_counts_and_estimates_the_end_in_no_more_bars_than_fit_a_terminal():
-    progress = LaunchProgress(10)
-    progress.running |= {0, 1}
-    begun = {"done": "0", "running": "2", "waiting": "8", "failed": "0", "core hours": "0.000", "cores": "2", "left": ""}
-    assert progress.row(2) == begun
-    progress.ended(0, 10.0, failed=False)
-    progress.ended(1, 20.0, failed=True)
-    ended = {"done": "1", "running": "0", "waiting": "8", "failed": "1", "core hours": "0.008", "cores": "4", "left": "0:00:30"}
-    assert (progress.row(4), LaunchProgress(1).row(4)) == (ended, {})
+def test_progress_has_no_more_bars_than_fit_a_terminal():
     with FINE.bars() as bars:
         for number in range(console.MOST_BARS + 5):
             bars.fit(f"training {number}", None)

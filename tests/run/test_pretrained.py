@@ -12,7 +12,6 @@ import yaml
 
 import vehest
 from place import write_csv
-from vehest.cli import _complete_model_or_file
 from vehest.estimators.model_files import load_model, save_model
 from vehest.estimators.registry import estimator_class
 from vehest.run.config import compose_config
@@ -45,15 +44,6 @@ def test_an_estimate_of_the_shipped_model_loads_no_torch_no_pandas_and_no_scipy_
         result = subprocess.run(command, capture_output=True, text=True, check=True, timeout=300)
         assert "numba" in result.stderr.split()
         assert not {"torch", "pandas", "scipy.signal", "scipy.stats", "matplotlib"} & set(result.stderr.split())
-
-
-def test_completion_of_the_first_word_offers_models_and_recordings(place):
-    (place.folder / "outputs" / "train" / "ksnn-a").mkdir(parents=True)
-    for name in ("lap.csv", "lap.parquet", "notes.txt"):
-        (place.folder / name).touch()
-    assert _complete_model_or_file("") == ["pretrained", "self_calibrating", "ksnn-a", "lap.csv", "lap.parquet"]
-    assert (_complete_model_or_file("la"), _complete_model_or_file("raw/o")) == (["lap.csv", "lap.parquet"], ["raw/one.csv"])
-    assert _complete_model_or_file("./la") == ["./lap.csv", "./lap.parquet"]
 
 
 def test_a_named_model_is_used_a_folder_is_no_recording_and_a_name_with_an_equals_sign_is_no_override(place):

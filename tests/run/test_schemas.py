@@ -390,8 +390,9 @@ def test_whole_numbers_stay_what_they_are_where_anything_may_stand():
     assert protocol_from_config({"rate_hz": 20}).rate_hz == 20.0
     low_pass = {"name": "low_pass", "cutoff_hz": 5.0}
     assert Preparation(transforms=(low_pass,)).as_plain()["transforms"] == [low_pass]
-    described = validated(Description, {"format": 1.0, "estimator": "a", "settings": {"x": 5.0, "y": [2.0]}}, "'f'")
-    assert (described.format, type(described.format), type(described.settings["x"])) == (1, int, float)
+    described = validated(Description, {"format": 1, "estimator": "a", "settings": {"x": 5.0, "y": [2.0]}}, "'f'")
+    assert (type(described.settings["x"]), type(described.settings["y"][0])) == (float, float)
+    assert "format must be a whole number, not 1.0" in refusal(lambda: validated(Description, {"format": 1.0, "estimator": "a"}, "'f'"))
     assert check_format(1, 2, "'f'") == 1
     for wrong in (0, 3, True, 1.5, None, "1"):
         assert "'f'" in refusal(lambda wrong=wrong: check_format(wrong, 2, "'f'"))

@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 
 from vehest.data.store import read_recording
-from vehest.run.config_files import complete_override
 from vehest.run.launchers import local
 from vehest.simulation.plant import compiled
 from vehest.sources.simulated import SimulatedSource
@@ -116,11 +115,9 @@ def test_a_report_of_simulated_drives_never_says_real(place):
     assert "| real |" not in report
 
 
-def test_what_cannot_be_simulated_is_one_line_and_options_of_the_data_set_are_offered(place):
+def test_what_cannot_be_simulated_is_one_line(place):
     place.refused("simulate", "mine", code=2, says="data set 'mine' is not simulated but read from files; run 'vehest ingest mine'")
     simulated(place, [{"id": "lap", "manoeuvre": LAP}])
     place.refused("simulate", "sim", "seed=one", code=2, says="dataset.seed must be a whole number, zero or positive, not 'one'")
     simulated(place, [{"id": "lap", "manoeuvre": {"name": "slalon"}}])
     place.refused("simulate", "sim", code=2, says="there is no manoeuvre 'slalon'; there are braking_in_turn, double_lane_change")
-    offered = [text for text, _ in complete_override("ingest", ["dataset=sim_small"], "dataset.")]
-    assert {"dataset.seed=0", "dataset.rate_hz=100"} <= set(offered)

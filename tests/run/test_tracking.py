@@ -20,7 +20,7 @@ from vehest.run.tracking import Tracker
 pytestmark = pytest.mark.apart
 
 
-def test_runs_are_tracked_with_parameters_metrics_model_and_figures_and_then_recognised_without_mlflow(place):
+def test_runs_are_tracked_with_parameters_metrics_and_model_and_then_recognised_without_mlflow(place):
     place.done("run", "small")
     client = _client(place)
     runs = {run.info.run_name: run for run in _runs(client)}
@@ -33,7 +33,6 @@ def test_runs_are_tracked_with_parameters_metrics_model_and_figures_and_then_rec
     assert _is_whole(client, trained)
     evaluated = runs["ksnn-linear_no_bias_p2-seed0-on-mine"]
     assert evaluated.data.metrics["rmse_sideslip.test"] > 0
-    assert [entry.path for entry in client.list_artifacts(evaluated.info.run_id, "figures")] == ["figures/traces_test.png"]
     done = _in_process(
         "import vehest.cli, atexit; atexit.register(lambda: print('mlflow' in sys.modules)); vehest.cli.main()", "run", "small"
     )
@@ -64,7 +63,7 @@ def _is_whole(client, run):
     """Whether a training's run has its losses and its files."""
     kept = {entry.path for entry in client.list_artifacts(run.info.run_id)}
     losses = [point.step for point in client.get_metric_history(run.info.run_id, "validation_loss")]
-    return run.info.status == "FINISHED" and losses == [1, 2] and {"model.safetensors", "model.yaml", "manifest.json", "figures"} <= kept
+    return run.info.status == "FINISHED" and losses == [1, 2] and {"model.safetensors", "model.yaml", "manifest.json"} <= kept
 
 
 def test_what_a_server_that_was_away_missed_is_logged_by_the_next_run(place, monkeypatch):
@@ -78,7 +77,7 @@ def test_what_a_server_that_was_away_missed_is_logged_by_the_next_run(place, mon
     assert sorted(run.info.status for run in _local(place)) == ["FINISHED"] * 12
 
 
-@pytest.mark.parametrize("step", ["log_batch", "log_artifact", "log_figure", "set_terminated"])
+@pytest.mark.parametrize("step", ["log_batch", "log_artifact", "set_terminated"])
 def test_a_run_that_was_half_logged_is_completed(place, monkeypatch, step):
     from mlflow import MlflowClient
 
@@ -96,7 +95,7 @@ def test_an_unfinished_run_of_another_output_root_is_left_alone(place, monkeypat
     shared = f"tracking.uri=sqlite:///{place.folder / 'outputs' / 'mlflow.db'}"
     (place.folder / "outputs").mkdir()
     with monkeypatch.context() as killed:
-        killed.setattr(MlflowClient, "log_figure", _raising(KeyboardInterrupt()))
+        killed.setattr(MlflowClient, "log_artifact", _raising(KeyboardInterrupt()))
         assert place(*TRAIN, shared, "output=there")[0] == 130
     assert place(*TRAIN, shared, "output=here")[0] == 0
     assert sorted(run.info.status for run in _local(place, "train")) == ["FINISHED", "RUNNING"]
@@ -109,8 +108,8 @@ def test_the_same_training_made_again_is_the_same_run_and_another_outcome_is_ano
     [folder] = (place.folder / "outputs" / "train").iterdir()
     artefact = read_artefact(folder)
     assert run.data.tags["vehest.key"] == artefact.key
-    tracker.log(artefact, lambda: pytest.fail("it is logged already"), {})
-    tracker.log(replace(artefact, outputs={**artefact.outputs, "fit.csv": "0" * 64}), dict, {})
+    tracker.log(artefact)
+    tracker.log(replace(artefact, outputs={**artefact.outputs, "fit.csv": "0" * 64}))
     assert [run.info.status for run in _local(place, "train")] == ["FINISHED"] * 2
 
 
@@ -226,9 +225,11 @@ def test_every_parameter_is_tracked_however_many_there_are(tmp_path):
 
     config = {"group": {f"value_{position}": position for position in range(250)}}
     (tmp_path / MANIFEST).write_text("{}")
+    for file in ("fit.csv", "timings.csv"):
+        (tmp_path / file).write_text("metric,value\n")
     artefact = Artefact(tmp_path, "train", "model", "abc", "complete", {}, config, {})
     said = []
-    Tracker({"name": "mlflow"}, tmp_path / "outputs", said.append).log(artefact, dict, {})
+    Tracker({"name": "mlflow"}, tmp_path / "outputs", said.append).log(artefact)
     assert not said
     [run] = _runs(MlflowClient(f"sqlite:///{tmp_path / 'outputs' / 'mlflow.db'}"))
     assert {key: int(value) for key, value in run.data.params.items()} == {f"group.{key}": v for key, v in config["group"].items()}

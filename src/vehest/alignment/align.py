@@ -91,26 +91,9 @@ class Residual:
 
     channel: str
     unit: str
-    time_before: FloatArray  # (T,)
-    before: FloatArray  # as recorded, (T,)
-    time_after: FloatArray  # (U,)
-    after: FloatArray  # once the transforms have been applied, (U,)
-    rest: FloatArray | None = None  # without the part that follows the accelerations, as roll and pitch do; None where not fitted, (U,)
-
-    @property
-    def rms(self) -> dict[str, float]:
-        """Root mean square ``before``, ``after`` and of the ``rest``; NaN where there is none."""
-        rest = math.nan if self.rest is None else rms(self.rest)
-        return {"before": rms(self.before), "after": rms(self.after), "rest": rest}
-
-
-@dataclass(frozen=True, eq=False)
-class Steering:
-    """Slow samples of calm driving that the steering ratio was fitted to."""
-
-    channel: str
-    expected: FloatArray  # road-wheel angle by the curvature of the path, lateral acceleration and lead included [rad], (T,)
-    measured: FloatArray  # channel [rad], (T,)
+    # ``before`` as recorded, ``after`` once the transforms have been applied, ``rest`` without the part that follows the accelerations, as
+    # roll and pitch do, NaN where not fitted
+    rms: Mapping[str, float]
 
 
 @dataclass(frozen=True, eq=False)
@@ -123,7 +106,6 @@ class Alignment:
     transforms: tuple[Mapping[str, Any], ...]  # configurations of the transforms that would correct it, in the order of their application
     residuals: tuple[Residual, ...] = ()  # of the channels that were compared
     correlation: Correlation | None = None  # where there is a reference
-    steering: Steering | None = None  # where the steering ratio was asked for
     notes: tuple[str, ...] = ()  # a sentence or two each
 
     def __getitem__(self, name: str) -> Parameter:
@@ -157,7 +139,7 @@ def align(recording: Recording, settings: AlignmentSettings) -> Alignment:
     transforms: list[dict[str, Any]] = []
     residuals: tuple[Residual, ...] = ()
     notes: list[str] = []
-    corrected, correlation, steering = recording, None, None
+    corrected, correlation = recording, None
     if settings.kinematic:
         fit = fit_imu(recording, settings, [name for quantity in settings.kinematic for name in QUANTITIES[quantity]])
         uncertainties = zip(fit.names, fit.scatter.tolist(), fit.tilt.tolist(), strict=True)
@@ -168,9 +150,9 @@ def align(recording: Recording, settings: AlignmentSettings) -> Alignment:
         residuals = _residuals(fit, signals_of(corrected, settings))
         correlation, notes = fit.correlation, _imu_notes(fit, parameters, settings)
     if "steering_ratio" in settings.estimate:
-        found, transform, steering, note = _align_steering(corrected, settings)
+        found, transform, note = _align_steering(corrected, settings)
         parameters, transforms, notes = [*parameters, *found], [*transforms, transform], [*notes, note]
-    return Alignment(recording, settings, tuple(parameters), tuple(transforms), residuals, correlation, steering, tuple(notes))
+    return Alignment(recording, settings, tuple(parameters), tuple(transforms), residuals, correlation, tuple(notes))
 
 
 def _parameter(name: str, value: float, scatter: float, tilt: float, freedom: int) -> Parameter:
@@ -203,9 +185,9 @@ def _residuals(fit: ImuFit, corrected: Signals) -> tuple[Residual, ...]:
     rest = after.measured - after({**NOTHING, **tilt})[0]
     found = []
     for row, channel in enumerate(fit.signals.channels):
-        own = rest[row] if any(tilt.values()) and channel != "yaw_rate" else None
-        unit = UNITS[f"offset_{channel}"]
-        found.append(Residual(channel, unit, fit.signals.time, error_before[row], corrected.time, error_after[row], own))
+        own = rms(rest[row]) if any(tilt.values()) and channel != "yaw_rate" else math.nan
+        sizes = {"before": rms(error_before[row]), "after": rms(error_after[row]), "rest": own}
+        found.append(Residual(channel, UNITS[f"offset_{channel}"], sizes))
     return tuple(found)
 
 
@@ -242,7 +224,7 @@ def _imu_notes(fit: ImuFit, parameters: Sequence[Parameter], settings: Alignment
     return notes
 
 
-def _align_steering(recording: Recording, settings: AlignmentSettings) -> tuple[list[Parameter], dict[str, Any], Steering, str]:
+def _align_steering(recording: Recording, settings: AlignmentSettings) -> tuple[list[Parameter], dict[str, Any], str]:
     """Least squares of channel = ratio·(atan(wheelbase·r/vx) + K·ay) + offset where the car drives calmly.
 
     A term in the derivative of the angle is fitted beside it: in transients the steering leads.
@@ -285,7 +267,7 @@ def _align_steering(recording: Recording, settings: AlignmentSettings) -> tuple[
     transform = {"name": "steering_ratio", "ratio": _rounded(ratio), "offset": _rounded(offset), "channel": source}
     ratio_of = f"The steering ratio is that of '{source}' to atan(wheelbase·{yaw_rate}/vx), wheelbase {settings.wheelbase:g} m"
     note = f"{ratio_of}, from {seconds:.0f} s of calm driving, which it describes within {rms(error):.2g} rad (root mean square)."
-    return found, transform, Steering(source, (solution @ columns - offset) / ratio, measured), note
+    return found, transform, note
 
 
 def _percent(share: float) -> str:

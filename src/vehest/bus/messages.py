@@ -53,8 +53,7 @@ VAL_ {band} SideslipAngleBand 1048575 "not available" ;
 def dbc_text(first_id: int = FIRST_ID) -> str:
     """The DBC of vehest's two messages, whose identifiers follow each other.
 
-    Raises:
-        ConfigurationError: they are no standard identifiers.
+    Raises `ConfigurationError`: they are no standard identifiers.
     """
     if not 0 < first_id <= LAST_STANDARD_ID:
         raise ConfigurationError(f"the identifier of estimates must lie between 0x1 and {LAST_STANDARD_ID:#x}, not {first_id:#x}")
@@ -64,9 +63,7 @@ def dbc_text(first_id: int = FIRST_ID) -> str:
 class EstimateFrames:
     """Writes estimates as frames; the identifier of the bands is the next one after ``first_id``.
 
-    Raises:
-        ConfigurationError: it is no standard identifier.
-        MissingError: python-can or cantools is not installed.
+    Raises `ConfigurationError`: it is no standard identifier. Raises `MissingError`: python-can or cantools is not installed.
     """
 
     def __init__(self, first_id: int = FIRST_ID) -> None:

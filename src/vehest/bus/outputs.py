@@ -20,8 +20,7 @@ FIRST, LAST = ("vy", "sideslip"), ("band_vy", "band_sideslip", "health", "health
 def output_files(path: Path | None) -> list[Path]:
     """Files that an output writes: a table, or a log of frames with its DBC beside it; none without a path.
 
-    Raises:
-        ConfigurationError: the path ends in neither ``.csv`` nor ``.asc``.
+    Raises `ConfigurationError`: the path ends in neither ``.csv`` nor ``.asc``.
     """
     if path is not None and path.suffix.lower() not in (".csv", ".asc"):
         raise ConfigurationError(f"'{path}' must end in .csv or .asc")
@@ -32,10 +31,7 @@ class Output:
     """Writes the files of ``path``.
 
     A table has the columns of ``vehest estimate`` for ``names``, all that estimates hold, and ``sampled``, the instant of the sample. A log
-    has the frames of estimates as they came off the bus.
-
-    Raises:
-        MissingError: a file cannot be written.
+    has the frames of estimates as they came off the bus. Raises `MissingError`: a file cannot be written.
     """
 
     def __init__(self, path: Path | None, names: Sequence[str], first_id: int) -> None:

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import gc
 import math
-import resource
 import sys
 import threading
 import time
@@ -35,16 +34,13 @@ from vehest.trust.contract import GuardedStepper
 SURVEY_SECONDS = 20.0
 LEAD_SECONDS = 0.5  # from the start of a replay in real time to its first frame
 PATIENCE = 0.25  # s, after which a thread looks whether it is to stop
-MEMORY_EVERY = 100  # samples
 SWITCH_SECONDS = 2e-4  # that another thread of Python may go on when the receiver has something to do
 
 
 def survey(log: Frames, signals: BusSignals, rate_hz: float | None = None) -> Timing:
     """Timing of a bus from the first seconds of a log, and from further on for signals that come later.
 
-    Raises:
-        DataError: it cannot be used, or a signal never occurs.
-        ConfigurationError: the rate is none.
+    Raises `DataError`: it cannot be used, or a signal never occurs. Raises `ConfigurationError`: the rate is none.
     """
     stamps = {name: array("d") for name in signals.wanted}
     first = math.inf
@@ -76,8 +72,7 @@ class Bus:
     def ends(self, messages: Iterable[tuple[int, bool]]) -> Iterator[tuple[Any, Any]]:
         """The sender's end of the bus, and the control unit's, which hears the messages only.
 
-        Raises:
-            MissingError: it cannot be opened.
+        Raises `MissingError`: it cannot be opened.
         """
         import can
 
@@ -127,14 +122,11 @@ class Replay:
         self.last = self.first  # time of the last frame that was sent [s]
         self.over = threading.Event()  # all frames were sent, or it was stopped
         self.failure: BaseException | None = None
-        self.resident = 0  # memory at first [bytes]
 
     def run(self, make_stepper: Callable[[], GuardedStepper], out: Path | None, view: View) -> Figures:
         """Estimate at the rate of the samples; the first stepper is for warming up.
 
-        Raises:
-            DataError: the log is damaged.
-            MissingError: the bus cannot be opened, or ``out`` not be written.
+        Raises `DataError`: the log is damaged. Raises `MissingError`: the bus cannot be opened, or ``out`` not be written.
         """
         names = warmed_up(make_stepper(), self.timing.rate_hz, tuple(self.signals.wanted))
         self.stepper, self.view = make_stepper(), view
@@ -265,18 +257,6 @@ class Replay:
         figures.samples_lost += bool(sample.missing)
         for name in sample.missing:
             figures.missing[name] = figures.missing.get(name, 0) + 1
-        if figures.samples % MEMORY_EVERY == 0:
-            now = resident_bytes()
-            self.resident = self.resident or now
-            figures.memory_growth_mb = max(figures.memory_growth_mb, (now - self.resident) / 1e6)
-
-
-def resident_bytes() -> int:
-    """Resident memory of this process; where the system does not tell, the most that it ever was."""
-    try:
-        return int(Path("/proc/self/statm").read_bytes().split()[1]) * resource.getpagesize()
-    except OSError:
-        return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * (1 if sys.platform == "darwin" else 1024)
 
 
 def warmed_up(stepper: GuardedStepper, rate_hz: float, channels: tuple[str, ...]) -> list[str]:

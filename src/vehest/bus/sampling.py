@@ -40,8 +40,7 @@ class Timing:
 def timing_of(stamps: Mapping[str, FloatArray], rate_hz: float | None = None) -> Timing:
     """Timing of a bus from channel -> times of its frames [s], at least two each, at ``rate_hz``, by default that of the fastest channel.
 
-    Raises:
-        ConfigurationError: a rate that is no rate.
+    Raises `ConfigurationError`: a rate that is no rate.
     """
     periods = {name: mean_step(np.diff(times)) for name, times in stamps.items()}
     clock = min(periods, key=lambda name: periods[name])

@@ -30,7 +30,6 @@ class Figures:
     estimates: int = 0  # that were sent
     latest_ms: float = 0.0  # longest time from a sample's instant until its estimate was sent; as fast as possible: that a sample took
     deadlines_missed: int = 0  # samples for which that was longer than a cycle of the bus
-    memory_growth_mb: float = 0.0  # most resident memory above that after the first second
 
     def plain(self) -> dict[str, Any]:
         """Figures for people and scripts."""

@@ -32,9 +32,7 @@ def written_aside(path: Path, *, replace_folder: bool = False) -> Iterator[Path]
     """Yield a path beside ``path``; on success it takes the place of ``path`` in one step, else it is removed.
 
     A file that is there may always be replaced, a folder by ``replace_folder``.
-
-    Raises:
-        MissingError: the disk is full or the folder cannot be written to.
+    Raises `MissingError`: the disk is full or the folder cannot be written to.
     """
     aside = aside_of(path)
     try:
@@ -64,9 +62,7 @@ def written_aside(path: Path, *, replace_folder: bool = False) -> Iterator[Path]
 def regular_file(path: Path) -> Path:
     """A file that can be read to its end: no folder, pipe or device.
 
-    Raises:
-        MissingError: there is nothing.
-        DataError: it is something else, or cannot be looked at.
+    Raises `MissingError`: there is nothing. Raises `DataError`: it is something else, or cannot be looked at.
     """
     try:
         mode = os.stat(path).st_mode

@@ -53,8 +53,7 @@ def limits_from_config(config: Mapping[str, Any] | None) -> Limits:
 def check_limit(name: str, value: float, what: str, error: type[ConfigurationError | DataError] = DataError) -> None:
     """Refuse a number above the limit ``name``, a field of `Limits`.
 
-    Raises:
-        DataError: it is above (or ``error``); its message begins with ``what``, ``"'lap.csv' would hold 4000000000 samples"``.
+    Raises `DataError`: it is above (or ``error``); its message begins with ``what``, ``"'lap.csv' would hold 4000000000 samples"``.
     """
     limit = getattr(current_limits(), name)
     if not value <= limit:

@@ -1,6 +1,6 @@
 """Validates plain values, as files hold them, against the dataclasses that describe them.
 
-Types are strict: a number is not taken from text, nor a truth value from a number; only a whole number may be written with a point.
+Types are strict: a number is not taken from text, nor a truth value from a number, nor a whole number from one with a point.
 Keys that the dataclass does not have are refused; one that takes further keys has ``__pydantic_config__ = FURTHER_KEYS``. In
 ``Annotated[float, "a number up to 5"]`` the text replaces what messages say of the type.
 """
@@ -102,28 +102,10 @@ _RESTORED = {new: old for old, new in _REPLACED.items()}
 
 
 def _validated(kind: Any, content: Any) -> Any:
-    """Validate plain values; whole numbers that are written with a point are whole numbers where these belong."""
     text = json.dumps([content], ensure_ascii=False)
     replaced = text.translate(_REPLACED) if _SURROGATE.search(text) else text
-    try:
-        (made,) = _adapter(kind).validate_json(replaced)
-    except ValidationError as problem:
-        odd = [found for found in problem.errors() if found["type"] in {"int_type", "literal_error"}]
-        wholes = [found["loc"] for found in odd if _is_whole(found["input"])]
-        if not wholes:
-            raise
-        plain = json.loads(replaced)
-        for loc in wholes:
-            holder, (*path, last) = plain, _path(loc, plain)
-            for part in path:
-                holder = holder[part]
-            holder[last] = int(holder[last])
-        (made,) = _adapter(kind).validate_json(json.dumps(plain))
+    (made,) = _adapter(kind).validate_json(replaced)
     return made if replaced is text else _with_surrogates(made)
-
-
-def _is_whole(value: Any) -> bool:
-    return isinstance(value, float) and value.is_integer() and abs(value) < 2**53
 
 
 def _with_surrogates(value: Any) -> Any:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import astuple, dataclass, field, replace
+from dataclasses import dataclass, field, replace
 from fnmatch import fnmatchcase
 from typing import Annotated, Any
 
@@ -16,7 +16,7 @@ from vehest.data.folds import FoldsFile, blocks_of, fold_of
 from vehest.data.laps import laps_of
 from vehest.data.recording import Recording
 from vehest.data.schema import validated
-from vehest.data.splits import VALIDATION, Kept, Span, Split
+from vehest.data.splits import VALIDATION, Span, Split
 from vehest.data.stretches import Condition, stretches_where
 
 Reader = Callable[[Iterable[str] | None], Recording]  # reads the named channels of one recording, or all
@@ -155,7 +155,6 @@ class _Ranges:
     def __init__(self, file: SplitFile, catalogue: Catalogue | None) -> None:
         self._file, self._catalogue, self._where = file, catalogue, f"split '{file.name}'"
         self._known: dict[str, Mapping[str, Reader]] = {}
-        self._kept: dict[str, Kept] = {}
 
     def split(self) -> Split:
         """The split of the ranges, or of one fold of a cross-validation."""
@@ -163,7 +162,7 @@ class _Ranges:
         if folds is None:
             train, validation = self._spans("train", file.train), self._spans(VALIDATION, file.validation)
             tests = {test: self._spans(test, entries) for test, entries in file.tests.items()}
-            return Split(file.name, train, validation, tests, self._kept)
+            return Split(file.name, train, validation, tests)
         if file.train or file.validation or file.tests:
             raise ConfigurationError(f"{self._where}: folds make training, validation and test; leave train, validation and tests out")
         dataset = file.dataset_of()
@@ -251,21 +250,15 @@ class _Ranges:
         return self._known[dataset]
 
     def _cut(self, role: str, whole: Sequence[Span], condition: Condition) -> list[Span]:
-        """Stretches of spans in which a condition holds; their amount is added up by role."""
+        """Stretches of spans in which a condition holds."""
         spans: list[Span] = []
-        seconds = of_seconds = 0.0
         for span in whole:
             recording = self._recording(span.dataset, span.recording, condition.magnitude)
             first, end = recording.index_range(span.start, span.stop)
-            of_seconds += (end - first) / recording.rate_hz
             for begin, after in stretches_where(recording, condition, first, end):
                 start = span.start if begin == first else recording.start_time + begin / recording.rate_hz
                 stop = span.stop if after == end else recording.start_time + after / recording.rate_hz
                 spans.append(replace(span, start=start, stop=stop))
-                seconds += (after - begin) / recording.rate_hz
         if not spans:
             raise ConfigurationError(f"{self._where}: the condition of {role} keeps nothing ({condition.describe()})")
-        so_far = self._kept.get(role, Kept(0, 0, 0.0, 0.0))
-        more = (len(whole), len(spans), seconds, of_seconds)
-        self._kept[role] = Kept(*(one + other for one, other in zip(astuple(so_far), more, strict=True)))
         return spans

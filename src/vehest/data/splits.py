@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from itertools import pairwise, product
 
 from vehest.data.errors import ConfigurationError
@@ -46,22 +46,6 @@ class Span:
 
 
 @dataclass(frozen=True)
-class Kept:
-    """Amount of driving that meets a condition."""
-
-    n_recordings: int  # number of recordings
-    n_spans: int  # number of stretches that were kept
-    seconds: float  # their time [s]
-    of_seconds: float  # time of the recordings, or of their ranges [s]
-
-    def describe(self) -> str:
-        """For messages and reports, for example ``61.2 of 90.0 min in 402 stretches of 161 recordings``."""
-        minutes = f"{self.seconds / 60.0:.1f} of {self.of_seconds / 60.0:.1f} min"
-        stretches = f"{self.n_spans} {'stretch' if self.n_spans == 1 else 'stretches'}"
-        return f"{minutes} in {stretches} of {self.n_recordings} {'recording' if self.n_recordings == 1 else 'recordings'}"
-
-
-@dataclass(frozen=True)
 class Split:
     """Training, validation and named test stretches.
 
@@ -76,8 +60,6 @@ class Split:
     train: tuple[Span, ...]  # stretches to learn from
     validation: tuple[Span, ...]  # stretches to stop on
     tests: Mapping[str, tuple[Span, ...]]  # name of a test set -> its stretches
-    # ``train``, ``validation`` or name of a test set -> what was kept, where a condition decided it
-    kept: Mapping[str, Kept] = field(default_factory=dict, compare=False)
 
     def __post_init__(self) -> None:
         if not (self.train or self.validation or self.tests):

@@ -50,27 +50,19 @@ UNITS |= {
 
 @dataclass(frozen=True)
 class Protocol:
-    """What is scored, and when.
+    """What is scored, and when."""
 
-    Args:
-        rate_hz: rate at which every estimate is read, whatever rate it was made at [Hz]; held, never interpolated.
-        warm_up_seconds: how long before a range, or before each sequence, an estimator may start [s].
-        skip_seconds: start of each range, or of each sequence, that is not scored [s].
-        sequence_seconds: ranges are cut, from their starts, into sequences of this length without overlap, in each of which an estimate
-            starts anew; a remainder is left out [s]. None leaves ranges whole.
-        initial_state: whether estimates start at the reference state of the first sample.
-        elsewhere: test sets, with commas between them, of another car or tyre than the training's that the recordings do not tell apart by
-            their vehicle: bands are wider there by their rule.
-        least_speed: of the car by its reference [m/s]; slower samples have no direction, and count as a sideslip of 0 without error.
-    """
-
-    rate_hz: float = 20.0
-    warm_up_seconds: float = 10.0
-    skip_seconds: float = 1.5
+    rate_hz: float = 20.0  # at which every estimate is read, whatever rate it was made at [Hz]; held, never interpolated
+    warm_up_seconds: float = 10.0  # how long before a range, or before each sequence, an estimator may start [s]
+    skip_seconds: float = 1.5  # start of each range, or of each sequence, that is not scored [s]
+    # ranges are cut, from their starts, into sequences of this length without overlap, in each of which an estimate starts anew; a
+    # remainder is left out [s]; None leaves ranges whole
     sequence_seconds: float | None = None
-    initial_state: bool = False
+    initial_state: bool = False  # whether estimates start at the reference state of the first sample
+    # test sets, with commas between them, of another car or tyre than the training's that the recordings do not tell apart by their
+    # vehicle: bands are wider there by their rule
     elsewhere: str | None = None
-    least_speed: float = 0.0
+    least_speed: float = 0.0  # of the car by its reference [m/s]; slower samples have no direction, and count as β = 0 without error
 
     @property
     def plain(self) -> dict[str, Any]:

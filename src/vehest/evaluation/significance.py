@@ -42,8 +42,6 @@ class Difference:
     mean: Interval  # of their mean losses over all seeds and samples
     median: Interval  # of the medians over seeds of their mean losses over samples
     root: Interval  # of the square roots of their mean losses, RMSEs where losses are squared errors; NaN where a loss is negative
-    n_blocks: int  # blocks that were resampled
-    dof: float  # degrees of freedom of Student's t behind both intervals
 
 
 def difference_of_blocks(first: FloatArray, second: FloatArray, sizes: FloatArray, *, n_resamples: int = 10_000) -> Difference:
@@ -87,8 +85,6 @@ def differences_of_blocks(pairs: Sequence[Pair], sizes: FloatArray, *, n_resampl
                 mean=_interval(float(means[0].mean() - means[1].mean()), drawn[0], dof),
                 median=_interval(float(np.median(means[0]) - np.median(means[1])), drawn[1], dof),
                 root=_interval(root, drawn[2], dof),
-                n_blocks=len(sizes),
-                dof=dof,
             )
         )
     return found

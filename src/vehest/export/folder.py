@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from pathlib import Path
 from typing import get_args
 
@@ -13,7 +12,6 @@ from vehest.data.errors import ConfigurationError, printable
 from vehest.data.files import written_aside
 from vehest.data.recording import Recording
 from vehest.estimators.base import Estimator
-from vehest.export.measure import STRICT, TARGETS, Footprint, footprint
 from vehest.export.program import TOLERANCES, context_of, program_files, vector_files
 from vehest.export.rendering import Precision, render
 from vehest.export.vectors import SECONDS, in_float64
@@ -28,7 +26,7 @@ OWN = "vehest_estimator.h"
 """The file that shows a folder to be an export."""
 FILES = frozenset(
     {f"vehest_{part}.{ending}" for part in ("types", "method", "health", "estimator") for ending in ("h", "c")}
-    | {"main.c", "Makefile", "test_vectors.csv", "expected.csv", "README.md", "main", "outcome.csv"}
+    | {"main.c", "Makefile", "test_vectors.csv", "expected.csv", "README.md", "main", "outcome.csv", "sizes"}
 )
 """All that an export and its Makefile write."""
 
@@ -42,7 +40,7 @@ def export_model(
     *,
     elsewhere: bool = False,
     drive: Recording | None = None,
-) -> list[Footprint]:
+) -> None:
     """Write a fitted estimator as C99 into a folder of its own; an earlier export there is replaced.
 
     Args:
@@ -53,9 +51,6 @@ def export_model(
         bus_rate_hz: rate at which samples come, if it is not the estimator's [Hz]; a causal low-pass leads down to that.
         elsewhere: whether the car or its tyres are others than those that were calibrated on; bands are twice as wide then.
         drive: recorded, at the rate at which samples come, for the test vectors; else they are `SECONDS` of a drive with every fault.
-
-    Returns:
-        What it takes, one for each compiler that was found.
 
     Raises:
         ConfigurationError: the estimator cannot be written in C, the bus is slower than it, float cannot resolve a channel, or the folder
@@ -70,33 +65,21 @@ def export_model(
     if precision == "float":
         refuse_unresolved(trust)
     files = program_files(stepper, kind, estimator.full_title)
-    found = [own for own in (footprint(files, target) for target in TARGETS) if own is not None]
-    files["README.md"] = readme(stepper, kind, found, drive, has_trust=trust is not None, elsewhere=elsewhere)
+    files["README.md"] = readme(stepper, kind, drive, has_trust=trust is not None, elsewhere=elsewhere)
     files |= vector_files(GuardedStepper(in_float64(estimator), trust, bus_rate_hz, elsewhere=elsewhere), drive)
     with written_aside(out, replace_folder=True) as aside:
         aside.mkdir()
         for name, text in files.items():
             (aside / name).write_text(text, encoding="utf-8")
-    return found
 
 
-def readme(
-    stepper: GuardedStepper,
-    precision: Precision,
-    footprints: Sequence[Footprint],
-    drive: Recording | None = None,
-    *,
-    has_trust: bool,
-    elsewhere: bool,
-) -> str:
-    """What people need to know of an export: how it is called, units, what it takes, licences."""
+def readme(stepper: GuardedStepper, precision: Precision, drive: Recording | None = None, *, has_trust: bool, elsewhere: bool) -> str:
+    """What people need to know of an export: how it is called, units, licences."""
     context = context_of(stepper, precision, stepper.estimator.full_title)
     context |= {
         "channels": [(name, CHANNELS[name].meaning) for name in stepper.estimator.channels],
         "units": {name: CHANNELS[name].unit for name in stepper.estimator.channels},
         "reasons": sorted(_reasons().items()),
-        "footprints": footprints,
-        "options": {target.title: " ".join((*STRICT, *target.options)) for target in TARGETS},
         "trust": has_trust,
         "elsewhere": elsewhere,
         "version": __version__,
@@ -110,8 +93,7 @@ def readme(
 def refuse_unresolved(trust: Trust | None) -> None:
     """Health of a channel that follows the others to the last digits, as one that was computed from them does, is not for float.
 
-    Raises:
-        ConfigurationError: there is one.
+    Raises `ConfigurationError`: there is one.
     """
     if trust is None or trust.health is None:
         return

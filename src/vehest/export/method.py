@@ -23,8 +23,7 @@ class MethodSource(NamedTuple):
 def method_source(estimator: Estimator, precision: Precision) -> MethodSource:
     """Header and source of a fitted estimator's method.
 
-    Raises:
-        ConfigurationError: the family has no C, or the estimator is not causal or not fitted.
+    Raises `ConfigurationError`: the family has no C, or the estimator is not causal or not fitted.
     """
     if not estimator.template:
         raise ConfigurationError(f"estimator '{estimator.name}' cannot be exported to C; these can: {', '.join(exportable())}")

@@ -37,10 +37,7 @@ def write_onnx(estimator: Estimator, path: str | Path) -> None:
     each, ``vy`` [m/s] among them, and the state after the sample as ``next_`` and its name. ``start_`` and its name in the metadata says
     what a state begins with, as JSON. Windowed networks give NaN until their window is full, as in Python. Numbers have the precision of
     the training. ``state_started`` of the velocity LSTM is 0 before the first sample, whose measured velocities it starts from.
-
-    Raises:
-        ConfigurationError: the estimator is no network.
-        MissingError: onnx or onnxscript is not installed.
+    Raises `ConfigurationError`: the estimator is no network. Raises `MissingError`: onnx or onnxscript is not installed.
     """
     if estimator.name not in NETWORKS:
         raise ConfigurationError(f"estimator '{estimator.name}' is no network that ONNX could hold; these are: {', '.join(NETWORKS)}")

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 import re
-import textwrap
 from collections.abc import Callable
 from functools import cache, partial
 from pathlib import Path
@@ -20,10 +19,9 @@ if TYPE_CHECKING:
 
 Precision = Literal["double", "float"]
 
-WIDTH = 128  # of a line of a table, its indent aside
 LARGEST_FLOAT = float(np.finfo(np.float32).max)
 LEAST_FLOAT = float(np.finfo(np.float32).tiny)
-LINE = 110  # characters of a line of the contract's tables
+LINE = 110  # characters of a line of a table
 _COMMENT = re.compile(r"(/\*.*?\*/)", re.DOTALL)
 _FLOATING = re.compile(r"(?<![\w.])(\d+\.\d*(?:[eE][+-]?\d+)?|\d+[eE][+-]?\d+)(?![\w.])")
 _BLANK = re.compile(r"\n{3,}")
@@ -63,8 +61,7 @@ def typed(source: str, precision: Precision) -> str:
 def literal(value: float, precision: Precision) -> str:
     """A C literal, without suffix, that reads back to the same double or to the float nearest to the value.
 
-    Raises:
-        ConfigurationError: the value is not finite in this precision.
+    Raises `ConfigurationError`: the value is not finite in this precision.
     """
     with np.errstate(over="ignore"):
         number = float(np.float32(value)) if precision == "float" else float(value)
@@ -119,21 +116,6 @@ def truths(values: Any) -> str:
     return braced(np.asarray(values, bool), lambda value: "true" if value else "false")
 
 
-def table(values: Any, precision: Precision) -> str:
-    """The initialiser of a constant array, nested as the array is."""
-    array = np.asarray(values, np.float64)
-    return _nested(array, precision, "    ")
-
-
-def _nested(array: np.ndarray[Any, Any], precision: Precision, indent: str) -> str:
-    if array.ndim == 1:
-        words = ", ".join(literal(float(value), precision) for value in array)
-        lines = textwrap.wrap(words, WIDTH)
-        return "{" + f"\n{indent}".join(lines) + "}"
-    inner = [_nested(part, precision, indent + "    ") for part in array]
-    return "{\n" + ",\n".join(f"{indent}{part}" for part in inner) + f"\n{indent[:-4]}}}"
-
-
 def ascii_only(text: str) -> str:
     """Text for comments and units in C, which not every compiler takes in UTF-8."""
     for mark, word in _ASCII.items():
@@ -160,7 +142,7 @@ def _environment(precision: Precision, beside: Path | None) -> Environment:
     )
     environment.filters |= {
         "real": partial(literal, precision=precision),
-        "table": partial(table, precision=precision),
+        "table": lambda values: braced(np.asarray(values, np.float64), partial(literal, precision=precision)),
         "ascii": ascii_only,
         "unit": unit_of,
     }

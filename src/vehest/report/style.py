@@ -22,7 +22,6 @@ DOUBLE_COLUMN = 7.16  # in, both columns
 MISSING = "–"
 
 REFERENCE_COLOUR = "#000000"
-LUENBERGER_GREY = "#767676"
 LINEAR_BLUES = ("#4aa5e0", "#0b4f9c")  # without and with bias
 NONLINEAR_ORANGES = ("#f59a23", "#b8480b")
 OTHER_COLOURS = ("#00876c", "#a6761d", "#d6336c", "#5b8c00", "#17a2b8", "#6d4c41")
@@ -130,11 +129,6 @@ def new_figure(width: float = DOUBLE_COLUMN, height: float = 3.0) -> Iterator[Ma
 
     with paper_style():
         yield Figure(figsize=(width, height), layout="constrained")
-
-
-def with_unit(quantity: str, unit: str) -> str:
-    """Header of a column or label of an axis: ``RMSE(β) [deg]``; no brackets where there is no unit."""
-    return quantity if unit in {"", "1"} else f"{quantity} [{unit}]"
 
 
 def significant(value: float, digits: int = 3) -> str:

@@ -21,7 +21,7 @@ from vehest.run.inspect_data import Lines, reading
 from vehest.run.printing import TerminalTable, counted
 from vehest.sources.base import open_source, read_single
 
-FILES = ("alignment.md", "alignment.csv", "alignment.yaml", "alignment.png", "alignment.svg")
+FILES = ("alignment.md", "alignment.csv", "alignment.yaml")
 
 
 def align_recording(source: str, overrides: Sequence[str], recording_id: str | None, settings: AlignmentSettings) -> Alignment:
@@ -73,11 +73,8 @@ def as_plain(alignment: Alignment) -> dict[str, Any]:
 
 
 def write_alignment(alignment: Alignment, folder: Path) -> None:
-    """Write report, table, transforms and figure into a folder of its own, all or nothing; raises `ConfigurationError`, `MissingError`."""
+    """Write report, table and transforms into a folder of its own, all or nothing; raises `ConfigurationError`, `MissingError`."""
     import pandas as pd
-
-    from vehest.report.alignment_figures import alignment_figure
-    from vehest.report.document import png_of, svg_of
 
     if folder.is_symlink() or (folder.exists() and not folder.is_dir()):
         raise ConfigurationError(f"'{folder}' is not a folder; name a new one")
@@ -87,12 +84,10 @@ def write_alignment(alignment: Alignment, folder: Path) -> None:
     recording = {"recording": alignment.recording.id, "kind": alignment.recording.kind}
     table = pd.DataFrame([recording | _plain_parameter(parameter) for parameter in alignment.parameters])
     texts = (_report(alignment), table.to_csv(index=False, lineterminator="\n"), _transforms(alignment))
-    figure = alignment_figure(alignment)
-    contents = [*(text.encode("utf-8", "backslashreplace") for text in texts), png_of(figure), svg_of(figure)]
     with written_aside(folder, replace_folder=True) as aside:
         aside.mkdir()
-        for name, content in zip(FILES, contents, strict=True):
-            (aside / name).write_bytes(content)
+        for name, text in zip(FILES, texts, strict=True):
+            (aside / name).write_text(text, encoding="utf-8", errors="backslashreplace")
 
 
 def _one_recording(source: str, config: Config, recording_id: str | None) -> Recording:
@@ -139,7 +134,6 @@ def _report(alignment: Alignment) -> str:
         "Transforms that would correct it, in this order, for `downsample`:",
         f"```yaml\n{_transforms(alignment).rstrip()}\n```",
         f"```sh\nvehest downsample DATASET rate_hz=… '{override_of(alignment)}'\n```",
-        "![Cross-correlation, residuals before and after](alignment.png)",
     ]
     return "\n\n".join(part for part in parts if part) + "\n"
 

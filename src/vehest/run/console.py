@@ -5,13 +5,20 @@ Text from files is shown with control characters as escapes, and nothing in it i
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext, suppress
 from typing import Any
 
-from rich.console import Console, RenderableType
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, ProgressColumn, TaskID, TextColumn, TimeElapsedColumn
-from rich.table import Table
+from rich.console import Console
+from rich.progress import (
+    BarColumn,
+    MofNCompleteColumn,
+    Progress,
+    ProgressColumn,
+    TaskID,
+    TextColumn,
+    TimeElapsedColumn,
+    TimeRemainingColumn,
+)
 from rich.text import Text
 
 from vehest.data.errors import printable
@@ -32,8 +39,7 @@ MARKS = {
 }
 """Status -> its word and colour."""
 
-MOST_ROWS = 12  # of finished trainings above the bars
-MOST_BARS = 16  # of trainings that run at a time
+MOST_BARS = 16
 
 
 class _Console(Console):
@@ -78,6 +84,7 @@ class Messages:
             MofNCompleteColumn(),
             TextColumn("{task.fields[note]}", markup=False),
             TimeElapsedColumn(),
+            TimeRemainingColumn(),
         )
         drawn = not self.quiet and self.console.is_terminal
         bars = Bars(*columns, console=self.console, transient=True, disable=not drawn)
@@ -85,31 +92,11 @@ class Messages:
 
 
 class Bars(Progress):
-    """Progress bars by name, between a table of finished trainings and counts of all."""
+    """Progress bars by name."""
 
     def __init__(self, *columns: ProgressColumn, **options: Any) -> None:
         self._named: dict[str, TaskID] = {}
-        self._done: dict[str, Mapping[str, float]] = {}
-        self._counted: Mapping[str, str] = {}
         super().__init__(*columns, **options)
-
-    def get_renderables(self) -> Iterator[RenderableType]:
-        """The table of the best, the bars, the counts."""
-        best = sorted(self._done.items(), key=lambda row: tuple(row[1].values()))[:MOST_ROWS]
-        figures = [("done so far", *best[0][1])] if best else []
-        figures += [(printable(name), *(f"{value:.3f}" for value in own.values())) for name, own in best]
-        yield from [_grid(figures)] if figures else []
-        yield self.make_tasks_table(self.tasks)
-        yield from [_grid([tuple(self._counted), tuple(self._counted.values())])] if self._counted else []
-
-    def count(self, counted: Mapping[str, str]) -> None:
-        """Show numbers below the bars, such as how many are done."""
-        self._counted = counted
-
-    def stands(self, name: str, figures: Mapping[str, float]) -> None:
-        """Add a finished training to the table, which the first figure sorts."""
-        if figures:
-            self._done[name] = figures
 
     def step(self, name: str, done: int, total: int, note: str = "") -> None:
         """Move a bar, which appears when it is first moved."""
@@ -130,11 +117,3 @@ class Bars(Progress):
         """Remove a bar."""
         if name in self._named:
             self.remove_task(self._named.pop(name))
-
-
-def _grid(rows: Sequence[Sequence[str]]) -> Table:
-    """A table without borders, its header first."""
-    table = Table.grid(padding=(0, 2))
-    for number, row in enumerate(rows):
-        table.add_row(*(Text(cell) for cell in row), style="" if number else "dim")
-    return table

@@ -47,10 +47,8 @@ def examine() -> Iterator[Item]:
     yield Item("ok", "configuration", f"{packaged('conf')}{'; ./conf is searched first' if Path('conf').is_dir() else ''}")
     yield _kernels()
     absent = [f"{use} need 'vehest[{extra}]'" for extra, (package, use) in EXTRAS.items() if importlib.util.find_spec(package) is None]
-    if absent:
-        yield Item("warning", "extras", f"{'; '.join(absent)}: pip install it where you need it")
-    else:
-        yield Item("ok", "extras", f"{', '.join(EXTRAS)} are there")
+    extras = f"{'; '.join(absent)}: pip install it where you need it" if absent else f"{', '.join(EXTRAS)} are there"
+    yield Item("warning" if absent else "ok", "extras", extras)
     root = os.environ.get("VEHEST_DATA")
     if not root:
         yield Item("warning", "recordings", "VEHEST_DATA is not set; only simulated data sets work without root=FOLDER")
@@ -60,10 +58,9 @@ def examine() -> Iterator[Item]:
         yield Item("ok", "recordings", root)
     folder = Path(os.environ.get("VEHEST_OUTPUT", "outputs"))
     existing = next((path for path in (folder, *folder.parents) if path.exists()), Path("/"))
-    if os.access(existing, os.W_OK):
-        yield Item("ok", "output", str(folder))
-    else:
-        yield Item("error", "output", f"'{folder}' cannot be written; set VEHEST_OUTPUT or give output=FOLDER")
+    writable = os.access(existing, os.W_OK)
+    refused = f"'{folder}' cannot be written; set VEHEST_OUTPUT or give output=FOLDER"
+    yield Item("ok" if writable else "error", "output", str(folder) if writable else refused)
     free = shutil.disk_usage(".").free / 1e9
     yield Item("ok" if free > 1.0 else "warning", "disk", f"{free:.1f} GB free here")
     yield Item("ok", "cores", f"{default_jobs()}; as many jobs run side by side")

@@ -23,14 +23,13 @@ from vehest.data.estimate import Estimate
 from vehest.data.recording import Recording
 from vehest.data.schema import settings_from_config
 from vehest.data.splits import TRAINING, VALIDATION, Span, Split
-from vehest.data.store import read_estimate, read_recording, write_estimate
+from vehest.data.store import read_recording, write_estimate
 from vehest.estimators.base import Estimator
 from vehest.estimators.model_files import load_model, read_description
 from vehest.estimators.registry import estimator_class
 from vehest.evaluation.bands import band_figures, banded, coverage_intervals, figures_by_regime
-from vehest.evaluation.blocks import segments_of, write_segments
+from vehest.evaluation.blocks import figure_intervals, segments_of, write_segments
 from vehest.evaluation.floors import cramer_rao_floor, drives_of, inputs_of, reference_floor
-from vehest.evaluation.intervals import figure_intervals
 from vehest.evaluation.lever_arm import CONDITION, lever_arm_figures
 from vehest.evaluation.metrics import UNITS, Protocol, Scored, accuracy, pieces_of, reference_state, score_all, scored_range, sequences
 from vehest.evaluation.regimes import errors_by_regime, regimes_of
@@ -312,18 +311,20 @@ def read_metrics(folder: Path) -> pd.DataFrame:
     return pd.concat([table for table in tables if len(table)], ignore_index=True)
 
 
+def test_figures(folder: Path) -> dict[str, float]:
+    """Metrics of an evaluation over all samples of each test set, ``METRIC.TEST_SET`` -> value."""
+    table = read_metrics(folder)
+    tested = table[~table["test_set"].isin((VALIDATION, TRAINING)) & (table["subset"] == "all") & (table["condition"] == "nominal")]
+    return dict(zip(tested["metric"] + "." + tested["test_set"], map(float, tested["value"]), strict=True))
+
+
+def rmse_of_tests(folder: Path) -> dict[str, float]:
+    """RMSE(β) of an evaluation on each test set [deg]."""
+    return {name: value for name, value in test_figures(folder).items() if name.startswith("rmse_sideslip")}
+
+
 def fault_figures(folder: Path) -> dict[str, float]:
     """Errors of an evaluation on tests under faults, ``METRIC.TEST_SET.CONDITION.SUBSET`` -> value."""
     rows = read_frame(folder / METRICS, COLUMNS, numbers=("value",)).to_dict("records")
     shown = [row for row in rows if is_fault(row["condition"]) and row["test_set"] != VALIDATION]
     return {".".join(row[key] for key in ("metric", "test_set", "condition", "subset")): float(row["value"]) for row in shown}
-
-
-def read_scored(evaluation: Artefact, split: Split, references: Mapping[str, Artefact], protocol: Protocol, test_set: str) -> list[Scored]:
-    """Estimate and reference of an evaluation on each range of a test set, or on each sequence."""
-    return score_all(
-        lambda position: read_estimate(evaluation.folder / test_set / f"{position}.parquet"),
-        test_sets(split)[test_set],
-        lambda span: read_recording(recording_file(references[span.dataset], span)),
-        protocol,
-    )

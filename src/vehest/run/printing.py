@@ -176,13 +176,13 @@ def summary_of_sweep(artefacts: SweepArtefacts, table: pd.DataFrame) -> Terminal
     """A row a combination with settings, seeds, mean and half interval on validation and tests."""
     from vehest.studies.sweep import table_of
 
-    kinds = " and ".join(kind.upper() if kind == "simulated" else kind for kind in dict.fromkeys(artefacts.kinds.values()))
-    title = f"{artefacts.name}: RMSE(β) [deg], mean over seeds ± half its 95 % interval (Student's t); {kinds} data"
+    kinds = " and ".join(kind.upper() if kind == "simulated" else kind for kind in dict.fromkeys(artefacts.part.kinds.values()))
+    title = f"{artefacts.part.study}: RMSE(β) [deg], mean over seeds ± half its 95 % interval (Student's t); {kinds} data"
     records = _records(table)
     figures = {
         "chosen": next((row for row in records if row["chosen"]), None),
         "summary": records,
-        "failed": [{"jobs": name, "message": reason} for name, reason in artefacts.failures.items()],
+        "failed": [{"jobs": name, "message": reason} for name, reason in artefacts.part.failed.items()],
     }
     note = "* lowest mean on the validation range; tests choose nothing" if table["chosen"].any() else ""
     return TerminalSummary((TerminalTable(title, *table_of(artefacts, table)),), note, "report.md", json.dumps(figures))

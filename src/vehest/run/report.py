@@ -48,7 +48,7 @@ from vehest.studies.sweep import DONE, FAILED, SweepArtefacts, build, summary
 
 STAGE, SWEEP = "report", "sweep"
 VERSION = "1"
-SWEEP_CODE = "sweep=1"
+SWEEP_CODE = "sweep=2"
 OVERVIEW = "tables/overview.csv"
 SCORES = ("rmse_sideslip", "rmse_vy", "fvu")
 
@@ -225,36 +225,26 @@ def _together(tables: Sequence[pd.DataFrame], study: str) -> pd.DataFrame:
 
 def draw_sweep(study: Study, comparison: Comparison, runner: Runner) -> tuple[Artefact, TerminalSummary]:
     """Draw a sweep, unless its report is there, and sum it up for the terminal; a failed job has a row with its reason."""
-    evaluation, configs = comparison.evaluation, [job.config for job in comparison.jobs if "estimator" in job.config]
+    configs = [job.config for job in comparison.jobs if "estimator" in job.config]
     conditions = dict.fromkeys(fault.condition for config in configs if (fault := chosen_fault(config)) is not None)
     under = [f"Faults: {', '.join(conditions)}; RMSE(β) under one counts the samples while it lasts"] if conditions else []
-    artefacts = SweepArtefacts(
-        name=study.study,
-        command=study.command,
-        keys=list(comparison.jobs[0].values),
-        jobs=_job_table(comparison),
-        split=evaluation.split,
-        protocol=evaluation.protocol,
-        kinds=evaluation.kinds,
-        data_titles=comparison.data_titles,
-        facts=[*comparison.facts, *under],
-        failures=comparison.failed,
-        patented=any(config["estimator"]["name"] == "ksnn" for config in configs),
-    )
+    part = _part_artefacts(study, "", comparison)
+    part = replace(part, facts=[*part.facts, *under])
+    artefacts = SweepArtefacts(part, list(comparison.jobs[0].values), _job_table(comparison))
     table = summary(artefacts.jobs, artefacts.keys, artefacts.sets)
     made = [own for member in comparison.members for own in (member.model, member.evaluation) if own is not None]
     plan = StagePlan(
         stage=SWEEP,
-        label=artefacts.name,
+        label=part.study,
         config={
-            "command": artefacts.command,
+            "command": part.command,
             "keys": artefacts.keys,
             "jobs": artefacts.jobs[["combination", "title", *artefacts.keys, "seed", "status"]].astype(object).to_dict("records"),
-            "failures": artefacts.failures,
-            "protocol": artefacts.protocol.plain,
-            "kinds": artefacts.kinds,
-            "data_titles": artefacts.data_titles,
-            "facts": artefacts.facts,
+            "failures": part.failed,
+            "protocol": part.protocol.plain,
+            "kinds": part.kinds,
+            "data_titles": part.data_titles,
+            "facts": part.facts,
         },
         inputs={f"{own.stage}/{own.folder.name}": own.digest for own in made},
         code=SWEEP_CODE,

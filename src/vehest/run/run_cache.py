@@ -28,7 +28,7 @@ from vehest.data.text_files import read_json, read_yaml
 from vehest.run.artefacts import Artefact, library_versions, read_artefact
 from vehest.run.config_files import conf_folders, find_pipeline, packaged
 from vehest.run.console import WARNING, Messages
-from vehest.run.launchers.base import LauncherOptions
+from vehest.run.launchers.base import RunOptions
 from vehest.run.printing import TerminalSummary
 from vehest.run.publishing import Publication, publish_study
 
@@ -38,20 +38,6 @@ if TYPE_CHECKING:
 FINISHED = "finished"  # folder of the records in an output root
 FORMAT = 3
 _RESOLVED = re.compile(r"\$\{\s*([A-Za-z_][\w.]*)\s*:\s*(\w*)")
-
-
-@dataclass(frozen=True)
-class RunOptions:
-    """Options of a command that runs stages: as `vehest run --help` describes them; no ``jobs`` is one a core, ``track`` logs runs."""
-
-    force: bool = False
-    dry_run: bool = False
-    quiet: bool = False
-    jobs: int | None = None
-    track: bool = False
-    minutes: float | None = None
-    launcher: LauncherOptions | None = None
-    retrain: bool = False
 
 
 @dataclass(frozen=True)
@@ -196,7 +182,7 @@ def _next_time(printed: Iterable[tuple[str, str, str, str]], made: Iterable[Arte
     for status, stage, label, detail in printed:
         if (stage, label) in names and status in ("done", "skip", "note"):
             yield "skip", stage, label, "up to date"
-        elif (status in ("note", WARNING) and stage != "calibrate") or stage == "split":
+        elif status in ("note", WARNING) and stage != "calibrate":
             yield status, stage, label, detail
 
 

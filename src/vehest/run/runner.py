@@ -24,16 +24,16 @@ from vehest.run.artefacts import Artefact, StagePlan, Status, ensured, find
 from vehest.run.config import Config, compose_config, missing_keys
 from vehest.run.console import Bars, Messages
 from vehest.run.downsample import plan_downsample, write_downsample
-from vehest.run.evaluate import Evaluation, protocol_from_config
+from vehest.run.evaluate import Evaluation, protocol_from_config, rmse_of_tests
 from vehest.run.evaluate_faults import FaultSettings
 from vehest.run.failures import Failure
 from vehest.run.group import Group, Member, drop_finished_checkpoint, existing
 from vehest.run.ingest import drop_parts, plan_ingest, write_ingest
-from vehest.run.launchers.base import Launcher, LaunchProgress
+from vehest.run.launchers.base import Launcher
 from vehest.run.launchers.local import LocalLauncher
 from vehest.run.locks import Waiting
 from vehest.run.signals import DryRunStop, StopSignals, TimeLimit
-from vehest.run.tracking import Tracker, log_member, rmse_of_tests
+from vehest.run.tracking import Tracker
 from vehest.run.train import STAGE as TRAIN
 from vehest.run.train import read_fit_metrics
 from vehest.run.weights import PublishedWeights
@@ -43,6 +43,7 @@ from vehest.trust.health import SLOW_KERNEL
 from vehest.trust.record import read_trust
 
 Value = TypeVar("Value")
+ALL = "all groups"  # bar above those of trainings
 
 
 @dataclass(eq=False)
@@ -110,13 +111,7 @@ class Runner:
             ingested = self._ingested(name, config)
             return {file.removesuffix(".parquet"): partial(read_recording, ingested.folder / file) for file in ingested.outputs}
 
-        def make() -> Split:
-            split = split_from_config(config["split"], recordings_of)
-            for role, kept in split.kept.items():
-                self.messages.line("done", "split", f"{split.name}, {role}", f"keeps {kept.describe()}")
-            return split
-
-        return self._once("split", config["split"], make)
+        return self._once("split", config["split"], partial(split_from_config, config["split"], recordings_of))
 
     def contents(self, config: Config) -> dict[str, tuple[RecordingSummary, ...]]:
         """Channels and rates of the recordings of every data set of a split, which are ingested for it; no samples are read."""
@@ -183,19 +178,16 @@ class Runner:
         if waiting:
             self._announce(waiting, len(members))
         while waiting:
-            progress, alone = LaunchProgress(len(waiting)), []
+            alone: list[Group] = []
             with self.messages.bars() as bars:
-                report = partial(self._report, waiting, progress, bars)
-                for done in self.launcher.launch(waiting, TimeLimit(self.stop, self.until), report):
+                bars.step(ALL, 0, len(waiting))
+                report = partial(self._report, waiting, bars)
+                for ended, done in enumerate(self.launcher.launch(waiting, TimeLimit(self.stop, self.until), report), start=1):
                     group, outcome = waiting[done.position], done.outcome
-                    progress.ended(done.position, done.seconds, failed=isinstance(outcome, Failure))
                     bars.close(group.name)
-                    bars.count(progress.row(self.launcher.cores))
+                    bars.step(ALL, ended, len(waiting))
                     if not isinstance(outcome, Failure):
                         members |= self._received(group, outcome)
-                        for member in outcome:
-                            if member.evaluation is not None:
-                                bars.stands(member.job.plan.label, rmse_of_tests(member.evaluation))
                     elif outcome.exit_code != DataError.exit_code or len(group.jobs) == 1:
                         failures |= {job.plan.key: outcome for job in group.jobs}
                         self.messages.line("fail", "train", group.name, outcome.message)
@@ -247,17 +239,15 @@ class Runner:
                     status, detail = _in_words(made)
                     self.messages.line(status, made.stage, made.label, detail)
             if self.tracker is not None:
-                log_member(self.tracker, member, group.evaluation)
+                self.tracker.log(member.model, member.calibration, member.evaluation)
         return {member.job.plan.key: member for member in outcome}
 
-    def _report(self, groups: Sequence[Group], of_all: LaunchProgress, bars: Bars, at: int, news: Progress | Waiting | None) -> None:
+    def _report(self, groups: Sequence[Group], bars: Bars, at: int, news: Progress | Waiting | None) -> None:
         """Draw the progress of a group, or print for whom it waits."""
         if isinstance(news, Waiting):
             self._print_waiting(news)
         else:
-            of_all.running.add(at)
             bars.fit(groups[at].name, news)
-            bars.count(of_all.row(self.launcher.cores))
 
     def _print_waiting(self, waiting: Waiting) -> None:
         self.messages.line("wait", waiting.stage, waiting.label, f"for {waiting.holder}, which makes it")
@@ -275,7 +265,7 @@ def _in_words(made: Artefact) -> tuple[str, str]:
         epochs = f"{fit['epochs']:.0f} epochs, " if fit.get("epochs") else ""
         return "done", epochs + (f"{fit['n_parameters']:.0f} parameters" if loss is None else f"validation loss {loss:.4g}")
     if made.stage == "evaluate":
-        return "done", ", ".join(f"{name} {value:.3f}°" for name, value in rmse_of_tests(made).items())
+        return "done", ", ".join(f"{name} {value:.3f}°" for name, value in rmse_of_tests(made.folder).items())
     trust = read_trust(made.folder)
     if trust.bands is None:
         return "note", f"no bands: {trust.about.note}"

@@ -22,22 +22,22 @@ from vehest.run.comparison import Comparison, lower_rate, named_failures, print_
 from vehest.run.config import Config, compose_config, key_of
 from vehest.run.console import Messages
 from vehest.run.estimate import find_model, model_artefact, preparation_of
-from vehest.run.evaluate import fault_figures, write_evaluation
+from vehest.run.evaluate import fault_figures, test_figures, write_evaluation
 from vehest.run.evaluate_faults import check_channels, faults_of
 from vehest.run.group import Group
 from vehest.run.ingest import STAGE as INGEST
 from vehest.run.ingest import plan_ingest
-from vehest.run.launchers.base import LauncherOptions, chosen_launcher
+from vehest.run.launchers.base import RunOptions, chosen_launcher
 from vehest.run.launchers.local import default_jobs
 from vehest.run.published import keys_of_study
 from vehest.run.publishing import RESULTS, Publication, publish_study
 from vehest.run.report import STAGE as REPORT
 from vehest.run.report import SWEEP, draw_report, draw_sweep
-from vehest.run.run_cache import Ran, RunCache, RunOptions, stamps_of
+from vehest.run.run_cache import Ran, RunCache, stamps_of
 from vehest.run.runner import Runner
 from vehest.run.signals import DryRunStop, StopSignals
 from vehest.run.study import Job, Jobs, Study, content_overrides, jobs_of, read_study, sweep_of
-from vehest.run.tracking import Tracker, log_scores, test_figures
+from vehest.run.tracking import Tracker
 from vehest.run.train import learnt_spans, read_fit_metrics, trained_rate
 from vehest.run.weights import PUBLISHED_WEIGHTS, PublishedWeights
 from vehest.sources.base import kind_of
@@ -50,7 +50,7 @@ def open_runner(config: Config, options: RunOptions, stages: Collection[str], st
     messages, stop, output = Messages(quiet=options.quiet), StopSignals(), Path(config["output"])
     tracker = Tracker(config["tracking"], output, messages.warn, stop.requested, study) if options.track or study else None
     forced = frozenset(stages if options.force else ())
-    launcher = chosen_launcher(options.launcher or LauncherOptions(), options.jobs, output, messages)
+    launcher = chosen_launcher(options.launcher, options.jobs, output, messages)
     runner = Runner(output, messages, stop, options.jobs or default_jobs(), forced, options.dry_run, tracker, launcher)
     with closing(launcher), use_limits(limits_from_config(config["limits"])), stop.installed():
         yield runner
@@ -246,8 +246,8 @@ def evaluate_one(overrides: Sequence[str], model: str | None, options: RunOption
         scoring = how.of(trained, calibration)
         artefact = runner.ensure(scoring.plan, partial(write_evaluation, scoring))
         if runner.tracker is not None:
-            log_scores(runner.tracker, trained, calibration, artefact, how)
-    return {"folder": str(artefact.folder), "skipped": artefact.skipped, **test_figures(artefact), **fault_figures(artefact.folder)}
+            runner.tracker.log(calibration, artefact)
+    return {"folder": str(artefact.folder), "skipped": artefact.skipped, **test_figures(artefact.folder), **fault_figures(artefact.folder)}
 
 
 def _only_group(config: Config, runner: Runner) -> Group:

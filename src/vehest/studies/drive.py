@@ -180,8 +180,11 @@ def appendix_of(name: str, part: PartArtefacts) -> list[Block]:
     return [lines, *(replace(block, name=f"{block.name}_{name}") for block in made[1:] if isinstance(block, Table))]
 
 
-def how_it_was_made(artefacts: PartArtefacts) -> list[Block]:
-    """The appendix: command, protocol, budgets, and the table ``ranges``."""
+CHOICE = "Seeds: of several seeds, the one with the lowest RMSE(v) on the validation range is shown. Test data choose nothing."
+
+
+def how_it_was_made(artefacts: PartArtefacts, choice: Sequence[str] = (CHOICE,)) -> list[Block]:
+    """The appendix: command, protocol, how seeds or settings are chosen, budgets, and the table ``ranges``."""
     protocol = artefacts.protocol
     lines = [
         f"Command: {as_code(artefacts.command)}",
@@ -189,7 +192,7 @@ def how_it_was_made(artefacts: PartArtefacts) -> list[Block]:
         f"start up to {protocol.warm_up_seconds:g} s before a {protocol.piece}; the first {protocol.skip_seconds:g} s of each "
         f"{protocol.piece} are not scored, for anyone.{protocol.start_in_words}",
         "Sideslip: β = atan2(v, u) with the measured u, for estimate and reference alike.",
-        "Seeds: of several seeds, the one with the lowest RMSE(v) on the validation range is shown. Test data choose nothing.",
+        *choice,
         *artefacts.facts,
     ]
     ranges = Table(

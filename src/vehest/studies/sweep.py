@@ -7,22 +7,28 @@ Student's t distribution. The combination is chosen on the validation range; tes
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import pandas as pd
 
 from vehest.constants import FloatArray
-from vehest.data.splits import VALIDATION, Span, Split
-from vehest.evaluation.metrics import Protocol
-from vehest.report.document import PATENT_NOTE, Block, Column, Document, Figure, Table, as_code, as_text
-from vehest.report.heat_map import Panel, heat_map
-from vehest.report.style import decimals_for, fixed
+from vehest.data.splits import VALIDATION
+from vehest.report.document import PATENT_NOTE, Block, Column, Document, Figure, Table
+from vehest.report.style import DOUBLE_COLUMN, SINGLE_COLUMN, MatplotlibFigure, decimals_for, fixed, new_figure
+from vehest.studies.artefacts import PartArtefacts
+from vehest.studies.drive import data_sentence, how_it_was_made
 
 CONFIDENCE = 0.95
 METRIC = "rmse_sideslip"
 DONE, FAILED = "done", "failed"
+LOGARITHMIC_FROM = 20.0
+MOST_COLUMNS_SIDE_BY_SIDE = 6
+CELL_HEIGHT = 0.42  # in
+NO_VALUE = "#ececec"
+LUMINANCE = (0.2126, 0.7152, 0.0722)  # of red, green and blue
 
 Value = bool | int | float | str
 
@@ -31,41 +37,33 @@ Value = bool | int | float | str
 class SweepArtefacts:
     """Everything that tables and figures of a sweep are made from."""
 
-    name: str  # name of the sweep
-    command: str  # the command that makes it
+    part: PartArtefacts  # the comparison of all combinations
     keys: Sequence[str]  # those that take several values, the seed aside, in the order of the command
     # a row a job: ``combination`` (counted from 0), ``title``, the keys, ``seed``, ``status`` (``done`` or ``failed``), ``error``,
     # ``n_parameters``, ``epochs``, and ``rmse_sideslip.SET``, ``rmse_vy.SET`` and ``fvu.SET`` for each set of `sets`; those of a
     # combination with a fault count the samples while it lasts
     jobs: pd.DataFrame
-    split: Split  # training, validation and test ranges
-    protocol: Protocol  # how estimates are scored
-    kinds: Mapping[str, str]  # data set -> ``real`` or ``simulated``
-    data_titles: Mapping[str, str]  # data set -> title, for people
-    facts: Sequence[str]  # lines on how it was made: budget, resampling
-    failures: Mapping[str, str] = field(default_factory=dict)  # what failed -> why
-    patented: bool = False  # whether a KS-NN is among the estimators
 
     @property
     def sets(self) -> list[str]:
         """What is scored: the validation range, where there is one, and each test set."""
-        return [*([VALIDATION] if self.split.validation else []), *self.split.tests]
+        return [*([VALIDATION] if self.part.split.validation else []), *self.part.split.tests]
 
 
 def build(artefacts: SweepArtefacts) -> Document:
-    """The report of a sweep: what was chosen, how it was made, all combinations, what failed, heat maps."""
-    table = summary(artefacts.jobs, artefacts.keys, artefacts.sets)
-    blocks: list[Block] = [_kind_sentence(artefacts), _chosen_sentence(artefacts, table), _how_it_was_made(artefacts)]
-    blocks += ["## Combinations", _table(artefacts, table)]
-    if artefacts.failures:
-        listed = "\n".join(f"- {name}: {reason}" for name, reason in artefacts.failures.items())
+    """The report of a sweep: what was chosen, all combinations, what failed, heat maps, how it was made."""
+    part, table = artefacts.part, summary(artefacts.jobs, artefacts.keys, artefacts.sets)
+    blocks: list[Block] = [data_sentence(part), _chosen_sentence(artefacts, table), "## Combinations", _table(artefacts, table)]
+    if part.failed:
+        listed = "\n".join(f"- {name}: {reason}" for name, reason in part.failed.items())
         blocks.append(f"## What failed\n\n{listed}")
     maps = heat_maps(artefacts, table)
     if maps:
         blocks += ["## Heat maps", *maps]
-    if artefacts.patented:
+    blocks += how_it_was_made(part, (_budget(artefacts.jobs), *INTERVAL_AND_CHOICE))
+    if any(model.estimator == "ksnn" for model in part.models):
         blocks.append(PATENT_NOTE)
-    return Document(f"Sweep {artefacts.name}", blocks)
+    return Document(f"Sweep {part.study}", blocks)
 
 
 def summary(jobs: pd.DataFrame, keys: Sequence[str], sets: Sequence[str]) -> pd.DataFrame:
@@ -137,22 +135,22 @@ def heat_maps(artefacts: SweepArtefacts, table: pd.DataFrame) -> list[Figure]:
     numeric = [key for key in varied if key not in switches and all(_is_number(value) for value in table[key])]
     if len(numeric) != 2 or len(numeric) + len(switches) != len(varied):
         return []
-    across, up = numeric
-    columns, rows = sorted(table[across].unique()), sorted(table[up].unique())
+    cells = [sorted(table[key].unique()) for key in numeric]
     names = short_names(artefacts.keys)
+    across, up = (names[key] for key in numeric)
     maps = []
     for name in artefacts.sets:
-        panels = [
-            _panel(own, key, name, [names[switch] for switch in switches], (across, columns), (up, rows))
-            for key, own in (table.groupby(switches, sort=False) if switches else [((), table)])
-        ]
+        panels = []
+        for key, own in table.groupby(switches, sort=False) if switches else [((), table)]:
+            title = ", ".join(f"{names[switch]} = {shown_value(value)}" for switch, value in zip(switches, key, strict=True))
+            panels.append(_panel(own, title, name, numeric, cells))
         where = "the validation range" if name == VALIDATION else f"test set `{name}`"
         caption = (
-            f"RMSE(β) on {where} over {names[across]} and {names[up]} ({_kinds(artefacts, name)}). In each cell the mean over seeds and, "
+            f"RMSE(β) on {where} over {across} and {up} ({_kinds(artefacts, name)}). In each cell the mean over seeds and, "
             f"below it, half its 95 % confidence interval. The frame marks the combination chosen on the validation range."
         )
-        ticks = [[str(value) for value in values] for values in (columns, rows)]
-        figure = heat_map(panels, ticks[0], ticks[1], names[across], names[up], f"RMSE(β), {name} [deg]")
+        ticks = [[str(value) for value in values] for values in cells]
+        figure = heat_map(panels, ticks[0], ticks[1], across, up, f"RMSE(β), {name} [deg]")
         maps.append(Figure(f"heat_map_{name.lower()}", caption, figure))
     return maps
 
@@ -172,43 +170,87 @@ def _is_number(value: object) -> bool:
     return isinstance(value, int | float | np.integer | np.floating) and not isinstance(value, bool | np.bool_)
 
 
-def _panel(
-    table: pd.DataFrame,
-    values: tuple[object, ...],
-    name: str,
-    switches: Sequence[str],
-    across: tuple[str, list[float]],
-    up: tuple[str, list[float]],
-) -> Panel:
-    mean, half = (np.full((len(up[1]), len(across[1])), np.nan) for _ in range(2))
-    marked = None
-    for row in table.to_dict("records"):
-        cell = up[1].index(row[up[0]]), across[1].index(row[across[0]])
-        mean[cell], half[cell] = row[f"{METRIC}.{name}"], row[f"{METRIC}_half.{name}"]
-        marked = cell if row["chosen"] else marked
-    title = ", ".join(f"{switch} = {shown_value(value)}" for switch, value in zip(switches, values, strict=True))
-    return Panel(title, mean, half, marked)
+def _panel(table: pd.DataFrame, title: str, name: str, numeric: Sequence[str], cells: list[list[float]]) -> Panel:
+    """Combinations with two numeric keys of these values, across and up."""
+    across, up = numeric
+    mean, half, chosen = (
+        table.pivot(index=up, columns=across, values=shown).reindex(index=cells[1], columns=cells[0]).to_numpy(dtype=float)
+        for shown in (f"{METRIC}.{name}", f"{METRIC}_half.{name}", "chosen")
+    )
+    marked = np.argwhere(chosen == 1.0).tolist()
+    return Panel(title, mean, half, (marked[0][0], marked[0][1]) if marked else None)
+
+
+@dataclass(frozen=True, eq=False)
+class Panel:
+    """One panel of a heat map."""
+
+    title: str  # what it shows; may be empty
+    mean: FloatArray  # colour and first line of each cell, NaN where there is none; shape (R, C)
+    half: FloatArray  # half the interval, NaN where there is none; shape (R, C)
+    marked: tuple[int, int] | None = None  # row and column of the cell with a frame
+
+
+def heat_map(
+    panels: Sequence[Panel], columns: Sequence[str], rows: Sequence[str], column_label: str, row_label: str, quantity: str
+) -> MatplotlibFigure:
+    """Panels, (R, C) each, on one scale of colours, the darker the larger; logarithmic where the largest value is 20 times the smallest."""
+    import matplotlib
+    from matplotlib.cm import ScalarMappable
+    from matplotlib.colors import LinearSegmentedColormap, LogNorm, Normalize
+
+    values = np.concatenate([panel.mean.ravel() for panel in panels])
+    finite = values[np.isfinite(values)] if np.isfinite(values).any() else np.zeros(1)
+    low, high = float(finite.min()), float(finite.max())
+    scale = LogNorm(low, high) if low > 0 and high / low > LOGARITHMIC_FROM else Normalize(low, high if high > low else low + 1.0)
+    across = 1 if len(columns) > MOST_COLUMNS_SIDE_BY_SIDE else min(len(panels), 2)
+    down = math.ceil(len(panels) / across)
+    width = SINGLE_COLUMN if across == 1 and len(columns) <= MOST_COLUMNS_SIDE_BY_SIDE else DOUBLE_COLUMN
+    with new_figure(width, down * (0.75 + CELL_HEIGHT * len(rows))) as figure:
+        grid = figure.subplots(down, across, sharex=True, sharey=True, squeeze=False)
+        shades = LinearSegmentedColormap.from_list("shades", matplotlib.colormaps["Blues"](np.linspace(0.1, 0.95, 64)))
+        colours = ScalarMappable(scale, shades)
+        for axes, panel in zip(grid.flat, panels, strict=False):
+            _draw(axes, panel, colours, decimals_for(finite.tolist()))
+            axes.set_title(panel.title, loc="left")
+            axes.set_xticks(range(len(columns)), columns)
+            axes.set_yticks(range(len(rows)), rows)
+        for axes in list(grid.flat)[len(panels) :]:
+            axes.set_visible(False)
+        for axes in grid[-1]:
+            axes.set_xlabel(column_label)
+        for axes in grid[:, 0]:
+            axes.set_ylabel(row_label)
+        figure.colorbar(colours, ax=list(grid.flat), label=quantity, pad=0.02, aspect=25).outline.set_visible(False)
+    return figure
+
+
+def _draw(axes: Any, panel: Panel, colours: Any, decimals: int) -> None:
+    from matplotlib.patches import Rectangle
+
+    edges = [np.arange(number + 1) - 0.5 for number in panel.mean.T.shape]
+    axes.pcolormesh(*edges, panel.mean, cmap=colours.cmap, norm=colours.norm, edgecolors="white", linewidth=0.8)
+    axes.set_facecolor(NO_VALUE)
+    for row, column in np.ndindex(panel.mean.shape):
+        mean, half = float(panel.mean[row, column]), float(panel.half[row, column])
+        words = fixed(mean, decimals) + (f"\n±{fixed(half, decimals)}" if math.isfinite(half) else "")
+        ink = "white" if math.isfinite(mean) and float(np.dot(LUMINANCE, colours.to_rgba(mean)[:3])) < 0.45 else "#111111"
+        axes.text(column, row, words, ha="center", va="center", fontsize=6.5, color=ink, linespacing=1.1)
+    if panel.marked is not None:
+        row, column = panel.marked
+        axes.add_patch(Rectangle((column - 0.46, row - 0.46), 0.92, 0.92, fill=False, edgecolor="#d6336c", linewidth=1.8))
+    axes.grid(visible=False)
+    axes.tick_params(length=0)
+    axes.spines[:].set_visible(False)
 
 
 # The words
 
 
 def _kinds(artefacts: SweepArtefacts, name: str) -> str:
-    spans = artefacts.split.validation if name == VALIDATION else artefacts.split.tests[name]
-    return " and ".join(sorted({_shouted(artefacts.kinds[span.dataset]) for span in spans}))
-
-
-def _shouted(kind: str) -> str:
-    """Simulated data must not be overlooked."""
-    return kind.upper() if kind == "simulated" else kind
-
-
-def _kind_sentence(artefacts: SweepArtefacts) -> str:
-    parts = "; ".join(f"{as_text(artefacts.data_titles[name])} ({_shouted(kind)})" for name, kind in artefacts.kinds.items())
-    kinds = set(artefacts.kinds.values())
-    if len(kinds) == 1:
-        return f"**{_shouted(kinds.pop())} data:** every number here comes from {parts}."
-    return f"**Real and SIMULATED data:** {parts}."
+    part = artefacts.part
+    spans = part.split.validation if name == VALIDATION else part.split.tests[name]
+    return " and ".join(sorted({part.kinds[span.dataset] for span in spans}))
 
 
 def _chosen_sentence(artefacts: SweepArtefacts, table: pd.DataFrame) -> str:
@@ -244,35 +286,22 @@ def mean_and_half(mean: float, half: float, decimals: int) -> str:
     return f"{fixed(mean, decimals)} ± {fixed(half, decimals)}" if math.isfinite(half) else fixed(mean, decimals)
 
 
-def _how_it_was_made(artefacts: SweepArtefacts) -> str:
-    jobs, protocol = artefacts.jobs, artefacts.protocol
+def _budget(jobs: pd.DataFrame) -> str:
     done = jobs[jobs["status"] == DONE]
     seeds = sorted({int(seed) for seed in jobs["seed"]})
     epochs = done["epochs"][done["epochs"] > 0]
     fewest, most = (f"{epochs.min():.0f}", f"{epochs.max():.0f}") if len(epochs) else ("", "")
     took = f"; training took {fewest if fewest == most else f'{fewest} to {most}'} epochs" if len(epochs) else ""
     counts = f"{jobs['combination'].nunique()} combinations, seeds {', '.join(map(str, seeds))}: {len(done)} of {len(jobs)} jobs done"
-    split = artefacts.split
-    ranges = [_ranges("training", split.train), _ranges("validation", split.validation)]
-    ranges += [_ranges(f"test `{name}`", spans) for name, spans in split.tests.items()]
-    lines = [
-        f"Command: {as_code(artefacts.command)}",
-        f"Budget: {counts}{took}",
-        *artefacts.facts,
-        f"Split `{split.name}`: {'; '.join(ranges)}",
-        f"Evaluation: every estimate is read at {protocol.rate_hz:g} Hz, held; up to {protocol.warm_up_seconds:g} s of warm-up before a "
-        f"{protocol.piece}, whose first {protocol.skip_seconds:g} s are not scored{'.' * bool(protocol.start_in_words)}"
-        f"{protocol.start_in_words.rstrip('.')}",
-        "Interval: mean ± half the two-sided 95 % confidence interval of the mean over seeds, t₀.₉₇₅ s/√n, from Student's t distribution "
-        "with n − 1 degrees of freedom; one seed has none. It covers what the seed changes, not what another drive or car would",
-        "Choice: the lowest mean RMSE(β) on the validation range, of the combinations without a failed seed. Test data choose nothing",
-        "Every job: [sweep.csv](sweep.csv). Every combination: [summary.csv](summary.csv)",
-    ]
-    return "## How it was made\n\n" + "\n".join(f"- {line}" for line in lines)
+    return f"Budget: {counts}{took}"
 
 
-def _ranges(role: str, spans: Sequence[Span]) -> str:
-    return f"{role} {', '.join(span.describe() for span in spans)}" if spans else f"no {role}"
+INTERVAL_AND_CHOICE = (
+    "Interval: mean ± half the two-sided 95 % confidence interval of the mean over seeds, t₀.₉₇₅ s/√n, from Student's t distribution "
+    "with n − 1 degrees of freedom; one seed has none. It covers what the seed changes, not what another drive or car would",
+    "Choice: the lowest mean RMSE(β) on the validation range, of the combinations without a failed seed. Test data choose nothing",
+    "Every job: [sweep.csv](sweep.csv). Every combination: [summary.csv](summary.csv)",
+)
 
 
 def _table(artefacts: SweepArtefacts, table: pd.DataFrame) -> Table:

@@ -28,11 +28,7 @@ class Checkpoint(NamedTuple):
 
 
 def save_checkpoint(folder: Path, checkpoint: Checkpoint) -> None:
-    """Replace the checkpoint in ``folder`` in one step.
-
-    Raises:
-        MissingError: it cannot be written.
-    """
+    """Replace the checkpoint in ``folder`` in one step. Raises `MissingError`: it cannot be written."""
     with written_aside(folder / _FILE) as aside:
         tensors = {name: tensor.detach().cpu().contiguous() for name, tensor in checkpoint.tensors.items()}
         try:

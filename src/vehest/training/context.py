@@ -9,51 +9,32 @@ from pathlib import Path
 
 @dataclass(frozen=True)
 class Progress:
-    """Where a fit stands after an epoch.
+    """Where a fit stands after an epoch."""
 
-    Args:
-        epoch: epochs finished.
-        max_epochs: epochs allowed.
-        active: members still training.
-        members: members in all.
-        best_validation_loss: lowest so far over the members.
-    """
-
-    epoch: int
-    max_epochs: int
-    active: int
-    members: int
-    best_validation_loss: float
+    epoch: int  # epochs finished
+    max_epochs: int  # epochs allowed
+    active: int  # members still training
+    members: int  # members in all
+    best_validation_loss: float  # lowest so far over the members
 
 
 @dataclass(frozen=True)
 class FitContext:
-    """Surroundings of a fit.
+    """Surroundings of a fit."""
 
-    Args:
-        checkpoint_folders: where each member keeps the state of its unfinished fit; empty if nothing is to be kept.
-        should_stop: asked after every batch; True ends the fit cleanly with the best so far.
-        on_progress: called after every epoch.
-    """
-
-    checkpoint_folders: Sequence[Path] = ()
-    should_stop: Callable[[], bool] = lambda: False
-    on_progress: Callable[[Progress], None] = lambda progress: None
+    checkpoint_folders: Sequence[Path] = ()  # where each member keeps the state of its unfinished fit; empty if nothing is to be kept
+    should_stop: Callable[[], bool] = lambda: False  # asked after every batch; True ends the fit cleanly with the best so far
+    on_progress: Callable[[Progress], None] = lambda progress: None  # called after every epoch
 
 
 @dataclass(frozen=True)
 class FitRecord:
-    """How a fit went.
+    """How a fit went."""
 
-    Args:
-        history: column -> values, one row an epoch or a search; empty where there is nothing to show.
-        metrics: figures such as ``epochs`` and ``train_seconds``.
-        interrupted: whether the fit was stopped before it was over.
-    """
-
+    # column -> values, one row an epoch or a search; empty where there is nothing to show
     history: Mapping[str, Sequence[float]] = field(default_factory=dict)
-    metrics: Mapping[str, float] = field(default_factory=dict)
-    interrupted: bool = False
+    metrics: Mapping[str, float] = field(default_factory=dict)  # figures such as ``epochs`` and ``train_seconds``
+    interrupted: bool = False  # whether the fit was stopped before it was over
 
 
 def record_of_epochs(

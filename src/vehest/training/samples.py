@@ -14,22 +14,17 @@ from vehest.training.sequences import Phase, PhaseSettings
 
 
 class Samples(NamedTuple):
-    """What is learnt from, as a network sees it.
+    """What is learnt from, as a network sees it."""
 
-    Attributes:
-        inputs: (N, C).
-        targets: (N,).
-    """
-
-    inputs: Tensor
-    targets: Tensor
+    inputs: Tensor  # (N, C)
+    targets: Tensor  # (N,)
 
 
 class Draw(NamedTuple):
-    """A batch: which samples each member sees, int64 (M, B), and the seed of each member's dropout, int64 (M,)."""
+    """A batch."""
 
-    rows: Tensor
-    seeds: Tensor
+    rows: Tensor  # which samples each member sees, int64 (M, B)
+    seeds: Tensor  # of each member's dropout, int64 (M,)
 
 
 @dataclass(frozen=True)

@@ -42,57 +42,33 @@ class Phase:
 
     Phases may be of one module or of several that share parameters; what an earlier phase learnt is where a later one starts.
     The module is never asked for random numbers: what is random about an epoch (order, offsets, masks of dropout) is drawn by ``batches``.
-
-    Args:
-        name: for people and for the checkpoint; unique among the phases of a training.
-        settings: step size, epochs, patience, clipping.
-        module: its parameters are changed in place.
-        batches: one epoch's batches; draws random numbers from the generator that it is given and from no other.
-        loss: scalar to minimise, of one batch; ``backward`` is called on it.
-        validation: loss on the validation data with the parameters as they stand; called without gradients.
-        prepare: called once before the first validation; may set parameters that this phase starts from.
-        trainable: which parameters learn, by name; the others are frozen (``requires_grad`` is False during the phase). All if None.
     """
 
-    name: str
-    settings: PhaseSettings
-    module: nn.Module
-    batches: Callable[[torch.Generator], Iterable[Any]]
-    loss: Callable[[Any], Tensor]
-    validation: Callable[[], float]
-    trainable: Callable[[str], bool] | None = None
-    prepare: Callable[[], None] | None = None
+    name: str  # for people and for the checkpoint; unique among the phases of a training
+    settings: PhaseSettings  # step size, epochs, patience, clipping
+    module: nn.Module  # its parameters are changed in place
+    batches: Callable[[torch.Generator], Iterable[Any]]  # of one epoch; random numbers are drawn from the generator and from no other
+    loss: Callable[[Any], Tensor]  # scalar to minimise, of one batch; ``backward`` is called on it
+    validation: Callable[[], float]  # loss on the validation data with the parameters as they stand; called without gradients
+    trainable: Callable[[str], bool] | None = None  # which parameters learn, by name, while the others are frozen; all if None
+    prepare: Callable[[], None] | None = None  # called once before the first validation; may set parameters that this phase starts from
 
 
 @dataclass
 class PhaseRecord:
-    """How a phase goes; plain values, which a checkpoint keeps as they are.
+    """How a phase goes; plain values, which a checkpoint keeps as they are."""
 
-    Args:
-        name: of the phase.
-        best_epoch: epoch (from 1) whose parameters were kept; 0 if none was better than the start.
-        best_loss: validation loss of the parameters that were kept.
-        start_loss: validation loss before the first epoch; NaN if it was stopped before.
-        train_loss: mean loss over the batches of each epoch, skipped ones left out.
-        validation_loss: after each epoch; NaN where not validated.
-        seconds: wall time, earlier runs that a checkpoint continues included [s].
-        skipped_steps: batches whose loss or gradient was not finite.
-        skipped_in_a_row: the last of them.
-        validated: whether it was, before the first epoch.
-        interrupted: whether it was stopped before it was over.
-    """
-
-    name: str
-    best_epoch: int = 0
-    best_loss: float = math.inf
-    start_loss: float = math.nan
-    train_loss: list[float] = field(default_factory=list)
-    validation_loss: list[float] = field(default_factory=list)
-    seconds: float = 0.0
-    skipped_steps: int = 0
-    skipped_in_a_row: int = 0
-    validated: bool = False
-    interrupted: bool = False
+    name: str  # of the phase
+    best_epoch: int = 0  # epoch (from 1) whose parameters were kept; 0 if none was better than the start
+    best_loss: float = math.inf  # validation loss of the parameters that were kept
+    start_loss: float = math.nan  # validation loss before the first epoch; NaN if it was stopped before
+    train_loss: list[float] = field(default_factory=list)  # mean over the batches of each epoch, skipped ones left out
+    validation_loss: list[float] = field(default_factory=list)  # after each epoch; NaN where not validated
+    seconds: float = 0.0  # wall time, earlier runs that a checkpoint continues included [s]
+    skipped_steps: int = 0  # batches whose loss or gradient was not finite
+    skipped_in_a_row: int = 0  # the last of them
+    validated: bool = False  # whether it was, before the first epoch
+    interrupted: bool = False  # whether it was stopped before it was over
 
     @property
     def epochs(self) -> int:

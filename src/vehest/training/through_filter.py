@@ -22,17 +22,11 @@ from vehest.training.sequences import Phase, PhaseSettings
 
 
 class Drive(NamedTuple):
-    """An uninterrupted drive, sampled, or several of one length.
+    """An uninterrupted drive, sampled, or several of one length."""
 
-    Attributes:
-        states: true ones, (..., T, n).
-        inputs: (..., T, p).
-        measurements: (..., T, m); NaN where nothing was measured.
-    """
-
-    states: Tensor
-    inputs: Tensor
-    measurements: Tensor
+    states: Tensor  # true ones, (..., T, n)
+    inputs: Tensor  # (..., T, p)
+    measurements: Tensor  # (..., T, m); NaN where nothing was measured
 
 
 class Filtering(nn.Module):
@@ -164,8 +158,7 @@ def filter_phases(
 ) -> list[Phase]:
     """Through the filter: one phase a length of the curriculum, the last on whole sequences.
 
-    Raises:
-        DataError: no training or validation drive is long enough.
+    Raises `DataError`: no training or validation drive is long enough.
     """
     judged = sequences_of(validation, settings.validation_steps)
     judged_by = torch.nonzero(weights.validation).flatten()
@@ -216,8 +209,7 @@ def filter_phases(
 def sequences_of(drives: Sequence[Drive], steps: int) -> Drive:
     """Drives cut from their start into sequences of so many steps, without overlap; a remainder is left out.
 
-    Raises:
-        DataError: no drive is long enough.
+    Raises `DataError`: no drive is long enough.
     """
     starts = [(drive, first) for drive in drives for first in range(0, len(drive.states) - steps + 1, steps)]
     return _stacked(starts, steps)

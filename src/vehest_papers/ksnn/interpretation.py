@@ -15,7 +15,7 @@ from vehest.data.recording import Recording
 from vehest.data.runs import true_runs
 from vehest.estimators.ksnn import Ksnn
 from vehest.report.document import Block, Column, Figure, Table
-from vehest.report.style import DOUBLE_COLUMN, REFERENCE_COLOUR, fixed, listed, new_figure, significant, with_unit
+from vehest.report.style import DOUBLE_COLUMN, REFERENCE_COLOUR, fixed, listed, new_figure, significant
 from vehest_papers.kit.legends import legend_above
 from vehest_papers.ksnn.activation import LOCAL_COLOURS, LOCAL_DASHES
 from vehest_papers.ksnn.linear_system import LocalModels, LpvModel, SubModels, decomposed_estimate
@@ -87,7 +87,7 @@ def gain_curves(models: Sequence[Trained]) -> list[Block]:
                             model.centres, getattr(model, panel)[:, column], color=colour, marker="o", linestyle="none", markersize=3.0
                         )
             first, second, unit = labels[panel]
-            axes.set_title(with_unit(f"{first} solid, {second} dashed", unit), loc="left")
+            axes.set_title(f"{first} solid, {second} dashed" + (f" [{unit}]" if unit != "1" else ""), loc="left")
             axes.set_xlabel("$|\\omega|$ [rad/s]")
             if panel in ("gamma", "beta", "poles"):
                 axes.axhline(1.0, color="#888888", linewidth=0.7, linestyle="dotted")

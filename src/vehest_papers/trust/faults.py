@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from vehest.constants import FloatArray
 from vehest.data.recording import Recording
 from vehest.data.splits import Span
-from vehest.evaluation.integrity import detection_delay
+from vehest.evaluation.under_fault import detection_delay
 from vehest.studies.artefacts import PartArtefacts
 from vehest.trust.faults import KINDS, SEVERITIES, Fault, applies, inject, window
 from vehest.trust.guard import Guard, learn_limits

@@ -1,14 +1,13 @@
-"""Chooses where groups run, this machine's cores, a Ray cluster or a SLURM queue, and counts how far they are.
+"""Chooses where groups run, this machine's cores, a Ray cluster or a SLURM queue.
 
-Imports nothing heavy: the command line reads its options here.
+Imports nothing heavy: the command line takes options from here.
 """
 
 from __future__ import annotations
 
 import importlib.util
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
-from datetime import timedelta
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Protocol
 
@@ -32,12 +31,22 @@ class LauncherOptions:
     slurm: Sequence[str] = ()
 
 
+@dataclass(frozen=True)
+class RunOptions:
+    """Options of a command that runs stages: as `vehest run --help` describes them; no ``jobs`` is one a core, ``track`` logs runs."""
+
+    force: bool = False
+    dry_run: bool = False
+    quiet: bool = False
+    jobs: int | None = None
+    track: bool = False
+    minutes: float | None = None
+    launcher: LauncherOptions = LauncherOptions()
+    retrain: bool = False
+
+
 class Launcher(Protocol):
     """Runs groups; outcomes come back to this process, which alone tracks and draws."""
-
-    @property
-    def cores(self) -> int:
-        """Groups that can run at a time."""
 
     def launch(self, groups: Sequence[Group], stop: StopSignals | TimeLimit, report: Reporter) -> Iterator[Done]:
         """Run groups as `local.launch` runs tasks, with members as outcomes; on a cluster only the begin of a group is reported.
@@ -72,31 +81,3 @@ def chosen_launcher(options: LauncherOptions, jobs: int | None, output: Path, me
     if name == "slurm":
         return SlurmLauncher(options.address or "slurm", jobs, parameters, output, messages)
     return RayLauncher(options.address, jobs, output, messages)
-
-
-@dataclass
-class LaunchProgress:
-    """Counts the groups of a launch, and estimates when the last will be done."""
-
-    total: int
-    core_seconds: float = 0.0
-    done: int = 0
-    failed: int = 0
-    running: set[int] = field(default_factory=set)
-
-    def ended(self, position: int, seconds: float, *, failed: bool) -> None:
-        """A group has ended after so many seconds of a core."""
-        self.running.discard(position)
-        self.core_seconds += seconds
-        self.failed += failed
-        self.done += not failed
-
-    def row(self, cores: int) -> Mapping[str, str]:
-        """Heading -> value, nothing for a single group; time left as if groups took what ended ones did and running ones were half done."""
-        running, ended = len(self.running), self.done + self.failed
-        waiting = self.total - ended - running
-        ahead = (waiting + 0.5 * running) / max(1, min(cores, waiting + running))
-        left = timedelta(seconds=round(ahead * self.core_seconds / ended)) if ended else ""
-        counts = {"done": self.done, "running": running, "waiting": waiting, "failed": self.failed}
-        shown = {**counts, "core hours": f"{self.core_seconds / 3600:.3f}", "cores": cores, "left": left}
-        return {name: str(value) for name, value in shown.items()} if self.total > 1 else {}

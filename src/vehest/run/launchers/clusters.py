@@ -79,7 +79,7 @@ def run_task(spec: TaskSpec, copies: Files | None, should_stop: Callable[[], boo
 
     Raises `MissingError` for other versions or copies that cannot be written, `NotShared` with neither a shared root nor copies.
     """
-    begun, here = time.monotonic(), versions_here()
+    here = versions_here()
     unlike = [f"{name} {here.get(name, 'missing')} instead of {own}" for name, own in spec.versions.items() if here.get(name) != own]
     if unlike:
         raise MissingError(f"{socket.gethostname()} has {', '.join(unlike)}; install the same versions on every machine")
@@ -92,7 +92,7 @@ def run_task(spec: TaskSpec, copies: Files | None, should_stop: Callable[[], boo
             unpack(copies or {})
         outcome = guarded(spec.group.run, should_stop, lambda _: None)
         made = {} if shared or isinstance(outcome, Failure) else pack(folders_of(outcome).difference(copies or ()))
-    return Done(spec.position, outcome, time.monotonic() - begun, made)
+    return Done(spec.position, outcome, made)
 
 
 def versions_here() -> dict[str, str]:
@@ -287,11 +287,6 @@ class SlurmLauncher:
         self._running: dict[Any, int] = {}
         self._lost: Counter[str] = Counter()  # jobs, by the name of their group
 
-    @property
-    def cores(self) -> int:
-        """Jobs at a time, as many as are allowed or else as run now."""
-        return self._jobs or max(1, sum(job.state == "RUNNING" for job in self._running))
-
     def launch(self, groups: Sequence[Group], stop: StopSignals | TimeLimit, report: Reporter) -> Iterator[Done]:
         """See `Launcher`."""
         if self._executor is None:
@@ -306,7 +301,7 @@ class SlurmLauncher:
                 if stop.requested():
                     waiting = []
                     self._call_off()
-                room = len(waiting) if self._cluster == "slurm" else self.cores - len(self._running)
+                room = self._jobs - len(self._running) if self._jobs and self._cluster == "local" else len(waiting)
                 self._running |= zip(self._begin(groups, waiting[:room]), waiting[:room], strict=True)
                 waiting = waiting[room:]
                 for job, position in self._running.items():

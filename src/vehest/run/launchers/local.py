@@ -29,11 +29,10 @@ Files = MutableMapping[Path, Mapping[str, bytes]]  # folder of an artefact -> it
 
 @dataclass(frozen=True)
 class Done:
-    """What a task returned, or why it failed, how long it ran [s], and what it made that is not in the output root yet."""
+    """What a task returned, or why it failed, and what it made that is not in the output root yet."""
 
     position: int
     outcome: Any
-    seconds: float = 0.0
     made: Files = field(default_factory=dict)
 
 
@@ -66,10 +65,9 @@ def launch(tasks: Sequence[Task], jobs: int, stop: StopSignals | TimeLimit, repo
         if stop.requested():
             return
         report(position, None)
-        begun = time.monotonic()
         with stop.deferred():
             outcome = guarded(task, stop.requested, partial(report, position))
-        yield Done(position, outcome, time.monotonic() - begun)
+        yield Done(position, outcome)
 
 
 def default_jobs() -> int:
@@ -132,7 +130,7 @@ def _work(position: int, task: Task) -> Done | None:
     if stopping.is_set():
         return None
     messages.put((position, None))
-    last = begun = time.monotonic()
+    last = time.monotonic()
 
     def on_progress(progress: Progress | Waiting) -> None:
         nonlocal last
@@ -141,4 +139,4 @@ def _work(position: int, task: Task) -> Done | None:
             messages.put((position, progress))
 
     with use_limits(_worker["limits"]):
-        return Done(position, guarded(task, stopping.is_set, on_progress), time.monotonic() - begun)
+        return Done(position, guarded(task, stopping.is_set, on_progress))

@@ -23,11 +23,11 @@ static const vehest_real TRANSFER = 0.18055555555555558; /* h/L: load that an ac
 static const vehest_real LOAD_FRONT = 4.8028125; /* at rest, per mass [m/s^2] */
 static const vehest_real LOAD_REAR = 5.007187500000001; /* [m/s^2] */
 static const vehest_real SLOWEST = 3.0; /* wheels roll without slip below it, and nothing counts as measured [m/s] */
-static const vehest_real ROLLING[N] = {0.25, 0.04000000000000001}; /* variances of a motion that nobody knows, and of a car that rolls */
-static const vehest_real PROCESS[N] = {0.25, 0.09}; /* variances of a step */
+static const vehest_real ROLLING[N] = { 0.25, 0.04000000000000001 }; /* variances of a motion that nobody knows, and of a car that rolls */
+static const vehest_real PROCESS[N] = { 0.25, 0.09 }; /* variances of a step */
 static const vehest_real SENSORS[2][2] = {
-    {0.010000000000000002, 0.2025},
-    {0.010000000000000002, 0.2025}
+    { 0.010000000000000002, 0.2025 },
+    { 0.010000000000000002, 0.2025 }
 }; /* variances of measurements, where the car is linear and where not */
 
 /* What all points share of a sample. */
@@ -64,7 +64,7 @@ static vehest_real axle_force(vehest_real tangent, vehest_real load, vehest_real
 /* Forces of both axles across the body, F_F cos(delta) and F_R [N], at a state. */
 static void forces_at(const vehest_real state[N], const settled *at, vehest_real *front, vehest_real *rear)
 {
-    static const vehest_real FRONT[3] = {0.45, 0.25, 0.05}, REAR[3] = {0.4, 0.2, 0.55};
+    static const vehest_real FRONT[3] = { 0.45, 0.25, 0.05 }, REAR[3] = { 0.4, 0.2, 0.55 };
     const vehest_real course_front = (state[0] + FRONT_ARM * state[1]) / at->vx;
     const vehest_real course_rear = (state[0] - REAR_ARM * state[1]) / at->vx;
     const vehest_real across = 1.0 + at->tangent * course_front;

@@ -15,29 +15,29 @@ static const vehest_real TAU = 0.05; /* sampling time [s] */
 static const vehest_real PER_WIDTH = 4.0; /* local models per yaw rate [s/rad] */
 /* gamma_1, gamma_2, beta_1, beta_2, w_1 of f_1 and of f_2 of every local model */
 static const vehest_real LINEAR[LOCAL][6] = {
-    {0.45, 0.25, 0.4, 0.2, 0.3, 0.1},
-    {0.05, 0.4, 0.55, 0.35, 0.45, 0.25}
+    { 0.45, 0.25, 0.4, 0.2, 0.3, 0.1 },
+    { 0.05, 0.4, 0.55, 0.35, 0.45, 0.25 }
 };
 /* w_2, w_3 of every local model, feedback function and neuron */
 static const vehest_real NEURON[LOCAL][2][HIDDEN][2] = {
     {
         {
-            {0.3, 0.3},
-            {0.1, 0.1}
+            { 0.3, 0.3 },
+            { 0.1, 0.1 }
         },
         {
-            {0.45, 0.45},
-            {0.25, 0.25}
+            { 0.45, 0.45 },
+            { 0.25, 0.25 }
         }
     },
     {
         {
-            {0.05, 0.05},
-            {0.4, 0.4}
+            { 0.05, 0.05 },
+            { 0.4, 0.4 }
         },
         {
-            {0.2, 0.2},
-            {0.55, 0.55}
+            { 0.2, 0.2 },
+            { 0.55, 0.55 }
         }
     }
 };

@@ -51,10 +51,6 @@ class Footprint:
     stack: int  # bytes of the deepest chain of calls, without what the C library takes
     library: tuple[str, ...]  # functions of the C library that are called
 
-    def figures(self) -> dict[str, int]:
-        """What the command prints, by name."""
-        return {f"{self.target}, bytes of {name}": getattr(self, name) for name in ("state", "code", "tables", "stack")}
-
 
 def footprint(files: Mapping[str, str], target: Target) -> Footprint | None:
     """What an export takes on a target; None where there is no compiler for it, or it cannot say.
