@@ -4,9 +4,10 @@
 
 Real: the Ferrari's laps 1 to 3, each tried after learning on the other two; its drives without a reference likewise, but the one that
 holds the same laps; two drives of an Audi TTS; quarters of two drives of the AV-21. Simulated: eight cars of `sim_fleet_real` for half
-an hour each, health learnt on the first five minutes. Every kind of fault in every channel at three severities, once a drive, at a third of
-it or of its first 150 s, for 10 s; each counts three times, as one to be found within 1, 3 and 10 s. What is learnt stays; limits and
-statistics are changed afterwards. Rows of a rule replace those of the same name in results/benchmarks/health_trade.csv, of which the figure is drawn.
+an hour each, health learnt on the first five minutes. Every kind of fault in every channel at three severities, once a drive, at a third
+of it or of its first 150 s, for 10 s; each counts three times, as one to be found within 1, 3 and 10 s. What is learnt stays; limits and
+statistics are changed afterwards. Rows of a rule replace those of the same name in results/benchmarks/health_trade.csv, of which the
+figure is drawn.
 """
 
 from __future__ import annotations
