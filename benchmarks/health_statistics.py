@@ -1,13 +1,13 @@
 """Alarms of health in driving without a fault against faults found, as its limits rise, and what each of its statistics earns.
 
-    PYTHONPATH=src VEHEST_DATA=FOLDER python benchmarks/health_statistics.py [--rule NAME]     # 15 minutes on one core
+    PYTHONPATH=src VEHEST_DATA=FOLDER python benchmarks/health_statistics.py [--rule NAME | --opened OUTPUT]     # 15 minutes on one core
 
 Real: the Ferrari's laps 1 to 3, each tried after learning on the other two; its drives without a reference likewise, but the one that
 holds the same laps; two drives of an Audi TTS; quarters of two drives of the AV-21. Simulated: eight cars of `sim_fleet_real` for half
 an hour each, health learnt on the first five minutes. Every kind of fault in every channel at three severities, once a drive, at a third
 of it or of its first 150 s, for 10 s; each counts three times, as one to be found within 1, 3 and 10 s. What is learnt stays; limits and
 statistics are changed afterwards. Rows of a rule replace those of the same name in results/benchmarks/health_trade.csv, of which the
-figure is drawn.
+figure is drawn. ``--opened``: tests that chose nothing, by the splits of results/trust, printed only.
 """
 
 from __future__ import annotations
@@ -29,8 +29,14 @@ from scipy.stats import chi2
 from vehest.constants import FloatArray
 from vehest.data.laps import laps_of
 from vehest.data.recording import Recording
+from vehest.data.splits import Span
+from vehest.data.store import read_recording
 from vehest.data.transforms import Resample
 from vehest.run.config import compose_config
+from vehest.run.console import Messages
+from vehest.run.runner import Runner
+from vehest.run.signals import StopSignals
+from vehest.run.train import recording_file
 from vehest.sources.base import Source, open_source
 from vehest.trust import health_kernel as kernel
 from vehest.trust.faults import KINDS, SEVERITIES, Fault, applies, inject, window
@@ -40,14 +46,16 @@ from vehest.trust.health import HealthModel, learn_health
 RESULT = Path(__file__).parents[1] / "results" / "benchmarks" / "health_trade.csv"
 RATE = 20.0
 WHEELS = tuple(f"wheel_speed_{place}" for place in ("fl", "fr", "rl", "rr"))
-WATCHED = ("yaw_rate", "vx", "ay", "ax", "steer", "handwheel", *WHEELS)
+PLAIN = ("yaw_rate", "vx", "ay", "ax", "steer", "handwheel", "motor_speed", "motor_current")
+WATCHED = (*PLAIN, *WHEELS)
 LASTS, LEARNT, TRIED = 10.0, 300.0, 150.0  # s: of a fault; of a simulated drive; of a drive that faults are tried in
+LEAST, MOST = 25.0, 6  # s of drives that faults are tried on, and how many of them after the same learning
 HORIZONS = (1.0, 3.0, 10.0)  # s after its onset, within which a fault has to be found
 GUARDED = ("nan", "inf", "huge")  # faults that the guard finds, whatever health does
 FERRARI = "20140222_01_01_03_250lm"
 FACTORS = (0.8, 0.9, 1.0, 1.1, 1.2, 1.3, 1.5, 1.75)
 
-Drives = Iterator[tuple[list[Recording], Recording]]  # what is learnt from, and what is tried
+Drives = Iterator[tuple[list[Recording], list[Recording], list[Recording]]]  # training, validation, and what is tried
 
 
 class Trial(NamedTuple):
@@ -67,7 +75,8 @@ def source(name: str, *overrides: str) -> Source:
 def others(drives: Sequence[Recording]) -> Drives:
     """Each drive, and those that it is tried after."""
     for drive in drives:
-        yield [own for own in drives if own is not drive], drive
+        learnt = [own for own in drives if own is not drive]
+        yield learnt[:-1], learnt[-1:], [drive]
 
 
 def parts(drive: Recording, count: int) -> list[Recording]:
@@ -96,8 +105,8 @@ def tts() -> Drives:
         columns = {"yaw_rate": "YawRate_radps", "vx": "Speed_mps", "ay": "LateralAcceleration_mps2", "steer": "deltaRoadwheels_rad"}
         channels = {name: held[column] for name, column in columns.items()}
         drives.append(Resample(RATE)(Recording(file.stem, "audi_tts", 200.0, 0.0, channels)))
-    for learnt, test in others(drives):
-        yield parts(learnt[0], 2), test
+    for drive, other in (drives, drives[::-1]):
+        yield *([half] for half in parts(other, 2)), [drive]
 
 
 def av21() -> Drives:
@@ -112,9 +121,28 @@ def fleet() -> Drives:
     counts = [f"dataset.drives.{k}.count={2 * (k < 4)}" for k in range(6)]
     own = source("sim_fleet_real", *counts, *(f"dataset.drives.{k}.manoeuvre.duration=1800" for k in range(6)))
     for name in own.ids():
-        drive = Resample(RATE)(own.read(name))
+        drive = Resample(RATE)(plain(own.read(name)))
         split = drive.start_time + LEARNT
-        yield parts(drive.cut(drive.start_time, split), 2), drive.cut(split, drive.end_time)
+        yield *([half] for half in parts(drive.cut(drive.start_time, split), 2)), [drive.cut(split, drive.end_time)]
+
+
+def plain(drive: Recording) -> Recording:
+    """Without wheels, and what is not watched."""
+    return drive.select([name for name in PLAIN if name in drive])
+
+
+def of_split(output: Path, *words: str) -> Drives:
+    """A split of results/trust; test sets of other tyres are left out."""
+    config = compose_config("eval", [*words, "estimator=zero", f"output={output}", "tracking=none"])
+    runner = Runner(output, Messages(), StopSignals())
+    split = runner.split(config)
+    data = runner.data_for(split, RATE, config)
+
+    def read(spans: Sequence[Span]) -> list[Recording]:
+        return [plain(read_recording(recording_file(data[own.dataset], own)).cut(own.start, own.stop)) for own in spans]
+
+    tests = [span for name, spans in split.tests.items() if name != "tyre_d" for span in spans]
+    yield read(split.train), read(split.validation), read(tests)
 
 
 SETS: dict[str, Callable[[], Drives]] = {
@@ -123,6 +151,13 @@ SETS: dict[str, Callable[[], Drives]] = {
     "Audi TTS": tts,
     "AV-21": av21,
     "Simulated fleet": fleet,
+}
+
+
+OPENED = {
+    "Ferrari, lap 5": ("split=ferrari_laps", "split.fold=4"),
+    "F1TENTH, tyre A": ("split=f1tenth_tyres",),
+    "Simulated BMW": ("split=sim_bmw",),
 }
 
 
@@ -146,23 +181,31 @@ def ratios_of(model: HealthModel, limits: GuardLimits, rows: FloatArray) -> Floa
     return np.stack([over[:, labels == group].max(axis=1) for group in dict.fromkeys(labels)], axis=1)
 
 
+def faults_of(test: Recording, channels: Sequence[str], ratios: Callable[[FloatArray], FloatArray]) -> list[tuple[int, FloatArray]]:
+    """First row of each fault, and what it shows from there on while it lasts."""
+    part, found = test.cut(test.start_time, test.start_time + TRIED), []
+    clean = {name: part[name] for name in channels}
+    for kind in (kind for kind in KINDS if kind not in GUARDED):
+        for channel in (channel for channel in channels if applies(kind, channel) and channel not in WHEELS[1:]):
+            for severity in SEVERITIES:
+                fault = Fault(kind, channel, severity, round(part.duration / 3.0, 2), LASTS)
+                first, end = window(fault, len(part), test.rate_hz)
+                rows = np.stack([inject(clean, test.rate_hz, fault)[name] for name in channels], axis=1)[:end]
+                found.append((first, ratios(rows)[first:]))
+    return found
+
+
 def tried(drives: Drives) -> list[Trial]:
     """Statistics of each drive with and without faults."""
     found = []
-    for learnt, test in drives:
-        channels, rate = tuple(name for name in WATCHED if all(name in own for own in (*learnt, test))), test.rate_hz
-        model, limits = learn_health(learnt[:-1], learnt[-1:], channels, rate), learn_limits(learnt, channels, rate)
-        ratios = partial(ratios_of, model, limits)
-        part = test.cut(test.start_time, test.start_time + TRIED)
-        clean, faulty = {name: part[name] for name in channels}, []
-        for kind in (kind for kind in KINDS if kind not in GUARDED):
-            for channel in (channel for channel in channels if applies(kind, channel) and channel not in WHEELS[1:]):
-                for severity in SEVERITIES:
-                    fault = Fault(kind, channel, severity, round(part.duration / 3.0, 2), LASTS)
-                    first, end = window(fault, len(part), rate)
-                    rows = np.stack([inject(clean, rate, fault)[name] for name in channels], axis=1)[:end]
-                    faulty.append((first, ratios(rows)[first:]))
-        found.append(Trial(list(dict.fromkeys(groups_of(model))), ratios(test.stack(channels)), faulty, rate))
+    for train, validation, tests in drives:
+        everything, rate = [*train, *validation, *tests], tests[0].rate_hz
+        channels = tuple(name for name in WATCHED if all(name in own for own in everything))
+        model, limits = learn_health(train, validation, channels, rate), learn_limits([*train, *validation], channels, rate)
+        ratios, long = partial(ratios_of, model, limits), [test for test in tests if test.duration >= LEAST]
+        for test in tests:
+            faulty = faults_of(test, channels, ratios) if any(test is own for own in long[:MOST]) else []
+            found.append(Trial(list(dict.fromkeys(groups_of(model))), ratios(test.stack(channels)), faulty, rate))
     return found
 
 
@@ -218,7 +261,13 @@ def main() -> None:
     """Print and write the trade, and print what each group of statistics earns."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--rule", default="present", help="name of the rows")
+    parser.add_argument("--opened", type=Path, metavar="OUTPUT", help="only the tests that chose nothing, with data in an output root")
     given = parser.parse_args()
+    for name, words in OPENED.items() if given.opened else ():
+        own = outcome(tried(of_split(given.opened, *words)))
+        print(name, {key: float(f"{value:.4g}") for key, value in own.items()}, flush=True)
+    if given.opened:
+        return
     rows, everything = [], []
     for name, drives in SETS.items():
         trials = tried(drives())
