@@ -149,7 +149,7 @@ def test_a_flag_is_taken_back_after_the_fault():
     part = np.array(drive["yaw_rate"])
     part[ONSET : ONSET + 100] += 0.05
     found = judged(model_of(), drive, yaw_rate=part)
-    assert found.status[ONSET + 1 : ONSET + 100].all()
+    assert found.status[ONSET + round(0.1 * RATE) : ONSET + 100].all()
     assert found.status[ONSET + 100 : ONSET + 100 + round(HOLD_SECONDS * RATE)].all()
     assert not found.status[ONSET + round(20 * RATE) :].any()
 

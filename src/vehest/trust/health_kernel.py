@@ -167,6 +167,7 @@ class State(NamedTuple):
     error: Annotated[FloatArray, "channels"]  # ε
     scaled: Annotated[FloatArray, "channels"]  # ε over its level at this speed
     clipped: Annotated[FloatArray, "channels"]
+    ratio: Annotated[FloatArray, "channels"]  # likelihood ratio of a jump
     score: Annotated[FloatArray, "channels"]  # S⁻¹ε
     clipped_score: Annotated[FloatArray, "channels"]
     stepped: Annotated[FloatArray, "channels"]  # sum over a step
@@ -328,7 +329,7 @@ def _look_at_innovations(model, state):  # type: ignore[no-untyped-def]
     found = state.statistics
     for i in range(model.layout.channels):
         z = abs(state.score[i]) / math.sqrt(model.precision[i, i]) if model.modelled[i] == 1 else 0.0
-        found.jump[i] = z / math.sqrt(CALM + state.energy[i])
+        state.ratio[i], found.jump[i] = z, z / math.sqrt(CALM + state.energy[i])
         if i == model.layout.yaw_rate:
             state.since_jump[0] = 0.0 if found.jump[i] > model.limits.jump[i] else state.since_jump[0] + 1.0
         normed = state.innovation[0, i] / model.deviation[i]
@@ -473,16 +474,18 @@ def _find_reason(slow, model, state):  # type: ignore[no-untyped-def]
         over = every[m] * model.inverse.every[m]
         highest = max(highest, over)
         if over >= 1.0:
-            size = every[m] if model.kind[m] == OFFSET else over  # likelihood ratios compare with each other as they are
-            weight = model.priority[m] + 0.5 * size / (1.0 + size)
+            weight = model.priority[m] + 0.5 * over / (1.0 + over)
             if weight > weightiest:
                 weightiest, best = weight, m
     if best < 0:
         return FREE, 0, -1, highest
     kind, channel, partner = model.kind[best], model.accused[best], model.partner[best]
-    if kind == OFFSET:
-        for i in range(model.layout.channels):
-            channel = i if state.statistics.offset[i] > state.statistics.offset[channel] else channel
+    if kind in (JUMP, OFFSET):  # likelihood ratios of the same form compare with each other as they are
+        C, likeliest = model.layout.channels, -1.0
+        for i in range(C):
+            ratio = state.ratio[i] if best < C else every[best // C * C + i]
+            if ratio > likeliest:
+                likeliest, channel = ratio, i
     if kind == LOCKED:
         kind = _wheel(channel, slow, state)
     elif kind in (OFFSET, CONTRADICTION):

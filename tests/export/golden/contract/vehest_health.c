@@ -357,6 +357,7 @@ static void look_at_innovations(vehest_health *h)
     for (int32_t i = 0; i < C; i++) {
         const vehest_real z = MODELLED[i] ? (VEHEST_ABS(h->score[i]) / VEHEST_SQRT(PRECISION[i][i])) : 0.0f;
         const vehest_real normed = h->innovation[0][i] / DEVIATION[i];
+        h->ratio[i] = z;
         h->statistic[AT_JUMP + i] = z / VEHEST_SQRT(CALM + h->energy[i]);
         if (i == 1) {
             h->since_jump = (h->statistic[AT_JUMP + i] > LIMIT[AT_JUMP + i]) ? 0U : counted(h->since_jump);
@@ -600,8 +601,7 @@ static suspicion find_reason(const vehest_health *h, int32_t slow, vehest_real *
         const vehest_real over = h->statistic[m] * INVERSE[m];
         *highest = larger(*highest, over);
         if (over >= 1.0f) {
-            const vehest_real size = (KIND[m] == OFFSET) ? h->statistic[m] : over; /* likelihood ratios compare with each other as they are */
-            const vehest_real weight = PRIORITY[m] + (0.5f * size / (1.0f + size));
+            const vehest_real weight = PRIORITY[m] + (0.5f * over / (1.0f + over));
             if (weight > weightiest) {
                 weightiest = weight;
                 best = m;
@@ -612,9 +612,12 @@ static suspicion find_reason(const vehest_health *h, int32_t slow, vehest_real *
         found.kind = KIND[best];
         found.channel = ACCUSED[best];
         found.partner = PARTNER[best];
-        if (found.kind == OFFSET) {
+        if ((found.kind == JUMP) || (found.kind == OFFSET)) { /* likelihood ratios of the same form compare with each other as they are */
+            vehest_real likeliest = -1.0f;
             for (int32_t i = 0; i < C; i++) {
-                if (h->statistic[AT_OFFSET + i] > h->statistic[AT_OFFSET + found.channel]) {
+                const vehest_real ratio = (best < C) ? h->ratio[i] : h->statistic[(best - (best % C)) + i];
+                if (ratio > likeliest) {
+                    likeliest = ratio;
                     found.channel = i;
                 }
             }

@@ -42,6 +42,7 @@ typedef struct {
     vehest_real error[VEHEST_CHANNELS]; /* innovation e */
     vehest_real scaled[VEHEST_CHANNELS]; /* e over its level at this speed */
     vehest_real clipped[VEHEST_CHANNELS];
+    vehest_real ratio[VEHEST_CHANNELS]; /* likelihood ratio of a jump */
     vehest_real score[VEHEST_CHANNELS]; /* S^-1 e */
     vehest_real clipped_score[VEHEST_CHANNELS];
     vehest_real stepped[VEHEST_CHANNELS]; /* sum over a step */
