@@ -45,14 +45,13 @@ SHORT_SECONDS = 0.25  # over which both sides of a relation are averaged before 
 
 BLOCK_SECONDS = 5.0  # whose largest values set the limits
 HOURS = 100.0  # in which healthy drives are to exceed a limit about once
-BETWEEN_DRIVES = 1.4  # by which another day's drive may exceed what was seen: tyres, track, wind
+BETWEEN_DRIVES = 1.25  # by which another day's drive may exceed what was seen: tyres, track, wind
 LEAST_VALUES = 10.0  # independent ones that any time holds
 LEAST_RUN = 4.0  # equal samples in a row
 LEAST_SHARE = 0.3
 LEAST = {"normal": 4.5, "slip": 0.3, "largest": 0.0}  # limits of statistics that are N(0, 1) without a fault, and of slip
 APART = 2.0  # times the next largest block, from which on a block is a fault of the recording itself
 MOST_APART = 0.01  # share of blocks that may be
-DOMAIN_MARGIN = 1.25  # of a channel over its largest value in training, beyond which it is outside what was learnt
 SPIN_MARGIN = 1.3
 HEAVIEST = 5.0  # of the mean weight of a sample, that one sample may have in a likelihood ratio
 STILL = {"yaw_rate": 0.05, "ay": 0.5}  # rad/s, m/s²: below which a car may be taken to stand
@@ -391,7 +390,7 @@ def limits_from(maxima: FloatArray, statistics: Sequence[Statistic], step: float
         if statistic.rule == "share":  # half way to 1 at most, or a channel that often repeats itself could never be found to repeat only
             limit = min(max(top + 0.15, LEAST_SHARE), 0.5 * (1.0 + min(top, 1.0)))
         elif statistic.rule == "domain":
-            limit = DOMAIN_MARGIN
+            limit = BETWEEN_DRIVES
         else:
             limit = max(limit + 2.0, LEAST_RUN) if statistic.rule == "run" else max(limit, LEAST[statistic.rule])
         found.append(limit if limit > 0.0 and not (statistic.rule == "share" and top >= 1.0) else 1e300)
@@ -403,9 +402,9 @@ def domain_verdict(model: HealthModel, samples: Mapping[str, FloatArray]) -> str
     outside, named = np.zeros(len(next(iter(samples.values()))), bool), []
     for name, largest in zip(model.channels, model.largest, strict=True):
         values = np.nan_to_num(np.asarray(samples[name], dtype=np.float64), posinf=0.0, neginf=0.0)
-        own = np.abs(values) > DOMAIN_MARGIN * largest
+        own = np.abs(values) > BETWEEN_DRIVES * largest
         if own.any():
-            named.append((int(own.sum()), f"|{name}| above {DOMAIN_MARGIN * largest:.3g} {CHANNELS[name].unit}"))
+            named.append((int(own.sum()), f"|{name}| above {BETWEEN_DRIVES * largest:.3g} {CHANNELS[name].unit}"))
         outside |= own
     if not named:
         return ""
