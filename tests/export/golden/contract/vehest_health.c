@@ -357,10 +357,11 @@ static void look_at_innovations(vehest_health *h)
     for (int32_t i = 0; i < C; i++) {
         const vehest_real z = MODELLED[i] ? (VEHEST_ABS(h->score[i]) / VEHEST_SQRT(PRECISION[i][i])) : 0.0f;
         const vehest_real normed = h->innovation[0][i] / DEVIATION[i];
+        const vehest_real jump = z / VEHEST_SQRT(CALM + h->energy[i]);
         h->ratio[i] = z;
-        h->statistic[AT_JUMP + i] = z / VEHEST_SQRT(CALM + h->energy[i]);
+        h->statistic[AT_JUMP + i] = jump;
         if (i == 1) {
-            h->since_jump = (h->statistic[AT_JUMP + i] > LIMIT[AT_JUMP + i]) ? 0U : counted(h->since_jump);
+            h->since_jump = (jump > LIMIT[i]) ? 0U : counted(h->since_jump);
         }
         h->energy[i] += FORGET_ENERGY * ((normed * normed) - h->energy[i]);
     }
