@@ -19,7 +19,7 @@ PILOTS ?= build/pilots
 SEED ?= 0
 MINUTES ?= 30
 
-.PHONY: reference_minutes help install run test test-durations lint test-apart test-page test-export test-cluster bench-launchers export_all test-docs test-fuzz test-wheel test-processes test-slow ui docs reference docs-site screenshots clean ferrari_drive ksnn learned_ukf learned_ukf_sim heavy_ekf cnn_ukf proving_ground real_cars leave_one_out sim_to_real trust online_faults own_car_proposals front_door own_car pretrained unseen_car unseen_car_record sweep bench-training bench-ingest bench-simulation bench-ksnn bench-ukf bench-ekf bench-cnn bench-trust bench-workflow replay_check replay_30min examples fuzz kills golden lock pilots pilots-compare
+.PHONY: reference_minutes help install run test test-durations lint test-apart test-page test-export test-cluster bench-launchers export_all test-docs test-fuzz test-wheel test-processes test-slow ui docs reference docs-site screenshots clean ferrari_drive ksnn learned_ukf learned_ukf_sim heavy_ekf cnn_ukf proving_ground real_cars leave_one_out sim_to_real trust online_faults own_car_proposals front_door own_car pretrained unseen_car unseen_car_record sweep bench-training bench-ingest bench-simulation bench-ksnn bench-ukf bench-ekf bench-cnn bench-trust bench-health bench-workflow replay_check replay_30min examples fuzz kills golden lock pilots pilots-compare
 
 help: ## list the targets
 	@grep -hE '^[a-z0-9_-]+:.*?## ' $(MAKEFILE_LIST) | awk -F':.*?## ' '{printf "  make %-16s %s\n", $$1, $$2}'
@@ -189,6 +189,9 @@ bench-simulation: $(INSTALLED) ## the compiled plant against plain Python, data 
 
 bench-trust: $(INSTALLED) ## what contract, band and health cost a step online and a minute in batch, against the estimator alone
 	$(BIN)/python benchmarks/trust.py
+
+bench-health: $(INSTALLED) ## alarms of health an hour against faults found, as its limits rise; needs VEHEST_DATA (15 minutes on one core)
+	$(BIN)/python benchmarks/health_statistics.py
 
 bench-ekf: $(INSTALLED) ## ten hours at 20 Hz through the compiled filter whose tyres adapt, against the same filter step by step
 	$(BIN)/python benchmarks/ekf.py

@@ -55,9 +55,9 @@ def trust_by_hand():
         spin=(0.8, 12.0),
         speeds=(5.0, 10.0, 20.0, 30.0, 40.0),
         levels=((0.5, 0.5, 0.5), (0.8, 0.8, 0.8), (1.0, 1.0, 1.0), (1.2, 1.2, 1.2), (1.5, 1.5, 1.5)),
-        healthy=((0.01, 0.0, 0.02), (0.0, 0.01, 0.0)),
-        heaviest=((10.0, 20.0, 30.0), (10.0, 20.0, 30.0)),
-        limits=tuple(4.0 + 0.25 * number for number in range(54)),
+        healthy=((0.01, 0.0, 0.02),),
+        heaviest=((10.0, 20.0, 30.0),),
+        limits=tuple(4.0 + 0.25 * number for number in range(22)),
     )
     own = {name: ChannelLimits(-size, size, size / 4.0, 0.5) for name, size in zip(channels, (120.0, 4.0, 40.0), strict=True)}
     v, angle = (Quantity(WEIGHTS, floor, (0.5, 1.0, 1.75, 2.5), (False,) * 4, 10.0) for floor in (0.02, 0.001))

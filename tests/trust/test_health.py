@@ -82,6 +82,7 @@ FAULTS = {
     "unit of the yaw rate": ("yaw_rate", np.degrees, kernel.UNIT, 0.1),
     "unit of ay": ("ay", lambda part: part / 9.81, kernel.UNIT, 1.0),
     "offset of ay": ("ay", lambda part: part + 1.5, kernel.OFFSET, 1.0),
+    "offset of ax": ("ax", lambda part: part + 1.0, kernel.OFFSET, 1.0),
     "offset of the yaw rate": ("yaw_rate", lambda part: part + 0.05, kernel.OFFSET, 0.5),
     "held": ("ay", lambda part: np.repeat(part[::8], 8)[: len(part)], kernel.FROZEN, 0.5),
 }
@@ -95,7 +96,11 @@ def test_planted_faults_are_flagged_with_their_reason(fault):
     assert (found.status[ONSET - 50 : ONSET] == VALID).all()
     assert (found.status[ONSET : ONSET + round(seconds * RATE)] > VALID).any()
     reason = usual_reason(found, ONSET + round(2 * RATE), ONSET + round(6 * RATE))
-    assert (reason_kind(reason), reason_channel(reason)) == (kind, channel), reason_in_words(reason)
+    alike = (
+        {"steer"} if fault == "offset of the yaw rate" else set()
+    )  # the steering angle's relation holds as little as with an offset of its own
+    assert reason_kind(reason) == kind, reason_in_words(reason)
+    assert reason_channel(reason) in {channel} | alike, reason_in_words(reason)
 
 
 def test_without_a_steering_angle_ay_and_yaw_rate_contradict_each_other():
@@ -133,10 +138,7 @@ def test_noise_jumps_and_lost_channels_are_told():
     assert reason_in_words(found.reason[ONSET]) == "ay is not measured"
     drive, generator = measured_drive(3), np.random.default_rng(0)
     noisy = judged(model_of(), drive, ax=after(drive["ax"], lambda part: part + 1.0 * generator.standard_normal(len(part))))
-    assert reason_in_words(noisy.reason[ONSET + round(RATE)]) in {
-        "ax is noisier than where the model learnt",
-        "ax has another scale than the other channels",
-    }
+    assert reason_in_words(noisy.reason[ONSET + round(RATE)]) == "ax jumps, or is noisier than where the model learnt"
     spiky = np.array(drive["steer"])
     spiky[ONSET] += 0.1
     assert judged(model_of(), drive, steer=spiky).status[ONSET] > VALID
@@ -147,7 +149,7 @@ def test_a_flag_is_taken_back_after_the_fault():
     part = np.array(drive["yaw_rate"])
     part[ONSET : ONSET + 100] += 0.05
     found = judged(model_of(), drive, yaw_rate=part)
-    assert found.status[ONSET + 1 : ONSET + 100].all()
+    assert found.status[ONSET + round(0.1 * RATE) : ONSET + 100].all()
     assert found.status[ONSET + 100 : ONSET + 100 + round(HOLD_SECONDS * RATE)].all()
     assert not found.status[ONSET + round(20 * RATE) :].any()
 

@@ -15,7 +15,7 @@ from vehest.estimators.base import Estimator
 from vehest.export.program import TOLERANCES, context_of, program_files, vector_files
 from vehest.export.rendering import Precision, render
 from vehest.export.vectors import SECONDS, in_float64
-from vehest.trust import health, health_kernel
+from vehest.trust import health
 from vehest.trust.contract import GuardedStepper
 from vehest.trust.record import Trust
 from vehest.version import __version__
@@ -111,7 +111,7 @@ def _reasons() -> dict[int, str]:
     return {
         kind: text.format(channel="CHANNEL", partner="PARTNER")
         for kind, (text, _) in health.REASONS.items()
-        if kind and kind not in (health_kernel.SMOOTH, health_kernel.LATE)
+        if kind and kind not in health.RETIRED
     }
 
 

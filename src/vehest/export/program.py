@@ -26,7 +26,6 @@ KINDS = (
     "HELD",
     "JUMP",
     "OFFSET",
-    "SCALE",
     "SIGN",
     "UNIT",
     "CONTRADICTION",

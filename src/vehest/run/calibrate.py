@@ -30,7 +30,7 @@ from vehest.trust.health import learn_health
 from vehest.trust.record import TRUST, About, Trust, read_trust, write_trust
 
 STAGE = "calibrate"
-VERSION = "2"
+VERSION = "3"
 WARM_UP_SECONDS = 10.0  # before a range, as far as its recording goes
 SKIP_SECONDS = 1.5  # at the start of each range, as in evaluations
 

@@ -30,7 +30,7 @@ from vehest.trust.contract import estimate_guarded
 from vehest.trust.faults import Fault, Severity, inject
 from vehest.trust.record import Trust, is_other_vehicle
 
-VERSION = "1"
+VERSION = "2"
 NONE = {"name": "none"}
 DRAWN_START = (0.2, 0.4)  # shares of a range, between which a start is drawn
 

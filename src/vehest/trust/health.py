@@ -26,7 +26,7 @@ from vehest.trust import health_kernel as kernel
 from vehest.trust.autoregression import Autoregression, fit_autoregression, learn_noise_levels
 from vehest.trust.front_end import behind_front_end
 from vehest.trust.guard import ENDLESS, longest_run, stops_of
-from vehest.trust.health_kernel import N_FORMS, N_LEVELS, Layout, Model, State, health_kernel
+from vehest.trust.health_kernel import N_LEVELS, Layout, Model, State, health_kernel
 from vehest.trust.named_arrays import allocated, views
 from vehest.trust.relations import FEATURES, RATE, Relation, learn_relations, least_speed_of, residuals_of, speed_channel, without_glitches
 
@@ -38,9 +38,10 @@ SPIN_SECONDS = 0.3
 SETTLE_SECONDS = 0.5  # after a start, before predictions count
 SHARE_SECONDS = 0.5  # over which equal samples are counted
 BRAKING_SECONDS = 0.2  # over which ax is averaged
-ENERGY_SECONDS = (0.1, 0.5)
-RATIO_SECONDS = (0.25, 1.0, 4.0, 12.0)
-RELATION_SECONDS = (0.25, 1.0, 12.0)
+ENERGY_SECONDS = 0.5  # over which what is usual is known, before a jump
+OFFSET_SECONDS = 4.0
+RELATION_SECONDS = 1.0
+SHORT_SECONDS = 0.25  # over which both sides of a relation are averaged before their signs and sizes are compared
 
 BLOCK_SECONDS = 5.0  # whose largest values set the limits
 HOURS = 100.0  # in which healthy drives are to exceed a limit about once
@@ -48,10 +49,9 @@ BETWEEN_DRIVES = 1.25  # by which another day's drive may exceed what was seen: 
 LEAST_VALUES = 10.0  # independent ones that any time holds
 LEAST_RUN = 4.0  # equal samples in a row
 LEAST_SHARE = 0.3
-LEAST = {"normal": 4.5, "slip": 0.3}  # limits of statistics that are N(0, 1) without a fault, and of slip
+LEAST = {"normal": 4.5, "slip": 0.3, "largest": 0.0}  # limits of statistics that are N(0, 1) without a fault, and of slip
 APART = 2.0  # times the next largest block, from which on a block is a fault of the recording itself
 MOST_APART = 0.01  # share of blocks that may be
-DOMAIN_MARGIN = 1.1  # of a channel over its largest value in training, beyond which it is outside what was learnt
 SPIN_MARGIN = 1.3
 HEAVIEST = 5.0  # of the mean weight of a sample, that one sample may have in a likelihood ratio
 STILL = {"yaw_rate": 0.05, "ay": 0.5}  # rad/s, m/s²: below which a car may be taken to stand
@@ -75,7 +75,7 @@ REASONS: dict[int, tuple[str, float]] = {
     kernel.MISSING: ("{channel} is not measured", 0.0),
     kernel.FROZEN: ("{channel} is frozen", 8.0),
     kernel.HELD: ("{channel} repeats its samples", 7.0),
-    kernel.JUMP: ("{channel} jumps", 2.0),
+    kernel.JUMP: ("{channel} jumps, or is noisier than where the model learnt", 2.0),
     kernel.NOISE: ("{channel} is noisier than where the model learnt", 2.5),
     kernel.SMOOTH: ("{channel} varies less than where the model learnt", 1.5),
     kernel.OFFSET: ("{channel} has an offset against the other channels", 4.0),
@@ -92,10 +92,12 @@ REASONS: dict[int, tuple[str, float]] = {
     BEYOND_SPEED: ("the estimate exceeds what the speed allows", 0.0),
     TOO_WIDE: ("the band of sideslip exceeds 6 degrees", 0.0),
 }
-"""Kind of a reason -> text, and priority over others: the most specific is given. SMOOTH and LATE are of earlier versions.
+"""Kind of a reason -> text, and priority over others: the most specific is given.
 
 A code is 10000 times the kind, 100 times the channel's number, and the partner's.
 """
+
+RETIRED = (kernel.NOISE, kernel.SMOOTH, kernel.SCALE, kernel.LATE)  # kinds of earlier versions
 
 
 def reason_in_words(code: float) -> str:
@@ -141,8 +143,8 @@ class HealthModel:
     spin: tuple[float, float]  # yaw rate, and its product with the speed, beyond which the car spins if they rise without a jump
     speeds: tuple[float, ...]  # at which the noise was looked at [unit of the speed channel]
     levels: tuple[tuple[float, ...], ...]  # size of the innovations at these speeds, in their deviations, one row a speed
-    healthy: tuple[tuple[float, ...], ...] = ()  # offset and scale that the likelihood ratios find in each channel of healthy drives
-    heaviest: tuple[tuple[float, ...], ...] = ()  # weight that one sample may have in them
+    healthy: tuple[tuple[float, ...], ...] = ()  # offset that the likelihood ratio finds in each channel of healthy drives, one row
+    heaviest: tuple[tuple[float, ...], ...] = ()  # weight that one sample may have in it, one row
     limits: tuple[float, ...] = ()  # of every statistic, in the order of `statistics`
     stops: tuple[tuple[float, float], ...] = ()  # of each channel, between which alone it is expected to move
     limits_behind_front_end: tuple[float, ...] = ()  # the same for samples that a filter from a faster bus has passed (`front_end`)
@@ -150,10 +152,9 @@ class HealthModel:
     def __post_init__(self) -> None:
         channels, relations = len(self.channels), len(self.relations)
         for name in ("healthy", "heaviest"):
-            object.__setattr__(self, name, getattr(self, name)[:N_FORMS])
+            object.__setattr__(self, name, getattr(self, name)[:1])
         for name in ("limits", "limits_behind_front_end"):
-            if len(getattr(self, name)) == 23 * channels + 4 * relations:
-                object.__setattr__(self, name, _earlier_limits(getattr(self, name), channels, relations))
+            object.__setattr__(self, name, _present_limits(getattr(self, name), channels, relations))
 
     @property
     def layout(self) -> Layout:
@@ -162,30 +163,22 @@ class HealthModel:
         columns = [names.index(name) if name in names else -1 for name in ("yaw_rate", speed_channel(names) or "", "ay", "ax")]
         rows = [max(round(seconds * self.rate_hz), 1) for seconds in (HOLD_SECONDS, BRIDGED_SECONDS, SPIN_SECONDS)]
         rows.append(max(round(SETTLE_SECONDS * self.rate_hz), len(self.coefficients)))
-        memories = (len(ENERGY_SECONDS), len(RATIO_SECONDS), len(RELATION_SECONDS))
-        return Layout._make([len(names), len(self.coefficients), len(self.relations), *memories, *columns, *rows, len(self.statistics)])
+        return Layout._make([len(names), len(self.coefficients), len(self.relations), *columns, *rows, len(self.statistics)])
 
     @property
     def statistics(self) -> list[Statistic]:
         """All statistics, in the kernel's order."""
-        found: list[Statistic] = []
-
-        def add(kind: int, rule: str, memories: Sequence[float] = (0.0,)) -> None:
-            found.extend(Statistic(kind, name, "", seconds, rule) for name in self.channels for seconds in memories)
-
-        add(kernel.JUMP, "normal")
-        add(kernel.JUMP, "normal")
-        add(kernel.NOISE, "largest", ENERGY_SECONDS)
-        add(kernel.JUMP, "normal")
-        for kind in (kernel.OFFSET, kernel.SCALE):
-            add(kind, "normal", RATIO_SECONDS)
-        add(kernel.FROZEN, "run")
-        add(kernel.HELD, "share")
-        add(kernel.OUTSIDE, "domain")
-        add(kernel.LOCKED, "slip")
-        for own in self.relations:
-            found.extend(Statistic(kernel.CONTRADICTION, own.target, own.partner, seconds, "largest") for seconds in RELATION_SECONDS)
-        return found
+        kinds = {
+            "normal": ((kernel.JUMP, 0.0), (kernel.JUMP, 0.0), (kernel.OFFSET, OFFSET_SECONDS)),
+            "run": ((kernel.FROZEN, 0.0),),
+            "share": ((kernel.HELD, 0.0),),
+            "domain": ((kernel.OUTSIDE, 0.0),),
+            "slip": ((kernel.LOCKED, 0.0),),
+        }
+        own = [
+            Statistic(kind, name, "", seconds, rule) for rule, those in kinds.items() for kind, seconds in those for name in self.channels
+        ]
+        return own + [Statistic(kernel.CONTRADICTION, one.target, one.partner, RELATION_SECONDS, "largest") for one in self.relations]
 
     def start(self) -> FloatArray:
         """State before the first row."""
@@ -197,7 +190,7 @@ class HealthModel:
         """The kernel's `Model` in one array.
 
         Args:
-            forgets: whether the likelihood ratios do; if not, they are sums over all rows.
+            forgets: whether the likelihood ratio of an offset does; if not, it is a sum over all rows.
             behind_front_end: whether rows come through the filter from a faster bus.
         """
         limits = (self.limits_behind_front_end if behind_front_end else ()) or self.limits
@@ -205,10 +198,8 @@ class HealthModel:
         tables, step, coefficients = allocated(Model, layout), 1.0 / self.rate_hz, np.array(self.coefficients)
         model, _ = views(Model, tables, layout)
 
-        def forgetting(*seconds: float) -> FloatArray:
-            return 1.0 - np.exp(-step / np.array(seconds))
-
-        settings = [*self.standstill, step, *self.spin, *forgetting(SHARE_SECONDS, BRAKING_SECONDS)]
+        seconds = (SHARE_SECONDS, BRAKING_SECONDS, ENERGY_SECONDS, OFFSET_SECONDS if forgets else math.inf, SHORT_SECONDS, RELATION_SECONDS)
+        settings = [*self.standstill, step, *self.spin, *(1.0 - np.exp(-step / np.array(seconds)))]
         for place, value in zip((*model.layout, *model.settings), (*layout, *settings), strict=True):
             place[...] = value
         for row, relation in enumerate(self.relations):
@@ -225,9 +216,7 @@ class HealthModel:
         model.largest[:] = np.maximum(self.largest, 1e-12)
         model.settled_gain[:] = (np.eye(layout.channels) - coefficients.sum(0)).T
         model.steps[:], model.step_power[:] = self._step_filter()
-        model.healthy[:], model.heaviest[:] = self.healthy or 0.0, self.heaviest or math.inf
-        model.forget_energy[:], model.forget_average[:] = forgetting(*ENERGY_SECONDS), forgetting(*RELATION_SECONDS)
-        model.forget_ratio[:] = forgetting(*RATIO_SECONDS) if forgets else 0.0
+        model.healthy[:], model.heaviest[:] = self.healthy[0] if self.healthy else 0.0, self.heaviest[0] if self.heaviest else math.inf
         model.stops[:] = np.array(self.stops or [(-ENDLESS, ENDLESS)]).T
         model.limits.every[:] = limits or math.inf
         model.inverse.every[:] = 1.0 / model.limits.every
@@ -251,11 +240,16 @@ class HealthModel:
         return (precision @ left)[::-1].transpose(0, 2, 1), np.einsum("jqm,qr,jrn->mn", left, precision, left)
 
 
-def _earlier_limits(limits: Sequence[float], channels: int, relations: int) -> tuple[float, ...]:
-    """Limits of earlier versions without those of retired statistics: energy over 2 s, its inverse, delays, relations over 4 s."""
-    jump, calm, energy, _, step, *forms, values, means = np.split(np.array(limits), channels * np.cumsum([1, 1, 3, 1, 1, 4, 4, 4, 4]))
-    kept = [jump, calm, energy.reshape(channels, 3)[:, :2], step, *forms[:2], values]
-    return tuple(np.concatenate([part.ravel() for part in (*kept, means.reshape(relations, 4)[:, [0, 1, 3]])]).tolist())
+def _present_limits(limits: Sequence[float], channels: int, relations: int) -> tuple[float, ...]:
+    """Limits without those of statistics that earlier versions had: 23 C + 4 R of them at first, then 17 C + 3 R, now 7 C + R."""
+    forms = {23 * channels + 4 * relations: 7 * channels, 17 * channels + 3 * relations: 5 * channels}.get(len(limits))
+    if forms is None:
+        return tuple(limits)
+    given, times = np.array(limits), 4 if forms == 7 * channels else 3
+    values, means = np.split(given[len(given) - 4 * channels - times * relations :], [4 * channels])
+    offsets = given[forms : forms + 4 * channels].reshape(channels, 4)[:, 2]
+    kept = [given[channels : 2 * channels], given[forms - channels : forms], offsets, values, means.reshape(relations, times)[:, 1]]
+    return tuple(np.concatenate(kept).tolist())
 
 
 def health_rows(packed: FloatArray, rows: FloatArray, measured: NDArray[np.bool_], state: FloatArray) -> Health:
@@ -343,18 +337,18 @@ def _plain(values: FloatArray) -> Any:
 
 
 def _with_healthy(model: HealthModel, recordings: Sequence[Recording]) -> HealthModel:
-    """With the offset and scale that the likelihood ratios find over all of training, and `HEAVIEST` times their mean weight."""
+    """With the offset that the likelihood ratio finds over all of training, and `HEAVIEST` times its mean weight."""
     packed = replace(model, limits=(), healthy=()).packed(forgets=False)
-    total, weight = np.zeros((2, len(model.channels), N_FORMS))
+    total, weight = np.zeros((2, len(model.channels)))
     for recording in recordings:
         memory, rows = model.start(), np.ascontiguousarray(recording.stack(model.channels))
         health_rows(packed, rows, np.isfinite(rows), memory)
         state, _ = views(State, memory, model.layout)
-        total += state.ratio_sum[:, 0]
-        weight += state.ratio_weight[:, 0]
+        total += state.ratio_sum
+        weight += state.ratio_weight
     found = total / np.maximum(weight, 1e-300)
     heaviest = HEAVIEST * weight / sum(len(recording) for recording in recordings)
-    return replace(model, healthy=_plain(found.T), heaviest=_plain(heaviest.T))
+    return replace(model, healthy=(_plain(found),), heaviest=(_plain(heaviest),))
 
 
 def block_maxima(model: HealthModel, recordings: Sequence[Recording]) -> FloatArray:
@@ -396,8 +390,8 @@ def limits_from(maxima: FloatArray, statistics: Sequence[Statistic], step: float
         if statistic.rule == "share":  # half way to 1 at most, or a channel that often repeats itself could never be found to repeat only
             limit = min(max(top + 0.15, LEAST_SHARE), 0.5 * (1.0 + min(top, 1.0)))
         elif statistic.rule == "domain":
-            limit = DOMAIN_MARGIN
-        elif statistic.rule != "largest":
+            limit = BETWEEN_DRIVES
+        else:
             limit = max(limit + 2.0, LEAST_RUN) if statistic.rule == "run" else max(limit, LEAST[statistic.rule])
         found.append(limit if limit > 0.0 and not (statistic.rule == "share" and top >= 1.0) else 1e300)
     return tuple(found)
@@ -408,9 +402,9 @@ def domain_verdict(model: HealthModel, samples: Mapping[str, FloatArray]) -> str
     outside, named = np.zeros(len(next(iter(samples.values()))), bool), []
     for name, largest in zip(model.channels, model.largest, strict=True):
         values = np.nan_to_num(np.asarray(samples[name], dtype=np.float64), posinf=0.0, neginf=0.0)
-        own = np.abs(values) > DOMAIN_MARGIN * largest
+        own = np.abs(values) > BETWEEN_DRIVES * largest
         if own.any():
-            named.append((int(own.sum()), f"|{name}| above {DOMAIN_MARGIN * largest:.3g} {CHANNELS[name].unit}"))
+            named.append((int(own.sum()), f"|{name}| above {BETWEEN_DRIVES * largest:.3g} {CHANNELS[name].unit}"))
         outside |= own
     if not named:
         return ""

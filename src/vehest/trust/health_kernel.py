@@ -4,14 +4,10 @@ rows -> x, y -> innovations ε -> statistics -> status, reason; the model and th
 
 With φ(x) features of yaw rate and speed, channels x become y = x - W φ(x), of which an autoregression predicts the next sample; ε is its
 error, in units of the noise at that speed, and S its covariance. A fault that adds b to channel i moves y by J b, J = ∂y/∂xᵢ, and the
-innovations by h b; one that multiplies it by s moves them by (s - 1)/s of what the channel, as it is measured, puts into them:
-
-    offset   h = J - Σ_l A_l J           scale   h_k = J x_k - Σ_l A_l J x_{k-l}
-
-x_k being taken as predicted, which keeps the noise in ε out of h. Each form is looked for by its likelihood ratio over exponentially
-forgotten samples, z = Σ λʲ hᵀS⁻¹ε / √(Σ λ²ʲ hᵀS⁻¹h), which is N(0, 1) without a fault (Willsky & Jones, A generalized likelihood ratio
-approach to the detection and estimation of jumps in linear systems, IEEE Trans. Automatic Control 21 (1), 1976; windows replaced by
-forgetting). Innovations count with at most `CLIP` deviations in it, and no sample with more than its share, so that a kerb is no offset.
+innovations by h b, h = J - Σ_l A_l J once it lasts. An offset is looked for by its likelihood ratio over exponentially forgotten samples,
+z = Σ λʲ hᵀS⁻¹ε / √(Σ λ²ʲ hᵀS⁻¹h), which is N(0, 1) without a fault (Willsky & Jones, A generalized likelihood ratio approach to the
+detection and estimation of jumps in linear systems, IEEE Trans. Automatic Control 21 (1), 1976; windows replaced by forgetting).
+Innovations count with at most `CLIP` deviations in it, and no sample with more than its share, so that a kerb is no offset.
 """
 
 from __future__ import annotations
@@ -32,7 +28,7 @@ part = partial(compiling.part, _nrt=False)  # arrays are views without reference
 
 PLAUSIBLE = 1000.0  # times the largest size in training, beyond which a value counts as not measured
 CLIP = 4.0  # standard deviations
-STEP_CLIP = 8.0  # the same for steps
+STEP_CLIP = 8.0  # the same for steps and for the energy
 CALM = 0.3  # of the mean energy: least energy of a calm stretch
 CAP = 2.0  # times its limit: a statistic remembers no more, so that it is down again soon after a fault
 INVALID = 1.5  # times its limit, from which on an estimate is invalid and not only degraded
@@ -48,7 +44,6 @@ INSTANT_FEATURES = 6  # that relations which hold for each sample may use
 FIRST_SMALL = 9  # of features: those of drag, which say nothing of signs and units
 N_FEATURES = 13  # this and the next two stand as digits in the shapes below
 N_LEVELS = 5  # speeds at which the noise is known
-N_FORMS = 2  # offset, scale
 
 FREE, MISSING, FROZEN, HELD, JUMP, NOISE, SMOOTH, OFFSET, SCALE, SIGN, UNIT, CONTRADICTION, OUTSIDE, SPIN, LOCKED, DROPOUT, LATE = range(17)
 """Kinds of reasons."""
@@ -60,9 +55,6 @@ class Layout(NamedTuple):
     channels: int
     order: int
     relations: int
-    energies: int
-    ratios: int
-    averages: int
     yaw_rate: int
     speed: int
     ay: int
@@ -85,22 +77,24 @@ class Settings(NamedTuple):
     spin_turning: float
     forget_share: float
     forget_ax: float
+    forget_energy: float
+    forget_offset: float
+    forget_short: float  # of relations, for signs and units
+    forget_relation: float
 
 
 class Statistics(NamedTuple):
     """A value of each statistic, in the order of `HealthModel.statistics`; ``every`` is all of them in one array."""
 
     every: Annotated[FloatArray, "statistics"]
-    jump: Annotated[FloatArray, "channels"]
-    calm: Annotated[FloatArray, "channels"]  # jumps against the energy of the last half second
-    energy: Annotated[FloatArray, "channels energies"]
+    jump: Annotated[FloatArray, "channels"]  # innovation against its energy in the last half second
     step: Annotated[FloatArray, "channels"]  # likelihood ratio of a step that began p samples ago
-    form: Annotated[FloatArray, "2 channels ratios"]  # likelihood ratios of offset and scale
+    offset: Annotated[FloatArray, "channels"]  # likelihood ratio
     run: Annotated[FloatArray, "channels"]  # equal samples in a row
     share: Annotated[FloatArray, "channels"]  # of equal samples
     domain: Annotated[FloatArray, "channels"]  # size over the largest in training
     slip: Annotated[FloatArray, "channels"]  # of wheels
-    relation: Annotated[FloatArray, "relations averages"]  # means of the residuals of relations
+    relation: Annotated[FloatArray, "relations"]  # means of the residuals of relations
 
 
 class Model(NamedTuple):
@@ -122,11 +116,8 @@ class Model(NamedTuple):
     settled_gain: Annotated[FloatArray, "channels channels"]  # 1 - Σ A_l [m, q]
     steps: Annotated[FloatArray, "order channels channels"]  # weight of a former innovation in q on a step in m [lag, m, q]
     step_power: Annotated[FloatArray, "channels channels"]
-    healthy: Annotated[FloatArray, "2 channels"]  # likelihood ratios of healthy drives
-    heaviest: Annotated[FloatArray, "2 channels"]  # largest weight of one sample in them
-    forget_energy: Annotated[FloatArray, "energies"]
-    forget_ratio: Annotated[FloatArray, "ratios"]
-    forget_average: Annotated[FloatArray, "averages"]
+    healthy: Annotated[FloatArray, "channels"]  # offsets of healthy drives
+    heaviest: Annotated[FloatArray, "channels"]  # largest weight of one sample in an offset
     stops: Annotated[FloatArray, "2 channels"]  # lower and upper, between which alone a channel is expected to move
     priority: Annotated[FloatArray, "statistics"]  # of reasons
     limits: Statistics
@@ -159,14 +150,13 @@ class State(NamedTuple):
     gap: Annotated[FloatArray, "channels"]  # rows without a sample; below zero while predictions settle again
     run: Annotated[FloatArray, "channels"]  # equal samples in a row
     share: Annotated[FloatArray, "channels"]  # of equal samples
-    past_x: Annotated[FloatArray, "order channels"]
     past_y: Annotated[FloatArray, "order channels"]
     innovation: Annotated[FloatArray, "order channels"]
-    energy: Annotated[FloatArray, "channels energies"]
-    ratio_sum: Annotated[FloatArray, "channels ratios 2"]  # Σ hᵀS⁻¹ε
-    ratio_weight: Annotated[FloatArray, "channels ratios 2"]  # Σ hᵀS⁻¹h
-    average: Annotated[FloatArray, "relations averages"]  # means of the residuals of relations
-    mean_speed: Annotated[FloatArray, "averages"]
+    energy: Annotated[FloatArray, "channels"]  # of the innovations
+    ratio_sum: Annotated[FloatArray, "channels"]  # Σ hᵀS⁻¹ε
+    ratio_weight: Annotated[FloatArray, "channels"]  # Σ hᵀS⁻¹h
+    average: Annotated[FloatArray, "relations"]  # means of the residuals of relations
+    mean_speed: Annotated[FloatArray, "2"]  # short and long
     left: Annotated[FloatArray, "relations"]  # short mean of the residual
     smooth: Annotated[FloatArray, "relations"]  # short mean of the target
     product: Annotated[FloatArray, "relations"]  # means of shown times expected, and of both squares
@@ -177,6 +167,7 @@ class State(NamedTuple):
     error: Annotated[FloatArray, "channels"]  # ε
     scaled: Annotated[FloatArray, "channels"]  # ε over its level at this speed
     clipped: Annotated[FloatArray, "channels"]
+    ratio: Annotated[FloatArray, "channels"]  # likelihood ratio of a jump
     score: Annotated[FloatArray, "channels"]  # S⁻¹ε
     clipped_score: Annotated[FloatArray, "channels"]
     stepped: Annotated[FloatArray, "channels"]  # sum over a step
@@ -208,7 +199,7 @@ def health_kernel(rows, measured, tables, memory, out, statistics):  # type: ign
         still = _describe(model, state)
         _predict(model, state)
         _look_at_innovations(model, state)
-        _look_for_forms(model, state)
+        _look_for_offsets(model, state)
         slow = _look_at_values(still, model, state)
         _look_at_relations(still, model, state)
         out[0, k], out[1, k], out[2, k] = _decide(absent, slow, model, state)
@@ -334,21 +325,15 @@ def _predict(model, state):  # type: ignore[no-untyped-def]
 
 @part()
 def _look_at_innovations(model, state):  # type: ignore[no-untyped-def]
-    """Jumps, jumps out of calm, and energy."""
-    E, found = model.layout.energies, state.statistics
+    """Jumps out of what has been usual for half a second."""
+    found = state.statistics
     for i in range(model.layout.channels):
         z = abs(state.score[i]) / math.sqrt(model.precision[i, i]) if model.modelled[i] == 1 else 0.0
-        found.jump[i] = z
-        found.calm[i] = z / math.sqrt(CALM + state.energy[i, 1])
+        state.ratio[i], found.jump[i] = z, z / math.sqrt(CALM + state.energy[i])
         if i == model.layout.yaw_rate:
-            state.since_jump[0] = 0.0 if z > model.limits.jump[i] else state.since_jump[0] + 1.0
-        normed = state.scaled[i] / model.deviation[i]
-        for e in range(E):
-            roof = CAP * model.limits.energy[i, e]
-            own = state.energy[i, e] + model.forget_energy[e] * (normed * normed - state.energy[i, e])
-            own = min(own, roof * roof)
-            state.energy[i, e] = own
-            found.energy[i, e] = math.sqrt(own)
+            state.since_jump[0] = 0.0 if found.jump[i] > model.limits.jump[i] else state.since_jump[0] + 1.0
+        normed = state.innovation[0, i] / model.deviation[i]
+        state.energy[i] += model.settings.forget_energy * (normed * normed - state.energy[i])
 
 
 @part()
@@ -361,31 +346,6 @@ def _slope(i, model, state):  # type: ignore[no-untyped-def]
             for f in range(1, INSTANT_FEATURES):
                 total -= model.instant[m, f] * (state.by_yaw_rate[f] if i == r else state.by_speed[f])
         state.slope[m] = total
-
-
-@part()
-def _effect(i, form, model, state):  # type: ignore[no-untyped-def]
-    """h: effect of one unit of a form of fault in channel i on the scaled innovations."""
-    C = model.layout.channels
-    for j in range(C):
-        state.effect[j] = 0.0
-    now = state.x[i] - state.error[i]
-    for m in range(C):
-        slope = state.slope[m]
-        if slope == 0.0:
-            continue
-        if form == 0 or m != i:  # effects on other channels by relations are taken as steady
-            steady = slope if form == 0 else slope * now
-            for j in range(C):
-                state.effect[j] += model.settled_gain[m, j] * steady
-        else:
-            state.effect[m] += slope * now
-            for lag in range(model.layout.order):
-                past = slope * state.past_x[lag, i]
-                for j in range(C):
-                    state.effect[j] -= model.lags[lag, m, j] * past
-    for j in range(C):
-        state.effect[j] /= state.level[j]
 
 
 @part()
@@ -402,47 +362,43 @@ def _look_for_step(i, counts, model, state):  # type: ignore[no-untyped-def]
 
 
 @part()
-def _look_for_form(i, form, counts, model, state):  # type: ignore[no-untyped-def]
-    """Likelihood ratios of a form of fault in channel i, over all times."""
+def _look_for_offset(i, counts, model, state):  # type: ignore[no-untyped-def]
+    """Likelihood ratio of an offset in channel i; h is its effect on the scaled innovations."""
     C, top, weight = model.layout.channels, 0.0, 0.0
-    _effect(i, form, model, state)
+    for j in range(C):
+        effect = 0.0
+        for m in range(C):
+            effect += model.settled_gain[m, j] * state.slope[m]
+        state.effect[j] = effect / state.level[j]
     for m in range(C):
         top += state.effect[m] * state.clipped_score[m]
         inner = 0.0
         for j in range(C):
             inner += model.precision[m, j] * state.effect[j]
         weight += state.effect[m] * inner
-    share = min(model.heaviest[form, i] / weight, 1.0) if counts and weight > 0.0 else 0.0
+    share = min(model.heaviest[i] / weight, 1.0) if counts and weight > 0.0 else 0.0
     top, weight = share * top, share * weight
-    top -= model.healthy[form, i] * weight
-    for g in range(model.layout.ratios):
-        keep = 1.0 - model.forget_ratio[g]
-        above = keep * state.ratio_sum[i, g, form] + top
-        below = keep * keep * state.ratio_weight[i, g, form] + weight
-        state.ratio_sum[i, g, form], state.ratio_weight[i, g, form] = above, below
-        state.statistics.form[form, i, g] = abs(above) / math.sqrt(below) if below > 0.0 else 0.0
+    keep = 1.0 - model.settings.forget_offset
+    above = keep * state.ratio_sum[i] + top - model.healthy[i] * weight
+    below = keep * keep * state.ratio_weight[i] + weight
+    state.ratio_sum[i], state.ratio_weight[i] = above, below
+    state.statistics.offset[i] = abs(above) / math.sqrt(below) if below > 0.0 else 0.0
 
 
 @part()
-def _look_for_forms(model, state):  # type: ignore[no-untyped-def]
-    """Steps, offsets and scales of each channel."""
-    C, found = model.layout.channels, state.statistics.form
+def _look_for_offsets(model, state):  # type: ignore[no-untyped-def]
+    """Steps and offsets of each channel."""
+    C, found, highest = model.layout.channels, state.statistics.offset, 0.0
     for i in range(C):
         _slope(i, model, state)
         counts = state.rows[0] >= model.layout.settling and model.modelled[i] == 1 and state.gap[i] == 0.0
         _look_for_step(i, counts, model, state)
-        for form in range(N_FORMS):
-            _look_for_form(i, form, counts, model, state)
-    for g in range(model.layout.ratios):
-        highest = 0.0
-        for form in range(N_FORMS):
-            for i in range(C):
-                highest = max(highest, found[form, i, g] * model.inverse.form[form, i, g])
-        if highest > CAP:  # all alike, so that they still compare with each other
-            for form in range(N_FORMS):
-                for i in range(C):
-                    found[form, i, g] *= CAP / highest
-                    state.ratio_sum[i, g, form] *= CAP / highest
+        _look_for_offset(i, counts, model, state)
+        highest = max(highest, found[i] * model.inverse.offset[i])
+    if highest > CAP:  # all alike, so that they still compare with each other
+        for i in range(C):
+            found[i] *= CAP / highest
+            state.ratio_sum[i] *= CAP / highest
 
 
 @part()
@@ -467,16 +423,20 @@ def _look_at_values(still, model, state):  # type: ignore[no-untyped-def]
 @part()
 def _look_at_relations(still, model, state):  # type: ignore[no-untyped-def]
     """Means of the residuals of relations; that of du/dt is (u - ū) f/((1 - f) τ), with ū of the same forgetting f."""
-    A, u, step, forgetting = model.layout.averages, _value(state, model.layout.speed), model.settings.step, model.forget_average
-    short, longer = forgetting[0], forgetting[min(1, A - 1)]
+    u, step, short, longer = (
+        _value(state, model.layout.speed),
+        model.settings.step,
+        model.settings.forget_short,
+        model.settings.forget_relation,
+    )
     state.mean_ax[0] += model.settings.forget_ax * (_value(state, model.layout.ax) - state.mean_ax[0])
     complete = True
     for i in range(model.layout.channels):
         complete = complete and state.gap[i] <= 0.0
-    for t in range(A):
+    for t, forget in enumerate((short, longer)):
         if state.rows[0] == 0.0:
             state.mean_speed[t] = u
-        state.mean_speed[t] += forgetting[t] * (u - state.mean_speed[t])
+        state.mean_speed[t] += forget * (u - state.mean_speed[t])
     for j in range(model.layout.relations):
         target = state.x[model.target[j]]
         left, small = target, 0.0
@@ -495,16 +455,14 @@ def _look_at_relations(still, model, state):  # type: ignore[no-untyped-def]
         state.product[j] += longer * (shown * expected - state.product[j])
         state.expected_power[j] += longer * (expected * expected - state.expected_power[j])
         state.shown_power[j] += longer * (shown * shown - state.shown_power[j])
-        for t in range(A):
-            forget = forgetting[t]
-            if complete:
-                state.average[j, t] += forget * (left - state.average[j, t])
-            change = gain * (u - state.mean_speed[t]) * forget / ((1.0 - forget) * step)
-            size, roof = abs(state.average[j, t] - change), CAP * model.limits.relation[j, t]
-            if size > roof:
-                state.average[j, t] = change + (state.average[j, t] - change) * roof / size
-                size = roof
-            state.statistics.relation[j, t] = size
+        if complete:
+            state.average[j] += longer * (left - state.average[j])
+        change = gain * (u - state.mean_speed[1]) * longer / ((1.0 - longer) * step)
+        size, roof = abs(state.average[j] - change), CAP * model.limits.relation[j]
+        if size > roof:
+            state.average[j] = change + (state.average[j] - change) * roof / size
+            size = roof
+        state.statistics.relation[j] = size
 
 
 @part()
@@ -516,27 +474,25 @@ def _find_reason(slow, model, state):  # type: ignore[no-untyped-def]
         over = every[m] * model.inverse.every[m]
         highest = max(highest, over)
         if over >= 1.0:
-            size = every[m] if _is_form(model.kind[m]) else over  # likelihood ratios compare with each other as they are
-            weight = model.priority[m] + 0.5 * size / (1.0 + size)
+            weight = model.priority[m] + 0.5 * over / (1.0 + over)
             if weight > weightiest:
                 weightiest, best = weight, m
     if best < 0:
         return FREE, 0, -1, highest
-    if _is_form(model.kind[best]):
-        best = _likeliest(best, model, state)
     kind, channel, partner = model.kind[best], model.accused[best], model.partner[best]
+    if kind in (JUMP, OFFSET):  # likelihood ratios of the same form compare with each other as they are
+        C, likeliest = model.layout.channels, -1.0
+        for i in range(C):
+            ratio = state.ratio[i] if best < C else every[best // C * C + i]
+            if ratio > likeliest:
+                likeliest, channel = ratio, i
     if kind == LOCKED:
         kind = _wheel(channel, slow, state)
-    elif _is_form(kind) or kind == CONTRADICTION:
+    elif kind in (OFFSET, CONTRADICTION):
         turned, culprit, against = _contradiction(model, state)
         if turned != FREE:
             kind, channel, partner = turned, culprit, against
     return kind, channel, partner, highest
-
-
-@part()
-def _is_form(kind):  # type: ignore[no-untyped-def]
-    return kind in (OFFSET, SCALE)
 
 
 @part()
@@ -567,18 +523,6 @@ def _decide(absent, slow, model, state):  # type: ignore[no-untyped-def]
 
 
 @part()
-def _likeliest(best, model, state):  # type: ignore[no-untyped-def]
-    """The form and channel with the largest likelihood ratio over the time of one that was exceeded."""
-    C, G, every = model.layout.channels, model.layout.ratios, state.statistics.every
-    first, found = C * (3 + model.layout.energies), best
-    for n in range(N_FORMS * C):
-        m = first + n * G + (best - first) % G
-        if every[m] > every[found]:
-            found = m
-    return found
-
-
-@part()
 def _wheel(channel, slow, state):  # type: ignore[no-untyped-def]
     """Whether a wheel that slips is locked, lost or neither."""
     if state.x[channel] >= (1.0 - LOST) * (state.x[channel] - state.y[channel]):
@@ -590,7 +534,7 @@ def _wheel(channel, slow, state):  # type: ignore[no-untyped-def]
 def _relation_kind(j, model, state):  # type: ignore[no-untyped-def]
     """Of the last second: `FREE` if a relation holds, `SIGN` or `UNIT` if not by far, -1 if the signals are too small."""
     product, expected, shown = state.product[j], state.expected_power[j], state.shown_power[j]
-    roof = model.limits.relation[j, 0]
+    roof = model.limits.relation[j]
     if max(expected, shown) < roof * roof:
         return -1
     if expected > LARGER * LARGER * shown or shown > LARGER * LARGER * expected:
@@ -633,6 +577,5 @@ def _remember(model, state):  # type: ignore[no-untyped-def]
     for i in range(model.layout.channels):
         for lag in range(model.layout.order - 1, 0, -1):
             state.past_y[lag, i] = state.past_y[lag - 1, i]
-            state.past_x[lag, i] = state.past_x[lag - 1, i]
-        state.past_y[0, i], state.past_x[0, i] = state.y[i], state.x[i]
+        state.past_y[0, i] = state.y[i]
     state.rows[0] += 1.0

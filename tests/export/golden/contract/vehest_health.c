@@ -2,7 +2,7 @@
  *
  * With features phi(x) of yaw rate and speed, channels x become y = x - W phi(x), of which an autoregression predicts the next sample; e is
  * its error, in units of the noise at that speed, S its covariance. A fault that adds b to channel i moves y by J b, J = dy/dx_i, and
- * the innovations by h b. Each form of fault is looked for by its likelihood ratio over exponentially forgotten samples,
+ * the innovations by h b. An offset is looked for by its likelihood ratio over exponentially forgotten samples,
  * z = sum(l^j h' S^-1 e) / sqrt(sum(l^2j h' S^-1 h)), which is N(0, 1) without a fault (Willsky & Jones, IEEE Trans. Automatic Control
  * 21 (1), 1976; windows replaced by forgetting). The source of every line is vehest.trust.health_kernel.
  */
@@ -12,11 +12,7 @@
 
 #define C VEHEST_CHANNELS
 #define P VEHEST_HEALTH_LAGS
-#define E VEHEST_HEALTH_ENERGIES
-#define G VEHEST_HEALTH_RATIOS
 #define R VEHEST_HEALTH_RELATIONS
-#define A VEHEST_HEALTH_AVERAGES
-#define FORMS VEHEST_HEALTH_FORMS
 #define FEATURES VEHEST_HEALTH_FEATURES
 #define INSTANT_FEATURES 6 /* those that relations which hold for each sample may use */
 #define LEVELS 5 /* speeds at which the noise is known */
@@ -24,15 +20,13 @@
 
 /* Where statistics of a kind begin. */
 #define AT_JUMP 0
-#define AT_CALM C
-#define AT_ENERGY (2 * C)
-#define AT_STEP ((2 + E) * C)
-#define AT_FORM ((3 + E) * C)
-#define AT_RUN ((3 + E + (FORMS * G)) * C)
-#define AT_SHARE (AT_RUN + C)
-#define AT_DOMAIN (AT_RUN + (2 * C))
-#define AT_SLIP (AT_RUN + (3 * C))
-#define AT_RELATION (AT_RUN + (4 * C))
+#define AT_STEP C
+#define AT_OFFSET (2 * C)
+#define AT_RUN (3 * C)
+#define AT_SHARE (4 * C)
+#define AT_DOMAIN (5 * C)
+#define AT_SLIP (6 * C)
+#define AT_RELATION (7 * C)
 
 /* Kinds of reasons. */
 #define FREE 0
@@ -40,7 +34,6 @@
 #define HELD 3
 #define JUMP 4
 #define OFFSET 7
-#define SCALE 8
 #define SIGN 9
 #define UNIT 10
 #define CONTRADICTION 11
@@ -57,7 +50,7 @@
 
 static const vehest_real PLAUSIBLE = 1000.0f; /* times the largest size in training, beyond which a value counts as not measured */
 static const vehest_real CLIP = 4.0f; /* standard deviations */
-static const vehest_real STEP_CLIP = 8.0f; /* the same for steps */
+static const vehest_real STEP_CLIP = 8.0f; /* the same for steps and for the energy */
 static const vehest_real CALM = 0.300000012f; /* of the mean energy: least energy of a calm stretch */
 static const vehest_real CAP = 2.0f; /* times its limit, beyond which a statistic remembers no more */
 static const vehest_real CLEARLY = 1.5f; /* times its limit, from which on an estimate is invalid */
@@ -134,17 +127,12 @@ static const vehest_real STEP_POWER[C][C] = {
     { 0.0f, 10000.0f, 10.0f },
     { 0.0f, 10.0f, 25.0f }
 };
-static const vehest_real HEALTHY[FORMS][C] = {
-    { 0.00999999978f, 0.0f, 0.0199999996f },
-    { 0.0f, 0.00999999978f, 0.0f }
-}; /* likelihood ratios of healthy drives */
-static const vehest_real HEAVIEST[FORMS][C] = {
-    { 10.0f, 20.0f, 30.0f },
-    { 10.0f, 20.0f, 30.0f }
-}; /* largest weight of one sample in them */
-static const vehest_real FORGET_ENERGY[E] = { 0.0951625854f, 0.0198013261f };
-static const vehest_real FORGET_RATIO[G] = { 0.0392105617f, 0.00995016657f, 0.00249687769f, 0.000832986203f };
-static const vehest_real FORGET_AVERAGE[A] = { 0.0392105617f, 0.00995016657f, 0.000832986203f };
+static const vehest_real HEALTHY[C] = { 0.00999999978f, 0.0f, 0.0199999996f }; /* offsets of healthy drives */
+static const vehest_real HEAVIEST[C] = { 10.0f, 20.0f, 30.0f }; /* largest weight of one sample in an offset */
+static const vehest_real FORGET_ENERGY = 0.0198013261f;
+static const vehest_real FORGET_OFFSET = 0.00249687769f;
+static const vehest_real FORGET_SHORT = 0.0392105617f; /* of relations, for signs and units */
+static const vehest_real FORGET_RELATION = 0.00995016657f;
 static const vehest_real RELATION[R][FEATURES] = {
     { 0.0500000007f, 0.0f, 0.0f, 1.0f, 0.0f, 0.0f, 0.0f, 0.0f, 0.0f, 0.0f, 0.0f, 0.0f, 0.0f }
 };
@@ -156,36 +144,17 @@ static const int32_t INVOLVED[R][C] = {
 }; /* 2: by a small term */
 static const vehest_real LIMIT[STATISTICS] = {
     4.0f, 4.25f, 4.5f, 4.75f, 5.0f, 5.25f, 5.5f, 5.75f, 6.0f, 6.25f, 6.5f, 6.75f, 7.0f, 7.25f, 7.5f, 7.75f, 8.0f, 8.25f, 8.5f, 8.75f,
-    9.0f, 9.25f, 9.5f, 9.75f, 10.0f, 10.25f, 10.5f, 10.75f, 11.0f, 11.25f, 11.5f, 11.75f, 12.0f, 12.25f, 12.5f, 12.75f, 13.0f,
-    13.25f, 13.5f, 13.75f, 14.0f, 14.25f, 14.5f, 14.75f, 15.0f, 15.25f, 15.5f, 15.75f, 16.0f, 16.25f, 16.5f, 16.75f, 17.0f,
-    17.25f
+    9.0f, 9.25f
 };
 static const vehest_real INVERSE[STATISTICS] = {
     0.25f, 0.235294119f, 0.222222224f, 0.210526317f, 0.200000003f, 0.190476194f, 0.181818187f, 0.173913047f, 0.166666672f,
     0.159999996f, 0.15384616f, 0.148148149f, 0.142857149f, 0.137931034f, 0.13333334f, 0.129032254f, 0.125f, 0.121212125f,
-    0.117647059f, 0.114285715f, 0.111111112f, 0.108108111f, 0.105263159f, 0.102564104f, 0.100000001f, 0.097560972f,
-    0.095238097f, 0.0930232555f, 0.0909090936f, 0.088888891f, 0.0869565234f, 0.0851063803f, 0.0833333358f, 0.0816326514f,
-    0.0799999982f, 0.0784313753f, 0.0769230798f, 0.0754716992f, 0.0740740746f, 0.0727272704f, 0.0714285746f,
-    0.0701754391f, 0.068965517f, 0.0677966103f, 0.0666666701f, 0.0655737668f, 0.0645161271f, 0.0634920672f, 0.0625f,
-    0.0615384616f, 0.0606060624f, 0.0597014911f, 0.0588235296f, 0.0579710156f
+    0.117647059f, 0.114285715f, 0.111111112f, 0.108108111f
 }; /* of the limits */
-static const vehest_real PRIORITY[STATISTICS] = {
-    2.0f, 2.0f, 2.0f, 2.0f, 2.0f, 2.0f, 2.5f, 2.5f, 2.5f, 2.5f, 2.5f, 2.5f, 2.0f, 2.0f, 2.0f, 4.0f, 4.0f, 4.0f, 4.0f, 4.0f, 4.0f, 4.0f,
-    4.0f, 4.0f, 4.0f, 4.0f, 4.0f, 4.0f, 4.0f, 4.0f, 4.0f, 4.0f, 4.0f, 4.0f, 4.0f, 4.0f, 4.0f, 4.0f, 4.0f, 8.0f, 8.0f, 8.0f, 7.0f, 7.0f,
-    7.0f, 1.0f, 1.0f, 1.0f, 9.0f, 9.0f, 9.0f, 3.0f, 3.0f, 3.0f
-}; /* of reasons */
-static const int32_t KIND[STATISTICS] = {
-    4, 4, 4, 4, 4, 4, 5, 5, 5, 5, 5, 5, 4, 4, 4, 7, 7, 7, 7, 7, 7, 7, 7, 7, 7, 7, 7, 8, 8, 8, 8, 8, 8, 8, 8, 8,
-    8, 8, 8, 2, 2, 2, 3, 3, 3, 12, 12, 12, 14, 14, 14, 11, 11, 11
-};
-static const int32_t ACCUSED[STATISTICS] = {
-    0, 1, 2, 0, 1, 2, 0, 0, 1, 1, 2, 2, 0, 1, 2, 0, 0, 0, 0, 1, 1, 1, 1, 2, 2, 2, 2, 0, 0, 0, 0, 1, 1, 1, 1, 2,
-    2, 2, 2, 0, 1, 2, 0, 1, 2, 0, 1, 2, 0, 1, 2, 2, 2, 2
-}; /* channels */
-static const int32_t PARTNER[STATISTICS] = {
-    -1, -1, -1, -1, -1, -1, -1, -1, -1, -1, -1, -1, -1, -1, -1, -1, -1, -1, -1, -1, -1, -1, -1, -1, -1, -1, -1,
-    -1, -1, -1, -1, -1, -1, -1, -1, -1, -1, -1, -1, -1, -1, -1, -1, -1, -1, -1, -1, -1, -1, -1, -1, 1, 1, 1
-}; /* channels; -1: none */
+static const vehest_real PRIORITY[STATISTICS] = { 2.0f, 2.0f, 2.0f, 2.0f, 2.0f, 2.0f, 4.0f, 4.0f, 4.0f, 8.0f, 8.0f, 8.0f, 7.0f, 7.0f, 7.0f, 1.0f, 1.0f, 1.0f, 9.0f, 9.0f, 9.0f, 3.0f }; /* of reasons */
+static const int32_t KIND[STATISTICS] = { 4, 4, 4, 4, 4, 4, 7, 7, 7, 2, 2, 2, 3, 3, 3, 12, 12, 12, 14, 14, 14, 11 };
+static const int32_t ACCUSED[STATISTICS] = { 0, 1, 2, 0, 1, 2, 0, 1, 2, 0, 1, 2, 0, 1, 2, 0, 1, 2, 0, 1, 2, 2 }; /* channels */
+static const int32_t PARTNER[STATISTICS] = { -1, -1, -1, -1, -1, -1, -1, -1, -1, -1, -1, -1, -1, -1, -1, -1, -1, -1, -1, -1, -1, 1 }; /* channels; -1: none */
 
 typedef struct {
     int32_t kind;
@@ -213,9 +182,7 @@ void vehest_health_start(vehest_health *health)
 {
     (void)memset(health, 0, sizeof(*health)); /* all bits 0 are the number 0 */
     for (int32_t i = 0; i < C; i++) {
-        for (int32_t e = 0; e < E; e++) {
-            health->energy[i][e] = 1.0f;
-        }
+        health->energy[i] = 1.0f;
     }
 }
 
@@ -384,25 +351,19 @@ static void predict(vehest_health *h)
     }
 }
 
-/* Jumps, jumps out of calm, and energy. */
+/* Jumps out of what has been usual for half a second. */
 static void look_at_innovations(vehest_health *h)
 {
     for (int32_t i = 0; i < C; i++) {
         const vehest_real z = MODELLED[i] ? (VEHEST_ABS(h->score[i]) / VEHEST_SQRT(PRECISION[i][i])) : 0.0f;
-        const vehest_real normed = h->scaled[i] / DEVIATION[i];
-        h->statistic[AT_JUMP + i] = z;
-        h->statistic[AT_CALM + i] = z / VEHEST_SQRT(CALM + h->energy[i][1]);
+        const vehest_real normed = h->innovation[0][i] / DEVIATION[i];
+        const vehest_real jump = z / VEHEST_SQRT(CALM + h->energy[i]);
+        h->ratio[i] = z;
+        h->statistic[AT_JUMP + i] = jump;
         if (i == 1) {
-            h->since_jump = (z > LIMIT[i]) ? 0U : counted(h->since_jump);
+            h->since_jump = (jump > LIMIT[i]) ? 0U : counted(h->since_jump);
         }
-        for (int32_t e = 0; e < E; e++) {
-            const int32_t at = AT_ENERGY + (i * E) + e;
-            const vehest_real roof = CAP * LIMIT[at];
-            vehest_real own = h->energy[i][e] + (FORGET_ENERGY[e] * ((normed * normed) - h->energy[i][e]));
-            own = smaller(own, roof * roof);
-            h->energy[i][e] = own;
-            h->statistic[at] = VEHEST_SQRT(own);
-        }
+        h->energy[i] += FORGET_ENERGY * ((normed * normed) - h->energy[i]);
     }
 }
 
@@ -425,38 +386,6 @@ static void find_slope(vehest_health *h, int32_t i)
     }
 }
 
-/* h: effect of one unit of a form of fault in channel i on the scaled innovations; form 0 offset, 1 scale. */
-static void find_effect(vehest_health *h, int32_t i, int32_t form)
-{
-    const vehest_real now = h->x[i] - h->error[i];
-    for (int32_t j = 0; j < C; j++) {
-        h->effect[j] = 0.0f;
-    }
-    for (int32_t m = 0; m < C; m++) {
-        const vehest_real slope = h->slope[m];
-        if (slope == 0.0f) {
-            continue;
-        }
-        if ((form == 0) || (m != i)) { /* effects on other channels by relations are taken as steady */
-            const vehest_real steady = (form == 0) ? slope : (slope * now);
-            for (int32_t j = 0; j < C; j++) {
-                h->effect[j] += SETTLED_GAIN[m][j] * steady;
-            }
-        } else {
-            h->effect[m] += slope * now;
-            for (int32_t lag = 0; lag < P; lag++) {
-                const vehest_real past = slope * h->past_x[lag][i];
-                for (int32_t j = 0; j < C; j++) {
-                    h->effect[j] -= LAG[lag][m][j] * past;
-                }
-            }
-        }
-    }
-    for (int32_t j = 0; j < C; j++) {
-        h->effect[j] /= h->level[j];
-    }
-}
-
 /* A step in channel i that began P samples ago. */
 static void look_for_step(vehest_health *h, int32_t i, bool counts)
 {
@@ -474,13 +403,20 @@ static void look_for_step(vehest_health *h, int32_t i, bool counts)
     h->statistic[AT_STEP + i] = (counts && (power > 0.0f)) ? (VEHEST_ABS(step) / VEHEST_SQRT(power)) : 0.0f;
 }
 
-/* A form of fault in channel i: likelihood ratios over all times. */
-static void look_for_form(vehest_health *h, int32_t i, int32_t form, bool counts)
+/* Likelihood ratio of an offset in channel i; h is its effect on the scaled innovations. */
+static void look_for_offset(vehest_health *h, int32_t i, bool counts)
 {
+    const vehest_real keep = 1.0f - FORGET_OFFSET;
     vehest_real top = 0.0f;
     vehest_real weight = 0.0f;
     vehest_real share;
-    find_effect(h, i, form);
+    for (int32_t j = 0; j < C; j++) {
+        vehest_real effect = 0.0f;
+        for (int32_t m = 0; m < C; m++) {
+            effect += SETTLED_GAIN[m][j] * h->slope[m];
+        }
+        h->effect[j] = effect / h->level[j];
+    }
     for (int32_t m = 0; m < C; m++) { /* h' S^-1 e and h' S^-1 h */
         vehest_real inner = 0.0f;
         top += h->effect[m] * h->clipped_score[m];
@@ -489,42 +425,29 @@ static void look_for_form(vehest_health *h, int32_t i, int32_t form, bool counts
         }
         weight += h->effect[m] * inner;
     }
-    share = (counts && (weight > 0.0f)) ? smaller(HEAVIEST[form][i] / weight, 1.0f) : 0.0f;
+    share = (counts && (weight > 0.0f)) ? smaller(HEAVIEST[i] / weight, 1.0f) : 0.0f;
     top = share * top;
     weight = share * weight;
-    top -= HEALTHY[form][i] * weight;
-    for (int32_t g = 0; g < G; g++) { /* z = sum / sqrt(weight), forgotten exponentially */
-        const vehest_real keep = 1.0f - FORGET_RATIO[g];
-        vehest_health_ratio *const ratio = &h->ratio[i][g][form];
-        ratio->sum = (keep * ratio->sum) + top;
-        ratio->weight = (keep * keep * ratio->weight) + weight;
-        h->statistic[AT_FORM + (((form * C) + i) * G) + g] =
-            (ratio->weight > 0.0f) ? (VEHEST_ABS(ratio->sum) / VEHEST_SQRT(ratio->weight)) : 0.0f;
-    }
+    h->ratio_sum[i] = ((keep * h->ratio_sum[i]) + top) - (HEALTHY[i] * weight); /* z = sum / sqrt(weight), forgotten exponentially */
+    h->ratio_weight[i] = (keep * keep * h->ratio_weight[i]) + weight;
+    h->statistic[AT_OFFSET + i] = (h->ratio_weight[i] > 0.0f) ? (VEHEST_ABS(h->ratio_sum[i]) / VEHEST_SQRT(h->ratio_weight[i])) : 0.0f;
 }
 
-/* Steps, offsets and scales of each channel. */
-static void look_for_forms(vehest_health *h)
+/* Steps and offsets of each channel. */
+static void look_for_offsets(vehest_health *h)
 {
+    vehest_real highest = 0.0f;
     for (int32_t i = 0; i < C; i++) {
         const bool counts = (h->rows >= ROWS_SETTLE) && MODELLED[i] && (h->gap[i] == 0);
         find_slope(h, i);
         look_for_step(h, i, counts);
-        for (int32_t form = 0; form < FORMS; form++) {
-            look_for_form(h, i, form, counts);
-        }
+        look_for_offset(h, i, counts);
+        highest = larger(highest, h->statistic[AT_OFFSET + i] * INVERSE[AT_OFFSET + i]);
     }
-    for (int32_t g = 0; g < G; g++) { /* all alike down to the cap, so that they still compare with each other */
-        vehest_real highest = 0.0f;
-        for (int32_t n = 0; n < (FORMS * C); n++) {
-            const int32_t place = AT_FORM + (n * G) + g;
-            highest = larger(highest, h->statistic[place] * INVERSE[place]);
-        }
-        if (highest > CAP) {
-            for (int32_t n = 0; n < (FORMS * C); n++) {
-                h->statistic[AT_FORM + (n * G) + g] *= CAP / highest;
-                h->ratio[n % C][g][n / C].sum *= CAP / highest;
-            }
+    if (highest > CAP) { /* all alike, so that they still compare with each other */
+        for (int32_t i = 0; i < C; i++) {
+            h->statistic[AT_OFFSET + i] *= CAP / highest;
+            h->ratio_sum[i] *= CAP / highest;
         }
     }
 }
@@ -547,9 +470,10 @@ static int32_t look_at_values(vehest_health *h, bool still)
 static void look_at_relation(vehest_health *h, int32_t j, bool still, bool complete)
 {
     const vehest_real u = h->x[0];
-    const vehest_real shortest = FORGET_AVERAGE[0];
-    const vehest_real longer = FORGET_AVERAGE[1];
     const vehest_real gain = still ? 0.0f : RATE_GAIN[j];
+    const vehest_real change = gain * (u - h->mean_speed[1]) * FORGET_RELATION / ((1.0f - FORGET_RELATION) * STEP); /* mean of du/dt */
+    const vehest_real roof = CAP * LIMIT[AT_RELATION + j];
+    vehest_real size;
     vehest_real left = h->x[TARGET[j]];
     vehest_real small = 0.0f; /* terms of drag: a fault of the yaw rate or ay is no sign or unit of ax */
     vehest_real shown;
@@ -564,30 +488,23 @@ static void look_at_relation(vehest_health *h, int32_t j, bool still, bool compl
         small = 0.0f;
     }
     if (complete) {
-        h->left[j] += shortest * ((left + small) - h->left[j]);
-        h->smooth[j] += shortest * (h->x[TARGET[j]] - h->smooth[j]);
+        h->left[j] += FORGET_SHORT * ((left + small) - h->left[j]);
+        h->smooth[j] += FORGET_SHORT * (h->x[TARGET[j]] - h->smooth[j]);
     }
     shown = h->smooth[j];
-    expected = (shown - h->left[j]) + (gain * (u - h->mean_speed[0]) * shortest / ((1.0f - shortest) * STEP));
-    h->product[j] += longer * ((shown * expected) - h->product[j]);
-    h->expected_power[j] += longer * ((expected * expected) - h->expected_power[j]);
-    h->shown_power[j] += longer * ((shown * shown) - h->shown_power[j]);
-    for (int32_t t = 0; t < A; t++) { /* the mean of du/dt is (u - mean u) f / ((1 - f) STEP), with the same forgetting f */
-        const int32_t place = AT_RELATION + (j * A) + t;
-        const vehest_real forget = FORGET_AVERAGE[t];
-        const vehest_real change = gain * (u - h->mean_speed[t]) * forget / ((1.0f - forget) * STEP);
-        const vehest_real roof = CAP * LIMIT[place];
-        vehest_real size;
-        if (complete) {
-            h->average[j][t] += forget * (left - h->average[j][t]);
-        }
-        size = VEHEST_ABS(h->average[j][t] - change);
-        if (size > roof) {
-            h->average[j][t] = change + ((h->average[j][t] - change) * roof / size);
-            size = roof;
-        }
-        h->statistic[place] = size;
+    expected = (shown - h->left[j]) + (gain * (u - h->mean_speed[0]) * FORGET_SHORT / ((1.0f - FORGET_SHORT) * STEP));
+    h->product[j] += FORGET_RELATION * ((shown * expected) - h->product[j]);
+    h->expected_power[j] += FORGET_RELATION * ((expected * expected) - h->expected_power[j]);
+    h->shown_power[j] += FORGET_RELATION * ((shown * shown) - h->shown_power[j]);
+    if (complete) {
+        h->average[j] += FORGET_RELATION * (left - h->average[j]);
     }
+    size = VEHEST_ABS(h->average[j] - change);
+    if (size > roof) {
+        h->average[j] = change + ((h->average[j] - change) * roof / size);
+        size = roof;
+    }
+    h->statistic[AT_RELATION + j] = size;
 }
 
 /* Means of the residuals of relations. */
@@ -598,34 +515,16 @@ static void look_at_relations(vehest_health *h, bool still)
     for (int32_t i = 0; i < C; i++) {
         complete = complete && (h->gap[i] <= 0);
     }
-    for (int32_t t = 0; t < A; t++) {
-        if (h->rows == 0U) {
-            h->mean_speed[t] = u;
-        }
-        h->mean_speed[t] += FORGET_AVERAGE[t] * (u - h->mean_speed[t]);
+    if (h->rows == 0U) {
+        h->mean_speed[0] = u;
+        h->mean_speed[1] = u;
     }
+    h->mean_speed[0] += FORGET_SHORT * (u - h->mean_speed[0]);
+    h->mean_speed[1] += FORGET_RELATION * (u - h->mean_speed[1]);
     for (int32_t j = 0; j < R; j++) {
         look_at_relation(h, j, still, complete);
     }
     h->mean_ax += FORGET_AX * (0.0f - h->mean_ax);
-}
-
-static bool is_form(int32_t kind)
-{
-    return (kind == OFFSET) || (kind == SCALE);
-}
-
-/* The form and channel with the largest likelihood ratio over the time of one that was exceeded. */
-static int32_t likeliest(const vehest_health *h, int32_t best)
-{
-    int32_t found = best;
-    for (int32_t n = 0; n < (FORMS * C); n++) {
-        const int32_t m = AT_FORM + (n * G) + ((best - AT_FORM) % G);
-        if (h->statistic[m] > h->statistic[found]) {
-            found = m;
-        }
-    }
-    return found;
 }
 
 /* Of the last second: FREE if a relation holds, SIGN or UNIT if not by far, NONE if the signals are too small. */
@@ -633,7 +532,7 @@ static int32_t judge_relation(const vehest_health *h, int32_t j)
 {
     const vehest_real expected = h->expected_power[j];
     const vehest_real shown = h->shown_power[j];
-    const vehest_real roof = LIMIT[AT_RELATION + (j * A)];
+    const vehest_real roof = LIMIT[AT_RELATION + j];
     int32_t found;
     if (larger(expected, shown) < (roof * roof)) {
         found = NONE;
@@ -703,8 +602,7 @@ static suspicion find_reason(const vehest_health *h, int32_t slow, vehest_real *
         const vehest_real over = h->statistic[m] * INVERSE[m];
         *highest = larger(*highest, over);
         if (over >= 1.0f) {
-            const vehest_real size = is_form(KIND[m]) ? h->statistic[m] : over; /* likelihood ratios compare with each other as they are */
-            const vehest_real weight = PRIORITY[m] + (0.5f * size / (1.0f + size));
+            const vehest_real weight = PRIORITY[m] + (0.5f * over / (1.0f + over));
             if (weight > weightiest) {
                 weightiest = weight;
                 best = m;
@@ -712,14 +610,21 @@ static suspicion find_reason(const vehest_health *h, int32_t slow, vehest_real *
         }
     }
     if (best >= 0) {
-        if (is_form(KIND[best])) {
-            best = likeliest(h, best);
-        }
         found.kind = KIND[best];
         found.channel = ACCUSED[best];
         found.partner = PARTNER[best];
+        if ((found.kind == JUMP) || (found.kind == OFFSET)) { /* likelihood ratios of the same form compare with each other as they are */
+            vehest_real likeliest = -1.0f;
+            for (int32_t i = 0; i < C; i++) {
+                const vehest_real ratio = (best < C) ? h->ratio[i] : h->statistic[(best - (best % C)) + i];
+                if (ratio > likeliest) {
+                    likeliest = ratio;
+                    found.channel = i;
+                }
+            }
+        }
         (void)slow;
-        if (is_form(found.kind) || (found.kind == CONTRADICTION)) {
+        if ((found.kind == OFFSET) || (found.kind == CONTRADICTION)) {
             const suspicion contradiction = find_contradiction(h);
             if (contradiction.kind != FREE) {
                 found = contradiction;
@@ -784,12 +689,10 @@ static void remember(vehest_health *h)
     for (int32_t lag = P - 1; lag > 0; lag--) {
         for (int32_t i = 0; i < C; i++) {
             h->past_y[lag][i] = h->past_y[lag - 1][i];
-            h->past_x[lag][i] = h->past_x[lag - 1][i];
         }
     }
     for (int32_t i = 0; i < C; i++) {
         h->past_y[0][i] = h->y[i];
-        h->past_x[0][i] = h->x[i];
     }
     h->rows = counted(h->rows);
 }
@@ -802,7 +705,7 @@ uint8_t vehest_health_step(vehest_health *health, const vehest_real row[VEHEST_C
     uint8_t status;
     predict(health);
     look_at_innovations(health);
-    look_for_forms(health);
+    look_for_offsets(health);
     slow = look_at_values(health, still);
     look_at_relations(health, still);
     status = decide(health, absent, slow, reason);

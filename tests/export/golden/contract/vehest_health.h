@@ -7,17 +7,8 @@
 
 #define VEHEST_HEALTH_LAGS 1 /* p of the autoregression */
 #define VEHEST_HEALTH_RELATIONS 1
-#define VEHEST_HEALTH_ENERGIES 2 /* times over which innovations are averaged */
-#define VEHEST_HEALTH_RATIOS 4 /* times over which likelihood ratios are summed */
-#define VEHEST_HEALTH_AVERAGES 3 /* times over which relations are averaged */
-#define VEHEST_HEALTH_FORMS 2 /* offset, scale */
 #define VEHEST_HEALTH_FEATURES 13
-#define VEHEST_HEALTH_STATISTICS 54
-
-typedef struct {
-    vehest_real sum; /* of h' S^-1 e */
-    vehest_real weight; /* of h' S^-1 h */
-} vehest_health_ratio;
+#define VEHEST_HEALTH_STATISTICS 22
 
 typedef struct {
     /* What lasts from sample to sample. */
@@ -33,13 +24,13 @@ typedef struct {
     int32_t gap[VEHEST_CHANNELS]; /* rows without a sample; below zero while predictions settle again */
     uint32_t run[VEHEST_CHANNELS]; /* equal samples in a row */
     vehest_real share[VEHEST_CHANNELS]; /* of equal samples */
-    vehest_real past_x[VEHEST_HEALTH_LAGS][VEHEST_CHANNELS];
     vehest_real past_y[VEHEST_HEALTH_LAGS][VEHEST_CHANNELS];
     vehest_real innovation[VEHEST_HEALTH_LAGS][VEHEST_CHANNELS];
-    vehest_real energy[VEHEST_CHANNELS][VEHEST_HEALTH_ENERGIES];
-    vehest_health_ratio ratio[VEHEST_CHANNELS][VEHEST_HEALTH_RATIOS][VEHEST_HEALTH_FORMS];
-    vehest_real average[VEHEST_HEALTH_RELATIONS][VEHEST_HEALTH_AVERAGES];
-    vehest_real mean_speed[VEHEST_HEALTH_AVERAGES];
+    vehest_real energy[VEHEST_CHANNELS]; /* of the innovations */
+    vehest_real ratio_sum[VEHEST_CHANNELS]; /* of h' S^-1 e */
+    vehest_real ratio_weight[VEHEST_CHANNELS]; /* of h' S^-1 h */
+    vehest_real average[VEHEST_HEALTH_RELATIONS];
+    vehest_real mean_speed[2]; /* short and long */
     vehest_real left[VEHEST_HEALTH_RELATIONS];
     vehest_real smooth[VEHEST_HEALTH_RELATIONS];
     vehest_real product[VEHEST_HEALTH_RELATIONS]; /* means of shown times expected, and of both squares */
@@ -51,6 +42,7 @@ typedef struct {
     vehest_real error[VEHEST_CHANNELS]; /* innovation e */
     vehest_real scaled[VEHEST_CHANNELS]; /* e over its level at this speed */
     vehest_real clipped[VEHEST_CHANNELS];
+    vehest_real ratio[VEHEST_CHANNELS]; /* likelihood ratio of a jump */
     vehest_real score[VEHEST_CHANNELS]; /* S^-1 e */
     vehest_real clipped_score[VEHEST_CHANNELS];
     vehest_real stepped[VEHEST_CHANNELS]; /* sum over a step */
