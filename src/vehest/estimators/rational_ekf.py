@@ -385,33 +385,22 @@ class RationalFilter(SideslipFilter):
         first = self.first_gaussian(samples[0], {}) if first is None else first
         if self.filter == "unscented":
             return self._unscented(samples, first, levels)
-        car, adapted, bound = self.car, self.adapted, self.bounds()
+        car, adapted, bounds = self.car, self.adapted, self.bounds()
         mean, covariance = first.mean.copy(), first.covariance.copy()
-        pull = [crossfall] * (len(mean) - len(bound))
-        bound = np.append(bound, [math.inf] * len(pull))
+        pull = [crossfall] * (len(mean) - len(bounds))
         out = _empty(len(samples), len(mean))
-        scan(
-            np.ascontiguousarray(samples),
+        track = (
             np.array([car.mass, car.yaw_inertia, car.cg_to_front_axle, car.cg_to_rear_axle]),
             np.array([*self.axle_curves, 1.0]),
             np.array([TYRE_PARAMETERS.index(name) for name in adapted], dtype=np.int64),
-            np.square([levels["yaw_rate"], levels["ay"], levels["steer"], *[levels["tyres"]] * len(adapted), *pull]),
-            -bound,
-            bound,
-            np.square(ROLLING),
-            self.start_tyres(),
-            self.largest_sideslip,
-            LOST**2,
-            1.0 / self.rate_hz,
-            self.minimum_speed,
-            self.adapt_above,
-            math.inf if gate is None else gate.deviations**2,
-            0 if gate is None else gate.patience,
-            np.zeros(2, np.int64) if refused is None else refused,
-            mean,
-            covariance,
-            *out,
+            *(1.0 / self.rate_hz, self.minimum_speed, self.adapt_above),
         )
+        variances = np.square([levels["yaw_rate"], levels["ay"], levels["steer"], *[levels["tyres"]] * len(adapted), *pull])
+        guessed = self.largest_sideslip, LOST**2, np.square(ROLLING)
+        limit, patience = (math.inf, 0) if gate is None else (gate.deviations**2, gate.patience)
+        gated = limit, patience, np.zeros(2, np.int64) if refused is None else refused
+        bounds = np.append(bounds, [math.inf] * len(pull))
+        scan(np.ascontiguousarray(samples), track, variances, bounds, self.start_tyres(), guessed, gated, (mean, covariance), out)
         means, deviation, *others = out
         return FilteredStates(means, *others, Gaussian(mean, covariance), deviation)  # type: ignore[call-arg, arg-type]
 

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
+from typing import Any
 
 import numba
 import numpy as np
@@ -36,37 +38,37 @@ def kalman_scan(
 
     Source: Kalman 1960; Joseph's form of the update (Bucy & Joseph 1968), with which covariances stay symmetric and positive.
     """
+    require_samples(measurements)
+    steps, m = measurements.shape
+    parts = [
+        contiguous(part, (steps, *shape), name)
+        for name, part, shape in zip(LinearModel._fields, model, shapes_of(model.transition.shape[-1], m), strict=True)
+    ]
+    taken = contiguous(measurements, (steps, m), "measurements").copy()
+    limit, patience = (math.inf, 0) if gate is None else (gate.deviations**2, gate.patience)
+    return filtered_by(_scan, parts, taken, initial, limit, patience, np.zeros(m, np.int64) if refused is None else refused)
+
+
+def require_samples(measurements: FloatArray) -> None:
+    """Raise `ValueError` for measurements that are not of shape (T, m), T > 0."""
     if measurements.ndim != 2 or len(measurements) == 0:
         raise ValueError(f"measurements must be of shape (T, m) with T > 0, not {measurements.shape}")
-    steps, m = measurements.shape
-    n = model.transition.shape[-1]
-    parts = [
-        _contiguous(part, (steps, *shape), name) for name, part, shape in zip(LinearModel._fields, model, shapes_of(n, m), strict=True)
-    ]
-    predicted = Gaussian(np.empty((steps, n)), np.empty((steps, n, n)))
-    filtered = Gaussian(np.empty((steps, n)), np.empty((steps, n, n)))
+
+
+def filtered_by(scan: Any, given: Sequence[Any], y: FloatArray, initial: Gaussian[FloatArray], *gate: Any) -> Filtered[FloatArray]:
+    """What a compiled scan makes of measurements y, (T, m), from an initial state; raises `numpy.linalg.LinAlgError` where it gives up."""
+    (steps, m), n = y.shape, initial.mean.shape[-1]
+    predicted, filtered = (Gaussian(np.empty((steps, n)), np.empty((steps, n, n))) for _ in range(2))
     innovation, covariance, likelihood = np.empty((steps, m)), np.empty((steps, m, m)), np.empty(steps)
-    taken = _contiguous(measurements, (steps, m), "measurements").copy()
-    failed = _scan(
-        *parts,
-        taken,
-        _contiguous(initial.mean, (n,), "initial.mean"),
-        _contiguous(initial.covariance, (n, n), "initial.covariance"),
-        *predicted,
-        *filtered,
-        innovation,
-        covariance,
-        likelihood,
-        math.inf if gate is None else gate.deviations**2,
-        0 if gate is None else gate.patience,
-        np.zeros(m, np.int64) if refused is None else refused,
-    )
+    start = contiguous(initial.mean, (n,), "initial.mean"), contiguous(initial.covariance, (n, n), "initial.covariance")
+    failed = scan(*given, y, start, tuple(predicted), tuple(filtered), innovation, covariance, likelihood, *gate)
     if failed >= 0:
         raise np.linalg.LinAlgError(f"the innovation covariance is not positive definite at sample {failed}")
-    return Filtered(predicted, filtered, innovation, covariance, ~np.isnan(taken), likelihood)
+    return Filtered(predicted, filtered, innovation, covariance, ~np.isnan(y), likelihood)
 
 
-def _contiguous(values: FloatArray, shape: tuple[int, ...], name: str) -> FloatArray:
+def contiguous(values: FloatArray, shape: tuple[int, ...], name: str) -> FloatArray:
+    """An array in float64 that is of a shape or broadcasts to it; raises `ValueError`, which names it."""
     if values.shape == shape and values.dtype == np.float64:
         return np.ascontiguousarray(values)
     try:
@@ -76,15 +78,12 @@ def _contiguous(values: FloatArray, shape: tuple[int, ...], name: str) -> FloatA
 
 
 @numba.njit(cache=True, error_model="numpy")
-def _scan(  # type: ignore[no-untyped-def]
-    A, b, Q, C, d, R, y, mean, cov, prior_mean, prior_cov, post_mean, post_cov, innovation, innovation_cov, likelihood,
-    limit, patience, refused,
-):  # fmt: skip
+def _scan(A, b, Q, C, d, R, y, start, predicted, filtered, innovation, innovation_cov, likelihood, limit, patience, refused):  # type: ignore[no-untyped-def]
     """Write states, innovations and likelihoods; returns the sample whose innovation covariance has no Cholesky factor, or -1.
 
     With a finite ``limit`` what the gate refuses becomes NaN in ``y``.
     """
-    steps, m = y.shape
+    (steps, m), (mean, cov), (prior_mean, prior_cov), (post_mean, post_cov) = y.shape, start, predicted, filtered
     n = len(mean)
     seen, room = np.empty((m, n)), scratch(m, n)
     for k in range(steps):

@@ -3,8 +3,9 @@
 Sequences lie side by side: means (n, B), covariances (n, n, B), sigma points (2n + 1, n, B), what is expected at them (2n + 1, m, B). A
 step works on those from ``first`` to ``end``, as many at once as fill a vector of `vehest.lanes`; vectors are read beyond ``end``, so that
 arrays are followed by room for one (`room`), and never written there. Every adjoint takes what its step was given, and adds to (``_bar``)
-gradients unless it says otherwise. A rule is the row [spread, centre_mean, centre_covariance, other] of a `SigmaRule`; ``lower`` holds the
-smallest possible value of each state. Sums are rounded as those of single numbers, so that a sequence has the same digits beside any other.
+gradients unless it says otherwise. ``rules`` are the row [spread, centre_mean, centre_covariance, other] of a `SigmaRule`, the smallest
+possible value of each state, the margin of a repair and whether there are repairs; ``drawn`` are sigma points, the factors and the
+covariances that they come from. Sums are rounded as those of single numbers, so that a sequence has the same digits beside any other.
 """
 
 from __future__ import annotations
@@ -20,14 +21,22 @@ from vehest.filters.gating import refuses
 from vehest.lanes import BYTES, choose, load_unfused, most, root, store, store_some, width
 
 compiled = numba.njit(cache=True, nogil=True, error_model="numpy", boundscheck=False)
-DIMENSIONS = {"rule": 1, "lower": 1, "likelihood": 1, "centre": 1} | dict.fromkeys(
-    ("mean", "mean_bar", "post_mean", "post_mean_bar", "y", "y_bar", "innovation"), 2
-)
-OTHERS = {"margin": None, "limit": None, "first": types.intp, "end": types.intp, "patience": types.intp, "repair": types.boolean} | {
+ARGUMENTS: dict[str, Any] = {
+    "rules": (1, 1, 0, types.boolean),
+    "drawn": (3, 3, 3),
+    "post": (2, 3),
+    "kept": (2, 3, 3, 1, 1),
+    "post_bars": (2, 3),
+    "prior_bars": (2, 3),
+    "other_bars": (3, 3, 3, 2),
     "repaired": types.boolean[::1],
     "gone": types.boolean[:, ::1],
     "refused": types.int64[:, ::1],
+    **dict.fromkeys(("mean", "mean_bar", "y"), 2),
+    **dict.fromkeys(("first", "end", "patience"), types.intp),
+    "limit": 0,
 }
+"""Dimensions of arrays, 0 of a number, or the type, of what steps are called with; others have three dimensions."""
 piece = numba.njit(forceinline=True, no_cpython_wrapper=True, no_cfunc_wrapper=True, error_model="numpy", boundscheck=False)
 
 
@@ -38,10 +47,16 @@ def room(shape: tuple[int, ...], dtype: Any) -> Any:
 
 
 def types_of(step: Any, dtype: Any) -> tuple[Any, ...]:
-    """Types of a step's arguments for arrays of a precision: those named in `DIMENSIONS` and `OTHERS`, else of three dimensions."""
+    """Types of a step's arguments for arrays of a precision, by their names in `ARGUMENTS`."""
     number = numba.from_dtype(np.dtype(dtype))
+
+    def kind(of: Any) -> Any:
+        if isinstance(of, tuple):
+            return types.BaseTuple.from_types(tuple(map(kind, of)))
+        return (types.Array(number, of, "C") if of else number) if isinstance(of, int) else of
+
     names = step.py_func.__code__.co_varnames[: step.py_func.__code__.co_argcount]
-    return tuple((OTHERS[name] or number) if name in OTHERS else types.Array(number, DIMENSIONS.get(name, 3), "C") for name in names)
+    return tuple(kind(ARGUMENTS.get(name, 3)) for name in names)
 
 
 @piece
@@ -92,8 +107,9 @@ def _any(condition, b, end, scratch):  # type: ignore[no-untyped-def]
 
 
 @compiled
-def points_of(mean, given, rule, lower, margin, repair, covariance, factor, points, repaired, first, end):  # type: ignore[no-untyped-def]
-    """Sigma points of ``given`` covariances, which become ``covariance`` where what is not positive definite is repaired, and factors."""
+def points_of(mean, given, rules, drawn, repaired, first, end):  # type: ignore[no-untyped-def]
+    """Sigma points of ``given`` covariances, factors, and the covariances where what is not positive definite is repaired."""
+    (rule, lower, margin, repair), (points, factor, covariance) = rules, drawn
     n, count, lanes = mean.shape[0], points.shape[0], width(mean)
     A, L, P, flags = _rows(n * n, mean), _rows(n * n, mean), _rows(count * n, mean), _rows(1, mean)
     for b in range(first, end, lanes):
@@ -119,9 +135,9 @@ def points_of(mean, given, rule, lower, margin, repair, covariance, factor, poin
 
 
 @compiled
-def points_adjoint(mean, factor, rule, lower, points_bar, mean_bar, covariance_bar, first, end):  # type: ignore[no-untyped-def]
+def points_adjoint(mean, factor, rules, points_bar, mean_bar, covariance_bar, first, end):  # type: ignore[no-untyped-def]
     """Adjoint of `points_of`; what a repair added counts as constant."""
-    n = mean.shape[0]
+    n, (rule, lower, _, _) = mean.shape[0], rules
     L, below, inner, x_bar, A_bar = _rows(n * n, mean), _rows(n * n, mean), _rows(n * n, mean), _rows(n, mean), _rows(n * n, mean)
     for b in range(first, end, width(mean)):
         _read(factor, L, b)
@@ -165,9 +181,9 @@ def _weighted(one, i, n, other, j, m, rule, centre):  # type: ignore[no-untyped-
 
 
 @compiled
-def moments_of(values, noise, rule, lower, mean, covariance, first, end):  # type: ignore[no-untyped-def]
+def moments_of(values, noise, rules, mean, covariance, first, end):  # type: ignore[no-untyped-def]
     """Weighted mean and covariance of what became of the points, plus noise."""
-    count, n = values.shape[:2]
+    (count, n), (rule, lower, _, _) = values.shape[:2], rules
     half = rule.dtype.type(0.5)
     deviation, x, A = _rows(count * n, values), _rows(n, values), _rows(n * n, values)
     for b in range(first, end, width(values)):
@@ -184,9 +200,9 @@ def moments_of(values, noise, rule, lower, mean, covariance, first, end):  # typ
 
 
 @compiled
-def moments_adjoint(values, rule, lower, mean_bar, covariance_bar, values_bar, noise_bar, first, end):  # type: ignore[no-untyped-def]
+def moments_adjoint(values, rules, mean_bar, covariance_bar, values_bar, noise_bar, first, end):  # type: ignore[no-untyped-def]
     """Adjoint of `moments_of`; writes ``values_bar`` and ``noise_bar``."""
-    count, n = values.shape[:2]
+    (count, n), (rule, lower, _, _) = values.shape[:2], rules
     half, two = rule.dtype.type(0.5), rule.dtype.type(2.0)
     deviation, V_bar = _rows(count * n, values), _rows(count * n, values)
     through, whole = _rows(n, values), _rows(n * n, values)
@@ -214,13 +230,13 @@ def moments_adjoint(values, rule, lower, mean_bar, covariance_bar, values_bar, n
 
 
 @compiled
-def gate_of(expected, noise, rule, limit, patience, y, refused, gone, first, end):  # type: ignore[no-untyped-def]
+def gate_of(expected, noise, rules, limit, patience, y, refused, gone, first, end):  # type: ignore[no-untyped-def]
     """What the gate refuses becomes NaN in ``y`` and true in ``gone``, (m, B); counts in ``refused``, (B, m); see `Gate`.
 
     A negative weight of the mean point cannot make a variance smaller than that of the noise.
     """
     count, m = expected.shape[:2]
-    _, centre_mean, centre_covariance, other = rule
+    _, centre_mean, centre_covariance, other = rules[0]
     for b in range(first, end):
         for i in range(m):
             gone[i, b] = False
@@ -240,32 +256,14 @@ def gate_of(expected, noise, rule, limit, patience, y, refused, gone, first, end
 
 
 @compiled
-def update_of(  # type: ignore[no-untyped-def]
-    mean,
-    covariance,
-    points,
-    expected,
-    y,
-    noise,
-    rule,
-    lower,
-    margin,
-    repair,
-    post_mean,
-    post_covariance,
-    innovation,
-    own,
-    gain,
-    likelihood,
-    repaired,
-    centre,
-    first,
-    end,
-):
+def update_of(mean, drawn, expected, y, noise, rules, post, kept, repaired, first, end):  # type: ignore[no-untyped-def]
     """The state given a measurement; what is NaN was not measured. ``repaired`` keeps what it was where nothing is repaired.
 
-    ``centre`` becomes the weight that the mean point had in covariances, (B,): 0 where a negative one took their definiteness.
+    Written are mean and covariance, ``post``, and ``kept``: innovation, its covariance, gain, likelihood, and the weight of the mean
+    point in covariances, (B,), 0 where a negative one took their definiteness.
     """
+    (rule, lower, margin, repair), (points, _, covariance) = rules, drawn
+    (post_mean, post_covariance), (innovation, own, gain, likelihood, centre) = post, kept
     count, m = expected.shape[:2]
     n, lanes = mean.shape[0], width(mean)
     half, log_two_pi = rule.dtype.type(0.5), rule.dtype.type(np.log(2.0 * np.pi))
@@ -399,29 +397,10 @@ def _solve(factor, given, at, m, solved):  # type: ignore[no-untyped-def]
 
 
 @compiled
-def update_adjoint(  # type: ignore[no-untyped-def]
-    mean,
-    points,
-    expected,
-    y,
-    rule,
-    lower,
-    innovation,
-    own,
-    gain,
-    centre,
-    post_mean_bar,
-    post_covariance_bar,
-    mean_bar,
-    covariance_bar,
-    points_bar,
-    expected_bar,
-    noise_bar,
-    y_bar,
-    first,
-    end,
-):
-    """Adjoint of `update_of`; writes ``mean_bar``, ``covariance_bar``, ``points_bar``, ``expected_bar``, ``noise_bar`` and ``y_bar``."""
+def update_adjoint(mean, points, expected, y, rules, kept, post_bars, prior_bars, other_bars, first, end):  # type: ignore[no-untyped-def]
+    """Adjoint of `update_of`; writes gradients of mean and covariance before, and of points, what is expected, noise and measurements."""
+    (rule, lower, _, _), (innovation, own, gain, _, centre), (post_mean_bar, post_covariance_bar) = rules, kept, post_bars
+    (mean_bar, covariance_bar), (points_bar, expected_bar, noise_bar, y_bar) = prior_bars, other_bars
     count, m = expected.shape[:2]
     n = mean.shape[0]
     half, two = rule.dtype.type(0.5), rule.dtype.type(2.0)

@@ -12,7 +12,7 @@ import numpy as np
 import torch
 
 from vehest.constants import GRAVITY
-from vehest.filters.unscented_scan import CompiledModel
+from vehest.filters.unscented_scan import PointModel
 from vehest.lanes import choose, each, load_unfused, most, store_some, width
 from vehest.vehicle.dugoff import LARGEST_RATIO, LEAST_COSINE, LEAST_LOAD, LEAST_SHARE, DugoffTrack
 
@@ -22,7 +22,7 @@ compiled = numba.njit(cache=True, nogil=True, error_model="numpy", boundscheck=F
 piece = numba.njit(forceinline=True, no_cpython_wrapper=True, no_cfunc_wrapper=True, error_model="numpy", boundscheck=False)
 
 
-class CompiledDugoffTrack(CompiledModel):
+class CompiledDugoffTrack(PointModel):
     """A `DugoffTrack` for the unscented filter; nothing of the car is learnt.
 
     Args:
@@ -30,13 +30,14 @@ class CompiledDugoffTrack(CompiledModel):
         dtype: precision of the arrays.
     """
 
+    is_compiled = True
+
     def __init__(self, track: DugoffTrack, dtype: torch.dtype = torch.float64) -> None:
         car = track.car
         scalar = np.float32 if dtype == torch.float32 else np.float64
         numbers = [car.mass, car.yaw_inertia, car.cg_to_front_axle, car.cg_to_rear_axle, car.cg_height, track.step, track.minimum_speed]
         axles = [[axle.cornering_stiffness, axle.friction, axle.reduction] for axle in (track.front, track.rear)]
         self.car = (np.array(numbers, scalar), np.array(axles, scalar), track.tyres == "smooth")
-        self.measured = 5 if track.sees_sideslip else 4
         self.entries = (_transition, _observation, _transition_adjoint, _observation_adjoint)
 
 

@@ -24,7 +24,7 @@ from vehest.constants import GRAVITY
 from vehest.estimators.kernels.activation import arctan, sigmoid, softplus, tanh
 from vehest.estimators.kernels.blas import one_blas_thread
 from vehest.estimators.kernels.compiling import entry, part
-from vehest.filters.unscented_scan import Array, CompiledModel
+from vehest.filters.unscented_scan import Array, PointModel
 from vehest.lanes import width
 from vehest.vehicle.dynamics import TURN, UNSCALED, Dynamics, NeuralCar, PacejkaCar, Perceptron, ResidualCar, TyreNetworkCar, physical_of
 from vehest.vehicle.tyres import STILL
@@ -45,7 +45,7 @@ def copy_rows(rows, out):  # type: ignore[no-untyped-def]
             out[i, p] = rows[i, p]
 
 
-class CompiledPlanarCar(CompiledModel):
+class CompiledPlanarCar(PointModel):
     """A planar car for the unscented filter.
 
     Args:
@@ -57,6 +57,8 @@ class CompiledPlanarCar(CompiledModel):
     Raises:
         ValueError: the car is of another kind, its network has not two hidden layers, or its tyres have a curvature.
     """
+
+    is_compiled = True
 
     def __init__(self, dynamics: Dynamics, step: float, lower: Sequence[float] | None, dtype: torch.dtype) -> None:
         kind = _kind_of(dynamics)
@@ -80,7 +82,6 @@ class CompiledPlanarCar(CompiledModel):
         numbers = [physical.mass, physical.wheelbase, physical.wheel_radius, step, TURN, UNSCALED, STILL, flat, GRAVITY]
         matrices = tuple(np.ascontiguousarray(arrays[place].T) for place in (0, 2, 4))
         self.car = ((*arrays[:6], *matrices), arrays[6], np.array(numbers, scalar), kind)
-        self.measured = 4
         self.entries = (_transition, _observation, _transition_adjoint, _observation_adjoint)
 
     def working(self) -> AbstractContextManager[object]:
