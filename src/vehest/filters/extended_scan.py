@@ -99,8 +99,8 @@ def extended_scan(
 
 
 @numba.njit(error_model="numpy")
-def _scan(transition, observation, parameters, Q, R, u, y, start, predicted, filtered, innovation, innovation_cov, likelihood):  # type: ignore[no-untyped-def]
-    """Write states, innovations and likelihoods; returns the sample whose innovation covariance has no Cholesky factor, or -1.
+def _scan(transition, observation, parameters, Q, R, u, y, start, predicted, filtered, innovation, innovation_cov):  # type: ignore[no-untyped-def]
+    """Write states and innovations; returns the sample whose innovation covariance has no Cholesky factor, or -1.
 
     This much is compiled for each model; the rest is loaded.
     """
@@ -119,7 +119,6 @@ def _scan(transition, observation, parameters, Q, R, u, y, start, predicted, fil
             innovation[k, i] = y[k, i] - expected[i] if known else 0.0
             for j in range(n):
                 seen[i, j] = slope[i, j] if known else 0.0
-        likelihood[k] = update(prior, post, y[k], R[k], innovation[k], innovation_cov[k], seen, room)
-        if math.isnan(likelihood[k]):
+        if not update(prior, post, y[k], R[k], innovation[k], innovation_cov[k], seen, room):
             return k
     return -1

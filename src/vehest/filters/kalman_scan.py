@@ -59,12 +59,12 @@ def filtered_by(scan: Any, given: Sequence[Any], y: FloatArray, initial: Gaussia
     """What a compiled scan makes of measurements y, (T, m), from an initial state; raises `numpy.linalg.LinAlgError` where it gives up."""
     (steps, m), n = y.shape, initial.mean.shape[-1]
     predicted, filtered = (Gaussian(np.empty((steps, n)), np.empty((steps, n, n))) for _ in range(2))
-    innovation, covariance, likelihood = np.empty((steps, m)), np.empty((steps, m, m)), np.empty(steps)
+    innovation, covariance = np.empty((steps, m)), np.empty((steps, m, m))
     start = contiguous(initial.mean, (n,), "initial.mean"), contiguous(initial.covariance, (n, n), "initial.covariance")
-    failed = scan(*given, y, start, tuple(predicted), tuple(filtered), innovation, covariance, likelihood, *gate)
+    failed = scan(*given, y, start, tuple(predicted), tuple(filtered), innovation, covariance, *gate)
     if failed >= 0:
         raise np.linalg.LinAlgError(f"the innovation covariance is not positive definite at sample {failed}")
-    return Filtered(predicted, filtered, innovation, covariance, ~np.isnan(y), likelihood)
+    return Filtered(predicted, filtered, innovation, covariance, ~np.isnan(y))
 
 
 def contiguous(values: FloatArray, shape: tuple[int, ...], name: str) -> FloatArray:
@@ -78,8 +78,8 @@ def contiguous(values: FloatArray, shape: tuple[int, ...], name: str) -> FloatAr
 
 
 @numba.njit(cache=True, error_model="numpy")
-def _scan(A, b, Q, C, d, R, y, start, predicted, filtered, innovation, innovation_cov, likelihood, limit, patience, refused):  # type: ignore[no-untyped-def]
-    """Write states, innovations and likelihoods; returns the sample whose innovation covariance has no Cholesky factor, or -1.
+def _scan(A, b, Q, C, d, R, y, start, predicted, filtered, innovation, innovation_cov, limit, patience, refused):  # type: ignore[no-untyped-def]
+    """Write states and innovations; returns the sample whose innovation covariance has no Cholesky factor, or -1.
 
     With a finite ``limit`` what the gate refuses becomes NaN in ``y``.
     """
@@ -109,8 +109,7 @@ def _scan(A, b, Q, C, d, R, y, start, predicted, filtered, innovation, innovatio
                 error -= seen[i, j] * prior_mean[k, j]
             innovation[k, i] = error
         prior, post = (prior_mean[k], prior_cov[k]), (post_mean[k], post_cov[k])
-        likelihood[k] = update(prior, post, y[k], R[k], innovation[k], innovation_cov[k], seen, room)
-        if math.isnan(likelihood[k]):
+        if not update(prior, post, y[k], R[k], innovation[k], innovation_cov[k], seen, room):
             return k
     return -1
 
@@ -136,15 +135,15 @@ def move(slope, cov, noise, out, room):  # type: ignore[no-untyped-def]
 
 @numba.njit(inline="always")
 def update(prior, post, y, R, innovation, S, seen, room):  # type: ignore[no-untyped-def]
-    """Write mean and covariance after a measurement, from those before, by Joseph's form, and S; returns the log-likelihood, or NaN.
+    """Write mean and covariance after a measurement, from those before, by Joseph's form, and S; False where S is not definite.
 
     What is NaN in ``y`` (m,) was not measured: its ``innovation`` and its row of ``seen``, H (m, n), are 0.
     """
     (mean, cov), (post_mean, post_cov), (of_both, of_states, of_measured) = prior, post, room
     (cross, gain, weighted), (kept, left, right), (noise, factor, whitened) = of_both, of_states, of_measured
-    m, n, count = len(y), len(mean), 0
+    m, n, known = len(y), len(mean), True
     for i in range(m):
-        count += not math.isnan(y[i])
+        known = known and not math.isnan(innovation[i])
         for j in range(m):
             noise[i, j] = R[i, j] if not math.isnan(y[i]) and not math.isnan(y[j]) else (1.0 if i == j else 0.0)
     _multiply(seen, cov, cross)
@@ -153,8 +152,8 @@ def update(prior, post, y, R, innovation, S, seen, room):  # type: ignore[no-unt
         for j in range(m):
             S[i, j] += noise[i, j]
     _make_symmetric(S)
-    if not _cholesky(S, factor):
-        return math.nan
+    if not (known and _cholesky(S, factor)):
+        return False
     for j in range(n):  # gain = (S⁻¹ H P)ᵀ
         for i in range(m):
             whitened[i] = cross[i, j]
@@ -182,13 +181,7 @@ def update(prior, post, y, R, innovation, S, seen, room):  # type: ignore[no-unt
         for j in range(n):
             post_cov[i, j] += right[i, j]
     _make_symmetric(post_cov)
-    for i in range(m):
-        whitened[i] = innovation[i]
-    _solve(factor, whitened)
-    total = count * math.log(2.0 * math.pi)
-    for i in range(m):
-        total += whitened[i] * whitened[i] + 2.0 * math.log(factor[i, i])
-    return -0.5 * total
+    return True
 
 
 @numba.njit(inline="always")

@@ -49,7 +49,6 @@ class Tape(NamedTuple):
     innovation: Any
     own: Any
     gain: Any
-    likelihood: Any
     centre: Any
     repaired: Any
     gone: Any
@@ -58,7 +57,7 @@ class Tape(NamedTuple):
 def tape_of(steps: int, sequences: int, n: int, m: int, dtype: Any) -> Tape:
     """A tape for n states and m measurements."""
     points = 2 * n + 1
-    shapes: list[tuple[int, ...]] = [(n,), (n, n), (n,), (n, n), (points, n), (points, m), (m,), (m, m), (n, m), (), ()]
+    shapes: list[tuple[int, ...]] = [(n,), (n, n), (n,), (n, n), (points, n), (points, m), (m,), (m, m), (n, m), ()]
     made = [room((steps, *shape, sequences), dtype) for shape in shapes]
     return Tape(*made, np.zeros((steps, sequences), np.bool_), np.zeros((steps, m, sequences), np.bool_))  # type: ignore[call-arg]
 
@@ -137,7 +136,7 @@ def forward(calls, at_state, car_at, at_prior, car_of, setting, tape, y, u, nois
             if setting.gated:
                 calls.gate_of(expected, added, rules, setting.limit, setting.patience, y[k], refused, tape.gone[k], first, end)
             post = tape.post_mean[k], tape.post_covariance[k]
-            kept = tape.innovation[k], tape.own[k], tape.gain[k], tape.likelihood[k], tape.centre[k]
+            kept = tape.innovation[k], tape.own[k], tape.gain[k], tape.centre[k]
             calls.update_of(mean, drawn, expected, y[k], added, rules, post, kept, repaired, first, end)
 
 
@@ -158,7 +157,7 @@ def backward(calls, setting, tape, y, u, bars, scratch, gradients, first, end): 
     for k in range(len(y) - 1, -1, -1):
         _add(post_mean_bar, mean_up[k], first, end)
         _add(post_covariance_bar, covariance_up[k], first, end)
-        mean, kept = tape.prior_mean[k], (tape.innovation[k], tape.own[k], tape.gain[k], tape.likelihood[k], tape.centre[k])
+        mean, kept = tape.prior_mean[k], (tape.innovation[k], tape.own[k], tape.gain[k], tape.centre[k])
         calls.points_of(mean, tape.prior_covariance[k], rules, drawn, lost, first, end)
         post_bars, prior_bars = (post_mean_bar, post_covariance_bar), (mean_bar, covariance_bar)
         other_bars = points_bar, expected_bar, spread_bar[k], y_bar[k]

@@ -225,7 +225,6 @@ def unscented_scan(
         outside[2],
         outside[3],
         ~(torch.isnan(measurements) | _by_sequence(tape.gone)),
-        _by_sequence(tape.likelihood),
     )
     return NonlinearFiltered(filtered, _by_sequence(tape.repaired))
 

@@ -25,7 +25,7 @@ ARGUMENTS: dict[str, Any] = {
     "rules": (1, 1, 0, types.boolean),
     "drawn": (3, 3, 3),
     "post": (2, 3),
-    "kept": (2, 3, 3, 1, 1),
+    "kept": (2, 3, 3, 1),
     "post_bars": (2, 3),
     "prior_bars": (2, 3),
     "other_bars": (3, 3, 3, 2),
@@ -259,18 +259,16 @@ def gate_of(expected, noise, rules, limit, patience, y, refused, gone, first, en
 def update_of(mean, drawn, expected, y, noise, rules, post, kept, repaired, first, end):  # type: ignore[no-untyped-def]
     """The state given a measurement; what is NaN was not measured. ``repaired`` keeps what it was where nothing is repaired.
 
-    Written are mean and covariance, ``post``, and ``kept``: innovation, its covariance, gain, likelihood, and the weight of the mean
-    point in covariances, (B,), 0 where a negative one took their definiteness.
+    Written are mean and covariance, ``post``, and ``kept``: innovation, its covariance, gain, and the weight of the mean point in
+    covariances, (B,), 0 where a negative one took their definiteness.
     """
     (rule, lower, margin, repair), (points, _, covariance) = rules, drawn
-    (post_mean, post_covariance), (innovation, own, gain, likelihood, centre) = post, kept
+    (post_mean, post_covariance), (innovation, own, gain, centre) = post, kept
     count, m = expected.shape[:2]
     n, lanes = mean.shape[0], width(mean)
-    half, log_two_pi = rule.dtype.type(0.5), rule.dtype.type(np.log(2.0 * np.pi))
     error, spread, deviation = _rows(m, mean), _rows(count * m, mean), _rows(count * n, mean)
     cross, factor, K, S, flags = _rows(n * m, mean), _rows(m * m, mean), _rows(n * m, mean), _rows(m * m, mean), _rows(1, mean)
     x, A, tried, weight = _rows(n, mean), _rows(n * n, mean), _rows(n * n, mean), _rows(1, mean)
-    whitened = np.empty(m, mean.dtype)
     for b in range(first, end, lanes):
         _spread(expected, points, mean, y, b, rule, error, spread, deviation)
         around, definite, lifted = _at(mean, 0, b) * 0 + rule[2], _at(mean, 0, b) * 0, False
@@ -301,17 +299,6 @@ def update_of(mean, drawn, expected, y, noise, rules, post, kept, repaired, firs
         _put(weight, 0, around)
         for i in range(n):
             _put(x, i, most(_moved(mean, K, error, i, m, b), lower[i]))
-        for lane in range(min(lanes, end - b)):
-            log_determinant, squared, measured = mean[0, b + lane] * 0, mean[0, b + lane] * 0, 0
-            for i in range(m):
-                measured += y[i, b + lane] == y[i, b + lane]
-                left = error[i, lane]
-                for c in range(i):
-                    left -= factor[i * m + c, lane] * whitened[c]
-                whitened[i] = left / factor[i * m + i, lane]
-                squared += whitened[i] * whitened[i]
-                log_determinant += np.log(factor[i * m + i, lane])
-            likelihood[b + lane] = -half * (squared + 2 * log_determinant + measured * log_two_pi)
         _write(x, post_mean, b, end)
         _write(A, post_covariance, b, end)
         _write(error, innovation, b, end)
@@ -399,7 +386,7 @@ def _solve(factor, given, at, m, solved):  # type: ignore[no-untyped-def]
 @compiled
 def update_adjoint(mean, points, expected, y, rules, kept, post_bars, prior_bars, other_bars, first, end):  # type: ignore[no-untyped-def]
     """Adjoint of `update_of`; writes gradients of mean and covariance before, and of points, what is expected, noise and measurements."""
-    (rule, lower, _, _), (innovation, own, gain, _, centre), (post_mean_bar, post_covariance_bar) = rules, kept, post_bars
+    (rule, lower, _, _), (innovation, own, gain, centre), (post_mean_bar, post_covariance_bar) = rules, kept, post_bars
     (mean_bar, covariance_bar), (points_bar, expected_bar, noise_bar, y_bar) = prior_bars, other_bars
     count, m = expected.shape[:2]
     n = mean.shape[0]
