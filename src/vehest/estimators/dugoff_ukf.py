@@ -41,7 +41,7 @@ from vehest.filters.sigma_points import symmetric_rule
 from vehest.filters.unscented_scan import MARGIN, UnscentedStepper
 from vehest.training.context import FitContext
 from vehest.training.identification import LEAST_PROCESS_YAW_RATE, IdentificationSettings
-from vehest.training.search import SearchRecord, nelder_mead_over_grid, optuna_search
+from vehest.training.search import SearchRecord
 from vehest.vehicle.dugoff import (
     BMW_545I,
     LARGEST_RATIO,
@@ -263,8 +263,7 @@ class DugoffUkf(SigmaPointEstimator):
             self.levels |= {name: ASSUMED[name] for name in searched}
         elif searched:
             search = self._tune(searched, data.train, training, context)
-            columns = [*(f"start_{name}" for name in searched), *searched, "train_loss"]
-            history = {name: search.starts[:, column].tolist() for column, name in enumerate(columns)}
+            history = search.history(searched)
             metrics |= {"evaluations": search.evaluations, "best_train_loss": search.cost}
             self.levels |= dict(zip(searched, (10.0**search.best).tolist(), strict=True))
             interrupted = search.interrupted
@@ -331,9 +330,7 @@ class DugoffUkf(SigmaPointEstimator):
 
         limits = BOXES | {"process_yaw_rate": (math.log10(LEAST_PROCESS_YAW_RATE), math.log10(training.most_process_yaw_rate))}
         boxes = [limits[name] for name in searched]
-        if training.method == "optuna":
-            return optuna_search(cost, boxes, training.trials, self._seed, context, stages=training.stages, shrink=training.shrink)
-        return nelder_mead_over_grid(cost, boxes, [STARTS[name] for name in searched], training.search, context)
+        return training.search(cost, boxes, [STARTS[name] for name in searched], self._seed, context)
 
     def mean_squared_error(
         self,

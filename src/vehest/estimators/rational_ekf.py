@@ -28,7 +28,7 @@ from vehest.filters.sigma_points import cubature_rule
 from vehest.filters.unscented_scan import TorchModel, UnscentedStepper
 from vehest.training.context import FitContext
 from vehest.training.noise_tuning import NoiseTuningSettings
-from vehest.training.search import SearchRecord, nelder_mead_over_grid, optuna_search
+from vehest.training.search import SearchRecord
 from vehest.vehicle.tyre_track import MOTION, TYRE_PARAMETERS, TyreTrack
 
 LEVELS = ("yaw_rate", "ay", "steer", "tyres")
@@ -245,8 +245,7 @@ class RationalFilter(SideslipFilter):
             extended, drives = self._extended(), self._drives(data.train)
             search = extended._tune(drives, training, context)
             n = len(self._searched)
-            columns = [*(f"start_{name}" for name in self._searched), *self._searched, "train_loss"]
-            history = {name: search.starts[:, column].tolist() for column, name in enumerate(columns)}
+            history = search.history(self._searched)
             boxes = np.array([BOXES[name] for name in self._searched])
             at_limits = np.minimum(search.best[:n] - boxes[:, 0], boxes[:, 1] - search.best[:n]) < EDGE * np.ptp(boxes, axis=1)
             metrics |= {"evaluations": search.evaluations, "best_train_loss": search.cost, "levels_at_limits": int(at_limits.sum())}
@@ -302,10 +301,8 @@ class RationalFilter(SideslipFilter):
         def cost(powers: FloatArray) -> float:
             return self._cost(drives, self._calibrated(powers, drives), skip)
 
-        boxes = [BOXES[name] for name in self._searched]
-        if training.method == "optuna":
-            return optuna_search(cost, boxes, training.trials, self._seed, context)
-        return nelder_mead_over_grid(cost, boxes, [STARTS[name] for name in self._searched], training.search, context)
+        boxes, starts = ([limits[name] for name in self._searched] for limits in (BOXES, STARTS))
+        return training.search(cost, boxes, starts, self._seed, context)
 
     def _calibrated(self, powers: FloatArray, drives: Sequence[tuple[FloatArray, FloatArray]]) -> dict[str, float]:
         """Levels at powers of ten of `_searched`; those of sensors are scaled so that innovations are as large as the filter expects."""

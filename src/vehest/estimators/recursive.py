@@ -111,14 +111,12 @@ class Recursive(Estimator):
 
         search = nelder_mead_over_grid(cost, boxes, starts, training, context)  # type: ignore[arg-type]
         self.values |= dict(zip(self.unknown, search.best.tolist(), strict=True))
-        columns = (*(f"start_{name}" for name in self.unknown), *self.unknown, "train_loss")
-        history = {name: search.starts[:, column].tolist() for column, name in enumerate(columns)}
         metrics = {
             "evaluations": search.evaluations,
             "best_train_loss": search.cost,
             "best_validation_loss": self.mean_squared_error(data.validation),
         }
-        return self.values, FitRecord(history, metrics, search.interrupted)
+        return self.values, FitRecord(search.history(self.unknown), metrics, search.interrupted)
 
     @property
     def n_parameters(self) -> int:
