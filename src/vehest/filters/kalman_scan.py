@@ -130,7 +130,7 @@ def move(slope, cov, noise, out, room):  # type: ignore[no-untyped-def]
     for i in range(len(out)):
         for j in range(len(out)):
             out[i, j] += noise[i, j]
-    _make_symmetric(out)
+    make_symmetric(out)
 
 
 @numba.njit(inline="always")
@@ -151,7 +151,7 @@ def update(prior, post, y, R, innovation, S, seen, room):  # type: ignore[no-unt
     for i in range(m):
         for j in range(m):
             S[i, j] += noise[i, j]
-    _make_symmetric(S)
+    make_symmetric(S)
     if not (known and _cholesky(S, factor)):
         return False
     for j in range(n):  # gain = (S⁻¹ H P)ᵀ
@@ -180,7 +180,7 @@ def update(prior, post, y, R, innovation, S, seen, room):  # type: ignore[no-unt
     for i in range(n):
         for j in range(n):
             post_cov[i, j] += right[i, j]
-    _make_symmetric(post_cov)
+    make_symmetric(post_cov)
     return True
 
 
@@ -221,7 +221,8 @@ def _multiply_transposed(a, b, out):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(inline="always")
-def _make_symmetric(a):  # type: ignore[no-untyped-def]
+def make_symmetric(a):  # type: ignore[no-untyped-def]
+    """The mean of a matrix and its transpose, in place."""
     for i in range(a.shape[0]):
         for j in range(i):
             a[i, j] = a[j, i] = 0.5 * (a[i, j] + a[j, i])

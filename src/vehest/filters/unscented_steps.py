@@ -60,7 +60,7 @@ def types_of(step: Any, dtype: Any) -> tuple[Any, ...]:
 
 
 @piece
-def _at(values, row, b):  # type: ignore[no-untyped-def]
+def at_row(values, row, b):  # type: ignore[no-untyped-def]
     """Vector of a row (the indices before the last one, as one) from sequence b on."""
     return load_unfused(values, row * values.shape[values.ndim - 1] + b)
 
@@ -85,7 +85,7 @@ def _rows(count, like):  # type: ignore[no-untyped-def]
 def _read(values, rows, b):  # type: ignore[no-untyped-def]
     """Sequences from b on to scratch."""
     for row in range(rows.shape[0]):
-        _put(rows, row, _at(values, row, b))
+        _put(rows, row, at_row(values, row, b))
 
 
 @piece
@@ -123,7 +123,7 @@ def points_of(mean, given, rules, drawn, repaired, first, end):  # type: ignore[
                     repaired[b + lane] = _repaired(A, L, lane, n, margin, repair)
         nothing = _own(L, 0) - _own(L, 0)  # NaN where a sequence is lost
         for i in range(n):
-            c = _at(mean, i, b)
+            c = at_row(mean, i, b)
             _put(P, i, choose(nothing == 0, most(c, lower[i]), nothing))
             for j in range(n):
                 offset = rule[0] * _own(L, i * n + j) if j <= i else nothing
@@ -144,12 +144,12 @@ def points_adjoint(mean, factor, rules, points_bar, mean_bar, covariance_bar, fi
         _read(covariance_bar, A_bar, b)
         nothing = _own(L, 0) * 0
         for i in range(n):
-            c, bar = _at(mean, i, b), _at(mean_bar, i, b)
-            bar = choose(c >= lower[i], bar + _at(points_bar, i, b), bar)
+            c, bar = at_row(mean, i, b), at_row(mean_bar, i, b)
+            bar = choose(c >= lower[i], bar + at_row(points_bar, i, b), bar)
             for j in range(n):
                 offset = rule[0] * _own(L, i * n + j) if j <= i else nothing
-                up = choose(c + offset >= lower[i], _at(points_bar, (1 + j) * n + i, b), nothing)
-                down = choose(c - offset >= lower[i], _at(points_bar, (1 + n + j) * n + i, b), nothing)
+                up = choose(c + offset >= lower[i], at_row(points_bar, (1 + j) * n + i, b), nothing)
+                down = choose(c - offset >= lower[i], at_row(points_bar, (1 + n + j) * n + i, b), nothing)
                 bar += up + down
                 _put(below, i * n + j, rule[0] * (up - down) if j <= i else nothing)
             _put(x_bar, i, bar)
@@ -162,12 +162,12 @@ def points_adjoint(mean, factor, rules, points_bar, mean_bar, covariance_bar, fi
 def _deviations(values, b, m, rule, deviation, i):  # type: ignore[no-untyped-def]
     """Write how far values (S, m, B) lie from their weighted mean in i, which is returned, into scratch (S · m, W)."""
     count = values.shape[0]
-    around = _at(values, 0, b) * 0
+    around = at_row(values, 0, b) * 0
     for s in range(1, count):
-        around += _at(values, s * m + i, b)
-    centre = rule[1] * _at(values, i, b) + rule[3] * around
+        around += at_row(values, s * m + i, b)
+    centre = rule[1] * at_row(values, i, b) + rule[3] * around
     for s in range(count):
-        _put(deviation, s * m + i, _at(values, s * m + i, b) - centre)
+        _put(deviation, s * m + i, at_row(values, s * m + i, b) - centre)
     return centre
 
 
@@ -192,7 +192,7 @@ def moments_of(values, noise, rules, mean, covariance, first, end):  # type: ign
         for i in range(n):
             for j in range(i + 1):
                 spread = _weighted(deviation, i, n, deviation, j, n, rule, rule[2])
-                spread += half * (_at(noise, i * n + j, b) + _at(noise, j * n + i, b))
+                spread += half * (at_row(noise, i * n + j, b) + at_row(noise, j * n + i, b))
                 _put(A, i * n + j, spread)
                 _put(A, j * n + i, spread)
         _write(x, mean, b, end)
@@ -209,9 +209,9 @@ def moments_adjoint(values, rules, mean_bar, covariance_bar, values_bar, noise_b
     for b in range(first, end, width(values)):
         for i in range(n):
             centre = _deviations(values, b, n, rule, deviation, i)
-            _put(through, i, choose(centre >= lower[i], _at(mean_bar, i, b), centre * 0))
+            _put(through, i, choose(centre >= lower[i], at_row(mean_bar, i, b), centre * 0))
             for j in range(n):
-                _put(whole, i * n + j, half * (_at(covariance_bar, i * n + j, b) + _at(covariance_bar, j * n + i, b)))
+                _put(whole, i * n + j, half * (at_row(covariance_bar, i * n + j, b) + at_row(covariance_bar, j * n + i, b)))
         for s in range(count):
             weight = two * (rule[2] if s == 0 else rule[3])
             for i in range(n):
@@ -271,7 +271,7 @@ def update_of(mean, drawn, expected, y, noise, rules, post, kept, repaired, firs
     x, A, tried, weight = _rows(n, mean), _rows(n * n, mean), _rows(n * n, mean), _rows(1, mean)
     for b in range(first, end, lanes):
         _spread(expected, points, mean, y, b, rule, error, spread, deviation)
-        around, definite, lifted = _at(mean, 0, b) * 0 + rule[2], _at(mean, 0, b) * 0, False
+        around, definite, lifted = at_row(mean, 0, b) * 0 + rule[2], at_row(mean, 0, b) * 0, False
         for attempt in range(3):  # as it is, without a negative weight, lifted
             if not lifted:
                 definite = _joint(spread, deviation, around, rule, y, noise, b, n, cross, S, factor)
@@ -283,7 +283,7 @@ def update_of(mean, drawn, expected, y, noise, rules, post, kept, repaired, firs
                     for row in range(m * m):
                         nothing += _own(S, row) * 0
                     for row in range(n * n):
-                        nothing += _at(covariance, row, b) * 0
+                        nothing += at_row(covariance, row, b) * 0
                     lost = choose(nothing == 0, lost, 0.0)
                     if _any(lost, b, end, flags):
                         for lane in range(min(lanes, end - b)):
@@ -309,7 +309,7 @@ def update_of(mean, drawn, expected, y, noise, rules, post, kept, repaired, firs
 
 @piece
 def _moved(mean, K, error, i, m, b):  # type: ignore[no-untyped-def]
-    state = _at(mean, i, b)
+    state = at_row(mean, i, b)
     for c in range(m):
         state += _own(K, i * m + c) * _own(error, c)
     return state
@@ -321,13 +321,13 @@ def _spread(expected, points, mean, y, b, rule, error, spread, deviation):  # ty
     count, m = expected.shape[:2]
     n = mean.shape[0]
     for i in range(m):
-        z, centre = _at(y, i, b), _deviations(expected, b, m, rule, spread, i)
+        z, centre = at_row(y, i, b), _deviations(expected, b, m, rule, spread, i)
         _put(error, i, choose(z == z, z - centre, 0.0))
         for s in range(count):
             _put(spread, s * m + i, choose(z == z, _own(spread, s * m + i), 0.0))
     for s in range(count):
         for i in range(n):
-            _put(deviation, s * n + i, _at(points, s * n + i, b) - _at(mean, i, b))
+            _put(deviation, s * n + i, at_row(points, s * n + i, b) - at_row(mean, i, b))
 
 
 @piece
@@ -340,9 +340,9 @@ def _joint(spread, deviation, centre, rule, y, noise, b, n, cross, own, factor):
             _put(cross, i * m + j, _weighted(deviation, i, n, spread, j, m, rule, centre))
     for i in range(m):
         for j in range(i + 1):
-            one, other = _at(y, i, b), _at(y, j, b)
+            one, other = at_row(y, i, b), at_row(y, j, b)
             bare = _weighted(spread, i, m, spread, j, m, rule, centre)
-            noisy = bare + half * (_at(noise, i * m + j, b) + _at(noise, j * m + i, b))
+            noisy = bare + half * (at_row(noise, i * m + j, b) + at_row(noise, j * m + i, b))
             alone = bare + 1 if i == j else bare
             value = choose(one == one, choose(other == other, noisy, alone), alone)
             _put(own, i * m + j, value)
@@ -360,7 +360,7 @@ def _posterior(covariance, b, cross, factor, gain, post_covariance):  # type: ig
         _solve(factor, cross, i * m, m, gain)
     for i in range(n):
         for j in range(i + 1):
-            left = half * (_at(covariance, i * n + j, b) + _at(covariance, j * n + i, b))
+            left = half * (at_row(covariance, i * n + j, b) + at_row(covariance, j * n + i, b))
             for c in range(m):
                 taken = _own(gain, i * m + c) * _own(cross, j * m + c) + _own(gain, j * m + c) * _own(cross, i * m + c)
                 left -= half * taken
@@ -401,16 +401,16 @@ def update_adjoint(mean, points, expected, y, rules, kept, post_bars, prior_bars
         _read(innovation, error, b)
         _read(own, S, b)
         _read(gain, K, b)
-        around = _at(centre, 0, b)
+        around = at_row(centre, 0, b)
         for i in range(n):
             state = _moved(mean, K, error, i, m, b)
-            _put(through, i, choose(state >= lower[i], _at(post_mean_bar, i, b), state * 0))
+            _put(through, i, choose(state >= lower[i], at_row(post_mean_bar, i, b), state * 0))
             for j in range(n):
-                _put(P, i * n + j, half * (_at(post_covariance_bar, i * n + j, b) + _at(post_covariance_bar, j * n + i, b)))
+                _put(P, i * n + j, half * (at_row(post_covariance_bar, i * n + j, b) + at_row(post_covariance_bar, j * n + i, b)))
         _cholesky(S, factor, m)
         _solve(factor, error, 0, m, solved)
         for c in range(m):  # pulled = Kᵀ m̄, the gradient of the innovation
-            pull, known = _own(through, 0) * 0, _at(y, c, b)
+            pull, known = _own(through, 0) * 0, at_row(y, c, b)
             for i in range(n):
                 pull += _own(K, i * m + c) * _own(through, i)
             _put(pulled, c, pull)
@@ -428,7 +428,7 @@ def update_adjoint(mean, points, expected, y, rules, kept, post_bars, prior_bars
                     for j in range(n):
                         bar += _own(K, i * m + c) * _own(P, i * n + j) * _own(K, j * m + d)
                 _put(own_bar, c * m + d, bar)
-                one, other = _at(y, c, b), _at(y, d, b)
+                one, other = at_row(y, c, b), at_row(y, d, b)
                 _put(R_bar, c * m + d, choose(one == one, choose(other == other, bar, bar * 0), bar * 0))
         for i in range(n):
             left = _own(through, i)
@@ -441,7 +441,7 @@ def update_adjoint(mean, points, expected, y, rules, kept, post_bars, prior_bars
                 left -= bar
             _put(x_bar, i, left)
         for c in range(m):
-            known = _at(y, c, b)
+            known = at_row(y, c, b)
             left = choose(known == known, -_own(pulled, c), _own(pulled, c) * 0)
             for s in range(count):
                 bar = _own(pulled, c) * 0

@@ -12,6 +12,7 @@ import numba
 import numpy as np
 
 from vehest.filters.gating import refuses
+from vehest.filters.kalman_scan import make_symmetric
 from vehest.vehicle.rational_tyres import rational_axle
 
 _axle = numba.njit(rational_axle)
@@ -158,7 +159,7 @@ def _add_noise(cov, front, car, speed, step, variances, wandering):  # type: ign
     if wandering:
         for i in range(4, len(cov)):
             cov[i, i] += step * variances[i - 1]
-    _make_symmetric(cov)
+    make_symmetric(cov)
 
 
 @numba.njit(inline="always")
@@ -221,7 +222,7 @@ def _reduce(cov, gain, cross, vx, crossfall, variances, measured, left):  # type
             if measured[1]:
                 total += (gain[i, 1] * variances[1] - seen_ay) * gain[j, 1]
             cov[i, j] = total
-    _make_symmetric(cov)
+    make_symmetric(cov)
 
 
 @numba.njit(inline="always")
@@ -249,10 +250,3 @@ def _note(k, mean, cov, means, deviations, sideslip_cov):  # type: ignore[no-unt
 def _clip(mean, bounds):  # type: ignore[no-untyped-def]
     for i in range(len(mean)):
         mean[i] = min(max(mean[i], -bounds[i]), bounds[i])
-
-
-@numba.njit(inline="always")
-def _make_symmetric(matrix):  # type: ignore[no-untyped-def]
-    for i in range(len(matrix)):
-        for j in range(i):
-            matrix[i, j] = matrix[j, i] = 0.5 * (matrix[i, j] + matrix[j, i])
