@@ -6,7 +6,7 @@ from functools import cache
 import numpy as np
 import pytest
 
-from vehest.data.errors import ConfigurationError, DataError
+from vehest.data.errors import DataError
 from vehest.data.recording import Recording
 from vehest.estimators.filtering.tyre_fit import KNOWN_C1, axle_force, axle_motion, fit_motion
 from vehest.vehicle.parameters import SingleTrackParameters
@@ -95,8 +95,6 @@ def test_measured_forces_and_several_drives_count_and_slow_samples_do_not():
 
 def test_refusals_say_what_to_do():
     own = drive()
-    with pytest.raises(ConfigurationError, match="'magic' is not one of: linear, rational"):
-        fit_motion(axle_motion([own], TRUCK), "magic")
     with pytest.raises(DataError, match="100 are needed"):
         axle_motion([own.cut(0.0, 1.0)], TRUCK)
     with pytest.raises(DataError, match="check the signs of steer, ay and vy_ref"):

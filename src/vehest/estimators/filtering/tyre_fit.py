@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from scipy import optimize, signal
 
 from vehest.constants import FloatArray
-from vehest.data.errors import ConfigurationError, DataError
+from vehest.data.errors import DataError
 from vehest.data.recording import Recording
 from vehest.vehicle.dugoff import LoadedCar
 from vehest.vehicle.parameters import SingleTrackParameters
@@ -195,13 +195,10 @@ def fit_motion(motion: AxleMotion, kind: Kind = "rational") -> TyreFit:
         kind: ``linear`` or ``rational``.
 
     Raises:
-        ConfigurationError: no such kind.
         DataError: forces run against slips.
 
     Source: Di Biase, Lenzo & Timpone 2020, section III.B, Figure 3 and Table 1; blocks as in Liang & Zeger, Biometrika 73 (1), 1986.
     """
-    if kind not in PARAMETERS:
-        raise ConfigurationError(f"a tyre curve of kind '{kind}' is not one of: {', '.join(PARAMETERS)}")
     axles = [_fitted(kind, slip, force, motion.block) for slip, force in zip(motion.slip, motion.force, strict=True)]
     (front, front_covariance, front_rms), (rear, rear_covariance, rear_rms) = axles
     covariance = np.stack([front_covariance, rear_covariance])

@@ -53,18 +53,11 @@ class CompiledPlanarCar(PointModel):
         step: [s].
         lower: smallest possible value of each state.
         dtype: precision of the arrays.
-
-    Raises:
-        ValueError: the car is of another kind, its network has not two hidden layers, or its tyres have a curvature.
     """
 
     is_compiled = True
 
     def __init__(self, dynamics: Dynamics, step: float, lower: Sequence[float] | None, dtype: torch.dtype) -> None:
-        kind = _kind_of(dynamics)
-        if kind is None:
-            known = "networks have two hidden layers, tyres no curvature"
-            raise ValueError(f"there is no compiled code for this {type(dynamics).__name__}: {known}")
         network = getattr(dynamics, "network", None)
         if isinstance(network, Perceptron):
             (W1, b1), (W2, b2), (W3, b3) = network.layers()
@@ -81,7 +74,7 @@ class CompiledPlanarCar(PointModel):
         flat = 4.0 * np.finfo(scalar).eps
         numbers = [physical.mass, physical.wheelbase, physical.wheel_radius, step, TURN, UNSCALED, STILL, flat, GRAVITY]
         matrices = tuple(np.ascontiguousarray(arrays[place].T) for place in (0, 2, 4))
-        self.car = ((*arrays[:6], *matrices), arrays[6], np.array(numbers, scalar), kind)
+        self.car = ((*arrays[:6], *matrices), arrays[6], np.array(numbers, scalar), _kind_of(dynamics))
         self.entries = (_transition, _observation, _transition_adjoint, _observation_adjoint)
 
     def working(self) -> AbstractContextManager[object]:
