@@ -405,6 +405,13 @@ class Estimator(ABC):
         """
 
 
+def require_shapes(of: Estimator, weights: Mapping[str, np.ndarray[Any, Any]], expected: Mapping[str, tuple[int, ...]]) -> None:
+    """Raise `DataError` for weights of other names or shapes than an estimator's settings ask for."""
+    differing = sorted({(name, values.shape) for name, values in weights.items()} ^ set(expected.items()))
+    if differing:
+        raise DataError(f"weights of '{of.name}' do not fit its settings: '{differing[0][0]}' is missing, unknown or of another shape")
+
+
 class RunStepper(Stepper):
     """An estimator that has `run`, one sample at a time."""
 

@@ -19,7 +19,7 @@ from vehest.data.errors import ConfigurationError, DataError
 from vehest.data.estimate import Estimate
 from vehest.data.recording import Recording
 from vehest.declared import Group, setting
-from vehest.estimators.base import FitData, FitRecord, Trial
+from vehest.estimators.base import FitData, FitRecord, Trial, require_shapes
 from vehest.estimators.filtering.dugoff_fit import fit_dugoff
 from vehest.estimators.filtering.sigma_point_stepper import FilterStep, SigmaPointEstimator
 from vehest.estimators.filtering.track_filter import (
@@ -456,9 +456,7 @@ class DugoffUkf(SigmaPointEstimator):
 
     def load_weights(self, weights: Mapping[str, np.ndarray[Any, Any]]) -> None:
         """Take tyres and levels back."""
-        shapes = {name: values.shape for name, values in DugoffUkf.weights(self).items()}
-        if {name: values.shape for name, values in weights.items()} != shapes:
-            raise DataError(f"weights of '{self.name}' must be {', '.join(shapes)} of these inputs, not {', '.join(weights)}")
+        require_shapes(self, weights, {name: values.shape for name, values in DugoffUkf.weights(self).items()})
         self.axle_tyres = np.array(weights["tyres"], dtype=np.float64)
         self.levels = dict(zip(self.level_names, weights["levels"].tolist(), strict=True))
 

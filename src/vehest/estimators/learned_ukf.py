@@ -382,12 +382,8 @@ class LearnedUkf(Network, SigmaPointEstimator):
 
 def _held(values: FloatArray) -> FloatArray:
     """The last value where one is missing; 0 before the first."""
-    held = values.copy()
-    for k in range(len(held)):
-        missing = np.isnan(held[k])
-        if missing.any():
-            held[k, missing] = held[k - 1, missing] if k else 0.0
-    return held
+    last = np.maximum.accumulate(np.where(np.isnan(values), 0, np.arange(1, len(values) + 1)[:, None]))
+    return np.take_along_axis(np.concatenate([np.zeros_like(values[:1]), values]), last, axis=0)
 
 
 def _dynamics_in_c(dynamics: nn.Module) -> dict[str, Any]:

@@ -18,7 +18,7 @@ from vehest.constants import FloatArray
 from vehest.data.errors import ConfigurationError, DataError
 from vehest.data.recording import Recording
 from vehest.declared import Group, setting
-from vehest.estimators.base import FitData, FitRecord, Trial, rate
+from vehest.estimators.base import FitData, FitRecord, Trial, rate, require_shapes
 from vehest.estimators.filtering.sideslip_filter import FilteredStates, SideslipFilter, read_levels
 from vehest.estimators.filtering.tyre_fit import NORMAL_95, AxleMotion, TyreFit, axle_motion, fit_motion
 from vehest.estimators.kernels.rational_ekf import _roll, scan
@@ -488,9 +488,7 @@ class RationalFilter(SideslipFilter):
 
     def load_weights(self, weights: Mapping[str, np.ndarray[Any, Any]]) -> None:
         """Take curves and levels back."""
-        shapes = {name: values.shape for name, values in self.weights().items()}
-        if {name: values.shape for name, values in weights.items()} != shapes:
-            raise DataError(f"weights of '{self.name}' must be {', '.join(shapes)}, not {', '.join(weights)}")
+        require_shapes(self, weights, {name: values.shape for name, values in self.weights().items()})
         curves = np.array(weights["curves"], dtype=np.float64)
         self.axle_curves = np.where(curves == 0.0, math.inf, curves)
         self.curve_covariance = np.array(weights["curve_covariance"], dtype=np.float64)

@@ -14,9 +14,9 @@ import numba
 import numpy as np
 
 from vehest.constants import FloatArray
-from vehest.data.errors import ConfigurationError, DataError
+from vehest.data.errors import ConfigurationError
 from vehest.data.recording import Recording
-from vehest.estimators.base import Estimator, FitData, FitRecord, require_learnable
+from vehest.estimators.base import Estimator, FitData, FitRecord, require_learnable, require_shapes
 from vehest.training.context import FitContext, NoTraining
 from vehest.training.search import nelder_mead_over_grid
 
@@ -176,9 +176,7 @@ class Recursive(Estimator):
         Raises:
             DataError: one is missing or unknown.
         """
-        expected = self.weights()
-        if {name: values.shape for name, values in weights.items()} != {name: values.shape for name, values in expected.items()}:
-            raise DataError(f"weights of '{self.name}' must be {', '.join(expected) or 'none'}, not {', '.join(weights)}")
+        require_shapes(self, weights, {name: values.shape for name, values in self.weights().items()})
         self.values = {name: float(weights[name][0]) for name in self.values}
 
 
