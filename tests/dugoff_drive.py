@@ -2,6 +2,7 @@
 
 import numpy as np
 
+from point_models import called
 from vehest.data.recording import Recording
 from vehest.estimators.kernels.dugoff_track import CompiledDugoffTrack
 from vehest.vehicle.dugoff import DugoffAxle, DugoffTrack, LoadedCar
@@ -19,8 +20,8 @@ def driven(inputs):
     """What the track does at 100 Hz from rest under speed, steering angle and ax, (T, 3): its two states and what is measured of them."""
     track, states = CompiledDugoffTrack(dugoff_track()), np.zeros((len(inputs), 1, 2))
     for k in range(len(inputs) - 1):
-        states[k + 1] = track.transition(states[k : k + 1], inputs[k : k + 1])[0]
-    return (*states[:, 0].T, *track.observation(states, inputs)[:, 0].T)
+        states[k + 1] = called(track, 0, states[k : k + 1], inputs[k : k + 1], 2)[0]
+    return (*states[:, 0].T, *called(track, 1, states, inputs, 4)[:, 0].T)
 
 
 def dugoff_drive(seconds=20.0, seed=0, noise=1.0, name="drive", *, straight=0.0):

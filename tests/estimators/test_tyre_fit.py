@@ -6,9 +6,9 @@ from functools import cache
 import numpy as np
 import pytest
 
-from vehest.data.errors import ConfigurationError, DataError
+from vehest.data.errors import DataError
 from vehest.data.recording import Recording
-from vehest.estimators.filtering.tyre_fit import KNOWN_C1, axle_force, axle_motion, fit_tyres
+from vehest.estimators.filtering.tyre_fit import KNOWN_C1, axle_force, axle_motion, fit_motion
 from vehest.vehicle.parameters import SingleTrackParameters
 
 TRUCK = SingleTrackParameters(7912.0, 24230.0, 1.7401, 1.7599, 1.0, 1.0)
@@ -47,7 +47,7 @@ def drive(kind="rational", seed=0, noise=1.0, seconds=100.0, rate_hz=50.0, size=
 
 @pytest.mark.parametrize("kind", ["linear", "rational"])
 def test_fit_finds_the_curves_of_a_car_that_has_such_curves(kind):
-    fit = fit_tyres([drive(kind, seconds=200.0)], TRUCK, kind)
+    fit = fit_motion(axle_motion([drive(kind, seconds=200.0)], TRUCK), kind)
     found = np.stack([fit.front, fit.rear])
     np.testing.assert_allclose(found, CURVES[kind], rtol=0.03)
     assert (np.abs(found - CURVES[kind]) < 2.0 * fit.interval).all()
@@ -64,14 +64,14 @@ def test_without_noise_the_forces_are_those_of_the_car():
 def test_intervals_hold_the_truth_about_as_often_as_they_say():
     inside = []
     for seed in range(12):
-        fit = fit_tyres([drive(seed=seed, rate_hz=20.0)], TRUCK)
+        fit = fit_motion(axle_motion([drive(seed=seed, rate_hz=20.0)], TRUCK))
         inside.append(np.abs(np.stack([fit.front, fit.rear]) - CURVES["rational"]) < fit.interval)
     assert 0.7 < np.mean(inside) <= 1.0
 
 
 def test_where_drives_say_nothing_of_the_bend_what_is_known_of_road_tyres_stands():
     """c1 stays where tyres peak at 9 degrees and as uncertain as that is, while c2 is what the drive says."""
-    fit = fit_tyres([drive(size=0.05)], TRUCK)
+    fit = fit_motion(axle_motion([drive(size=0.05)], TRUCK))
     assert (np.abs(np.log(np.stack([fit.front, fit.rear])[:, 0]) - KNOWN_C1[0]) < 1.0 * KNOWN_C1[1]).all()
     found, interval = np.array([fit.front[0], fit.rear[0]]), fit.interval[:, 0]
     np.testing.assert_allclose(interval / found, 1.96 * KNOWN_C1[1], rtol=0.3)
@@ -83,8 +83,8 @@ def test_measured_forces_and_several_drives_count_and_slow_samples_do_not():
     wheels = {f"fy_{wheel}": np.full(len(own), value) for wheel, value in (("fl", 1.0), ("fr", 2.0), ("rl", 10.0), ("rr", 20.0))}
     motion = axle_motion([replace(own, channels={**own.channels, **wheels})], TRUCK, measured_forces=True)
     np.testing.assert_allclose(motion.force, np.repeat([[3.0], [30.0]], motion.force.shape[1], axis=1))
-    both = fit_tyres([drive(seed=1), drive(seed=2)], TRUCK)
-    assert both.slip.shape[1] == 2 * fit_tyres([drive(seed=1)], TRUCK).slip.shape[1]
+    both = fit_motion(axle_motion([drive(seed=1), drive(seed=2)], TRUCK))
+    assert both.slip.shape[1] == 2 * fit_motion(axle_motion([drive(seed=1)], TRUCK)).slip.shape[1]
     own = drive()
     slow, unknown = np.array(own["vx"]), np.array(own["ay"])
     slow[:500], unknown[1000:1100] = 1.0, np.nan
@@ -95,9 +95,7 @@ def test_measured_forces_and_several_drives_count_and_slow_samples_do_not():
 
 def test_refusals_say_what_to_do():
     own = drive()
-    with pytest.raises(ConfigurationError, match="'magic' is not one of: linear, rational"):
-        fit_tyres([own], TRUCK, "magic")
     with pytest.raises(DataError, match="100 are needed"):
-        fit_tyres([own.cut(0.0, 1.0)], TRUCK)
+        axle_motion([own.cut(0.0, 1.0)], TRUCK)
     with pytest.raises(DataError, match="check the signs of steer, ay and vy_ref"):
-        fit_tyres([replace(own, channels={**own.channels, "ay": -own["ay"], "yaw_rate": -own["yaw_rate"]})], TRUCK)
+        fit_motion(axle_motion([replace(own, channels={**own.channels, "ay": -own["ay"], "yaw_rate": -own["yaw_rate"]})], TRUCK))

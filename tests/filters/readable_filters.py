@@ -102,8 +102,14 @@ class _Updated(NamedTuple):
     state: Gaussian[Tensor]
     innovation: Tensor
     innovation_covariance: Tensor
-    log_likelihood: Tensor
     lost: Tensor
+
+
+def log_likelihood(steps):
+    """Of each sample's measurements given those before, (..., T), by innovations and their covariances; 0 where nothing was measured."""
+    errors, covariances, measured = (torch.as_tensor(part) for part in (steps.innovation, steps.innovation_covariance, steps.measured))
+    squared = torch.linalg.solve(covariances, errors).mul(errors).sum(-1)
+    return -0.5 * (squared + torch.logdet(covariances) + measured.sum(-1, dtype=errors.dtype) * math.log(2.0 * math.pi))
 
 
 def unscented_filter(model, measurements, inputs, initial, rule):
@@ -136,7 +142,6 @@ def unscented_filter(model, measurements, inputs, initial, rule):
         torch.stack([update.innovation for update in updates], axis),
         torch.stack([update.innovation_covariance for update in updates], axis),
         ~torch.isnan(measurements),
-        torch.stack([update.log_likelihood for update in updates], axis),
     )
     return NonlinearFiltered(steps, torch.stack(lost, axis))
 
@@ -175,11 +180,7 @@ def _updated(model, state, factor, y, u, rule):
             both = gain @ cross.mT
             reduction = both + both.mT - gain @ covariance @ gain.mT
         posterior = model.possible(state.mean + (gain @ innovation.unsqueeze(-1)).squeeze(-1))
-        whitened = torch.linalg.solve_triangular(factor, innovation.unsqueeze(-1), upper=False).squeeze(-1)
-        determinant = 2.0 * factor.diagonal(dim1=-2, dim2=-1).log().sum(-1)
-        count = measured.sum(-1, dtype=y.dtype)
-        likelihood = -0.5 * (whitened.square().sum(-1) + determinant + count * math.log(2.0 * math.pi))
-        return _Updated(Gaussian(posterior, symmetric(state.covariance - reduction)), innovation, covariance, likelihood, lost)
+        return _Updated(Gaussian(posterior, symmetric(state.covariance - reduction)), innovation, covariance, lost)
 
     updated = conditioned(rule)
     if rule.centre_covariance >= 0.0:
@@ -196,7 +197,6 @@ def _updated(model, state, factor, y, u, rule):
         Gaussian(*map(chosen, without.state, updated.state)),
         innovation,
         chosen(without.innovation_covariance, updated.innovation_covariance),
-        chosen(without.log_likelihood, updated.log_likelihood),
         lost,
     )
 
@@ -224,8 +224,7 @@ def extended_filter(model, measurements, inputs, initial):
             gain = torch.where(model.free(state.mean, u)[:, None], gain, 0.0)
         covariance = state.covariance - gain @ cross.mT - cross @ gain.mT + gain @ S @ gain.mT
         posterior = Gaussian(model.possible(state.mean + gain @ innovation), 0.5 * (covariance + covariance.mT))
-        fit = innovation @ torch.linalg.solve(S, innovation) + torch.logdet(S) + int(measured.sum()) * math.log(2.0 * math.pi)
-        samples.append((*state, *posterior, innovation, S, measured, -0.5 * fit))
+        samples.append((*state, *posterior, innovation, S, measured))
         state = posterior
     parts = [torch.stack(part) for part in zip(*samples, strict=True)]
     return Filtered(Gaussian(*parts[:2]), Gaussian(*parts[2:4]), *parts[4:])

@@ -62,7 +62,7 @@ def test_on_a_linear_model_it_is_the_kalman_filter_also_where_noise_changes_with
     ours = extended_scan(compiled, y, offsets, initial)
     assert np.abs(ours.filtered.mean - theirs.filtered.mean).max() < 1e-9
     assert np.abs(ours.filtered.covariance - theirs.filtered.covariance).max() < 1e-9
-    assert np.abs(ours.log_likelihood - theirs.log_likelihood).max() < 1e-9
+    assert np.abs(ours.innovation_covariance - theirs.innovation_covariance).max() < 1e-9
     with pytest.raises(ValueError, match=r"measurements must be of shape \(T, m\) with T > 0"):
         extended_scan(compiled, y[:0], offsets[:0], initial)
     with pytest.raises(ValueError, match=r"inputs of shape \(29, 3\) do not fit"):

@@ -103,7 +103,6 @@ def test_gaps_and_ends_do_not_count():
     assert high_passed_level([offset], 0.2) == pytest.approx(without, rel=1e-6)
 
 
-@pytest.mark.parametrize(("series", "cutoff", "what"), [(np.zeros(50), 0.2, "samples without a gap"), (np.zeros(500), 0.9, "cut-off must")])
-def test_what_cannot_be_read_is_refused(series, cutoff, what):
-    with pytest.raises(ValueError, match=what):
-        high_passed_level([series], cutoff)
+def test_what_is_too_short_is_refused():
+    with pytest.raises(ValueError, match="samples without a gap"):
+        high_passed_level([np.zeros(50)], 0.2)

@@ -67,7 +67,7 @@ def test_an_outlier_is_as_good_as_missing_and_takes_no_other_sensor_with_it():
         for name in ("filtered", "predicted"):
             for a, b in zip(getattr(gated, name), getattr(known, name), strict=True):
                 assert np.array_equal(a, b)
-        assert np.array_equal(gated.log_likelihood, known.log_likelihood)
+        assert np.array_equal(gated.innovation_covariance, known.innovation_covariance)
 
 
 def test_after_a_jump_of_the_truth_the_gate_opens_and_the_filter_comes_back():
@@ -116,7 +116,7 @@ def test_the_scan_refuses_what_the_readable_filter_refuses_whatever_the_rule():
         assert scanned.measured[0, 15 + PATIENCE, 1], "open again"
         for a, b in zip(readable.filtered, scanned.filtered, strict=True):
             assert torch.allclose(a, b, rtol=0, atol=1e-12 * float(a.abs().max())), name
-        assert torch.allclose(readable.log_likelihood, scanned.log_likelihood, rtol=1e-10, atol=1e-10)
+        assert torch.allclose(readable.innovation_covariance, scanned.innovation_covariance, rtol=1e-10, atol=1e-10)
 
 
 def test_gradients_through_a_gate_are_those_of_missing_measurements():

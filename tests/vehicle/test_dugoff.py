@@ -5,6 +5,7 @@ import pytest
 import torch
 
 from dugoff_drive import FRONT, dugoff_track
+from point_models import called
 from vehest.estimators.filtering.track_filter import TrackFilter
 from vehest.estimators.kernels.dugoff_track import CompiledDugoffTrack
 from vehest.filters.unscented_scan import TorchModel
@@ -65,11 +66,11 @@ def test_the_compiled_track_is_the_readable_one(tyres):
     track = dugoff_track(tyres, sees_sideslip=True)
     readable, compiled = TorchModel(track.transition, track.observation), CompiledDugoffTrack(track)
     points, inputs = (part.numpy() for part in driven(300))
-    for name, size in (("transition", 2), ("observation", 5)):
-        expected, found = (getattr(model, name)(points, inputs) for model in (readable, compiled))
+    for entry, size in enumerate((2, 5)):
+        expected, found = (called(model, entry, points, inputs, size) for model in (readable, compiled))
         np.testing.assert_allclose(found, expected, rtol=1e-12, atol=1e-9)
         upstream = drawn(300, 5, size, seed=3).numpy()
-        expected, found = (getattr(model, f"{name}_adjoint")(points, inputs, upstream, []) for model in (readable, compiled))
+        expected, found = (called(model, 2 + entry, points, inputs, 2, upstream, []) for model in (readable, compiled))
         assert np.isfinite(found).all()
         np.testing.assert_allclose(found, expected, rtol=1e-9, atol=1e-9)
 

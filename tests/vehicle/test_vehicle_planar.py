@@ -144,6 +144,3 @@ def test_positive_parameters_stay_positive():
     with torch.no_grad():
         own.get_parameter("log_inertia").sub_(20.0)
     assert 0.0 < own["inertia"].item() < 1e-8
-    for wrong in ({"mass": 0.0}, {"mass": math.nan}):
-        with pytest.raises(ValueError, match="mass must be positive"):
-            PositiveParameters(wrong)

@@ -12,7 +12,7 @@ from typing import Any, ClassVar, NamedTuple
 import numpy as np
 
 from vehest.constants import FloatArray
-from vehest.data.errors import DataError
+from vehest.data.errors import ConfigurationError, DataError
 from vehest.data.estimate import Estimate
 from vehest.data.recording import HIGHEST_RATE, Recording
 from vehest.data.schema import settings_from_config
@@ -117,6 +117,7 @@ class Estimator(ABC):
         covariance_of: quantities that the covariances of `run` are of.
         ignores_initial_state: whether an initial state is left aside; else it is used, or refused as an error.
         slow_kernel: ``module:function`` that takes tens of seconds to compile; empty: none.
+        offline: error of `online` where its settings make it not causal, with those that make it causal.
         trials: in the first comparison on a new car; none: it is left out.
         notice: lines for users of the method, such as a patent.
         template: C template of a step, in ``export/templates/methods`` or beside the family's module; empty: it has none.
@@ -136,6 +137,7 @@ class Estimator(ABC):
     covariance_of: ClassVar[tuple[str, ...]] = ()
     ignores_initial_state: ClassVar[bool] = False
     slow_kernel: ClassVar[str] = ""
+    offline: ClassVar[str] = "an estimator that is not causal cannot run along with a drive"
     trials: ClassVar[tuple[Trial, ...]] = ()
     notice: ClassVar[tuple[str, ...]] = ()
     template: ClassVar[str] = ""
@@ -385,6 +387,8 @@ class Estimator(ABC):
         Raises:
             ConfigurationError: it has not been fitted, or is not causal.
         """
+        if not self.causal:
+            raise ConfigurationError(self.offline)
         self.require_fitted()
         return RunStepper(self)
 
@@ -399,6 +403,13 @@ class Estimator(ABC):
         Raises:
             DataError: a name or shape does not fit the settings.
         """
+
+
+def require_shapes(of: Estimator, weights: Mapping[str, np.ndarray[Any, Any]], expected: Mapping[str, tuple[int, ...]]) -> None:
+    """Raise `DataError` for weights of other names or shapes than an estimator's settings ask for."""
+    differing = sorted({(name, values.shape) for name, values in weights.items()} ^ set(expected.items()))
+    if differing:
+        raise DataError(f"weights of '{of.name}' do not fit its settings: '{differing[0][0]}' is missing, unknown or of another shape")
 
 
 class RunStepper(Stepper):

@@ -19,7 +19,7 @@ from vehest.data.errors import ConfigurationError, DataError
 from vehest.data.estimate import Estimate
 from vehest.data.recording import Recording
 from vehest.declared import Group, setting
-from vehest.estimators.base import FitData, FitRecord, Trial
+from vehest.estimators.base import FitData, FitRecord, Trial, require_shapes
 from vehest.estimators.filtering.dugoff_fit import fit_dugoff
 from vehest.estimators.filtering.sigma_point_stepper import FilterStep, SigmaPointEstimator
 from vehest.estimators.filtering.track_filter import (
@@ -41,7 +41,7 @@ from vehest.filters.sigma_points import symmetric_rule
 from vehest.filters.unscented_scan import MARGIN, UnscentedStepper
 from vehest.training.context import FitContext
 from vehest.training.identification import LEAST_PROCESS_YAW_RATE, IdentificationSettings
-from vehest.training.search import SearchRecord, nelder_mead_over_grid, optuna_search
+from vehest.training.search import SearchRecord
 from vehest.vehicle.dugoff import (
     BMW_545I,
     LARGEST_RATIO,
@@ -263,8 +263,7 @@ class DugoffUkf(SigmaPointEstimator):
             self.levels |= {name: ASSUMED[name] for name in searched}
         elif searched:
             search = self._tune(searched, data.train, training, context)
-            columns = [*(f"start_{name}" for name in searched), *searched, "train_loss"]
-            history = {name: search.starts[:, column].tolist() for column, name in enumerate(columns)}
+            history = search.history(searched)
             metrics |= {"evaluations": search.evaluations, "best_train_loss": search.cost}
             self.levels |= dict(zip(searched, (10.0**search.best).tolist(), strict=True))
             interrupted = search.interrupted
@@ -331,9 +330,7 @@ class DugoffUkf(SigmaPointEstimator):
 
         limits = BOXES | {"process_yaw_rate": (math.log10(LEAST_PROCESS_YAW_RATE), math.log10(training.most_process_yaw_rate))}
         boxes = [limits[name] for name in searched]
-        if training.method == "optuna":
-            return optuna_search(cost, boxes, training.trials, self._seed, context, stages=training.stages, shrink=training.shrink)
-        return nelder_mead_over_grid(cost, boxes, [STARTS[name] for name in searched], training.search, context)
+        return training.search(cost, boxes, [STARTS[name] for name in searched], self._seed, context)
 
     def mean_squared_error(
         self,
@@ -459,9 +456,7 @@ class DugoffUkf(SigmaPointEstimator):
 
     def load_weights(self, weights: Mapping[str, np.ndarray[Any, Any]]) -> None:
         """Take tyres and levels back."""
-        shapes = {name: values.shape for name, values in DugoffUkf.weights(self).items()}
-        if {name: values.shape for name, values in weights.items()} != shapes:
-            raise DataError(f"weights of '{self.name}' must be {', '.join(shapes)} of these inputs, not {', '.join(weights)}")
+        require_shapes(self, weights, {name: values.shape for name, values in DugoffUkf.weights(self).items()})
         self.axle_tyres = np.array(weights["tyres"], dtype=np.float64)
         self.levels = dict(zip(self.level_names, weights["levels"].tolist(), strict=True))
 

@@ -20,7 +20,7 @@ from vehest.estimators.networks.sample_network import SampleNetwork, clip_sidesl
 from vehest.training.context import FitContext
 from vehest.training.identification import IdentificationSettings
 from vehest.training.samples import SampleSettings
-from vehest.training.search import SearchRecord, nelder_mead_over_grid, optuna_search
+from vehest.training.search import SearchRecord
 from vehest.training.sequences import PhaseSettings
 
 BOX = ((-6.0, 4.0), (0.2, 2.0))
@@ -111,9 +111,7 @@ class EnsembleUkf(NetworkUkf):
             pseudo = [PseudoMeasurement(sideslip, scaled_variance(variance, scaling)) for sideslip, variance in found]
             return finite(self.mean_squared_error(recordings, how.skip_seconds, over=how.error, pseudo=pseudo))
 
-        if how.method == "optuna":
-            return optuna_search(cost, BOX, training.scaling_trials, self._seed, quiet, stages=how.stages, shrink=how.shrink)
-        return nelder_mead_over_grid(cost, BOX, STARTS, how.search, quiet)
+        return how.search(cost, BOX, STARTS, self._seed, quiet, training.scaling_trials)
 
     def _mean_and_variance(self, inputs: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Mean (T,) [rad] and variance (T,) [rad²] of the networks' angles."""

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from vehest.constants import FloatArray
 from vehest.data.errors import ConfigurationError
 from vehest.declared import Group, setting
-from vehest.estimators.base import Stepper, Trial
+from vehest.estimators.base import Trial
 from vehest.estimators.filtering.sideslip_filter import MEASURED, SideslipFilter
 from vehest.filters.gating import refuses
 from vehest.filters.gaussian import Gaussian
@@ -53,6 +53,7 @@ class FactorGraph(SideslipFilter):
 
     name, title = "factor_graph", "Factor graph"
     trials = (Trial(10, "factor graph over half a second, causal; nothing is learnt", "estimator.window=0.5 {car}"),)
+    offline = "a factor graph over a whole recording cannot run along with a drive; set estimator.window=0.05 [s]"
     window: float | None = setting(None, "how far the graph of a causal estimate reaches back; null: one graph, offline", unit="s")
     noise: FactorNoise = setting(FactorNoise(), "standard deviations of the factors")
 
@@ -146,12 +147,6 @@ class FactorGraph(SideslipFilter):
                     samples[-1, column] = np.nan
             filtered = kalman_scan(model, samples[:, MEASURED], start)
         return smoothed_means(model, filtered)
-
-    def online(self) -> Stepper:
-        """A stepper with an empty window."""
-        if not self.causal:
-            raise ConfigurationError("a factor graph over a whole recording cannot run along with a drive; set estimator.window=0.05 [s]")
-        return super().online()
 
     def weights(self) -> dict[str, np.ndarray[Any, Any]]:
         """There are none."""

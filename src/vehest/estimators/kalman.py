@@ -12,11 +12,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vehest.constants import FloatArray
-from vehest.data.errors import ConfigurationError
 from vehest.data.estimate import Estimate
 from vehest.data.recording import Recording
 from vehest.declared import Group, setting
-from vehest.estimators.base import FitData, FitRecord, Stepper, Trial
+from vehest.estimators.base import FitData, FitRecord, Trial
 from vehest.estimators.filtering.sideslip_filter import FilteredStates, SideslipFilter, read_levels
 from vehest.filters.gating import Gate
 from vehest.filters.gaussian import Gaussian
@@ -78,6 +77,10 @@ class KalmanFilter(SideslipFilter):
     learns_from = ()
     may_be_nan = LEVELS
     template = "kalman"
+    offline = (
+        "a Kalman filter that reads its noise levels off the whole recording cannot run along with a drive; "
+        "set estimator.noise.read_from=training, or give the levels"
+    )
     noise: SensorNoise = setting(SensorNoise(), "standard deviations of the sensors' noise")
     offsets: SensorOffsets = setting(SensorOffsets(), "standard deviations of offsets that are states")
     initial_deviation: float = setting(100.0, "of β and r before the first sample", unit="rad, rad/s", positive=True)
@@ -171,15 +174,6 @@ class KalmanFilter(SideslipFilter):
                 transition[:, :2, row], observation[:, 0, row] = -B, -D
         offset = np.concatenate([model.transition_offset, np.zeros((steps, n - 2))], axis=1)
         return LinearModel(transition, offset, noise, observation, model.observation_offset, model.observation_noise)
-
-    def online(self) -> Stepper:
-        """A stepper that knows nothing of the state yet."""
-        if not self.causal:
-            raise ConfigurationError(
-                "a Kalman filter that reads its noise levels off the whole recording cannot run along with a drive; "
-                "set estimator.noise.read_from=training, or give the levels"
-            )
-        return super().online()
 
     def c_values(self) -> dict[str, Any]:
         """Its car, levels of noise, offsets and gate."""

@@ -13,11 +13,11 @@ import torch
 from torch import Tensor, nn
 
 from vehest.constants import GRAVITY, FloatArray
-from vehest.data.errors import ConfigurationError, DataError
+from vehest.data.errors import ConfigurationError
 from vehest.data.estimate import Estimate
 from vehest.data.recording import Recording
 from vehest.declared import Group, setting
-from vehest.estimators.base import Estimator, FitData, FitRecord, Trial
+from vehest.estimators.base import Estimator, FitData, FitRecord, Trial, require_learnable
 from vehest.estimators.filtering.car_filter import LEAST_ENTROPY, CarFilter
 from vehest.estimators.filtering.sigma_point_stepper import FilterStep, SigmaPointEstimator
 from vehest.estimators.network import Network
@@ -136,9 +136,6 @@ class LearnedUkf(Network, SigmaPointEstimator):
     least_speed: float = setting(0.05, "smallest forward speed that the state may have", unit="m/s", positive=True)
     least_friction: float = setting(0.05, "smallest friction that the state may have", positive=True)
     car: CarSettings = setting(CarSettings(), "known of the car, and where learning starts")
-
-    def __init__(self, settings: Any) -> None:
-        super().__init__(settings)
 
     def check(self) -> None:
         """Raises:
@@ -330,11 +327,7 @@ class LearnedUkf(Network, SigmaPointEstimator):
         Raises:
             DataError: a reference, an input or the motor's speed is missing or has gaps.
         """
-        for name in (*REFERENCES, "motor_speed", *INPUTS):
-            if name not in recording:
-                raise DataError(f"recording '{recording.id}' has no channel '{name}', which estimator '{self.name}' learns from")
-            if np.isnan(recording[name]).any():
-                raise DataError(f"recording '{recording.id}': channel '{name}' has gaps, which estimator '{self.name}' cannot learn from")
+        require_learnable([recording], (*REFERENCES, "motor_speed", *INPUTS), self.name)
         measurements, inputs = self._samples(recording)
         states = [recording[name] for name in REFERENCES] + [measurements[:, 3], np.full(len(recording), self.friction)]
         return Drive(*(torch.as_tensor(part, dtype=dtype) for part in (np.stack(states, 1), inputs, measurements)))
@@ -389,12 +382,8 @@ class LearnedUkf(Network, SigmaPointEstimator):
 
 def _held(values: FloatArray) -> FloatArray:
     """The last value where one is missing; 0 before the first."""
-    held = values.copy()
-    for k in range(len(held)):
-        missing = np.isnan(held[k])
-        if missing.any():
-            held[k, missing] = held[k - 1, missing] if k else 0.0
-    return held
+    last = np.maximum.accumulate(np.where(np.isnan(values), 0, np.arange(1, len(values) + 1)[:, None]))
+    return np.take_along_axis(np.concatenate([np.zeros_like(values[:1]), values]), last, axis=0)
 
 
 def _dynamics_in_c(dynamics: nn.Module) -> dict[str, Any]:

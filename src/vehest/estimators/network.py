@@ -9,8 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from vehest.data.errors import DataError
-from vehest.estimators.base import Estimator, FitData, FitRecord
+from vehest.estimators.base import Estimator, FitData, FitRecord, require_shapes
 from vehest.training.context import FitContext
 
 
@@ -86,10 +85,7 @@ class Network(Estimator):
             DataError: a name or shape does not fit the settings.
         """
         expected = self.weight_shapes()
-        found = {name: tuple(np.shape(values)) for name, values in weights.items()}
-        if expected != found:
-            differing = sorted(set(expected.items()) ^ set(found.items()))[0][0]
-            raise DataError(f"weights of '{self.name}' do not fit its settings: '{differing}' is missing, unknown or of another shape")
+        require_shapes(self, weights, expected)
         dtype = next(iter(weights.values())).dtype
         self._loaded = {name: np.array(weights[name], dtype=dtype) for name in expected}
         vars(self).pop("network", None)

@@ -18,7 +18,7 @@ from vehest.constants import FloatArray
 from vehest.data.errors import ConfigurationError, DataError
 from vehest.data.recording import Recording
 from vehest.declared import Group, setting
-from vehest.estimators.base import FitData, FitRecord, Trial, rate
+from vehest.estimators.base import FitData, FitRecord, Trial, rate, require_shapes
 from vehest.estimators.filtering.sideslip_filter import FilteredStates, SideslipFilter, read_levels
 from vehest.estimators.filtering.tyre_fit import NORMAL_95, AxleMotion, TyreFit, axle_motion, fit_motion
 from vehest.estimators.kernels.rational_ekf import _roll, scan
@@ -28,7 +28,7 @@ from vehest.filters.sigma_points import cubature_rule
 from vehest.filters.unscented_scan import TorchModel, UnscentedStepper
 from vehest.training.context import FitContext
 from vehest.training.noise_tuning import NoiseTuningSettings
-from vehest.training.search import SearchRecord, nelder_mead_over_grid, optuna_search
+from vehest.training.search import SearchRecord
 from vehest.vehicle.tyre_track import MOTION, TYRE_PARAMETERS, TyreTrack
 
 LEVELS = ("yaw_rate", "ay", "steer", "tyres")
@@ -245,8 +245,7 @@ class RationalFilter(SideslipFilter):
             extended, drives = self._extended(), self._drives(data.train)
             search = extended._tune(drives, training, context)
             n = len(self._searched)
-            columns = [*(f"start_{name}" for name in self._searched), *self._searched, "train_loss"]
-            history = {name: search.starts[:, column].tolist() for column, name in enumerate(columns)}
+            history = search.history(self._searched)
             boxes = np.array([BOXES[name] for name in self._searched])
             at_limits = np.minimum(search.best[:n] - boxes[:, 0], boxes[:, 1] - search.best[:n]) < EDGE * np.ptp(boxes, axis=1)
             metrics |= {"evaluations": search.evaluations, "best_train_loss": search.cost, "levels_at_limits": int(at_limits.sum())}
@@ -302,10 +301,8 @@ class RationalFilter(SideslipFilter):
         def cost(powers: FloatArray) -> float:
             return self._cost(drives, self._calibrated(powers, drives), skip)
 
-        boxes = [BOXES[name] for name in self._searched]
-        if training.method == "optuna":
-            return optuna_search(cost, boxes, training.trials, self._seed, context)
-        return nelder_mead_over_grid(cost, boxes, [STARTS[name] for name in self._searched], training.search, context)
+        boxes, starts = ([limits[name] for name in self._searched] for limits in (BOXES, STARTS))
+        return training.search(cost, boxes, starts, self._seed, context)
 
     def _calibrated(self, powers: FloatArray, drives: Sequence[tuple[FloatArray, FloatArray]]) -> dict[str, float]:
         """Levels at powers of ten of `_searched`; those of sensors are scaled so that innovations are as large as the filter expects."""
@@ -385,33 +382,22 @@ class RationalFilter(SideslipFilter):
         first = self.first_gaussian(samples[0], {}) if first is None else first
         if self.filter == "unscented":
             return self._unscented(samples, first, levels)
-        car, adapted, bound = self.car, self.adapted, self.bounds()
+        car, adapted, bounds = self.car, self.adapted, self.bounds()
         mean, covariance = first.mean.copy(), first.covariance.copy()
-        pull = [crossfall] * (len(mean) - len(bound))
-        bound = np.append(bound, [math.inf] * len(pull))
+        pull = [crossfall] * (len(mean) - len(bounds))
         out = _empty(len(samples), len(mean))
-        scan(
-            np.ascontiguousarray(samples),
+        track = (
             np.array([car.mass, car.yaw_inertia, car.cg_to_front_axle, car.cg_to_rear_axle]),
             np.array([*self.axle_curves, 1.0]),
             np.array([TYRE_PARAMETERS.index(name) for name in adapted], dtype=np.int64),
-            np.square([levels["yaw_rate"], levels["ay"], levels["steer"], *[levels["tyres"]] * len(adapted), *pull]),
-            -bound,
-            bound,
-            np.square(ROLLING),
-            self.start_tyres(),
-            self.largest_sideslip,
-            LOST**2,
-            1.0 / self.rate_hz,
-            self.minimum_speed,
-            self.adapt_above,
-            math.inf if gate is None else gate.deviations**2,
-            0 if gate is None else gate.patience,
-            np.zeros(2, np.int64) if refused is None else refused,
-            mean,
-            covariance,
-            *out,
+            *(1.0 / self.rate_hz, self.minimum_speed, self.adapt_above),
         )
+        variances = np.square([levels["yaw_rate"], levels["ay"], levels["steer"], *[levels["tyres"]] * len(adapted), *pull])
+        guessed = self.largest_sideslip, LOST**2, np.square(ROLLING)
+        limit, patience = (math.inf, 0) if gate is None else (gate.deviations**2, gate.patience)
+        gated = limit, patience, np.zeros(2, np.int64) if refused is None else refused
+        bounds = np.append(bounds, [math.inf] * len(pull))
+        scan(np.ascontiguousarray(samples), track, variances, bounds, self.start_tyres(), guessed, gated, (mean, covariance), out)
         means, deviation, *others = out
         return FilteredStates(means, *others, Gaussian(mean, covariance), deviation)  # type: ignore[call-arg, arg-type]
 
@@ -502,9 +488,7 @@ class RationalFilter(SideslipFilter):
 
     def load_weights(self, weights: Mapping[str, np.ndarray[Any, Any]]) -> None:
         """Take curves and levels back."""
-        shapes = {name: values.shape for name, values in self.weights().items()}
-        if {name: values.shape for name, values in weights.items()} != shapes:
-            raise DataError(f"weights of '{self.name}' must be {', '.join(shapes)}, not {', '.join(weights)}")
+        require_shapes(self, weights, {name: values.shape for name, values in self.weights().items()})
         curves = np.array(weights["curves"], dtype=np.float64)
         self.axle_curves = np.where(curves == 0.0, math.inf, curves)
         self.curve_covariance = np.array(weights["curve_covariance"], dtype=np.float64)

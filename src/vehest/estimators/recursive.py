@@ -14,9 +14,9 @@ import numba
 import numpy as np
 
 from vehest.constants import FloatArray
-from vehest.data.errors import ConfigurationError, DataError
+from vehest.data.errors import ConfigurationError
 from vehest.data.recording import Recording
-from vehest.estimators.base import Estimator, FitData, FitRecord, require_learnable
+from vehest.estimators.base import Estimator, FitData, FitRecord, require_learnable, require_shapes
 from vehest.training.context import FitContext, NoTraining
 from vehest.training.search import nelder_mead_over_grid
 
@@ -111,14 +111,12 @@ class Recursive(Estimator):
 
         search = nelder_mead_over_grid(cost, boxes, starts, training, context)  # type: ignore[arg-type]
         self.values |= dict(zip(self.unknown, search.best.tolist(), strict=True))
-        columns = (*(f"start_{name}" for name in self.unknown), *self.unknown, "train_loss")
-        history = {name: search.starts[:, column].tolist() for column, name in enumerate(columns)}
         metrics = {
             "evaluations": search.evaluations,
             "best_train_loss": search.cost,
             "best_validation_loss": self.mean_squared_error(data.validation),
         }
-        return self.values, FitRecord(history, metrics, search.interrupted)
+        return self.values, FitRecord(search.history(self.unknown), metrics, search.interrupted)
 
     @property
     def n_parameters(self) -> int:
@@ -178,9 +176,7 @@ class Recursive(Estimator):
         Raises:
             DataError: one is missing or unknown.
         """
-        expected = self.weights()
-        if {name: values.shape for name, values in weights.items()} != {name: values.shape for name, values in expected.items()}:
-            raise DataError(f"weights of '{self.name}' must be {', '.join(expected) or 'none'}, not {', '.join(weights)}")
+        require_shapes(self, weights, {name: values.shape for name, values in self.weights().items()})
         self.values = {name: float(weights[name][0]) for name in self.values}
 
 

@@ -11,7 +11,7 @@ import numpy as np
 
 from vehest.constants import FloatArray
 from vehest.filters.gaussian import Filtered, Gaussian
-from vehest.filters.kalman_scan import _contiguous, move, scratch, update
+from vehest.filters.kalman_scan import contiguous, filtered_by, move, require_samples, scratch, update
 
 Compiled = Callable[..., Any]
 """A function that numba has compiled."""
@@ -85,59 +85,40 @@ def extended_scan(
 
     Source: Jazwinski 1970, Chapter 8.
     """
-    if measurements.ndim != 2 or len(measurements) == 0:
-        raise ValueError(f"measurements must be of shape (T, m) with T > 0, not {measurements.shape}")
+    require_samples(measurements)
     if inputs.ndim != 2 or len(inputs) != len(measurements):
         raise ValueError(f"inputs of shape {inputs.shape} do not fit measurements of shape {measurements.shape}")
     (steps, m), n = measurements.shape, len(initial.mean)
-    predicted = Gaussian(np.empty((steps, n)), np.empty((steps, n, n)))
-    filtered = Gaussian(np.empty((steps, n)), np.empty((steps, n, n)))
-    innovation, covariance, likelihood = np.empty((steps, m)), np.empty((steps, m, m)), np.empty(steps)
-    failed = _scan(
-        model.transition,
-        model.observation,
-        _contiguous(model.parameters, np.shape(model.parameters), "parameters"),
-        _contiguous(model.process_noise, (steps, n, n), "process_noise"),
-        _contiguous(model.observation_noise, (steps, m, m), "observation_noise"),
-        _contiguous(measurements, (steps, m), "measurements"),
-        _contiguous(inputs, inputs.shape, "inputs"),
-        _contiguous(initial.mean, (n,), "initial.mean"),
-        _contiguous(initial.covariance, (n, n), "initial.covariance"),
-        predicted,
-        filtered,
-        innovation,
-        covariance,
-        likelihood,
+    given = (
+        contiguous(model.parameters, np.shape(model.parameters), "parameters"),
+        contiguous(model.process_noise, (steps, n, n), "process_noise"),
+        contiguous(model.observation_noise, (steps, m, m), "observation_noise"),
+        contiguous(inputs, inputs.shape, "inputs"),
     )
-    if failed >= 0:
-        raise np.linalg.LinAlgError(f"the innovation covariance is not positive definite at sample {failed}")
-    return Filtered(predicted, filtered, innovation, covariance, ~np.isnan(measurements), likelihood)
+    return filtered_by(_scan, (model.transition, model.observation, *given), contiguous(measurements, (steps, m), "measurements"), initial)
 
 
 @numba.njit(error_model="numpy")
-def _scan(  # type: ignore[no-untyped-def]
-    transition, observation, parameters, Q, R, y, u, mean, cov, predicted, filtered, innovation, innovation_cov, likelihood
-):
-    """Write states, innovations and likelihoods; returns the sample whose innovation covariance has no Cholesky factor, or -1.
+def _scan(transition, observation, parameters, Q, R, u, y, start, predicted, filtered, innovation, innovation_cov):  # type: ignore[no-untyped-def]
+    """Write states and innovations; returns the sample whose innovation covariance has no Cholesky factor, or -1.
 
     This much is compiled for each model; the rest is loaded.
     """
-    m, n = y.shape[1], len(mean)
+    m, n, (prior_mean, prior_cov), (post_mean, post_cov) = y.shape[1], len(start[0]), predicted, filtered
     seen, room = np.empty((m, n)), scratch(m, n)
     for k in range(len(y)):
-        prior, post = (predicted.mean[k], predicted.covariance[k]), (filtered.mean[k], filtered.covariance[k])
+        prior, post = (prior_mean[k], prior_cov[k]), (post_mean[k], post_cov[k])
         if k == 0:
-            prior[0][:], prior[1][:] = mean, cov
+            prior[0][:], prior[1][:] = start
         else:
-            prior[0][:], slope = transition(filtered.mean[k - 1], u[k - 1], parameters)
-            move(slope, filtered.covariance[k - 1], Q[k - 1], prior[1], room)
+            prior[0][:], slope = transition(post_mean[k - 1], u[k - 1], parameters)
+            move(slope, post_cov[k - 1], Q[k - 1], prior[1], room)
         expected, slope = observation(prior[0], u[k], parameters)
         for i in range(m):
             known = not math.isnan(y[k, i])
             innovation[k, i] = y[k, i] - expected[i] if known else 0.0
             for j in range(n):
                 seen[i, j] = slope[i, j] if known else 0.0
-        likelihood[k] = update(prior, post, y[k], R[k], innovation[k], innovation_cov[k], seen, room)
-        if math.isnan(likelihood[k]):
+        if not update(prior, post, y[k], R[k], innovation[k], innovation_cov[k], seen, room):
             return k
     return -1

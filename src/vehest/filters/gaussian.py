@@ -36,7 +36,6 @@ class Filtered(NamedTuple, Generic[Array]):
         innovation_covariance: (..., T, m, m); rows and columns of what was not measured are those of the identity, so that
             eᵀS⁻¹e counts what was measured only.
         measured: whether there was a measurement, bool, (..., T, m).
-        log_likelihood: of each sample's measurements given those before, (..., T); 0 where nothing was measured.
     """
 
     predicted: Gaussian[Array]
@@ -44,4 +43,3 @@ class Filtered(NamedTuple, Generic[Array]):
     innovation: Array
     innovation_covariance: Array
     measured: Tensor | NDArray[np.bool_]
-    log_likelihood: Array

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
+from typing import Any
 
 import numba
 import numpy as np
@@ -36,37 +38,37 @@ def kalman_scan(
 
     Source: Kalman 1960; Joseph's form of the update (Bucy & Joseph 1968), with which covariances stay symmetric and positive.
     """
+    require_samples(measurements)
+    steps, m = measurements.shape
+    parts = [
+        contiguous(part, (steps, *shape), name)
+        for name, part, shape in zip(LinearModel._fields, model, shapes_of(model.transition.shape[-1], m), strict=True)
+    ]
+    taken = contiguous(measurements, (steps, m), "measurements").copy()
+    limit, patience = (math.inf, 0) if gate is None else (gate.deviations**2, gate.patience)
+    return filtered_by(_scan, parts, taken, initial, limit, patience, np.zeros(m, np.int64) if refused is None else refused)
+
+
+def require_samples(measurements: FloatArray) -> None:
+    """Raise `ValueError` for measurements that are not of shape (T, m), T > 0."""
     if measurements.ndim != 2 or len(measurements) == 0:
         raise ValueError(f"measurements must be of shape (T, m) with T > 0, not {measurements.shape}")
-    steps, m = measurements.shape
-    n = model.transition.shape[-1]
-    parts = [
-        _contiguous(part, (steps, *shape), name) for name, part, shape in zip(LinearModel._fields, model, shapes_of(n, m), strict=True)
-    ]
-    predicted = Gaussian(np.empty((steps, n)), np.empty((steps, n, n)))
-    filtered = Gaussian(np.empty((steps, n)), np.empty((steps, n, n)))
-    innovation, covariance, likelihood = np.empty((steps, m)), np.empty((steps, m, m)), np.empty(steps)
-    taken = _contiguous(measurements, (steps, m), "measurements").copy()
-    failed = _scan(
-        *parts,
-        taken,
-        _contiguous(initial.mean, (n,), "initial.mean"),
-        _contiguous(initial.covariance, (n, n), "initial.covariance"),
-        *predicted,
-        *filtered,
-        innovation,
-        covariance,
-        likelihood,
-        math.inf if gate is None else gate.deviations**2,
-        0 if gate is None else gate.patience,
-        np.zeros(m, np.int64) if refused is None else refused,
-    )
+
+
+def filtered_by(scan: Any, given: Sequence[Any], y: FloatArray, initial: Gaussian[FloatArray], *gate: Any) -> Filtered[FloatArray]:
+    """What a compiled scan makes of measurements y, (T, m), from an initial state; raises `numpy.linalg.LinAlgError` where it gives up."""
+    (steps, m), n = y.shape, initial.mean.shape[-1]
+    predicted, filtered = (Gaussian(np.empty((steps, n)), np.empty((steps, n, n))) for _ in range(2))
+    innovation, covariance = np.empty((steps, m)), np.empty((steps, m, m))
+    start = contiguous(initial.mean, (n,), "initial.mean"), contiguous(initial.covariance, (n, n), "initial.covariance")
+    failed = scan(*given, y, start, tuple(predicted), tuple(filtered), innovation, covariance, *gate)
     if failed >= 0:
         raise np.linalg.LinAlgError(f"the innovation covariance is not positive definite at sample {failed}")
-    return Filtered(predicted, filtered, innovation, covariance, ~np.isnan(taken), likelihood)
+    return Filtered(predicted, filtered, innovation, covariance, ~np.isnan(y))
 
 
-def _contiguous(values: FloatArray, shape: tuple[int, ...], name: str) -> FloatArray:
+def contiguous(values: FloatArray, shape: tuple[int, ...], name: str) -> FloatArray:
+    """An array in float64 that is of a shape or broadcasts to it; raises `ValueError`, which names it."""
     if values.shape == shape and values.dtype == np.float64:
         return np.ascontiguousarray(values)
     try:
@@ -76,15 +78,12 @@ def _contiguous(values: FloatArray, shape: tuple[int, ...], name: str) -> FloatA
 
 
 @numba.njit(cache=True, error_model="numpy")
-def _scan(  # type: ignore[no-untyped-def]
-    A, b, Q, C, d, R, y, mean, cov, prior_mean, prior_cov, post_mean, post_cov, innovation, innovation_cov, likelihood,
-    limit, patience, refused,
-):  # fmt: skip
-    """Write states, innovations and likelihoods; returns the sample whose innovation covariance has no Cholesky factor, or -1.
+def _scan(A, b, Q, C, d, R, y, start, predicted, filtered, innovation, innovation_cov, limit, patience, refused):  # type: ignore[no-untyped-def]
+    """Write states and innovations; returns the sample whose innovation covariance has no Cholesky factor, or -1.
 
     With a finite ``limit`` what the gate refuses becomes NaN in ``y``.
     """
-    steps, m = y.shape
+    (steps, m), (mean, cov), (prior_mean, prior_cov), (post_mean, post_cov) = y.shape, start, predicted, filtered
     n = len(mean)
     seen, room = np.empty((m, n)), scratch(m, n)
     for k in range(steps):
@@ -110,8 +109,7 @@ def _scan(  # type: ignore[no-untyped-def]
                 error -= seen[i, j] * prior_mean[k, j]
             innovation[k, i] = error
         prior, post = (prior_mean[k], prior_cov[k]), (post_mean[k], post_cov[k])
-        likelihood[k] = update(prior, post, y[k], R[k], innovation[k], innovation_cov[k], seen, room)
-        if math.isnan(likelihood[k]):
+        if not update(prior, post, y[k], R[k], innovation[k], innovation_cov[k], seen, room):
             return k
     return -1
 
@@ -132,20 +130,20 @@ def move(slope, cov, noise, out, room):  # type: ignore[no-untyped-def]
     for i in range(len(out)):
         for j in range(len(out)):
             out[i, j] += noise[i, j]
-    _make_symmetric(out)
+    make_symmetric(out)
 
 
 @numba.njit(inline="always")
 def update(prior, post, y, R, innovation, S, seen, room):  # type: ignore[no-untyped-def]
-    """Write mean and covariance after a measurement, from those before, by Joseph's form, and S; returns the log-likelihood, or NaN.
+    """Write mean and covariance after a measurement, from those before, by Joseph's form, and S; False where S is not definite.
 
     What is NaN in ``y`` (m,) was not measured: its ``innovation`` and its row of ``seen``, H (m, n), are 0.
     """
     (mean, cov), (post_mean, post_cov), (of_both, of_states, of_measured) = prior, post, room
     (cross, gain, weighted), (kept, left, right), (noise, factor, whitened) = of_both, of_states, of_measured
-    m, n, count = len(y), len(mean), 0
+    m, n, known = len(y), len(mean), True
     for i in range(m):
-        count += not math.isnan(y[i])
+        known = known and not math.isnan(innovation[i])
         for j in range(m):
             noise[i, j] = R[i, j] if not math.isnan(y[i]) and not math.isnan(y[j]) else (1.0 if i == j else 0.0)
     _multiply(seen, cov, cross)
@@ -153,9 +151,9 @@ def update(prior, post, y, R, innovation, S, seen, room):  # type: ignore[no-unt
     for i in range(m):
         for j in range(m):
             S[i, j] += noise[i, j]
-    _make_symmetric(S)
-    if not _cholesky(S, factor):
-        return math.nan
+    make_symmetric(S)
+    if not (known and _cholesky(S, factor)):
+        return False
     for j in range(n):  # gain = (S⁻¹ H P)ᵀ
         for i in range(m):
             whitened[i] = cross[i, j]
@@ -182,14 +180,8 @@ def update(prior, post, y, R, innovation, S, seen, room):  # type: ignore[no-unt
     for i in range(n):
         for j in range(n):
             post_cov[i, j] += right[i, j]
-    _make_symmetric(post_cov)
-    for i in range(m):
-        whitened[i] = innovation[i]
-    _solve(factor, whitened)
-    total = count * math.log(2.0 * math.pi)
-    for i in range(m):
-        total += whitened[i] * whitened[i] + 2.0 * math.log(factor[i, i])
-    return -0.5 * total
+    make_symmetric(post_cov)
+    return True
 
 
 @numba.njit(inline="always")
@@ -229,7 +221,8 @@ def _multiply_transposed(a, b, out):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(inline="always")
-def _make_symmetric(a):  # type: ignore[no-untyped-def]
+def make_symmetric(a):  # type: ignore[no-untyped-def]
+    """The mean of a matrix and its transpose, in place."""
     for i in range(a.shape[0]):
         for j in range(i):
             a[i, j] = a[j, i] = 0.5 * (a[i, j] + a[j, i])

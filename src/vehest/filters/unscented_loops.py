@@ -6,6 +6,7 @@ several may run side by side. It calls models and steps by their addresses, so t
 
 from __future__ import annotations
 
+from collections import namedtuple
 from functools import cache
 from typing import Any, NamedTuple
 
@@ -28,12 +29,9 @@ from vehest.filters.unscented_steps import (
 
 
 class Setting(NamedTuple):
-    """What a filter does the same at every sample; ``rule`` and ``lower`` as in `unscented_steps`, ``limit`` is a gate's deviations²."""
+    """What a filter does the same at every sample; ``rules`` as in `unscented_steps`, ``limit`` is a gate's deviations²."""
 
-    rule: Any
-    lower: Any
-    margin: Any
-    repair: bool
+    rules: tuple[Any, Any, Any, bool]
     gated: bool
     limit: Any
     patience: int
@@ -51,7 +49,6 @@ class Tape(NamedTuple):
     innovation: Any
     own: Any
     gain: Any
-    likelihood: Any
     centre: Any
     repaired: Any
     gone: Any
@@ -60,7 +57,7 @@ class Tape(NamedTuple):
 def tape_of(steps: int, sequences: int, n: int, m: int, dtype: Any) -> Tape:
     """A tape for n states and m measurements."""
     points = 2 * n + 1
-    shapes: list[tuple[int, ...]] = [(n,), (n, n), (n,), (n, n), (points, n), (points, m), (m,), (m, m), (n, m), (), ()]
+    shapes: list[tuple[int, ...]] = [(n,), (n, n), (n,), (n, n), (points, n), (points, m), (m,), (m, m), (n, m), ()]
     made = [room((steps, *shape, sequences), dtype) for shape in shapes]
     return Tape(*made, np.zeros((steps, sequences), np.bool_), np.zeros((steps, m, sequences), np.bool_))  # type: ignore[call-arg]
 
@@ -69,8 +66,8 @@ def forward_scratch(tape: Tape) -> tuple[Any, ...]:
     """What `forward` works with: each call has its own, so that no two threads write to one line of a cache at every step."""
     points, covariance, spread = tape.moved[0], tape.prior_covariance[0], tape.own[0]
     lost = np.empty(points.shape[-1:], np.bool_)
-    points, factor, own, made, made_spread = (room(part.shape, part.dtype) for part in (points, *[covariance] * 3, spread))
-    return points, factor, own, lost, made, made_spread
+    *drawn, made, made_spread = (room(part.shape, part.dtype) for part in (points, *[covariance] * 3, spread))
+    return tuple(drawn), lost, made, made_spread
 
 
 def backward_scratch(tape: Tape) -> tuple[Any, ...]:
@@ -79,7 +76,7 @@ def backward_scratch(tape: Tape) -> tuple[Any, ...]:
     states = (mean, covariance)
     shapes = [part.shape for part in (points, covariance, covariance, points, points, points, expected, *states, *states)]
     made = [room(shape, points.dtype) for shape in shapes]
-    return (*made[:3], np.empty(points.shape[-1:], np.bool_), *made[3:])
+    return tuple(made[:3]), np.empty(points.shape[-1:], np.bool_), *made[3:]
 
 
 def by_address(function: Any, *arguments: Any) -> CompileResultWAP:
@@ -93,6 +90,10 @@ def _of_types(function: Any, kinds: tuple[Any, ...]) -> CompileResultWAP:
 
 
 FORWARD, BACKWARD = (points_of, moments_of, gate_of, update_of), (points_of, update_adjoint, points_adjoint, moments_adjoint)
+Forward = namedtuple("Forward", ("points_of", "moments_of", "gate_of", "update_of", "transition", "observation", "car"))
+"""What `forward` calls: `FORWARD`, a model's transition and observation, and what both are given; numba warns of a plain tuple of these."""
+Backward = namedtuple("Backward", ("points_of", "update", "points", "moments", "transition", "observation", "car"))
+"""What `backward` calls, likewise: `BACKWARD` and the model's adjoints."""
 
 
 @cache
@@ -102,111 +103,45 @@ def steps_by_address(steps: tuple[Any, ...], dtype: Any) -> tuple[CompileResultW
 
 
 @compiled
-def forward(  # type: ignore[no-untyped-def]
-    points_of,
-    moments_of,
-    gate_of,
-    update_of,
-    transition,
-    observation,
-    car,
-    process_at,
-    process_car,
-    spread_at,
-    spread_car,
-    setting,
-    tape,
-    y,
-    u,
-    process,
-    spread,
-    refused,
-    scratch,
-    halves,
-    first,
-    end,
-):
+def forward(calls, at_state, car_at, at_prior, car_of, setting, tape, y, u, noise, refused, scratch, halves, first, end):  # type: ignore[no-untyped-def]
     """Halves of steps: half 2k moves the states to sample k of the tape, half 2k + 1 takes in the measurement there.
 
-    Noise is ``process`` and ``spread``, (T, k, k, B), or where there is a function, what it writes: ``at(states, inputs, car, out, first,
-    end)``. What a gate refuses becomes NaN in ``y`` and counts in ``refused``, (B, m).
+    ``noise`` is that of the process and that of measurements, (T, k, k, B), or where there is a function ``at…``, what that writes:
+    ``at(states, inputs, car, out, first, end)``. What a gate refuses becomes NaN in ``y`` and counts in ``refused``, (B, m).
     """
-    rule, lower = setting.rule, setting.lower
-    points, factor, covariance, lost, made_process, made_spread = scratch
+    car, rules, (drawn, lost, made_process, made_spread) = calls.car, setting.rules, scratch
     for half in range(halves[0], halves[1]):
         k = half // 2
         if half % 2 == 0:
-            mean, given, inputs, moved, repaired = (
-                tape.post_mean[k - 1],
-                tape.post_covariance[k - 1],
-                u[k - 1],
-                tape.moved[k],
-                tape.repaired[k],
-            )
-            points_of(mean, given, rule, lower, setting.margin, setting.repair, covariance, factor, points, repaired, first, end)
-            transition(points, inputs, car, moved, first, end)
-            if process_at is None:
-                added = process[k - 1]
+            mean, inputs = tape.post_mean[k - 1], u[k - 1]
+            calls.points_of(mean, tape.post_covariance[k - 1], rules, drawn, tape.repaired[k], first, end)
+            calls.transition(drawn[0], inputs, car, tape.moved[k], first, end)
+            if at_state is None:
+                added = noise[0][k - 1]
             else:
-                process_at(mean, inputs, process_car, made_process, first, end)
+                at_state(mean, inputs, car_at, made_process, first, end)
                 added = made_process
-            moments_of(moved, added, rule, lower, tape.prior_mean[k], tape.prior_covariance[k], first, end)
+            calls.moments_of(tape.moved[k], added, rules, tape.prior_mean[k], tape.prior_covariance[k], first, end)
         else:
-            mean, given, inputs, expected, repaired = tape.prior_mean[k], tape.prior_covariance[k], u[k], tape.expected[k], tape.repaired[k]
-            points_of(mean, given, rule, lower, setting.margin, setting.repair, covariance, factor, points, lost, first, end)
+            mean, inputs, expected, repaired = tape.prior_mean[k], u[k], tape.expected[k], tape.repaired[k]
+            calls.points_of(mean, tape.prior_covariance[k], rules, drawn, lost, first, end)
             for b in range(first, end):
                 repaired[b] |= lost[b]
-            observation(points, inputs, car, expected, first, end)
-            if spread_at is None:
-                noise = spread[k]
+            calls.observation(drawn[0], inputs, car, expected, first, end)
+            if at_prior is None:
+                added = noise[1][k]
             else:
-                spread_at(mean, inputs, spread_car, made_spread, first, end)
-                noise = made_spread
+                at_prior(mean, inputs, car_of, made_spread, first, end)
+                added = made_spread
             if setting.gated:
-                gate_of(expected, noise, rule, setting.limit, setting.patience, y[k], refused, tape.gone[k], first, end)
-            update_of(
-                mean,
-                covariance,
-                points,
-                expected,
-                y[k],
-                noise,
-                rule,
-                lower,
-                setting.margin,
-                setting.repair,
-                tape.post_mean[k],
-                tape.post_covariance[k],
-                tape.innovation[k],
-                tape.own[k],
-                tape.gain[k],
-                tape.likelihood[k],
-                repaired,
-                tape.centre[k],
-                first,
-                end,
-            )
+                calls.gate_of(expected, added, rules, setting.limit, setting.patience, y[k], refused, tape.gone[k], first, end)
+            post = tape.post_mean[k], tape.post_covariance[k]
+            kept = tape.innovation[k], tape.own[k], tape.gain[k], tape.centre[k]
+            calls.update_of(mean, drawn, expected, y[k], added, rules, post, kept, repaired, first, end)
 
 
 @compiled
-def backward(  # type: ignore[no-untyped-def]
-    points_of,
-    update_adjoint,
-    points_adjoint,
-    moments_adjoint,
-    transition_adjoint,
-    observation_adjoint,
-    car,
-    setting,
-    tape,
-    y,
-    u,
-    bars,
-    scratch,
-    gradients,
-    first,
-    end,
-):
+def backward(calls, setting, tape, y, u, bars, scratch, gradients, first, end):  # type: ignore[no-untyped-def]
     """The adjoint of `forward` over all samples.
 
     Args:
@@ -215,50 +150,30 @@ def backward(  # type: ignore[no-untyped-def]
         gradients: those of the model's parameters are added.
     """
     process_bar, spread_bar, y_bar, mean_up, covariance_up = bars
-    points, factor, covariance, lost, points_bar, through, moved_bar, expected_bar = scratch[:8]
-    post_mean_bar, post_covariance_bar, mean_bar, covariance_bar = scratch[8:]
-    margin, repair, rule, lower = setting.margin, setting.repair, setting.rule, setting.lower
+    drawn, lost, points_bar, through, moved_bar, expected_bar, post_mean_bar, post_covariance_bar, mean_bar, covariance_bar = scratch
+    car, rules, points, factor = calls.car, setting.rules, drawn[0], drawn[1]
     _clear(post_mean_bar, first, end)
     _clear(post_covariance_bar, first, end)
     for k in range(len(y) - 1, -1, -1):
         _add(post_mean_bar, mean_up[k], first, end)
         _add(post_covariance_bar, covariance_up[k], first, end)
-        mean = tape.prior_mean[k]
-        points_of(mean, tape.prior_covariance[k], rule, lower, margin, repair, covariance, factor, points, lost, first, end)
-        update_adjoint(
-            mean,
-            points,
-            tape.expected[k],
-            y[k],
-            rule,
-            lower,
-            tape.innovation[k],
-            tape.own[k],
-            tape.gain[k],
-            tape.centre[k],
-            post_mean_bar,
-            post_covariance_bar,
-            mean_bar,
-            covariance_bar,
-            points_bar,
-            expected_bar,
-            spread_bar[k],
-            y_bar[k],
-            first,
-            end,
-        )
-        observation_adjoint(points, u[k], car, expected_bar, through, gradients, first, end)
+        mean, kept = tape.prior_mean[k], (tape.innovation[k], tape.own[k], tape.gain[k], tape.centre[k])
+        calls.points_of(mean, tape.prior_covariance[k], rules, drawn, lost, first, end)
+        post_bars, prior_bars = (post_mean_bar, post_covariance_bar), (mean_bar, covariance_bar)
+        other_bars = points_bar, expected_bar, spread_bar[k], y_bar[k]
+        calls.update(mean, points, tape.expected[k], y[k], rules, kept, post_bars, prior_bars, other_bars, first, end)
+        calls.observation(points, u[k], car, expected_bar, through, gradients, first, end)
         _add(points_bar, through, first, end)
-        points_adjoint(mean, factor, rule, lower, points_bar, mean_bar, covariance_bar, first, end)
+        calls.points(mean, factor, rules, points_bar, mean_bar, covariance_bar, first, end)
         if k == 0:
             break
-        moments_adjoint(tape.moved[k], rule, lower, mean_bar, covariance_bar, moved_bar, process_bar[k - 1], first, end)
+        calls.moments(tape.moved[k], rules, mean_bar, covariance_bar, moved_bar, process_bar[k - 1], first, end)
         mean = tape.post_mean[k - 1]
-        points_of(mean, tape.post_covariance[k - 1], rule, lower, margin, repair, covariance, factor, points, lost, first, end)
-        transition_adjoint(points, u[k - 1], car, moved_bar, points_bar, gradients, first, end)
+        calls.points_of(mean, tape.post_covariance[k - 1], rules, drawn, lost, first, end)
+        calls.transition(points, u[k - 1], car, moved_bar, points_bar, gradients, first, end)
         _clear(post_mean_bar, first, end)
         _clear(post_covariance_bar, first, end)
-        points_adjoint(mean, factor, rule, lower, points_bar, post_mean_bar, post_covariance_bar, first, end)
+        calls.points(mean, factor, rules, points_bar, post_mean_bar, post_covariance_bar, first, end)
 
 
 @compiled

@@ -6,12 +6,11 @@ and what became of the points are kept, so that long sequences need little memor
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 from functools import partial
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, cast
 
 import numpy as np
 import torch
@@ -25,6 +24,8 @@ from vehest.filters.sigma_points import SigmaRule
 from vehest.filters.unscented_loops import (
     BACKWARD,
     FORWARD,
+    Backward,
+    Forward,
     Setting,
     Tape,
     backward,
@@ -61,36 +62,33 @@ class NonlinearFiltered(NamedTuple):
     repaired: Tensor
 
 
-class PointModel(ABC):
+class PointModel:
     """How sigma points move and what is expected at them, with adjoints; arrays of one precision, float32 or float64.
 
     Attributes:
+        entries: transition and observation, called with (points, inputs, car, out, first, end), and their adjoints, called with
+            (points, inputs, car, upstream, out, gradients, first, end), which add to the gradients of parameters. Sequences lie side by
+            side in points (S, n, B), inputs (p, B), what is expected (S, m, B) and gradients, each followed by room for a vector; ``out``
+            is written from ``first`` to ``end``.
+        car: what all are given.
+        is_compiled: whether the entries are, so that the loop over samples runs without Python.
         parameters: what gradients are wanted for.
         lower: smallest possible value of each state, (n,); none: everything is possible.
     """
 
+    entries: Sequence[Any]
+    car: Any = None
+    is_compiled = False
     parameters: Sequence[Tensor] = ()
     lower: Sequence[float] | None = None
 
     def working(self) -> AbstractContextManager[object]:
-        """What the methods below are called within, by one thread for all."""
+        """What the entries are called within, by one thread for all."""
         return nullcontext()
 
-    @abstractmethod
-    def transition(self, points: Array, inputs: Array) -> Array:
-        """Points one step later, (B, S, n) under inputs (B, p) -> (B, S, n)."""
-
-    @abstractmethod
-    def observation(self, points: Array, inputs: Array) -> Array:
-        """What is expected at points, (B, S, n) -> (B, S, m)."""
-
-    @abstractmethod
-    def transition_adjoint(self, points: Array, inputs: Array, upstream: Array, gradients: Sequence[Array]) -> Array:
-        """Gradient of the points, (B, S, n); those of the parameters are added to ``gradients``."""
-
-    @abstractmethod
-    def observation_adjoint(self, points: Array, inputs: Array, upstream: Array, gradients: Sequence[Array]) -> Array:
-        """Gradient of the points, (B, S, n); those of the parameters are added to ``gradients``."""
+    def learnt(self, gradients: Sequence[Array]) -> tuple[Any, ...]:
+        """Gradients of the parameters as the adjoints take them."""
+        return tuple(gradients)
 
 
 class TorchModel(PointModel):
@@ -106,84 +104,32 @@ class TorchModel(PointModel):
     def __init__(
         self, transition: Function, observation: Function, parameters: Sequence[Tensor] = (), lower: Sequence[float] | None = None
     ) -> None:
-        self._transition, self._observation = transition, observation
         self.parameters = [parameter for parameter in parameters if parameter.requires_grad]
         self.lower = lower
-
-    def transition(self, points: Array, inputs: Array) -> Array:
-        """By the function."""
-        return self._value(self._transition, points, inputs)
-
-    def observation(self, points: Array, inputs: Array) -> Array:
-        """By the function."""
-        return self._value(self._observation, points, inputs)
-
-    def transition_adjoint(self, points: Array, inputs: Array, upstream: Array, gradients: Sequence[Array]) -> Array:
-        """By automatic differentiation."""
-        return self._adjoint(self._transition, points, inputs, upstream, gradients)
-
-    def observation_adjoint(self, points: Array, inputs: Array, upstream: Array, gradients: Sequence[Array]) -> Array:
-        """By automatic differentiation."""
-        return self._adjoint(self._observation, points, inputs, upstream, gradients)
+        self.entries = [partial(how, function) for how in (self._value, self._adjoint) for function in (transition, observation)]
 
     @staticmethod
-    def _value(function: Function, points: Array, inputs: Array) -> Array:
+    def _value(function: Function, points: Array, inputs: Array, car: Any, out: Array, first: int, end: int) -> None:
         with torch.no_grad():
-            value: Array = function(torch.from_numpy(points), torch.from_numpy(inputs).unsqueeze(-2)).contiguous().numpy()
-        return value
+            value = function(*_of_torch(points, inputs, first, end))
+        out[..., first:end] = value.movedim(0, -1).numpy()
 
-    def _adjoint(self, function: Function, points: Array, inputs: Array, upstream: Array, gradients: Sequence[Array]) -> Array:
+    def _adjoint(
+        self, function: Function, points: Array, inputs: Array, car: Any, up: Array, out: Array, gradients: Sequence[Array], *ends: int
+    ) -> None:
         with torch.enable_grad():
-            state = torch.from_numpy(points).requires_grad_()
-            value = function(state, torch.from_numpy(inputs).unsqueeze(-2))
-            own = torch.autograd.grad(value, [state, *self.parameters], torch.from_numpy(upstream), allow_unused=True)
+            state, held = _of_torch(points, inputs, *ends)
+            upstream = torch.from_numpy(_apart(up, *ends))
+            own = torch.autograd.grad(
+                function(state.requires_grad_(), held), [state, *self.parameters], upstream, allow_unused=True, materialize_grads=True
+            )
         for gradient, part in zip(gradients, own[1:], strict=True):
-            if part is not None:
-                gradient += part.numpy()
-        return np.zeros_like(points) if own[0] is None else np.ascontiguousarray(own[0].numpy())
+            gradient += part.numpy()
+        out[..., slice(*ends)] = own[0].movedim(0, -1).numpy()
 
 
-class CompiledModel(PointModel):
-    """A model whose functions are compiled, so that the loop over samples runs without Python.
-
-    Attributes:
-        entries: compiled transition and observation, called with (points, inputs, car, out, first, end), and their adjoints, called with
-            (points, inputs, car, upstream, out, gradients, first, end). Sequences lie side by side in points (S, n, B), inputs (p, B), what
-            is expected (S, m, B) and gradients, each followed by room for a vector; ``out`` is written from ``first`` to ``end``.
-        car: what all are given.
-        measured: number m of measurements.
-    """
-
-    entries: Sequence[Any]
-    car: tuple[Any, ...]
-    measured: int
-
-    def transition(self, points: Array, inputs: Array) -> Array:
-        """See `PointModel`."""
-        return self._called(0, points, inputs, points.shape[2])
-
-    def observation(self, points: Array, inputs: Array) -> Array:
-        """See `PointModel`."""
-        return self._called(1, points, inputs, self.measured)
-
-    def transition_adjoint(self, points: Array, inputs: Array, upstream: Array, gradients: Sequence[Array]) -> Array:
-        """See `PointModel`."""
-        return self._called(2, points, inputs, points.shape[2], upstream, gradients)
-
-    def observation_adjoint(self, points: Array, inputs: Array, upstream: Array, gradients: Sequence[Array]) -> Array:
-        """See `PointModel`."""
-        return self._called(3, points, inputs, points.shape[2], upstream, gradients)
-
-    def _called(self, entry: int, points: Array, inputs: Array, size: int, upstream: Array | None = None, gradients: Any = None) -> Array:
-        given = [_beside(part) for part in (points, inputs)]
-        out = room((points.shape[1], size, points.shape[0]), points.dtype)
-        ups, learnt = ([], []) if upstream is None else ([_beside(upstream)], [self.learnt(gradients)])
-        self.entries[entry](*given, self.car, *ups, out, *learnt, 0, len(points))
-        return _apart(out)
-
-    def learnt(self, gradients: Sequence[Array]) -> tuple[Any, ...]:
-        """Gradients of the parameters as the adjoints take them."""
-        return tuple(gradients)
+def _of_torch(points: Array, inputs: Array, first: int, end: int) -> tuple[Tensor, Tensor]:
+    return torch.from_numpy(_apart(points, first, end)), torch.from_numpy(_apart(inputs, first, end)).unsqueeze(-2)
 
 
 @dataclass(frozen=True, eq=False)
@@ -211,7 +157,7 @@ class CompiledNoise:
 def _setting(model: PointModel, rule: SigmaRule, n: int, dtype: Any, repair: bool, gate: Gate | None) -> Setting:
     lower = np.full(n, -np.inf, dtype) if model.lower is None else np.asarray(model.lower, dtype)
     limit, patience = (0.0, 0) if gate is None else (gate.deviations**2, gate.patience)
-    return Setting(np.array(rule, dtype), lower, dtype(MARGIN), repair, gate is not None, dtype(limit), patience)
+    return Setting((np.array(rule, dtype), lower, dtype(MARGIN), repair), gate is not None, dtype(limit), patience)
 
 
 def unscented_scan(
@@ -279,7 +225,6 @@ def unscented_scan(
         outside[2],
         outside[3],
         ~(torch.isnan(measurements) | _by_sequence(tape.gone)),
-        _by_sequence(tape.likelihood),
     )
     return NonlinearFiltered(filtered, _by_sequence(tape.repaired))
 
@@ -352,7 +297,7 @@ class UnscentedStepper:
         if at not in self._runs:
             self._runs[at] = _forward_by(self._model, (at, at))
         with self._model.working():
-            self._runs[at](self._setting, self._tape, y, u, given, given, self._refused, self._scratch, (half, half + 1), 0, 1)
+            self._runs[at](self._setting, self._tape, y, u, (given, given), self._refused, self._scratch, (half, half + 1), 0, 1)
 
 
 def moved(model: PointModel, states: Tensor, inputs: Tensor) -> Tensor:
@@ -364,16 +309,19 @@ def moved(model: PointModel, states: Tensor, inputs: Tensor) -> Tensor:
 class _Moved(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, model: PointModel, states: Tensor, inputs: Tensor, *parameters: Tensor) -> Tensor:
-        ctx.kept = (model, states.detach().unsqueeze(1).contiguous().numpy(), inputs.contiguous().numpy())
+        points, held = (_by_time(part.unsqueeze(1)) for part in (states, inputs))
+        ctx.kept, out = (model, points, held[0]), room(points.shape, points.dtype)
         with model.working():
-            return torch.from_numpy(model.transition(*ctx.kept[1:])[:, 0])
+            model.entries[0](*ctx.kept[1:], model.car, out, 0, len(states))
+        return torch.from_numpy(_apart(out[0]))
 
     @staticmethod
     def backward(ctx: Any, *upstream: Tensor) -> tuple[Tensor | None, ...]:
         model, points, inputs = ctx.kept
         gradients = [np.zeros(tuple(parameter.shape), points.dtype) for parameter in model.parameters]
         with model.working():
-            model.transition_adjoint(points, inputs, upstream[0].unsqueeze(1).contiguous().numpy(), gradients)
+            given = _by_time(upstream[0].unsqueeze(1)), room(points.shape, points.dtype), model.learnt(gradients)
+            model.entries[2](points, inputs, model.car, *given, 0, points.shape[-1])
         return (None, None, None, *(torch.from_numpy(gradient) for gradient in gradients))
 
 
@@ -394,12 +342,12 @@ class _Scan(torch.autograd.Function):
         observation: Tensor,
         *parameters: Tensor,
     ) -> tuple[Tensor, Tensor]:
-        y, u, *noises = (_by_time(tensor) for tensor in (measurements, inputs, process, observation))
+        y, u, noises = _by_time(measurements), _by_time(inputs), (_by_time(process), _by_time(observation))
         tape.prior_mean[0], tape.prior_covariance[0] = _beside(mean.detach().numpy()), _beside(covariance.detach().numpy())
         refused, halves = np.zeros(measurements.shape[::2], np.int64), (1, 2 * len(y))
-        run = _compiled_forward_by(model, functions, tape, u)
+        run = _forward_by(model, functions, (tape, u[0]))
         with model.working():
-            share(lambda *own: run(setting, tape, y, u, *noises, refused, forward_scratch(tape), halves, *own), len(measurements))
+            share(lambda *own: run(setting, tape, y, u, noises, refused, forward_scratch(tape), halves, *own), len(measurements))
         ctx.kept = (model, setting, share, tape, functions, y, u)
         return _by_sequence(tape.post_mean), _by_sequence(tape.post_covariance)
 
@@ -429,46 +377,30 @@ class _Scan(torch.autograd.Function):
         return (None, None, None, None, None, y_bar, None, *first_bars, *noise_bars, *summed)
 
 
-def _forward_by(model: PointModel, functions: Sequence[NoiseAt | None]) -> Callable[..., None]:
-    """The loop over samples with a model and noise, uncompiled."""
-    called = (
-        (*model.entries[:2], model.car)
-        if isinstance(model, CompiledModel)
-        else (_written(model.transition), _written(model.observation), None)
-    )
-    noises: list[Any] = []
-    for at in functions:
-        noises += [at.entry, at.car] if isinstance(at, CompiledNoise) else [at and _written(at), None]
-    return partial(getattr(forward, "py_func", forward), *FORWARD, *called, *noises)
-
-
-def _compiled_forward_by(model: PointModel, functions: Sequence[NoiseAt | None], tape: Tape, u: Array) -> Callable[..., None]:
-    """The same, compiled where model and noise are."""
-    compiled = [at for at in functions if at is None or isinstance(at, CompiledNoise)]
-    if not isinstance(model, CompiledModel) or len(compiled) < len(functions) or config.DISABLE_JIT:
-        return _forward_by(model, functions)
-    points, inputs, expected, ends = tape.moved[0], u[0], tape.expected[0], (0, 0)
-    called = [
-        by_address(entry, points, inputs, model.car, out, *ends) for entry, out in zip(model.entries[:2], (points, expected), strict=True)
-    ]
-    noises: list[Any] = []
-    for at in compiled:
-        state, out = tape.post_mean[0], tape.post_covariance[0]
-        noises += [None, None] if at is None else [by_address(at.entry, state, inputs, at.car, out, *ends), at.car]
-    return partial(forward, *steps_by_address(FORWARD, points.dtype), *called, model.car, *noises)
+def _forward_by(model: PointModel, functions: Sequence[NoiseAt | None], like: tuple[Tape, Array] | None = None) -> Callable[..., None]:
+    """The loop over samples with a model and noise, compiled for arrays like a tape's and inputs, (p, B), where both are compiled."""
+    entries, cars = [*model.entries[:2]], [at.car if isinstance(at, CompiledNoise) else None for at in functions]
+    at_states = [at.entry if isinstance(at, CompiledNoise) else at and _written(at) for at in functions]
+    loop, steps = getattr(forward, "py_func", forward), cast(tuple[Any, ...], FORWARD)
+    if like and model.is_compiled and not config.DISABLE_JIT and all(at is None or isinstance(at, CompiledNoise) for at in functions):
+        (tape, inputs), loop, steps = like, forward, steps_by_address(FORWARD, like[1].dtype)
+        given = (tape.moved[0], inputs, model.car), (tape.post_mean[0], inputs)
+        entries = [by_address(entry, *given[0], out, 0, 0) for entry, out in zip(entries, (tape.moved[0], tape.expected[0]), strict=True)]
+        at_states = [at and by_address(at, *given[1], car, tape.post_covariance[0], 0, 0) for at, car in zip(at_states, cars, strict=True)]
+    return partial(loop, Forward._make((*steps, *entries, model.car)), at_states[0], cars[0], at_states[1], cars[1])
 
 
 def _backward_by(model: PointModel, tape: Tape, u: Array, gradients: Sequence[Array]) -> tuple[Callable[..., None], Any]:
     """The adjoint's loop with a model, and the gradients as it takes them."""
-    if not isinstance(model, CompiledModel) or config.DISABLE_JIT:
-        adjoints = (_added(model.transition_adjoint), _added(model.observation_adjoint))
-        return partial(getattr(backward, "py_func", backward), *BACKWARD, *adjoints, None), gradients
-    own, points, inputs = model.learnt(gradients), tape.moved[0], u[0]
+    own = model.learnt(gradients)
+    if not model.is_compiled or config.DISABLE_JIT:
+        return partial(getattr(backward, "py_func", backward), Backward._make((*BACKWARD, *model.entries[2:], model.car))), own
+    points, inputs = tape.moved[0], u[0]
     called = [
         by_address(entry, points, inputs, model.car, upstream, points, own, 0, 0)
         for entry, upstream in zip(model.entries[2:], (points, tape.expected[0]), strict=True)
     ]
-    return partial(backward, *steps_by_address(BACKWARD, points.dtype), *called, model.car), own
+    return partial(backward, Backward._make((*steps_by_address(BACKWARD, points.dtype), *called, model.car))), own
 
 
 def _written(function: Callable[[Array, Array], Array]) -> Callable[..., None]:
@@ -476,15 +408,6 @@ def _written(function: Callable[[Array, Array], Array]) -> Callable[..., None]:
 
     def write(values: Array, inputs: Array, _: Any, out: Array, first: int, end: int) -> None:
         out[..., first:end] = _beside(function(_apart(values, first, end), _apart(inputs, first, end)))
-
-    return write
-
-
-def _added(function: Callable[..., Array]) -> Callable[..., None]:
-    """The same of an adjoint."""
-
-    def write(points: Array, inputs: Array, _: Any, upstream: Array, out: Array, gradients: Sequence[Array], first: int, end: int) -> None:
-        out[..., first:end] = _beside(function(*(_apart(part, first, end) for part in (points, inputs, upstream)), gradients))
 
     return write
 

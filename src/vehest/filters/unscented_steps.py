@@ -3,8 +3,9 @@
 Sequences lie side by side: means (n, B), covariances (n, n, B), sigma points (2n + 1, n, B), what is expected at them (2n + 1, m, B). A
 step works on those from ``first`` to ``end``, as many at once as fill a vector of `vehest.lanes`; vectors are read beyond ``end``, so that
 arrays are followed by room for one (`room`), and never written there. Every adjoint takes what its step was given, and adds to (``_bar``)
-gradients unless it says otherwise. A rule is the row [spread, centre_mean, centre_covariance, other] of a `SigmaRule`; ``lower`` holds the
-smallest possible value of each state. Sums are rounded as those of single numbers, so that a sequence has the same digits beside any other.
+gradients unless it says otherwise. ``rules`` are the row [spread, centre_mean, centre_covariance, other] of a `SigmaRule`, the smallest
+possible value of each state, the margin of a repair and whether there are repairs; ``drawn`` are sigma points, the factors and the
+covariances that they come from. Sums are rounded as those of single numbers, so that a sequence has the same digits beside any other.
 """
 
 from __future__ import annotations
@@ -20,14 +21,22 @@ from vehest.filters.gating import refuses
 from vehest.lanes import BYTES, choose, load_unfused, most, root, store, store_some, width
 
 compiled = numba.njit(cache=True, nogil=True, error_model="numpy", boundscheck=False)
-DIMENSIONS = {"rule": 1, "lower": 1, "likelihood": 1, "centre": 1} | dict.fromkeys(
-    ("mean", "mean_bar", "post_mean", "post_mean_bar", "y", "y_bar", "innovation"), 2
-)
-OTHERS = {"margin": None, "limit": None, "first": types.intp, "end": types.intp, "patience": types.intp, "repair": types.boolean} | {
+ARGUMENTS: dict[str, Any] = {
+    "rules": (1, 1, 0, types.boolean),
+    "drawn": (3, 3, 3),
+    "post": (2, 3),
+    "kept": (2, 3, 3, 1),
+    "post_bars": (2, 3),
+    "prior_bars": (2, 3),
+    "other_bars": (3, 3, 3, 2),
     "repaired": types.boolean[::1],
     "gone": types.boolean[:, ::1],
     "refused": types.int64[:, ::1],
+    **dict.fromkeys(("mean", "mean_bar", "y"), 2),
+    **dict.fromkeys(("first", "end", "patience"), types.intp),
+    "limit": 0,
 }
+"""Dimensions of arrays, 0 of a number, or the type, of what steps are called with; others have three dimensions."""
 piece = numba.njit(forceinline=True, no_cpython_wrapper=True, no_cfunc_wrapper=True, error_model="numpy", boundscheck=False)
 
 
@@ -38,14 +47,20 @@ def room(shape: tuple[int, ...], dtype: Any) -> Any:
 
 
 def types_of(step: Any, dtype: Any) -> tuple[Any, ...]:
-    """Types of a step's arguments for arrays of a precision: those named in `DIMENSIONS` and `OTHERS`, else of three dimensions."""
+    """Types of a step's arguments for arrays of a precision, by their names in `ARGUMENTS`."""
     number = numba.from_dtype(np.dtype(dtype))
+
+    def kind(of: Any) -> Any:
+        if isinstance(of, tuple):
+            return types.BaseTuple.from_types(tuple(map(kind, of)))
+        return (types.Array(number, of, "C") if of else number) if isinstance(of, int) else of
+
     names = step.py_func.__code__.co_varnames[: step.py_func.__code__.co_argcount]
-    return tuple((OTHERS[name] or number) if name in OTHERS else types.Array(number, DIMENSIONS.get(name, 3), "C") for name in names)
+    return tuple(kind(ARGUMENTS.get(name, 3)) for name in names)
 
 
 @piece
-def _at(values, row, b):  # type: ignore[no-untyped-def]
+def at_row(values, row, b):  # type: ignore[no-untyped-def]
     """Vector of a row (the indices before the last one, as one) from sequence b on."""
     return load_unfused(values, row * values.shape[values.ndim - 1] + b)
 
@@ -70,7 +85,7 @@ def _rows(count, like):  # type: ignore[no-untyped-def]
 def _read(values, rows, b):  # type: ignore[no-untyped-def]
     """Sequences from b on to scratch."""
     for row in range(rows.shape[0]):
-        _put(rows, row, _at(values, row, b))
+        _put(rows, row, at_row(values, row, b))
 
 
 @piece
@@ -92,8 +107,9 @@ def _any(condition, b, end, scratch):  # type: ignore[no-untyped-def]
 
 
 @compiled
-def points_of(mean, given, rule, lower, margin, repair, covariance, factor, points, repaired, first, end):  # type: ignore[no-untyped-def]
-    """Sigma points of ``given`` covariances, which become ``covariance`` where what is not positive definite is repaired, and factors."""
+def points_of(mean, given, rules, drawn, repaired, first, end):  # type: ignore[no-untyped-def]
+    """Sigma points of ``given`` covariances, factors, and the covariances where what is not positive definite is repaired."""
+    (rule, lower, margin, repair), (points, factor, covariance) = rules, drawn
     n, count, lanes = mean.shape[0], points.shape[0], width(mean)
     A, L, P, flags = _rows(n * n, mean), _rows(n * n, mean), _rows(count * n, mean), _rows(1, mean)
     for b in range(first, end, lanes):
@@ -107,7 +123,7 @@ def points_of(mean, given, rule, lower, margin, repair, covariance, factor, poin
                     repaired[b + lane] = _repaired(A, L, lane, n, margin, repair)
         nothing = _own(L, 0) - _own(L, 0)  # NaN where a sequence is lost
         for i in range(n):
-            c = _at(mean, i, b)
+            c = at_row(mean, i, b)
             _put(P, i, choose(nothing == 0, most(c, lower[i]), nothing))
             for j in range(n):
                 offset = rule[0] * _own(L, i * n + j) if j <= i else nothing
@@ -119,21 +135,21 @@ def points_of(mean, given, rule, lower, margin, repair, covariance, factor, poin
 
 
 @compiled
-def points_adjoint(mean, factor, rule, lower, points_bar, mean_bar, covariance_bar, first, end):  # type: ignore[no-untyped-def]
+def points_adjoint(mean, factor, rules, points_bar, mean_bar, covariance_bar, first, end):  # type: ignore[no-untyped-def]
     """Adjoint of `points_of`; what a repair added counts as constant."""
-    n = mean.shape[0]
+    n, (rule, lower, _, _) = mean.shape[0], rules
     L, below, inner, x_bar, A_bar = _rows(n * n, mean), _rows(n * n, mean), _rows(n * n, mean), _rows(n, mean), _rows(n * n, mean)
     for b in range(first, end, width(mean)):
         _read(factor, L, b)
         _read(covariance_bar, A_bar, b)
         nothing = _own(L, 0) * 0
         for i in range(n):
-            c, bar = _at(mean, i, b), _at(mean_bar, i, b)
-            bar = choose(c >= lower[i], bar + _at(points_bar, i, b), bar)
+            c, bar = at_row(mean, i, b), at_row(mean_bar, i, b)
+            bar = choose(c >= lower[i], bar + at_row(points_bar, i, b), bar)
             for j in range(n):
                 offset = rule[0] * _own(L, i * n + j) if j <= i else nothing
-                up = choose(c + offset >= lower[i], _at(points_bar, (1 + j) * n + i, b), nothing)
-                down = choose(c - offset >= lower[i], _at(points_bar, (1 + n + j) * n + i, b), nothing)
+                up = choose(c + offset >= lower[i], at_row(points_bar, (1 + j) * n + i, b), nothing)
+                down = choose(c - offset >= lower[i], at_row(points_bar, (1 + n + j) * n + i, b), nothing)
                 bar += up + down
                 _put(below, i * n + j, rule[0] * (up - down) if j <= i else nothing)
             _put(x_bar, i, bar)
@@ -146,12 +162,12 @@ def points_adjoint(mean, factor, rule, lower, points_bar, mean_bar, covariance_b
 def _deviations(values, b, m, rule, deviation, i):  # type: ignore[no-untyped-def]
     """Write how far values (S, m, B) lie from their weighted mean in i, which is returned, into scratch (S · m, W)."""
     count = values.shape[0]
-    around = _at(values, 0, b) * 0
+    around = at_row(values, 0, b) * 0
     for s in range(1, count):
-        around += _at(values, s * m + i, b)
-    centre = rule[1] * _at(values, i, b) + rule[3] * around
+        around += at_row(values, s * m + i, b)
+    centre = rule[1] * at_row(values, i, b) + rule[3] * around
     for s in range(count):
-        _put(deviation, s * m + i, _at(values, s * m + i, b) - centre)
+        _put(deviation, s * m + i, at_row(values, s * m + i, b) - centre)
     return centre
 
 
@@ -165,9 +181,9 @@ def _weighted(one, i, n, other, j, m, rule, centre):  # type: ignore[no-untyped-
 
 
 @compiled
-def moments_of(values, noise, rule, lower, mean, covariance, first, end):  # type: ignore[no-untyped-def]
+def moments_of(values, noise, rules, mean, covariance, first, end):  # type: ignore[no-untyped-def]
     """Weighted mean and covariance of what became of the points, plus noise."""
-    count, n = values.shape[:2]
+    (count, n), (rule, lower, _, _) = values.shape[:2], rules
     half = rule.dtype.type(0.5)
     deviation, x, A = _rows(count * n, values), _rows(n, values), _rows(n * n, values)
     for b in range(first, end, width(values)):
@@ -176,7 +192,7 @@ def moments_of(values, noise, rule, lower, mean, covariance, first, end):  # typ
         for i in range(n):
             for j in range(i + 1):
                 spread = _weighted(deviation, i, n, deviation, j, n, rule, rule[2])
-                spread += half * (_at(noise, i * n + j, b) + _at(noise, j * n + i, b))
+                spread += half * (at_row(noise, i * n + j, b) + at_row(noise, j * n + i, b))
                 _put(A, i * n + j, spread)
                 _put(A, j * n + i, spread)
         _write(x, mean, b, end)
@@ -184,18 +200,18 @@ def moments_of(values, noise, rule, lower, mean, covariance, first, end):  # typ
 
 
 @compiled
-def moments_adjoint(values, rule, lower, mean_bar, covariance_bar, values_bar, noise_bar, first, end):  # type: ignore[no-untyped-def]
+def moments_adjoint(values, rules, mean_bar, covariance_bar, values_bar, noise_bar, first, end):  # type: ignore[no-untyped-def]
     """Adjoint of `moments_of`; writes ``values_bar`` and ``noise_bar``."""
-    count, n = values.shape[:2]
+    (count, n), (rule, lower, _, _) = values.shape[:2], rules
     half, two = rule.dtype.type(0.5), rule.dtype.type(2.0)
     deviation, V_bar = _rows(count * n, values), _rows(count * n, values)
     through, whole = _rows(n, values), _rows(n * n, values)
     for b in range(first, end, width(values)):
         for i in range(n):
             centre = _deviations(values, b, n, rule, deviation, i)
-            _put(through, i, choose(centre >= lower[i], _at(mean_bar, i, b), centre * 0))
+            _put(through, i, choose(centre >= lower[i], at_row(mean_bar, i, b), centre * 0))
             for j in range(n):
-                _put(whole, i * n + j, half * (_at(covariance_bar, i * n + j, b) + _at(covariance_bar, j * n + i, b)))
+                _put(whole, i * n + j, half * (at_row(covariance_bar, i * n + j, b) + at_row(covariance_bar, j * n + i, b)))
         for s in range(count):
             weight = two * (rule[2] if s == 0 else rule[3])
             for i in range(n):
@@ -214,13 +230,13 @@ def moments_adjoint(values, rule, lower, mean_bar, covariance_bar, values_bar, n
 
 
 @compiled
-def gate_of(expected, noise, rule, limit, patience, y, refused, gone, first, end):  # type: ignore[no-untyped-def]
+def gate_of(expected, noise, rules, limit, patience, y, refused, gone, first, end):  # type: ignore[no-untyped-def]
     """What the gate refuses becomes NaN in ``y`` and true in ``gone``, (m, B); counts in ``refused``, (B, m); see `Gate`.
 
     A negative weight of the mean point cannot make a variance smaller than that of the noise.
     """
     count, m = expected.shape[:2]
-    _, centre_mean, centre_covariance, other = rule
+    _, centre_mean, centre_covariance, other = rules[0]
     for b in range(first, end):
         for i in range(m):
             gone[i, b] = False
@@ -240,42 +256,22 @@ def gate_of(expected, noise, rule, limit, patience, y, refused, gone, first, end
 
 
 @compiled
-def update_of(  # type: ignore[no-untyped-def]
-    mean,
-    covariance,
-    points,
-    expected,
-    y,
-    noise,
-    rule,
-    lower,
-    margin,
-    repair,
-    post_mean,
-    post_covariance,
-    innovation,
-    own,
-    gain,
-    likelihood,
-    repaired,
-    centre,
-    first,
-    end,
-):
+def update_of(mean, drawn, expected, y, noise, rules, post, kept, repaired, first, end):  # type: ignore[no-untyped-def]
     """The state given a measurement; what is NaN was not measured. ``repaired`` keeps what it was where nothing is repaired.
 
-    ``centre`` becomes the weight that the mean point had in covariances, (B,): 0 where a negative one took their definiteness.
+    Written are mean and covariance, ``post``, and ``kept``: innovation, its covariance, gain, and the weight of the mean point in
+    covariances, (B,), 0 where a negative one took their definiteness.
     """
+    (rule, lower, margin, repair), (points, _, covariance) = rules, drawn
+    (post_mean, post_covariance), (innovation, own, gain, centre) = post, kept
     count, m = expected.shape[:2]
     n, lanes = mean.shape[0], width(mean)
-    half, log_two_pi = rule.dtype.type(0.5), rule.dtype.type(np.log(2.0 * np.pi))
     error, spread, deviation = _rows(m, mean), _rows(count * m, mean), _rows(count * n, mean)
     cross, factor, K, S, flags = _rows(n * m, mean), _rows(m * m, mean), _rows(n * m, mean), _rows(m * m, mean), _rows(1, mean)
     x, A, tried, weight = _rows(n, mean), _rows(n * n, mean), _rows(n * n, mean), _rows(1, mean)
-    whitened = np.empty(m, mean.dtype)
     for b in range(first, end, lanes):
         _spread(expected, points, mean, y, b, rule, error, spread, deviation)
-        around, definite, lifted = _at(mean, 0, b) * 0 + rule[2], _at(mean, 0, b) * 0, False
+        around, definite, lifted = at_row(mean, 0, b) * 0 + rule[2], at_row(mean, 0, b) * 0, False
         for attempt in range(3):  # as it is, without a negative weight, lifted
             if not lifted:
                 definite = _joint(spread, deviation, around, rule, y, noise, b, n, cross, S, factor)
@@ -287,7 +283,7 @@ def update_of(  # type: ignore[no-untyped-def]
                     for row in range(m * m):
                         nothing += _own(S, row) * 0
                     for row in range(n * n):
-                        nothing += _at(covariance, row, b) * 0
+                        nothing += at_row(covariance, row, b) * 0
                     lost = choose(nothing == 0, lost, 0.0)
                     if _any(lost, b, end, flags):
                         for lane in range(min(lanes, end - b)):
@@ -303,17 +299,6 @@ def update_of(  # type: ignore[no-untyped-def]
         _put(weight, 0, around)
         for i in range(n):
             _put(x, i, most(_moved(mean, K, error, i, m, b), lower[i]))
-        for lane in range(min(lanes, end - b)):
-            log_determinant, squared, measured = mean[0, b + lane] * 0, mean[0, b + lane] * 0, 0
-            for i in range(m):
-                measured += y[i, b + lane] == y[i, b + lane]
-                left = error[i, lane]
-                for c in range(i):
-                    left -= factor[i * m + c, lane] * whitened[c]
-                whitened[i] = left / factor[i * m + i, lane]
-                squared += whitened[i] * whitened[i]
-                log_determinant += np.log(factor[i * m + i, lane])
-            likelihood[b + lane] = -half * (squared + 2 * log_determinant + measured * log_two_pi)
         _write(x, post_mean, b, end)
         _write(A, post_covariance, b, end)
         _write(error, innovation, b, end)
@@ -324,7 +309,7 @@ def update_of(  # type: ignore[no-untyped-def]
 
 @piece
 def _moved(mean, K, error, i, m, b):  # type: ignore[no-untyped-def]
-    state = _at(mean, i, b)
+    state = at_row(mean, i, b)
     for c in range(m):
         state += _own(K, i * m + c) * _own(error, c)
     return state
@@ -336,13 +321,13 @@ def _spread(expected, points, mean, y, b, rule, error, spread, deviation):  # ty
     count, m = expected.shape[:2]
     n = mean.shape[0]
     for i in range(m):
-        z, centre = _at(y, i, b), _deviations(expected, b, m, rule, spread, i)
+        z, centre = at_row(y, i, b), _deviations(expected, b, m, rule, spread, i)
         _put(error, i, choose(z == z, z - centre, 0.0))
         for s in range(count):
             _put(spread, s * m + i, choose(z == z, _own(spread, s * m + i), 0.0))
     for s in range(count):
         for i in range(n):
-            _put(deviation, s * n + i, _at(points, s * n + i, b) - _at(mean, i, b))
+            _put(deviation, s * n + i, at_row(points, s * n + i, b) - at_row(mean, i, b))
 
 
 @piece
@@ -355,9 +340,9 @@ def _joint(spread, deviation, centre, rule, y, noise, b, n, cross, own, factor):
             _put(cross, i * m + j, _weighted(deviation, i, n, spread, j, m, rule, centre))
     for i in range(m):
         for j in range(i + 1):
-            one, other = _at(y, i, b), _at(y, j, b)
+            one, other = at_row(y, i, b), at_row(y, j, b)
             bare = _weighted(spread, i, m, spread, j, m, rule, centre)
-            noisy = bare + half * (_at(noise, i * m + j, b) + _at(noise, j * m + i, b))
+            noisy = bare + half * (at_row(noise, i * m + j, b) + at_row(noise, j * m + i, b))
             alone = bare + 1 if i == j else bare
             value = choose(one == one, choose(other == other, noisy, alone), alone)
             _put(own, i * m + j, value)
@@ -375,7 +360,7 @@ def _posterior(covariance, b, cross, factor, gain, post_covariance):  # type: ig
         _solve(factor, cross, i * m, m, gain)
     for i in range(n):
         for j in range(i + 1):
-            left = half * (_at(covariance, i * n + j, b) + _at(covariance, j * n + i, b))
+            left = half * (at_row(covariance, i * n + j, b) + at_row(covariance, j * n + i, b))
             for c in range(m):
                 taken = _own(gain, i * m + c) * _own(cross, j * m + c) + _own(gain, j * m + c) * _own(cross, i * m + c)
                 left -= half * taken
@@ -399,29 +384,10 @@ def _solve(factor, given, at, m, solved):  # type: ignore[no-untyped-def]
 
 
 @compiled
-def update_adjoint(  # type: ignore[no-untyped-def]
-    mean,
-    points,
-    expected,
-    y,
-    rule,
-    lower,
-    innovation,
-    own,
-    gain,
-    centre,
-    post_mean_bar,
-    post_covariance_bar,
-    mean_bar,
-    covariance_bar,
-    points_bar,
-    expected_bar,
-    noise_bar,
-    y_bar,
-    first,
-    end,
-):
-    """Adjoint of `update_of`; writes ``mean_bar``, ``covariance_bar``, ``points_bar``, ``expected_bar``, ``noise_bar`` and ``y_bar``."""
+def update_adjoint(mean, points, expected, y, rules, kept, post_bars, prior_bars, other_bars, first, end):  # type: ignore[no-untyped-def]
+    """Adjoint of `update_of`; writes gradients of mean and covariance before, and of points, what is expected, noise and measurements."""
+    (rule, lower, _, _), (innovation, own, gain, centre), (post_mean_bar, post_covariance_bar) = rules, kept, post_bars
+    (mean_bar, covariance_bar), (points_bar, expected_bar, noise_bar, y_bar) = prior_bars, other_bars
     count, m = expected.shape[:2]
     n = mean.shape[0]
     half, two = rule.dtype.type(0.5), rule.dtype.type(2.0)
@@ -435,16 +401,16 @@ def update_adjoint(  # type: ignore[no-untyped-def]
         _read(innovation, error, b)
         _read(own, S, b)
         _read(gain, K, b)
-        around = _at(centre, 0, b)
+        around = at_row(centre, 0, b)
         for i in range(n):
             state = _moved(mean, K, error, i, m, b)
-            _put(through, i, choose(state >= lower[i], _at(post_mean_bar, i, b), state * 0))
+            _put(through, i, choose(state >= lower[i], at_row(post_mean_bar, i, b), state * 0))
             for j in range(n):
-                _put(P, i * n + j, half * (_at(post_covariance_bar, i * n + j, b) + _at(post_covariance_bar, j * n + i, b)))
+                _put(P, i * n + j, half * (at_row(post_covariance_bar, i * n + j, b) + at_row(post_covariance_bar, j * n + i, b)))
         _cholesky(S, factor, m)
         _solve(factor, error, 0, m, solved)
         for c in range(m):  # pulled = Kᵀ m̄, the gradient of the innovation
-            pull, known = _own(through, 0) * 0, _at(y, c, b)
+            pull, known = _own(through, 0) * 0, at_row(y, c, b)
             for i in range(n):
                 pull += _own(K, i * m + c) * _own(through, i)
             _put(pulled, c, pull)
@@ -462,7 +428,7 @@ def update_adjoint(  # type: ignore[no-untyped-def]
                     for j in range(n):
                         bar += _own(K, i * m + c) * _own(P, i * n + j) * _own(K, j * m + d)
                 _put(own_bar, c * m + d, bar)
-                one, other = _at(y, c, b), _at(y, d, b)
+                one, other = at_row(y, c, b), at_row(y, d, b)
                 _put(R_bar, c * m + d, choose(one == one, choose(other == other, bar, bar * 0), bar * 0))
         for i in range(n):
             left = _own(through, i)
@@ -475,7 +441,7 @@ def update_adjoint(  # type: ignore[no-untyped-def]
                 left -= bar
             _put(x_bar, i, left)
         for c in range(m):
-            known = _at(y, c, b)
+            known = at_row(y, c, b)
             left = choose(known == known, -_own(pulled, c), _own(pulled, c) * 0)
             for s in range(count):
                 bar = _own(pulled, c) * 0

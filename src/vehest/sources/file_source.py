@@ -12,6 +12,7 @@ from vehest.data.errors import ConfigurationError, DataError, MissingError
 from vehest.data.recording import Recording
 from vehest.sources.base import Source, existing_folder, kind_of
 from vehest.sources.clocks import Clock
+from vehest.sources.columns import Column, columns_from_config
 from vehest.sources.tables import listed
 
 
@@ -112,6 +113,14 @@ class FileSource(Source):
             )
         except DataError as error:
             raise DataError(f"{where}: {error}") from None
+
+    def _declared(self, entries: Mapping[str, Any] | None, kind: type[Column] = Column) -> dict[str, Any]:
+        """Channel -> its declaration, one at least; those that the option ``gappy`` names are `gappy`."""
+        columns = columns_from_config(entries or {}, self.name, kind)
+        if not columns:
+            raise ConfigurationError(f"{self.where}: channels must map a channel to its column and unit")
+        self.gappy = self._gappy_among(columns)
+        return columns
 
     def _gappy_among(self, channels: Iterable[str]) -> frozenset[str]:
         """Channels that the option ``gappy`` names, which must be among the data set's."""

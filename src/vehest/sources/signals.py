@@ -23,7 +23,7 @@ from vehest.data.errors import ConfigurationError, DataError
 from vehest.data.recording import Recording
 from vehest.sources.base import require_files
 from vehest.sources.clocks import SLACK, Clock, at_ticks, common_span, on_nearest, require_samples, ticks_within, uniform_clock
-from vehest.sources.columns import ChannelMap, ChannelNames, Column, Positive, Rate, columns_from_config
+from vehest.sources.columns import ChannelMap, ChannelNames, Column, Positive, Rate
 from vehest.sources.file_source import FileSource
 from vehest.sources.table_rows import timed_runs
 from vehest.sources.unit_spellings import require_unit
@@ -81,10 +81,7 @@ class SignalSource(FileSource):
         super().__init__(dataset)
         self._require_pattern()
         options = self.options
-        self.channels: dict[str, Any] = columns_from_config(options.channels, self.name, self.channel_type)
-        self.gappy = self._gappy_among(self.channels)
-        if not self.channels:
-            raise ConfigurationError(f"{self.where}: channels must map a channel to its column and unit")
+        self.channels = self._declared(options.channels, self.channel_type)
         if (options.rate_hz is None) == (options.raster is None):
             raise ConfigurationError(f"{self.where}: give either rate_hz, or as raster the channel whose clock is taken")
         self._signals = lru_cache(1)(self._read_signals)

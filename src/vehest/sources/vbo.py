@@ -18,13 +18,13 @@ from pydantic import Field
 
 from vehest.constants import FloatArray
 from vehest.data.channels import channel
-from vehest.data.errors import ConfigurationError, DataError, printable
+from vehest.data.errors import DataError, printable
 from vehest.data.files import regular_file
 from vehest.data.recording import Recording
 from vehest.sources.base import require_files
 from vehest.sources.clock_times import past_midnight
 from vehest.sources.clocks import ClockPolicy, uniform_clock
-from vehest.sources.columns import ChannelMap, ChannelNames, Positive, columns_from_config
+from vehest.sources.columns import ChannelMap, ChannelNames, Positive
 from vehest.sources.file_source import FileSource
 from vehest.sources.table_rows import timed_runs
 from vehest.sources.tables import TextLayout, read_columns, require_columns
@@ -74,10 +74,7 @@ class VboSource(FileSource):
 
     def __init__(self, dataset: Mapping[str, Any]) -> None:
         super().__init__(dataset)
-        self.columns = columns_from_config(self.options.channels, self.name)
-        if not self.columns:
-            raise ConfigurationError(f"{self.where}: channels must map a channel to its column and unit")
-        self.gappy = self._gappy_among(self.columns)
+        self.columns = self._declared(self.options.channels)
         self._require_pattern()
         self._log = lru_cache(1)(read_log)
 

@@ -6,7 +6,8 @@ from dataclasses import dataclass
 from typing import ClassVar, Literal
 
 from vehest.declared import Group, setting
-from vehest.training.search import DirectSearchSettings
+from vehest.training.context import FitContext
+from vehest.training.search import Box, Cost, DirectSearchSettings, SearchRecord, nelder_mead_over_grid, optuna_search
 
 
 @dataclass(frozen=True)
@@ -27,7 +28,10 @@ class NoiseTuningSettings(Group):
     trials: int = setting(200, "evaluations of Optuna", least=1)
     skip_seconds: float = setting(1.5, "first seconds of each recording that do not count", unit="s", least=0.0)
 
-    @property
-    def search(self) -> DirectSearchSettings:
-        """What Nelder-Mead is told."""
-        return DirectSearchSettings(self.grid, self.max_evaluations, self.tolerance)
+    def search(self, cost: Cost, boxes: Box, starts: Box, seed: int, context: FitContext, trials: int | None = None) -> SearchRecord:
+        """The smallest cost within boxes, by Optuna or by Nelder-Mead over ranges of starts; see `vehest.training.search`."""
+        if self.method == "optuna":
+            staged = {name: getattr(self, name) for name in ("stages", "shrink") if hasattr(self, name)}
+            return optuna_search(cost, boxes, trials or self.trials, seed, context, **staged)
+        limits = DirectSearchSettings(self.grid, self.max_evaluations, self.tolerance)
+        return nelder_mead_over_grid(cost, boxes, starts, limits, context)

@@ -17,6 +17,8 @@ from vehest.declared import Group, setting
 from vehest.training.context import FitContext, Progress
 
 FIRST_STEP = 0.05
+Cost = Callable[[FloatArray], float]
+Box = Sequence[tuple[float, float]]
 
 
 @dataclass(frozen=True)
@@ -39,14 +41,13 @@ class SearchRecord(NamedTuple):
     evaluations: int  # of the cost, in all
     interrupted: bool  # before the last start
 
+    def history(self, names: Sequence[str]) -> dict[str, list[float]]:
+        """Starts, what each led to and its cost, as a fit's history has them."""
+        columns = (*(f"start_{name}" for name in names), *names, "train_loss")
+        return dict(zip(columns, self.starts.T.tolist(), strict=True))
 
-def nelder_mead_over_grid(
-    cost: Callable[[FloatArray], float],
-    box: Sequence[tuple[float, float]],
-    start_range: Sequence[tuple[float, float]],
-    settings: DirectSearchSettings,
-    context: FitContext,
-) -> SearchRecord:
+
+def nelder_mead_over_grid(cost: Cost, box: Box, start_range: Box, settings: DirectSearchSettings, context: FitContext) -> SearchRecord:
     """Minimise a cost that need not be smooth, keeping the best of several local searches.
 
     Args:
@@ -84,7 +85,7 @@ def _record(rows: Sequence[FloatArray], evaluations: int, interrupted: bool) -> 
     return SearchRecord(best[n : 2 * n], float(best[-1]), table, evaluations, interrupted)
 
 
-def _simplex(start: FloatArray, box: Sequence[tuple[float, float]]) -> FloatArray:
+def _simplex(start: FloatArray, box: Box) -> FloatArray:
     """A start and a step of 5 % of the box along each parameter, inwards where it would leave the box."""
     vertices = np.tile(start, (len(start) + 1, 1))
     for k, (low, high) in enumerate(box):
@@ -94,14 +95,7 @@ def _simplex(start: FloatArray, box: Sequence[tuple[float, float]]) -> FloatArra
 
 
 def optuna_search(
-    cost: Callable[[FloatArray], float],
-    box: Sequence[tuple[float, float]],
-    trials: int,
-    seed: int,
-    context: FitContext,
-    *,
-    stages: int = 1,
-    shrink: float = 0.3,
+    cost: Cost, box: Box, trials: int, seed: int, context: FitContext, *, stages: int = 1, shrink: float = 0.3
 ) -> SearchRecord:
     """Minimise a cost by Optuna's tree-structured Parzen estimator: in the whole box, then perhaps in smaller ones around the best so far.
 

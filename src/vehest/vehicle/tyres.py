@@ -32,17 +32,12 @@ class TyreForces(NamedTuple):
 class PositiveParameters(nn.Module):
     """Named positive numbers, learnt from values as their logarithms.
 
-    Raises:
-        ValueError: a value is not positive.
-
     Source: Węgrzynowski et al. 2024, Section III-B.4.
     """
 
     def __init__(self, values: Mapping[str, float]) -> None:
         super().__init__()
         for name, value in values.items():
-            if not (math.isfinite(value) and value > 0.0):
-                raise ValueError(f"{name} must be positive, not {value}")
             self.register_parameter(f"log_{name}", nn.Parameter(torch.tensor(math.log(value))))
 
     def __getitem__(self, name: str) -> Tensor:

@@ -11,7 +11,7 @@ import numpy as np
 import pandas as pd
 
 from vehest.constants import FloatArray
-from vehest.estimators.filtering.tyre_fit import fit_tyres
+from vehest.estimators.filtering.tyre_fit import axle_motion, fit_motion
 from vehest.evaluation.significance import difference_of_blocks, root_interval
 from vehest.vehicle.parameters import SingleTrackParameters
 from vehest_papers.heavy_ekf import paper
@@ -221,7 +221,8 @@ def absorbed(levels: Mapping[str, Levels]) -> pd.DataFrame:
     rows, cells, ends = [], [], []
     for mistake in MISTAKES:
         conditions = Conditions(ABSORBED_SLIP, crossfall=mistake.crossfall)
-        fit = fit_tyres([mistake.measured(drive(conditions, seed)).recording for seed in _FITTED_SEEDS], mistake.car(), minimum_speed=2.0)
+        drives = [mistake.measured(drive(conditions, seed)).recording for seed in _FITTED_SEEDS]
+        fit = fit_motion(axle_motion(drives, mistake.car(), minimum_speed=2.0))
         curves = np.concatenate([fit.front, fit.rear])
         squared: dict[str, list[float]] = {name: [] for name in (paper.LINT, paper.RATT, paper.RATTE)}
         last = []

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from contextlib import AbstractContextManager
+from collections.abc import Callable
 
 import numpy as np
 import torch
@@ -15,7 +14,7 @@ from vehest.estimators.learned_ukf import LearnedUkf
 from vehest.estimators.model_files import load_model
 from vehest.evaluation.metrics import WEIGHTS, sequences
 from vehest.filters.gaussian import Gaussian
-from vehest.filters.unscented_scan import Array, NonlinearFiltered, PointModel
+from vehest.filters.unscented_scan import NonlinearFiltered, PointModel
 from vehest.studies.artefacts import EvaluatedModel, PartArtefacts
 from vehest.training.through_filter import Drive
 from vehest.vehicle.dynamics import STATES
@@ -27,28 +26,13 @@ class Swapped(PointModel):
     """Moves points by one model and expects measurements by another; without adjoints, so it cannot be trained."""
 
     def __init__(self, predicting: PointModel, observing: PointModel) -> None:
-        self._predicting, self._observing = predicting, observing
-        self.lower = predicting.lower
+        self.working, self.lower = predicting.working, predicting.lower  # type: ignore[method-assign]
+        self.entries = [_with_its_car(predicting, 0), _with_its_car(observing, 1)]
 
-    def working(self) -> AbstractContextManager[object]:
-        """Of the one that predicts."""
-        return self._predicting.working()
 
-    def transition(self, points: Array, inputs: Array) -> Array:
-        """Of the one that predicts."""
-        return self._predicting.transition(points, inputs)
-
-    def observation(self, points: Array, inputs: Array) -> Array:
-        """Of the one that observes."""
-        return self._observing.observation(points, inputs)
-
-    def transition_adjoint(self, points: Array, inputs: Array, upstream: Array, gradients: Sequence[Array]) -> Array:
-        """Refused."""
-        raise NotImplementedError("a swapped model has no adjoints")
-
-    def observation_adjoint(self, points: Array, inputs: Array, upstream: Array, gradients: Sequence[Array]) -> Array:
-        """Refused."""
-        raise NotImplementedError("a swapped model has no adjoints")
+def _with_its_car(model: PointModel, entry: int) -> Callable[..., None]:
+    """An entry of a model, whatever car it is called with."""
+    return lambda points, inputs, _, out, first, end: model.entries[entry](points, inputs, model.car, out, first, end)
 
 
 def loaded(model: EvaluatedModel) -> LearnedUkf:

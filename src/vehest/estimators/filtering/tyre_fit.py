@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from scipy import optimize, signal
 
 from vehest.constants import FloatArray
-from vehest.data.errors import ConfigurationError, DataError
+from vehest.data.errors import DataError
 from vehest.data.recording import Recording
 from vehest.vehicle.dugoff import LoadedCar
 from vehest.vehicle.parameters import SingleTrackParameters
@@ -181,15 +181,8 @@ def _motion_of(
     return slip, np.stack([rear * total + moment, front * total - moment]) / (front + rear), driven
 
 
-def fit_tyres(
-    recordings: Sequence[Recording],
-    parameters: SingleTrackParameters,
-    kind: Kind = "rational",
-    *,
-    minimum_speed: float = 3.0,
-    measured_forces: bool = False,
-) -> TyreFit:
-    """Least squares of both axle curves on measured drives.
+def fit_motion(motion: AxleMotion, kind: Kind = "rational") -> TyreFit:
+    """Least squares of both axle curves.
 
     Drives that stay where tyres are nearly linear say nothing of c₁: it is known beforehand as well as `PEAK_SLIP` says of road tyres, a
     block of 10 s counting as one sample against it.
@@ -198,34 +191,14 @@ def fit_tyres(
     blocks): residuals of neighbouring samples are hardly independent, and to count them so would make intervals far too narrow.
 
     Args:
-        recordings: as `axle_motion` takes them.
-        parameters: mass, inertia and the places of the axles.
-        kind: ``linear`` or ``rational``.
-        minimum_speed: slower samples are left out [m/s].
-        measured_forces: as in `axle_motion`.
-
-    Raises:
-        ConfigurationError: no such kind.
-        DataError: a channel is missing, or hardly any samples are left.
-
-    Source: Di Biase, Lenzo & Timpone 2020, section III.B, Figure 3 and Table 1; blocks as in Liang & Zeger, Biometrika 73 (1), 1986.
-    """
-    return fit_motion(axle_motion(recordings, parameters, minimum_speed, measured_forces=measured_forces), kind)
-
-
-def fit_motion(motion: AxleMotion, kind: Kind = "rational") -> TyreFit:
-    """The same of slips and forces that are at hand already.
-
-    Args:
         motion: of both axles.
         kind: ``linear`` or ``rational``.
 
     Raises:
-        ConfigurationError: no such kind.
         DataError: forces run against slips.
+
+    Source: Di Biase, Lenzo & Timpone 2020, section III.B, Figure 3 and Table 1; blocks as in Liang & Zeger, Biometrika 73 (1), 1986.
     """
-    if kind not in PARAMETERS:
-        raise ConfigurationError(f"a tyre curve of kind '{kind}' is not one of: {', '.join(PARAMETERS)}")
     axles = [_fitted(kind, slip, force, motion.block) for slip, force in zip(motion.slip, motion.force, strict=True)]
     (front, front_covariance, front_rms), (rear, rear_covariance, rear_rms) = axles
     covariance = np.stack([front_covariance, rear_covariance])

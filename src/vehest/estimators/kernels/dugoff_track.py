@@ -7,22 +7,19 @@ from __future__ import annotations
 
 import math
 
-import numba
 import numpy as np
 import torch
 
 from vehest.constants import GRAVITY
-from vehest.filters.unscented_scan import CompiledModel
-from vehest.lanes import choose, each, load_unfused, most, store_some, width
+from vehest.filters.unscented_scan import PointModel
+from vehest.filters.unscented_steps import at_row, compiled, piece
+from vehest.lanes import choose, each, most, store_some, width
 from vehest.vehicle.dugoff import LARGEST_RATIO, LEAST_COSINE, LEAST_LOAD, LEAST_SHARE, DugoffTrack
 
 PLAIN, SMOOTH = LARGEST_RATIO["plain"], LARGEST_RATIO["smooth"]
 
-compiled = numba.njit(cache=True, nogil=True, error_model="numpy", boundscheck=False)
-piece = numba.njit(forceinline=True, no_cpython_wrapper=True, no_cfunc_wrapper=True, error_model="numpy", boundscheck=False)
 
-
-class CompiledDugoffTrack(CompiledModel):
+class CompiledDugoffTrack(PointModel):
     """A `DugoffTrack` for the unscented filter; nothing of the car is learnt.
 
     Args:
@@ -30,20 +27,15 @@ class CompiledDugoffTrack(CompiledModel):
         dtype: precision of the arrays.
     """
 
+    is_compiled = True
+
     def __init__(self, track: DugoffTrack, dtype: torch.dtype = torch.float64) -> None:
         car = track.car
         scalar = np.float32 if dtype == torch.float32 else np.float64
         numbers = [car.mass, car.yaw_inertia, car.cg_to_front_axle, car.cg_to_rear_axle, car.cg_height, track.step, track.minimum_speed]
         axles = [[axle.cornering_stiffness, axle.friction, axle.reduction] for axle in (track.front, track.rear)]
         self.car = (np.array(numbers, scalar), np.array(axles, scalar), track.tyres == "smooth")
-        self.measured = 5 if track.sees_sideslip else 4
         self.entries = (_transition, _observation, _transition_adjoint, _observation_adjoint)
-
-
-@piece
-def _at(values, row, b):  # type: ignore[no-untyped-def]
-    """Vector of a row (the indices before the last one, as one) from sequence b on."""
-    return load_unfused(values, row * values.shape[values.ndim - 1] + b)
 
 
 @piece
@@ -56,12 +48,12 @@ def _settled(inputs, b, car):  # type: ignore[no-untyped-def]
     """Of one sample: speed, tangent and cosine of the steering angle, loads of both axles."""
     mass, _, front_arm, rear_arm, height, _, minimum_speed = car
     wheelbase = front_arm + rear_arm
-    transfer = _at(inputs, 2, b) * (height / wheelbase)
+    transfer = at_row(inputs, 2, b) * (height / wheelbase)
     gravity = car.dtype.type(GRAVITY)
     front, rear = gravity * rear_arm / wheelbase, gravity * front_arm / wheelbase
-    least, steer = car.dtype.type(LEAST_LOAD), _at(inputs, 1, b)
+    least, steer = car.dtype.type(LEAST_LOAD), at_row(inputs, 1, b)
     load_front, load_rear = mass * most(front - transfer, least * front), mass * most(rear + transfer, least * rear)
-    return most(_at(inputs, 0, b), minimum_speed), each(math.tan, steer), each(math.cos, steer), load_front, load_rear
+    return most(at_row(inputs, 0, b), minimum_speed), each(math.tan, steer), each(math.cos, steer), load_front, load_rear
 
 
 @piece
@@ -93,7 +85,7 @@ def _forces(points, s, b, settled, track):  # type: ignore[no-untyped-def]
     """Forces across the body at point s, front and rear, and the derivative of each by the lateral velocity of its axle."""
     vx, turned, cosine, load_front, load_rear = settled
     car, axles, smooth = track
-    vy, yaw_rate = _at(points, 2 * s, b), _at(points, 2 * s + 1, b)
+    vy, yaw_rate = at_row(points, 2 * s, b), at_row(points, 2 * s + 1, b)
     course_front, course_rear = (vy + car[2] * yaw_rate) / vx, (vy - car[3] * yaw_rate) / vx
     across = 1 + turned * course_front
     least = axles.dtype.type(LEAST_COSINE)
@@ -109,8 +101,8 @@ def _transition(points, inputs, track, out, first, end):  # type: ignore[no-unty
     car = track[0]
     mass, inertia, front_arm, rear_arm, _, step, minimum_speed = car
     for b in range(first, end, width(points)):
-        settled, rolls = _settled(inputs, b, car), _at(inputs, 0, b) < minimum_speed
-        turn = _at(inputs, 0, b) * _at(inputs, 1, b) / (front_arm + rear_arm)
+        settled, rolls = _settled(inputs, b, car), at_row(inputs, 0, b) < minimum_speed
+        turn = at_row(inputs, 0, b) * at_row(inputs, 1, b) / (front_arm + rear_arm)
         for s in range(points.shape[0]):
             vy, yaw_rate, front, rear, _, _ = _forces(points, s, b, settled, track)
             across = vy + step * ((front + rear) / mass - settled[0] * yaw_rate)
@@ -139,10 +131,10 @@ def _transition_adjoint(points, inputs, track, upstream, out, gradients, first, 
     car = track[0]
     mass, inertia, front_arm, rear_arm, _, step, minimum_speed = car
     for b in range(first, end, width(points)):
-        settled, rolls = _settled(inputs, b, car), _at(inputs, 0, b) < minimum_speed
+        settled, rolls = _settled(inputs, b, car), at_row(inputs, 0, b) < minimum_speed
         for s in range(points.shape[0]):
             _, _, _, _, by_front, by_rear = _forces(points, s, b, settled, track)
-            across, turning = _at(upstream, 2 * s, b), _at(upstream, 2 * s + 1, b)
+            across, turning = at_row(upstream, 2 * s, b), at_row(upstream, 2 * s + 1, b)
             front_bar = step * (across / mass + turning * front_arm / inertia) * by_front
             rear_bar = step * (across / mass - turning * rear_arm / inertia) * by_rear
             spun = turning - step * settled[0] * across + front_arm * front_bar - rear_arm * rear_bar
@@ -159,11 +151,11 @@ def _observation_adjoint(points, inputs, track, upstream, out, gradients, first,
         vx = settled[0]
         for s in range(points.shape[0]):
             vy, _, _, _, by_front, by_rear = _forces(points, s, b, settled, track)
-            across = _at(upstream, m * s, b) / mass
-            front_bar = (across + _at(upstream, m * s + 2, b)) * by_front
-            rear_bar = (across + _at(upstream, m * s + 3, b)) * by_rear
+            across = at_row(upstream, m * s, b) / mass
+            front_bar = (across + at_row(upstream, m * s + 2, b)) * by_front
+            rear_bar = (across + at_row(upstream, m * s + 3, b)) * by_rear
             bar = front_bar + rear_bar
             if m == 5:
-                bar += _at(upstream, m * s + 4, b) * vx / (vx * vx + vy * vy)
+                bar += at_row(upstream, m * s + 4, b) * vx / (vx * vx + vy * vy)
             _put(out, 2 * s, b, bar, end)
-            _put(out, 2 * s + 1, b, _at(upstream, m * s + 1, b) + front_arm * front_bar - rear_arm * rear_bar, end)
+            _put(out, 2 * s + 1, b, at_row(upstream, m * s + 1, b) + front_arm * front_bar - rear_arm * rear_bar, end)

@@ -24,7 +24,7 @@ from vehest.constants import GRAVITY
 from vehest.estimators.kernels.activation import arctan, sigmoid, softplus, tanh
 from vehest.estimators.kernels.blas import one_blas_thread
 from vehest.estimators.kernels.compiling import entry, part
-from vehest.filters.unscented_scan import Array, CompiledModel
+from vehest.filters.unscented_scan import Array, PointModel
 from vehest.lanes import width
 from vehest.vehicle.dynamics import TURN, UNSCALED, Dynamics, NeuralCar, PacejkaCar, Perceptron, ResidualCar, TyreNetworkCar, physical_of
 from vehest.vehicle.tyres import STILL
@@ -45,7 +45,7 @@ def copy_rows(rows, out):  # type: ignore[no-untyped-def]
             out[i, p] = rows[i, p]
 
 
-class CompiledPlanarCar(CompiledModel):
+class CompiledPlanarCar(PointModel):
     """A planar car for the unscented filter.
 
     Args:
@@ -53,16 +53,11 @@ class CompiledPlanarCar(CompiledModel):
         step: [s].
         lower: smallest possible value of each state.
         dtype: precision of the arrays.
-
-    Raises:
-        ValueError: the car is of another kind, its network has not two hidden layers, or its tyres have a curvature.
     """
 
+    is_compiled = True
+
     def __init__(self, dynamics: Dynamics, step: float, lower: Sequence[float] | None, dtype: torch.dtype) -> None:
-        kind = _kind_of(dynamics)
-        if kind is None:
-            known = "networks have two hidden layers, tyres no curvature"
-            raise ValueError(f"there is no compiled code for this {type(dynamics).__name__}: {known}")
         network = getattr(dynamics, "network", None)
         if isinstance(network, Perceptron):
             (W1, b1), (W2, b2), (W3, b3) = network.layers()
@@ -79,8 +74,7 @@ class CompiledPlanarCar(CompiledModel):
         flat = 4.0 * np.finfo(scalar).eps
         numbers = [physical.mass, physical.wheelbase, physical.wheel_radius, step, TURN, UNSCALED, STILL, flat, GRAVITY]
         matrices = tuple(np.ascontiguousarray(arrays[place].T) for place in (0, 2, 4))
-        self.car = ((*arrays[:6], *matrices), arrays[6], np.array(numbers, scalar), kind)
-        self.measured = 4
+        self.car = ((*arrays[:6], *matrices), arrays[6], np.array(numbers, scalar), _kind_of(dynamics))
         self.entries = (_transition, _observation, _transition_adjoint, _observation_adjoint)
 
     def working(self) -> AbstractContextManager[object]:
@@ -512,16 +506,21 @@ def _block_of(sequences, count):  # type: ignore[no-untyped-def]
 
 
 @piece
-def _filling(points, like):  # type: ignore[no-untyped-def]
-    """Columns for so many points, as many as fill whole vectors."""
-    lanes = width(like)
-    return (points + lanes - 1) // lanes * lanes
+def _taken(points, inputs, first, end):  # type: ignore[no-untyped-def]
+    """Points of some sequences and their inputs, in as many columns as fill whole vectors; see `_columns` and `_driven`."""
+    count, n, _ = points.shape
+    lanes = width(points)
+    columns = ((end - first) * count + lanes - 1) // lanes * lanes
+    x, u = np.empty((n, columns), points.dtype), np.empty((4, columns), points.dtype)
+    _columns(points, first, end, 1, x)
+    _driven(inputs, first, end, count, u)
+    return x, u
 
 
 @piece
-def _room(points, columns, car, dtype):  # type: ignore[no-untyped-def]
-    """For what the network sees, slips, both hidden layers, the network's outputs, forces, and rates without what a network adds."""
-    T1, _, T2 = car[0][:3]
+def _room(points, x, car):  # type: ignore[no-untyped-def]
+    """For what the network sees of so many points, slips, both hidden layers, its outputs, forces, and rates without what it adds."""
+    (T1, _, T2), columns, dtype = car[0][:3], x.shape[1], x.dtype
     return (
         np.empty((points, T1.shape[0]), dtype),
         np.empty((3, columns), dtype),
@@ -534,19 +533,10 @@ def _room(points, columns, car, dtype):  # type: ignore[no-untyped-def]
 
 
 @piece
-def _four_rooms(points, columns, car, dtype):  # type: ignore[no-untyped-def]
-    return (
-        _room(points, columns, car, dtype),
-        _room(points, columns, car, dtype),
-        _room(points, columns, car, dtype),
-        _room(points, columns, car, dtype),
-    )
-
-
-@piece
-def _stages(x0, u, car, x, rooms, rates):  # type: ignore[no-untyped-def]
-    """The four stages of the Runge-Kutta method."""
+def _stages(x0, u, car, rooms):  # type: ignore[no-untyped-def]
+    """States and rates at the four stages of the Runge-Kutta method."""
     step, half = car[2][3], x0.dtype.type(0.5)
+    x, rates = np.empty((4, *x0.shape), x0.dtype), np.empty((4, *x0.shape), x0.dtype)
     motion = np.empty((4, x0.shape[1]), x0.dtype)
     for stage in range(4):
         if stage == 0:
@@ -558,6 +548,7 @@ def _stages(x0, u, car, x, rooms, rates):  # type: ignore[no-untyped-def]
                     x[stage, i, p] = x0[i, p] + share * rates[stage - 1, i, p]
         _motion(x[stage], u, car, rooms[stage], motion)
         _rates(x[stage], motion, rates[stage])
+    return x, rates
 
 
 @compiled
@@ -567,33 +558,25 @@ def _transition(points, inputs, car, out, start, stop):  # type: ignore[no-untyp
     size = _block_of(stop - start, count)
     for first in range(start, stop, size):
         end = min(first + size, stop)
-        own = (end - first) * count
-        columns = _filling(own, points)
-        x0, u = np.empty((n, columns), points.dtype), np.empty((4, columns), points.dtype)
-        x, rates = np.empty((4, n, columns), points.dtype), np.empty((4, n, columns), points.dtype)
-        room = _room(own, columns, car, points.dtype)
-        _columns(points, first, end, 1, x0)
-        _driven(inputs, first, end, count, u)
-        _stages(x0, u, car, x, (room, room, room, room), rates)
+        x0, u = _taken(points, inputs, first, end)
+        room = _room((end - first) * count, x0, car)
+        _, rates = _stages(x0, u, car, (room, room, room, room))
         for i in range(n):
-            for p in range(columns):
+            for p in range(x0.shape[1]):
                 x0[i, p] += sixth * (rates[0, i, p] + two * rates[1, i, p] + two * rates[2, i, p] + rates[3, i, p])
         _put(x0, out, first, end)
 
 
 @compiled
 def _observation(points, inputs, car, out, start, stop):  # type: ignore[no-untyped-def]
-    count, n, _ = points.shape
+    count = points.shape[0]
     size = _block_of(stop - start, count)
     for first in range(start, stop, size):
         end = min(first + size, stop)
-        own = (end - first) * count
-        columns = _filling(own, points)
-        x, u, expected = np.empty((n, columns), points.dtype), np.empty((4, columns), points.dtype), np.empty((4, columns), points.dtype)
-        _columns(points, first, end, 1, x)
-        _driven(inputs, first, end, count, u)
-        _motion(x, u, car, _room(own, columns, car, points.dtype), expected)
-        for p in range(columns):
+        x, u = _taken(points, inputs, first, end)
+        expected = np.empty_like(u)
+        _motion(x, u, car, _room((end - first) * count, x, car), expected)
+        for p in range(x.shape[1]):
             expected[2, p], expected[3, p] = x[2, p], x[3, p]
         _put(expected, out, first, end)
 
@@ -606,14 +589,11 @@ def _transition_adjoint(points, inputs, car, upstream, out, gradients, start, st
     size = _block_of(stop - start, count)
     for first in range(start, stop, size):
         end = min(first + size, stop)
-        own = (end - first) * count
-        columns = _filling(own, points)
-        x0, u, up = np.empty((n, columns), points.dtype), np.empty((4, columns), points.dtype), np.empty((n, columns), points.dtype)
-        x, rates = np.empty((4, n, columns), points.dtype), np.empty((4, n, columns), points.dtype)
-        rooms = _four_rooms(own, columns, car, points.dtype)
-        _columns(points, first, end, 1, x0)
-        _driven(inputs, first, end, count, u)
-        _stages(x0, u, car, x, rooms, rates)
+        x0, u = _taken(points, inputs, first, end)
+        own, columns = (end - first) * count, x0.shape[1]
+        rooms = (_room(own, x0, car), _room(own, x0, car), _room(own, x0, car), _room(own, x0, car))
+        x, _ = _stages(x0, u, car, rooms)
+        up = np.empty_like(x0)
         _columns(upstream, first, end, 0, up)
         total, stage_bar, rates_bar = up.copy(), np.zeros_like(up), np.empty((4, columns), points.dtype)
         for k in range(4):
@@ -638,21 +618,15 @@ def _transition_adjoint(points, inputs, car, upstream, out, gradients, start, st
 
 @compiled
 def _observation_adjoint(points, inputs, car, upstream, out, gradients, start, stop):  # type: ignore[no-untyped-def]
-    learning = gradients[7]
-    count, n, _ = points.shape
+    learning, count = gradients[7], points.shape[0]
     size = _block_of(stop - start, count)
     for first in range(start, stop, size):
         end = min(first + size, stop)
-        own = (end - first) * count
-        columns = _filling(own, points)
-        x, u, up = np.empty((n, columns), points.dtype), np.empty((4, columns), points.dtype), np.empty((4, columns), points.dtype)
-        room = _room(own, columns, car, points.dtype)
-        _columns(points, first, end, 1, x)
-        _driven(inputs, first, end, count, u)
-        _motion(x, u, car, room, np.empty((4, columns), points.dtype))
+        x, u = _taken(points, inputs, first, end)
+        room, up, x_bar = _room((end - first) * count, x, car), np.empty_like(u), np.zeros_like(x)
+        _motion(x, u, car, room, np.empty_like(u))
         _columns(upstream, first, end, 0, up)
-        x_bar = np.zeros_like(x)
-        for p in range(columns):
+        for p in range(x.shape[1]):
             x_bar[2, p], x_bar[3, p] = up[2, p], up[3, p]
             up[2, p], up[3, p] = 0, 0
         _motion_adjoint(x, u, car, room, up, x_bar, learning, gradients)

@@ -12,74 +12,41 @@ import numba
 import numpy as np
 
 from vehest.filters.gating import refuses
+from vehest.filters.kalman_scan import make_symmetric
 from vehest.vehicle.rational_tyres import rational_axle
 
 _axle = numba.njit(rational_axle)
 
 
 @numba.njit(cache=True, error_model="numpy")
-def scan(  # type: ignore[no-untyped-def]
-    samples,
-    car,
-    nominal,
-    adapted,
-    variances,
-    lower,
-    upper,
-    rolling,
-    start_tyres,
-    largest,
-    lost,
-    step,
-    minimum_speed,
-    adapt_above,
-    limit,
-    patience,
-    refused,
-    mean,
-    cov,
-    means,
-    deviations,
-    sideslip_cov,
-    innovation,
-    innovation_cov,
-    measured,
-):
+def scan(samples, track, variances, bounds, start_tyres, guessed, gate, state, out):  # type: ignore[no-untyped-def]
     """Filter samples of yaw_rate, vx, ay, steer, (T, 4); NaN in yaw_rate and ay is skipped.
 
-    Below the minimum speed wheels roll without slip: β = a_R δ/L, r = u δ/L, with variances ``rolling``, and tyre parameters are held.
-    States are β, r, β', r', the logarithms of the adapted tyre parameters and, optionally, the pull of a crossfall b = g sin φ [m/s²]:
+    Below the minimum speed wheels roll without slip: β = a_R δ/L, r = u δ/L, and tyre parameters are held. States are β, r, β', r', the
+    logarithms of the adapted tyre parameters and, optionally, the pull of a crossfall b = g sin φ [m/s²]:
 
         β'⁺ = (F_F + F_R)/(M u) - r + b/u,   a_y = u (β' + r) - b,   b⁺ = b
 
     Args:
         samples: (T, 4).
-        car: mass, yaw inertia, a_F, a_R.
-        nominal: tyre parameters in the order of `TYRE_PARAMETERS`, (5,).
-        adapted: which of them are states, (p,), p = n - 4, or n - 5 where the last state is b.
+        track: mass, yaw inertia, a_F and a_R; tyre parameters in the order of `TYRE_PARAMETERS`, (5,); which of them are states, (p,),
+            p = n - 4, or n - 5 where the last state is b; Δt [s]; the minimum speed [m/s]; and the lateral acceleration |u r| below which
+            the states from the fifth on are held [m/s²].
         variances: of yaw rate, ay, steering angle · √s, and the states from the fifth on a second, (3 + n - 4,).
-        lower: of states, (n,).
-        upper: of states, (n,).
-        rolling: variances of the first four states of a car that rolls, (4,).
+        bounds: largest absolute value of each state, (n,).
         start_tyres: covariance of the logarithms of the adapted parameters at the start, (p, p).
-        largest: sideslip angle [rad] from which on the motion is guessed anew, that of a car that rolls, and tyres start anew as well: they
-            are taken to be the reason.
-        lost: variance of β [rad²] from which on the motion alone is guessed anew; without measurements the model may be unstable.
-        step: Δt [s].
-        minimum_speed: [m/s].
-        adapt_above: lateral acceleration |u r| below which the states from the fifth on are held [m/s²].
-        limit: square of the gate's deviations, inf: no gate; see `Gate`.
-        patience: of the gate, in samples.
-        refused: how often on end yaw rate and ay were refused before the first sample, (2,); after the last one on return.
-        mean: at the first sample before its measurement, (n,); at the last sample after it on return.
-        cov: likewise, (n, n).
-        means: out, (T, n).
-        deviations: out, (T, n).
-        sideslip_cov: out, of β and r, (T, 2, 2).
-        innovation: out, (T, 2).
-        innovation_cov: out, (T, 2, 2).
-        measured: out, (T, 2).
+        guessed: sideslip angle [rad] from which on the motion is guessed anew, that of a car that rolls, and tyres start anew as well:
+            they are taken to be the reason; variance of β [rad²] from which on the motion alone is guessed anew, since without
+            measurements the model may be unstable; and variances of the first four states of a car that rolls, (4,).
+        gate: its deviations squared, inf: none; its patience in samples; and how often on end yaw rate and ay were refused before the first
+            sample, (2,), after the last one on return.
+        state: mean (n,) and covariance (n, n) at the first sample before its measurement; at the last sample after it on return.
+        out: means and deviations of states, (T, n) each, covariance of β and r, (T, 2, 2), innovation, (T, 2), its covariance,
+            (T, 2, 2), and what was measured, (T, 2).
     """
+    car, nominal, adapted, step, minimum_speed, adapt_above = track
+    (largest, lost, rolling), (limit, patience, refused), (mean, cov) = guessed, gate, state
+    means, deviations, sideslip_cov, innovation, innovation_cov, measured = out
     n, tyres = len(mean), 4 + len(adapted)
     left, gain, cross = np.empty((n, n)), np.empty((n, 2)), np.empty((n, 2))
     per_rate, per_turn = np.zeros(n), np.zeros(n)
@@ -99,7 +66,7 @@ def scan(  # type: ignore[no-untyped-def]
             front = _move(mean, car, parameters, adapted, speed, samples[k - 1, 3], step, per_rate, per_turn)
             _spread(cov, per_rate, per_turn, step, left)
             _add_noise(cov, front, car, speed, step, variances, abs(speed * mean[1]) >= adapt_above)
-            _clip(mean, lower, upper)
+            _clip(mean, bounds)
             if not abs(mean[0]) < largest:
                 _roll(mean, cov, rolling, car, vx, steer)
                 mean[4:tyres], cov[4:tyres, 4:tyres] = 0.0, start_tyres
@@ -112,7 +79,7 @@ def scan(  # type: ignore[no-untyped-def]
         _gain(cross, innovation_cov[k], held, gain)
         for i in range(n):
             mean[i] += gain[i, 0] * innovation[k, 0] + gain[i, 1] * innovation[k, 1]
-        _clip(mean, lower, upper)
+        _clip(mean, bounds)
         _reduce(cov, gain, cross, vx, tyres < n, variances, measured[k], left)
         _note(k, mean, cov, means, deviations, sideslip_cov)
 
@@ -192,7 +159,7 @@ def _add_noise(cov, front, car, speed, step, variances, wandering):  # type: ign
     if wandering:
         for i in range(4, len(cov)):
             cov[i, i] += step * variances[i - 1]
-    _make_symmetric(cov)
+    make_symmetric(cov)
 
 
 @numba.njit(inline="always")
@@ -255,7 +222,7 @@ def _reduce(cov, gain, cross, vx, crossfall, variances, measured, left):  # type
             if measured[1]:
                 total += (gain[i, 1] * variances[1] - seen_ay) * gain[j, 1]
             cov[i, j] = total
-    _make_symmetric(cov)
+    make_symmetric(cov)
 
 
 @numba.njit(inline="always")
@@ -280,13 +247,6 @@ def _note(k, mean, cov, means, deviations, sideslip_cov):  # type: ignore[no-unt
 
 
 @numba.njit(inline="always")
-def _clip(mean, lower, upper):  # type: ignore[no-untyped-def]
+def _clip(mean, bounds):  # type: ignore[no-untyped-def]
     for i in range(len(mean)):
-        mean[i] = min(max(mean[i], lower[i]), upper[i])
-
-
-@numba.njit(inline="always")
-def _make_symmetric(matrix):  # type: ignore[no-untyped-def]
-    for i in range(len(matrix)):
-        for j in range(i):
-            matrix[i, j] = matrix[j, i] = 0.5 * (matrix[i, j] + matrix[j, i])
+        mean[i] = min(max(mean[i], -bounds[i]), bounds[i])

@@ -61,19 +61,6 @@ def losses_of(
     return losses
 
 
-def squared_error(outputs: NDArray[Any], targets: NDArray[Any], gradient: NDArray[Any]) -> float:
-    """Mean of (o - t)²; a `Criterion` of one output."""
-    return float(_squared_error(outputs, targets, gradient))
-
-
-def gaussian_likelihood(outputs: NDArray[Any], targets: NDArray[Any], gradient: NDArray[Any]) -> float:
-    """Mean of (log v + (o - t)²/v)/2 with v = softplus(o₂) + 1e-6; a `Criterion` of two outputs.
-
-    Source: Lakshminarayanan, Pritzel & Blundell, Simple and scalable predictive uncertainty estimation using deep ensembles, 2017, Eq. 1.
-    """
-    return float(_gaussian_likelihood(outputs, targets, gradient))
-
-
 class _Outputs(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, inputs: Tensor, seeds: NDArray[np.int64], hidden: int, *parameters: Tensor) -> Tensor:
@@ -130,16 +117,13 @@ class _Losses(torch.autograd.Function):
 
     @staticmethod
     def backward(ctx: Any, *upstream: Tensor) -> tuple[Tensor | None, ...]:
-        scaled = (torch.from_numpy(gradient).mul_(_row(upstream[0], gradient.ndim)) for gradient in ctx.kept)
+        scaled = (torch.from_numpy(gradient).mul_(upstream[0].reshape(-1, *[1] * (gradient.ndim - 1))) for gradient in ctx.kept)
         return (None, None, None, None, None, None, *scaled)
 
 
-def _row(values: Tensor, dimensions: int) -> Tensor:
-    return values.reshape(-1, *[1] * (dimensions - 1))
-
-
 @compiled
-def _squared_error(outputs, targets, gradient):  # type: ignore[no-untyped-def]
+def squared_error(outputs, targets, gradient):  # type: ignore[no-untyped-def]
+    """Mean of (o - t)²; a `Criterion` of one output."""
     total, count = 0.0, len(targets)
     for row in range(count):
         error = outputs[row, 0] - targets[row]
@@ -149,7 +133,11 @@ def _squared_error(outputs, targets, gradient):  # type: ignore[no-untyped-def]
 
 
 @compiled
-def _gaussian_likelihood(outputs, targets, gradient):  # type: ignore[no-untyped-def]
+def gaussian_likelihood(outputs, targets, gradient):  # type: ignore[no-untyped-def]
+    """Mean of (log v + (o - t)²/v)/2 with v = softplus(o₂) + 1e-6; a `Criterion` of two outputs.
+
+    Source: Lakshminarayanan, Pritzel & Blundell, Simple and scalable predictive uncertainty estimation using deep ensembles, 2017, Eq. 1.
+    """
     total, count = 0.0, len(targets)
     for row in range(count):
         raw, error = outputs[row, 1], outputs[row, 0] - targets[row]

@@ -19,7 +19,7 @@ from vehest.data.errors import ConfigurationError, DataError, MissingError
 from vehest.data.recording import Recording
 from vehest.sources.base import existing_folder, require_files
 from vehest.sources.clocks import ClockPolicy, uniform_clock
-from vehest.sources.columns import ChannelMap, ChannelNames, Positive, column_from_config, columns_from_config
+from vehest.sources.columns import ChannelMap, ChannelNames, Positive, column_from_config
 from vehest.sources.file_source import FileSource
 from vehest.sources.revs.csv_layout import read_csv, read_vehicle_parameters
 from vehest.sources.revs.mat_layout import read_mat_columns
@@ -57,11 +57,8 @@ class RevsSource(FileSource):
         super().__init__(dataset)
         options = self.options
         extra = (options.extra_channels or {}).get(options.layout)
-        self.columns = columns_from_config({**(options.channels or {}), **(extra or {})}, self.name)
-        if not self.columns:
-            raise ConfigurationError(f"{self.where}: channels must map a channel to its column and unit")
+        self.columns = self._declared({**(options.channels or {}), **(extra or {})})
         self.time = column_from_config(options.time, f"{self.where}: time", "s")
-        self.gappy = self._gappy_among(self.columns)
         if options.rate_hz is not None and options.layout != "mat":
             raise ConfigurationError(f"{self.where}: rate_hz is an option of layout mat; 'vehest downsample' brings others to another rate")
         strict = {column.column for name, column in self.columns.items() if name not in self.gappy}
