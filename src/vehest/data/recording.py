@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
+from itertools import pairwise
 from typing import Any, Literal
 
 import numpy as np
@@ -128,8 +129,14 @@ class Recording:
         if first >= last:
             spans = f"spans {self.start_time:.12g} s to {self.end_time:.12g} s"
             raise DataError(f"recording '{self.id}' {spans}; it has no samples between {start:.12g} s and {stop:.12g} s")
-        channels = {name: samples[first:last] for name, samples in self.channels.items()}
-        return replace(self, start_time=self.start_time + first / self.rate_hz, channels=channels)
+        return self.part(slice(first, last))
+
+    def part(self, samples: slice) -> Recording:
+        """The samples of a range of indices; the same recording where that is all of them."""
+        if samples == slice(0, len(self)):
+            return self
+        channels = {name: values[samples] for name, values in self.channels.items()}
+        return replace(self, start_time=self.start_time + samples.start / self.rate_hz, channels=channels)
 
     def index_range(self, start: float, stop: float) -> tuple[int, int]:
         """First index and end index of the samples taken in [start, stop), clipped to the recording."""
@@ -145,3 +152,9 @@ def clock_tolerance(start_time: float, end_time: float, rate_hz: float) -> float
     """
     resolution = math.ulp(max(abs(start_time), abs(end_time)))
     return min(max(1e-6, 2.0 * resolution * rate_hz), 0.25)
+
+
+def part_slices(n_samples: int, rate_hz: float, longest: float = 3600.0) -> list[slice]:
+    """Ranges of indices that divide so many samples into parts of about one length, none longer than ``longest`` [s]."""
+    edges = np.linspace(0, n_samples, max(math.ceil(n_samples / (longest * rate_hz)), 1) + 1).astype(int).tolist()
+    return [slice(first, end) for first, end in pairwise(edges)]
