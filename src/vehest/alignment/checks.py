@@ -27,7 +27,7 @@ from vehest.alignment.signs import (
 from vehest.alignment.standstill import BoolArray, standstill
 from vehest.data.channels import CHANNELS
 from vehest.data.errors import DataError
-from vehest.data.recording import Recording, part_slices
+from vehest.data.recording import PART, Recording, part_slices
 from vehest.data.runs import equal_runs, true_runs
 
 __all__ = ["Finding", "checks_of_recording"]
@@ -49,13 +49,13 @@ REVERSE_SPEED = 0.5  # m/s
 REVERSE_SECONDS = 1.0
 
 
-def checks_of_recording(recording: Recording, *, whole: bool = True) -> list[Finding]:
-    """All checks of a recording's samples, the gravest findings first; of a drive of hours hour by hour (`merged_findings`).
+def checks_of_recording(recording: Recording) -> list[Finding]:
+    """All checks of a recording's samples, the gravest findings first; of a long drive part by part (`merged_findings`).
 
-    Of a part of a drive, not ``whole``, in which the car stands throughout, only impossible values count.
+    Of a part of a drive in which the car stands throughout only impossible values count.
     """
     slices = part_slices(len(recording), recording.rate_hz)
-    whole = whole and len(slices) == 1
+    whole = len(slices) == 1 and PART not in recording.provenance
     with np.errstate(all="ignore"):  # of samples up to 1e308, which a check may square
         return merged_findings(_findings(recording.part(own), whole=whole) for own in slices)
 
@@ -76,9 +76,9 @@ def merged_findings(parts: Iterable[Sequence[Finding]]) -> list[Finding]:
     return sorted(found, key=lambda finding: order[finding.level])
 
 
-def refuse_errors(recording: Recording, accepted: Collection[str], place: str, *, whole: bool = True) -> list[Finding]:
+def refuse_errors(recording: Recording, accepted: Collection[str], place: str) -> list[Finding]:
     """What `checks_of_recording` finds; raises `DataError`, beginning with ``place``, where one that is not accepted is an error."""
-    findings = checks_of_recording(recording, whole=whole)
+    findings = checks_of_recording(recording)
     for finding in findings:
         if finding.level == "error" and finding.check not in accepted:
             raise DataError(f"{place}: channel '{finding.channel}': {finding.message} (or dataset.accept=[{finding.check}])")
