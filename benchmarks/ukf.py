@@ -10,8 +10,8 @@ equations (ukf_jax.py) stands beside, compiled before it is timed.
 Every case runs in a process of its own; a figure is the best of its repeats, by turns. On a machine that does other things too, look at
 the processor's seconds on one thread: threads that wait for each other waste time. Memory is the peak beyond what imports, data and a
 warm-up on three samples took. Compilation is timed once with an empty cache and once with the one it filled; step() of the online filter
-over 10,000 samples on one thread. Sequences are of the F1TENTH recordings (VEHEST_DATA), else of the simulated tyre sets. BENCH_BUSY=1 keeps a
-core busy (beside.py).
+over 10,000 samples on one thread. Sequences are of the F1TENTH recordings (VEHEST_DATA), else of the simulated tyre sets.
+BENCH_BUSY=1 keeps a core busy (beside.py).
 """
 
 from __future__ import annotations
