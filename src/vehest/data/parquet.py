@@ -54,7 +54,7 @@ def number_batches(path: Path, file: pq.ParquetFile, names: Sequence[str]) -> It
     n_rows, done = file.metadata.num_rows, 0
     check_limit("samples", n_rows, f"'{path}' holds {n_rows} rows")
     check_unpacked(path, path.stat().st_size, 8 * n_rows * len(names))
-    for batch in file.iter_batches(ROWS_AT_A_TIME, columns=list(names)):
+    for batch in file.iter_batches(ROWS_AT_A_TIME, columns=list(names), use_threads=False):
         done += batch.num_rows
         yield batch
     if done != n_rows:

@@ -4,12 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping
 from fractions import Fraction
-from itertools import chain, pairwise
 from pathlib import Path
 from typing import Any
 
 from vehest.data.errors import DataError
-from vehest.data.recording import Recording, joined
+from vehest.data.recording import PART, Recording, joined
 from vehest.data.store import read_recording, write_recording
 from vehest.data.transforms import Resample, Transform, transform_from_config
 from vehest.run.artefacts import Artefact, StagePlan
@@ -51,14 +50,14 @@ def resampled_parts(parts: Iterable[Recording], rate_hz: float, preparation: Map
         parts = [joined(list(parts))]
     kept: list[Recording] = []
     done = 0  # samples at the start of the outcome that are out already
-    for part, following in pairwise(chain(parts, [None])):
-        assert part is not None
+    for part in parts:
         whole = joined([*kept, part])
         found = resampled(whole, rate_hz, preparation)
         ratio = (Fraction(found.rate_hz) / Fraction(whole.rate_hz)).limit_denominator(1000)
         reach = Resample.reach(ratio)
         begin = (len(whole) - 2 * reach) // ratio.denominator * ratio.denominator
-        if following is None:
+        number, last = part.provenance.get(PART, (1, 1))
+        if number == last:
             yield found.part(slice(done, len(found)))
         elif begin > 0:
             yield found.part(slice(done, int((begin + reach) * ratio)))

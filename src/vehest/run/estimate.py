@@ -144,15 +144,16 @@ def estimate_file(words: Sequence[str], out: Path, *, strict: bool = False, car:
         report = _Report(model, trust, config["dataset"].get("accept") or (), f"'{file}'" if strict else None)
         drive = report.checked(chain([(first, known)], parts))
         if log or not run.takes_parts:
-            drive = iter([joined(list(drive))])
+            first = joined(list(drive))
+            drive = iter([first])
+        needed = resampled_parts((part.select(model.channels) for part in drive), model.settings.rate_hz, model.preparation)
+        estimates = report.counted(run(part.channels, part) for part in needed)
         if log:
-            whole = next(drive)
-            estimate = estimate_recording(model, whole, trust)
-            list(report.counted([estimate]))
-            write_log(estimate, whole, file, out)
+            (estimate,) = estimates
+            write_log(estimate, first, file, out)
         else:
-            needed = resampled_parts((part.select(model.channels) for part in drive), model.settings.rate_hz, model.preparation)
-            write_estimate_table(report.counted(run(part.channels, part) for part in needed), out)
+            del first  # a part that is done needs no memory
+            write_estimate_table(estimates, out)
     for remark in remarks:
         note(remark)
     findings = [_in_words(finding) for finding in merged_findings(report.findings)]
@@ -353,7 +354,7 @@ class _Report:
         self.health = trust.health if trust is not None else None
         self.findings: list[list[Finding]] = []
         self.outside: Any = 0
-        self.id, self.seconds = "", 0.0
+        self.seconds = 0.0
         self.samples = self.estimated = self.invalid = 0
         self.extremes: list[float] = []
         self.half: list[FloatArray] = []
@@ -366,7 +367,7 @@ class _Report:
             if self.strict and found:
                 raise DataError(f"{self.strict}: {_in_words(found[0])}")
             self.findings.append(found)
-            self.id, self.seconds = part.id, self.seconds + part.duration
+            self.seconds += part.duration
             if self.health is not None:
                 self.outside = self.outside + outside_domain(self.health, {name: part[name] for name in self.health.channels})
             yield part
@@ -386,7 +387,7 @@ class _Report:
             self.reasons.update(dict(zip(found.tolist(), counts.tolist(), strict=True)))
             yield part
         if not self.estimated:
-            raise _too_short(self.model, self.id, self.seconds)
+            raise _too_short(self.model, self.last.recording_id, self.seconds)
 
     def summary(self) -> dict[str, Any]:
         """Figures of the estimate, for people and scripts."""
@@ -398,10 +399,7 @@ class _Report:
             "samples": self.samples,
             "estimated": self.estimated,
             "quantities": {name: QUANTITIES[name] for name in last.channels},
-            "sideslip_deg": {
-                "min": round(float(np.fmin.reduce(self.extremes)), 3),
-                "max": round(float(np.fmax.reduce(self.extremes)), 3),
-            },
+            "sideslip_deg": {end: round(float(take.reduce(self.extremes)), 3) for end, take in (("min", np.fmin), ("max", np.fmax))},
         }
         if self.half:
             half = np.degrees(np.concatenate(self.half))
@@ -415,8 +413,7 @@ class _Report:
             bands = "its bands are its own" if "band_vy" in self.last.channels else "no band"
             return f"this model has no calibration: {bands}, and health from gaps and speeds alone"
         worst = [reason_in_words(code) for code, _ in sorted(self.reasons.items(), key=lambda one: -one[1])[:2]]
-        valid = f"valid in {100.0 * (1.0 - self.invalid / self.estimated):.3g} % of the drive" + (
-            f"; else: {', '.join(worst)}" if worst else ""
-        )
+        share = 100.0 * (1.0 - self.invalid / self.estimated)
+        valid = f"valid in {share:.3g} % of the drive" + (f"; else: {', '.join(worst)}" if worst else "")
         outside = domain_verdict(self.health, self.outside)
         return f"{outside}; {valid}" if outside else valid

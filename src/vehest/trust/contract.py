@@ -59,27 +59,18 @@ def estimate_guarded(
     *,
     elsewhere: bool = False,
 ) -> Estimate:
-    """Estimate a recording under the contract.
-
-    Args:
-        estimator: fitted.
-        samples: channels that it reads, (T,) each, as received: they may hold NaN, infinite or senseless values.
-        recording: its clock, name and vehicle are used, its samples are not.
-        trust: learnt with the estimator; without it limits are those of any car, and there is neither band nor health of channels.
-        initial_state: of a protocol, at the first sample.
-        elsewhere: whether the car or its tyres are others than those that were calibrated on.
-
-    Returns:
-        ``vy``, ``sideslip``, ``health``, ``health_reason`` and, with calibrated bands, ``band_vy`` and ``band_sideslip``.
-
-    Raises:
-        DataError: a channel is missing.
-    """
+    """Estimate a recording under the contract; see `GuardedRun`."""
     return GuardedRun(estimator, trust, initial_state, elsewhere=elsewhere)(samples, recording)
 
 
 class GuardedRun:
-    """`estimate_guarded` for a recording that comes in parts, one after another, to the same bits; the first may be all of it.
+    """An estimator under the contract on a recording, or on its parts one after another, to the same bits.
+
+    Args:
+        estimator: fitted.
+        trust: learnt with the estimator; without it limits are those of any car, and there is neither band nor health of channels.
+        initial_state: of a protocol, at the first sample.
+        elsewhere: whether the car or its tyres are others than those that were calibrated on.
 
     Attributes:
         takes_parts: whether the estimator can go on where it stopped; else the recording must come whole.
@@ -104,7 +95,18 @@ class GuardedRun:
         self.covariance_of: tuple[str, ...] = ()
 
     def __call__(self, samples: Mapping[str, FloatArray], recording: Recording) -> Estimate:
-        """The estimate of a part, whose clock and name are those of ``recording``; raises `DataError` where a channel is missing."""
+        """The estimate of a part.
+
+        Args:
+            samples: channels that the estimator reads, (T,) each, as received: they may hold NaN, infinite or senseless values.
+            recording: its clock, name and vehicle are used, its samples are not.
+
+        Returns:
+            ``vy``, ``sideslip``, ``health``, ``health_reason`` and, with calibrated bands, ``band_vy`` and ``band_sideslip``.
+
+        Raises:
+            DataError: a channel is missing.
+        """
         estimator = self.estimator
         missing = [name for name in estimator.channels if name not in samples]
         if missing:
