@@ -107,7 +107,7 @@ def write_estimate(estimate: Estimate, path: Path) -> None:
 
 
 def write_estimate_parts(parts: Iterable[Estimate], path: Path) -> None:
-    """`write_estimate` for the parts of an estimate, one after another; the file appears once all are there."""
+    """`write_estimate` for the parts of an estimate, one after another, with the quantities that the first has."""
     rest = iter(parts)
     first = next(rest)
     about = _attributes(first, _OF_ESTIMATE)
@@ -178,7 +178,7 @@ def _write(path: Path, parts: Iterable[Mapping[str, FloatArray]], content: str, 
         try:
             with pq.ParquetWriter(stream, first.schema, **_LAYOUT) as writer:
                 for table in chain([first], tables):
-                    writer.write_table(table)
+                    writer.write_table(table.select(first.schema.names))
         except pa.ArrowException as error:
             raise writing_error(path, OSError(str(error))) from error
 

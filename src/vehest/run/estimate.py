@@ -321,7 +321,7 @@ def write_estimate_table(parts: Iterable[Estimate], path: Path) -> None:
         writer = csv.writer(stream, lineterminator="\n")
         writer.writerow(first)
         for columns in chain([first], tables):
-            writer.writerows(zip(*columns.values(), strict=True))
+            writer.writerows(zip(*(columns[name] for name in first), strict=True))
 
 
 def _text_columns(columns: Mapping[str, FloatArray]) -> dict[str, list[Any]]:

@@ -167,6 +167,7 @@ class GuardedRun:
         try:
             estimate = self._going_on(state).estimate([piece], None if self._begun or start else self.initial_state)[0]
         except FAILURES:
+            self._state = None
             return self._stepped(start, end) if self.estimator.causal else np.full(end - start, np.nan)
         shift = slice(len(window) + extra, len(window) + extra + end - start)
         if "vx" in estimate.channels:
