@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from fnmatch import fnmatchcase
+from itertools import repeat, takewhile
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -13,10 +14,11 @@ from pydantic import AfterValidator, Field
 from vehest.constants import FloatArray
 from vehest.data.channels import CHANNELS, channel
 from vehest.data.errors import ConfigurationError, DataError, MissingError
+from vehest.data.parquet import ROWS_AT_A_TIME
 from vehest.data.recording import PART, Recording, part_slices
 from vehest.data.store import is_stored_recording, read_recording
 from vehest.sources.base import open_source, require_files
-from vehest.sources.clocks import Clock, ClockPolicy, uniform_clock
+from vehest.sources.clocks import Clock, ClockPolicy, even_clock, uniform_clock
 from vehest.sources.columns import ChannelMap, ChannelNames, Column, ColumnName, Positive, column_from_config, columns_from_config
 from vehest.sources.file_source import FileSource
 from vehest.sources.sample_and_hold import held_from_config
@@ -112,14 +114,15 @@ class TabularSource(FileSource):
         options, time = self.options, self.time
         apart = not (self._cuts or options.runs or self.held or self.pose or self.dropped or self.transforms or self.reference_point)
         require_files([file], self.name)
-        if not apart or time is None or file.stat().st_size < LARGE or is_stored_recording(file):
+        if not apart or time is None or options.clock != "strict" or file.stat().st_size < LARGE or is_stored_recording(file):
             yield self.read_file(file)
             return
         columns = self._columns_of(file)
-        wanted = list(dict.fromkeys(column.column for column in columns.values()))
+        wanted = list(dict.fromkeys([*(column.column for column in columns.values()), time.column]))
         try:
-            clock = self._clock_of(read_columns(file, [time.column], self.layout), f"'{file}'")
-            if clock.stamps is not None:
+            blocks = column_parts(file, [time.column], self.layout, repeat(ROWS_AT_A_TIME))
+            clock = even_clock(time.to_si(block[time.column], "s") for block in takewhile(lambda block: len(block[time.column]), blocks))
+            if clock is None:
                 yield self.read_file(file)
                 return
             slices = part_slices(clock.n_samples, clock.rate_hz)
@@ -171,8 +174,11 @@ class TabularSource(FileSource):
         part: Sequence[int] = (1, 1),
     ) -> Recording:
         """The recording of a file's columns, or of one run of them, or of a part by its number, that of all parts and its clock."""
+        n_rows = len(next(iter(values.values())))
         where = f"'{file}'" if run is None else f"'{file}', run {run}"
-        clock = clock or self._clock_of(values, where)
+        if clock is None and self.time is not None:
+            clock = uniform_clock(self.time.to_si(values[self.time.column], "s"), where, self.options.clock)
+        clock = clock or Clock(0.0, float(self.options.rate_hz), n_rows)
         held = () if self.held is None else self.held.channels
         channels = {
             name: clock.align(column.to_si(values[column.column], channel(name).unit), gappy=name in self.gappy)
@@ -191,11 +197,6 @@ class TabularSource(FileSource):
             clock = replace(clock, start_time=float(clock.ticks()[inside.start]), n_samples=inside.stop - inside.start, stamps=None)
             provenance["held"] = self.held.description(rate)
         return self._recording(_name_of(file, run), f"'{file}'", clock, channels, provenance)
-
-    def _clock_of(self, values: Mapping[str, FloatArray], where: str) -> Clock:
-        if self.time is None:
-            return Clock(0.0, float(self.options.rate_hz), len(next(iter(values.values()))))
-        return uniform_clock(self.time.to_si(values[self.time.column], "s"), where, self.options.clock)
 
     def _files(self) -> list[Path]:
         """Tables of the data set, without those that it excludes."""
