@@ -402,8 +402,10 @@ class _Report:
             "sideslip_deg": {end: round(float(take.reduce(self.extremes)), 3) for end, take in (("min", np.fmin), ("max", np.fmax))},
         }
         if self.half:
-            half = np.degrees(np.concatenate(self.half))
-            band = {"median": round(float(np.median(half)), 3), "largest": round(float(half.max()), 3)} if len(half) else {}
+            half = np.concatenate(self.half)
+            np.degrees(half, out=half)
+            middle = float(np.median(half, overwrite_input=True)) if len(half) else 0.0
+            band = {"median": round(middle, 3), "largest": round(float(half.max()), 3)} if len(half) else {}
             figures["band_sideslip_deg"] = band
         return figures
 

@@ -118,7 +118,7 @@ class TabularSource(FileSource):
             yield self.read_file(file)
             return
         columns = self._columns_of(file)
-        wanted = list(dict.fromkeys([*(column.column for column in columns.values()), time.column]))
+        wanted = list(dict.fromkeys(column.column for column in columns.values()))
         try:
             blocks = column_parts(file, [time.column], self.layout, repeat(ROWS_AT_A_TIME))
             clock = even_clock(time.to_si(block[time.column], "s") for block in takewhile(lambda block: len(block[time.column]), blocks))
