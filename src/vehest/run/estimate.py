@@ -8,6 +8,7 @@ from __future__ import annotations
 import csv
 import hashlib
 import json
+from array import array
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
@@ -357,7 +358,7 @@ class _Report:
         self.seconds = 0.0
         self.samples = self.estimated = self.invalid = 0
         self.extremes: list[float] = []
-        self.half: list[FloatArray] = []
+        self.half = array("d")  # widths of the band
         self.reasons: Counter[float] = Counter()
 
     def checked(self, parts: Iterable[tuple[Recording, list[Finding]]]) -> Iterator[Recording]:
@@ -380,7 +381,7 @@ class _Report:
             self.extremes += [float(np.fmin.reduce(degrees)), float(np.fmax.reduce(degrees))]
             self.samples, self.estimated = self.samples + len(part), self.estimated + int(known.sum())
             if "band_sideslip" in part.channels:
-                self.half.append(part["band_sideslip"][~np.isnan(part["band_sideslip"])])
+                self.half.frombytes(part["band_sideslip"][~np.isnan(part["band_sideslip"])].tobytes())
             status, reasons = part["health"][known], part["health_reason"][known]
             self.invalid += int((status > 0).sum())
             found, counts = np.unique(reasons[(status > 0) & (reasons > 0)], return_counts=True)
@@ -401,8 +402,8 @@ class _Report:
             "quantities": {name: QUANTITIES[name] for name in last.channels},
             "sideslip_deg": {end: round(float(take.reduce(self.extremes)), 3) for end, take in (("min", np.fmin), ("max", np.fmax))},
         }
-        if self.half:
-            half = np.concatenate(self.half)
+        if "band_sideslip" in last.channels:
+            half = np.frombuffer(self.half)
             np.degrees(half, out=half)
             middle = float(np.median(half, overwrite_input=True)) if len(half) else 0.0
             band = {"median": round(middle, 3), "largest": round(float(half.max()), 3)} if len(half) else {}

@@ -24,9 +24,9 @@ from vehest.sources.file_source import FileSource
 from vehest.sources.sample_and_hold import held_from_config
 from vehest.sources.table_pose import table_pose_from_config
 from vehest.sources.table_rows import counted_runs, dropped_rows_from_config, kept_rows, timed_runs
-from vehest.sources.tables import TextLayout, column_names, column_parts, listed, read_columns
+from vehest.sources.tables import TextLayout, column_names, column_parts, is_parquet, listed, read_columns
 
-LARGE = 1 << 25  # bytes of a table from which on it is read by parts
+LARGE = 1 << 25  # bytes of a table of text from which on it is read in parts
 
 
 def _encoding(name: str) -> str:
@@ -114,7 +114,8 @@ class TabularSource(FileSource):
         options, time = self.options, self.time
         apart = not (self._cuts or options.runs or self.held or self.pose or self.dropped or self.transforms or self.reference_point)
         require_files([file], self.name)
-        if not apart or time is None or options.clock != "strict" or file.stat().st_size < LARGE or is_stored_recording(file):
+        small = not is_parquet(file) and file.stat().st_size < LARGE
+        if small or not apart or time is None or options.clock != "strict" or is_stored_recording(file):
             yield self.read_file(file)
             return
         columns = self._columns_of(file)
