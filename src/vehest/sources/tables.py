@@ -141,7 +141,9 @@ def column_parts(file: Path, wanted: Sequence[str], layout: TextLayout, lengths:
                     at, done = at + own.num_rows, done + own.num_rows
                     if at == batch.num_rows:
                         batch, at = next(batches, None), 0
-                yield {name: column[:done] for name, column in values.items()}
+                for column in values.values():
+                    column.flags.writeable = False  # so that a recording shares it
+                yield values if done == length else {name: column[:done] for name, column in values.items()}
     except DAMAGE:
         read_columns(file, wanted, layout)  # whose errors state the row
         raise
