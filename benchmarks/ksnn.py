@@ -5,7 +5,7 @@ depend on values), in float32, batches of 64 windows, with the validation loss a
 autograd and Adam, one network at a time; it is timed on one epoch of one seed, and 64 seeds take 64 times as long. Both ways are allowed
 two threads, the seeds together are timed from the end of the first epoch, each way runs in a process of its own, after a warm-up, and the
 ways take turns; a figure is the best of the rounds, for both alike, memory the peak of the process so far. The first epoch's validation
-losses are compared.
+losses are compared. BENCH_BUSY=1 keeps a core busy (beside.py).
 """
 
 from __future__ import annotations
@@ -18,12 +18,13 @@ import time
 from concurrent.futures import ProcessPoolExecutor
 from contextlib import ExitStack
 from multiprocessing import get_context
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-RESULT = Path(__file__).parents[1] / "results" / "benchmarks" / "ksnn.json"
+from beside import result_file, spinning
+
+RESULT = result_file("ksnn")
 SAMPLES, VALIDATION_SECONDS, WINDOW, BATCH = 6000, 30.0, 30, 64
 PLAIN_SEEDS, EPOCHS, ROUNDS = 1, 4, 3
 THREADS = 2
@@ -174,4 +175,5 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    with spinning():
+        main()

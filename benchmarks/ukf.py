@@ -11,6 +11,7 @@ Every case runs in a process of its own; a figure is the best of its repeats, by
 the processor's seconds on one thread: threads that wait for each other waste time. Memory is the peak beyond what imports, data and a
 warm-up on three samples took. Compilation is timed once with an empty cache and once with the one it filled; step() of the online filter
 over 10,000 samples on one thread. Sequences are of the F1TENTH recordings (VEHEST_DATA), else of the simulated tyre sets.
+BENCH_BUSY=1 keeps a core busy (beside.py).
 """
 
 from __future__ import annotations
@@ -30,8 +31,10 @@ from multiprocessing import get_context
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from beside import result_file, spinning
+
 ROOT = Path(__file__).parents[1]
-RESULT = ROOT / "results" / "benchmarks" / "ukf.json"
+RESULT = result_file("ukf")
 STEPS, ONLINE_STEPS = 500, 10_000
 THREADS = int(os.environ.get("BENCH_THREADS", "2"))
 CASES = {28: (8.0, 3, 2), 256: (4.0, 2, 2)}  # sequences: ratio that is asked for, repeats within a process, rounds
@@ -439,4 +442,5 @@ if __name__ == "__main__":
     if sys.argv[1:] == ["first_steps"]:
         print(first_steps())
     else:
-        main()
+        with spinning():
+            main()

@@ -165,4 +165,4 @@ def write_estimate(estimate: Estimate, path: str | Path) -> None:
         ConfigurationError: another ending.
         MissingError: it cannot be written.
     """
-    write_estimate_table(estimate, Path(path))
+    write_estimate_table([estimate], Path(path))

@@ -13,10 +13,11 @@ from vehest.alignment.checks import checks_of_recording
 from vehest.alignment.delays import delays_of, spectra_of
 from vehest.alignment.motion import motion_of
 from vehest.alignment.spectra import cross_spectra, lag_of
+from vehest.alignment.standstill import standstill
 
 
 def delays(recording):
-    motion = motion_of(recording)
+    motion = motion_of(recording, ~standstill(recording))
     spectra = spectra_of(motion)
     return [] if spectra is None else delays_of(motion, spectra)
 

@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pandas as pd
+import pyarrow.parquet as pq
 import pytest
 import yaml
 
@@ -76,6 +77,47 @@ def test_accelerations_that_contradict_turning_are_refused_unless_they_are_accep
     _, err = saved.done("estimate", "own", "lap.csv", f"dataset.accept=[{check}]", "-o", "out.csv")
     [warning] = [line for line in err.splitlines() if message in line]
     assert warning.startswith("warning: ay")
+
+
+def in_parts(monkeypatch, seconds=7.0):
+    monkeypatch.setattr("vehest.data.recording.LONGEST_PART", seconds)
+    monkeypatch.setattr("vehest.sources.tabular.LARGE", 0)
+
+
+@pytest.mark.parametrize("name", ["own", "self_calibrating", "pretrained"])
+def test_a_drive_read_and_estimated_in_parts_has_the_bits_and_figures_of_the_whole(saved, monkeypatch, name):
+    speed, lost = np.array(drive_of(4)["vx"]), slice(1200, 1500)
+    speed[lost] = -30.0  # which no guard believes: the estimators wait, and start anew across a seam
+    for end, changes in ((".csv", {}), (".parquet", {"vx": speed})):
+        lap(changes)
+        if end == ".parquet":
+            pd.read_csv("lap.csv").to_parquet("lap.parquet")
+        command = ("estimate", name, f"lap{end}", "dataset.accept=[sign,unit,impossible]", "--json")
+        whole = json.loads(saved.done(*command, "-o", f"whole{end}")[0])
+        with monkeypatch.context() as patch:
+            in_parts(patch)
+            parts = json.loads(saved.done(*command, "-o", f"parts{end}")[0])
+        if end == ".csv":
+            assert Path("parts.csv").read_bytes() == Path("whole.csv").read_bytes()
+        else:
+            pd.testing.assert_frame_equal(pd.read_parquet("parts.parquet"), pd.read_parquet("whole.parquet"), check_exact=True)
+            assert pq.ParquetFile("parts.parquet").num_row_groups == 5
+        assert {**parts, "out": "", "findings": []} == {**whole, "out": "", "findings": []}
+
+
+@pytest.mark.parametrize(
+    ("row", "column", "cell"),
+    [(2500, "ay", np.nan), (2500, "vx", "text"), (2500, "time", 99.0), (2999, "vx", 1e9), (1500, "time", 15.004), (0, "yaw_rate", np.inf)],
+)
+def test_bad_rows_have_the_same_line_in_parts_and_nothing_is_written(saved, monkeypatch, row, column, cell):
+    lap()
+    table = pd.read_csv("lap.csv").astype({column: object})
+    table.loc[row, column] = cell
+    table.to_csv("lap.csv", index=False)
+    whole = saved.refused("estimate", "own", "lap.csv", "-o", "out.csv")
+    in_parts(monkeypatch)
+    assert saved.refused("estimate", "own", "lap.csv", "-o", "out.csv") == whole
+    assert not [*saved.folder.glob("*out*")]
 
 
 def test_online_says_what_estimate_says_of_the_whole_drive(model):

@@ -32,6 +32,7 @@ from vehest.trust.health import (
     domain_verdict,
     health_rows,
     learn_health,
+    outside_domain,
     reason_in_words,
 )
 
@@ -247,9 +248,9 @@ def test_a_glitch_of_the_recording_is_no_limit():
 def test_models_come_back_from_files_and_say_what_lies_outside_training_or_of_another_rate():
     model, drive = model_of(), measured_drive(3)
     fast = {name: np.array(drive[name]) for name in CHANNELS}
-    assert domain_verdict(model, fast) == ""
+    assert domain_verdict(model, outside_domain(model, fast)) == ""
     fast["ay"][: len(drive) // 4] = 50.0
-    assert domain_verdict(model, fast).startswith("25 % of the drive outside what the model learnt: |ay| above ")
+    assert domain_verdict(model, outside_domain(model, fast)).startswith("25 % of the drive outside what the model learnt: |ay| above ")
     model = model_of()
     read = validated(HealthModel, yaml.safe_load(yaml.safe_dump(plain(asdict(model)))), "'trust.yaml'")
     np.testing.assert_array_equal(read.packed(), model.packed())

@@ -9,7 +9,7 @@ import numpy as np
 from vehest.alignment.findings import Finding
 from vehest.alignment.motion import Motion
 from vehest.alignment.spectra import LONGEST_TIME_CONSTANT, CrossSpectra, Lag, Measured, lag_of
-from vehest.alignment.standstill import standstill
+from vehest.alignment.standstill import BoolArray
 from vehest.constants import FloatArray
 from vehest.data.recording import Recording
 
@@ -76,9 +76,8 @@ def _seconds(measured: Measured) -> str:
     return f"{measured.value:.2g} s (95 %: {max(measured.low, 0.0):.2g} to {measured.high:.2g})"
 
 
-def held_findings(recording: Recording) -> list[Finding]:
+def held_findings(recording: Recording, moving: BoolArray) -> list[Finding]:
     """Channels whose samples repeat in steps: a slower sensor, whose last value was held. Those of one rate make one finding."""
-    moving = ~standstill(recording)
     held: dict[str, list[str]] = {}
     for name, samples in recording.channels.items():
         rate = held_rate(samples[moving], recording.rate_hz)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterable, Iterator
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 
 import numpy as np
 import scipy
@@ -24,10 +24,10 @@ from vehest.alignment.signs import (
     turned_channels,
     wrong_unit,
 )
-from vehest.alignment.standstill import standstill
+from vehest.alignment.standstill import BoolArray, standstill
 from vehest.data.channels import CHANNELS
 from vehest.data.errors import DataError
-from vehest.data.recording import Recording
+from vehest.data.recording import PART, Recording, part_slices
 from vehest.data.runs import equal_runs, true_runs
 
 __all__ = ["Finding", "checks_of_recording"]
@@ -50,21 +50,42 @@ REVERSE_SECONDS = 1.0
 
 
 def checks_of_recording(recording: Recording) -> list[Finding]:
-    """All checks of a recording's samples, the gravest findings first."""
+    """All checks of a recording's samples, the gravest findings first; of a long drive part by part (`merged_findings`).
+
+    Of a part of a drive in which the car stands throughout only impossible values count.
+    """
+    slices = part_slices(len(recording), recording.rate_hz)
+    whole = len(slices) == 1 and PART not in recording.provenance
     with np.errstate(all="ignore"):  # of samples up to 1e308, which a check may square
-        findings = [finding for check in _CHECKS for finding in check(recording)]
+        return merged_findings(_findings(recording.part(own), whole=whole) for own in slices)
+
+
+def _findings(recording: Recording, *, whole: bool) -> list[Finding]:
+    moving = ~standstill(recording)
+    checks = _CHECKS if whole or moving.any() else (_impossible_values,)
+    return [finding for check in checks for finding in check(recording, moving)]
+
+
+def merged_findings(parts: Iterable[Sequence[Finding]]) -> list[Finding]:
+    """Findings in the parts of a drive, the gravest first: of each level, check and channel those of the first part that has any."""
+    found: list[Finding] = []
+    for part in parts:
+        known = {(one.level, one.check, one.channel) for one in found}
+        found += [one for one in part if (one.level, one.check, one.channel) not in known]
     order = {"error": 0, "warning": 1, "note": 2}
-    return sorted(findings, key=lambda finding: order[finding.level])
+    return sorted(found, key=lambda finding: order[finding.level])
 
 
-def refuse_errors(recording: Recording, accepted: Collection[str], place: str) -> None:
-    """Raise `DataError`, whose message begins with ``place``, where a check that is not accepted finds an error."""
-    for finding in checks_of_recording(recording):
+def refuse_errors(recording: Recording, accepted: Collection[str], place: str) -> list[Finding]:
+    """What `checks_of_recording` finds; raises `DataError`, beginning with ``place``, where one that is not accepted is an error."""
+    findings = checks_of_recording(recording)
+    for finding in findings:
         if finding.level == "error" and finding.check not in accepted:
             raise DataError(f"{place}: channel '{finding.channel}': {finding.message} (or dataset.accept=[{finding.check}])")
+    return findings
 
 
-def _impossible_values(recording: Recording) -> Iterator[Finding]:
+def _impossible_values(recording: Recording, _: BoolArray) -> Iterator[Finding]:
     spun = bool(dict(recording.provenance.get("flags") or {}).get("spun"))
     for name, samples in recording.channels.items():
         channel = CHANNELS[name]
@@ -80,9 +101,9 @@ def _impossible_values(recording: Recording) -> Iterator[Finding]:
         yield Finding("note" if spun else "error", "impossible", name, message)
 
 
-def _agreement(recording: Recording) -> list[Finding]:
+def _agreement(recording: Recording, moving: BoolArray) -> list[Finding]:
     """Channels that planar motion ties together: signs and units first, the rest with these put right."""
-    motion = motion_of(recording)
+    motion = motion_of(recording, moving)
     if not motion.moving.any():
         return []
     relations = relations_of(motion)
@@ -129,16 +150,15 @@ def _kinematics(motion: Motion) -> Iterator[Finding]:
         yield Finding("warning", "kinematics", "vy_ref", message)
 
 
-def _not_measured(recording: Recording) -> Iterator[Finding]:
+def _not_measured(recording: Recording, _: BoolArray) -> Iterator[Finding]:
     for name in sorted(recording.gappy):
         missing = int(np.isnan(recording[name]).sum())
         if missing:
             yield Finding("note", "nan", name, f"{100 * missing / len(recording):.1f} % of the samples are 'not measured'")
 
 
-def _stuck(recording: Recording) -> Iterator[Finding]:
+def _stuck(recording: Recording, moving: BoolArray) -> Iterator[Finding]:
     """Values that stay the same for long while the car moves; at standstill nothing needs to change."""
-    moving = ~standstill(recording)
     moved = np.concatenate([[0], np.cumsum(moving)])
     for name, samples in recording.channels.items():
         known = np.flatnonzero(~np.isnan(samples))
@@ -159,9 +179,8 @@ def _stuck(recording: Recording) -> Iterator[Finding]:
             yield Finding("warning", "stuck", name, f"stays at {samples[first]:.6g} {unit} for {seconds:.3g} s from {time:.12g} s")
 
 
-def _saturated(recording: Recording) -> Iterator[Finding]:
+def _saturated(recording: Recording, moving: BoolArray) -> Iterator[Finding]:
     """Samples that pile up at the highest or lowest value, again and again, far more often than at the value next to it."""
-    moving = ~standstill(recording)
     for name, samples in recording.channels.items():
         known = samples[np.isfinite(samples) & moving]
         lowest, highest = (known.min(), known.max()) if len(known) >= FEWEST_SAMPLES else (0.0, 0.0)
@@ -177,7 +196,7 @@ def _saturated(recording: Recording) -> Iterator[Finding]:
                 yield Finding("warning", "saturated", name, message)
 
 
-def _steering_offset(recording: Recording) -> Iterator[Finding]:
+def _steering_offset(recording: Recording, _: BoolArray) -> Iterator[Finding]:
     """Straight ahead the steering angle must be about zero: its median where a moving car hardly turns."""
     if not {"vx", "yaw_rate", "steer"} <= set(recording.channels):
         return
@@ -190,7 +209,7 @@ def _steering_offset(recording: Recording) -> Iterator[Finding]:
         yield Finding("warning", "offset", "steer", f"{message}take {offset:.3g} rad off with the transform offset_correction")
 
 
-def _wheel_dropout(recording: Recording) -> Iterator[Finding]:
+def _wheel_dropout(recording: Recording, _: BoolArray) -> Iterator[Finding]:
     """A wheel that shows next to nothing beside the other three while the car neither stands nor brakes hard.
 
     On slippery roads wheels lock under gentle braking too; without a channel of the brakes that looks like a dropout.
@@ -211,7 +230,7 @@ def _wheel_dropout(recording: Recording) -> Iterator[Finding]:
             yield Finding("warning", "dropout", name, f"{message}; the transform speed_from_wheels leaves such a wheel out")
 
 
-def _reverse(recording: Recording) -> Iterator[Finding]:
+def _reverse(recording: Recording, _: BoolArray) -> Iterator[Finding]:
     """Driving backwards is legitimate, but most estimators take the car to go forwards."""
     speed = "vx" if "vx" in recording else "vx_ref"
     if speed not in recording:
@@ -233,7 +252,7 @@ def _longest(runs: NDArray[np.int64], recording: Recording) -> str:
     return f"for {(end - begin) / recording.rate_hz:.3g} s from {recording.time[begin]:.12g} s"
 
 
-_CHECKS: tuple[Callable[[Recording], Iterable[Finding]], ...] = (
+_CHECKS: tuple[Callable[[Recording, BoolArray], Iterable[Finding]], ...] = (
     _impossible_values,
     _agreement,
     _not_measured,

@@ -17,6 +17,7 @@ from vehest.alignment.lateral import lateral_lateness
 from vehest.alignment.motion import WHEELS, Motion, motion_of
 from vehest.alignment.settings import TILT_LAG_GAIN
 from vehest.alignment.spectra import LARGEST_LAG, CrossSpectra, Measured, cross_spectra, lag_of
+from vehest.alignment.standstill import standstill
 from vehest.constants import FloatArray
 from vehest.data.channels import REFERENCE_SUFFIX
 from vehest.data.recording import Recording
@@ -131,7 +132,7 @@ def _sound(delay: Measured) -> bool:
 
 def late_channels(recording: Recording) -> dict[str, Late]:
     """Channel -> its delay, as the checks of a recording find it."""
-    motion = motion_of(recording)
+    motion = motion_of(recording, ~standstill(recording))
     spectra = spectra_of(motion)
     if spectra is None:
         return {}

@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from vehest.alignment.standstill import BoolArray, standstill
+from vehest.alignment.standstill import BoolArray
 from vehest.constants import FloatArray
 from vehest.data.channels import CHANNELS
 from vehest.data.recording import Recording
@@ -91,12 +91,12 @@ class Motion:
         return replace(self, channels={name: samples * factors.get(name, 1.0) for name, samples in self.channels.items()})
 
 
-def motion_of(recording: Recording) -> Motion:
-    """Channels that are complete, or nearly, and not larger than a wrong unit explains."""
+def motion_of(recording: Recording, moving: BoolArray) -> Motion:
+    """Channels that are complete, or nearly, and not larger than a wrong unit explains; ``moving``: where the car does not stand."""
     channels = {name: whole for name in recording.channels if (whole := _whole(recording, name)) is not None}
     speed = next((name for name in ("vx_ref", "vx") if name in channels), "")
     velocity = next((name for name in ("vy_ref", "sideslip_ref") if name in channels), "") if speed else ""
-    return Motion(recording.rate_hz, channels, speed, velocity, ~standstill(recording))
+    return Motion(recording.rate_hz, channels, speed, velocity, moving)
 
 
 def _whole(recording: Recording, name: str) -> FloatArray | None:

@@ -20,7 +20,8 @@ from vehest.data.text_files import first_line
 DAMAGE = (pa.ArrowException, OSError, ValueError, TypeError, KeyError, MemoryError, OverflowError, RecursionError)
 """What pyarrow and NumPy raise where a file is not what it says; an ArrowInvalid is a ValueError, too."""
 
-ROWS_AT_A_TIME = 1 << 17
+ROWS_AT_A_TIME = 1 << 15
+BUFFER = 1 << 17  # bytes of a column that are read at a time; pyarrow else reads all of it
 
 
 @contextmanager
@@ -33,7 +34,7 @@ def parquet_file(path: Path) -> Iterator[pq.ParquetFile]:
             footer = int.from_bytes(stream.read(4), "little")
             if footer < size:
                 check_limit("text_bytes", footer, f"'{path}' holds a description of {footer} bytes")
-            with pq.ParquetFile(stream, page_checksum_verification=True) as file:
+            with pq.ParquetFile(stream, page_checksum_verification=True, pre_buffer=False, buffer_size=BUFFER) as file:
                 yield file
     except VehestError:
         raise
@@ -41,8 +42,8 @@ def parquet_file(path: Path) -> Iterator[pq.ParquetFile]:
         raise DataError(f"'{path}' is truncated or damaged ({first_line(error)}); make it again") from None
 
 
-def read_numbers(path: Path, file: pq.ParquetFile, names: Sequence[str]) -> dict[str, NDArray[np.float64]]:
-    """Columns of numbers or dates that are there once each, float64 of shape (T,), missing values NaN; `DataError` for anything else.
+def number_batches(path: Path, file: pq.ParquetFile, names: Sequence[str]) -> Iterator[pa.RecordBatch]:
+    """Columns of numbers or dates that are there once each, some rows at a time; `DataError` for anything else.
 
     Dates with times count from 1970 in the file's unit, ``unit`` of their type.
     """
@@ -50,17 +51,25 @@ def read_numbers(path: Path, file: pq.ParquetFile, names: Sequence[str]) -> dict
         kind = file.schema_arrow.field(name).type
         if not (pa.types.is_floating(kind) or pa.types.is_integer(kind) or pa.types.is_timestamp(kind)):
             raise DataError(f"'{path}': column '{name}' is of type {str(kind)[:60]}; numbers are needed")
-    n_rows = file.metadata.num_rows
+    n_rows, done = file.metadata.num_rows, 0
     check_limit("samples", n_rows, f"'{path}' holds {n_rows} rows")
     check_unpacked(path, path.stat().st_size, 8 * n_rows * len(names))
-    values = {name: np.empty(n_rows) for name in names}
-    done = 0
-    for batch in file.iter_batches(ROWS_AT_A_TIME, columns=list(values)):
-        for name, column in zip(batch.schema.names, batch.columns, strict=True):
-            values[name][done : done + len(column)] = numbers_of(column)
+    for batch in file.iter_batches(ROWS_AT_A_TIME, columns=list(names), use_threads=False):
         done += batch.num_rows
+        yield batch
     if done != n_rows:
         raise DataError(f"'{path}' is truncated or damaged: it says that it holds {n_rows} rows, and holds {done}; make it again")
+
+
+def read_numbers(path: Path, file: pq.ParquetFile, names: Sequence[str]) -> dict[str, NDArray[np.float64]]:
+    """Columns of `number_batches`, float64 of shape (T,), missing values NaN."""
+    values, done = {name: np.empty(0) for name in names}, 0
+    for batch in number_batches(path, file, names):
+        for name, column in zip(batch.schema.names, batch.columns, strict=True):
+            if not done:
+                values[name] = np.empty(file.metadata.num_rows)
+            values[name][done : done + len(column)] = numbers_of(column)
+        done += batch.num_rows
     return values
 
 

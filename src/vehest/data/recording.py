@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from itertools import pairwise
 from typing import Any, Literal
 
 import numpy as np
@@ -15,6 +16,8 @@ from vehest.data.errors import DataError
 
 Kind = Literal["real", "simulated"]
 
+LONGEST_PART = 900.0  # s; a longer drive is checked and, from a large table, read in parts
+PART = "part"  # in the provenance of a part of a drive: its number and that of all
 LOWEST_RATE, HIGHEST_RATE = 1e-6, 1e5  # between which a sampling rate lies [Hz]
 
 
@@ -57,7 +60,7 @@ class Recording:
             raise DataError(f"recording '{self.id}': kind must be real or simulated, not '{self.kind}'")
         object.__setattr__(self, "rate_hz", float(self.rate_hz))
         object.__setattr__(self, "start_time", float(self.start_time))
-        frozen = {channel(name).name: np.array(samples, dtype=np.float64, copy=True) for name, samples in self.channels.items()}
+        frozen = {channel(name).name: _own(samples) for name, samples in self.channels.items()}
         n_samples = max((samples.size for samples in frozen.values()), default=0)
         if not n_samples or any(samples.shape != (n_samples,) for samples in frozen.values()):
             shapes = {name: samples.shape for name, samples in frozen.items()}
@@ -128,14 +131,27 @@ class Recording:
         if first >= last:
             spans = f"spans {self.start_time:.12g} s to {self.end_time:.12g} s"
             raise DataError(f"recording '{self.id}' {spans}; it has no samples between {start:.12g} s and {stop:.12g} s")
-        channels = {name: samples[first:last] for name, samples in self.channels.items()}
-        return replace(self, start_time=self.start_time + first / self.rate_hz, channels=channels)
+        return self.part(slice(first, last))
+
+    def part(self, samples: slice) -> Recording:
+        """The samples of a range of indices; the same recording where that is all of them."""
+        if samples == slice(0, len(self)):
+            return self
+        channels = {name: values[samples] for name, values in self.channels.items()}
+        return replace(self, start_time=self.start_time + samples.start / self.rate_hz, channels=channels)
 
     def index_range(self, start: float, stop: float) -> tuple[int, int]:
         """First index and end index of the samples taken in [start, stop), clipped to the recording."""
         tolerance = clock_tolerance(self.start_time, self.end_time, self.rate_hz)
         first, end = ((time - self.start_time) * self.rate_hz - tolerance for time in (start, stop))
         return math.ceil(min(max(first, 0.0), len(self))), math.ceil(min(max(end, 0.0), len(self)))
+
+
+def joined(parts: Sequence[Recording]) -> Recording:
+    """The recording of parts that follow one another."""
+    first = parts[0]
+    channels = {name: np.concatenate([part[name] for part in parts]) for name in first.channels}
+    return replace(first, channels=channels, provenance={key: value for key, value in first.provenance.items() if key != PART})
 
 
 def clock_tolerance(start_time: float, end_time: float, rate_hz: float) -> float:
@@ -145,3 +161,15 @@ def clock_tolerance(start_time: float, end_time: float, rate_hz: float) -> float
     """
     resolution = math.ulp(max(abs(start_time), abs(end_time)))
     return min(max(1e-6, 2.0 * resolution * rate_hz), 0.25)
+
+
+def _own(samples: FloatArray) -> FloatArray:
+    """Samples that nobody else can change: a copy, unless they are those of a recording."""
+    shared = isinstance(samples, np.ndarray) and samples.base is None and not samples.flags.writeable and samples.dtype == np.float64
+    return samples if shared else np.array(samples, dtype=np.float64, copy=True)
+
+
+def part_slices(n_samples: int, rate_hz: float) -> list[slice]:
+    """Ranges of indices that divide so many samples into parts of about one length, none longer than `LONGEST_PART`."""
+    edges = np.linspace(0, n_samples, max(math.ceil(n_samples / (LONGEST_PART * rate_hz)), 1) + 1).astype(int).tolist()
+    return [slice(first, end) for first, end in pairwise(edges)]

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
+from itertools import chain
 from pathlib import Path
 from typing import Any, Literal, TypeVar
 
@@ -72,7 +73,7 @@ _Description = TypeVar("_Description", RecordingDescription, EstimateDescription
 def write_recording(recording: Recording, path: Path) -> None:
     """Store one recording; the file appears complete or not at all. Raises `MissingError`: the file cannot be written."""
     about = _attributes(recording, _OF_RECORDING) | {"gappy": sorted(recording.gappy), "provenance": dict(recording.provenance)}
-    _write(path, recording.channels, "recording", about)
+    _write(path, [recording.channels], "recording", about)
 
 
 def read_recording(path: Path, channels: Iterable[str] | None = None) -> Recording:
@@ -102,13 +103,29 @@ def is_stored_recording(path: Path) -> bool:
 
 def write_estimate(estimate: Estimate, path: Path) -> None:
     """Store one estimate, with its time column, so that other tools can read it. Raises `MissingError`: the file cannot be written."""
-    about = _attributes(estimate, _OF_ESTIMATE)
-    columns = {"time": estimate.time, **estimate.channels}
-    if estimate.covariance is not None:
-        about |= {"n_states": estimate.covariance.shape[1], "covariance_of": list(estimate.covariance_of)}
-        for row, column in np.ndindex(estimate.covariance.shape[1:]):
-            columns[f"{_COVARIANCE}_{row}_{column}"] = estimate.covariance[:, row, column]
-    _write(path, columns, "estimate", about)
+    write_estimate_parts([estimate], path)
+
+
+def write_estimate_parts(parts: Iterable[Estimate], path: Path) -> None:
+    """`write_estimate` for the parts of an estimate, one after another, with the quantities that the first has."""
+    rest = iter(parts)
+    first = next(rest)
+    about = _attributes(first, _OF_ESTIMATE)
+    if first.covariance is not None:
+        about |= {"n_states": first.covariance.shape[1], "covariance_of": list(first.covariance_of)}
+    _write(path, estimate_columns(chain([first], rest)), "estimate", about)
+
+
+def estimate_columns(parts: Iterable[Estimate]) -> Iterator[dict[str, FloatArray]]:
+    """Time, quantities and entries of the covariance of each part of an estimate, on one clock."""
+    done, start = 0, None
+    for part in parts:
+        start = part.start_time if start is None else start
+        columns = {"time": start + np.arange(done, done + len(part)) / part.rate_hz, **part.channels}
+        done += len(part)
+        if part.covariance is not None:
+            columns |= {f"{_COVARIANCE}_{i}_{j}": part.covariance[:, i, j] for i, j in np.ndindex(part.covariance.shape[1:])}
+        yield columns
 
 
 def read_estimate(path: Path) -> Estimate:
@@ -150,19 +167,27 @@ def _attributes(of: object, names: Iterable[str]) -> dict[str, Any]:
     return {name: getattr(of, name) for name in names}
 
 
-def _write(path: Path, columns: Mapping[str, FloatArray], content: str, about: Mapping[str, Any]) -> None:
+def _write(path: Path, parts: Iterable[Mapping[str, FloatArray]], content: str, about: Mapping[str, Any]) -> None:
     try:
         described = json.dumps({"format": _FORMAT, "content": content, **about}).encode()
     except (TypeError, ValueError) as error:
         raise DataError(f"'{path}' cannot be written: the provenance holds more than JSON values ({first_line(error)})") from None
-    buffers = {name: pa.py_buffer(np.ascontiguousarray(values, dtype=np.float64)) for name, values in columns.items()}
-    arrays = {name: pa.Array.from_buffers(pa.float64(), own.size // 8, [None, own]) for name, own in buffers.items()}  # without pandas
-    table = pa.table(arrays).replace_schema_metadata({_METADATA_KEY: described})
+    tables = (_table(columns).replace_schema_metadata({_METADATA_KEY: described}) for columns in parts)
+    first = next(tables)
     with written_aside(path) as aside, open(aside, "wb") as stream:  # pyarrow itself takes no names that are not UTF-8
         try:
-            pq.write_table(table, stream, **_LAYOUT)
+            with pq.ParquetWriter(stream, first.schema, **_LAYOUT) as writer:
+                for table in chain([first], tables):
+                    writer.write_table(table.select(first.schema.names))
         except pa.ArrowException as error:
             raise writing_error(path, OSError(str(error))) from error
+
+
+def _table(columns: Mapping[str, FloatArray]) -> pa.Table:
+    buffers = {name: pa.py_buffer(np.ascontiguousarray(values, dtype=np.float64)) for name, values in columns.items()}
+    return pa.table(
+        {name: pa.Array.from_buffers(pa.float64(), own.size // 8, [None, own]) for name, own in buffers.items()}
+    )  # without pandas
 
 
 def _read(path: Path, kind: type[_Description], names: list[str] | None = None) -> tuple[dict[str, FloatArray], _Description]:

@@ -90,6 +90,12 @@ class Resample:
             channels = {name: _resampled(recording[name], up, down, taps, n_out) for name in names}
         return replace(recording, rate_hz=self.rate_hz, channels=channels)
 
+    @classmethod
+    def reach(cls, ratio: Fraction) -> int:
+        """How many samples before or after it a sample depends on at most, in whole steps of the new clock."""
+        up, down = ratio.numerator, ratio.denominator
+        return -(-(cls.zero_crossings * max(up, down) // up + 1) // down) * down
+
     def _taps(self, up: int, down: int) -> FloatArray:
         slower = max(up, down)
         half = self.zero_crossings * slower

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Iterator, Mapping
+from fractions import Fraction
 from pathlib import Path
 from typing import Any
 
 from vehest.data.errors import DataError
-from vehest.data.recording import Recording
+from vehest.data.recording import PART, Recording, joined
 from vehest.data.store import read_recording, write_recording
 from vehest.data.transforms import Resample, Transform, transform_from_config
 from vehest.run.artefacts import Artefact, StagePlan
@@ -41,6 +42,27 @@ def resampled(recording: Recording, rate_hz: float, preparation: Mapping[str, An
     for transform in transforms_of({**preparation, "rate_hz": rate_hz}):
         recording = transform(recording)
     return recording
+
+
+def resampled_parts(parts: Iterable[Recording], rate_hz: float, preparation: Mapping[str, Any]) -> Iterator[Recording]:
+    """`resampled` for a recording that comes in parts, to the same bits; a preparation with other transforms needs it whole."""
+    if preparation["transforms"]:
+        parts = [joined(list(parts))]
+    kept: list[Recording] = []
+    done = 0  # samples at the start of the outcome that are out already
+    for part in parts:
+        whole = joined([*kept, part])
+        found = resampled(whole, rate_hz, preparation)
+        ratio = (Fraction(found.rate_hz) / Fraction(whole.rate_hz)).limit_denominator(1000)
+        reach = Resample.reach(ratio)
+        begin = (len(whole) - 2 * reach) // ratio.denominator * ratio.denominator
+        number, last = part.provenance.get(PART, (1, 1))
+        if number == last:
+            yield found.part(slice(done, len(found)))
+        elif begin > 0:
+            yield found.part(slice(done, int((begin + reach) * ratio)))
+            whole, done = whole.part(slice(begin, len(whole))), int(reach * ratio)
+        kept = [whole]
 
 
 def transforms_of(config: Mapping[str, Any]) -> list[Transform]:

@@ -8,22 +8,26 @@ from __future__ import annotations
 import csv
 import hashlib
 import json
-from collections.abc import Callable, Mapping, Sequence
+from array import array
+from collections import Counter
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from vehest.alignment.checks import checks_of_recording, refuse_errors
-from vehest.constants import GRAVITY
+from vehest.alignment.checks import checks_of_recording, merged_findings, refuse_errors
+from vehest.alignment.findings import Finding
+from vehest.constants import GRAVITY, FloatArray
 from vehest.data.channels import REFERENCE_SUFFIX
 from vehest.data.errors import ConfigurationError, DataError, MissingError
 from vehest.data.estimate import QUANTITIES, Estimate
 from vehest.data.files import sha256_of, written_aside
 from vehest.data.limits import limits_from_config, use_limits
-from vehest.data.recording import Recording
-from vehest.data.store import write_estimate
+from vehest.data.recording import Recording, joined
+from vehest.data.store import estimate_columns, write_estimate_parts
 from vehest.data.transforms import OF_REFERENCES
 from vehest.estimators.base import Estimator
 from vehest.estimators.kernels.compiling import has_to_compile
@@ -33,13 +37,13 @@ from vehest.run.calibrate import trust_of
 from vehest.run.car_record import calibrated, read_car, with_settings
 from vehest.run.config import Config, compose_config, key_of, value_of
 from vehest.run.config_files import is_file_name
-from vehest.run.downsample import resampled
+from vehest.run.downsample import resampled, resampled_parts
 from vehest.run.estimate_log import LOGS, check_log_name, write_log
 from vehest.run.printing import complain, counted, note
 from vehest.run.train import STAGE as TRAIN
-from vehest.sources.base import read_single
-from vehest.trust.contract import estimate_guarded
-from vehest.trust.health import SLOW_KERNEL, domain_verdict, reason_in_words
+from vehest.sources.base import read_single, source_of_file
+from vehest.trust.contract import GuardedRun
+from vehest.trust.health import SLOW_KERNEL, domain_verdict, outside_domain, reason_in_words
 from vehest.trust.record import Trust, is_other_vehicle
 
 SUFFIXES = (".parquet", ".csv")
@@ -121,43 +125,57 @@ def estimate_file(words: Sequence[str], out: Path, *, strict: bool = False, car:
     config = compose_config("estimate", overrides)
     folder, model, trust = open_model(name, Path(config["output"]), note)
     with use_limits(limits_from_config(config["limits"])):
-        drive = read_by(config, file)
-    remarks: list[str] = []
-    if name == SELF_CALIBRATING:
-        assumed, remarks = _assumed(settings, drive, model.settings.wheelbase if car is None else None)
-        settings |= assumed
-    if settings:
-        model = with_settings(model, settings)
-        if trust is not None and trust.health is not None and trust.health.channels != model.channels:
-            trust = replace(trust, health=None)  # of a channel that is not measured
-    if car is not None:
-        model = calibrated(model, read_car(car))
-    if has_to_compile(model.slow_kernel) or (trust is not None and has_to_compile(SLOW_KERNEL)):
-        note("compiling once, about 20 s")
-    if any(key_of(override).split(".")[0] == "downsample" for override in overrides):
-        model.preparation = config["downsample"]
-    with use_limits(limits_from_config(config["limits"])):
-        findings = findings_of(drive, model, config["dataset"].get("accept") or ())
-        if strict and findings:
-            raise DataError(f"'{file}': {findings[0]}")
-        result = estimate_recording(model, drive, trust)
-    if out.suffix.lower() in LOGS:
-        write_log(result, drive, file, out)
-    else:
-        write_estimate_table(result, out)
+        parts = _checked_parts(config, file)
+        first, known = next(parts)
+        remarks: list[str] = []
+        if name == SELF_CALIBRATING:
+            assumed, remarks = _assumed(settings, first, model.settings.wheelbase if car is None else None)
+            settings |= assumed
+        if settings:
+            model = with_settings(model, settings)
+            if trust is not None and trust.health is not None and trust.health.channels != model.channels:
+                trust = replace(trust, health=None)  # of a channel that is not measured
+        if car is not None:
+            model = calibrated(model, read_car(car))
+        if has_to_compile(model.slow_kernel) or (trust is not None and has_to_compile(SLOW_KERNEL)):
+            note("compiling once, about 20 s")
+        if any(key_of(override).split(".")[0] == "downsample" for override in overrides):
+            model.preparation = config["downsample"]
+        run, log = _run_on(model, trust, first), out.suffix.lower() in LOGS
+        report = _Report(model, trust, config["dataset"].get("accept") or (), f"'{file}'" if strict else None)
+        drive = report.checked(chain([(first, known)], parts))
+        if log or not run.takes_parts:
+            first = joined(list(drive))
+            drive = iter([first])
+        needed = resampled_parts((part.select(model.channels) for part in drive), model.settings.rate_hz, model.preparation)
+        estimates = report.counted(run(part.channels, part) for part in needed)
+        if log:
+            (estimate,) = estimates
+            write_log(estimate, first, file, out)
+        else:
+            del first  # a part that is done needs no memory
+            write_estimate_table(estimates, out)
     for remark in remarks:
         note(remark)
+    findings = [_in_words(finding) for finding in merged_findings(report.findings)]
     for finding in findings:
         complain(f"warning: {finding}")
     return {
         "out": str(out),
         "model": name if name in WITH_VEHEST else str(folder),
         **({"car": str(car)} if car is not None else {}),
-        **_summary(result),
-        "verdict": _verdict(result, drive, trust),
+        **report.summary(),
+        "verdict": report.verdict(),
         "findings": findings,
         **({"note": pretrained_note(name)} if name in WITH_VEHEST else {}),
     }
+
+
+def _checked_parts(config: Config, file: Path) -> Iterator[tuple[Recording, list[Finding]]]:
+    """A recording in parts that follow one another, each with the findings of its checks; raises as `read_table` does."""
+    dataset = _without_references(config["dataset"])
+    for part in source_of_file(dataset, file).file_parts(file):
+        yield part, refuse_errors(part, dataset.get("accept") or (), f"'{file}'")
 
 
 def _assumed(settings: Mapping[str, Any], drive: Recording, wheelbase: float | None) -> tuple[dict[str, Any], list[str]]:
@@ -225,14 +243,27 @@ def _without_references(dataset: dict[str, Any]) -> dict[str, Any]:
 
 def findings_of(recording: Recording, model: Estimator, accepted: Sequence[str]) -> list[str]:
     """Findings in the channels that a model reads; raises `DataError` where they contradict each other, so that no estimate is right."""
+    return [_in_words(finding) for finding in _model_findings(recording, model, accepted, None)]
+
+
+def _in_words(finding: Finding) -> str:
+    return f"{finding.channel}: {finding.message}" if finding.channel else finding.message
+
+
+def _model_findings(recording: Recording, model: Estimator, accepted: Sequence[str], known: Sequence[Finding] | None) -> list[Finding]:
+    """`findings_of`; ``known`` are those of all channels: where these have none, nor have fewer channels."""
     read = [name for name in model.channels if name in recording]
-    findings = [finding for finding in checks_of_recording(recording.select(read)) if finding.level != "note"] if read else []
+    if known is not None and (set(read) == set(recording.channels) or all(finding.level == "note" for finding in known)):
+        findings = list(known)
+    else:
+        findings = checks_of_recording(recording.select(read)) if read else []
+    findings = [finding for finding in findings if finding.level != "note"]
     for finding in findings:
         if finding.check in CONTRADICTIONS and finding.check not in accepted:
             what = f"channels contradict each other: {finding.message}"
             raise DataError(f"recording '{recording.id}': {what} (or dataset.accept=[{finding.check}])")
-    found = [f"{finding.channel}: {finding.message}" if finding.channel else finding.message for finding in findings]
-    return found + wheelbase_findings(recording, getattr(model.settings, "wheelbase", None))
+    too_small = wheelbase_findings(recording, getattr(model.settings, "wheelbase", None))
+    return findings + [Finding("warning", "wheelbase", "", message) for message in too_small]
 
 
 def wheelbase_findings(recording: Recording, wheelbase: float | None) -> list[str]:
@@ -256,8 +287,11 @@ def wheelbase_findings(recording: Recording, wheelbase: float | None) -> list[st
 def estimate_recording(model: Estimator, recording: Recording, trust: Trust | None = None) -> Estimate:
     """Bring a recording to the model's rate and run the model on it, guarded as online (`vehest.trust.contract`); raises `DataError`."""
     needed = prepared_recording(model, recording)
-    estimate = estimate_guarded(model, needed.channels, needed, trust, elsewhere=is_other_vehicle(trust, recording))
-    return require_estimate(model, recording, estimate)
+    return require_estimate(model, recording, _run_on(model, trust, recording)(needed.channels, needed))
+
+
+def _run_on(model: Estimator, trust: Trust | None, recording: Recording) -> GuardedRun:
+    return GuardedRun(model, trust, elsewhere=is_other_vehicle(trust, recording))
 
 
 def prepared_recording(model: Estimator, recording: Recording, rate_hz: float | None = None) -> Recording:
@@ -268,23 +302,38 @@ def prepared_recording(model: Estimator, recording: Recording, rate_hz: float | 
 def require_estimate(model: Estimator, recording: Recording, estimate: Estimate) -> Estimate:
     """The estimate; raises `DataError` where it is empty, since the recording is too short."""
     if np.isnan(estimate["vy"]).all():
-        raise DataError(f"recording '{recording.id}' lasts {recording.duration:.3g} s, too short for '{model.name}' to estimate anything")
+        raise _too_short(model, recording.id, recording.duration)
     return estimate
 
 
-def write_estimate_table(estimate: Estimate, path: Path) -> None:
-    """Write an estimate as Parquet or CSV, by the file's ending."""
+def _too_short(model: Estimator, recording_id: str, seconds: float) -> DataError:
+    return DataError(f"recording '{recording_id}' lasts {seconds:.3g} s, too short for '{model.name}' to estimate anything")
+
+
+def write_estimate_table(parts: Iterable[Estimate], path: Path) -> None:
+    """Write an estimate, of parts that follow one another, as Parquet or CSV, by the file's ending."""
     _check_table_name(path)
     if path.suffix.lower() == ".parquet":
-        write_estimate(estimate, path)
+        write_estimate_parts(parts, path)
         return
-    columns: dict[str, list[Any]] = {"time": estimate.time.tolist()}
-    columns |= {name: ["" if np.isnan(value) else value for value in values.tolist()] for name, values in estimate.channels.items()}
-    if "health" in columns:
-        columns["health"] = estimate["health"].astype(int).tolist()
-        columns["health_reason"] = [reason_in_words(code) for code in estimate["health_reason"]]
+    tables = map(_text_columns, estimate_columns(parts))
+    first = next(tables)
     with written_aside(path) as aside, open(aside, "w", newline="", encoding="utf-8") as stream:
-        csv.writer(stream, lineterminator="\n").writerows([columns, *zip(*columns.values(), strict=True)])
+        writer = csv.writer(stream, lineterminator="\n")
+        writer.writerow(first)
+        for columns in chain([first], tables):
+            writer.writerows(zip(*(columns[name] for name in first), strict=True))
+
+
+def _text_columns(columns: Mapping[str, FloatArray]) -> dict[str, list[Any]]:
+    """Cells of a table of text, with the reasons of health in words."""
+    cells: dict[str, list[Any]] = {"time": columns["time"].tolist()}
+    own = {name: values for name, values in columns.items() if name in QUANTITIES}
+    cells |= {name: ["" if np.isnan(value) else value for value in values.tolist()] for name, values in own.items()}
+    if "health" in columns:
+        cells["health"] = columns["health"].astype(int).tolist()
+        cells["health_reason"] = [reason_in_words(code) for code in columns["health_reason"]]
+    return cells
 
 
 def _check_table_name(path: Path) -> None:
@@ -292,35 +341,82 @@ def _check_table_name(path: Path) -> None:
         raise ConfigurationError(f"'{path}' must end in {', '.join(SUFFIXES)} or, as a log with further channels, {' or '.join(LOGS)}")
 
 
-def _summary(estimate: Estimate) -> dict[str, Any]:
-    """Figures of an estimate, for people and scripts."""
-    degrees = np.degrees(estimate["sideslip"])
-    figures: dict[str, Any] = {
-        "recording": estimate.recording_id,
-        "estimator": estimate.estimator,
-        "rate_hz": estimate.rate_hz,
-        "samples": len(estimate),
-        "estimated": int((~np.isnan(estimate["vy"])).sum()),
-        "quantities": {name: QUANTITIES[name] for name in estimate.channels},
-        "sideslip_deg": {"min": round(float(np.fmin.reduce(degrees)), 3), "max": round(float(np.fmax.reduce(degrees)), 3)},
-    }
-    if "band_sideslip" in estimate.channels:
-        half = np.degrees(estimate["band_sideslip"][~np.isnan(estimate["band_sideslip"])])
-        band = {"median": round(float(np.median(half)), 3), "largest": round(float(half.max()), 3)} if len(half) else {}
-        figures["band_sideslip_deg"] = band
-    return figures
+class _Report:
+    """Findings, figures and verdict of a drive that is checked and estimated in parts.
 
+    Args:
+        model, trust: that estimate it.
+        accepted: checks whose contradictions do not count.
+        strict: name of the file if findings are an error.
+    """
 
-def _verdict(estimate: Estimate, recording: Recording, trust: Trust | None) -> str:
-    """The share of valid samples and what makes others invalid, in a line."""
-    if trust is None or trust.health is None:
-        bands = "its bands are its own" if "band_vy" in estimate.channels else "no band"
-        return f"this model has no calibration: {bands}, and health from gaps and speeds alone"
-    estimated = ~np.isnan(estimate["vy"])
-    status, reasons = estimate["health"][estimated], estimate["health_reason"][estimated]
-    found, counts = np.unique(reasons[(status > 0) & (reasons > 0)], return_counts=True)
-    worst = [reason_in_words(float(found[at])) for at in np.argsort(-counts)[:2]]
-    share = 100.0 * (1.0 - float((status > 0).mean()))
-    valid = f"valid in {share:.3g} % of the drive" + (f"; else: {', '.join(worst)}" if worst else "")
-    outside = domain_verdict(trust.health, {name: recording[name] for name in trust.health.channels})
-    return f"{outside}; {valid}" if outside else valid
+    def __init__(self, model: Estimator, trust: Trust | None, accepted: Sequence[str], strict: str | None) -> None:
+        self.model, self.accepted, self.strict = model, accepted, strict
+        self.health = trust.health if trust is not None else None
+        self.findings: list[list[Finding]] = []
+        self.outside: Any = 0
+        self.seconds = 0.0
+        self.samples = self.estimated = self.invalid = 0
+        self.extremes: list[float] = []
+        self.half = array("d")  # widths of the band
+        self.reasons: Counter[float] = Counter()
+
+    def checked(self, parts: Iterable[tuple[Recording, list[Finding]]]) -> Iterator[Recording]:
+        """The parts, once they are checked; raises `DataError` as `findings_of` does, and where it is strict."""
+        for part, known in parts:
+            found = _model_findings(part, self.model, self.accepted, known)
+            if self.strict and found:
+                raise DataError(f"{self.strict}: {_in_words(found[0])}")
+            self.findings.append(found)
+            self.seconds += part.duration
+            if self.health is not None:
+                self.outside = self.outside + outside_domain(self.health, {name: part[name] for name in self.health.channels})
+            yield part
+
+    def counted(self, parts: Iterable[Estimate]) -> Iterator[Estimate]:
+        """The parts of the estimate, once they count; raises `DataError` where all are empty."""
+        for part in parts:
+            self.last, known = part, ~np.isnan(part["vy"])
+            degrees = np.degrees(part["sideslip"])
+            self.extremes += [float(np.fmin.reduce(degrees)), float(np.fmax.reduce(degrees))]
+            self.samples, self.estimated = self.samples + len(part), self.estimated + int(known.sum())
+            if "band_sideslip" in part.channels:
+                self.half.frombytes(part["band_sideslip"][~np.isnan(part["band_sideslip"])].tobytes())
+            status, reasons = part["health"][known], part["health_reason"][known]
+            self.invalid += int((status > 0).sum())
+            found, counts = np.unique(reasons[(status > 0) & (reasons > 0)], return_counts=True)
+            self.reasons.update(dict(zip(found.tolist(), counts.tolist(), strict=True)))
+            yield part
+        if not self.estimated:
+            raise _too_short(self.model, self.last.recording_id, self.seconds)
+
+    def summary(self) -> dict[str, Any]:
+        """Figures of the estimate, for people and scripts."""
+        last = self.last
+        figures: dict[str, Any] = {
+            "recording": last.recording_id,
+            "estimator": last.estimator,
+            "rate_hz": last.rate_hz,
+            "samples": self.samples,
+            "estimated": self.estimated,
+            "quantities": {name: QUANTITIES[name] for name in last.channels},
+            "sideslip_deg": {end: round(float(take.reduce(self.extremes)), 3) for end, take in (("min", np.fmin), ("max", np.fmax))},
+        }
+        if "band_sideslip" in last.channels:
+            half = np.frombuffer(self.half)
+            np.degrees(half, out=half)
+            middle = float(np.median(half, overwrite_input=True)) if len(half) else 0.0
+            band = {"median": round(middle, 3), "largest": round(float(half.max()), 3)} if len(half) else {}
+            figures["band_sideslip_deg"] = band
+        return figures
+
+    def verdict(self) -> str:
+        """The share of valid samples and what makes others invalid, in a line."""
+        if self.health is None:
+            bands = "its bands are its own" if "band_vy" in self.last.channels else "no band"
+            return f"this model has no calibration: {bands}, and health from gaps and speeds alone"
+        worst = [reason_in_words(code) for code, _ in sorted(self.reasons.items(), key=lambda one: -one[1])[:2]]
+        share = 100.0 * (1.0 - self.invalid / self.estimated)
+        valid = f"valid in {share:.3g} % of the drive" + (f"; else: {', '.join(worst)}" if worst else "")
+        outside = domain_verdict(self.health, self.outside)
+        return f"{outside}; {valid}" if outside else valid

@@ -163,6 +163,10 @@ class Source(ABC):
         """
         return self._prepared(self.read_raw_file(file))
 
+    def file_parts(self, file: Path) -> Iterator[Recording]:
+        """`read_file` in parts that follow one another, so that hours need little memory; all at once where the source knows no better."""
+        yield self.read_file(file)
+
     def _prepared(self, recording: Recording) -> Recording:
         """A recording after the data set's transforms and with its reference at the centre of gravity, unless it has been through them."""
         if len(recording) > 1:
@@ -210,11 +214,16 @@ def read_single(dataset: Mapping[str, Any], file: Path) -> Recording:
         MissingError: it is not there.
         DataError: it cannot be used as it is.
     """
+    return source_of_file(dataset, file).read_file(file)
+
+
+def source_of_file(dataset: Mapping[str, Any], file: Path) -> Source:
+    """The source of a data set that a file wherever it is shall be read by; raises as `read_single` does."""
     require_no_spreadsheet(file)
     if dataset.get("source") == "tabular" and file.suffix.lower() in NO_TABLES:
         what = f"describe its signals once by 'vehest new NAME {file.name}', then add dataset=NAME"
         raise ConfigurationError(f"'{file}' is no table; {what}")
-    return open_source(dataset).read_file(file)
+    return open_source(dataset)
 
 
 def require_no_spreadsheet(file: Path) -> None:

@@ -6,7 +6,7 @@ stamps -> `require_clock` -> `uniform_clock` or, with software delay, `uniform_t
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Literal
 
@@ -175,6 +175,33 @@ def uniform_clock(stamps: FloatArray, where: str, policy: ClockPolicy = "strict"
     elif uneven := unevenness(stamps):
         raise DataError(f"{where}: {uneven}; {fix}")
     return Clock(start, plain_rate(rate, min(deviation / len(steps), 1e-4)), len(stamps))
+
+
+def even_clock(blocks: Iterable[FloatArray]) -> Clock | None:
+    """The `uniform_clock` of stamps (T,) that come in blocks, where these are surely strict and even; else None."""
+    lines: list[tuple[int, int, float, float, float]] = []
+    intervals: list[float] = []
+    count, before = 0, np.empty(0)
+    for block in blocks:
+        if not (np.abs(block) <= LATEST_TIME).all():
+            return None
+        steps, own = np.diff(block, prepend=before), float(block[-1] - block[0]) / max(len(block) - 1, 1)
+        intervals += [float(steps.min(initial=math.inf)), float(steps.max(initial=0.0))]
+        most = float(np.abs(block - block[0] - own * np.arange(len(block))).max())  # away from the block's own line
+        lines.append((count, len(block) - 1, float(block[0]), own, most))
+        count, before = count + len(block), block[-1:]
+    if not FEWEST < count < MOST_STEPS:
+        return None
+    low, high, start = min(intervals), max(intervals), lines[0][2]
+    elapsed, n_steps = float(before[0]) - start, count - 1
+    step = elapsed / n_steps
+    away = max(abs(first - start - at * step) + abs(own - step) * reach + most for at, reach, first, own, most in lines)
+    if (
+        not (1.0 - RATE_TOLERANCE) / HIGHEST_RATE <= low <= high <= min(LONGEST_STEP, (1.0 + MOST_JITTER) * low)
+        or away > MOST_CLOCK_DRIFT * low
+    ):
+        return None
+    return Clock(start, plain_rate(n_steps / elapsed, min(MOST_DRIFT / n_steps, 1e-4)), count)
 
 
 def uniform_times(

@@ -8,11 +8,14 @@ from __future__ import annotations
 import codecs
 import csv
 import re
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import ExitStack
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
+from typing import Any
 
+import numpy as np
 import pyarrow as pa
 import pyarrow.csv as pc
 
@@ -20,7 +23,7 @@ from vehest.constants import FloatArray
 from vehest.data.errors import DataError, printable
 from vehest.data.files import regular_file
 from vehest.data.limits import check_limit, check_unpacked
-from vehest.data.parquet import DAMAGE, numbers_of, parquet_file, read_numbers
+from vehest.data.parquet import DAMAGE, number_batches, numbers_of, parquet_file, read_numbers
 from vehest.data.text_files import first_line
 from vehest.sources.clock_times import seconds_of_text
 
@@ -102,12 +105,7 @@ def read_columns(file: Path, wanted: Sequence[str], layout: TextLayout = TextLay
         with parquet_file(file) as parquet:
             return read_numbers(file, parquet, wanted)
     opened = partial(table_stream, file) if text is None else partial(pa.BufferReader, text)
-    convert = pc.ConvertOptions(
-        column_types={name: pa.string() if name == layout.clock else pa.float64() for name in wanted},
-        include_columns=list(wanted),
-        decimal_point=layout.decimal,
-        null_values=[*pc.ConvertOptions().null_values, *layout.missing],
-    )
+    convert = _conversion(wanted, layout)
     try:
         table = parse_table(opened, layout, convert)
     except DAMAGE:
@@ -123,8 +121,41 @@ def read_columns(file: Path, wanted: Sequence[str], layout: TextLayout = TextLay
     return {name: _seconds(file, name, columns.pop(name)) if name == layout.clock else numbers_of(columns.pop(name)) for name in wanted}
 
 
+def column_parts(file: Path, wanted: Sequence[str], layout: TextLayout, lengths: Iterable[int]) -> Iterator[dict[str, FloatArray]]:
+    """Columns as `read_columns` gives them, so many rows at a time, at most as many as there are; raises as it does."""
+    require_columns(file, column_names(file, layout), wanted)
+    try:
+        with ExitStack() as opened:
+            if is_parquet(file):
+                batches = number_batches(file, opened.enter_context(parquet_file(file)), wanted)
+            else:
+                options = _options(layout, _conversion(wanted, layout))
+                batches = iter(pc.open_csv(opened.enter_context(table_stream(file)), **options))
+            batch, at = next(batches, None), 0
+            for length in lengths:
+                values, done = {name: np.empty(length) for name in wanted}, 0
+                while batch is not None and done < length:
+                    own = batch.slice(at, length - done)
+                    for name in wanted:
+                        values[name][done : done + own.num_rows] = numbers_of(own.column(name))
+                    at, done = at + own.num_rows, done + own.num_rows
+                    if at == batch.num_rows:
+                        batch, at = next(batches, None), 0
+                for column in values.values():
+                    column.flags.writeable = False  # so that a recording shares it
+                yield values if done == length else {name: column[:done] for name, column in values.items()}
+    except DAMAGE:
+        read_columns(file, wanted, layout)  # whose errors state the row
+        raise
+
+
 def parse_table(opened: Callable[[], pa.NativeFile], layout: TextLayout, convert: pc.ConvertOptions, *, threads: bool = True) -> pa.Table:
     """Table of text as pyarrow converts it; raises what pyarrow raises."""
+    with opened() as stream:
+        return pc.read_csv(stream, **_options(layout, convert, threads=threads))
+
+
+def _options(layout: TextLayout, convert: pc.ConvertOptions, *, threads: bool = True) -> dict[str, Any]:
     read = pc.ReadOptions(
         use_threads=threads,
         block_size=BLOCK,
@@ -133,8 +164,16 @@ def parse_table(opened: Callable[[], pa.NativeFile], layout: TextLayout, convert
         skip_rows_after_names=layout.rows_below_names,
         column_names=None if layout.names is None else list(layout.names),
     )
-    with opened() as stream:
-        return pc.read_csv(stream, read, pc.ParseOptions(delimiter=layout.delimiter), convert)
+    return {"read_options": read, "parse_options": pc.ParseOptions(delimiter=layout.delimiter), "convert_options": convert}
+
+
+def _conversion(wanted: Sequence[str], layout: TextLayout) -> pc.ConvertOptions:
+    return pc.ConvertOptions(
+        column_types={name: pa.string() if name == layout.clock else pa.float64() for name in wanted},
+        include_columns=list(wanted),
+        decimal_point=layout.decimal,
+        null_values=[*pc.ConvertOptions().null_values, *layout.missing],
+    )
 
 
 def table_stream(file: Path) -> pa.NativeFile:

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from fnmatch import fnmatchcase
+from itertools import repeat, takewhile
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -13,16 +14,19 @@ from pydantic import AfterValidator, Field
 from vehest.constants import FloatArray
 from vehest.data.channels import CHANNELS, channel
 from vehest.data.errors import ConfigurationError, DataError, MissingError
-from vehest.data.recording import Recording
+from vehest.data.parquet import ROWS_AT_A_TIME
+from vehest.data.recording import PART, Recording, part_slices
 from vehest.data.store import is_stored_recording, read_recording
 from vehest.sources.base import open_source, require_files
-from vehest.sources.clocks import Clock, ClockPolicy, uniform_clock
+from vehest.sources.clocks import Clock, ClockPolicy, even_clock, uniform_clock
 from vehest.sources.columns import ChannelMap, ChannelNames, Column, ColumnName, Positive, column_from_config, columns_from_config
 from vehest.sources.file_source import FileSource
 from vehest.sources.sample_and_hold import held_from_config
 from vehest.sources.table_pose import table_pose_from_config
 from vehest.sources.table_rows import counted_runs, dropped_rows_from_config, kept_rows, timed_runs
-from vehest.sources.tables import TextLayout, column_names, listed, read_columns
+from vehest.sources.tables import TextLayout, column_names, column_parts, is_parquet, listed, read_columns
+
+LARGE = 1 << 25  # bytes of a table of text from which on it is read in parts
 
 
 def _encoding(name: str) -> str:
@@ -86,21 +90,52 @@ class TabularSource(FileSource):
         self._require_pattern()
         self.layout = TextLayout(options.delimiter, options.decimal, options.encoding, options.skip_rows)
 
+    def file_parts(self, file: Path) -> Iterator[Recording]:
+        """`read_file` in parts, of a large table whose clock is even and whose rows can be read one after another."""
+        options, time = self.options, self.time
+        apart = not (self._cuts or options.runs or self.held or self.pose or self.dropped or self.transforms or self.reference_point)
+        require_files([file], self.name)
+        small = not is_parquet(file) and file.stat().st_size < LARGE
+        if small or not apart or time is None or options.clock != "strict" or is_stored_recording(file):
+            yield self.read_file(file)
+            return
+        columns = self._columns_of(file)
+        wanted = list(dict.fromkeys(column.column for column in columns.values()))
+        try:
+            blocks = column_parts(file, [time.column], self.layout, repeat(ROWS_AT_A_TIME))
+            clock = even_clock(time.to_si(block[time.column], "s") for block in takewhile(lambda block: len(block[time.column]), blocks))
+            if clock is None:
+                yield self.read_file(file)
+                return
+            slices = part_slices(clock.n_samples, clock.rate_hz)
+            parts = column_parts(file, wanted, self.layout, (rows.stop - rows.start for rows in slices))
+            for number, (rows, values) in enumerate(zip(slices, parts, strict=True), 1):
+                own = replace(clock, start_time=clock.start_time + rows.start / clock.rate_hz, n_samples=rows.stop - rows.start)
+                yield self._prepared(self._made_of(file, None, columns, values, own, [number, len(slices)]))
+        except DataError:
+            self.read_file(file)  # whose errors are of all its rows
+            raise
+
     def _read(self, file: Path, run: int | None) -> Recording:
         require_files([file], self.name)
         if is_stored_recording(file):
             return read_recording(file)
+        columns = self._columns_of(file)
+        wanted = [column.column for column in (*columns.values(), *(self.pose.columns.values() if self.pose else ()))]
+        extra = [self.time and self.time.column, self.options.runs, self.held and self.held.updated]
+        values = self._values(file, list(dict.fromkeys([*wanted, *(str(name) for name in extra if name is not None)])))
+        rows = self._runs_of(file)[run]
+        return self._made_of(file, run, columns, {name: samples[rows] for name, samples in values.items()})
+
+    def _columns_of(self, file: Path) -> Mapping[str, Column]:
+        """Column of each channel: those of the data set, else those that are named like channels."""
         names, columns = column_names(file, self.layout), self.columns
         if columns is None:
             columns = {name: Column(name, CHANNELS[name].unit) for name in names if name in CHANNELS}
         if not columns:
             what = f"has no column that is named like a channel (it has {listed(names)})"
             raise DataError(f"'{file}' {what}; describe them by 'vehest new NAME {file.name}', then add dataset=NAME")
-        wanted = [column.column for column in (*columns.values(), *(self.pose.columns.values() if self.pose else ()))]
-        extra = [self.time and self.time.column, self.options.runs, self.held and self.held.updated]
-        values = self._values(file, list(dict.fromkeys([*wanted, *(str(name) for name in extra if name is not None)])))
-        rows = self._runs_of(file)[run]
-        return self._made_of(file, run, columns, {name: samples[rows] for name, samples in values.items()})
+        return columns
 
     def _values(self, file: Path, wanted: list[str]) -> dict[str, FloatArray]:
         """Columns without the rows that the data set leaves out."""
@@ -111,21 +146,28 @@ class TabularSource(FileSource):
         kept = kept_rows(len(next(iter(values.values()))), dropped, file)
         return {name: samples[kept] for name, samples in values.items()}
 
-    def _made_of(self, file: Path, run: int | None, columns: Mapping[str, Column], values: Mapping[str, FloatArray]) -> Recording:
-        """The recording of a file's columns, or of one run of them."""
+    def _made_of(
+        self,
+        file: Path,
+        run: int | None,
+        columns: Mapping[str, Column],
+        values: Mapping[str, FloatArray],
+        clock: Clock | None = None,
+        part: Sequence[int] = (1, 1),
+    ) -> Recording:
+        """The recording of a file's columns, or of one run of them, or of a part by its number, that of all parts and its clock."""
         n_rows = len(next(iter(values.values())))
         where = f"'{file}'" if run is None else f"'{file}', run {run}"
-        if self.time is not None:
+        if clock is None and self.time is not None:
             clock = uniform_clock(self.time.to_si(values[self.time.column], "s"), where, self.options.clock)
-        else:
-            clock = Clock(0.0, float(self.options.rate_hz), n_rows)
+        clock = clock or Clock(0.0, float(self.options.rate_hz), n_rows)
         held = () if self.held is None else self.held.channels
         channels = {
             name: clock.align(column.to_si(values[column.column], channel(name).unit), gappy=name in self.gappy)
             for name, column in columns.items()
             if name not in held
         }
-        provenance: dict[str, Any] = {"file": file.name} | ({} if run is None else {"run": run})
+        provenance: dict[str, Any] = {"file": file.name} | ({} if run is None else {"run": run}) | ({PART: part} if part[1] > 1 else {})
         if file.stem in self.dropped:
             provenance["dropped_rows"] = list(self.options.drop_rows[file.stem])
         if self.pose is not None:

@@ -17,6 +17,7 @@ import math
 import warnings
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
+from copy import copy
 from numbers import Real
 from typing import Any
 
@@ -58,65 +59,90 @@ def estimate_guarded(
     *,
     elsewhere: bool = False,
 ) -> Estimate:
-    """Estimate a recording under the contract.
+    """Estimate a recording under the contract; see `GuardedRun`."""
+    return GuardedRun(estimator, trust, initial_state, elsewhere=elsewhere)(samples, recording)
+
+
+class GuardedRun:
+    """An estimator under the contract on a recording, or on its parts one after another, to the same bits.
 
     Args:
         estimator: fitted.
-        samples: channels that it reads, (T,) each, as received: they may hold NaN, infinite or senseless values.
-        recording: its clock, name and vehicle are used, its samples are not.
         trust: learnt with the estimator; without it limits are those of any car, and there is neither band nor health of channels.
         initial_state: of a protocol, at the first sample.
         elsewhere: whether the car or its tyres are others than those that were calibrated on.
 
-    Returns:
-        ``vy``, ``sideslip``, ``health``, ``health_reason`` and, with calibrated bands, ``band_vy`` and ``band_sideslip``.
-
-    Raises:
-        DataError: a channel is missing.
+    Attributes:
+        takes_parts: whether the estimator can go on where it stopped; else the recording must come whole.
     """
-    missing = [name for name in estimator.channels if name not in samples]
-    if missing:
-        raise DataError(f"recording '{recording.id}' has no channel '{missing[0]}', which estimator '{estimator.name}' needs")
-    rows = np.ascontiguousarray(np.stack([np.asarray(samples[name], np.float64) for name in estimator.channels], axis=1))
-    limits, rate = limits_for(estimator, trust), estimator.settings.rate_hz
-    cleaned = Guard(estimator.channels, estimator.skippable, limits, rate, remembers=starts_anew(estimator))(rows)
-    monitor = Monitor(estimator, trust, elsewhere=elsewhere)
-    verdict = monitor.before(rows, cleaned)
-    run = _Run(estimator, recording, cleaned, Watch(limits, estimator.warm_up_steps, rate), initial_state)
-    at = 0
-    while at < len(rows):
-        at = run.piece(at)
-    return run.estimate(monitor, verdict)
 
-
-class _Run:
     def __init__(
-        self, estimator: Estimator, recording: Recording, cleaned: Cleaned, watch: Watch, initial_state: Mapping[str, float] | None
+        self, estimator: Estimator, trust: Trust | None, initial_state: Mapping[str, float] | None = None, *, elsewhere: bool = False
     ) -> None:
-        self.estimator, self.recording, self.cleaned, self.watch = estimator, recording, cleaned, watch
-        self.initial_state = initial_state
-        self.motion, steps = motion_of(estimator.channels, cleaned), len(cleaned.rows)
-        self.out, self.marks = np.full(steps, np.nan), np.zeros(steps, np.int8)
-        self.vx, self.variance = np.full(steps, np.nan), np.full(steps, np.nan)
+        limits, rate, kind = limits_for(estimator, trust), estimator.settings.rate_hz, type(estimator)
+        self.estimator, self.initial_state = estimator, initial_state
+        self.guard = Guard(estimator.channels, estimator.skippable, limits, rate, remembers=starts_anew(estimator))
+        self.monitor = Monitor(estimator, trust, elsewhere=elsewhere)
+        self.watch = Watch(limits, estimator.warm_up_steps, rate)
+        self._has_state = estimator.causal and kind._estimate_all is Estimator._estimate_all and kind.run is not Estimator.run
+        self.takes_parts = self._has_state or estimator.warm_up_steps > 0
+        self._begun, self._speed = False, np.full(1, np.nan)
+        self._state: Any = None  # of the estimator after the last row
+        self._window = np.empty((0, len(estimator.channels)))  # rows that it still sees, where it has no state
+        self._late: dict[str, FloatArray] = {}  # values of the last ``horizon_steps`` rows
         self.others: dict[str, FloatArray] = {}
         self.covariance: FloatArray | None = None
         self.covariance_of: tuple[str, ...] = ()
 
-    def piece(self, start: int) -> int:
+    def __call__(self, samples: Mapping[str, FloatArray], recording: Recording) -> Estimate:
+        """The estimate of a part.
+
+        Args:
+            samples: channels that the estimator reads, (T,) each, as received: they may hold NaN, infinite or senseless values.
+            recording: its clock, name and vehicle are used, its samples are not.
+
+        Returns:
+            ``vy``, ``sideslip``, ``health``, ``health_reason`` and, with calibrated bands, ``band_vy`` and ``band_sideslip``.
+
+        Raises:
+            DataError: a channel is missing.
+        """
+        estimator = self.estimator
+        missing = [name for name in estimator.channels if name not in samples]
+        if missing:
+            raise DataError(f"recording '{recording.id}' has no channel '{missing[0]}', which estimator '{estimator.name}' needs")
+        rows = np.ascontiguousarray(np.stack([np.asarray(samples[name], np.float64) for name in estimator.channels], axis=1))
+        self.recording, self.cleaned, steps = recording, self.guard(rows), len(rows)
+        verdict = self.monitor.before(rows, self.cleaned)
+        self.motion = motion_of(estimator.channels, self.cleaned)
+        self.out, self.marks = np.full(steps, np.nan), np.zeros(steps, np.int8)
+        self.vx, self.variance = np.full(steps, np.nan), np.full(steps, np.nan)
+        self.others = {name: np.full(steps, np.nan) for name in self.others}
+        if self.covariance is not None:
+            self.covariance = np.full((steps, *self.covariance.shape[1:]), np.nan)
+        at = 0
+        while at < steps:
+            at = self._piece(at)
+        self._begun = True
+        return self._estimate(verdict)
+
+    def _piece(self, start: int) -> int:
         """Go on from a row up to the next wait or restart, or until the estimator is lost; returns the row to go on with.
 
         After a loss the next attempt is short at first, so that an estimator that is lost again and again takes no quadratic time.
         """
-        flow = self.cleaned.flow
+        flow, lost = self.cleaned.flow, self.watch.state[5] > 0
         ends = np.flatnonzero(flow[start + 1 :] != (flow[start] if flow[start] == WAIT else USE))
         end = start + 1 + int(ends[0]) if len(ends) else len(flow)
         if flow[start] == WAIT:
             return self._watched(start, end, np.full(end - start, np.nan))[0]
+        goes_on = self._begun and start == 0 and flow[0] == USE and not lost
+        state, window = (self._state, self._window) if goes_on else (None, self._window[:0])
         first_reach = self.estimator.warm_up_steps + math.ceil(2.0 * self.estimator.settings.rate_hz)
-        reach = min(start + first_reach, end) if start > 0 and self.watch.state[5] > 0 else end
+        reach = min(start + first_reach, end) if lost else end
         while True:
             before = self.watch.state.copy()
-            at, lost = self._watched(start, reach, self._raw(start, reach))
+            at, lost = self._watched(start, reach, self._raw(start, reach, state, window))
             if lost or reach == end:
                 return at
             self.watch.state[:] = before
@@ -130,18 +156,20 @@ class _Run:
         self.out[start:done], self.marks[start:done] = watched.vy, watched.marks
         return done, watched.lost
 
-    def _raw(self, start: int, end: int) -> FloatArray:
-        """The estimator's v after each row of a piece that it begins anew, (T,)."""
+    def _raw(self, start: int, end: int, state: Any, window: FloatArray) -> FloatArray:
+        """The estimator's v after each row of a piece, (T,), which goes on from a state or from the rows before it, or begins anew."""
         extra = self.estimator.horizon_steps  # rows after the last, whose values no estimate at their time depends on
-        rows = np.concatenate([self.cleaned.rows[start:end], np.repeat(self.cleaned.rows[end - 1 : end], extra, axis=0)])
-        channels = dict(zip(self.estimator.channels, rows.T, strict=True))
+        seen = np.concatenate([window, self.cleaned.rows[start:end]])
+        self._window = seen[max(len(seen) - self.estimator.warm_up_steps, 0) :]
+        channels = dict(zip(self.estimator.channels, np.concatenate([seen, np.repeat(seen[-1:], extra, axis=0)]).T, strict=True))
         r, rate = self.recording, self.estimator.settings.rate_hz
         piece = Recording(r.id, r.vehicle, rate, r.start_time, channels, r.kind, frozenset(self.estimator.skippable))
         try:
-            estimate = self.estimator.estimate([piece], self.initial_state if start == 0 else None)[0]
+            estimate = self._going_on(state).estimate([piece], None if self._begun or start else self.initial_state)[0]
         except FAILURES:
+            self._state = None
             return self._stepped(start, end) if self.estimator.causal else np.full(end - start, np.nan)
-        shift = slice(extra, extra + end - start)
+        shift = slice(len(window) + extra, len(window) + extra + end - start)
         if "vx" in estimate.channels:
             self.vx[start:end] = estimate["vx"][shift]
         if "vy" in estimate.covariance_of and estimate.covariance is not None:
@@ -171,21 +199,36 @@ class _Run:
             self.variance[k] = found.get("vy_variance", math.nan)
         return raw
 
-    def estimate(self, monitor: Monitor, verdict: Health) -> Estimate:
+    def _going_on(self, state: Any) -> Estimator:
+        """The estimator, which begins with a state unless it is None, and leaves the one after its last row."""
+        if not self._has_state:
+            return self.estimator
+        own = copy(self.estimator)
+
+        def run(samples: FloatArray, first: Any) -> tuple[dict[str, Any], Any]:
+            found, self._state = self.estimator.run(samples, first if state is None else state)
+            return found, self._state
+
+        vars(own)["run"] = run
+        return own
+
+    def _estimate(self, verdict: Health) -> Estimate:
         """The estimate on the recording's clock: that after row k holds ``horizon_steps`` samples later, its health at once."""
-        r, horizon = self.recording, self.estimator.horizon_steps
-        vx = np.where(np.isnan(self.motion[:, 0]), self.vx, self.motion[:, 0])
-        last = np.maximum.accumulate(np.where(np.isnan(vx), -1, np.arange(len(vx))))
-        vx = np.where(last < 0, np.nan, vx[last])
+        r, horizon, monitor = self.recording, self.estimator.horizon_steps, self.monitor
+        vx = np.concatenate([self._speed, np.where(np.isnan(self.motion[:, 0]), self.vx, self.motion[:, 0])])
+        vx = vx[np.maximum.accumulate(np.where(np.isnan(vx), 0, np.arange(len(vx))))][1:]
+        self._speed = vx[-1:]
         bands = monitor.after(verdict, Watched(self.out, self.marks, lost=False), self.cleaned, vx, self.variance)
 
-        def later(values: FloatArray) -> FloatArray:
-            return np.concatenate([np.full(horizon, np.nan), values])[: len(values)]
+        def later(name: str, values: FloatArray) -> FloatArray:
+            both = np.concatenate([self._late.get(name, np.full(horizon, np.nan)), values])
+            self._late[name] = both[len(values) :]
+            return both[: len(values)]
 
-        vy = later(self.out)
-        channels = {"vy": vy, "sideslip": np.arctan2(vy, vx), **{name: later(values) for name, values in self.others.items()}}
+        vy = later("vy", self.out)
+        channels = {"vy": vy, "sideslip": np.arctan2(vy, vx), **{name: later(name, values) for name, values in self.others.items()}}
         if monitor.has_bands:
-            channels |= {"band_vy": later(bands[:, 0]), "band_sideslip": later(bands[:, 1])}
+            channels |= {"band_vy": later("band_vy", bands[:, 0]), "band_sideslip": later("band_sideslip", bands[:, 1])}
         channels |= {"health": verdict.status, "health_reason": verdict.reason}
         mode: Mode = "causal" if self.estimator.causal else "offline"
         covariance = (self.covariance, self.covariance_of) if self.covariance is not None and horizon == 0 else (None, ())

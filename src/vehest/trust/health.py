@@ -397,17 +397,22 @@ def limits_from(maxima: FloatArray, statistics: Sequence[Statistic], step: float
     return tuple(found)
 
 
-def domain_verdict(model: HealthModel, samples: Mapping[str, FloatArray]) -> str:
-    """One line on the share of a drive, channel -> (T,), outside the training's range, and by which channels; empty if there is none."""
-    outside, named = np.zeros(len(next(iter(samples.values()))), bool), []
-    for name, largest in zip(model.channels, model.largest, strict=True):
-        values = np.nan_to_num(np.asarray(samples[name], dtype=np.float64), posinf=0.0, neginf=0.0)
-        own = np.abs(values) > BETWEEN_DRIVES * largest
-        if own.any():
-            named.append((int(own.sum()), f"|{name}| above {BETWEEN_DRIVES * largest:.3g} {CHANNELS[name].unit}"))
-        outside |= own
+def outside_domain(model: HealthModel, samples: Mapping[str, FloatArray]) -> NDArray[np.int64]:
+    """Samples of a drive, channel -> (T,), outside the training's range, (C + 2,): of each channel, of any, and number of all."""
+    sizes = [np.abs(np.nan_to_num(np.asarray(samples[name], dtype=np.float64), posinf=0.0, neginf=0.0)) for name in model.channels]
+    outside = [size > BETWEEN_DRIVES * largest for size, largest in zip(sizes, model.largest, strict=True)]
+    return np.array([*(own.sum() for own in outside), np.any(outside, axis=0).sum(), len(sizes[0])])
+
+
+def domain_verdict(model: HealthModel, counts: NDArray[np.int64]) -> str:
+    """One line on the share of a drive outside the training's range, and by which channels, of `outside_domain`; empty if there is none."""
+    *numbers, outside, samples = counts.tolist()
+    named = [
+        (own, f"|{name}| above {BETWEEN_DRIVES * largest:.3g} {CHANNELS[name].unit}")
+        for own, name, largest in zip(numbers, model.channels, model.largest, strict=True)
+        if own
+    ]
     if not named:
         return ""
     words = ", ".join(text for _, text in sorted(named, reverse=True)[:3])
-    share = 100.0 * float(outside.sum()) / len(outside)
-    return f"{share:.3g} % of the drive outside what the model learnt: {words}"
+    return f"{100.0 * outside / samples:.3g} % of the drive outside what the model learnt: {words}"
