@@ -39,7 +39,7 @@ class Kinds:
 
 
 def test_plain_values_become_dataclasses_that_may_take_further_keys():
-    given = {"names": ["a"], "inner": [{"gain": 1}, None], "pair": [0, "b"], "maps": {"c": {"d": {"gain": 0.5, "steps": 4.0}}}}
+    given = {"names": ["a"], "inner": [{"gain": 1}, None], "pair": [0, "b"], "maps": {"c": {"d": {"gain": 0.5, "steps": 4}}}}
     assert validated(Kinds, given, "'f'") == Kinds(("a",), (Inner(1.0), None), pair=(0.0, "b"), maps={"c": {"d": Inner(0.5, 4)}})
 
     @dataclass(frozen=True)

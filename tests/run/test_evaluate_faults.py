@@ -135,7 +135,7 @@ def test_an_evaluation_under_a_fault_is_skipped_another_seed_is_another_and_with
     manifest = json.loads((evaluated(trained)[0] / "manifest.json").read_text())
     assert set(manifest["config"]) == {"sets", "protocol", "kinds", "split"}
     assert manifest["code"] == code_of_evaluation("kinematic"), "and the code of faults does not count"
-    assert json.loads((first[0] / "manifest.json").read_text())["code"] == f"{manifest['code']} faults=1"
+    assert json.loads((first[0] / "manifest.json").read_text())["code"] == f"{manifest['code']} faults=2"
     assert set(manifest["outputs"]) == {"metrics.csv", "timings.csv", "blocks.csv", "validation/0.parquet", "test/0.parquet"}
 
 

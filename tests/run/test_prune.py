@@ -53,7 +53,7 @@ def test_what_todays_code_has_made_stays_and_models_of_estimators_that_are_not_i
     assert root.found() == {}
     inputs = {artefact.folder.name: artefact.digest for artefact in (root.model, root.trusted, root.scored)}
     root.add("report", "mine", {"module": "drive"}, inputs, report.code_of_report("drive"))
-    root.add("evaluate", "faulted", {"faults": []}, {}, f"{root.scored.code} faults=1")
+    root.add("evaluate", "faulted", {"faults": []}, {}, f"{root.scored.code} faults=2")
     root.add("train", "theirs", {"estimator": {"name": "somebody_elses"}}, {}, "train=1 somebody_elses=1 training=1")
     assert root.found() == {}
 

@@ -122,7 +122,7 @@ def test_splits_take_the_drives_by_their_names_and_the_limited_one_learns_below_
     assert {span.stop for span in full.tests["test"]} == {4.5}  # below 5 m/s after that
     assert {span.stop for span in limited.train + limited.validation} == {2.5}  # beyond 7 m/s² after that
     assert limited.tests == full.tests
-    assert limited.kept["train"].seconds == pytest.approx(161 * 2.5)
+    assert len(limited.train) == 161
 
 
 def test_the_cars_mass_inertia_and_axle_distances_are_the_papers():
