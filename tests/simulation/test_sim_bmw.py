@@ -5,7 +5,6 @@ from functools import cache, partial
 from pathlib import Path
 
 import numpy as np
-import pytest
 import yaml
 
 from vehest.data.recording import Recording
