@@ -11,6 +11,7 @@ import math
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -23,7 +24,7 @@ from vehest.evaluation.metrics import Scored
 from vehest.evaluation.ranking import BASELINES
 from vehest.report import figures
 from vehest.report.document import PATENT_NOTE, REPORT, Block, Column, Document, Figure, Table, as_code
-from vehest.report.style import REFERENCE, fixed, line_of
+from vehest.report.style import DOUBLE_COLUMN, REFERENCE, Line, MatplotlibFigure, fixed, line_of, new_figure
 from vehest.studies.artefacts import EvaluatedModel, PartArtefacts, StudyArtefacts
 from vehest_papers.kit.methods import bullets, scoring
 from vehest_papers.kit.reading import metric_values
@@ -38,6 +39,7 @@ ADDED = ("level",)  # parts that were added after the real recording had been lo
 
 SHIPPED = "third"  # the choice whose model comes with vehest
 
+LOGARITHMIC_FROM = 20.0
 WANTED_FVU = 0.10
 GOAL_FVU = 0.06
 
@@ -59,6 +61,16 @@ REASONS = {
     "that mislead",
 }
 """Why each part of the pipeline is there; all but the added ones were laid down before any of them was tested."""
+
+
+@dataclass(frozen=True, eq=False)
+class Spread:
+    """One row of a dot plot."""
+
+    label: str  # what the row shows
+    line: Line
+    values: FloatArray  # one value a seed, shape (S,); those that are not finite are left out
+    chosen: float  # value of the chosen seed
 
 
 @dataclass(frozen=True)
@@ -339,12 +351,12 @@ def _spread(steps: Sequence[Step], choices: Mapping[str, Choice]) -> Figure:
         line = line_of(step.models[0].estimator, step.models[0].variant)
         short = f"{step.part}, {step.models[0].title.removeprefix('KS-NN ').replace(' no bias', '')}"
         label = f"{short} ({', '.join(words)})" if words else short
-        rows.append(figures.Spread(label, line, step.test["fvu"], float(step.test["fvu"][seed])))
+        rows.append(Spread(label, line, step.test["fvu"], float(step.test["fvu"][seed])))
     return Figure(
         "spread",
         "Fraction of the variance of v left unexplained on the real Ferrari, of every seed; first, second and third choice in brackets. "
         "Diamonds: the seed with the lowest error on the simulated cars that choose; ticks: medians.",
-        figures.spread_figure(rows, "FVU on the real car"),
+        spread_figure(rows, "FVU on the real car"),
     )
 
 
@@ -398,3 +410,47 @@ def _busiest(scored: Scored, samples: float) -> slice:
     n = min(round(samples), len(scored.time))
     first = int(np.convolve(np.square(scored.sideslip_ref), np.ones(n), mode="valid").argmax())
     return slice(first, first + n)
+
+
+def spread_figure(rows: Sequence[Spread], quantity: str) -> MatplotlibFigure:
+    """Dots of all seeds, one row an estimator; the chosen seed as a diamond, the median as a tick."""
+    with new_figure(DOUBLE_COLUMN * 0.86, 0.7 + 0.27 * max(len(rows), 2)) as figure:
+        axes = figure.add_subplot()
+        for position, row in enumerate(rows):
+            values = row.values[np.isfinite(row.values)]
+            others = np.delete(values, np.flatnonzero(values == row.chosen)[:1])
+            offsets = 0.2 * np.resize([1.0, -1.0, 0.5, -0.5, 0.0], len(others))
+            axes.scatter(others, position + offsets, s=11, color=row.line.colour, alpha=0.65, linewidths=0, zorder=3)
+            if len(values) > 1:
+                axes.plot([values.min(), values.max()], [position] * 2, color=row.line.colour, linewidth=0.8, alpha=0.5, zorder=2)
+                axes.plot([np.median(values)] * 2, [position - 0.36, position + 0.36], color=row.line.colour, linewidth=1.6, zorder=2)
+            axes.scatter(row.chosen, position, s=30, marker="D", color=row.line.colour, edgecolors="black", linewidths=0.8, zorder=4)
+        axes.set_yticks(range(len(rows)), [row.label for row in rows])
+        axes.set_ylim(len(rows) - 0.4, -0.6)
+        axes.grid(axis="x")
+        axes.grid(visible=False, axis="y")
+        axes.tick_params(axis="y", length=0)
+        axes.set_xlabel(quantity)
+        _scale_of_spread(axes, np.concatenate([row.values for row in rows]))
+        _key_of_spread(axes)
+    return figure
+
+
+def _scale_of_spread(axes: Any, values: FloatArray) -> None:
+    finite = values[np.isfinite(values)]
+    if len(finite) and finite.min() > 0 and finite.max() / finite.min() > LOGARITHMIC_FROM:
+        axes.set_xscale("log")
+    elif len(finite):
+        axes.set_xlim(0.0, 1.04 * float(finite.max()) or 1.0)
+
+
+def _key_of_spread(axes: Any) -> None:
+    from matplotlib.lines import Line2D
+
+    grey = "#666666"
+    handles = [
+        Line2D([], [], linestyle="none", marker="o", color=grey, markersize=3.5, label="a seed"),
+        Line2D([], [], linestyle="none", marker="|", color=grey, markersize=9, markeredgewidth=1.6, label="median"),
+        Line2D([], [], linestyle="none", marker="D", color=grey, markeredgecolor="black", markersize=5, label="seed chosen on validation"),
+    ]
+    axes.legend(handles=handles, loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=3, borderaxespad=0.2)

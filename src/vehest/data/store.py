@@ -184,10 +184,8 @@ def _write(path: Path, parts: Iterable[Mapping[str, FloatArray]], content: str, 
 
 
 def _table(columns: Mapping[str, FloatArray]) -> pa.Table:
-    buffers = {name: pa.py_buffer(np.ascontiguousarray(values, dtype=np.float64)) for name, values in columns.items()}
-    return pa.table(
-        {name: pa.Array.from_buffers(pa.float64(), own.size // 8, [None, own]) for name, own in buffers.items()}
-    )  # without pandas
+    buffers = {name: pa.py_buffer(np.ascontiguousarray(values, dtype=np.float64)) for name, values in columns.items()}  # without pandas
+    return pa.table({name: pa.Array.from_buffers(pa.float64(), own.size // 8, [None, own]) for name, own in buffers.items()})
 
 
 def _read(path: Path, kind: type[_Description], names: list[str] | None = None) -> tuple[dict[str, FloatArray], _Description]:

@@ -17,17 +17,6 @@ if TYPE_CHECKING:
 
 STATIC_POINTS = 500
 LEAST_SAMPLES = 20
-LOGARITHMIC_FROM = 20.0
-
-
-@dataclass(frozen=True, eq=False)
-class Spread:
-    """One row of a dot plot."""
-
-    label: str  # what the row shows
-    line: Line
-    values: FloatArray  # one value a seed, shape (S,); those that are not finite are left out
-    chosen: float  # value of the chosen seed
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,30 +59,6 @@ class Learning:
         if history is None or history.empty or not {"epoch", "train_loss", "validation_loss"} <= set(history.columns):
             return None
         return cls(label, line, *(history[name].to_numpy(np.float64) for name in ("epoch", "train_loss", "validation_loss")))
-
-
-def spread_figure(rows: Sequence[Spread], quantity: str) -> MatplotlibFigure:
-    """Dots of all seeds, one row an estimator; the chosen seed as a diamond, the median as a tick."""
-    with new_figure(DOUBLE_COLUMN * 0.86, 0.7 + 0.27 * max(len(rows), 2)) as figure:
-        axes = figure.add_subplot()
-        for position, row in enumerate(rows):
-            values = row.values[np.isfinite(row.values)]
-            others = np.delete(values, np.flatnonzero(values == row.chosen)[:1])
-            offsets = 0.2 * np.resize([1.0, -1.0, 0.5, -0.5, 0.0], len(others))
-            axes.scatter(others, position + offsets, s=11, color=row.line.colour, alpha=0.65, linewidths=0, zorder=3)
-            if len(values) > 1:
-                axes.plot([values.min(), values.max()], [position] * 2, color=row.line.colour, linewidth=0.8, alpha=0.5, zorder=2)
-                axes.plot([np.median(values)] * 2, [position - 0.36, position + 0.36], color=row.line.colour, linewidth=1.6, zorder=2)
-            axes.scatter(row.chosen, position, s=30, marker="D", color=row.line.colour, edgecolors="black", linewidths=0.8, zorder=4)
-        axes.set_yticks(range(len(rows)), [row.label for row in rows])
-        axes.set_ylim(len(rows) - 0.4, -0.6)
-        axes.grid(axis="x")
-        axes.grid(visible=False, axis="y")
-        axes.tick_params(axis="y", length=0)
-        axes.set_xlabel(quantity)
-        _scale_of_spread(axes, np.concatenate([row.values for row in rows]))
-        _key_of_spread(axes)
-    return figure
 
 
 def traces_figure(time: FloatArray, reference: Traces, estimates: Sequence[Traces], time_label: str) -> MatplotlibFigure:
@@ -231,26 +196,6 @@ def decimated(time: FloatArray, values: FloatArray, n_points: int) -> tuple[Floa
             kept += [int(stretch[np.nanargmin(part)]), int(stretch[np.nanargmax(part)])]
     order = np.unique([0, *kept, len(values) - 1])
     return time[order], values[order]
-
-
-def _scale_of_spread(axes: Any, values: FloatArray) -> None:
-    finite = values[np.isfinite(values)]
-    if len(finite) and finite.min() > 0 and finite.max() / finite.min() > LOGARITHMIC_FROM:
-        axes.set_xscale("log")
-    elif len(finite):
-        axes.set_xlim(0.0, 1.04 * float(finite.max()) or 1.0)
-
-
-def _key_of_spread(axes: Any) -> None:
-    from matplotlib.lines import Line2D
-
-    grey = "#666666"
-    handles = [
-        Line2D([], [], linestyle="none", marker="o", color=grey, markersize=3.5, label="a seed"),
-        Line2D([], [], linestyle="none", marker="|", color=grey, markersize=9, markeredgewidth=1.6, label="median"),
-        Line2D([], [], linestyle="none", marker="D", color=grey, markeredgecolor="black", markersize=5, label="seed chosen on validation"),
-    ]
-    axes.legend(handles=handles, loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=3, borderaxespad=0.2)
 
 
 def _legend_above(figure: Any, axes: Any) -> None:
