@@ -84,7 +84,7 @@ def _rows(pieces: Sequence[FloatArray], order: int) -> tuple[FloatArray, FloatAr
     windows += [sliding_window_view(piece, order + 1, axis=0).transpose(0, 2, 1)[:, ::-1] for piece in pieces if len(piece) > order]
     rows = np.concatenate(windows)
     rows = rows[np.isfinite(rows).all((1, 2))]
-    return rows[:, 1:].reshape(len(rows), -1), np.ascontiguousarray(rows[:, 0])
+    return rows[:, 1:].reshape(len(rows), order * rows.shape[2]), rows[:, 0]
 
 
 def _least_squares(regressors: FloatArray, targets: FloatArray, columns: int) -> FloatArray:
