@@ -269,7 +269,7 @@ def terms_of(rows: FloatArray, vy: FloatArray, variance: FloatArray, columns: ND
 
 def _with_factors(own: Quantity, scores: FloatArray, blocks: NDArray[np.int64]) -> Quantity:
     factors, beyond = zip(*(pooled_quantile(scores, blocks, level) for level in LEVELS), strict=True)
-    squared = np.bincount(np.unique(blocks, return_inverse=True)[1], weights=np.square(scores))
+    squared = np.asarray(np.bincount(np.unique(blocks, return_inverse=True)[1], weights=np.square(scores)), dtype=np.float64)
     return replace(own, factors=factors, beyond=beyond, effective_blocks=effective_blocks(squared))
 
 
