@@ -69,7 +69,7 @@ def faults_row() -> dict[str, Any]:
     import vehest
     from single_track_drive import linear_drive
     from vehest.run.estimate import prepared_recording
-    from vehest.trust.contract import estimate_guarded
+    from vehest.trust.contract import GuardedRun
     from vehest.trust.faults import KINDS, Fault, inject
 
     model = vehest.load_model()
@@ -81,7 +81,7 @@ def faults_row() -> dict[str, Any]:
         for onset in range(30, 80, 5)
     ]
     alone = least(lambda: [model.estimate([drive]) for _ in faults])
-    whole = least(lambda: [estimate_guarded(model, inject(drive.channels, drive.rate_hz, fault), drive, trust) for fault in faults])
+    whole = least(lambda: [GuardedRun(model, trust)(inject(drive.channels, drive.rate_hz, fault), drive) for fault in faults])
     return compared(f"ksnn: {len(faults)} faults in 150 s", alone, whole)
 
 
@@ -90,7 +90,7 @@ def main() -> None:
     import vehest
     from single_track_drive import linear_drive
     from vehest.run.artefacts import library_versions
-    from vehest.trust.contract import GuardedStepper, estimate_guarded
+    from vehest.trust.contract import GuardedRun, GuardedStepper
 
     torch.set_num_threads(1)
     drives = [linear_drive(60.0, 100.0, seed)[0] for seed in range(3)]
@@ -127,7 +127,7 @@ def main() -> None:
         )
         alone, whole = (
             least(lambda: model.estimate([measured])),  # noqa: B023
-            least(lambda: estimate_guarded(model, columns, measured, trust)),  # noqa: B023
+            least(lambda: GuardedRun(model, trust)(columns, measured)),  # noqa: B023
         )
         rows.append(compared(f"{name}: a minute in batch", alone, whole))
     machine = f"{platform.machine()}, {platform.system()} {platform.release()}"

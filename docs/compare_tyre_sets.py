@@ -8,11 +8,12 @@ paper's other recordings, which are for tests, nothing is read.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator, Sequence
 from fnmatch import fnmatchcase
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
 import yaml
 from scipy import signal
 
@@ -24,47 +25,54 @@ REAL = ("f1tenth", "iros_hoons_1_with_friction_run_*")
 SIMULATED = (("sim_tyre_sets", "learn_a_*"), ("sim_tyre_sets", "test_a_*"), ("sim_tyre_sets", "test_d_*"))
 SLOWEST = 0.5  # [m/s]; the real recordings are cut where the car is slower
 CAR = yaml.safe_load((Path(__file__).parents[1] / "conf" / "vehicle" / "f1tenth.yaml").read_text(encoding="utf-8"))["parameters"]
+REAR = CAR["cg_to_rear_axle"]
+QUANTILES = (0.01, 0.25, 0.5, 0.75, 0.95, 0.99)
+DIGITS = (2, 2, 2, 1, 1, 1, 2, 0, 2, 1, 1, 2)
 
 
-def _slip(drive: Recording) -> np.ndarray:
-    return np.asarray((drive["vx"] - drive["vx_ref"]) / drive["vx_ref"])
+def drives_of(dataset: str, pattern: str) -> list[Recording]:
+    """Recordings of a data set whose names are like a pattern."""
+    source = open_source(compose_config("ingest", [f"dataset={dataset}"])["dataset"])
+    return [source.read(name) for name in source.ids() if fnmatchcase(name, pattern)]
 
 
-def _rear(drive: Recording) -> np.ndarray:
-    return np.degrees(np.abs(np.arctan2(drive["vy_ref"] - CAR["cg_to_rear_axle"] * drive["yaw_rate_ref"], drive["vx_ref"])))
+def quantities(drive: Recording) -> pd.DataFrame:
+    """A column a quantity, of `DIGITS`; what inertial channels show beside the reference's derivatives counts either sign."""
+    vx, vy, turn, rate = drive["vx_ref"], drive["vy_ref"], drive["yaw_rate_ref"], drive.rate_hz
+    ax, ay = np.gradient(vx) * rate - vy * turn, np.gradient(vy) * rate + vx * turn
+    return pd.DataFrame(
+        {
+            "v_x [m/s]": vx,
+            "abs v_y [m/s]": np.abs(vy),
+            "abs yaw rate [rad/s]": np.abs(turn),
+            "abs ay, reference [m/s²]": np.abs(derivative(vy, rate) + vx * turn),
+            "abs β [°]": np.degrees(np.abs(np.arctan2(vy, vx))),
+            "abs slip angle, rear [°]": np.degrees(np.abs(np.arctan2(vy - REAR * turn, vx))),
+            "slip ratio of the motor": (drive["vx"] - vx) / vx,
+            "motor current [A]": drive["motor_current"],
+            "abs steer [rad]": np.abs(drive["steer"]),
+            "abs ax less its truth [m/s²]": np.abs(drive["ax"] - ax),
+            "abs ay less its truth [m/s²]": np.abs(drive["ay"] - ay),
+            "abs yaw rate less its truth [rad/s]": np.abs(drive["yaw_rate"] - turn),
+        }
+    )
 
 
-def _lacks(channel: str) -> Callable[[Recording], np.ndarray]:
-    """What an inertial channel shows beside the reference's derivatives, either sign."""
-
-    def lack(drive: Recording) -> np.ndarray:
-        rate, turn, vx, vy = drive.rate_hz, drive["yaw_rate_ref"], drive["vx_ref"], drive["vy_ref"]
-        true = {"ax": np.gradient(vx) * rate - vy * turn, "ay": np.gradient(vy) * rate + vx * turn, "yaw_rate": turn}
-        return np.abs(drive[channel] - true[channel])
-
-    return lack
-
-
-def _derivative(samples: np.ndarray, rate_hz: float) -> np.ndarray:
+def derivative(samples: np.ndarray, rate_hz: float) -> np.ndarray:
+    """By a Savitzky-Golay filter."""
     return np.asarray(signal.savgol_filter(samples, 15, 2, deriv=1, delta=1.0 / rate_hz))
 
 
-def _ay(drive: Recording) -> np.ndarray:
-    return np.asarray(_derivative(drive["vy_ref"], drive.rate_hz) + drive["vx_ref"] * drive["yaw_rate_ref"])
-
-
-def identified() -> Iterator[str]:
+def identified(drives: Sequence[Recording]) -> Iterator[str]:
     """Lines: motor, steering and vibration of the real car, with mass, wheel radius and wheelbase as given."""
-    mass, radius, wheelbase = CAR["mass"], CAR["wheel_radius"], CAR["cg_to_front_axle"] + CAR["cg_to_rear_axle"]
-    drives = _drives(*REAL)
+    mass, radius, wheelbase = CAR["mass"], CAR["wheel_radius"], CAR["cg_to_front_axle"] + REAR
     columns = []
     for drive in drives:
         vx, vy, turn, rate = drive["vx_ref"], drive["vy_ref"], drive["yaw_rate_ref"], drive.rate_hz
-        ax = _derivative(vx, rate) - vy * turn
-        scrub = -_ay(drive) * np.tan(drive["steer"]) * CAR["cg_to_rear_axle"] / wheelbase
-        rows = np.stack([ax - scrub, drive["motor_current"], -_derivative(drive["vx"], rate), -np.ones_like(ax)])
-        second = np.ones(100) / 100.0
-        columns.append(np.stack([np.convolve(row, second, "valid") for row in rows]))
+        scrub = -(derivative(vy, rate) + vx * turn) * np.tan(drive["steer"]) * REAR / wheelbase
+        left = derivative(vx, rate) - vy * turn - scrub
+        rows = (left, drive["motor_current"], -derivative(drive["vx"], rate), -np.ones_like(vx))
+        columns.append(np.stack([np.convolve(row, np.ones(100) / 100.0, "valid") for row in rows]))
     left, *right = np.concatenate(columns, axis=1)
     per_ampere, inertia, friction = np.linalg.lstsq(np.stack(right, axis=1), left, rcond=None)[0]
     yield f"torque_constant {per_ampere * mass * radius:.4f} N m/A, or {per_ampere:.3f} m/s² per ampere"
@@ -73,55 +81,27 @@ def identified() -> Iterator[str]:
     steer_rate = np.concatenate([np.abs(np.gradient(drive["steer"])) * drive.rate_hz for drive in drives])
     largest = max(drive["steer"].max() for drive in drives)
     yield f"steering_rate: 99 % below {np.quantile(steer_rate, 0.99):.2f} rad/s; largest_steer {largest:.3f} rad"
-    speed = np.concatenate([drive["motor_speed"] for drive in drives])
-    for channel in ("yaw_rate", "ax", "ay"):
-        squares = np.concatenate([_lacks(channel)(drive) for drive in drives]) ** 2
-        spread = {low: np.sqrt(squares[(speed >= low) & (speed < low + 10)].mean()) for low in range(10, 80, 10)}
-        yield f"{channel} less its truth, by wheel speed from [rad/s]: " + ", ".join(f"{low}: {value:.2f}" for low, value in spread.items())
+    shown, speed = pd.concat(map(quantities, drives)), np.concatenate([drive["motor_speed"] for drive in drives])
+    spread = (shown.filter(like="less its truth") ** 2).groupby(speed // 10 * 10).mean() ** 0.5
+    yield f"RMS by wheel speed from [rad/s]:\n{spread.loc[10:70].round(2).to_string()}"
     for channel in ("yaw_rate_ref", "vx_ref", "vy_ref", "vx", "motor_current"):
         jumps = np.concatenate([np.diff(drive[channel], 2) for drive in drives])
         yield f"{channel}: second differences of {jumps.std() / np.sqrt(6.0):.4f} as white noise a sample"
 
 
-QUANTITIES: dict[str, tuple[Callable[[Recording], np.ndarray], str]] = {
-    "v_x [m/s]": (lambda drive: drive["vx_ref"], ".2f"),
-    "abs v_y [m/s]": (lambda drive: np.abs(drive["vy_ref"]), ".2f"),
-    "abs yaw rate [rad/s]": (lambda drive: np.abs(drive["yaw_rate_ref"]), ".2f"),
-    "abs ay, reference [m/s²]": (lambda drive: np.abs(_ay(drive)), ".1f"),
-    "abs β [°]": (lambda drive: np.degrees(np.abs(np.arctan2(drive["vy_ref"], drive["vx_ref"]))), ".1f"),
-    "abs slip angle, rear [°]": (_rear, ".1f"),
-    "slip ratio of the motor": (_slip, ".2f"),
-    "motor current [A]": (lambda drive: drive["motor_current"], ".0f"),
-    "abs steer [rad]": (lambda drive: np.abs(drive["steer"]), ".2f"),
-    "abs ax less its truth [m/s²]": (_lacks("ax"), ".1f"),
-    "abs ay less its truth [m/s²]": (_lacks("ay"), ".1f"),
-    "abs yaw rate less its truth [rad/s]": (_lacks("yaw_rate"), ".2f"),
-}
-QUANTILES = (0.01, 0.25, 0.5, 0.75, 0.95, 0.99)
-
-
-def _drives(dataset: str, pattern: str) -> list[Recording]:
-    source = open_source(compose_config("ingest", [f"dataset={dataset}"])["dataset"])
-    return [source.read(name) for name in source.ids() if fnmatchcase(name, pattern)]
-
-
-def table() -> Iterator[str]:
+def table(sets: dict[str, list[Recording]]) -> Iterator[str]:
     """Lines of the table: a row a quantity, a column a set, in a cell the quantiles."""
-    sets = {"real": _drives(*REAL)} | {f"`{pattern}`": _drives(name, pattern) for name, pattern in SIMULATED}
-    shares = ", ".join(f"{100 * quantile:g} %" for quantile in QUANTILES)
-    yield f"| {shares} of | " + " | ".join(sets) + " |"
+    frames = [pd.concat(map(quantities, drives)) for drives in sets.values()]
+    yield f"| {', '.join(f'{100 * quantile:g} %' for quantile in QUANTILES)} of | {' | '.join(sets)} |"
     yield "| :-- |" + " :-- |" * len(sets)
-    for name, (quantity, style) in QUANTITIES.items():
-        cells = []
-        for drives in sets.values():
-            values = np.concatenate([quantity(drive)[drive["vx_ref"] > SLOWEST] for drive in drives])
-            cells.append(", ".join(f"{value:{style}}" for value in np.quantile(values, QUANTILES)))
-        yield f"| {name} | " + " | ".join(cells) + " |"
-    minutes = [f"{sum(map(len, drives)) / 6000.0:.1f}" for drives in sets.values()]
-    slow = [f"{100.0 * np.concatenate([drive['vx_ref'] <= SLOWEST for drive in drives]).mean():.1f}" for drives in sets.values()]
-    yield "| minutes | " + " | ".join(minutes) + " |"
-    yield f"| % of samples at {SLOWEST} m/s or less, left out above | " + " | ".join(slow) + " |"
+    for name, digits in zip(frames[0], DIGITS, strict=True):
+        cells = [frame.loc[frame["v_x [m/s]"] > SLOWEST, name].quantile(QUANTILES) for frame in frames]
+        yield f"| {name} | " + " | ".join(", ".join(f"{value:.{digits}f}" for value in cell) for cell in cells) + " |"
+    yield "| minutes | " + " | ".join(f"{len(frame) / 6000.0:.1f}" for frame in frames) + " |"
+    slow = [100.0 * (frame["v_x [m/s]"] <= SLOWEST).mean() for frame in frames]
+    yield f"| % of samples at {SLOWEST} m/s or less, left out above | " + " | ".join(f"{share:.1f}" for share in slow) + " |"
 
 
 if __name__ == "__main__":
-    print("\n".join([*identified(), "", *table()]))
+    real = drives_of(*REAL)
+    print("\n".join([*identified(real), "", *table({"real": real, **{f"`{name}`": drives_of(of, name) for of, name in SIMULATED}})]))

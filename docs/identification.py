@@ -1,19 +1,24 @@
-"""What docs/identify_*.py share: the folder of the recordings, least squares, delays, a low-pass, the scatter of poses."""
+"""What docs/identify_*.py share: the folder of the recordings, least squares, delays, a low-pass, the scatter of poses, printing.
+
+A drive is a table with a row a sample of an even clock; its column ``kept`` says which rows count.
+"""
 
 from __future__ import annotations
 
 import os
 import sys
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pandas as pd
 from numpy.typing import NDArray
 from scipy import signal
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
+Figures = dict[str, float]  # by name; those that end in ``_sd`` are standard deviations
 
 BLOCK = 50  # samples that are resampled together
 
@@ -26,32 +31,53 @@ def data_folder() -> Path:
     return Path(root)
 
 
-def regression(columns: list[Array], measured: Array, chosen: Any = slice(None)) -> tuple[list[float], float]:
-    """Factors of least squares, and the standard deviation of the residual."""
-    rows, values = np.stack(columns, axis=1)[chosen], measured[chosen]
-    factors = np.linalg.lstsq(rows, values, rcond=None)[0]
-    return factors.tolist(), float((values - rows @ factors).std())
+def show(title: str, figures: Mapping[str, float]) -> None:
+    """Print figures, each with its standard deviation where it has one."""
+    print(f"\n## {title}")
+    for name, value in figures.items():
+        if not name.endswith("_sd"):
+            print(f"{name:56} {value:.10g}" + (f" ± {figures[f'{name}_sd']:.2g}" if f"{name}_sd" in figures else ""))
 
 
-def block_regression(columns: list[Array], measured: Array, chosen: Any = slice(None)) -> tuple[list[float], list[float]]:
-    """Factors of least squares, and their standard deviations over 200 resamples of the drive in blocks."""
-    rows, values = np.stack(columns, axis=1)[chosen], measured[chosen]
+def factors_of(columns: Mapping[str, Array], measured: Array, chosen: Any = slice(None)) -> Figures:
+    """Factors of least squares by the columns' names, and their standard deviations over 200 resamples of the drive in blocks."""
+    rows, values = np.stack(list(columns.values()), axis=1)[chosen], measured[chosen]
     blocks = len(rows) // BLOCK
     generator = np.random.default_rng(0)
     drawn = []
     for _ in range(200):
         picked = (generator.integers(0, blocks, blocks)[:, None] * BLOCK + np.arange(BLOCK)).ravel()
         drawn.append(np.linalg.lstsq(rows[picked], values[picked], rcond=None)[0])
-    return np.linalg.lstsq(rows, values, rcond=None)[0].tolist(), np.std(drawn, axis=0).tolist()
+    found = dict(zip(columns, np.linalg.lstsq(rows, values, rcond=None)[0].tolist(), strict=True))
+    return found | {f"{name}_sd": sd for name, sd in zip(columns, np.std(drawn, axis=0).tolist(), strict=True)}
 
 
-def best_delay(delays: Iterable[float], columns_of: Callable[[float], list[Array]], measured: Array) -> tuple[float, float, list[Array]]:
-    """Residual, delay [s] and columns of the delay whose columns explain a signal best."""
-    scored = []
-    for delay in delays:
-        columns = columns_of(delay)
-        scored.append((regression(columns, measured)[1], float(delay), columns))
-    return min(scored, key=lambda one: one[0])
+def rest_of(columns: Sequence[Array], measured: Array) -> Array:
+    """What least squares leaves of a signal."""
+    rows = np.stack(columns, axis=1)
+    return np.asarray(measured - rows @ np.linalg.lstsq(rows, measured, rcond=None)[0])
+
+
+def best_delay(delays: Iterable[float], columns_of: Callable[[float], Sequence[Array]], measured: Array) -> tuple[float, float]:
+    """Standard deviation of the residual, and the delay [s] whose columns explain a signal best."""
+    return min((float(rest_of(columns_of(delay), measured).std()), float(delay)) for delay in delays)
+
+
+def joined(drives: Sequence[pd.DataFrame], name: str, rate: float, delay: float = 0.0) -> Array:
+    """A signal of all drives as it was some time earlier, rows that count."""
+    return np.concatenate([late(own[name].to_numpy(np.float64), delay, rate)[own["kept"].to_numpy()] for own in drives])
+
+
+def explained(
+    drives: Sequence[pd.DataFrame], rate: float, name: str, by: Sequence[str], delays: Iterable[float], chosen: Any = slice(None)
+) -> Figures:
+    """A sensor's signal by others that are some time older: factors, delay, residual, and correlation with the first of them."""
+    measured = joined(drives, name, rate)[chosen]
+    rest, delay = best_delay(delays, lambda one: [joined(drives, other, rate, one)[chosen] for other in by], measured)
+    columns = {f"{name} by {other}": joined(drives, other, rate, delay)[chosen] for other in by}
+    correlation = float(np.corrcoef(columns[f"{name} by {by[0]}"], measured)[0, 1])
+    about = {"late [ms]": 1e3 * delay, "rest": rest, "varies by": float(measured.std()), "correlation": correlation, "rows": len(measured)}
+    return factors_of(columns, measured) | {f"{name} {what}": value for what, value in about.items()}
 
 
 def smooth(samples: Array, cutoff: float, rate: float) -> Array:
@@ -70,9 +96,12 @@ def accelerations(vx: Array, vy: Array, yaw_rate: Array, rate: float) -> tuple[A
     return np.gradient(vy) * rate + vx * yaw_rate, np.gradient(vx) * rate - vy * yaw_rate
 
 
-def squared_scatter(times: Array, place: Array, middle: int) -> Array:
-    """Variance, along each axis, of nine poses about the cubic through them."""
-    near = slice(middle - 4, middle + 5)
-    basis = np.vander((times[near] - times[middle]) / 0.04, 4)
-    rest = place[near] - basis @ np.linalg.lstsq(basis, place[near], rcond=None)[0]
-    return np.asarray(np.square(rest).sum(axis=0) / (9 - 4))
+def scatter(times: Array, place: Array, middles: Iterable[int]) -> Array:
+    """Distance by which nine poses about each of some rows scatter about the cubic through them."""
+    found = []
+    for middle in middles:
+        near = slice(middle - 4, middle + 5)
+        basis = np.vander((times[near] - times[middle]) / 0.04, 4)
+        rest = place[near] - basis @ np.linalg.lstsq(basis, place[near], rcond=None)[0]
+        found.append(np.sqrt(np.square(rest).sum() / (9 - 4)))
+    return np.array(found)

@@ -9,21 +9,16 @@ deviations over 200 resamples of the drive in blocks of half a second.
 
 from __future__ import annotations
 
-import sys
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass, replace
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pandas as pd
 import yaml
-from identification import Array, accelerations, block_regression, data_folder, smooth, squared_scatter
-from numpy.typing import NDArray
+from identification import Array, Figures, Mask, accelerations, data_folder, factors_of, scatter, show, smooth
 from scipy import signal
 
-from vehest.data.errors import VehestError
-from vehest.data.recording import Recording
 from vehest.sources.base import open_source
 from vehest.sources.clocks import uniform_times
 from vehest.sources.limited import Reading
@@ -34,6 +29,18 @@ from vehest.sources.rosbag.topics import read_bag
 ROOT = Path(__file__).resolve().parents[1]
 BAG = "iros_hoons_12_final"
 CSV_FILES = ("iros_hoons_1_with_friction", "hoons_all_test", "xray_duck_all_test")
+FIELDS = {
+    "imu": ("linear_acceleration.x", "linear_acceleration.y", "linear_acceleration.z", "angular_velocity.z"),
+    "vesc": ("state.speed", "state.avg_iq"),
+    "servo": ("data",),
+    "body": tuple(f"pose.{part}" for part in POSE_FIELDS),
+}
+IMU, MOTOR, BODY, SERVO = "/imu", "/vesc/core", "/optitrack/rigid_body_0", "/vesc/servo_position_command"
+RATES = {IMU: 400.0, MOTOR: 100.0, BODY: 100.0}
+# columns of a drive: velocities from motion capture [m/s, rad/s]; IMU [m/s², rad/s]; motor's speed [electrical rpm, in the CSV files m/s]
+# and current [A]; servo's value, in the CSV files steering angle [rad]
+COLUMNS = ("vx", "vy", "yaw_rate", "ax", "ay", "gyro", "motor", "current", "steer")
+IN_CSV = ("v_x", "v_y", "r", "ax_imu", "ay_imu", "r_imu", "omega_wheels", "Iq", "delta")
 START = 1.0  # s, as declared
 RATE = 100.0
 WHEELBASE = 0.33  # m, the publishers'
@@ -42,75 +49,33 @@ GENTLE = 4.0  # m/s² of lateral acceleration, up to which a tyre's slip is take
 CUTOFF = 8.0  # Hz
 
 
-@dataclass(frozen=True)
-class Drive:
-    """One drive on a clock of 100 Hz; accelerations and currents as their files count them, angles in rad.
-
-    Args:
-        vx, vy, yaw_rate: from motion capture [m/s, rad/s].
-        ax, ay, gyro: from the IMU [m/s², rad/s].
-        motor, current: of the motor's controller [electrical rpm, or m/s in the CSV files; A].
-        steer: servo value, or steering angle in the CSV files.
-    """
-
-    name: str
-    vx: Array
-    vy: Array
-    yaw_rate: Array
-    ax: Array
-    ay: Array
-    gyro: Array
-    motor: Array
-    current: Array
-    steer: Array
+def identify(folder: Path) -> Figures:
+    """Every constant by name; names that end in ``_sd`` are uncertainties."""
+    return {name: value for part in parts_of(folder).values() for name, value in part.items()}
 
 
-def main() -> None:
-    """Print every figure."""
-    folder = data_folder() / "f1tenth"
-    try:
-        identify(folder, print)
-    except VehestError as error:
-        sys.exit(str(error))
-
-
-def identify(folder: Path, say: Callable[[str], None] = lambda line: None) -> dict[str, float]:
-    """Identify every constant.
-
-    Args:
-        folder: with the bag and the CSV files.
-        say: is given each line.
-
-    Returns:
-        the constants by name; names that end in ``_sd`` are their uncertainties.
-    """
+def parts_of(folder: Path) -> dict[str, Figures]:
+    """The same by title, of the bag and the CSV files in a folder."""
     declared = yaml.safe_load((ROOT / "conf" / "dataset" / "f1tenth_bag.yaml").read_text(encoding="utf-8"))
-    bag = _read(folder, declared)
-    runs = list(_csv_runs(folder))
-    say(f"# {BAG}.zip (real data), bag's clock from its first message; CSV files: {len(runs)} runs (real data)")
-    found = _clocks(bag, say)
+    wanted = [(declared["topics"][name]["topic"], declared["topics"][name]["type"], paths) for name, paths in FIELDS.items()]
+    bag = read_bag(folder / f"{BAG}.zip", "read_topics", topics=wanted, layouts=declared["messages"])
+    tables = {stem: pd.read_csv(folder / f"{stem}.csv") for stem in CSV_FILES}
+    parts = {f"{stem} {number}": part for stem, table in tables.items() for number, part in table.groupby("run_id", sort=False)}
+    new_names = dict(zip(IN_CSV, COLUMNS, strict=True))
+    runs = {name: part.rename(columns=new_names)[[*COLUMNS]].reset_index(drop=True).astype(float) for name, part in parts.items()}
     drive = _drive(bag)
-    found |= _rigid_body(drive, say)
-    turned = _turned(drive, found["body_yaw"])
-    found |= _imu(drive, turned, bag, say)
-    found |= _steering(turned, runs, say)
-    found |= _motor(turned, runs, say)
-    found |= _publishers_filter(runs, say)
-    found |= _same_drive(drive, runs, say)
-    found |= _residuals(declared, folder, runs, say)
-    return found
-
-
-def _read(folder: Path, declared: dict[str, Any]) -> Reading:
-    topics = declared["topics"]
-    fields = {
-        "imu": ("linear_acceleration.x", "linear_acceleration.y", "linear_acceleration.z", "angular_velocity.z"),
-        "vesc": ("state.speed", "state.avg_iq"),
-        "servo": ("data",),
-        "body": tuple(f"pose.{part}" for part in POSE_FIELDS),
+    body = _rigid_body(drive)
+    turned = _turned(drive, body["body_yaw"])
+    return {
+        "Whose time stamps, and which clock": _clocks(bag),
+        "Rigid body": body,
+        f"IMU against motion capture, both below {CUTOFF:g} Hz": _imu(drive, turned, bag.arrays[f"{IMU}.linear_acceleration.z"]),
+        "Steering": _steering(turned, pd.concat(runs.values())),
+        "Motor": _motor(turned, pd.concat([run for name, run in runs.items() if name.startswith("hoons_all_test")])),
+        "The publishers' Savitzky-Golay window": _publishers_filter(runs),
+        "Is the bag's drive one of the CSV runs? [rad/s, RMS]": _same_drive(drive, runs),
+        f"d(vy)/dt - (ay - vx·r) where vx > {MOVING:g} m/s [m/s², RMS below 10 Hz]": _residuals(declared | {"path": str(folder)}, runs),
     }
-    wanted = [(topics[name]["topic"], topics[name]["type"], paths) for name, paths in fields.items()]
-    return read_bag(folder / f"{BAG}.zip", "read_topics", topics=wanted, layouts=declared["messages"])
 
 
 def _seconds(bag: Reading, topic: str, clock: str = "stamped") -> Array:
@@ -118,321 +83,195 @@ def _seconds(bag: Reading, topic: str, clock: str = "stamped") -> Array:
     return np.asarray((bag.arrays[f"{topic}@{clock}"] - bag.summary["start"]) * 1e-9)
 
 
-def _clocks(bag: Reading, say: Callable[[str], None]) -> dict[str, float]:
-    say("\n## Whose time stamps, and which clock")
-    found = {}
-    for topic, rate in (("/imu", 400.0), ("/vesc/core", 100.0), ("/optitrack/rigid_body_0", 100.0)):
+def _clocks(bag: Reading) -> Figures:
+    found: Figures = {}
+    for topic, rate in RATES.items():
         stamps, received = _seconds(bag, topic), _seconds(bag, topic, "received")
-        late = (bag.arrays[f"{topic}@received"] - bag.arrays[f"{topic}@stamped"]) * 1e-6
-        kept = stamps >= START
-        steps = 1e3 * np.diff(stamps[kept])
-        _, rate_hz, jitter = uniform_times(stamps[kept], rate, topic)
+        steps = 1e3 * np.diff(stamps[stamps >= START])
+        _, found[f"rate {topic}"], jitter = uniform_times(stamps[stamps >= START], rate, topic)
         *_, received_jitter = uniform_times(received[received >= START], rate, topic)
-        say(
-            f"{topic}: {len(stamps)} messages, {rate_hz:.4f} Hz; header to reception {np.median(late):.2f} ms, "
-            f"at most {late.max():.1f}; intervals of headers {steps.min():.3f} to {steps.max():.2f} ms; "
-            f"about an even clock headers {1e3 * jitter:.2f}, receptions {1e3 * received_jitter:.2f} ms (RMS)"
-        )
-        found[f"rate {topic}"] = rate_hz
-    stamps = _seconds(bag, "/optitrack/rigid_body_0")
+        late = received - stamps
+        own = {"header to reception": np.median(late), "at most": late.max(), "headers about an even clock": jitter}
+        own = {name: 1e3 * float(value) for name, value in (own | {"receptions about an even clock": received_jitter}).items()}
+        own |= {"shortest interval of headers": steps.min(), "longest interval of headers": steps.max()}
+        found |= {f"{topic} {name} [ms]": value for name, value in own.items()}
+    stamps = _seconds(bag, BODY)
     kept = stamps >= START
-    stamps = stamps[kept]
-    even, *_ = uniform_times(stamps, 100.0, "pose")
-    place = np.stack([bag.arrays[f"/optitrack/rigid_body_0.pose.position.{axis}"][kept] for axis in "xy"], axis=1)
+    stamps, (even, *_) = stamps[kept], uniform_times(stamps[kept], RATES[BODY], BODY)
+    place = np.stack([bag.arrays[f"{BODY}.pose.position.{axis}"][kept] for axis in "xy"], axis=1)
     fast = np.flatnonzero(np.hypot(*np.gradient(place, even, axis=0).T) > 1.0)
     for name, times in (("header", stamps), ("even", even)):
-        squares = [squared_scatter(times, place, middle) for middle in fast[(fast > 8) & (fast < len(stamps) - 8)]]
-        found[f"pose_roughness_{name}"] = float(np.sqrt(np.mean(squares)))
-    scatter = {name: 1e3 * found[f"pose_roughness_{name}"] for name in ("header", "even")}
-    say(
-        f"poses above 1 m/s scatter about cubics through 9 of them by {scatter['header']:.3f} mm with the headers' times, "
-        f"by {scatter['even']:.3f} mm with an even clock: they were taken evenly and stamped late"
-    )
+        apart = scatter(times, place, fast[(fast > 8) & (fast < len(stamps) - 8)])
+        found[f"pose_roughness_{name}"] = float(np.sqrt(np.mean(np.square(apart)) / 2.0))  # of an axis [m]
     return found
 
 
-def _drive(bag: Reading) -> Drive:
+def _drive(bag: Reading) -> pd.DataFrame:
     """The bag on a clock of 100 Hz, before anything is identified."""
-
-    def even(topic: str, rate: float) -> tuple[Array, NDArray[np.bool_]]:
+    times, kept = {}, {}
+    for topic, rate in RATES.items():
         stamps = _seconds(bag, topic)
-        kept = stamps >= START
-        return uniform_times(stamps[kept], rate, topic)[0], kept
-
-    imu_times, imu_kept = even("/imu", 400.0)
-    vesc_times, vesc_kept = even("/vesc/core", 100.0)
-    body_times, body_kept = even("/optitrack/rigid_body_0", 100.0)
-    servo_times = _seconds(bag, "/vesc/servo_position_command", "received")
-    poses = np.stack([bag.arrays[f"/optitrack/rigid_body_0.pose.{part}"][body_kept] for part in POSE_FIELDS], axis=1)
+        kept[topic] = stamps >= START
+        times[topic] = uniform_times(stamps[kept[topic]], rate, topic)[0]
+    servo_times = _seconds(bag, SERVO, "received")
+    poses = np.stack([bag.arrays[f"{BODY}.pose.{part}"][kept[BODY]] for part in POSE_FIELDS], axis=1)
     plane, yaw = ground_plane(poses[:, :3], poses[:, 3:], "z", "pose")
-    motion = PoseOptions().motion(plane, yaw, float(np.diff(body_times).mean()))
-    begin, end = max(imu_times[0], vesc_times[0], body_times[0]), min(imu_times[-1], vesc_times[-1], body_times[-1], servo_times[-1])
+    motion = PoseOptions().motion(plane, yaw, float(np.diff(times[BODY]).mean()))
+    begin, end = max(own[0] for own in times.values()), min(own[-1] for own in (*times.values(), servo_times))
     grid = np.arange(np.ceil(begin * RATE), np.floor(end * RATE) + 1) / RATE
-    return Drive(
-        "bag",
-        *(np.interp(grid, body_times, samples) for samples in (motion.vx, motion.vy, motion.yaw_rate)),
-        *(
-            np.interp(grid, imu_times, bag.arrays[f"/imu.{name}"][imu_kept])
-            for name in ("linear_acceleration.x", "linear_acceleration.y", "angular_velocity.z")
-        ),
-        *(np.interp(grid, vesc_times, bag.arrays[f"/vesc/core.{name}"][vesc_kept]) for name in ("state.speed", "state.avg_iq")),
-        np.interp(grid, servo_times, bag.arrays["/vesc/servo_position_command.data"]),
-    )
+    found = {name: np.interp(grid, times[BODY], getattr(motion, name)) for name in COLUMNS[:3]}
+    for topic, names in ((IMU, ("linear_acceleration.x", "linear_acceleration.y", "angular_velocity.z")), (MOTOR, FIELDS["vesc"])):
+        for name in names:
+            found[name] = np.interp(grid, times[topic], bag.arrays[f"{topic}.{name}"][kept[topic]])
+    found["servo"] = np.interp(grid, servo_times, bag.arrays[f"{SERVO}.data"])
+    return pd.DataFrame(dict(zip(COLUMNS, found.values(), strict=True)))
 
 
-def _turned(drive: Drive, yaw: float) -> Drive:
+def _turned(drive: pd.DataFrame, yaw: float) -> pd.DataFrame:
     cosine, sine = np.cos(yaw), np.sin(yaw)
-    return replace(drive, vx=cosine * drive.vx + sine * drive.vy, vy=-sine * drive.vx + cosine * drive.vy)
+    return drive.assign(vx=cosine * drive.vx + sine * drive.vy, vy=-sine * drive.vx + cosine * drive.vy)
 
 
-def _csv_runs(folder: Path) -> Iterator[Drive]:
-    for stem in CSV_FILES:
-        table = pd.read_csv(folder / f"{stem}.csv")
-        for number, rows in table.groupby("run_id", sort=False):
-            names = ("v_x", "v_y", "r", "ax_imu", "ay_imu", "r_imu", "omega_wheels", "Iq", "delta")
-            yield Drive(f"{stem} {number}", *(rows[name].to_numpy(dtype=np.float64) for name in names))
-
-
-def _rigid_body(drive: Drive, say: Callable[[str], None]) -> dict[str, float]:
+def _rigid_body(drive: pd.DataFrame) -> Figures:
     """vy/vx = yaw + lever·r/vx - compliance·vx·r: where the rear axle stands still sideways, but for its tyres' slip."""
-    say("\n## Rigid body")
-    gentle = (drive.vx > MOVING) & (np.abs(drive.vx * drive.yaw_rate) < GENTLE)
-    columns = [np.ones_like(drive.vx), drive.yaw_rate / np.maximum(drive.vx, 0.1), drive.vx * drive.yaw_rate]
-    (yaw, lever, slip), spread = block_regression(columns, drive.vy / np.maximum(drive.vx, 0.1), gentle)
-    straight = gentle & (np.abs(drive.yaw_rate) < 0.3)
-    sideslip = np.degrees(np.arctan2(drive.vy, drive.vx)[straight].mean())
-    say(
-        f"x axis to the car's forward axis: {yaw:.4f} ± {spread[0]:.4f} rad ({np.degrees(yaw):.2f}°) counter-clockwise; "
-        f"mean sideslip where |r| < 0.3 rad/s: {sideslip:.2f}° ({straight.sum()} samples)"
-    )
-    say(f"rear axle to origin: {lever:.3f} ± {spread[1]:.3f} m forward (slip {slip:.4f} ± {spread[2]:.4f} rad per m/s²)")
-    return {"body_yaw": yaw, "body_yaw_sd": spread[0], "rear_axle_to_body": lever, "rear_axle_to_body_sd": spread[1]}
+    vx, yaw_rate = (drive[name].to_numpy() for name in ("vx", "yaw_rate"))
+    gentle, divisor = (vx > MOVING) & (np.abs(vx * yaw_rate) < GENTLE), np.maximum(vx, 0.1)
+    columns = {"body_yaw": np.ones_like(vx), "rear_axle_to_body": yaw_rate / divisor, "slip [rad s²/m]": vx * yaw_rate}
+    straight = drive[gentle & (np.abs(yaw_rate) < 0.3)]
+    found = factors_of(columns, drive.vy.to_numpy() / divisor, gentle)
+    return found | {"mean sideslip where |r| < 0.3 rad/s [deg]": float(np.degrees(np.arctan2(straight.vy, straight.vx).mean()))}
 
 
-def _imu(unturned: Drive, drive: Drive, bag: Reading, say: Callable[[str], None]) -> dict[str, float]:
-    say(f"\n## IMU against motion capture (both below {CUTOFF:g} Hz)")
-    lateral, forward, turning, _ = _planar_accelerations(drive)
-    one = np.ones_like(lateral)
-    inner = np.zeros(len(one), dtype=bool)
-    inner[100:-100] = True
-    found = {}
-    for name, measured, columns in (
-        ("gyro_z", _smooth(drive.gyro), [_smooth(drive.yaw_rate), one]),
-        ("acc_y", _smooth(drive.ay), [lateral, forward, turning, one]),
-        ("acc_x", _smooth(drive.ax), [forward, lateral, _smooth(drive.yaw_rate**2), one]),
-    ):
-        factors, spread = block_regression(columns, measured, inner)
-        correlation = np.corrcoef(measured[inner], columns[0][inner])[0, 1]
-        found[name] = factors[0]
-        rest = (
-            ""
-            if name == "gyro_z"
-            else f", the other axis' {factors[1]:+.3f} ± {spread[1]:.3f}, lever {factors[2]:+.3f} ± {spread[2]:.3f} m"
-        )
-        say(f"{name}: {factors[0]:+.3f} ± {spread[0]:.3f} times the car's, correlation {correlation:+.3f}{rest}, offset {factors[-1]:+.4f}")
-    crossed, crossed_sd = block_regression(_planar_accelerations(unturned), _smooth(drive.ay), inner)
-    say(f"acc_y before the rigid body is turned: the other axis' {crossed[1]:+.3f} ± {crossed_sd[1]:.3f}")
-    acc_z = bag.arrays["/imu.linear_acceleration.z"]
-    still = np.abs(drive.motor) < 1.0
-    still &= signal.convolve(np.abs(drive.motor), np.ones(101), mode="same") < 1.0
-    say(
-        f"acc_z {acc_z.mean():+.3f} m/s² on average: z is up; standing for {still.sum() / RATE:.1f} s: "
-        f"acc_x {drive.ax[still].mean():+.3f}, acc_y {drive.ay[still].mean():+.3f} m/s², gyro_z {drive.gyro[still].mean():+.4f} rad/s"
-    )
-    delays = np.arange(-0.03, 0.0301, 0.0005)
-    gyro = _smooth(drive.gyro)
+def _imu(unturned: pd.DataFrame, drive: pd.DataFrame, acc_z: Array) -> Figures:
+    lateral, forward, turning = _planar_accelerations(drive)
+    gyro, ay, ax, yaw_rate = (_smooth(drive[name]) for name in ("gyro", "ay", "ax", "yaw_rate"))
+    one, inner = np.ones_like(lateral), slice(100, -100)
+    found = factors_of({"gyro_z": yaw_rate, "gyro_z offset": one}, gyro, inner)
+    columns = (lateral, forward, turning, one), (forward, lateral, _smooth(drive.yaw_rate**2), one)
+    for name, measured, own in (("acc_y", ay, columns[0]), ("acc_x", ax, columns[1])):
+        names = (name, f"{name} the other axis'", f"{name} lever [m]", f"{name} offset")
+        found |= factors_of(dict(zip(names, own, strict=True)), measured, inner)
+        found[f"{name} correlation"] = float(np.corrcoef(measured[inner], own[0][inner])[0, 1])
+    crossed = factors_of(dict(zip(("own", "other", "lever", "offset"), (*_planar_accelerations(unturned), one), strict=True)), ay, inner)
+    found |= {f"acc_y the other axis' before the turn{end}": crossed[f"other{end}"] for end in ("", "_sd")}
+    motor = np.abs(drive.motor)
+    still = (motor < 1.0) & (signal.convolve(motor, np.ones(101), mode="same") < 1.0)
+    found |= {f"standing: {name}": float(drive[name][still].mean()) for name in ("ax", "ay", "gyro")}
+    found |= {"standing [s]": still.sum() / RATE, "acc_z": float(acc_z.mean())}
     time = np.arange(len(gyro)) / RATE
-    found["acc_z"] = float(acc_z.mean())
-    pairs = (("gyro_z", gyro, _smooth(drive.yaw_rate)), ("acc_y", np.sign(found["acc_y"]) * _smooth(drive.ay), lateral))
-    for name, late, reference in pairs:
-        errors = [np.var((late - np.interp(time - delay, time, reference))[100:-100]) for delay in delays]
-        found[f"delay_{name}"] = float(delays[np.argmin(errors)])
-        best, none = np.sqrt(min(errors)), np.sqrt(errors[len(delays) // 2])
-        unit = "rad/s" if name == "gyro_z" else "m/s²"
-        late_ms = 1e3 * found[f"delay_{name}"]
-        say(f"{name} is {late_ms:+.1f} ms later than motion capture (RMS {best:.4f} {unit}, without a shift {none:.4f})")
+    for name, own, reference in (("gyro_z", gyro, yaw_rate), ("acc_y", np.sign(found["acc_y"]) * ay, lateral)):
+
+        def rest(delay: float, own: Array = own, reference: Array = reference) -> float:
+            return float(np.std((own - np.interp(time - delay, time, reference))[inner]))
+
+        delays = np.arange(-0.03, 0.0301, 0.0005)
+        best = min((rest(delay), delay) for delay in delays)
+        found |= {f"{name} late [ms]": 1e3 * best[1], f"{name} rest": best[0], f"{name} rest without a shift": rest(0.0)}
     return found
 
 
-def _planar_accelerations(drive: Drive) -> list[Array]:
-    """Lateral, longitudinal and yaw acceleration from motion capture, and a constant."""
-    planar = accelerations(drive.vx, drive.vy, drive.yaw_rate, RATE)
-    return [*(_smooth(one) for one in (*planar, np.gradient(drive.yaw_rate) * RATE)), np.ones_like(drive.vx)]
+def _planar_accelerations(drive: pd.DataFrame) -> tuple[Array, Array, Array]:
+    """Lateral, longitudinal and yaw acceleration from motion capture."""
+    vx, vy, yaw_rate = (drive[name].to_numpy() for name in COLUMNS[:3])
+    lateral, forward = accelerations(vx, vy, yaw_rate, RATE)
+    return _smooth(lateral), _smooth(forward), _smooth(np.gradient(yaw_rate) * RATE)
 
 
-def _steering(drive: Drive, runs: list[Drive], say: Callable[[str], None]) -> dict[str, float]:
-    say("\n## Steering")
-    low, high = drive.steer.min(), drive.steer.max()
-    neutral, share = _most_frequent(drive.steer)
-    ends = np.concatenate([run.steer for run in runs])
-    gain = float(ends.max() / (neutral - low))
-    say(
-        f"servo {low:.10f} to {high:.10f}, {share:.0%} of the time at {neutral:.6f}; CSV delta {ends.min():.10f} to {ends.max():.10f} rad: "
-        f"{gain:.9f} rad a unit about {neutral:g}; 0.531/0.35 = {0.531 / 0.35:.9f}"
-    )
-    turning = (drive.vx > MOVING) & (np.abs(drive.vx * drive.yaw_rate) > 0.3)
-    agreement = np.corrcoef(neutral - drive.steer[turning], drive.yaw_rate[turning])[0, 1]
-    csv_turning = [np.corrcoef(run.steer, run.yaw_rate)[0, 1] for run in runs]
-    say(
-        f"servo below neutral turns left: correlation of neutral - servo with yaw rate {agreement:+.2f}; of the CSV runs' delta with r "
-        f"{min(csv_turning):+.2f} to {max(csv_turning):+.2f}"
-    )
-    found = {"servo_neutral": neutral, "servo_gain": gain, "servo_agreement": float(agreement)}
-    full = (np.abs(drive.steer - neutral) > 0.345) & (drive.vx > MOVING) & (np.abs(drive.vx * drive.yaw_rate) < 2.0)
+def _steering(drive: pd.DataFrame, csv: pd.DataFrame) -> Figures:
+    values, counts = np.unique(np.round(drive.steer, 9), return_counts=True)
+    neutral = float(values[np.argmax(counts)])
+    turning, away = (drive.vx > MOVING) & (np.abs(drive.vx * drive.yaw_rate) > 0.3), neutral - drive.steer
+    full = (np.abs(away) > 0.345) & (drive.vx > MOVING) & (np.abs(drive.vx * drive.yaw_rate) < 2.0)
     full &= signal.convolve(full.astype(float), np.ones(31), mode="same") > 30.5
-    kinematic = np.abs(np.arctan(WHEELBASE * drive.yaw_rate[full] / drive.vx[full]))
-    found["kinematic_lock"] = float(kinematic.mean())
-    say(
-        f"at full lock and |ay| < 2 m/s² atan(L·r/vx) is {kinematic.mean():.3f} rad (standard deviation {kinematic.std():.3f}, "
-        f"{full.sum()} samples), {kinematic.mean() / 0.531:.2f} of the 0.531 rad that the publishers' scale gives"
-    )
+    lock = np.abs(np.arctan(WHEELBASE * drive.yaw_rate[full] / drive.vx[full]))
+    return {
+        "servo, least": drive.steer.min(),
+        "servo, largest": drive.steer.max(),
+        "servo_neutral": neutral,
+        "CSV delta, least [rad]": csv.steer.min(),
+        "CSV delta, largest [rad]": csv.steer.max(),
+        "servo_gain": float(csv.steer.max() / (neutral - drive.steer.min())),
+        "servo_agreement": float(np.corrcoef(away[turning], drive.yaw_rate[turning])[0, 1]),
+        "at full lock atan(L·r/vx) [rad]": float(lock.mean()),
+        "at full lock over 0.531 rad": float(lock.mean()) / 0.531,
+    }
+
+
+def _motor(drive: pd.DataFrame, csv: pd.DataFrame) -> Figures:
+    def regressed(one: pd.DataFrame, name: str, chosen: Mask, *, current: bool) -> Figures:
+        lock = np.arctan(WHEELBASE * one.yaw_rate / np.maximum(one.vx, 0.1))
+        columns = {
+            name: one.vx,
+            f"{name}, times dvx/dt": _change(one.vx),
+            f"{name}, times the front's": one.vx * (1.0 / np.cos(lock) - 1.0),
+        }
+        return factors_of(columns | ({f"{name}, times the current": one.current} if current else {}), one.motor.to_numpy(), chosen)
+
+    found = regressed(drive, "erpm_per_mps", (drive.vx > MOVING).to_numpy(), current=False)
+    for name, one in (("bag", drive.assign(motor=drive.motor / found["erpm_per_mps"])), ("hoons_all_test", csv)):
+        gentle = ((one.vx > MOVING) & (np.abs(one.vx * one.yaw_rate) < GENTLE) & (np.abs(one.vy) < 0.15 * one.vx)).to_numpy()
+        found |= regressed(one, f"{name}: motor over vx at no current", gentle, current=True)
+        columns = {f"{name}: m/s² an ampere": one.current, f"{name}: constant drag": np.ones(len(one)), f"{name}: drag by vx": one.vx}
+        found |= factors_of(columns, _change(one.vx), gentle & (np.abs(one.yaw_rate) < 0.5).to_numpy())
+        found |= {f"{name}: least current [A]": one.current.min(), f"{name}: largest current [A]": one.current.max()}
     return found
 
 
-def _motor(drive: Drive, runs: list[Drive], say: Callable[[str], None]) -> dict[str, float]:
-    say("\n## Motor")
-    found = {}
-    (gain, lag, front), spread = _motor_regression(drive, drive.vx > MOVING)
-    found |= {"erpm_per_mps": gain, "erpm_per_mps_sd": spread[0]}
-    say(
-        f"speed = {gain:.0f} ± {spread[0]:.0f} electrical rpm for 1 m/s ({1 / gain:.4e} m/s each), "
-        f"{1e3 * lag / gain:+.0f} ms times dvx/dt, "
-        f"and {front / gain:.2f} ± {spread[2] / gain:.2f} of what the front wheels go farther in turns (both axles alike: 0.5)"
-    )
-    same = replace(drive, motor=drive.motor / gain)
-    tyre_a = _joined([run for run in runs if run.name.startswith("hoons_all_test")])
-    for one in (same, replace(tyre_a, name="hoons_all_test")):
-        gentle = (one.vx > MOVING) & (np.abs(one.vx * one.yaw_rate) < GENTLE) & (np.abs(one.vy) < 0.15 * one.vx)
-        factors, spread = _motor_regression(one, gentle, current=True)
-        straight = gentle & (np.abs(one.yaw_rate) < 0.5)
-        acceleration = signal.savgol_filter(one.vx, 21, 2, deriv=1, delta=1.0 / RATE)
-        drag, drag_spread = block_regression([one.current, np.ones_like(one.vx), one.vx], acceleration, straight)
-        found[f"motor_scale {one.name}"], found[f"acceleration_per_ampere {one.name}"] = factors[0], drag[0]
-        say(
-            f"{one.name}: motor speed {factors[0]:.3f} ± {spread[0]:.3f} times vx at no current, "
-            f"{drag[0]:.3f} ± {drag_spread[0]:.3f} m/s² an ampere ({gentle.sum()} samples with |ay| < {GENTLE:g} m/s² and little sideslip)"
-        )
-    say(
-        f"current: bag {drive.current.min():.2f} to {drive.current.max():.2f} A, CSV {min(run.current.min() for run in runs):.1f} to "
-        f"{max(run.current.max() for run in runs):.1f} A"
-    )
-    return found
+def _change(vx: pd.Series) -> Array:
+    return np.asarray(signal.savgol_filter(vx, 21, 2, deriv=1, delta=1.0 / RATE))
 
 
-def _motor_regression(drive: Drive, chosen: NDArray[np.bool_], current: bool = False) -> tuple[list[float], list[float]]:
-    acceleration = signal.savgol_filter(drive.vx, 21, 2, deriv=1, delta=1.0 / RATE)
-    lock = np.arctan(WHEELBASE * drive.yaw_rate / np.maximum(drive.vx, 0.1))
-    columns = [drive.vx, acceleration, drive.vx * (1.0 / np.cos(lock) - 1.0)]
-    return block_regression([*columns, drive.current] if current else columns, drive.motor, chosen)
-
-
-def _joined(runs: list[Drive]) -> Drive:
-    names = ("vx", "vy", "yaw_rate", "ax", "ay", "gyro", "motor", "current", "steer")
-    return Drive("joined", *(np.concatenate([getattr(run, name) for run in runs]) for name in names))
-
-
-def _publishers_filter(runs: list[Drive], say: Callable[[str], None]) -> dict[str, float]:
-    """A Savitzky-Golay derivative leaves notches in the spectrum where its window spans whole waves; they tell the window."""
-    say("\n## The publishers' Savitzky-Golay window")
-    spectra = [signal.welch(run.yaw_rate, RATE, nperseg=512) for run in runs if len(run.yaw_rate) > 1024]
+def _publishers_filter(runs: Mapping[str, pd.DataFrame]) -> Figures:
+    """A Savitzky-Golay derivative leaves notches in the spectrum where its window spans whole waves; correlations of logarithms tell it."""
+    spectra = [signal.welch(run.yaw_rate.to_numpy(), RATE, nperseg=512) for run in runs.values() if len(run) > 1024]
     frequency, power = spectra[0][0], np.median([spectrum for _, spectrum in spectra], axis=0)
-    scores = {}
+    band, scores = (frequency > 5) & (frequency < 45), {}
     for window in range(5, 31, 2):
         response = np.abs(signal.freqz(signal.savgol_coeffs(window, 2, deriv=1), worN=2 * np.pi * frequency / RATE)[1])
-        band = (frequency > 5) & (frequency < 45)
         scores[window] = float(np.corrcoef(np.log(response[band] + 1e-4), np.log(power[band]))[0, 1])
-    best, second = sorted(scores, key=lambda window: -scores[window])[:2]
-    say(
-        f"spectrum of r in the CSV files between 5 and 45 Hz against a filter of second order: {best} samples "
-        f"(correlation of the logarithms {scores[best]:.2f}; next {second} with {scores[second]:.2f}; 9: {scores[9]:.2f})"
-    )
-    return {"publishers_window": float(best)}
+    return {f"{window} samples": scores[window] for window in sorted(scores, key=lambda window: -scores[window])[:2]}
 
 
-def _same_drive(drive: Drive, runs: list[Drive], say: Callable[[str], None]) -> dict[str, float]:
+def _same_drive(drive: pd.DataFrame, runs: Mapping[str, pd.DataFrame]) -> Figures:
     """Slides the liveliest seconds of the bag along every run."""
-    say("\n## Is the bag's drive one of the CSV runs?")
-    n = min(len(run.gyro) for run in runs)
-    first = int(np.argmax(np.lib.stride_tricks.sliding_window_view(drive.gyro, n).std(axis=1)))
-    piece = drive.gyro[first : first + n]
-    best = (np.inf, "")
-    for run in runs:
+    gyro, n = drive.gyro.to_numpy(), min(len(run) for run in runs.values())
+    first = int(np.argmax(np.lib.stride_tricks.sliding_window_view(gyro, n).std(axis=1)))
+    piece = gyro[first : first + n]
+    nearest = []
+    for run in runs.values():
         squares = np.convolve(np.square(run.gyro), np.ones(n), mode="valid") - 2 * np.correlate(run.gyro, piece) + np.square(piece).sum()
-        best = min(best, (float(np.sqrt(squares.min() / n)), run.name))
-    own = np.sqrt(np.mean(np.square(piece - drive.yaw_rate[first : first + n])))
-    say(
-        f"the {n / RATE:.2f} s in which its yaw rate changes most (RMS {np.sqrt(np.mean(piece**2)):.2f} rad/s) differ by "
-        f"{best[0]:.2f} rad/s RMS from the nearest stretch of all {len(runs)} runs ({best[1]}), "
-        f"by {own:.2f} rad/s from the bag's own motion capture: "
-        f"it is {'none' if best[0] > 2 * own else 'one'} of them"
-    )
-    return {"nearest_run_rms": best[0], "own_rms": float(own)}
+        nearest.append(float(np.sqrt(squares.min() / n)))
+    own = float(np.sqrt(np.mean(np.square(piece - drive.yaw_rate[first : first + n]))))
+    return {"seconds": n / RATE, "to the nearest stretch of all runs": min(nearest), "to the bag's own motion capture": own}
 
 
-def residual_rms(vx: Array, vy: Array, ay: Array, yaw_rate: Array, moving: NDArray[np.bool_], cutoff: float) -> tuple[float, float, float]:
-    """d(vy)/dt - (ay - vx·r) below a frequency: RMS, mean, and standard deviation over that of ay.
-
-    Args:
-        vx, vy: reference [m/s], shape (T,).
-        ay: measured [m/s²].
-        yaw_rate: measured [rad/s].
-        moving: samples that count.
-        cutoff: of a second-order Butterworth filter run both ways [Hz].
-    """
-    derivative = signal.savgol_filter(vy, 9, 2, deriv=1, delta=1.0 / RATE)
-    residual = _smooth(derivative - (ay - vx * yaw_rate), cutoff)
-    counted = moving.copy()
-    counted[:20] = counted[-20:] = False
-    rest = residual[counted]
-    return float(np.sqrt(np.mean(rest**2))), float(rest.mean()), float(rest.std() / _smooth(ay, cutoff)[counted].std())
-
-
-def residuals_of(vx: Array, vy: Array, ay: Array, yaw_rate: Array) -> list[tuple[float, float, float]]:
-    """Residuals below 5, 10 and 20 Hz where the car moves, and below 10 Hz where it does so gently."""
-    moving = vx > MOVING
-    gentle = moving & (np.abs(_smooth(vx * yaw_rate)) < GENTLE)
-    residuals = [residual_rms(vx, vy, ay, yaw_rate, moving, cutoff) for cutoff in (5.0, 10.0, 20.0)]
-    return [*residuals, residual_rms(vx, vy, ay, yaw_rate, gentle, 10.0)]
-
-
-def residuals_of_recording(recording: Recording) -> list[tuple[float, float, float]]:
-    """The same of a recording's reference and IMU."""
-    return residuals_of(*(recording[name] for name in ("vx_ref", "vy_ref", "ay", "yaw_rate")))
-
-
-def _residuals(declared: dict[str, Any], folder: Path, runs: list[Drive], say: Callable[[str], None]) -> dict[str, float]:
-    say("\n## Residual of d(vy)/dt - (ay - vx·r) where vx > 0.5 m/s [m/s²], as vehest ingests the bag and as the CSV files are")
-    here = declared | {"path": str(folder)}
-    (bag,) = open_source(here).recordings()
-    (wide,) = open_source(here | {"pose": declared["pose"] | {"window": 15}}).recordings()
-    topics = declared["topics"]
-    (averaged,) = open_source(here | {"topics": topics | {"imu": topics["imu"] | {"average": 0.01}}}).recordings()
-    (held,) = open_source(here | {"topics": topics | {"servo": topics["servo"] | {"interpolation": "hold"}}}).recordings()
-    variants = {"bag": bag, "bag, window of 15 samples": wide, "bag, IMU averaged over 10 ms": averaged}
-    say(f"| drive | samples | RMS to 5 Hz | to 10 Hz | to 20 Hz | mean | to 10 Hz where abs(vx·r) < {GENTLE:g} | deviation, of ay's |")
-    say("| :-- | --: | --: | --: | --: | --: | --: | --: |")
-    rows = [(name, int((one["vx_ref"] > MOVING).sum()), residuals_of_recording(one)) for name, one in variants.items()]
-    rows += [(run.name, int((run.vx > MOVING).sum()), residuals_of(run.vx, run.vy, run.ay, run.gyro)) for run in runs]
-    found = {}
-    for name, samples, ((low, mean, _), (middle, _, share), (high, _, _), (gentle, _, _)) in rows:
-        say(f"| {name} | {samples} | {low:.2f} | {middle:.2f} | {high:.2f} | {mean:+.2f} | {gentle:.2f} | {share:.2f} |")
-        found |= {f"residual {name}": middle, f"gentle_residual {name}": gentle, f"residual_share {name}": share}
-    moving = bag["vx_ref"] > MOVING
+def _residuals(declared: dict[str, Any], runs: Mapping[str, pd.DataFrame]) -> Figures:
+    """As vehest ingests the bag, and of the CSV files; also where abs(vx·r) is below 4 m/s², and by the deviation of ay."""
+    topics, channels = declared["topics"], ("vx_ref", "vy_ref", "ay", "yaw_rate")
+    changes = {"bag": {}, "bag, window of 15 samples": {"pose": declared["pose"] | {"window": 15}}}
+    changes["bag, IMU averaged over 10 ms"] = {"topics": topics | {"imu": topics["imu"] | {"average": 0.01}}}
+    recordings = {name: next(iter(open_source(declared | own).recordings())) for name, own in changes.items()}
+    drives = {name: [one[channel] for channel in channels] for name, one in recordings.items()}
+    drives |= {name: [run[channel].to_numpy() for channel in ("vx", "vy", "ay", "gyro")] for name, run in runs.items()}
+    found: Figures = {}
+    for name, (vx, vy, ay, yaw_rate) in drives.items():
+        rest = _smooth(signal.savgol_filter(vy, 9, 2, deriv=1, delta=1.0 / RATE) - (ay - vx * yaw_rate), 10.0)
+        moving = vx > MOVING
+        moving[:20] = moving[-20:] = False
+        gentle = moving & (np.abs(_smooth(vx * yaw_rate)) < GENTLE)
+        found |= {name: float(np.sqrt(np.mean(rest[moving] ** 2))), f"{name}, gentle": float(np.sqrt(np.mean(rest[gentle] ** 2)))}
+        share = rest[moving].std() / _smooth(ay, 10.0)[moving].std()
+        found |= {f"{name}, mean": float(rest[moving].mean()), f"{name}, of ay": float(share)}
+    one, wide = recordings["bag"], recordings["bag, window of 15 samples"]
     for name in ("vx_ref", "vy_ref", "yaw_rate_ref"):
-        say(f"{name} with a window of 15 samples differs from that of 9 by {np.std((wide[name] - bag[name])[moving]):.4f} (RMS)")
-    away = np.sqrt(np.mean(np.square(held["steer"] - bag["steer"])))
-    say(f"holding the servo's command instead of drawing lines between commands changes steer by {away:.4f} rad (RMS)")
+        found[f"{name} changes with a window of 15 samples"] = float(np.std((wide[name] - one[name])[one["vx_ref"] > MOVING]))
     return found
 
 
-def _smooth(samples: Array, cutoff: float = CUTOFF) -> Array:
+def _smooth(samples: Any, cutoff: float = CUTOFF) -> Array:
     return smooth(samples, cutoff, RATE)
 
 
-def _most_frequent(samples: Array) -> tuple[float, float]:
-    values, counts = np.unique(np.round(samples, 9), return_counts=True)
-    return float(values[np.argmax(counts)]), float(counts.max() / len(samples))
-
-
 if __name__ == "__main__":
-    main()
+    for title, figures in parts_of(data_folder() / "f1tenth").items():
+        show(title, figures)

@@ -138,7 +138,7 @@ def _first_sentence(file: Path) -> str:
     return re.split(r"(?<=\.)\s+(?=[A-Z])", " ".join(lines), maxsplit=1)[0]
 
 
-# Channels and simulated sensors
+# Channels
 
 
 def channels() -> Iterable[str]:
@@ -161,62 +161,6 @@ def units() -> Iterable[str]:
     for unit, (si, factor) in _UNITS.items():
         conversions.setdefault(si, []).append(f"`{unit}`" + (f" × {factor:.10g}" if factor != 1.0 else ""))
     yield _table(("unit of channels", "may be given as"), [(si, ", ".join(dict.fromkeys(given))) for si, given in conversions.items()])
-
-
-SENSOR_HEADER = ("sensor", "noise [/√Hz]", "offset", "drift (time)", "step", "delay [ms]", "scale [%]")
-
-
-def sensors(preset: str, besides: str = "") -> Iterable[str]:
-    """Levels of a preset, less those that are equal in another one, its mounting and its vibration."""
-    from vehest.simulation.sensors.levels import PRESETS
-
-    levels = PRESETS[preset]
-    place = _nonzero(levels.imu)
-    yield _table(SENSOR_HEADER, _sensor_rows(levels, PRESETS.get(besides)))
-    yield f"`imu`: {place}; the rest is zero." if place else "`imu`: all zero."
-    if besides and _nonzero(levels.vibration):
-        yield f"`vibration`: {_nonzero(levels.vibration)}."
-
-
-def _nonzero(values: Any) -> str:
-    return ", ".join(f"`{field.name}` {getattr(values, field.name):g}" for field in fields(values) if getattr(values, field.name))
-
-
-def sensor_sources() -> Iterable[str]:
-    """Where the levels of the default preset come from, as its dataclass says."""
-    from vehest.simulation.sensors.levels import SensorLevels
-
-    names: dict[str, list[str]] = {}
-    for name, meaning in _sections(SensorLevels).items():
-        if name in {field.name for field in fields(SensorLevels)}:
-            names.setdefault(meaning, []).append(f"`{name}`")
-    yield "\n".join(f"- {', '.join(named)}: {meaning}" for meaning, named in names.items())
-
-
-def references() -> Iterable[str]:
-    """Levels and levers of the reference sensors."""
-    from vehest.simulation.sensors.levels import REFERENCES
-
-    shown = (REFERENCES["gnss"], REFERENCES["optical"], REFERENCES["motion_capture"])
-    levers = ("lever_x", "lever_y", "lever_z", "lever_error")
-    yield _table(("reference", *SENSOR_HEADER), [(f"`{r.kind}`", *row) for r in shown for row in _sensor_rows(r)])
-    rows = [(f"`{r.kind}`", *(f"{getattr(r, lever):g}" for lever in levers)) for r in shown]
-    yield _table(("reference", *(f"`{lever}` [m]" for lever in levers)), rows)
-
-
-def _sensor_rows(levels: Any, listed: Any = None) -> Iterable[tuple[str, ...]]:
-    """A row for the sensors of equal levels among the fields of a dataclass, less those that another one lists."""
-    from vehest.simulation.sensors.levels import SensorLevel
-
-    rows: dict[tuple[str, ...], list[str]] = {}
-    for field in fields(levels):
-        level = getattr(levels, field.name)
-        if isinstance(level, SensorLevel) and level != getattr(listed, field.name, None):
-            drift = f"{level.drift:g} ({level.drift_time:g} s)" if level.drift else "0"
-            rest = (f"{level.quantisation:g}", f"{1e3 * level.delay:g}", f"{1e2 * level.scale:g}")
-            rows.setdefault((f"{level.noise:g}", f"{level.offset:g}", drift, *rest), []).append(f"`{field.name}`")
-    for values, names in rows.items():
-        yield ", ".join(names), *values
 
 
 # Manoeuvres and courses
@@ -355,31 +299,6 @@ def leaderboard(source: str = "ferrari_drive/tables/leaderboard_test.csv") -> It
         yield _table(("estimator", *columns), lines, right=len(columns))
 
 
-def across_vehicles() -> Iterable[str]:
-    """FVU on the car not trained on, ours beside the paper's, from the study of the KS-NN."""
-    rows = _rows(RESULTS / "ksnn" / "tables" / "overview.csv")
-    lines = []
-    for model in dict.fromkeys(row["model"] for row in rows):
-        own = [row for row in rows if row["model"] == model]
-        lines.append((model, *(f"{float(row[key]):.3f}" if row[key] else "–" for row in own for key in ("paper_fvu_other", "fvu_other"))))
-    columns = [f"{scheme.lower()}, {who}" for scheme in dict.fromkeys(row["scheme"] for row in rows) for who in ("paper", "ours")]
-    if lines:
-        yield _table(("estimator", *columns), lines, right=len(columns))
-
-
-def other_vehicles() -> Iterable[str]:
-    """RMSE(β) with its interval on every test set of `leave_one_out`, a column a variant."""
-    files = sorted((RESULTS / "leave_one_out" / "tables").glob("leaderboard_*.csv"))
-    rows = [row for file in files for row in _rows(file) if row["rmse_sideslip"]]
-    titles = list(dict.fromkeys(row["estimator_title"] for row in rows))
-    tests: dict[str, dict[str, str]] = {}
-    for row in rows:
-        tests.setdefault(f"{row['title']}, {row['test_set']}", {})[row["estimator_title"]] = _with_interval(row)
-    lines = [(test, *(cells.get(title, "–") for title in titles)) for test, cells in tests.items()]
-    if lines:
-        yield _table(("test", *titles), lines, right=len(titles))
-
-
 def _rows(path: Path) -> list[dict[str, str]]:
     if not path.is_file():
         return []
@@ -405,8 +324,8 @@ def _table(header: Sequence[str], rows: Iterable[Sequence[str]], right: int = 0)
 PARTS: dict[str, Callable[..., Iterable[str]]] = {
     part.__name__: part
     for part in (
-        *(commands, files, channels, units, sensors, sensor_sources, references, manoeuvres, courses),
-        *(settings, figures, leaderboard, across_vehicles, other_vehicles),
+        *(commands, files, channels, units, manoeuvres, courses),
+        *(settings, figures, leaderboard),
     )
 }
 

@@ -53,8 +53,6 @@ ABLATIONS: dict[str, dict[str, Any]] = {
     "no roll leakage": {"leakage": 0.0, "leakage_deviation": 1e-4},
 }
 
-SMOOTHED: dict[str, dict[str, Any]] = {"smoothed": {"smoothed": True}}
-
 
 class Car(NamedTuple):
     """A car with its drives."""
@@ -156,7 +154,8 @@ def identified_on(car: Car, drives: Sequence[Recording]) -> dict[str, dict[str, 
 def models_of(car: Car, rate_hz: float, has_ax: bool) -> dict[str, Estimator]:
     """The methods that are compared, by title."""
     sheet = {"wheelbase": car.wheelbase, "cg_to_rear_axle": car.cg_to_rear_axle or TYPICAL_REAR * car.wheelbase, "rate_hz": rate_hz}
-    filters = {name: filter_of(car, rate_hz, **({"measured_ax": has_ax} | changed)) for name, changed in (ABLATIONS | SMOOTHED).items()}
+    variants = ABLATIONS | {"smoothed": {"smoothed": True}}
+    filters = {name: filter_of(car, rate_hz, **({"measured_ax": has_ax} | changed)) for name, changed in variants.items()}
     return {"data sheet": DataSheet.from_config(sheet), **filters}
 
 

@@ -116,11 +116,6 @@ def started(model: Estimator, record: CarRecord, names: Sequence[str], widening:
     return with_settings(new, changed)
 
 
-def error_of(model: Estimator, drive: Recording, slowest: float) -> float:
-    """RMSE(β) where the car moves [deg]."""
-    return judged(model, drive, slowest)[0]
-
-
 def judged(model: Estimator, drive: Recording, slowest: float) -> tuple[float, float]:
     """RMSE(β) where the car moves [deg], and the share of v within its band of 90 %."""
     speed, truth, estimate = drive["vx"], drive["vy_ref"], model.estimate([drive.select(model.channels)])[0]
@@ -149,9 +144,9 @@ def carried_over(runner: Runner, root: str) -> tuple[pd.DataFrame, pd.DataFrame]
         for drive in drives:
             others = {name: own for name, own in found.items() if name not in (drive.id, HELD_BACK)}
             if others:
-                record, errors = record_of(model, others), {"cold": error_of(model, drive, car.slowest)}
+                record, errors = record_of(model, others), {"cold": judged(model, drive, car.slowest)[0]}
                 for title, by in product(SETS, (1.0, WIDENING, 3.0)):
-                    errors[f"{title}; {by:g}"] = error_of(started(model, record, SETS[title], by), drive, car.slowest)
+                    errors[f"{title}; {by:g}"] = judged(started(model, record, SETS[title], by), drive, car.slowest)[0]
                 rows.append({"car": car.title, "drive": drive.id, **errors})
     return pd.DataFrame(pairs), pd.DataFrame(rows)
 
@@ -180,7 +175,7 @@ def lateness(runner: Runner, root: str) -> pd.DataFrame:
             row |= {"by the reference": 1e3 * known[0].value, "±": 1e3 * known[0].half_width} if known else {}
             row["deviations of ay's offset"] = offset_of(model, drive)
             row |= dict(zip(("error", "band holds"), judged(model, drive, car.slowest), strict=True))
-            row["once advanced by it"] = error_of(model, advanced(drive, found), car.slowest)
+            row["once advanced by it"] = judged(model, advanced(drive, found), car.slowest)[0]
             row |= dict(zip(("40 ms later", "band holds then"), judged(model, advanced(drive, -0.04), car.slowest), strict=True))
             rows.append(row)
     return pd.DataFrame(rows)

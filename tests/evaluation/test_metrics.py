@@ -177,9 +177,9 @@ def test_lever_arms_end_at_half_a_metre_and_need_a_turn():
     yaw_rate = recording["yaw_rate"][-round((N / RATE - 1.5) * RATE) :]
     assert found["rmse_vy"] == pytest.approx(0.8 * np.sqrt(np.mean(yaw_rate**2)), rel=1e-9)
     part = scored(recording, recording["vy_ref"] + 0.1)
-    best = best_lever_arm([part], [np.zeros(len(part.vy))], [np.ones(len(part.vy))])
-    assert best.x == 0.0
-    np.testing.assert_array_equal(best.parts[0].vy, part.vy)
+    x, (moved,) = best_lever_arm([part], [np.zeros(len(part.vy))], [np.ones(len(part.vy))])
+    assert x == 0.0
+    np.testing.assert_array_equal(moved.vy, part.vy)
 
 
 @pytest.mark.parametrize("point", [None, {"x": 0.0, "y": 0.0}])

@@ -13,7 +13,6 @@ from vehest.evaluation.blocks import (
     _window,
     block_labels,
     block_sums,
-    effective_blocks,
     politis_white_length,
     read_segments,
     segments_of,
@@ -22,6 +21,7 @@ from vehest.evaluation.blocks import (
 from vehest.evaluation.metrics import Scored, accuracy
 from vehest.evaluation.ranking import rank
 from vehest.evaluation.significance import holm, root_interval, unexplained_interval
+from vehest.trust.bands import effective_blocks
 
 RATE = 20.0
 

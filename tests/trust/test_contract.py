@@ -14,7 +14,7 @@ from every_estimator import drive_for, fitted
 from vehest.data.errors import ConfigurationError, DataError
 from vehest.estimators.base import Stepper
 from vehest.estimators.registry import estimator_names
-from vehest.trust.contract import GuardedStepper, estimate_guarded
+from vehest.trust.contract import GuardedRun, GuardedStepper
 from vehest.trust.front_end import FrontEnd
 from vehest.trust.guard import usual_limits
 from vehest.trust.watch import CLIPPED, EXTRAPOLATED, SPINNING, STARTED, Watch
@@ -61,7 +61,7 @@ def test_a_drive_without_faults_is_estimated_as_without_the_contract(name):
     estimator = ready(name)
     drive = drive_for(estimator)
     plain = estimator.estimate([drive])[0]
-    guarded = estimate_guarded(estimator, columns(estimator, drive), drive)
+    guarded = GuardedRun(estimator)(columns(estimator, drive), drive)
     np.testing.assert_allclose(guarded["vy"], plain["vy"], rtol=0.0, atol=1e-12)
 
 
@@ -71,7 +71,7 @@ def test_hostile_samples_leave_an_estimate_that_is_finite_bounded_and_the_same_o
     estimator = ready(name)
     drive = short_drive(estimator)
     samples = hostile_columns(estimator, drive, seed)
-    batch = estimate_guarded(estimator, samples, drive)
+    batch = GuardedRun(estimator)(samples, drive)
     one_by_one = online(estimator, samples)
     np.testing.assert_allclose(batch["vy"], one_by_one, rtol=0.0, atol=1e-9)
     after = estimator.warm_up_steps + estimator.horizon_steps
@@ -219,7 +219,7 @@ def test_offline_estimators_and_missing_channels_are_refused():
     estimator = ready("zero")
     drive = planar_drive(5.0)
     with pytest.raises(DataError, match="recording 'drive' has no channel 'vx'"):
-        estimate_guarded(estimator, {"ay": drive["ay"]}, drive)
+        GuardedRun(estimator)({"ay": drive["ay"]}, drive)
 
 
 def test_front_end_filters_as_scipy_does_and_passes_on_at_the_estimators_rate():

@@ -135,7 +135,6 @@ class Replay:
         with (
             self.bus.ends(self.signals.database.messages) as (self.sender, self.unit),
             closing(Output(out, names, self.frames.identifiers[0])) as self.output,
-            view,
             _undisturbed(),
         ):
             frames = (frame for frame in self.log if frame.timestamp >= self.first and is_on(frame, self.signals.bus))

@@ -6,50 +6,31 @@ A band is meant for v and β each: figures of β are in degrees, those of v have
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import stats
 
 from vehest.constants import FloatArray
-from vehest.evaluation.blocks import LEAST_BLOCKS, block_labels, effective_blocks, segments_of
+from vehest.evaluation.blocks import LEAST_BLOCKS, block_labels, block_sums, segments_of
 from vehest.evaluation.metrics import Scored
 from vehest.evaluation.regimes import AY_BANDS, Mask, is_known
-from vehest.trust.bands import LEVELS, SHOWN_LEVEL, Bands, intraclass_correlation
+from vehest.trust.bands import LEVELS, SHOWN_LEVEL, Bands, effective_blocks, intraclass_correlation
 from vehest.trust.bands import block_labels as manoeuvre_labels
 
 CONFIDENCE = 0.95
 IN_REGIMES = ("coverage_90", "width_90", "interval_score")
 SUFFIXES = {"sideslip": "", "vy": "_vy"}  # quantity -> what its figures' names end in
-
-
-@dataclass(frozen=True, eq=False)
-class Banded:
-    """Errors of one quantity and the half widths of its bands, one array a range or sequence."""
-
-    errors: Sequence[FloatArray]  # (K,) each, [deg] or [m/s]
-    half: Sequence[FloatArray]  # (K, L) each, one column a level of `LEVELS`, in the same unit
-
-    @property
-    def together(self) -> tuple[FloatArray, FloatArray]:
-        """All errors (N,) and half widths (N, L)."""
-        return np.concatenate(self.errors), np.concatenate(self.half)
-
-    def only(self, masks: Sequence[Mask]) -> Banded:
-        """The samples that are chosen of each range."""
-        chosen = zip(self.errors, self.half, masks, strict=True)
-        parts = [(error[mask], half[mask]) for error, half, mask in chosen]
-        return Banded([error for error, _ in parts], [half for _, half in parts])
+Banded = tuple[FloatArray, FloatArray]  # errors of all ranges, (N,) [deg] or [m/s], and half widths in the same unit, (N, L), of `LEVELS`
 
 
 def banded(parts: Sequence[Scored], bands: Bands) -> dict[str, Banded]:
-    """Errors and 90 % bands of ``vy`` [m/s] and ``sideslip`` [deg]; all levels are in proportion."""
-    turned = [np.remainder(part.sideslip - part.sideslip_ref + np.pi, 2.0 * np.pi) - np.pi for part in parts]
-    errors = {"vy": [part.vy - part.vy_ref for part in parts], "sideslip": [np.degrees(own) for own in turned]}
-    unit = {"vy": 1.0, "sideslip": np.degrees(1.0)}
+    """Errors and bands of ``vy`` [m/s] and ``sideslip`` [deg]; all levels are in proportion to that at 90 %."""
+    turned = np.concatenate([np.remainder(part.sideslip - part.sideslip_ref + np.pi, 2.0 * np.pi) - np.pi for part in parts])
+    errors = {"vy": np.concatenate([part.vy - part.vy_ref for part in parts]), "sideslip": np.degrees(turned)}
+    shown = {"vy": 1.0, "sideslip": np.degrees(1.0)}
     beside = {"vy": bands.vy.beside(SHOWN_LEVEL), "sideslip": bands.sideslip.beside(SHOWN_LEVEL)}
-    return {name: Banded(errors[name], [unit[name] * part.bands[name][:, None] * beside[name] for part in parts]) for name in SUFFIXES}
+    half = {name: shown[name] * np.concatenate([part.bands[name] for part in parts])[:, None] * beside[name] for name in SUFFIXES}
+    return {name: (errors[name], half[name]) for name in SUFFIXES}
 
 
 def band_figures(
@@ -64,10 +45,10 @@ def band_figures(
     labels = np.concatenate(manoeuvre_labels(turns, [len(part.time) for part in parts], rate_hz)[0])
     figures: dict[str, float] = {}
     for name, suffix in SUFFIXES.items():
-        errors, half = own[name].together
+        errors, half = own[name]
         shown = half[:, LEVELS.index(SHOWN_LEVEL)]
         inside = np.abs(errors)[:, None] <= half
-        by_block = _sums(inside[:, LEVELS.index(SHOWN_LEVEL)].astype(np.float64), labels) / np.bincount(labels)
+        by_block = block_sums(inside[:, LEVELS.index(SHOWN_LEVEL)].astype(np.float64), labels) / np.bincount(labels)
         normalised = np.square(np.divide(errors, shown, out=np.zeros_like(errors), where=shown > 0))
         found = {f"coverage_{100 * level:.0f}": float(inside[:, k].mean()) for k, level in enumerate(LEVELS)}
         found |= {
@@ -77,7 +58,7 @@ def band_figures(
             "interval_score": float(interval_score(errors, shown, SHOWN_LEVEL).mean()),
             "crps": float(crps_of_levels(errors, half, LEVELS).mean()),
             "error_icc": intraclass_correlation(normalised, labels),
-            "band_blocks": effective_blocks(_sums(normalised, labels)),
+            "band_blocks": effective_blocks(block_sums(normalised, labels)),
         }
         figures |= {f"{metric}{suffix}": value for metric, value in found.items()}
     return figures
@@ -88,12 +69,13 @@ def coverage_intervals(own: Mapping[str, Banded], parts: Sequence[Scored], rate_
     segments, found = segments_of(parts, rate_hz), {}
     starts = np.concatenate([[0], np.cumsum(segments.samples)[:-1]]).astype(np.int64)
     for name, suffix in SUFFIXES.items():
-        errors, half = own[name].together
+        errors, half = own[name]
         for k, level in enumerate(LEVELS):
             inside = np.add.reduceat((np.abs(errors) <= half[:, k]).astype(np.float64), starts)
             labels = block_labels(segments, (1.0 - inside / segments.samples)[None])
             if labels.max() + 1 >= LEAST_BLOCKS:
-                found[f"coverage_{100 * level:.0f}{suffix}"] = proportion_interval(_sums(inside, labels), _sums(segments.samples, labels))
+                sums = block_sums(np.stack([inside, segments.samples]), labels)
+                found[f"coverage_{100 * level:.0f}{suffix}"] = proportion_interval(*sums)
     return found
 
 
@@ -101,9 +83,9 @@ def figures_by_regime(own: Mapping[str, Banded], masks: Sequence[Mapping[str, Ma
     """Band of lateral acceleration -> `IN_REGIMES` of β and v over all ranges; only those that have 2 s of samples."""
     found: dict[str, dict[str, float]] = {}
     for regime in (regime for regime in AY_BANDS if is_known(regime, masks, rate_hz)):
-        found[regime] = {}
+        found[regime], inside = {}, np.concatenate([mask[regime] for mask in masks])
         for name, suffix in SUFFIXES.items():
-            errors, half = own[name].only([mask[regime] for mask in masks]).together
+            errors, half = (values[inside] for values in own[name])
             shown = half[:, LEVELS.index(SHOWN_LEVEL)]
             values = (np.mean(np.abs(errors) <= shown), 2.0 * shown.mean(), interval_score(errors, shown, SHOWN_LEVEL).mean())
             found[regime] |= {f"{metric}{suffix}": float(value) for metric, value in zip(IN_REGIMES, values, strict=True)}
@@ -169,7 +151,3 @@ def proportion_interval(sums: FloatArray, sizes: FloatArray) -> tuple[float, flo
     low = float(stats.beta.ppf(outside, hits, misses + 1.0)) if hits > 0 else 0.0
     high = float(stats.beta.ppf(1.0 - outside, hits + 1.0, misses)) if misses > 0 else 1.0
     return low, high
-
-
-def _sums(values: FloatArray, labels: NDArray[np.int64]) -> FloatArray:
-    return np.asarray(np.bincount(labels, weights=values), dtype=np.float64)

@@ -174,15 +174,6 @@ def block_sums(values: FloatArray, labels: NDArray[np.int64]) -> FloatArray:
     return summed if values.ndim > 1 else np.asarray(summed[0])
 
 
-def effective_blocks(sums: FloatArray) -> float:
-    """How many blocks of equal loss would be spread out like these, (B,): (Σ s)² / Σ s², 1 where a single block holds all of it.
-
-    Source: Kish, Survey Sampling, 1965, Section 11.7, for weights.
-    """
-    total = float(np.sum(np.square(sums)))
-    return float(np.sum(sums)) ** 2 / total if total > 0 else float(len(sums))
-
-
 def figure_intervals(segments: Segments) -> dict[str, tuple[float, float]]:
     """95 % intervals over blocks of the drive, of one training: what another drive of this kind would give.
 

@@ -8,7 +8,7 @@ each happened to learn, too.
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
@@ -22,18 +22,12 @@ LONGEST = 0.5  # m, ahead of the reference's point or behind it
 METRICS = ("rmse_vy", "rmse_sideslip", "fvu")
 
 
-@dataclass(frozen=True)
-class LeverArm:
-    """A lever arm and what is left with it."""
-
-    x: float  # how far ahead of the reference's point the estimate holds [m]; at most `LONGEST` either way
-    parts: tuple[Scored, ...]  # the estimates at the reference's point
-
-
 def best_lever_arm(
     parts: Sequence[Scored], yaw_rates: Sequence[FloatArray], speeds: Sequence[FloatArray], least_speed: float = 0.0
-) -> LeverArm:
+) -> tuple[float, list[Scored]]:
     """The lever arm x that leaves the least error: argmin of the mean of (v̂ - v - x·r)², that is Σ(v̂ - v)r / Σr², within `LONGEST`.
+
+    Returns x, how far ahead of the reference's point the estimates hold [m], and the estimates at the latter.
 
     ``yaw_rates`` r [rad/s] and ``speeds`` u [m/s], by which sideslip is made of v, are at the samples of ``parts``.
     """
@@ -46,7 +40,7 @@ def best_lever_arm(
         vy = part.vy - x * yaw_rate
         standing = np.hypot(speed, part.vy_ref) < least_speed
         moved.append(replace(part, vy=vy, sideslip=np.where(standing, 0.0, np.arctan2(vy, speed))))
-    return LeverArm(x, tuple(moved))
+    return x, moved
 
 
 def lever_arm_figures(parts: Sequence[Scored], pieces: Iterable[tuple[Recording, Span]], protocol: Protocol) -> dict[str, float]:
@@ -68,6 +62,6 @@ def lever_arm_figures(parts: Sequence[Scored], pieces: Iterable[tuple[Recording,
             return {}
     if not yaw_rates:
         return {}
-    best = best_lever_arm(parts, yaw_rates, speeds, protocol.least_speed)
-    figures = accuracy(best.parts)
-    return {**{name: figures[name] for name in METRICS}, "lever_arm": best.x}
+    x, moved = best_lever_arm(parts, yaw_rates, speeds, protocol.least_speed)
+    figures = accuracy(moved)
+    return {**{name: figures[name] for name in METRICS}, "lever_arm": x}

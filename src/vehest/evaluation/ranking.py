@@ -9,8 +9,9 @@ from typing import Literal
 import numpy as np
 
 from vehest.constants import FloatArray
-from vehest.evaluation.blocks import LEAST_BLOCKS, Segments, block_labels, block_sums, effective_blocks
+from vehest.evaluation.blocks import LEAST_BLOCKS, Segments, block_labels, block_sums
 from vehest.evaluation.significance import CONFIDENCE, Pair, differences_of_blocks, holm, root_intervals
+from vehest.trust.bands import effective_blocks
 
 Name = tuple[str, str]  # estimator and variant
 

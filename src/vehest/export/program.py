@@ -20,21 +20,6 @@ from vehest.trust.guard import BRIDGED_SECONDS, STANDSTILL_SPEED, STANDSTILL_YAW
 
 TOLERANCES = {"double": 1e-9, "float": 1e-3}
 """Precision -> by how much the outcome of the vectors may differ from that of Python [m/s, rad]."""
-KINDS = (
-    "FREE",
-    "FROZEN",
-    "HELD",
-    "JUMP",
-    "OFFSET",
-    "SIGN",
-    "UNIT",
-    "CONTRADICTION",
-    "OUTSIDE",
-    "MISSING",
-    "SPIN",
-    "LOCKED",
-    "DROPOUT",
-)
 
 
 def brief(value: float) -> str:
@@ -56,7 +41,7 @@ def program_files(stepper: GuardedStepper, precision: Precision, title: str) -> 
     """
     header, source = method_source(stepper.estimator, precision)
     context = context_of(stepper, precision, title)
-    wanted = ["types.h", "estimator.h", "estimator.c", *(["health.h", "health.c"] if context["health"] is not None else [])]
+    wanted = ["types.h", "estimator.h", "estimator.c", *(["health.h", "health.c"] if context["h"] is not None else [])]
     files = {"vehest_method.h": header, "vehest_method.c": source}
     files |= {f"vehest_{name}": render(f"{name}.j2", precision, **context) for name in wanted}
     values = {
@@ -102,10 +87,7 @@ def context_of(stepper: GuardedStepper, precision: Precision, title: str) -> dic
         "fading": math.exp(-interval / watch.FADE_SECONDS),
         "w": vars(watch),
         "verdict": vars(verdict),
-        "kernel": vars(health_kernel),
         "k": vars(health_kernel),
-        "kinds": KINDS,
-        "health": health,
         "h": health,
         "r": number,
         "reals": lambda values: braced(values, number),

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import re
+import textwrap
 from collections.abc import Callable
 from functools import cache, partial
 from pathlib import Path
@@ -94,16 +95,11 @@ def braced(values: Any, write: Callable[[Any], str]) -> str:
 
 def _wrapped(words: list[str]) -> str:
     """Words in braces, on one line if they fit on it."""
-    if sum(len(word) + 2 for word in words) <= LINE:
-        return "{ " + ", ".join(words) + " }"
-    lines, line = [], ""
-    for word in words:
-        if line and len(line) + len(word) + 2 > LINE:
-            lines.append(line.rstrip())
-            line = ""
-        line += f"{word}, "
-    lines.append(line.rstrip().rstrip(","))
-    return "{\n" + "\n".join(f"    {line}" for line in lines) + "\n}"
+    text = ", ".join(words)
+    if len(text) + 2 <= LINE:
+        return f"{{ {text} }}"
+    lines = textwrap.wrap(f"{text},", LINE - 1, break_long_words=False, break_on_hyphens=False)
+    return "{\n" + "\n".join(f"    {line}" for line in lines).removesuffix(",") + "\n}"
 
 
 def whole(values: Any) -> str:

@@ -124,7 +124,5 @@ def _noise(n: int, seed: int) -> FloatArray:
 def table_text(columns: Sequence[str], rows: FloatArray) -> str:
     """A table as CSV, every number so that it reads back to the same."""
     out = io.StringIO()
-    out.write(",".join(columns) + "\n")
-    for row in rows.tolist():
-        out.write(",".join("nan" if math.isnan(value) else f"{value:.17g}" for value in row) + "\n")
+    np.savetxt(out, rows, fmt="%.17g", delimiter=",", header=",".join(columns), comments="")
     return out.getvalue()

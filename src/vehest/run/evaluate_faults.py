@@ -26,7 +26,7 @@ from vehest.run.artefacts import Artefact
 from vehest.run.config import Config, compose_config
 from vehest.run.config_files import choices
 from vehest.run.train import recording_file
-from vehest.trust.contract import estimate_guarded
+from vehest.trust.contract import GuardedRun
 from vehest.trust.faults import Fault, Severity, inject
 from vehest.trust.record import Trust, is_other_vehicle
 
@@ -151,7 +151,7 @@ def errors_under(
         fault = settings.within(start, recording.duration - start, position)
         samples = inject(recording.channels, recording.rate_hz, fault)
         elsewhere = other_vehicle or is_other_vehicle(trust, recording)
-        estimate = estimate_guarded(estimator, samples, recording, trust, state, elsewhere=elsewhere)
+        estimate = GuardedRun(estimator, trust, state, elsewhere=elsewhere)(samples, recording)
         onset = recording.start_time + fault.onset
         lost = np.isnan(estimate["vy"]) & (estimate.time >= onset)
         channels = {name: np.where(lost, np.inf, estimate[name]) for name in ("vy", "sideslip")}

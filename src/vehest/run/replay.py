@@ -62,7 +62,7 @@ def replay_log(
         faster = timing.rate_hz if abs(timing.rate_hz / fitted.settings.rate_hz - 1.0) > SAME_RATE else None
         if write_dbc is not None:
             write_dbc_file(write_dbc, estimates.identifiers[0])
-        view = View(None if quiet else sys.stderr, f"{log.name} on {bus.interface} {bus.channel}")
+        view = View(None if quiet else sys.stderr)
         figures = Replay(frames, wanted, timing, bus, estimates, stopped).run(lambda: GuardedStepper(fitted, trust, faster), out, view)
     return {
         "log": str(log),

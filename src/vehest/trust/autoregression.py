@@ -13,6 +13,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
 
 from vehest.constants import FloatArray
 from vehest.data.errors import DataError
@@ -79,16 +80,11 @@ def fit_autoregression(pieces: Sequence[FloatArray], max_order: int = 10) -> Aut
 
 def _rows(pieces: Sequence[FloatArray], order: int) -> tuple[FloatArray, FloatArray]:
     """Regressors (N, p·C), the latest sample first, and targets (N, C) of complete rows."""
-    regressors, targets = [], []
-    for piece in pieces:
-        if len(piece) > order:
-            regressors.append(np.concatenate([piece[order - lag : len(piece) - lag] for lag in range(1, order + 1)], axis=1))
-            targets.append(piece[order:])
-    if not targets:
-        return np.empty((0, order * pieces[0].shape[1])), np.empty((0, pieces[0].shape[1]))
-    before, after = np.concatenate(regressors), np.concatenate(targets)
-    complete = np.isfinite(before).all(1) & np.isfinite(after).all(1)
-    return before[complete], after[complete]
+    windows = [np.empty((0, order + 1, pieces[0].shape[1]))]
+    windows += [sliding_window_view(piece, order + 1, axis=0).transpose(0, 2, 1)[:, ::-1] for piece in pieces if len(piece) > order]
+    rows = np.concatenate(windows)
+    rows = rows[np.isfinite(rows).all((1, 2))]
+    return rows[:, 1:].reshape(len(rows), order * rows.shape[2]), rows[:, 0]
 
 
 def _least_squares(regressors: FloatArray, targets: FloatArray, columns: int) -> FloatArray:

@@ -269,10 +269,17 @@ def terms_of(rows: FloatArray, vy: FloatArray, variance: FloatArray, columns: ND
 
 def _with_factors(own: Quantity, scores: FloatArray, blocks: NDArray[np.int64]) -> Quantity:
     factors, beyond = zip(*(pooled_quantile(scores, blocks, level) for level in LEVELS), strict=True)
-    squared = np.bincount(np.unique(blocks, return_inverse=True)[1], weights=np.square(scores))
-    total = float(np.sum(np.square(squared)))
-    effective = float(squared.sum()) ** 2 / total if total > 0 else float(len(squared))
-    return replace(own, factors=factors, beyond=beyond, effective_blocks=effective)
+    squared = np.asarray(np.bincount(np.unique(blocks, return_inverse=True)[1], weights=np.square(scores)), dtype=np.float64)
+    return replace(own, factors=factors, beyond=beyond, effective_blocks=effective_blocks(squared))
+
+
+def effective_blocks(sums: FloatArray) -> float:
+    """How many blocks of equal loss would be spread out like these, (B,): (Σ s)² / Σ s², 1 where a single block holds all of it.
+
+    Source: Kish, Survey Sampling, 1965, Section 11.7, for weights.
+    """
+    total = float(np.sum(np.square(sums)))
+    return float(np.sum(sums)) ** 2 / total if total > 0 else float(len(sums))
 
 
 def fitted_scale(terms: FloatArray, errors: FloatArray) -> tuple[FloatArray, float]:

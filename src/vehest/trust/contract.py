@@ -1,4 +1,4 @@
-"""The contract of every estimator, online (`GuardedStepper`) and for a recording (`estimate_guarded`), by the same compiled recursions.
+"""The contract of every estimator, online (`GuardedStepper`) and for a recording (`GuardedRun`), by the same compiled recursions.
 
     received rows -> guard -> health -> estimator -> watch -> verdict, bands -> estimate
 
@@ -50,19 +50,6 @@ def limits_for(estimator: Estimator, trust: Trust | None) -> GuardLimits:
     return own or usual_limits(estimator.channels, estimator.settings.rate_hz)
 
 
-def estimate_guarded(
-    estimator: Estimator,
-    samples: Mapping[str, FloatArray],
-    recording: Recording,
-    trust: Trust | None = None,
-    initial_state: Mapping[str, float] | None = None,
-    *,
-    elsewhere: bool = False,
-) -> Estimate:
-    """Estimate a recording under the contract; see `GuardedRun`."""
-    return GuardedRun(estimator, trust, initial_state, elsewhere=elsewhere)(samples, recording)
-
-
 class GuardedRun:
     """An estimator under the contract on a recording, or on its parts one after another, to the same bits.
 
@@ -77,7 +64,7 @@ class GuardedRun:
     """
 
     def __init__(
-        self, estimator: Estimator, trust: Trust | None, initial_state: Mapping[str, float] | None = None, *, elsewhere: bool = False
+        self, estimator: Estimator, trust: Trust | None = None, initial_state: Mapping[str, float] | None = None, *, elsewhere: bool = False
     ) -> None:
         limits, rate, kind = limits_for(estimator, trust), estimator.settings.rate_hz, type(estimator)
         self.estimator, self.initial_state = estimator, initial_state
