@@ -165,12 +165,12 @@ def _drive(bag: Reading) -> Drive:
     servo_times = _seconds(bag, "/vesc/servo_position_command", "received")
     poses = np.stack([bag.arrays[f"/optitrack/rigid_body_0.pose.{part}"][body_kept] for part in POSE_FIELDS], axis=1)
     plane, yaw = ground_plane(poses[:, :3], poses[:, 3:], "z", "pose")
-    motion = PoseOptions().motion(plane, yaw, float(np.diff(body_times).mean()))
     begin, end = max(imu_times[0], vesc_times[0], body_times[0]), min(imu_times[-1], vesc_times[-1], body_times[-1], servo_times[-1])
     grid = np.arange(np.ceil(begin * RATE), np.floor(end * RATE) + 1) / RATE
+    motion = PoseOptions().references(plane, yaw, float(np.diff(body_times).mean()), at=(body_times, grid))
     return Drive(
         "bag",
-        *(np.interp(grid, body_times, samples) for samples in (motion.vx, motion.vy, motion.yaw_rate)),
+        *(motion[name] for name in ("vx_ref", "vy_ref", "yaw_rate_ref")),
         *(
             np.interp(grid, imu_times, bag.arrays[f"/imu.{name}"][imu_kept])
             for name in ("linear_acceleration.x", "linear_acceleration.y", "angular_velocity.z")
