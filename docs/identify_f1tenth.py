@@ -116,10 +116,10 @@ def _drive(bag: Reading) -> pd.DataFrame:
     servo_times = _seconds(bag, SERVO, "received")
     poses = np.stack([bag.arrays[f"{BODY}.pose.{part}"][kept[BODY]] for part in POSE_FIELDS], axis=1)
     plane, yaw = ground_plane(poses[:, :3], poses[:, 3:], "z", "pose")
-    motion = PoseOptions().motion(plane, yaw, float(np.diff(times[BODY]).mean()))
     begin, end = max(own[0] for own in times.values()), min(own[-1] for own in (*times.values(), servo_times))
     grid = np.arange(np.ceil(begin * RATE), np.floor(end * RATE) + 1) / RATE
-    found = {name: np.interp(grid, times[BODY], getattr(motion, name)) for name in COLUMNS[:3]}
+    motion = PoseOptions().references(plane, yaw, float(np.diff(times[BODY]).mean()), at=(times[BODY], grid))
+    found = {name: motion[f"{name}_ref"] for name in COLUMNS[:3]}
     for topic, names in ((IMU, ("linear_acceleration.x", "linear_acceleration.y", "angular_velocity.z")), (MOTOR, FIELDS["vesc"])):
         for name in names:
             found[name] = np.interp(grid, times[topic], bag.arrays[f"{topic}.{name}"][kept[topic]])

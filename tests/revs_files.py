@@ -1,6 +1,6 @@
 """Writes files in the official layouts of the Revs database, from signals that the caller knows; for tests and benchmarks.
 
-Names of columns, structs and parameters are those that public programs read from the real files; values are made here.
+Names of columns and parameters are those that public programs read from the real files; values are made here.
 """
 
 from __future__ import annotations
@@ -12,7 +12,6 @@ from itertools import zip_longest
 import numpy as np
 import pyarrow as pa
 import pyarrow.csv as pc
-from scipy.io import savemat
 
 from vehest.constants import FloatArray
 
@@ -31,29 +30,27 @@ PARAMETERS = {
     "roadWheelAngleFR": ("°", [-6.9, 0.0, 6.7]),
 }
 
-_DRIVER, _INS, _TYRE = "driverData", "insData", "tireData"
-
 
 def _columns():
-    """The 55 columns in order: name -> (unit, rate of its sensor [Hz], struct of the MAT file)."""
-    columns = {"time": ("s", CSV_RATE_HZ, "")}
+    """The 55 columns in order: name -> (unit, rate of its sensor [Hz])."""
+    columns = {"time": ("s", CSV_RATE_HZ)}
     for name, unit in {"handwheelAngle": "°", "throttle": "%", "brake": "%", "clutch": "%", "engineSpeed": "rpm", "PPS": "-"}.items():
-        columns[name] = (unit, CSV_RATE_HZ, _DRIVER)
+        columns[name] = (unit, CSV_RATE_HZ)
     for name, unit in {"gpsTime": "s", "latitude": "°", "longitude": "°", "altitude": "m"}.items():
-        columns[name] = (unit, GPS_RATE_HZ, _INS)
+        columns[name] = (unit, GPS_RATE_HZ)
     ins = dict.fromkeys(("vNorth", "vEast", "vUp", "horizontalSpeed", "vxCG", "vyCG", "vzCG"), "m/s")
     ins |= dict.fromkeys(("axCG", "ayCG", "azCG"), "m/s²") | dict.fromkeys(("yawAngle", "pitchAngle", "rollAngle"), "°")
     ins |= dict.fromkeys(("rollRate", "pitchRate", "yawRate"), "°/s") | {"sideSlip": "°", "distance": "m"}
     for name, unit in ins.items():
-        columns[name] = (unit, INS_RATE_HZ, _INS)
+        columns[name] = (unit, INS_RATE_HZ)
     for name in ("numSVsTracked", "gpsPosMode", "gpsVelMode", "gpsOrientMode", "HDOP", "PDOP"):
-        columns[name] = ("-", GPS_RATE_HZ, _INS)
+        columns[name] = ("-", GPS_RATE_HZ)
     for what, unit, axes in (("pos", "m", "north east down"), ("vel", "m/s", "north east down"), ("orient", "°", "heading pitch roll")):
         for axis in axes.split():
-            columns[f"{what}Accuracy_{axis}"] = (unit, GPS_RATE_HZ, _INS)
+            columns[f"{what}Accuracy_{axis}"] = (unit, GPS_RATE_HZ)
     for what, unit, corners in (("chassisAccel", "g", "FL FR RL RR"), ("deflection", "mm", "FL FR RR"), ("wheelAccel", "g", "FL FR RL RR")):
         for corner in corners.split():
-            columns[f"{what}{corner}"] = (unit, CSV_RATE_HZ, _TYRE)
+            columns[f"{what}{corner}"] = (unit, CSV_RATE_HZ)
     return columns
 
 
@@ -89,7 +86,6 @@ def smooth_drive(seconds, start_time=0.0, decimals=None):
     truth["steer"] = truth["handwheel"] / 13.3
     signals = _ins_signals({name: samples[:: CSV_RATE_HZ // INS_RATE_HZ] for name, samples in truth.items()})
     signals["handwheelAngle"] = np.rad2deg(truth["handwheel"])
-    signals |= {f"roadWheelAngle{side}": size * np.rad2deg(truth["steer"]) for side, size in (("", 1.0), ("FL", 1.01), ("FR", 0.99))}
     if decimals is not None:
         signals = {name: np.round(samples, decimals) for name, samples in signals.items()}
     return Drive(seconds, signals, start_time), truth
@@ -101,25 +97,15 @@ def write_csv(path, drive, *, blank_rows=37):
     Columns that the drive lacks are filled with something; every column slower than 1 kHz, or those named, begin with ``blank_rows``.
     """
     arrays = []
-    for name, (_, rate, _) in COLUMNS.items():
+    for name, (_, rate) in COLUMNS.items():
         values = _held(drive, name, rate)
         blank = blank_rows.get(name, 0) if isinstance(blank_rows, Mapping) else (blank_rows if rate < CSV_RATE_HZ else 0)
         arrays.append(pa.array(values, mask=np.arange(drive.rows()) < blank if blank else None))
     with open(path, "wb") as stream:
-        header = [*PREAMBLE, ",".join(COLUMNS), ",".join(unit for unit, _, _ in COLUMNS.values()), ""]
+        header = [*PREAMBLE, ",".join(COLUMNS), ",".join(unit for unit, _ in COLUMNS.values()), ""]
         stream.write("\r\n".join(header).encode("latin-1"))
         options = pc.WriteOptions(include_header=False, quoting_style="none")
         pc.write_csv(pa.table(arrays, names=list(COLUMNS)), stream, options)
-
-
-def write_mat(path, drive, *, compressed=True):
-    """One official MAT file: structs of channels, each a struct of value and time, compressed as MATLAB's -v7 does."""
-    structs = {_INS: {}, _TYRE: {}, _DRIVER: {}}
-    for name, values in drive.signals.items():
-        _, rate, struct = COLUMNS.get(name, ("°", CSV_RATE_HZ, _TYRE))
-        structs[struct][name] = {"value": values[:, None], "time": (drive.start_time + np.arange(len(values)) / rate)[:, None]}
-    parameters = {name: {"value": np.asarray(values)[:, None], "units": unit} for name, (unit, values) in PARAMETERS.items()}
-    savemat(path, {**structs, "params": parameters}, do_compression=compressed, oned_as="column")
 
 
 def write_vehicle_parameters(path):

@@ -28,7 +28,7 @@ from vehest.run.config import compose_config
 from vehest.run.downsample import transforms_of
 from vehest.simulation.plant.multi_body import MultiBodyPlant
 from vehest.simulation.plant.parameters import vehicle_from_configuration
-from vehest.simulation.sensors.levels import SensorLevel, ideal_sensors
+from vehest.simulation.sensors.levels import PRESETS, SensorLevel, Tilt
 from vehest.simulation.sensors.recording import measure, specific_force
 
 IMU = ("lever_arm", "mounting", "delay", "offsets")
@@ -41,12 +41,12 @@ tolerances are at least 1.5 times those, except for the delay without a referenc
 LARGEST_UNCERTAINTY = TOLERANCE | {"delay": 0.004}
 
 NOISE = replace(  # nothing but noise, so that no other errors come on top of the planted ones: 0.0017 rad/s, 0.035 m/s² and 0.05 m/s
-    ideal_sensors(),
+    PRESETS["ideal"],
     yaw_rate=SensorLevel(noise=2.4e-4),
     ax=SensorLevel(noise=0.005),
     ay=SensorLevel(noise=0.005),
     vx=SensorLevel(noise=0.0071),
-    reference=replace(ideal_sensors().reference, vy=SensorLevel(noise=0.0021)),  # 0.015 m/s
+    reference=replace(PRESETS["ideal"].reference, vy=SensorLevel(noise=0.0021)),  # 0.015 m/s
 )
 CONFIGURATION = Path(__file__).parents[2] / "conf" / "vehicle" / "bmw_320i_low.yaml"
 
@@ -81,7 +81,7 @@ def recorded(motion, planted, *, leaning=False, reference_rate=False):
     """
     p = dict.fromkeys(PLANTED, 0.0) | planted
     time = np.arange(len(motion)) / 100.0
-    force = specific_force(motion)[:2] if leaning else np.stack([motion.ax, motion.ay])
+    force = specific_force(motion, Tilt())[:2] if leaning else np.stack([motion.ax, motion.ay])
     spin = np.stack([np.zeros(len(time)), np.zeros(len(time)), motion.yaw_rate])
     spin_dot = np.stack([np.zeros(len(time)), np.zeros(len(time)), CubicSpline(time, motion.yaw_rate)(time, 1)])
     lever = np.broadcast_to(np.array([[p["lever_x"]], [p["lever_y"]], [0.0]]), spin.shape)

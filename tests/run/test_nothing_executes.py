@@ -62,21 +62,6 @@ def mdf(honest, hostile):
     return by_source(source="mdf", rate_hz=100, channels=ONE)
 
 
-def mat(honest, hostile):
-    from scipy.io import savemat
-
-    values = {"value": np.sin(FAST)[:, None], "time": FAST[:, None]}
-    text = {"insData": {"vxCG": {**values, "value": PAYLOAD}}, PAYLOAD[:5]: PAYLOAD}
-    for packed in (False, True):
-        savemat(honest / f"a{packed:d}.mat", {"insData": {"vxCG": values}}, do_compression=packed)
-        savemat(hostile / f"text{packed:d}.mat", text, do_compression=packed)
-        savemat(hostile / f"object{packed:d}.mat", {"insData": {"vxCG": np.array([PAYLOAD, 1], dtype=object)}}, do_compression=packed)
-    (hostile / "pickle.mat").write_bytes((honest / "a0.mat").read_bytes() + PICKLE)
-    declared = {"channels": {"vx": {"column": "vxCG", "unit": "m/s"}}, "time": {"column": "time", "unit": "s"}}
-    read = by_source(source="revs", layout="mat", rate_hz=100, **declared)
-    return lambda file: read(file.with_suffix(""))
-
-
 def rosbag(honest, hostile):
     from test_sources_rosbag import Topic, write_bag
 
@@ -166,7 +151,6 @@ def model(honest, hostile):
 
 CASES = {
     "mdf": (mdf, "asammdf", {"formula_4.10.mf4", "formula_3.30.mf4", "power.mf4", "nested.mf4"}),
-    "mat": (mat, "", {"text0.mat", "object0.mat", "pickle.mat", "text1.mat", "object1.mat"}),
     "rosbag": (rosbag, "rosbags", {"view_load", "view_zeros", "endless"}),
     "vbo": (vbo, "", {"number0.vbo", "pickle.vbo"}),
     "table": (table, "", {"cell0.csv", "pickle.csv"}),

@@ -19,15 +19,20 @@ from vehest.simulation.driving.manoeuvres import manoeuvre_from_config
 from vehest.simulation.errors import SimulationError
 from vehest.simulation.plant.multi_body import MultiBodyPlant
 from vehest.simulation.plant.parameters import Vehicle
-from vehest.simulation.road.course import Compound, Corner, Layout, Straight, build_course, course_by_name
+from vehest.simulation.road.course import build_course, course_by_name
 from vehest.simulation.road.lines import least_within
+from vehest.simulation.road.segments import Compound, Corner, Straight
 from vehest.simulation.road.surface import surface_from_config
-from vehest.simulation.road.tracks import LAYOUTS
-from vehest.simulation.sensors.levels import ideal_sensors
+from vehest.simulation.road.tracks import LAYOUTS, Layout
+from vehest.simulation.sensors.levels import PRESETS
 
 LOWERED = shipped("bmw_320i_low")
 HANDLING = course_by_name("handling")
 LAP_SEEDS = (0, 2)  # the fastest styles among seeds 0 to 4
+
+
+def gap(course):
+    return math.hypot(course.x[-1] - course.x[0], course.y[-1] - course.y[0])
 
 
 def drive(seed, duration=12.0, **options):
@@ -75,7 +80,7 @@ def recording():
 )
 def test_courses_are_closed_and_as_long_as_stated(name, shortest, longest):
     course = course_by_name(name)
-    assert course.gap < 1e-6
+    assert gap(course) < 1e-6
     assert abs(course.turning) == pytest.approx(2.0 * math.pi, abs=1e-9)
     assert shortest < course.length < longest
     for values in (course.bank, course.grade, course.friction):
@@ -118,11 +123,11 @@ def test_course_positions_follow_from_their_curvature(name):
 
 def test_square_courses_have_the_length_turning_bank_and_heights_of_their_parts():
     corner = Corner(radius=50.0, angle=math.pi / 2.0, transition=10.0)
-    square = build_course("square", [Straight(101.0), corner, Straight(100.0), corner] * 2)
-    assert square.gap < 1e-9
+    square = build_course("square", Layout((Straight(101.0), corner, Straight(100.0), corner) * 2))
+    assert gap(square) < 1e-9
     assert square.length == pytest.approx(402.0 + 4.0 * (50.0 * math.pi / 2.0 + 10.0))
     corner = Compound((Corner(40.0, math.pi / 3.0, 12.0), Corner(80.0, math.pi / 6.0, 12.0)))
-    square = build_course("square", [Straight(100.0), corner] * 4)
+    square = build_course("square", Layout((Straight(100.0), corner) * 4))
     assert square.turning == pytest.approx(2.0 * math.pi)
     assert np.unique(np.round(1.0 / square.curvature[square.curvature > 1e-3])).tolist()[0] == 40.0
     with pytest.raises(ValueError, match="one side"):
@@ -140,7 +145,7 @@ def test_square_courses_have_the_length_turning_bank_and_heights_of_their_parts(
 
 def test_courses_styles_and_steps_that_make_no_sense_are_refused():
     with pytest.raises(ConfigurationError, match="90°"):
-        build_course("open", [Straight(100.0), Corner(50.0, math.pi / 2.0, 10.0)])
+        build_course("open", Layout((Straight(100.0), Corner(50.0, math.pi / 2.0, 10.0))))
     with pytest.raises(ConfigurationError, match="handling"):
         course_by_name("nordschleife")
     with pytest.raises(ConfigurationError, match="grip fraction"):
@@ -263,7 +268,7 @@ def test_flat_leaves_bank_and_grade_out_and_the_sampling_rate_does_not_change_th
     motion = trip(1, course="palm_beach_like", duration=2.0, flat=True).motion
     assert not motion.bank.any()
     assert not motion.grade.any()
-    coarse, fine = (drive(seed=0, duration=8.0, rate_hz=rate, sensors=ideal_sensors()) for rate in (20.0, 100.0))
+    coarse, fine = (drive(seed=0, duration=8.0, rate_hz=rate, sensors=PRESETS["ideal"]) for rate in (20.0, 100.0))
     for name in coarse.channels:
         np.testing.assert_array_equal(coarse[name], fine[name][::5])
 
@@ -309,7 +314,7 @@ def test_rollover_says_which_drive_and_when():
     assert raised.value.exit_code == 3
 
 
-@pytest.mark.parametrize("options", [{"rate_hz": 30.0}, {"rate_hz": 0.0}, {"duration": 0.0}, {"seed": -1}])
+@pytest.mark.parametrize("options", [{"rate_hz": 30.0}, {"rate_hz": 0.0}, {"duration": 0.0}])
 def test_drive_that_makes_no_sense_is_refused(options):
     with pytest.raises(ConfigurationError):
         drive(**{"seed": 0, "duration": 1.0, **options})

@@ -15,7 +15,7 @@ from vehest.constants import GRAVITY
 from vehest.data.errors import ConfigurationError
 from vehest.run.config import compose_config
 from vehest.simulation.driving.freestyle import Freestyle
-from vehest.simulation.driving.manoeuvres import one_of
+from vehest.simulation.driving.manoeuvres import manoeuvre_from_config
 from vehest.simulation.errors import SimulationError
 from vehest.simulation.planar_drive import CHANNELS, PLANAR_MANOEUVRES, drive_freely, simulate_planar_drive
 from vehest.simulation.plant.planar import FIRST_WHEEL, LOAD_AX, LOAD_AY, STEER, VX, VY, YAW_RATE, Inputs, PlanarPlant
@@ -234,9 +234,9 @@ def car_with(**changes):
     [
         (lambda: car_with(height=1.0), "unknown key 'height'"),
         (lambda: car_with(mass=-1.0), "mass: .* greater than 0, not -1"),
-        (lambda: one_of({"name": "slalom"}, PLANAR_MANOEUVRES), "there is no manoeuvre 'slalom'; there are freestyle"),
-        (lambda: one_of({"name": "freestyle", "brakes": 2.0}, PLANAR_MANOEUVRES), "brakes must lie between 0 and 1"),
-        (lambda: one_of({"name": "freestyle", "brakes": 0.6, "kicks": 0.6}, PLANAR_MANOEUVRES), "shares of one"),
+        (lambda: manoeuvre_from_config({"name": "slalom"}, PLANAR_MANOEUVRES), "there is no manoeuvre 'slalom'; there are freestyle"),
+        (lambda: manoeuvre_from_config({"name": "freestyle", "brakes": 2.0}, PLANAR_MANOEUVRES), "brakes must lie between 0 and 1"),
+        (lambda: manoeuvre_from_config({"name": "freestyle", "brakes": 0.6, "kicks": 0.6}, PLANAR_MANOEUVRES), "shares of one"),
     ],
 )
 def test_cars_and_manoeuvres_that_make_no_sense_are_refused(make, complaint):

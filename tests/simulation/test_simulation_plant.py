@@ -1,10 +1,8 @@
 """The plant: library's equations, what was added to them, and that it holds from standstill to a spin."""
 
-import fcntl
 import math
 from dataclasses import fields
 from functools import cache
-from threading import Event, Thread
 from types import FunctionType
 
 import numpy as np
@@ -16,7 +14,6 @@ from vehiclemodels.init_mb import init_mb
 from vehiclemodels.vehicle_dynamics_mb import vehicle_dynamics_mb
 
 from vehest.constants import GRAVITY
-from vehest.data.errors import ConfigurationError
 from vehest.simulation.errors import SimulationError
 from vehest.simulation.plant import compiled
 from vehest.simulation.plant.equations import SMALLEST_WHEEL_VELOCITY, multi_body
@@ -370,10 +367,6 @@ def test_states_and_starts_that_make_no_sense_are_errors_and_the_published_bmw_r
     state.values[VY] = np.nan
     with pytest.raises(SimulationError):
         plant.advance(state, inputs_of(), 1)
-    with pytest.raises(ConfigurationError, match="step"):
-        MultiBodyPlant(LOWERED, step=0.0)
-    with pytest.raises(ConfigurationError, match="-1"):
-        MultiBodyPlant(LOWERED).initial_state(0.0, 0.0, 0.0, -1.0)
 
 
 def test_lifted_wheel_carries_nothing_and_does_not_outrun_the_engine():
@@ -401,22 +394,6 @@ def test_no_state_becomes_infinite_between_standstill_and_70_m_per_s(vehicle):
                 assert abs(state.values[ROLL]) < (0.3 if vehicle.name.startswith("set") else 0.2)  # the published springs are soft
 
 
-def test_first_call_waits_for_another_process_that_compiles(monkeypatch):
-    function, called = compiled._Kept(compiled._advance), Event()
-    assert function.lock is not None
-    monkeypatch.setattr(function, "dispatcher", called.set)
-    first = Thread(target=function)
-    with function.lock.open("w") as file:
-        fcntl.flock(file, fcntl.LOCK_EX)
-        first.start()
-        assert not called.wait(0.3)
-    assert called.wait(10.0)
-    first.join()
-    with function.lock.open("w") as file:
-        fcntl.flock(file, fcntl.LOCK_EX)
-        function()  # later calls do not
-
-
 def test_no_kind_of_array_is_compiled_for_twice():
     plant, state = MultiBodyPlant(FERRARI), MultiBodyPlant(FERRARI).initial_state(0.0, 0.0, 0.0, 20.0)
     read_only, columns = np.broadcast_to(inputs_of(), (3, 5)), np.zeros((3, 10), order="F")[:, ::2]
@@ -424,4 +401,4 @@ def test_no_kind_of_array_is_compiled_for_twice():
         for friction in (1.0, [1, 1, 1], np.broadcast_to(1.0, 3)):
             plant.motion([state] * 3, inputs, 100.0, friction=friction)
         plant.advance(state, inputs[0], 1)
-    assert [len(function.dispatcher.signatures) for function in (compiled.advance, compiled.evaluate)] == [1, 1]
+    assert [len(function.signatures) for function in (compiled.advance, compiled.evaluate)] == [1, 1]

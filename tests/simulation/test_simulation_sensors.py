@@ -12,7 +12,7 @@ from vehest.data.channels import CHANNELS
 from vehest.data.errors import ConfigurationError
 from vehest.simulation.plant.motion import WHEELS, Motion
 from vehest.simulation.sensors.config import sensor_levels_from_config, switched_off
-from vehest.simulation.sensors.levels import PRESETS, Mounting, Reference, SensorLevel, SensorLevels, Tilt, Vibration, ideal_sensors
+from vehest.simulation.sensors.levels import PRESETS, Mounting, Reference, SensorLevel, SensorLevels, Tilt, Vibration
 from vehest.simulation.sensors.recording import body_rates, described, measure, specific_force
 from vehest_papers.proving_ground.noise_reading import noise_density, read_off
 
@@ -84,7 +84,7 @@ def swerving(seconds):
 
 def only(**levels):
     """Ideal sensors but for the given ones."""
-    return replace(ideal_sensors(), **levels)
+    return replace(PRESETS["ideal"], **levels)
 
 
 def different(one, other):
@@ -94,7 +94,7 @@ def different(one, other):
 
 def test_ideal_and_switched_off_sensors_show_the_motion_itself_without_angles_of_the_body():
     motion = weaving()
-    shown = measure(motion, ideal_sensors(), seed=3)
+    shown = measure(motion, PRESETS["ideal"], seed=3)
     for name in ("vx", "yaw_rate", "roll_rate", "pitch_rate", "ax", "ay", "steer"):
         np.testing.assert_array_equal(shown[name], getattr(motion, name), err_msg=name)
     for place, wheel in enumerate(WHEELS):
@@ -109,7 +109,7 @@ def test_ideal_and_switched_off_sensors_show_the_motion_itself_without_angles_of
     assert {"roll", "pitch", "handwheel"}.isdisjoint(shown)
     assert len(shown) == 2 + 5 + 4 + 12 + 2 + 4
     nothing = switched_off(PRESETS["race"], "tilt", "imu", "reference", *SENSORS)
-    assert different(measure(motion, nothing, 0), measure(motion, ideal_sensors(), 1)) == set()
+    assert different(measure(motion, nothing, 0), measure(motion, PRESETS["ideal"], 1)) == set()
 
 
 def test_a_single_sample_is_measured_and_cars_without_an_electric_motor_show_none():
@@ -128,7 +128,7 @@ def test_a_single_sample_is_measured_and_cars_without_an_electric_motor_show_non
 def test_vibration_grows_with_the_wheels_speed_and_moves_nothing_else():
     motion = motion_of(20_000, wheel_speed=np.repeat(np.linspace(0.0, 100.0, 20_000)[:, None], 4, axis=1))
     shaken = measure(motion, only(vibration=Vibration(yaw_rate=0.01, ax=0.1, ay=0.2)), seed=3)
-    assert different(shaken, measure(motion, ideal_sensors(), seed=3)) == {"yaw_rate", "ax", "ay"}
+    assert different(shaken, measure(motion, PRESETS["ideal"], seed=3)) == {"yaw_rate", "ax", "ay"}
     for name, per_speed in (("yaw_rate", 0.01), ("ax", 0.1), ("ay", 0.2)):
         for part in (slice(1_000, 3_000), slice(17_000, 19_000)):
             expected = per_speed * np.sqrt((motion.wheel_speed[part, 0] ** 2).mean())
@@ -216,13 +216,13 @@ def test_gravity_leaks_in_at_rest_with_the_left_side_up_or_the_nose_down(angle, 
 
 def test_specific_force_and_gyros_are_those_of_turned_axes():
     motion = weaving()
-    force = specific_force(motion)
+    force = specific_force(motion, Tilt())
     for k in (0, 333, 1999):
         road, body = _rotation(motion.bank[k], motion.grade[k]), _rotation(motion.roll[k], motion.pitch[k])
         level = road @ np.array([motion.ax[k], motion.ay[k], 0.0]) - np.array([0.0, 0.0, -G])
         np.testing.assert_allclose(force[:, k], (road @ body).T @ level, atol=1e-12)
     # A turntable: the body's axes in the road's are R(t) = Rz(ψ)Ry(θ)Rx(φ), its angular velocity the skew matrix RᵀdR/dt.
-    shown = body_rates(motion)
+    shown = body_rates(motion, Tilt())
     t, h = 3.21, 1e-5
     k = 321
     yaw = lambda s: -0.4 / 1.1 * math.cos(1.1 * s)  # noqa: E731
@@ -233,7 +233,7 @@ def test_specific_force_and_gyros_are_those_of_turned_axes():
     straight = measure(motion, only(tilt=Tilt()), seed=0)
     turned = measure(motion, only(tilt=Tilt(), imu=Mounting(roll=0.1, pitch=-0.05, yaw=0.2)), seed=0)
     axes = _turn_z(0.2) @ _rotation(0.1, -0.05)
-    for names, third in ((("roll_rate", "pitch_rate", "yaw_rate"), None), (("ax", "ay"), specific_force(motion)[2])):
+    for names, third in ((("roll_rate", "pitch_rate", "yaw_rate"), None), (("ax", "ay"), specific_force(motion, Tilt())[2])):
         vector = np.stack([straight[name] for name in names] + ([third] if third is not None else []))
         np.testing.assert_allclose(np.stack([turned[name] for name in names]), (axes.T @ vector)[: len(names)], atol=1e-12)
 
@@ -359,7 +359,7 @@ def test_the_seed_decides_every_sample_and_a_longer_drive_begins_alike():
     [
         ("", SensorLevels()),
         ("race", PRESETS["race"]),
-        ("ideal", ideal_sensors()),
+        ("ideal", PRESETS["ideal"]),
         ("{ay: {noise: 0}}", replace(SensorLevels(), ay=replace(SensorLevels().ay, noise=0.0))),
         ("{preset: race, ay: {noise: 0}}", switched_off(PRESETS["race"], "ay.noise")),
         ("{preset: ideal, ay: {noise: 1, drift: 0.5, drift_time: 20}}", only(ay=SensorLevel(noise=1.0, drift=0.5, drift_time=20.0))),

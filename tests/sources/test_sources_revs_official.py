@@ -1,13 +1,12 @@
-"""The official CSV and MAT layouts of the Revs database: known values in, SI units out; whatever is malformed is one line."""
+"""The official CSV layout of the Revs database: known values in, SI units out; whatever is malformed is one line."""
 
 import re
 
 import numpy as np
 import pytest
 from refusals import refusal
-from scipy.io import savemat
 
-from revs_files import COLUMNS, PREAMBLE, Drive, smooth_drive, write_csv, write_mat, write_vehicle_parameters
+from revs_files import COLUMNS, PREAMBLE, Drive, smooth_drive, write_csv, write_vehicle_parameters
 from vehest.run.config import compose_config
 from vehest.sources.base import open_source
 from vehest.sources.revs import RevsSource
@@ -44,11 +43,6 @@ def csv(root):
     return root / "revs" / f"{NAME}.csv"
 
 
-@pytest.fixture
-def mat(root):
-    return root / "revs" / f"{NAME}.mat"
-
-
 def test_the_csv_files_angles_in_degrees_become_radians_and_its_held_values_stay(root, csv):
     drive, truth = smooth_drive(SECONDS, start_time=12.5)
     write_csv(csv, drive, blank_rows=BLANK)
@@ -63,34 +57,7 @@ def test_the_csv_files_angles_in_degrees_become_radians_and_its_held_values_stay
         np.testing.assert_allclose(recording[name], expected, **ONE_ROUNDING, err_msg=name)
 
 
-def test_the_mat_file_is_read_at_the_rate_of_the_ins_and_has_the_road_wheel_angle(root, mat):
-    drive, truth = smooth_drive(SECONDS, start_time=12.5)
-    write_mat(mat, drive)
-    recording = read(root, layout="mat")
-    assert (recording.rate_hz, recording.start_time, len(recording)) == (100.0, 12.5, 100 * SECONDS)
-    assert set(recording.channels) == set(truth)
-    for name in recording.channels:
-        np.testing.assert_allclose(recording[name], truth[name][::10], **ONE_ROUNDING, err_msg=name)
-    assert recording.provenance["native_rates_hz"]["vxCG"] == 100.0
-    assert recording.provenance["native_rates_hz"]["handwheelAngle"] == 1000.0
-
-
-def test_a_sample_of_a_mat_file_is_the_last_value_at_or_before_it(root, mat):
-    fast, slow = np.arange(10_000.0), np.arange(1000.0)
-    structs = {
-        "insData": {"vxCG": {"value": slow, "time": 3.0 + np.arange(1000) / 100}},
-        "driverData": {"handwheelAngle": {"value": fast, "time": 3.0004 + np.arange(10_000) / 1000}},
-    }
-    savemat(mat, structs, oned_as="column")
-    channels = {"vx": {"column": "vxCG", "unit": "m/s"}, "handwheel": {"column": "driverData.handwheelAngle", "unit": "rad"}}
-    both = read(root, layout="mat", channels=channels, extra_channels={}, accept=["impossible"])
-    assert both.start_time == pytest.approx(3.01, abs=1e-12)  # the first tick at which both have a value
-    assert both.rate_hz == 100.0
-    np.testing.assert_array_equal(both["vx"], slow[1:])
-    np.testing.assert_array_equal(both["handwheel"], 9.0 + 10.0 * np.arange(999))  # at 3.01 s the value of 3.0094 s holds
-
-
-def test_gappy_channels_keep_their_blanks_and_hold_up_no_other(root, csv, mat):
+def test_gappy_channels_keep_their_blanks_and_hold_up_no_other(root, csv):
     drive, _ = smooth_drive(SECONDS)
     roll = np.array(drive.signals["rollAngle"])
     roll[200:230] = np.nan
@@ -102,8 +69,6 @@ def test_gappy_channels_keep_their_blanks_and_hold_up_no_other(root, csv, mat):
     assert np.isfinite(recording["roll"][3500:]).all()
     write_csv(csv, drive, blank_rows=0)
     np.testing.assert_array_equal(np.flatnonzero(np.isnan(read(root, gappy=["roll"])["roll"])), np.arange(2000, 2300))
-    write_mat(mat, drive)
-    np.testing.assert_array_equal(np.flatnonzero(np.isnan(read(root, layout="mat", gappy=["roll"])["roll"])), np.arange(200, 230))
 
 
 def test_provenance_tells_session_parameters_and_file(root, csv):
@@ -168,26 +133,6 @@ def test_the_files_own_row_of_units_must_not_contradict_the_declared_ones(root, 
     csv.write_bytes(with_cell(12, "yawRate", "rad/s")(one_second))
     assert "column 'yawRate' is in 'rad/s' by the file and in 'deg/s' by conf/dataset" in refused(root)
     assert len(read(root, units_row="ignore")) == 1000 - BLANK
-
-
-def signal(values, rate=100.0, start=0.0):
-    return {"value": values, "time": start + np.arange(len(values)) / rate}
-
-
-STEADY = np.linspace(1, 2, 100)
-
-
-def test_an_odd_mat_file_is_one_line(root, mat):
-    channels, gap = {"vx": {"column": "vxCG", "unit": "m/s"}}, np.r_[0:50, 90:140] / 100
-    for content, said in (
-        ({"insData": {"vxCG": {"value": STEADY}}}, "has no channel 'vxCG' with a field 'time' (it has insData.vxCG)"),
-        ({name: {"vxCG": signal(STEADY)} for name in ("a", "b")}, "more than once (a.vxCG, b.vxCG); name its struct too"),
-        ({"insData": {"vxCG": {"value": "fast", "time": STEADY}}}, "'insData.vxCG.value' is no row or column of real numbers"),
-        ({"insData": {"vxCG": {"value": STEADY, "time": gap}}}, "'insData.vxCG': 1 gaps"),
-    ):
-        savemat(mat, content, oned_as="column")
-        message = refused(root, layout="mat", channels=channels, extra_channels={})
-        assert all(words in message for words in (mat.name, said))
 
 
 def test_a_malformed_table_of_vehicle_parameters_is_one_line(root, csv, one_second):

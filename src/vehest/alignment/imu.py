@@ -59,8 +59,7 @@ class Correlation:
     """Cross-correlation between the sensor and its expected signal by the reference."""
 
     signal: str  # for people
-    lag: FloatArray  # by which the sensor is late [s], (L,)
-    value: FloatArray  # between -1 and 1, (L,)
+    at_end: bool  # whether the largest value lies at the end of the delays that are searched
     peak: float  # lag of the largest value, between samples by a parabola [s]
     highest: float  # the largest value
 
@@ -130,11 +129,6 @@ class Signals:
     def channels(self) -> tuple[str, ...]:
         """The channels that are compared."""
         return IMU_CHANNELS if self.reference_rate is not None else IMU_CHANNELS[:2]
-
-    @property
-    def time(self) -> FloatArray:
-        """Of the low-passed samples [s]."""
-        return self.recording.time[self.margin : len(self.measured) - self.margin : self.smoothing.step]
 
     def low_passed(self, samples: NDArray[Any], order: int = 0) -> NDArray[Any]:
         """A derivative of the low-passed samples without the margins."""
@@ -300,12 +294,13 @@ def _cross_correlation(signals: Signals, yaw: float, settings: AlignmentSettings
     size = np.sqrt(own_energy * derived_energy)
     value = np.divide(products, size, out=np.zeros(len(lags)), where=size > 0)
     top = int(np.argmax(value))
+    at_end = top in (0, len(value) - 1)
     shift = 0.0
-    if 0 < top < len(value) - 1:
+    if not at_end:
         before, at, after = value[top - 1 : top + 2]
         bend = before - 2.0 * at + after
         shift = 0.5 * (before - after) / bend if bend < 0 else 0.0
-    return Correlation(what, lags / signals.rate_hz, value, float(lags[top] + shift) / signals.rate_hz, float(value[top]))
+    return Correlation(what, at_end, float(lags[top] + shift) / signals.rate_hz, float(value[top]))
 
 
 def _require_peak(recording: Recording, correlation: Correlation, settings: AlignmentSettings) -> None:
@@ -314,7 +309,7 @@ def _require_peak(recording: Recording, correlation: Correlation, settings: Alig
         what = f"{correlation.signal} of sensor and reference correlate by {correlation.highest:.2f} at most"
         fix = f"check units, signs and channels (vehest data check), or raise max_delay ({settings.max_delay:g} s)"
         raise DataError(f"recording '{recording.id}': {what}; {fix}")
-    if np.argmax(correlation.value) in (0, len(correlation.value) - 1):
+    if correlation.at_end:
         raise DataError(f"recording '{recording.id}': the best correlation is at the end of the {settings.max_delay:g} s; raise max_delay")
 
 

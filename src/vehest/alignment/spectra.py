@@ -88,7 +88,10 @@ def cross_spectra(signals: Mapping[str, FloatArray], rate_hz: float, used: BoolA
         parts.append(np.fft.rfft((pieces - level) * window, axis=1)[:, inside])
     spectrum = np.stack(parts, axis=-1)  # (segments, F, N)
     edges = np.linspace(0, len(spectrum), min(MOST_GROUPS, len(spectrum)) + 1).astype(int)
-    groups = [_outer(spectrum[first:last]) for first, last in itertools.pairwise(edges)]
+    groups = []
+    for first, last in itertools.pairwise(edges):
+        across = spectrum[first:last].transpose(1, 2, 0)  # (F, N, segments)
+        groups.append(across.conj() @ across.transpose(0, 2, 1))
     return CrossSpectra(tuple(signals), np.asarray(frequency[inside], dtype=np.float64), np.stack(groups))
 
 
@@ -96,11 +99,6 @@ def _pieces(samples: FloatArray, factor: int, length: int) -> FloatArray:
     """Segments of the averaged samples, (segments, length)."""
     slower = samples[: len(samples) // factor * factor].reshape(-1, factor).mean(axis=1)
     return np.lib.stride_tricks.sliding_window_view(slower, length)[:: max(length // 2, 1)]
-
-
-def _outer(spectrum: ComplexArray) -> ComplexArray:
-    across = spectrum.transpose(1, 2, 0)  # (F, N, segments)
-    return np.asarray(across.conj() @ across.transpose(0, 2, 1), dtype=np.complex128)
 
 
 @dataclass(frozen=True)

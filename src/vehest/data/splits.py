@@ -84,9 +84,5 @@ class Split:
     @property
     def datasets(self) -> tuple[str, ...]:
         """Names of the data sets it draws on, sorted."""
-        return tuple(sorted({span.dataset for span in self.all_spans}))
-
-    @property
-    def all_spans(self) -> tuple[Span, ...]:
-        """Every stretch of training, validation and tests."""
-        return tuple(span for spans in (self.train, self.validation, *self.tests.values()) for span in spans)
+        spans = (self.train, self.validation, *self.tests.values())
+        return tuple(sorted({span.dataset for own in spans for span in own}))

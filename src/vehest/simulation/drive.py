@@ -35,19 +35,19 @@ LONGEST_STOP = 60.0  # within which a car stands that spun or left the road [s]
 STOPPING_SHARE = 0.7  # share of the grip with which a driver brakes after a spin or beside the road; assumed
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Flags:
     """Outcome of a drive."""
 
     spun: bool  # the car slid beyond the validity of its equations of rolling
-    left_road: bool  # it was further beside its line than the manoeuvre's half_width
-    stood: bool  # it stands at the end
+    left_road: bool = False  # it was further beside its line than the manoeuvre's half_width
+    stood: bool = False  # it stands at the end
     completed: bool  # the manoeuvre came to its own end, and was not cut off because it took too long
-    gave_up_at: float | None  # when the driver began to stop because of a spin or beside the road [s]; none if never
-    largest_lateral_error: float | None  # distance from the line [m]; none where there is no line
+    gave_up_at: float | None = None  # when the driver began to stop because of a spin or beside the road [s]; none if never
+    largest_lateral_error: float | None = None  # distance from the line [m]; none where there is no line
     largest_sideslip: float  # above 1 m/s, either sign [rad]
     largest_ay: float  # either sign [m/s²]
-    stability_share: float | None  # of the recorded time in which stability control intervened; none where it is off
+    stability_share: float | None = None  # of the recorded time in which stability control intervened; none where it is off
 
 
 @dataclass(frozen=True, eq=False)
@@ -107,9 +107,7 @@ def simulate_drive(
 
 @contextmanager
 def naming(id: str, seed: int) -> Iterator[None]:
-    """Names drive and seed in the errors of a simulation; raises `ConfigurationError` where the seed is negative."""
-    if seed < 0:
-        raise ConfigurationError(f"drive '{id}': a seed must be zero or positive, not {seed}")
+    """Names drive and seed in the errors of a simulation."""
     try:
         yield
     except SimulationError as error:
@@ -162,10 +160,7 @@ def drive(
         except SimulationError as error:
             raise SimulationError(f"manoeuvre '{manoeuvre.name}', {time:.2f} s after the first sample: {error}") from error
         now += stride
-    trip = ride.trip(plant, rate_hz, controller.drawn)
-    if trip is None:
-        raise ConfigurationError(f"manoeuvre '{manoeuvre.name}' is over before the first sample at {rate_hz} Hz")
-    return trip
+    return ride.trip(plant, rate_hz, controller.drawn)
 
 
 class _Ride:
@@ -249,10 +244,8 @@ class _Ride:
         self._interventions += self.stability.active
         self._road.append((self.decision.friction, self.bank, self.grade, self.decision.lateral_error))
 
-    def trip(self, plant: MultiBodyPlant, rate_hz: float, drawn: dict[str, Any]) -> Trip | None:
-        """The samples that were kept, if any."""
-        if not self._states:
-            return None
+    def trip(self, plant: MultiBodyPlant, rate_hz: float, drawn: dict[str, Any]) -> Trip:
+        """The samples that were kept."""
         friction, bank, grade, lateral_error = np.array(self._road).T
         motion = plant.motion(self._states, np.array(self._inputs), rate_hz, friction=friction, bank=bank, grade=grade)
         moving = np.hypot(motion.vx, motion.vy) > 1.0

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from copy import deepcopy
 from dataclasses import dataclass, fields, replace
 from typing import Annotated, Any
 
@@ -40,19 +41,12 @@ class Variation:
         return float(generator.uniform(low, high))
 
 
-@dataclass(frozen=True)
-class Variations:
-    """Variations of a data set."""
-
-    vary: Annotated[tuple[Variation, ...], "a list of {parameters, factor, log}"]
-
-
 def variations_from_config(entries: Any) -> tuple[Variation, ...]:
     """Variations from a data set's ``vary``: a list of ``{parameters: [m, m_s], factor: [0.9, 1.2]}``, ``log: true`` if wanted.
 
     Raises `ConfigurationError` where an entry is no variation.
     """
-    return validated(Variations, {"vary": entries}, "", error=ConfigurationError).vary
+    return validated(tuple[Variation, ...], entries, "", error=ConfigurationError, group="vary")
 
 
 def varied(vehicle: Vehicle, variations: Sequence[Variation], seed: int) -> Vehicle:
@@ -60,7 +54,7 @@ def varied(vehicle: Vehicle, variations: Sequence[Variation], seed: int) -> Vehi
     if not variations:
         return vehicle
     generator = np.random.default_rng(np.random.SeedSequence(entropy=seed, spawn_key=(_STREAM, 0)))
-    overrides = _deep(vehicle.overrides)
+    overrides = deepcopy(dict(vehicle.overrides))
     published, rear = library_parameters(vehicle), rear_tyre(vehicle)
     scaled: dict[str, float] = {}
     for variation in variations:
@@ -106,8 +100,8 @@ class SensorVariation:
         kinds = [entry.name for entry in fields(SensorLevel)]
         if not isinstance(entries, Mapping) or set(entries) - {*kinds, "roll_share"}:
             raise ConfigurationError(f"vary_sensors is a mapping from {', '.join(kinds)} or roll_share to ranges of scales, not {entries}")
-        factors = {str(kind): _range(value, "vary_sensors") for kind, value in entries.items() if kind != "roll_share"}
-        return cls(factors, _range(entries["roll_share"], "vary_sensors", lowest=-np.inf) if "roll_share" in entries else None)
+        factors = {str(kind): _range(value) for kind, value in entries.items() if kind != "roll_share"}
+        return cls(factors, _range(entries["roll_share"], lowest=-np.inf) if "roll_share" in entries else None)
 
     def applied(self, levels: SensorLevels, seed: int) -> SensorLevels:
         """Levels as the seed scales them; the same ones if nothing varies. References stay as they are."""
@@ -125,12 +119,8 @@ class SensorVariation:
         return replace(levels, **changed)
 
 
-def _range(value: Any, where: str, lowest: float = 0.0) -> tuple[float, float]:
+def _range(value: Any, lowest: float = 0.0) -> tuple[float, float]:
     numbers = isinstance(value, Sequence) and not isinstance(value, str) and all(is_number(end) for end in value)
     if not numbers or len(value) != 2 or not lowest <= value[0] <= value[1]:
-        raise ConfigurationError(f"{where}: a range is a pair [lowest, highest] of scales, not {value}")
+        raise ConfigurationError(f"vary_sensors: a range is a pair [lowest, highest] of scales, not {value}")
     return float(value[0]), float(value[1])
-
-
-def _deep(mapping: Mapping[str, Any]) -> dict[str, Any]:
-    return {name: _deep(value) if isinstance(value, Mapping) else value for name, value in mapping.items()}

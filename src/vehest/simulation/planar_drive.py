@@ -7,7 +7,6 @@ from dataclasses import asdict
 
 import numpy as np
 
-from vehest.data.errors import ConfigurationError
 from vehest.data.recording import Recording
 from vehest.simulation.drive import RATE_HZ, Flags, Trip, naming, recording_of, whole_steps
 from vehest.simulation.driving.driver import Observation
@@ -35,7 +34,6 @@ def simulate_planar_drive(
     seed: int,
     rate_hz: float = RATE_HZ,
     sensors: SensorLevels = PRESETS["small_car"],
-    stability_control: bool = False,
     surface: Surface = SURFACES["dry"],
 ) -> Recording:
     """A recording of one drive; the same arguments give the same samples, bit by bit.
@@ -45,14 +43,11 @@ def simulate_planar_drive(
     Args:
         seed: of the driver, of patches on the surface and of the sensors' errors; zero or positive.
         rate_hz: sampling rate; a whole number of plant steps must fit between samples [Hz].
-        stability_control: such a car has none; anything but False is refused.
 
     Raises:
         ConfigurationError: a value that makes no sense.
         SimulationError: a state is not finite.
     """
-    if stability_control:
-        raise ConfigurationError(f"drive '{id}': vehicle '{car.name}' has no stability control")
     plant = PlanarPlant(car)
     with naming(id, seed):
         trip = drive_freely(plant, manoeuvre, seed, rate_hz=rate_hz, surface=surface)
@@ -93,15 +88,5 @@ def drive_freely(
     motion = plant.motion(kept, acting, rate_hz)
     moving = np.hypot(motion.vx, motion.vy) > 1.0
     sideslip = float(np.abs(motion.sideslip[moving]).max(initial=0.0))
-    flags = Flags(
-        spun=sideslip > SPUN,
-        left_road=False,
-        stood=False,
-        completed=True,
-        gave_up_at=None,
-        largest_lateral_error=None,
-        largest_sideslip=sideslip,
-        largest_ay=float(np.abs(motion.ay).max()),
-        stability_share=None,
-    )
+    flags = Flags(spun=sideslip > SPUN, completed=True, largest_sideslip=sideslip, largest_ay=float(np.abs(motion.ay).max()))
     return Trip(motion, np.full(len(motion), np.nan), flags, driver.drawn)

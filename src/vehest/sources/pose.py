@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
 from typing import Literal, get_args
@@ -16,24 +15,6 @@ from vehest.data.errors import DataError
 UpAxis = Literal["y", "z"]
 PoseChannel = Literal["vx_ref", "vy_ref", "yaw_rate_ref", "sideslip_ref"]
 POSE_CHANNELS: tuple[PoseChannel, ...] = get_args(PoseChannel)  # channels that poses give
-
-
-@dataclass(frozen=True)
-class PlanarMotion:
-    """Motion of a car's reference point in the plane, in ISO 8855 axes, shape (T,) each."""
-
-    vx: FloatArray  # m/s
-    vy: FloatArray  # m/s
-    yaw_rate: FloatArray  # rad/s
-
-    def at(self, times: FloatArray, grid: FloatArray) -> PlanarMotion:
-        """The same on another clock, along straight lines."""
-        return PlanarMotion(*(np.interp(grid, times, samples) for samples in (self.vx, self.vy, self.yaw_rate)))
-
-    def channels(self, names: Sequence[str]) -> dict[str, FloatArray]:
-        """Reference channels of these names."""
-        made = {"vx_ref": self.vx, "vy_ref": self.vy, "yaw_rate_ref": self.yaw_rate, "sideslip_ref": np.arctan2(self.vy, self.vx)}
-        return {name: made[name] for name in names}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -50,14 +31,26 @@ class PoseOptions:
         if not 1 <= self.order < self.window or self.window % 2 == 0:
             raise ValueError(f"window must be an odd number above order, and order at least 1, not {self.window} and {self.order}")
 
-    def motion(self, positions: FloatArray, yaw: FloatArray, interval: float, turned: float = 0.0, where: str = "poses") -> PlanarMotion:
-        """Differentiate poses by a Savitzky-Golay filter and turn the velocity into the car's axes; raises `DataError` for too few poses.
+    def references(
+        self,
+        positions: FloatArray,
+        yaw: FloatArray,
+        interval: float,
+        turned: float = 0.0,
+        where: str = "poses",
+        at: tuple[FloatArray, FloatArray] | None = None,
+    ) -> dict[str, FloatArray]:
+        """Reference channels: poses are differentiated by a Savitzky-Golay filter and the velocity is turned into the car's axes.
 
         Args:
             positions: of the rigid body's origin, x and y with z up [m], evenly sampled, shape (T, 2).
             yaw: of the rigid body, unwrapped [rad], shape (T,).
             interval: between two samples [s].
             turned: from the rigid body's x axis to the car's forward axis, counter-clockwise [rad].
+            at: times of the samples, and others [s] to which straight lines bring the velocities.
+
+        Raises:
+            DataError: too few poses.
 
         Source:
             Savitzky & Golay, Smoothing and differentiation of data by simplified least squares procedures, Anal. Chem. 36 (8), 1964.
@@ -68,11 +61,15 @@ class PoseOptions:
         velocity_x, velocity_y, yaw_rate = derivative(positions[:, 0]), derivative(positions[:, 1]), derivative(yaw)
         heading = scipy.signal.savgol_filter(yaw, self.window, self.order) + turned
         cosine, sine = np.cos(heading), np.sin(heading)
-        return PlanarMotion(
-            vx=cosine * velocity_x + sine * velocity_y - yaw_rate * self.lever_y,
-            vy=-sine * velocity_x + cosine * velocity_y + yaw_rate * self.lever_x,
-            yaw_rate=yaw_rate,
-        )
+        made = {
+            "vx_ref": cosine * velocity_x + sine * velocity_y - yaw_rate * self.lever_y,
+            "vy_ref": -sine * velocity_x + cosine * velocity_y + yaw_rate * self.lever_x,
+            "yaw_rate_ref": yaw_rate,
+        }
+        if at is not None:
+            made = {name: np.interp(at[1], at[0], samples) for name, samples in made.items()}
+        made["sideslip_ref"] = np.arctan2(made["vy_ref"], made["vx_ref"])
+        return {name: made[name] for name in self.channels}
 
 
 def ground_plane(positions: FloatArray, orientations: FloatArray, up: UpAxis, where: str) -> tuple[FloatArray, FloatArray]:

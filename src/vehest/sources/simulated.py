@@ -17,6 +17,8 @@ from vehest.data.errors import ConfigurationError, MissingError
 from vehest.data.limits import check_limit
 from vehest.data.recording import Recording
 from vehest.data.splits import check_name
+from vehest.simulation.plant.planar_car import PLANAR, planar_car_from_configuration
+from vehest.simulation.plant.wear import Stint
 from vehest.sources.base import Source
 
 Whole = Annotated[int, Field(ge=0), "a whole number, zero or positive"]
@@ -45,7 +47,7 @@ class Drive:
     stability_control: bool | None = None
     sensors: Annotated[str | dict[str, Any], "a preset, or a mapping of what differs from one"] | None = None
     payload: Payload | None = None
-    tyres: Annotated[dict[str, float], "a mapping such as {cold: 0.06, wear: 0.04}"] | None = None
+    tyres: Annotated[Stint, "a mapping such as {cold: 0.06, wear: 0.04}"] | None = None
 
 
 @dataclass(frozen=True)
@@ -113,6 +115,8 @@ class SimulatedSource(Source):
         return int(np.random.SeedSequence([self.options.seed, zlib.crc32(drive_id.encode())]).generate_state(1)[0]) if own is None else own
 
     def _simulation(self, drive_id: str, variations: Sequence[Any]) -> partial[Recording]:
+        from vehest.simulation.driving.manoeuvres import MANOEUVRES, manoeuvre_from_config
+        from vehest.simulation.planar_drive import PLANAR_MANOEUVRES
         from vehest.simulation.road.surface import surface_from_config
         from vehest.simulation.sensors.config import sensor_levels_from_config
 
@@ -120,14 +124,14 @@ class SimulatedSource(Source):
         vehicle = self._vehicle_of(drive)
         stability_control = self.options.stability_control if drive.stability_control is None else drive.stability_control
         sensors = self.sensors if drive.sensors is None else sensor_levels_from_config(drive.sensors)
+        manoeuvres: Mapping[str, Any] = PLANAR_MANOEUVRES if _is_planar(vehicle) else MANOEUVRES
         return partial(
-            _simulator_of(vehicle, variations, seed, drive),
+            _simulator_of(vehicle, variations, seed, drive, stability_control),
             id=drive_id,
-            manoeuvre=_manoeuvre_of(drive.manoeuvre, vehicle, stability_control),
+            manoeuvre=manoeuvre_from_config(drive.manoeuvre, manoeuvres),
             seed=seed,
             rate_hz=self.options.rate_hz,
             sensors=self.sensor_variation.applied(sensors, seed),
-            stability_control=stability_control,
             surface=surface_from_config(self.options.surface if drive.surface is None else drive.surface),
         )
 
@@ -164,41 +168,29 @@ class SimulatedSource(Source):
 
 
 def _is_planar(vehicle: Mapping[str, Any]) -> bool:
-    from vehest.simulation.plant.planar_car import PLANAR
-
     return vehicle.get("plant") == PLANAR
 
 
-def _simulator_of(vehicle: Mapping[str, Any], variations: Sequence[Any], seed: int, drive: Drive | None = None) -> partial[Recording]:
+def _simulator_of(
+    vehicle: Mapping[str, Any], variations: Sequence[Any], seed: int, drive: Drive | None = None, stability_control: bool = False
+) -> partial[Recording]:
     """The simulator of a vehicle, varied by the seed of a drive, with the drive's payload and tyres that age."""
     from vehest.simulation.drive import simulate_drive
     from vehest.simulation.fleet import varied, varied_planar
     from vehest.simulation.planar_drive import simulate_planar_drive
     from vehest.simulation.plant.parameters import loaded, vehicle_from_configuration
-    from vehest.simulation.plant.planar_car import planar_car_from_configuration
-    from vehest.simulation.plant.wear import stint_from_config
 
     payload, tyres = (drive.payload, drive.tyres) if drive else (None, None)
     if _is_planar(vehicle):
         if payload or tyres:
             raise ConfigurationError(f"vehicle '{vehicle.get('name')}': payload and tyres are of the multi-body plant only; leave them out")
+        if stability_control:
+            raise ConfigurationError(f"vehicle '{vehicle.get('name')}' has no stability control; leave stability_control out")
         return partial(simulate_planar_drive, car=varied_planar(planar_car_from_configuration(vehicle), variations, seed))
     own = varied(vehicle_from_configuration(vehicle), variations, seed)
     if payload:
         own = loaded(own, payload.mass, payload.forward, payload.up)
-    return partial(simulate_drive, vehicle=own, stint=stint_from_config(tyres) if tyres else None)
-
-
-def _manoeuvre_of(entry: Mapping[str, Any], vehicle: Mapping[str, Any], stability_control: bool) -> Any:
-    """A manoeuvre, among those of the vehicle's plant."""
-    from vehest.simulation.driving.manoeuvres import manoeuvre_from_config, one_of
-    from vehest.simulation.planar_drive import PLANAR_MANOEUVRES
-
-    if not _is_planar(vehicle):
-        return manoeuvre_from_config(entry)
-    if stability_control:
-        raise ConfigurationError(f"vehicle '{vehicle.get('name')}' has no stability control; leave stability_control out")
-    return one_of(entry, PLANAR_MANOEUVRES)
+    return partial(simulate_drive, vehicle=own, stint=tyres, stability_control=stability_control)
 
 
 SOURCE = SimulatedSource

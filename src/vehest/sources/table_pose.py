@@ -41,8 +41,7 @@ class TablePose(PoseOptions):
                 what = f"pose column '{self.columns[name].column}' holds no number in {len(odd)} rows of the run, first in row {odd[0] + 1}"
                 raise DataError(f"{where}: {what}; leave them out by drop_rows")
         x, y, yaw = (clock.align(samples) for samples in (poses["x"], poses["y"], np.unwrap(poses["yaw"])))
-        motion = self.motion(np.stack([x, y], axis=1), yaw, 1.0 / clock.rate_hz, self.yaw_offset, where)
-        return motion.channels(self.channels)
+        return self.references(np.stack([x, y], axis=1), yaw, 1.0 / clock.rate_hz, self.yaw_offset, where)
 
 
 def table_pose_from_config(entry: Any, where: str) -> TablePose:

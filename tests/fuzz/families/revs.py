@@ -1,11 +1,11 @@
-"""The Revs database: official CSV and MAT files, a folder of text files, tables of vehicle parameters."""
+"""The Revs database: official CSV files, a folder of text files, tables of vehicle parameters."""
 
 import numpy as np
 
 from fuzz.case import Command, generator, template
 from fuzz.honest import write_yaml
 from fuzz.mutations import spoil_bytes
-from revs_files import smooth_drive, write_csv, write_mat, write_vehicle_parameters
+from revs_files import smooth_drive, write_csv, write_vehicle_parameters
 
 NAME = "20140222_01_01_03_250lm"
 TEXT = {"vx": "m/s", "yaw_rate": "rad/s", "ax": "m/s²", "ay": "m/s²", "steer": "rad", "vy_ref": "m/s"}
@@ -13,13 +13,11 @@ TEXT = {"vx": "m/s", "yaw_rate": "rad/s", "ax": "m/s²", "ay": "m/s²", "steer":
 
 @template
 def revs(folder):
-    """A recording in both official layouts, its car's parameters, and a recording as text files."""
+    """A recording in the official layout, its car's parameters, and a recording as text files."""
     files = folder / "raw" / "revs"
     (files / "lap").mkdir(parents=True)
     drive, truth = smooth_drive(3.0, start_time=12.5, decimals=6)
     write_csv(files / f"{NAME}.csv", drive)
-    write_mat(files / f"{NAME}.mat", drive)
-    write_mat(files / "plain.mat", drive, compressed=False)
     write_vehicle_parameters(files / "250lm.csv")
     time = 12.5 + np.arange(len(truth["vx"]) // 10) / 100
     for name, samples in {"t": time, **{name: truth[name][::10] for name in TEXT}}.items():
@@ -32,12 +30,10 @@ def revs(folder):
 
 @generator("revs", weight=10)
 def official_files(case):
-    """The CSV, the MAT file, plain or packed, the table of vehicle parameters, and text files."""
+    """The CSV, the table of vehicle parameters, and text files."""
     folder = case.copy("revs") / "raw" / "revs"
-    if case.rng.random() < 0.5:
-        (folder / "plain.mat").replace(folder / f"{NAME}.mat")
-    files = {f"{NAME}.csv": "csv", f"{NAME}.mat": "mat", "250lm.csv": "csv", "lap/vx.txt": "text", "lap/t.txt": "text"}
+    files = {f"{NAME}.csv": "csv", "250lm.csv": "csv", "lap/vx.txt": "text", "lap/t.txt": "text"}
     file, layout = case.rng.choice(list(files.items()))
     case.spoil(folder / file, spoil_bytes)
-    words = ("text",) if layout == "text" else ("revs_targa_2014", f"dataset.recordings=[{NAME}]", f"dataset.layout={layout}")
+    words = ("text",) if layout == "text" else ("revs_targa_2014", f"dataset.recordings=[{NAME}]")
     return Command((*case.rng.choice([("data", "check"), ("ingest",)]), *words))

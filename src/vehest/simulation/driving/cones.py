@@ -121,7 +121,7 @@ def _between_cones(manoeuvre: DoubleLaneChange | Slalom, gates: tuple[Gate, ...]
     driver = replace(usual, preview_time=0.57 * usual.preview_time, steering_lag=0.5 * usual.steering_lag)
     shape = line_through(gates, car.width, 40.0, 60.0)
     grip = car.grip * OpenArea(surface, seed).mean
-    speed = own_speed or min(math.sqrt(severity * grip / shape.largest_curvature), FASTEST_SHARE * car.top_speed)
+    speed = own_speed or min(math.sqrt(severity * grip / float(np.abs(shape.curvature).max())), FASTEST_SHARE * car.top_speed)
     run_in = (SETTLING_TIME + 1.0) * speed
     line = _beginning_at(shape, run_in - 40.0) if run_in > 40.0 else shape
     if side < 0.0:

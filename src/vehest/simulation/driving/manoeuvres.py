@@ -10,7 +10,7 @@ Time is zero at the first sample of the recording; SETTLING_TIME before it the c
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import Any
 
 from vehest.data.errors import ConfigurationError
 from vehest.data.schema import validated
@@ -20,11 +20,6 @@ from vehest.simulation.driving.laps import FastLap, Laps, SpeedLaps
 from vehest.simulation.driving.manoeuvre import Manoeuvre
 from vehest.simulation.driving.open_loop import RandomSteer, Spiral, StepSteer
 
-if TYPE_CHECKING:
-    from _typeshed import DataclassInstance
-
-Made = TypeVar("Made", bound="DataclassInstance")
-
 MANOEUVRES: Mapping[str, type[Manoeuvre]] = {
     made.name: made
     for made in (Laps, SpeedLaps, FastLap, DoubleLaneChange, Slalom, SteadyCircle, BrakingInTurn, StepSteer, Spiral, RandomSteer)
@@ -32,12 +27,7 @@ MANOEUVRES: Mapping[str, type[Manoeuvre]] = {
 """Manoeuvres by name."""
 
 
-def manoeuvre_from_config(configuration: Mapping[str, Any]) -> Manoeuvre:
-    """A manoeuvre of the multi-body plant from its ``name`` and any of its parameters; raises `ConfigurationError` where one is wrong."""
-    return one_of(configuration, MANOEUVRES)
-
-
-def one_of(configuration: Mapping[str, Any], among: Mapping[str, type[Made]]) -> Made:
+def manoeuvre_from_config(configuration: Mapping[str, Any], among: Mapping[str, type[Any]] = MANOEUVRES) -> Any:
     """A manoeuvre from its ``name`` and any of its parameters, ``among`` those that the plant has; else `ConfigurationError`."""
     values = dict(configuration)
     name = values.pop("name", None)

@@ -10,28 +10,26 @@ from vehest.simulation.plant.motion import Motion
 from vehest.simulation.plant.multi_body import MultiBodyPlant, PlantState
 
 RATE_HZ = 50.0
+AY_RATE = 0.5  # by which the lateral acceleration of a neutral car would grow [m/s³]
+LONGEST = 60.0  # s
 
 
-def ramp_steer(
-    plant: MultiBodyPlant, speed: float, *, ay_rate: float = 0.5, friction: float = 1.0, direction: float = 1.0, duration: float = 60.0
-) -> Motion:
+def ramp_steer(plant: MultiBodyPlant, speed: float, *, friction: float = 1.0, direction: float = 1.0) -> Motion:
     """Constant speed, slowly growing steering angle, until the lateral acceleration falls by 3 % again; 50 Hz.
 
     Towards the limit, where the lateral acceleration hardly grows any more, the steering angle grows up to ten times faster.
 
     Args:
         speed: [m/s].
-        ay_rate: by which the lateral acceleration of a neutral car would grow [m/s³].
         friction: scale of the tyres' friction.
         direction: 1 to the left, -1 to the right.
-        duration: at most [s].
     """
-    steering_velocity = direction * ay_rate * plant.wheelbase / speed**2 * max(1.0, speed / 15.0)
+    steering_velocity = direction * AY_RATE * plant.wheelbase / speed**2 * max(1.0, speed / 15.0)
     state, per_sample = plant.initial_state(0.0, 0.0, 0.0, speed), round(1.0 / (RATE_HZ * plant.step))
     states: list[PlantState] = []
     inputs: list[FloatArray] = []
     integral = largest = 0.0
-    for _ in range(round(duration * RATE_HZ)):
+    for _ in range(round(LONGEST * RATE_HZ)):
         now = abs(state.vx * state.yaw_rate)
         error = speed - state.vx
         integral += error / RATE_HZ

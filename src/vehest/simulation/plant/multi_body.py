@@ -26,7 +26,6 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from vehest.constants import GRAVITY, FloatArray
-from vehest.data.errors import ConfigurationError
 from vehest.simulation.errors import SimulationError
 from vehest.simulation.plant import compiled
 from vehest.simulation.plant.compiled import N_INPUTS
@@ -95,17 +94,10 @@ class MultiBodyPlant:
 
     The yaw moment brings its braking force |M|/(track/2) along. It does not use up the braked tyres' grip, and does
     nothing below about 1 m/s and in a spin.
-
-    Raises:
-        ConfigurationError: the step is not positive.
     """
 
     vehicle: Vehicle  # the car
     step: float = 1e-3  # integration step [s]; where slow wheels need it, a step is made in parts
-
-    def __post_init__(self) -> None:
-        if not self.step > 0:
-            raise ConfigurationError(f"the plant's step must be positive, not {self.step} s")
 
     @cached_property
     def parameters(self) -> Any:
@@ -137,9 +129,7 @@ class MultiBodyPlant:
         return values
 
     def initial_state(self, x: float, y: float, yaw: float, vx: float) -> PlantState:
-        """In equilibrium, rolling straight on at a place [m], heading [rad] and speed [m/s], or standing; raises `ConfigurationError`."""
-        if not vx >= 0:
-            raise ConfigurationError(f"a car starts forwards or standing, not at {vx} m/s")
+        """In equilibrium, rolling straight on at a place [m], heading [rad] and speed [m/s], or standing."""
         values = self._at_rest.copy()
         values[[X, Y, YAW, VX]] = x, y, yaw, vx
         values[FIRST_WHEEL : FIRST_WHEEL + 4] = vx / self.parameters.R_w

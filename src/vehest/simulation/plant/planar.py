@@ -18,13 +18,12 @@ from __future__ import annotations
 import math
 from collections import namedtuple
 from collections.abc import Sequence
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numba
 import numpy as np
 
 from vehest.constants import GRAVITY, FloatArray
-from vehest.data.errors import ConfigurationError
 from vehest.simulation.errors import SimulationError
 from vehest.simulation.plant.motion import WHEELS, Motion
 from vehest.simulation.plant.planar_car import PARAMETERS, PlanarCar
@@ -127,8 +126,7 @@ def _advance(state, wanted_steer, wanted_current, scale, p, step, n_steps):  # t
     return state
 
 
-@dataclass(frozen=True, eq=False)
-class Inputs:
+class Inputs(NamedTuple):
     """Inputs of the car."""
 
     steer: float = 0.0  # wanted road-wheel angle [rad]
@@ -137,11 +135,9 @@ class Inputs:
 
 
 class PlanarPlant:
-    """A car and its equations of motion, integrated by ``step`` [s]; raises `ConfigurationError` where that is not positive."""
+    """A car and its equations of motion, integrated by ``step`` [s]."""
 
     def __init__(self, car: PlanarCar, step: float = 1e-3) -> None:
-        if not step > 0.0:
-            raise ConfigurationError(f"vehicle '{car.name}': the plant's step must be positive, not {step}")
         self.car, self.step = car, step
         self._values = PlanarValues(**car.parameters)
 
@@ -155,13 +151,11 @@ class PlanarPlant:
     def derivative(self, state: FloatArray, inputs: Inputs) -> tuple[FloatArray, FloatArray]:
         """Rate of change of the state, (22,), and each tyre's force along and across the body and its load [N], (4, 3)."""
         forces = np.empty((4, 3))
-        return _derivative(state, float(inputs.steer), float(inputs.current), float(inputs.friction), self._values, forces), forces
+        return _derivative(state, *map(float, inputs), self._values, forces), forces
 
     def advance(self, state: FloatArray, inputs: Inputs, n_steps: int) -> FloatArray:
         """The state after some steps with constant inputs, (22,); raises `SimulationError` where a state is not finite."""
-        after: FloatArray = _advance(
-            state, float(inputs.steer), float(inputs.current), float(inputs.friction), self._values, self.step, n_steps
-        )
+        after: FloatArray = _advance(state, *map(float, inputs), self._values, self.step, n_steps)
         if not np.isfinite(after).all():
             raise SimulationError(
                 f"the planar plant's state is not finite {n_steps * self.step:g} s after vx = {state[VX]:.3g} m/s, "

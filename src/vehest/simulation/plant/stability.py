@@ -43,16 +43,7 @@ class StabilityControl:
     def step(
         self, before: StabilityState, interval: float, *, steer: float, vx: float, yaw_rate: float, friction: float = 1.0
     ) -> StabilityState:
-        """The control's next state.
-
-        Args:
-            before: its state until now.
-            interval: time since then [s].
-            steer: road-wheel angle [rad].
-            vx: forward speed [m/s].
-            yaw_rate: [rad/s].
-            friction: scale of the tyres' friction, as far as the control knows it.
-        """
+        """The state ``interval`` [s] after ``before``; ``friction`` scales that of the tyres, as far as the control knows it."""
         if vx < self.slowest:
             return StabilityState(reference=yaw_rate)
         wanted = vx * steer / (self.wheelbase + self.understeer_gradient * vx**2)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 
 import numpy as np
@@ -15,7 +15,7 @@ from vehest.data.errors import ConfigurationError
 from vehest.simulation.road.segments import Compound, Corner, Segment, Straight
 from vehest.simulation.road.tracks import LAYOUTS, Layout
 
-__all__ = ["Compound", "Corner", "Course", "Layout", "Straight", "build_course", "course_by_name"]
+SPACING = 1.0  # of the samples of a course at most [m]
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,51 +38,41 @@ class Course:
         return float(self.arc_length[-1])
 
     @property
-    def gap(self) -> float:
-        """Distance between the end and the start [m]."""
-        return math.hypot(self.x[-1] - self.x[0], self.y[-1] - self.y[0])
-
-    @property
     def turning(self) -> float:
         """Change of heading once around, positive to the left [rad]."""
         return float(self.heading[-1] - self.heading[0])
 
 
-def build_course(name: str, segments: Sequence[Segment] | Layout, spacing: float = 1.0) -> Course:
+def build_course(name: str, layout: Layout) -> Course:
     """A closed course from its segments, starting at the origin along the x axis.
 
     The corners are kept as they are and must turn by a full circle in total; the course is closed by the smallest
-    change, in the sum of squares, of the lengths of its straights. Sample spacing [m] is at most ``spacing``.
+    change, in the sum of squares, of the lengths of its straights.
 
     Raises:
         ConfigurationError: the corners do not add up to a circle, a corner is too short for its clothoids, or a
             straight would have to become negative.
     """
-    layout = segments if isinstance(segments, Layout) else Layout(tuple(segments))
     for segment in layout.segments:
         if isinstance(segment, Corner | Compound) and segment.arc < 0:
             raise ConfigurationError(f"course '{name}': {segment} is too short for its transitions")
     turning = sum(segment.angle for segment in layout.segments)
     if abs(abs(turning) - 2.0 * math.pi) > 1e-9:
         raise ConfigurationError(f"course '{name}': its corners turn by {math.degrees(turning):.6g}°, not by ±360°")
-    return _trace(name, Layout(tuple(_close(name, layout.segments)), layout.crossfall, layout.heights, layout.friction), spacing)
+    return _trace(name, replace(layout, segments=tuple(_close(name, layout.segments))))
 
 
+@cache
 def course_by_name(name: str) -> Course:
     """One of the courses of the proving ground; raises `ConfigurationError` where there is no such course."""
     if name not in LAYOUTS:
         raise ConfigurationError(f"there is no course '{name}'; there are {', '.join(sorted(LAYOUTS))}")
-    return _build_by_name(name)
-
-
-@cache
-def _build_by_name(name: str) -> Course:
     return build_course(name, LAYOUTS[name])
 
 
 def _close(name: str, segments: Sequence[Segment]) -> list[Segment]:
     """The segments with the straights' lengths changed so that the end meets the start."""
-    traced = _trace(name, Layout(tuple(segments)), spacing=1.0)
+    traced = _trace(name, Layout(tuple(segments)))
     headings = _headings_of_straights(segments)
     directions = np.stack([np.cos(headings), np.sin(headings)])
     change = -np.linalg.pinv(directions) @ np.array([traced.x[-1], traced.y[-1]])
@@ -106,9 +96,9 @@ def _headings_of_straights(segments: Sequence[Segment]) -> FloatArray:
     return np.array(headings)
 
 
-def _trace(name: str, layout: Layout, spacing: float) -> Course:
+def _trace(name: str, layout: Layout) -> Course:
     nodes, curvatures, banks = _nodes(layout.segments)
-    n_cells = math.ceil(nodes[-1] / spacing)
+    n_cells = math.ceil(nodes[-1] / SPACING)
     arc_length = np.linspace(0.0, nodes[-1], n_cells + 1)
     heading_at = _HeadingProfile(nodes, curvatures)
     x, y = _integrate_position(np.union1d(arc_length, nodes), heading_at, arc_length)

@@ -38,11 +38,6 @@ class Line:
     heading: FloatArray
     curvature: FloatArray
 
-    @property
-    def largest_curvature(self) -> float:
-        """Of either sign [1/m]."""
-        return float(np.abs(self.curvature).max())
-
 
 @lru_cache(maxsize=64)
 def line_through(gates: tuple[Gate, ...], width: float, run_in: float, run_out: float) -> Line:

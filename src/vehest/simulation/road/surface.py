@@ -80,8 +80,4 @@ def surface_from_config(configuration: str | Mapping[str, Any] | None) -> Surfac
         if configuration not in SURFACES:
             raise ConfigurationError(f"there is no surface '{configuration}'; there are {', '.join(SURFACES)}")
         return SURFACES[configuration]
-    if not isinstance(configuration, Mapping):
-        raise ConfigurationError(
-            f"a surface is one of {', '.join(SURFACES)}, or a mapping such as {{friction: 0.6}}, not {configuration!r}"
-        )
     return validated(Surface, {"name": "own", **configuration}, "surface", error=ConfigurationError)

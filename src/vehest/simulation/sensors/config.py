@@ -46,8 +46,6 @@ def sensor_levels_from_config(value: Any) -> SensorLevels:
     Raises:
         ConfigurationError: an unknown name, with those there are, or a value that makes no sense.
     """
-    if value is not None and not isinstance(value, str | Mapping):
-        raise ConfigurationError(f"sensors is the name of a preset ({', '.join(PRESETS)}) or a mapping, not {value!r}")
     given = {"preset": value} if isinstance(value, str) else value or {}
     changes = {str(key): change for key, change in given.items()}
     preset = str(changes.pop("preset", "default"))

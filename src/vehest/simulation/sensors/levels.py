@@ -271,10 +271,9 @@ SMALL_CAR = SensorLevels(
 """A model race car of 5 kg: little noise at rest, an inertial unit that shakes with the wheels."""
 
 
-def ideal_sensors() -> SensorLevels:
-    """Sensors without any error: they show the true motion of the centre of gravity in the road's axes."""
-    levels: SensorLevels = without_errors(SensorLevels())
-    return levels
-
-
-PRESETS: dict[str, SensorLevels] = {"default": SensorLevels(), "race": RACE, "ideal": ideal_sensors(), "small_car": SMALL_CAR}
+PRESETS: dict[str, SensorLevels] = {
+    "default": SensorLevels(),
+    "race": RACE,
+    "ideal": without_errors(SensorLevels()),  # shows the true motion of the centre of gravity in the road's axes
+    "small_car": SMALL_CAR,
+}

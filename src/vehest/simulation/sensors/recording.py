@@ -64,13 +64,12 @@ def _speed_of_wheels(motion: Motion) -> FloatArray:
     return turning * radius
 
 
-def specific_force(motion: Motion, tilt: Tilt | None = None) -> FloatArray:
+def specific_force(motion: Motion, tilt: Tilt) -> FloatArray:
     """Specific force at the centre of gravity in the axes of the tilted body, forward, left and up [m/s²], (3, T).
 
     The road's axes follow from level ones by grade, then bank, the body's from the road's by pitch, then roll. Accelerations of the body
     along its vertical axis are left out.
     """
-    tilt = tilt or Tilt()
     grade, bank = motion.grade * tilt.grade, motion.bank * tilt.bank
     road = np.stack(
         [motion.ax - GRAVITY * np.sin(grade), motion.ay + GRAVITY * np.cos(grade) * np.sin(bank), GRAVITY * np.cos(grade) * np.cos(bank)]
@@ -78,12 +77,11 @@ def specific_force(motion: Motion, tilt: Tilt | None = None) -> FloatArray:
     return _turned(road, motion.roll * (tilt.roll * tilt.roll_share), motion.pitch * tilt.pitch)
 
 
-def body_rates(motion: Motion, tilt: Tilt | None = None) -> FloatArray:
+def body_rates(motion: Motion, tilt: Tilt) -> FloatArray:
     """Angular velocity about the body's forward, left and upward axes [rad/s], (3, T).
 
     ``motion`` has the rates of roll, pitch and yaw angle. In a steady turn a rolled body also turns about its own lateral axis.
     """
-    tilt = tilt or Tilt()
     roll, pitch = motion.roll * tilt.roll, motion.pitch * tilt.pitch
     sin_roll, cos_roll, sin_pitch, cos_pitch = np.sin(roll), np.cos(roll), np.sin(pitch), np.cos(pitch)
     return np.stack(

@@ -1,6 +1,6 @@
 """Revs Vehicle Dynamics Database (Kegelman & Gerdes, Stanford Digital Repository).
 
-Layouts: ``csv`` and ``mat``, the official ones, a file a recording; ``text``, a folder a recording and a text file a channel, as re-laid
+Layouts: ``csv``, the official one, a file a recording; ``text``, a folder a recording and a text file a channel, as re-laid
 by Leanza, Reina & Blanco-Claraco 2021.
 """
 
@@ -15,37 +15,34 @@ from pydantic import Field
 
 from vehest.constants import FloatArray
 from vehest.data.channels import channel
-from vehest.data.errors import ConfigurationError, DataError, MissingError
+from vehest.data.errors import DataError, MissingError
 from vehest.data.recording import Recording
 from vehest.sources.base import existing_folder, require_files
 from vehest.sources.clocks import ClockPolicy, uniform_clock
-from vehest.sources.columns import ChannelMap, ChannelNames, Positive, column_from_config
+from vehest.sources.columns import ChannelMap, ChannelNames, column_from_config
 from vehest.sources.file_source import FileSource
 from vehest.sources.revs.csv_layout import read_csv, read_vehicle_parameters
-from vehest.sources.revs.mat_layout import read_mat_columns
 from vehest.sources.tables import TextLayout, read_columns
 from vehest.sources.unit_spellings import require_unit
 
-SUFFIXES = {"csv": ".csv", "mat": ".mat", "text": ""}
+SUFFIXES = {"csv": ".csv", "text": ""}
 
 
 @dataclass(frozen=True)
 class RevsOptions:
     """Options of the source; docs/sources/revs.md describes them."""
 
-    layout: Literal["csv", "mat", "text"]
+    layout: Literal["csv", "text"]
     path: str | None = None
     recordings: tuple[str, ...] | None = None
     files: str | None = None
     vehicle_parameters: str | None = None
     time: dict[str, Any] | None = None
     channels: ChannelMap | None = None
-    extra_channels: dict[Literal["csv", "mat", "text"], dict[str, Any] | None] | None = None
     clock: ClockPolicy = "strict"
     gappy: ChannelNames | None = None
     preamble_lines: Annotated[int, Field(ge=0, le=100)] = 10
     units_row: Literal["check", "ignore"] = "check"
-    rate_hz: Positive | None = None
 
 
 class RevsSource(FileSource):
@@ -56,11 +53,8 @@ class RevsSource(FileSource):
     def __init__(self, dataset: Mapping[str, Any]) -> None:
         super().__init__(dataset)
         options = self.options
-        extra = (options.extra_channels or {}).get(options.layout)
-        self.columns = self._declared({**(options.channels or {}), **(extra or {})})
+        self.columns = self._declared(options.channels)
         self.time = column_from_config(options.time, f"{self.where}: time", "s")
-        if options.rate_hz is not None and options.layout != "mat":
-            raise ConfigurationError(f"{self.where}: rate_hz is an option of layout mat; 'vehest downsample' brings others to another rate")
         strict = {column.column for name, column in self.columns.items() if name not in self.gappy}
         self.column_names = list(dict.fromkeys(column.column for column in self.columns.values()))
         self.gappy_columns = set(self.column_names) - strict
@@ -85,7 +79,7 @@ class RevsSource(FileSource):
         return dict(files) if parameters is None else {**files, parameters.name: parameters}
 
     def file_names(self) -> list[str]:
-        """Files of the named recordings in the official layouts, and the table of vehicle parameters."""
+        """Files of the named recordings in the official layout, and the table of vehicle parameters."""
         suffix = SUFFIXES[self.options.layout]
         if not suffix or self.options.recordings is None:
             return []
@@ -95,13 +89,9 @@ class RevsSource(FileSource):
     def read_raw(self, recording_id: str) -> Recording:
         """Read one recording by its name."""
         files, path, options = self._files_of(recording_id), self._path(recording_id), self.options
-        if options.layout == "mat":
-            clock, values, rates = read_mat_columns(path, self.column_names, self.time, options.rate_hz, options.clock, self.gappy_columns)
-            origin: dict[str, Any] = {"file": path.name, "native_rates_hz": rates}
-        else:
-            own, origin = self._read_csv(path) if options.layout == "csv" else (self._read_text(files), {})
-            clock = uniform_clock(self.time.to_si(own[self.time.column], "s"), f"'{path}'", options.clock)
-            values = {name: clock.align(own[name], name in self.gappy_columns) for name in self.column_names}
+        own, origin = self._read_csv(path) if options.layout == "csv" else (self._read_text(files), {})
+        clock = uniform_clock(self.time.to_si(own[self.time.column], "s"), f"'{path}'", options.clock)
+        values = {name: clock.align(own[name], name in self.gappy_columns) for name in self.column_names}
         channels = {name: column.to_si(values[column.column], channel(name).unit) for name, column in self.columns.items()}
         provenance = {"layout": options.layout, **origin}
         parameters = self._parameters_file()

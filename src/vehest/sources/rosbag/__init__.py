@@ -146,7 +146,7 @@ class RosbagSource(FileSource):
         if rate_hz is None:
             plane = np.stack([np.interp(grid, times, plane[:, axis]) for axis in (0, 1)], axis=1)
             times, yaw, rate_hz = grid, np.interp(grid, times, yaw), self.options.rate_hz
-        return pose.motion(plane, yaw, 1.0 / rate_hz, pose.yaw, where).at(times, grid).channels(pose.channels)
+        return pose.references(plane, yaw, 1.0 / rate_hz, pose.yaw, where, at=(times, grid))
 
 
 def _averaging(width: int) -> FloatArray:
