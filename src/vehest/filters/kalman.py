@@ -54,7 +54,3 @@ def smoothed_means(model: LinearModel[FloatArray], filtered: Filtered[FloatArray
         means[k] += gains[k] @ (means[k + 1] - ahead.mean[k + 1])
     return means
 
-
-def shapes_of(n: int, m: int) -> tuple[tuple[int, ...], ...]:
-    """Shapes of a `LinearModel`'s parts at one sample, for n states and m measurements."""
-    return (n, n), (n,), (n, n), (m, n), (m,), (m, m)
