@@ -18,12 +18,11 @@ from vehest.data.estimate import Estimate
 from vehest.data.recording import Recording
 from vehest.declared import Group, setting
 from vehest.estimators.base import Estimator, FitData, FitRecord, Trial, require_learnable
-from vehest.estimators.filtering.car_filter import LEAST_ENTROPY, CarFilter
+from vehest.estimators.filtering.car_filter import CarFilter
 from vehest.estimators.filtering.sigma_point_stepper import FilterStep, SigmaPointEstimator
 from vehest.estimators.network import Network
 from vehest.filters.gaussian import Gaussian
-from vehest.filters.noise_models import StateDependentNoise
-from vehest.filters.unscented_scan import MARGIN, UnscentedStepper
+from vehest.filters.unscented_scan import MARGIN, CompiledNoise, StepNoise, UnscentedStepper
 from vehest.training.context import FitContext
 from vehest.training.sequences import PhaseRecord, record_of_phases, train_phases
 from vehest.training.through_filter import Drive, ThroughFilterSettings, Weights, filter_phases, one_step_phase
@@ -355,7 +354,7 @@ class LearnedUkf(Network, SigmaPointEstimator):
         s = self.settings
         own = deepcopy(self.filter).double()
         with torch.no_grad():
-            process, observation = own.process_noise, own.observation_noise
+            process, observation = own.noise_at()
             return {
                 **super().c_values(),
                 **_dynamics_in_c(own.dynamics),
@@ -375,8 +374,8 @@ class LearnedUkf(Network, SigmaPointEstimator):
                 "unscaled": UNSCALED,
                 "friction": s.friction if s.start_friction is None else s.start_friction,
                 "initial": _numbers(own.initial_covariance()) + np.diag([*np.square(UNKNOWN), 0.0]),
-                "process": _noise_in_c(process, LEAST_ENTROPY, own.noise_at()[0]),
-                "observation": _noise_in_c(observation, None, own.noise_at()[1]),
+                "process": _noise_in_c(process),
+                "observation": _noise_in_c(observation),
             }
 
 
@@ -407,22 +406,15 @@ def _dynamics_in_c(dynamics: nn.Module) -> dict[str, Any]:
     return values
 
 
-def _noise_in_c(noise: nn.Module, least: float | None, at: Any) -> dict[str, Any]:
+def _noise_in_c(noise: StepNoise) -> dict[str, Any]:
     """A covariance that is constant, or linear in the state by its factor; see `compiled_noise`."""
-    if not isinstance(noise, StateDependentNoise):
-        nothing = np.zeros((1, len(STATES)))
-        return {"constant": at(nothing, nothing)[0], "weight": None}
-    n = noise.constant.n
-    unit = noise.unit[torch.tril_indices(n, n)[0]]
-    return {
-        "constant": _numbers(noise.constant(noise.state_unit, noise.state_unit)),
-        "weight": _numbers(noise.weight / noise.state_unit * unit[:, None]),
-        "offset": _numbers(noise.offset * unit),
-        "scale": noise.scale,
-        "least": least,
-        "units": n * math.log(2.0 * math.pi * math.e),
-        "size": n,
-    }
+    if not isinstance(noise, CompiledNoise):
+        return {"constant": noise[0], "weight": None}
+    constant, weight, offset, *numbers = noise.car
+    scale, least = map(float, numbers)
+    n = len(constant)
+    values = {"constant": constant, "weight": weight, "offset": offset, "scale": scale, "least": least if math.isfinite(least) else None}
+    return {**values, "units": n * math.log(2.0 * math.pi * math.e), "size": n}
 
 
 def _numbers(values: Tensor) -> np.ndarray[Any, Any]:

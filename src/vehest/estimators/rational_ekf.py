@@ -24,7 +24,7 @@ from vehest.estimators.filtering.tyre_fit import NORMAL_95, AxleMotion, TyreFit,
 from vehest.estimators.kernels.rational_ekf import _roll, scan
 from vehest.filters.gating import Gate
 from vehest.filters.gaussian import Gaussian
-from vehest.filters.sigma_points import cubature_rule
+from vehest.filters.sigma_points import symmetric_rule
 from vehest.filters.unscented_scan import TorchModel, UnscentedStepper
 from vehest.training.context import FitContext
 from vehest.training.noise_tuning import NoiseTuningSettings
@@ -398,8 +398,7 @@ class RationalFilter(SideslipFilter):
         gated = limit, patience, np.zeros(2, np.int64) if refused is None else refused
         bounds = np.append(bounds, [math.inf] * len(pull))
         scan(np.ascontiguousarray(samples), track, variances, bounds, self.start_tyres(), guessed, gated, (mean, covariance), out)
-        means, deviation, *others = out
-        return FilteredStates(means, *others, Gaussian(mean, covariance), deviation)  # type: ignore[call-arg, arg-type]
+        return FilteredStates(*out, Gaussian(mean, covariance))
 
     def _unscented(self, samples: FloatArray, first: Gaussian[FloatArray], levels: Mapping[str, float]) -> FilteredStates:
         """The same by sigma points; what is held keeps its variance (Schmidt's consider state)."""
@@ -409,17 +408,12 @@ class RationalFilter(SideslipFilter):
             lambda points, inputs: track.transition(points.clamp_(-limit, limit), inputs),
             lambda points, inputs: track.observation(points.clamp_(-limit, limit), inputs),
         )
-        filtered = UnscentedStepper(model, *first, 2, cubature_rule(len(bound)))
+        filtered = UnscentedStepper(model, *first, 2, symmetric_rule(len(bound), 0.0))
         prior, (mean, covariance) = filtered.prior, filtered.state
         mean[:], covariance[:] = first
         sensors = np.square([[levels["yaw_rate"], levels["ay"]]])[..., None] * np.eye(2)
         geometry = np.array([car.mass, car.yaw_inertia, car.cg_to_front_axle, car.cg_to_rear_axle])
         out = _empty(len(samples), len(bound))
-
-        def process_noise(states: FloatArray, inputs: FloatArray) -> FloatArray:
-            turn = inputs[0, 0] * (states[0, 1] + track.step * states[0, 3])
-            tyres = levels["tyres"] if abs(turn) >= self.adapt_above else 0.0
-            return track.process_noise(torch.as_tensor(states), torch.as_tensor(inputs), levels["steer"], tyres).numpy()
 
         for k, (yaw_rate, vx, ay, steer) in enumerate(samples):
             if vx < self.minimum_speed:
@@ -427,7 +421,11 @@ class RationalFilter(SideslipFilter):
                 innovation, spread, measured = np.zeros(2), np.eye(2), np.zeros(2, bool)
             else:
                 if k:
-                    filtered.predict(np.array([max(samples[k - 1, 1], self.minimum_speed), samples[k - 1, 3]]), process_noise)
+                    before = np.array([max(samples[k - 1, 1], self.minimum_speed), samples[k - 1, 3]])
+                    wanders = abs(before[0] * (mean[1] + track.step * mean[3])) >= self.adapt_above
+                    spreads = levels["steer"], levels["tyres"] * wanders
+                    at = torch.as_tensor(mean[None]), torch.as_tensor(before[None])
+                    filtered.predict(before, track.process_noise(*at, *spreads).numpy())
                     prior.mean.clip(-bound, bound, out=prior.mean)
                     diverged = not abs(prior.mean[0]) < self.largest_sideslip
                     if diverged or not prior.covariance[0, 0] < LOST**2:
@@ -446,8 +444,7 @@ class RationalFilter(SideslipFilter):
             deviation = np.sqrt(np.maximum(np.diagonal(covariance), 0.0))
             for target, values in zip(out, (mean, deviation, covariance[:2, :2], innovation, spread, measured), strict=True):
                 target[k] = values
-        means, deviations, *others = out
-        return FilteredStates(means, *others, Gaussian(mean.copy(), covariance.copy()), deviations)  # type: ignore[call-arg, arg-type]
+        return FilteredStates(*out, Gaussian(mean.copy(), covariance.copy()))
 
     def parameters_of(self, states: FloatArray) -> dict[str, FloatArray]:
         """Tyre parameters of states, (T, n), in SI units: name -> (T,)."""

@@ -9,23 +9,16 @@ from typing import Any, ClassVar, NamedTuple
 from vehest.constants import FloatArray
 from vehest.estimators.base import Stepper
 from vehest.estimators.filtering.gated import GatedFilter
-from vehest.filters.unscented_scan import NoiseAt, UnscentedStepper
+from vehest.filters.unscented_scan import StepNoise, UnscentedStepper
 
 
 class FilterStep(NamedTuple):
-    """A sample as a filter takes it; see `UnscentedStepper.step`.
+    """A sample as a filter takes it; see `UnscentedStepper.step`."""
 
-    Attributes:
-        measurement: (m,).
-        inputs: (p,).
-        process_noise: of the step that led to the sample.
-        observation_noise: of the measurement.
-    """
-
-    measurement: FloatArray
-    inputs: FloatArray
-    process_noise: FloatArray | NoiseAt
-    observation_noise: FloatArray | NoiseAt
+    measurement: FloatArray  # (m,)
+    inputs: FloatArray  # (p,)
+    process_noise: StepNoise  # of the step that led to the sample
+    observation_noise: StepNoise  # of the measurement
 
 
 class SigmaPointEstimator(GatedFilter):
