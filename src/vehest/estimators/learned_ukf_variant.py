@@ -50,8 +50,7 @@ class LearnedUkfVariant(LearnedUkf):
         return super().n_parameters - held * (not self.correlated_noise)
 
     def _new_dynamics(self) -> Dynamics:
-        car = self.car
-        return PacejkaCar(car.chassis, car.start, with_curvature=True) if self.curvature else super()._new_dynamics()
+        return PacejkaCar(vars(self.car), with_curvature=True) if self.curvature else super()._new_dynamics()
 
 
 ESTIMATOR = LearnedUkfVariant
