@@ -12,7 +12,7 @@ from conftest import planar_drive
 from vehest.data.windows import windows_of
 from vehest.estimators.gru import Gru
 from vehest.estimators.kernels.activation import arctan, rational_tanh, softplus
-from vehest.estimators.kernels.luenberger import implicit_euler_observer, observe
+from vehest.estimators.luenberger import implicit_euler_observer, observe
 from vehest.estimators.kernels.threads import over_members
 from vehest.estimators.ksnn import Ksnn
 from vehest.estimators.lstm import Lstm

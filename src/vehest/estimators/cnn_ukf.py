@@ -234,7 +234,7 @@ class EndToEnd:
 
     def __init__(self, estimator: CnnUkf, samples: Samples, recordings: Sequence[Recording], training: EndToEndSettings) -> None:
         self.estimator, self.samples, self.recordings, self.training = estimator, samples, recordings, training
-        self.filter = TrackFilter(estimator.track(sees_sideslip=True))
+        self.filter = TrackFilter(estimator.track())
         self.sensors = estimator.noise_covariances(estimator.levels)[1]
         self.lengths = [len(recording) for recording in recordings]
         self.offsets = np.concatenate([[0], np.cumsum(self.lengths)])

@@ -232,8 +232,8 @@ class DugoffUkf(SigmaPointEstimator):
         """Seed of the genetic searches and of Optuna's trials."""
         self._seed = seed
 
-    def track(self, *, sees_sideslip: bool = False) -> DugoffTrack:
-        """The model, with a sideslip angle among its measurements or without.
+    def track(self) -> DugoffTrack:
+        """The model.
 
         Raises:
             ConfigurationError: the tyres are neither given nor identified.
@@ -242,7 +242,7 @@ class DugoffUkf(SigmaPointEstimator):
             raise ConfigurationError(f"estimator '{self.name}' has no tyres yet; fit or load it first, or give estimator.tyres")
         s = self.settings
         front, rear = (DugoffAxle(*self.axle_tyres[part].tolist()) for part in (slice(0, 3), slice(3, 6)))
-        return DugoffTrack(s.car, front, rear, 1.0 / s.rate_hz, s.curve, s.minimum_speed, sees_sideslip)
+        return DugoffTrack(s.car, front, rear, 1.0 / s.rate_hz, s.curve, s.minimum_speed)
 
     @classmethod
     def fit_members(cls, members: Sequence[Any], data: FitData, training: Any, context: FitContext) -> list[FitRecord]:
@@ -382,7 +382,7 @@ class DugoffUkf(SigmaPointEstimator):
 
         Levels are found, and networks learn, without a gate: noise that is too small would close it.
         """
-        model = TrackFilter(self.track(sees_sideslip=pseudo is not None))
+        model = TrackFilter(self.track())
         process, sensors = self.noise_covariances(self.levels if levels is None else levels)
         for rows in groups_of([len(recording) for recording in recordings], MOST_TOGETHER):
             parts = [self.taken(recordings[row].stack(self.channels)) for row in rows]
@@ -403,8 +403,11 @@ class DugoffUkf(SigmaPointEstimator):
                 yield rows, model.filtered(measurements, inputs, steps_noise, noise, initial, gate).steps
 
     def taken(self, samples: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Samples (T, n) of ``channels`` as the filter takes them: measurements of sensors (T, 4), inputs (T, 3)."""
-        return samples_of(samples[:, : len(CHANNELS[self.inputs])])
+        """Samples (T, n) of ``channels`` as the filter takes them: measurements (T, 4), NaN where there are no forces, and inputs (T, 3)."""
+        yaw_rate, vx, ay, steer, ax = samples.T[: len(INERTIAL)]
+        wheels = samples[:, len(INERTIAL) : len(CHANNELS[self.inputs])]
+        forces = [wheels[:, 0] + wheels[:, 1], wheels[:, 2] + wheels[:, 3]] if wheels.shape[1] else [np.full(len(samples), np.nan)] * 2
+        return np.stack([ay, yaw_rate, *forces], 1), np.stack([vx, steer, ax], 1)
 
     def trusts_forces(self, ay: FloatArray, before: bool = False) -> NDArray[np.bool_]:
         """Where forces are trusted, (T,), given the measured lateral acceleration (T,) [m/s²]; see `in_nonlinear_range`."""
@@ -426,7 +429,7 @@ class DugoffUkf(SigmaPointEstimator):
 
     def new_filter(self, first: FilterStep) -> UnscentedStepper:
         """Straight ahead and unknown, or rolling."""
-        own = TrackFilter(self.track(sees_sideslip=len(first.measurement) > 4))
+        own = TrackFilter(self.track())
         mean, covariance = (part[0].numpy() for part in own.start(torch.as_tensor(first.inputs)[None]))
         return UnscentedStepper(own.model, mean, covariance, len(first.measurement), own.rule, gate=self.gate_in_use())
 
@@ -525,19 +528,6 @@ def finite(error: float) -> float:
     return error if math.isfinite(error) else BAD
 
 
-def samples_of(samples: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Samples of ``channels`` as the filter takes them.
-
-    Args:
-        samples: (T, 9), or (T, 5) without forces.
-
-    Returns:
-        Measurements (T, 4), NaN where there are no forces, and inputs (T, 3).
-    """
-    yaw_rate, vx, ay, steer, ax = samples.T[: len(INERTIAL)]
-    wheels = samples[:, len(INERTIAL) :]
-    forces = [wheels[:, 0] + wheels[:, 1], wheels[:, 2] + wheels[:, 3]] if wheels.shape[1] else [np.full(len(samples), np.nan)] * 2
-    return np.stack([ay, yaw_rate, *forces], 1), np.stack([vx, steer, ax], 1)
 
 
 ESTIMATOR = DugoffUkf
