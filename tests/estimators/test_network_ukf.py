@@ -21,7 +21,7 @@ from vehest.estimators.networks.sample_network import learnt_samples
 from vehest.estimators.registry import estimator_class
 from vehest.filters.unscented_scan import TorchModel
 from vehest.training.context import FitContext
-from vehest.training.identification import IdentificationSettings
+from vehest.training.noise_tuning import IdentificationSettings
 from vehest.training.samples import Draw
 from vehest.training.sequences import PhaseSettings
 

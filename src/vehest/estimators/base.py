@@ -63,20 +63,13 @@ def require_learnable(
 
 
 class Trial(NamedTuple):
-    """A family in the first comparison on a car without a trained model (`vehest new`).
+    """A family in the first comparison on a car without a trained model (`vehest new`)."""
 
-    Attributes:
-        place: among the trials of all families, the most promising and cheap first; those that differ in place alone are one sweep.
-        about: text for people.
-        overrides: of settings and training; ``{wheelbase}`` and ``{mass}`` are those of the car, ``{car}`` all of its parameters that the
-            family's settings have.
-        samples: that some range for training, and each for validation, has to have at the family's rate.
-    """
-
-    place: float
-    about: str
+    place: float  # among the trials of all families, the promising and cheap first; those that differ in place alone are one sweep
+    about: str  # text for people
+    # of settings and training; ``{wheelbase}`` and ``{mass}`` are those of the car, ``{car}`` all of its parameters that the settings have
     overrides: str = ""
-    samples: int = 0
+    samples: int = 0  # that some range for training, and each for validation, has to have at the family's rate
 
 
 class Stepper(ABC):

@@ -40,7 +40,8 @@ from vehest.filters.noise_levels import quiet_level
 from vehest.filters.sigma_points import symmetric_rule
 from vehest.filters.unscented_scan import MARGIN, UnscentedStepper
 from vehest.training.context import FitContext
-from vehest.training.identification import LEAST_PROCESS_YAW_RATE, IdentificationSettings
+from vehest.training.noise_tuning import LEAST_PROCESS_YAW_RATE, IdentificationSettings
+from vehest.training.noise_tuning import finite
 from vehest.training.search import SearchRecord
 from vehest.vehicle.dugoff import (
     BMW_545I,
@@ -68,7 +69,6 @@ BOXES = {"process_vy": (-5.0, 0.0), "force_factor": (0.0, 2.0)}  # powers of ten
 STARTS = {"process_vy": (-4.0, -2.0), "process_yaw_rate": (-4.0, -2.0), "force_factor": (0.3, 1.0)}
 QUIET_SECONDS = 0.5  # of the pieces of drives in which the steering angle deviates least from a straight line
 MOST_TOGETHER = 200_000  # samples that are filtered at a time
-BAD = 1e6  # rad², instead of a cost that is not finite
 
 
 @dataclass(frozen=True)
@@ -111,16 +111,11 @@ TYRES = tuple(entry.name for entry in fields(AxleTyres))
 
 
 class PseudoMeasurement(NamedTuple):
-    """What a network adds to T samples.
+    """What a network adds to T samples."""
 
-    Attributes:
-        sideslip: β_DD, (T,) [rad].
-        variance: of the measurement that the filter takes it for, (T,) [rad²].
-        process: variances of a step of lateral velocity and yaw rate, (T, 2) [m²/s², rad²/s²]; none: the filter's own.
-    """
-
-    sideslip: FloatArray
-    variance: FloatArray
+    sideslip: FloatArray  # β_DD, (T,) [rad]
+    variance: FloatArray  # of the measurement that the filter takes it for, (T,) [rad²]
+    # variances of a step of lateral velocity and yaw rate, (T, 2) [m²/s², rad²/s²]; none: the filter's own
     process: FloatArray | None = None
 
 
@@ -523,9 +518,6 @@ def with_variance(sensors: Tensor, variance: Tensor) -> Tensor:
     return torch.diag_embed(torch.cat([sensors.diagonal(dim1=-2, dim2=-1), variance.unsqueeze(-1)], -1))
 
 
-def finite(error: float) -> float:
-    """An error, or a large one instead of one that is not finite."""
-    return error if math.isfinite(error) else BAD
 
 
 

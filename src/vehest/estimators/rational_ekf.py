@@ -27,7 +27,7 @@ from vehest.filters.gaussian import Gaussian
 from vehest.filters.sigma_points import symmetric_rule
 from vehest.filters.unscented_scan import TorchModel, UnscentedStepper
 from vehest.training.context import FitContext
-from vehest.training.noise_tuning import NoiseTuningSettings
+from vehest.training.noise_tuning import NoiseTuningSettings, finite
 from vehest.training.search import SearchRecord
 from vehest.vehicle.tyre_track import MOTION, TYRE_PARAMETERS, TyreTrack
 
@@ -47,7 +47,6 @@ BOXES = {"ay": (-1.0, 5.0), "steer": (-4.0, 4.0), "tyres": (-8.0, 1.0)}  # power
 EDGE = 0.01  # of a box's width: a search that ends nearer to its end has ended on it
 STARTS = {"ay": (1.5, 2.0), "steer": (0.0, 1.5), "tyres": (-3.5, -2.0)}
 FIRST_SCALE, CALIBRATIONS = 0.01, 2  # rad/s: where the level of the yaw rate starts, and how often it is scaled
-BAD = 1e6  # rad², instead of a cost that is not finite
 
 Tyres = Literal["linear", "rational", "rational_adaptive", "rational_friction"]
 KINDS: dict[str, tuple[str, str, tuple[str, ...]]] = {
@@ -332,8 +331,7 @@ class RationalFilter(SideslipFilter):
             error = (self.filter_samples(samples, levels=levels).mean[:, 0] - reference)[skip:]
             counted = (samples[skip:, 1] >= self.minimum_speed) & np.isfinite(reference[skip:])
             total, count = total + float(np.square(error[counted]).sum()), count + int(counted.sum())
-        value = total / max(count, 1)
-        return value if math.isfinite(value) else BAD
+        return finite(total / max(count, 1))
 
     def first_gaussian(self, sample: FloatArray, given: Mapping[str, float]) -> Gaussian[FloatArray]:
         """At rest on its course, or what a protocol hands over; parameters as they were fitted."""

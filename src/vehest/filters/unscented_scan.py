@@ -59,22 +59,17 @@ class NonlinearFiltered(NamedTuple):
 class PointModel:
     """How sigma points move and what is expected at them, with adjoints; arrays of one precision, float32 or float64.
 
-    Attributes:
-        entries: transition and observation, called with (points, inputs, car, out, first, end), and their adjoints, called with
-            (points, inputs, car, upstream, out, gradients, first, end), which add to the gradients of parameters. Sequences lie side by
-            side in points (S, n, B), inputs (p, B), what is expected (S, m, B) and gradients, each followed by room for a vector; ``out``
-            is written from ``first`` to ``end``.
-        car: what all are given.
-        is_compiled: whether the entries are, so that the loop over samples runs without Python.
-        parameters: what gradients are wanted for.
-        lower: smallest possible value of each state, (n,); none: everything is possible.
+    Entries are transition and observation, called with (points, inputs, car, out, first, end), and their adjoints, called with (points,
+    inputs, car, upstream, out, gradients, first, end), which add to the gradients of parameters. Sequences lie side by side in points
+    (S, n, B), inputs (p, B), what is expected (S, m, B) and gradients, each followed by room for a vector; ``out`` is written from ``first``
+    to ``end``.
     """
 
     entries: Sequence[Any]
-    car: Any = None
-    is_compiled = False
-    parameters: Sequence[Tensor] = ()
-    lower: Sequence[float] | None = None
+    car: Any = None  # what all are given
+    is_compiled = False  # whether the entries are, so that the loop over samples runs without Python
+    parameters: Sequence[Tensor] = ()  # what gradients are wanted for
+    lower: Sequence[float] | None = None  # smallest possible value of each state, (n,); none: everything is possible
 
     def working(self) -> AbstractContextManager[object]:
         """What the entries are called within, by one thread for all."""

@@ -15,7 +15,7 @@ from vehest.data.errors import DataError
 from vehest.data.recording import Recording
 from vehest.data.splits import VALIDATION
 from vehest.estimators.base import Estimator
-from vehest.estimators.dugoff_ukf import finite
+from vehest.training.noise_tuning import finite
 from vehest.estimators.ensemble_ukf import BOX, EnsembleUkf, scaled_variance
 from vehest.estimators.model_files import load_model
 from vehest.estimators.network_ukf import LEAST_VARIANCE

@@ -45,42 +45,25 @@ NORMAL_95 = 1.959964
 
 
 class AxleMotion(NamedTuple):
-    """What the axles do along drives; slips and forces have a row an axle, front and rear.
+    """What the axles do along drives; slips and forces have a row an axle, front and rear."""
 
-    Attributes:
-        slip: slip angles, positive where they make a force to the left, (2, N) [rad].
-        force: lateral forces, (2, N) [N].
-        block: number of the stretch of time a sample belongs to, (N,).
-        driven: forward speed [m/s], steering angle [rad] and longitudinal acceleration [m/s²], (3, N); NaN where none was measured.
-    """
-
-    slip: FloatArray
-    force: FloatArray
-    block: NDArray[np.int64]
-    driven: FloatArray
+    slip: FloatArray  # slip angles, positive where they make a force to the left, (2, N) [rad]
+    force: FloatArray  # lateral forces, (2, N) [N]
+    block: NDArray[np.int64]  # number of the stretch of time a sample belongs to, (N,)
+    driven: FloatArray  # forward speed [m/s], steering angle [rad] and longitudinal acceleration [m/s²], (3, N); NaN: not measured
 
 
 @dataclass(frozen=True, eq=False)
 class TyreFit:
-    """Curves of both axles.
-
-    Args:
-        kind: ``linear`` or ``rational``.
-        front: parameters of the front axle in the order of `PARAMETERS`, (P,).
-        rear: those of the rear axle.
-        covariance: of the front and of the rear parameters, (2, P, P).
-        residual_rms: of the front and of the rear force, (2,) [N].
-        slip: slip angles that were fitted to, (2, N) [rad].
-        force: forces that were fitted to, (2, N) [N].
-    """
+    """Curves of both axles."""
 
     kind: Kind
-    front: FloatArray
-    rear: FloatArray
-    covariance: FloatArray
-    residual_rms: FloatArray
-    slip: FloatArray
-    force: FloatArray
+    front: FloatArray  # parameters of the front axle in the order of `PARAMETERS`, (P,)
+    rear: FloatArray  # those of the rear axle
+    covariance: FloatArray  # of the front and of the rear parameters, (2, P, P)
+    residual_rms: FloatArray  # of the front and of the rear force, (2,) [N]
+    slip: FloatArray  # slip angles that were fitted to, (2, N) [rad]
+    force: FloatArray  # forces that were fitted to, (2, N) [N]
 
     @property
     def interval(self) -> FloatArray:

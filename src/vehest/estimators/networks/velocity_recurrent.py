@@ -219,23 +219,14 @@ class RecurrentVelocityEstimator(HiddenStateEstimator):
 
 
 class _Batch(NamedTuple):
-    """Sequences side by side.
+    """Sequences side by side."""
 
-    Attributes:
-        starts: velocities to start from, (B, O).
-        inputs: measurements, (B, T, C).
-        targets: references, (B, T, O).
-        mask: of dropout, (B, T, H).
-        counted: which samples the loss is taken of, (B, T), 0 or 1; none: all but the dropped ones.
-        goes_on: whether the batch continues the one before, whose hidden state it starts from.
-    """
-
-    starts: Tensor
-    inputs: Tensor
-    targets: Tensor
-    mask: Tensor | None = None
-    counted: Tensor | None = None
-    goes_on: bool = False
+    starts: Tensor  # velocities to start from, (B, O)
+    inputs: Tensor  # measurements, (B, T, C)
+    targets: Tensor  # references, (B, T, O)
+    mask: Tensor | None = None  # of dropout, (B, T, H)
+    counted: Tensor | None = None  # which samples the loss is taken of, (B, T), 0 or 1; none: all but the dropped ones
+    goes_on: bool = False  # whether the batch continues the one before, whose hidden state it starts from
 
     def stretch(self, first: int, end: int) -> _Batch:
         """Its samples from ``first`` to ``end``."""
