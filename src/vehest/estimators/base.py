@@ -96,45 +96,28 @@ class Estimator(ABC):
     """A method that estimates lateral velocity and sideslip from measured channels.
 
     A family declares itself in its class: settings by `setting`, fitted numbers by `fitted`, and what follows. Settings are then an
-    attribute of the estimator each, and together ``settings``, of the dataclass ``settings_type`` that is made of them.
-
-    Attributes:
-        name: name in conf/estimator and in the registry.
-        title: name for people.
-        channels: measured channels it reads.
-        training_type: dataclass of the settings of its fit.
-        learns_from: reference channels that its fit reads.
-        skippable: channels of ``channels`` that may have gaps, because the method does without a sample.
-        refuses: which measurements of a sample are errors: ``NaN`` where it is not skippable, ``infinite``.
-        may_be_nan: weights that may stay NaN, because each recording tells them.
-        covariance_of: quantities that the covariances of `run` are of.
-        ignores_initial_state: whether an initial state is left aside; else it is used, or refused as an error.
-        slow_kernel: ``module:function`` that takes tens of seconds to compile; empty: none.
-        offline: error of `online` where its settings make it not causal, with those that make it causal.
-        trials: in the first comparison on a new car; none: it is left out.
-        notice: lines for users of the method, such as a patent.
-        template: C template of a step, in ``export/templates/methods`` or beside the family's module; empty: it has none.
-        version: raised when weights or estimates change; a version of ``training_type`` alone when the fit does.
-        preparation: how recordings are brought to its rate before it sees them (method, transforms).
+    attribute of the estimator each, and together ``settings``, of the dataclass ``settings_type`` that is made of them. ``preparation`` is how
+    recordings are brought to its rate before it sees them (method, transforms).
     """
 
-    name: ClassVar[str]
-    title: ClassVar[str]
-    channels: ClassVar[tuple[str, ...]]
+    name: ClassVar[str]  # in conf/estimator and in the registry
+    title: ClassVar[str]  # name for people
+    channels: ClassVar[tuple[str, ...]]  # measured channels it reads
     settings_type: ClassVar[Any] = EstimatorSettings
-    training_type: ClassVar[type]
-    learns_from: tuple[str, ...] = ("vy_ref",)
-    skippable: ClassVar[tuple[str, ...]] = ()
-    refuses: ClassVar[tuple[str, ...]] = ()
-    may_be_nan: ClassVar[tuple[str, ...]] = ()
-    covariance_of: ClassVar[tuple[str, ...]] = ()
-    ignores_initial_state: ClassVar[bool] = False
-    slow_kernel: ClassVar[str] = ""
+    training_type: ClassVar[type]  # dataclass of the settings of its fit
+    learns_from: tuple[str, ...] = ("vy_ref",)  # reference channels that its fit reads
+    skippable: ClassVar[tuple[str, ...]] = ()  # channels of ``channels`` that may have gaps, because the method does without a sample
+    refuses: ClassVar[tuple[str, ...]] = ()  # measurements of a sample that are errors: ``NaN`` where it is not skippable, ``infinite``
+    may_be_nan: ClassVar[tuple[str, ...]] = ()  # weights that may stay NaN, because each recording tells them
+    covariance_of: ClassVar[tuple[str, ...]] = ()  # quantities that the covariances of `run` are of
+    ignores_initial_state: ClassVar[bool] = False  # whether an initial state is left aside; else it is used, or refused as an error
+    slow_kernel: ClassVar[str] = ""  # ``module:function`` that takes tens of seconds to compile; empty: none
+    # error of `online` where its settings make it not causal, with those that make it causal
     offline: ClassVar[str] = "an estimator that is not causal cannot run along with a drive"
-    trials: ClassVar[tuple[Trial, ...]] = ()
-    notice: ClassVar[tuple[str, ...]] = ()
-    template: ClassVar[str] = ""
-    version: ClassVar[str] = "1"
+    trials: ClassVar[tuple[Trial, ...]] = ()  # in the first comparison on a new car; none: it is left out
+    notice: ClassVar[tuple[str, ...]] = ()  # lines for users of the method, such as a patent
+    template: ClassVar[str] = ""  # C template of a step, in ``export/templates/methods`` or beside the family's module; empty: none
+    version: ClassVar[str] = "1"  # raised when weights or estimates change; a version of ``training_type`` alone when the fit does
 
     def __init_subclass__(cls, **options: Any) -> None:
         super().__init_subclass__(**options)

@@ -57,12 +57,7 @@ class Recursive(Estimator):
         self.unknown = tuple(name for name, value in given.items() if value is None)
 
     def first_state(self, sample: FloatArray, given: Mapping[str, float]) -> Any:
-        """The state before the first sample: what is given, else what is measured, else 0.
-
-        Args:
-            sample: values of ``channels``, (C,).
-            given: what a protocol hands over of ``vy``, ``vx`` [m/s] and ``yaw_rate`` [rad/s]; empty otherwise.
-        """
+        """The state before the first sample: what is given, else what is measured, else 0; see `Estimator.first_state`."""
         measured = dict(zip(self.channels, sample.tolist(), strict=True)) | {"vy": 0.0}
         return tuple(float(given.get(name, measured.get(name, 0.0))) for name in self.states)
 
