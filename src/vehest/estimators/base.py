@@ -73,13 +73,9 @@ class Trial(NamedTuple):
 
 
 class Stepper(ABC):
-    """An estimator that runs along with the drive, one sample after another.
+    """An estimator that runs along with the drive, one sample after another."""
 
-    Attributes:
-        horizon_steps: how many sampling intervals after the sample the returned estimate holds.
-    """
-
-    horizon_steps: ClassVar[int] = 0
+    horizon_steps: ClassVar[int] = 0  # sampling intervals after the sample for which the returned estimate holds
 
     @abstractmethod
     def step(self, sample: Mapping[str, float]) -> dict[str, float]:
@@ -116,6 +112,7 @@ class Estimator(ABC):
     offline: ClassVar[str] = "an estimator that is not causal cannot run along with a drive"
     trials: ClassVar[tuple[Trial, ...]] = ()  # in the first comparison on a new car; none: it is left out
     notice: ClassVar[tuple[str, ...]] = ()  # lines for users of the method, such as a patent
+    style: ClassVar[tuple[str, str, str] | None] = None  # see `line_style`
     template: ClassVar[str] = ""  # C template of a step, in ``export/templates/methods`` or beside the family's module; empty: none
     version: ClassVar[str] = "1"  # raised when weights or estimates change; a version of ``training_type`` alone when the fit does
 
@@ -192,7 +189,7 @@ class Estimator(ABC):
     @classmethod
     def line_style(cls, variant: str) -> tuple[str, str, str] | None:
         """Colour, dash and marker of its lines in figures; none: a colour that follows from its name."""
-        return None
+        return cls.style
 
     @property
     def batch_key(self) -> tuple[Any, ...]:

@@ -137,10 +137,7 @@ class LearnedUkf(Network, SigmaPointEstimator):
         """Its network: the filter whose dynamics and noise are learnt."""
         return self.network
 
-    @property
-    def adapts(self) -> bool:
-        """Friction is a state."""
-        return True
+    adapts = True  # friction is a state
 
     @property
     def variant(self) -> str:

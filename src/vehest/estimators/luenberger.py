@@ -85,11 +85,7 @@ class Luenberger(Recursive):
     threshold: float = fitted(
         "yaw rate ω_th below which it is reset", unit="rad/s", start=(0.0, 0.3), box=(0.0, 0.5), of_largest="yaw_rate"
     )
-
-    @classmethod
-    def line_style(cls, variant: str) -> tuple[str, str, str]:
-        """Grey."""
-        return "#767676", "solid", "s"
+    style = "#767676", "solid", "s"
 
 
     def run(self, samples: FloatArray, state: Any) -> tuple[dict[str, FloatArray], Any]:

@@ -192,26 +192,25 @@ class RationalFilter(SideslipFilter):
     @property
     def learns(self) -> bool:
         """Whether curves or levels are not given."""
-        return not (self._curves_given and self._levels_given)
+        return not self._curves_given or bool(self._unknown)
 
     @property
     def n_parameters(self) -> int:
         """Parameters of curves and levels of noise that are not given."""
-        unknown = [name for name in self.level_names if getattr(self.noise, name) is None]
-        return len(self.curve_names) * (not self._curves_given) + len(unknown)
+        return len(self.curve_names) * (not self._curves_given) + len(self._unknown)
 
     @property
     def _curves_given(self) -> bool:
         return self.curves.c2_front is not None
 
     @property
-    def _levels_given(self) -> bool:
-        return all(getattr(self.noise, name) is not None for name in self.level_names)
+    def _unknown(self) -> tuple[str, ...]:
+        return tuple(name for name in self.level_names if getattr(self.noise, name) is None)
 
     @property
     def _searched(self) -> tuple[str, ...]:
         """Levels that are tuned: the sensors' as ratios to the first, whose size follows from the innovations."""
-        return tuple(name for name in self.level_names[1:] if getattr(self.noise, name) is None)
+        return tuple(name for name in self._unknown if name != LEVELS[0])
 
     def seed(self, seed: int) -> None:
         """Seed of Optuna's trials; nothing else is random."""
@@ -277,9 +276,8 @@ class RationalFilter(SideslipFilter):
         return {**found, **intervals, **rms}
 
     def _levels_of(self, recordings: Sequence[Recording]) -> dict[str, float]:
-        unknown = [name for name in self.level_names if getattr(self.noise, name) is None]
-        assumed = {name: value for name, value in ASSUMED.items() if name in unknown}
-        return self.values | assumed | read_levels(recordings, [name for name in LEVELS[:2] if name in unknown], CUTOFF)
+        assumed = {name: value for name, value in ASSUMED.items() if name in self._unknown}
+        return self.values | assumed | read_levels(recordings, [name for name in LEVELS[:2] if name in self._unknown], CUTOFF)
 
     def _extended(self) -> RationalFilter:
         """The extended filter of the same model, by which levels are found: a search through the unscented one would take hours."""

@@ -31,17 +31,13 @@ class Recursive(Estimator):
 
     Numbers that it declares by `fitted` are attributes, NaN before the fit; one that is given as a setting is not fitted. A family has
     either a compiled ``step(numbers, state, sample)``, which returns the state after a sample, or its own `run`.
-
-    Attributes:
-        states: quantities of an `Estimate` that the state of ``step`` consists of, ``vy`` first.
-        values: fitted numbers by name.
     """
 
     training_type: ClassVar[type] = NoTraining
-    states: ClassVar[tuple[str, ...]] = ("vy",)
+    states: ClassVar[tuple[str, ...]] = ("vy",)  # quantities of an `Estimate` that the state of ``step`` consists of, ``vy`` first
     refuses: ClassVar[tuple[str, ...]] = ("NaN",)
     step: ClassVar[Any]
-    values: dict[str, float]
+    values: dict[str, float]  # fitted numbers by name
 
     def __init_subclass__(cls, **options: Any) -> None:
         super().__init_subclass__(**options)

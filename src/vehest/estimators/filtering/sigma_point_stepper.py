@@ -22,13 +22,9 @@ class FilterStep(NamedTuple):
 
 
 class SigmaPointEstimator(GatedFilter):
-    """An estimator by an unscented filter.
+    """An estimator by an unscented filter."""
 
-    Attributes:
-        states: names of the filter's states, ``vy`` among them.
-    """
-
-    states: ClassVar[tuple[str, ...]]
+    states: ClassVar[tuple[str, ...]]  # names of the filter's states, ``vy`` among them
 
     @abstractmethod
     def filter_step(self, sample: FloatArray, memory: dict[str, Any]) -> FilterStep:
