@@ -8,11 +8,11 @@ from typing import NamedTuple
 
 import pytest
 import torch
-from point_models import noise_by
 from readable_filters import unscented_filter
 from test_filters_nonlinear import RULES, STEP, constant, measured_pendulum, pendulum_with_radar, sharp
 from torch import Tensor
 
+from point_models import noise_by
 from vehest.filters.gaussian import Gaussian
 from vehest.filters.sigma_points import symmetric_rule
 from vehest.filters.unscented_scan import TorchModel, UnscentedStepper, moved, unscented_scan

@@ -92,8 +92,8 @@ class Estimator(ABC):
     """A method that estimates lateral velocity and sideslip from measured channels.
 
     A family declares itself in its class: settings by `setting`, fitted numbers by `fitted`, and what follows. Settings are then an
-    attribute of the estimator each, and together ``settings``, of the dataclass ``settings_type`` that is made of them. ``preparation`` is how
-    recordings are brought to its rate before it sees them (method, transforms).
+    attribute of the estimator each, and together ``settings``, of the dataclass ``settings_type`` that is made of them. ``preparation`` is
+    how recordings are brought to its rate before it sees them (method, transforms).
     """
 
     name: ClassVar[str]  # in conf/estimator and in the registry

@@ -40,8 +40,7 @@ from vehest.filters.noise_levels import quiet_level
 from vehest.filters.sigma_points import symmetric_rule
 from vehest.filters.unscented_scan import MARGIN, UnscentedStepper
 from vehest.training.context import FitContext
-from vehest.training.noise_tuning import LEAST_PROCESS_YAW_RATE, IdentificationSettings
-from vehest.training.noise_tuning import finite
+from vehest.training.noise_tuning import LEAST_PROCESS_YAW_RATE, IdentificationSettings, finite
 from vehest.training.search import SearchRecord
 from vehest.vehicle.dugoff import (
     BMW_545I,
@@ -398,7 +397,7 @@ class DugoffUkf(SigmaPointEstimator):
                 yield rows, model.filtered(measurements, inputs, steps_noise, noise, initial, gate).steps
 
     def taken(self, samples: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Samples (T, n) of ``channels`` as the filter takes them: measurements (T, 4), NaN where there are no forces, and inputs (T, 3)."""
+        """Samples (T, n) of ``channels`` as the filter takes them: measurements (T, 4), NaN where there are no forces; inputs (T, 3)."""
         yaw_rate, vx, ay, steer, ax = samples.T[: len(INERTIAL)]
         wheels = samples[:, len(INERTIAL) : len(CHANNELS[self.inputs])]
         forces = [wheels[:, 0] + wheels[:, 1], wheels[:, 2] + wheels[:, 3]] if wheels.shape[1] else [np.full(len(samples), np.nan)] * 2
@@ -516,10 +515,6 @@ def with_variance(sensors: Tensor, variance: Tensor) -> Tensor:
         variance: of the network's angle (...) [rad²].
     """
     return torch.diag_embed(torch.cat([sensors.diagonal(dim1=-2, dim2=-1), variance.unsqueeze(-1)], -1))
-
-
-
-
 
 
 ESTIMATOR = DugoffUkf

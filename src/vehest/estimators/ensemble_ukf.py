@@ -18,8 +18,7 @@ from vehest.estimators.kernels.sample_network import gaussian_likelihood
 from vehest.estimators.network_ukf import LEAST_VARIANCE, NetworkUkf
 from vehest.estimators.networks.sample_network import SampleNetwork, clip_sideslip
 from vehest.training.context import FitContext
-from vehest.training.noise_tuning import IdentificationSettings
-from vehest.training.noise_tuning import finite
+from vehest.training.noise_tuning import IdentificationSettings, finite
 from vehest.training.samples import SampleSettings
 from vehest.training.search import SearchRecord
 from vehest.training.sequences import PhaseSettings

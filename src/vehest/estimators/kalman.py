@@ -137,7 +137,7 @@ class KalmanFilter(SideslipFilter):
     def filter_samples(
         self, samples: FloatArray, first: Gaussian[FloatArray], gate: Gate | None = None, refused: NDArray[np.int64] | None = None
     ) -> FilteredStates:
-        """Filter by `kalman_scan`; a_y is measured first. With offsets as states a_y + b_ay is measured, and the wheels stand at δ - b_δ."""
+        """Filter by `kalman_scan`; a_y is measured first. With offsets as states that is a_y + b_ay, and wheels stand at δ - b_δ."""
         yaw_rate, vx, ay, steer = samples.T
         A, B, C, D = self.sampled_model(vx)
         offsets, steps = self.offsets, len(samples)

@@ -87,7 +87,6 @@ class Luenberger(Recursive):
     )
     style = "#767676", "solid", "s"
 
-
     def run(self, samples: FloatArray, state: Any) -> tuple[dict[str, FloatArray], Any]:
         """Lateral and forward velocity [m/s]."""
         vy, vx = observe(samples, self.gain, self.threshold, 1.0 / self.rate_hz, *state)

@@ -47,5 +47,3 @@ def _own_class(name: str) -> type[Estimator] | None:
         return None
     found: type[Estimator] | None = getattr(importlib.import_module(f"{package.__name__}.{name}"), "ESTIMATOR", None)
     return found
-
-

@@ -36,7 +36,6 @@ PARAMETERS = slice(kernel.LEAKAGE, kernel.ERROR)  # among the states
 UNMEASURED = 20.0  # m/s per √s: process noise of u where ax is not measured
 
 
-
 class SelfCalibrating(Recursive):
     """A bank of Kalman filters over grip limits of the rear axle, weighed against a network and steady cornering.
 
@@ -137,7 +136,6 @@ class SelfCalibrating(Recursive):
     def full_title(self) -> str:
         """Title with whether it smooths."""
         return f"{self.title}, smoothed" if self.smoothed else self.title
-
 
     @property
     def rear(self) -> float:

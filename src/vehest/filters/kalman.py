@@ -45,4 +45,3 @@ def smoothed_means(model: LinearModel[FloatArray], filtered: Filtered[FloatArray
     for k in range(len(means) - 2, -1, -1):
         means[k] += gains[k] @ (means[k + 1] - ahead.mean[k + 1])
     return means
-

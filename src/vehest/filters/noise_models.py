@@ -1,4 +1,4 @@
-"""Covariances of noise that can be learnt, constant or linear in the state, in torch and compiled for filters at work; a floor of entropy."""
+"""Covariances of noise that can be learnt, constant or linear in the state, in torch and compiled for use; a floor for their entropy."""
 
 from __future__ import annotations
 

@@ -23,5 +23,3 @@ def symmetric_rule(n: int, kappa: float) -> SigmaRule:
     """
     total = n + kappa
     return SigmaRule(math.sqrt(total), kappa / total, kappa / total, 0.5 / total)
-
-

@@ -61,8 +61,8 @@ class PointModel:
 
     Entries are transition and observation, called with (points, inputs, car, out, first, end), and their adjoints, called with (points,
     inputs, car, upstream, out, gradients, first, end), which add to the gradients of parameters. Sequences lie side by side in points
-    (S, n, B), inputs (p, B), what is expected (S, m, B) and gradients, each followed by room for a vector; ``out`` is written from ``first``
-    to ``end``.
+    (S, n, B), inputs (p, B), what is expected (S, m, B) and gradients, each followed by room for a vector; ``out`` is written from
+    ``first`` to ``end``.
     """
 
     entries: Sequence[Any]
@@ -132,7 +132,6 @@ class CompiledNoise:
 
 StepNoise = Array | CompiledNoise
 """Of one sample: (1, k, k), or at the state."""
-
 
 
 def _setting(model: PointModel, rule: SigmaRule, n: int, dtype: Any, repair: bool, gate: Gate | None) -> Setting:
@@ -382,8 +381,6 @@ def _backward_by(model: PointModel, tape: Tape, u: Array, gradients: Sequence[Ar
         for entry, upstream in zip(model.entries[2:], (points, tape.expected[0]), strict=True)
     ]
     return partial(backward, Backward._make((*steps_by_address(BACKWARD, points.dtype), *called, model.car))), own
-
-
 
 
 def _beside(values: Array) -> Array:

@@ -29,8 +29,6 @@ class Drive(NamedTuple):
     measurements: Tensor  # (..., T, m); NaN where nothing was measured
 
 
-
-
 @dataclass(frozen=True)
 class ThroughFilterSettings(Group):
     """How a filter's model is trained (Węgrzynowski et al. 2024, Section IV-A, and its authors' code)."""

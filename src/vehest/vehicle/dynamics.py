@@ -184,7 +184,7 @@ class TyreNetworkCar(Dynamics):
 
 
 def physical_of(dynamics: Dynamics) -> tuple[Tensor, tuple[float, ...]]:
-    """Learnt values in the order of `LEARNT` and `PACEJKA`, differentiable, and known ones in that of `KNOWN`; 0 and 1 where a car has none."""
+    """Learnt values in the order of `LEARNT` and `PACEJKA`, differentiable, and known ones as `KNOWN`; 0 and 1 where a car has none."""
     car, tyres = getattr(dynamics, "car", None), getattr(dynamics, "tyres", None)
     if not isinstance(car, PlanarCar):
         return torch.zeros(len(LEARNT) + len(PACEJKA)), (1.0,) * len(KNOWN)

@@ -124,15 +124,16 @@ class CarFilter(nn.Module):
         """
         if states is not None or self.constant:
             at = initial.mean.new_zeros(1, 1, len(STATES)) if states is None else states
-            noises: Any = (self._process_noise(at, inputs), self.observation_noise(at, inputs))
+            process, observation = self._process_noise(at, inputs), self.observation_noise(at, inputs)
         else:
-            noises = self.noise_at()
+            process, observation = self.noise_at()  # type: ignore[assignment]
         return unscented_scan(
             model or self.point_model(),
             measurements,
             inputs,
             initial,
-            *noises,
+            process,
+            observation,
             self.rule,
             repair=self.repair,
             share=partial(over_members, pieces=1),

@@ -46,7 +46,7 @@ class FilteredStates(NamedTuple):
 
 
 class FilterState(NamedTuple):
-    """What a filter carries from sample to sample: the last one, which is filtered again without its measurements, and the state after it."""
+    """What a filter carries on: the last sample, which is filtered again without its measurements, and the state after it."""
 
     sample: FloatArray | None  # values of ``channels``, (C,); none before the first
     state: Gaussian[FloatArray]  # after that sample, or before the first

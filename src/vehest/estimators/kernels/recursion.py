@@ -45,7 +45,9 @@ class Recursion(NamedTuple):
         self._over(flat, series, starts, weights, starts.shape[1], gradient, np.empty(0))
         return gradient
 
-    def descend(self, flat: Floats, series: Floats, starts: NDArray[np.int64], targets: Floats, batch: int, adam: tuple[Any, ...]) -> Floats:
+    def descend(
+        self, flat: Floats, series: Floats, starts: NDArray[np.int64], targets: Floats, batch: int, adam: tuple[Any, ...]
+    ) -> Floats:
         """Steps of Adam on mean squared errors, in place; returns sums of squared errors, (M,), float64.
 
         Args:
