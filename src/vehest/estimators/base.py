@@ -136,11 +136,7 @@ class Estimator(ABC):
         self.check()
 
     def check(self) -> None:  # noqa: B027 (most families have nothing to check)
-        """Check settings against each other.
-
-        Raises:
-            ConfigurationError: they do not fit.
-        """
+        """Check settings against each other; raises `ConfigurationError`: they do not fit."""
 
     @property
     def rate_hz(self) -> float:
@@ -149,11 +145,7 @@ class Estimator(ABC):
 
     @classmethod
     def from_config(cls, config: Mapping[str, Any]) -> Estimator:
-        """Build one from plain values.
-
-        Raises:
-            ConfigurationError: an unknown setting or a value out of range.
-        """
+        """Build one from plain values; raises `ConfigurationError`: an unknown setting or a value out of range."""
         return cls(settings_from_config(cls.settings_type, config, "estimator"))
 
     @property
@@ -205,11 +197,7 @@ class Estimator(ABC):
         return ()
 
     def c_values(self) -> Mapping[str, Any]:
-        """Values that ``template`` needs of the fitted estimator.
-
-        Raises:
-            ConfigurationError: these settings have no C.
-        """
+        """Values that ``template`` needs of the fitted estimator; raises `ConfigurationError`: these settings have no C."""
         raise NotImplementedError(f"{type(self).__name__} has a template and no method 'c_values'")
 
     @property
@@ -284,11 +272,7 @@ class Estimator(ABC):
         return recording.select(self.channels)
 
     def checked_sample(self, sample: Mapping[str, float]) -> FloatArray:
-        """Values of ``channels`` at one instant, (C,).
-
-        Raises:
-            DataError: one is missing, or is refused.
-        """
+        """Values of ``channels`` at one instant, (C,); raises `DataError`: one is missing, or is refused."""
         try:
             values = [float(sample[name]) for name in self.channels]
         except KeyError as error:
@@ -341,9 +325,7 @@ class Estimator(ABC):
         raise NotImplementedError(f"{type(self).__name__} has no method 'run'")
 
     def require_fitted(self) -> None:  # noqa: B027 (most networks are complete when they are made)
-        """Raises:
-        ConfigurationError: a number is neither given nor fitted.
-        """
+        """Raises `ConfigurationError`: a number is neither given nor fitted."""
 
     def _estimate_one(self, recording: Recording, initial_state: Mapping[str, float] | None) -> Estimate:
         self.require_fitted()
@@ -355,11 +337,7 @@ class Estimator(ABC):
         return self._wrapped(recording, found.pop("vy"), covariance, self.covariance_of if covariance is not None else (), **found)
 
     def online(self) -> Stepper:
-        """A stepper in its initial state.
-
-        Raises:
-            ConfigurationError: it has not been fitted, or is not causal.
-        """
+        """A stepper in its initial state; raises `ConfigurationError`: it has not been fitted, or is not causal."""
         if not self.causal:
             raise ConfigurationError(self.offline)
         self.require_fitted()
@@ -371,11 +349,7 @@ class Estimator(ABC):
 
     @abstractmethod
     def load_weights(self, weights: Mapping[str, np.ndarray[Any, Any]]) -> None:
-        """Take weights back.
-
-        Raises:
-            DataError: a name or shape does not fit the settings.
-        """
+        """Take weights back; raises `DataError`: a name or shape does not fit the settings."""
 
 
 def require_shapes(of: Estimator, weights: Mapping[str, np.ndarray[Any, Any]], expected: Mapping[str, tuple[int, ...]]) -> None:

@@ -169,9 +169,7 @@ class DugoffUkf(SigmaPointEstimator):
         self._seed = 0
 
     def check(self) -> None:
-        """Raises:
-        ConfigurationError: thresholds of the non-linear range in the wrong order.
-        """
+        """Raises `ConfigurationError`: thresholds of the non-linear range in the wrong order."""
         if not self.linear_below <= self.nonlinear_from:
             raise ConfigurationError(
                 f"estimator.linear_below must lie between 0 and nonlinear_from ({self.nonlinear_from:g}), not at {self.linear_below:g}"
@@ -216,9 +214,7 @@ class DugoffUkf(SigmaPointEstimator):
         return [name for name in names if getattr(self.noise, name) is None]
 
     def require_fitted(self) -> None:
-        """Raises:
-        ConfigurationError: tyres or levels are neither given nor found.
-        """
+        """Raises `ConfigurationError`: tyres or levels are neither given nor found."""
         self.track()
         self.noise_covariances(self.levels)
 
@@ -227,11 +223,7 @@ class DugoffUkf(SigmaPointEstimator):
         self._seed = seed
 
     def track(self) -> DugoffTrack:
-        """The model.
-
-        Raises:
-            ConfigurationError: the tyres are neither given nor identified.
-        """
+        """The model; raises `ConfigurationError`: the tyres are neither given nor identified."""
         if np.isnan(self.axle_tyres).any():
             raise ConfigurationError(f"estimator '{self.name}' has no tyres yet; fit or load it first, or give estimator.tyres")
         s = self.settings

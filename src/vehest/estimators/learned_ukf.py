@@ -126,9 +126,7 @@ class LearnedUkf(Network, SigmaPointEstimator):
     car: CarSettings = setting(CarSettings(), "known of the car, and where learning starts")
 
     def check(self) -> None:
-        """Raises:
-        ConfigurationError: friction that starts below its smallest value.
-        """
+        """Raises `ConfigurationError`: friction that starts below its smallest value."""
         if self.start_friction is not None and not self.start_friction > self.least_friction:
             raise ConfigurationError(f"estimator.start_friction must lie above least_friction, not at {self.start_friction}")
 

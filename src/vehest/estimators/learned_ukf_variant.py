@@ -24,9 +24,7 @@ class LearnedUkfVariant(LearnedUkf):
     curvature: bool = setting(False, "whether Pacejka's curves have the E terms of Eq. 3, learnt from 0 on; of dynamics=pacejka alone")
 
     def check(self) -> None:
-        """Raises:
-        ConfigurationError: a curvature of other dynamics.
-        """
+        """Raises `ConfigurationError`: a curvature of other dynamics."""
         super().check()
         if self.curvature and self.dynamics != "pacejka":
             raise ConfigurationError(f"estimator.curvature is of estimator.dynamics=pacejka, not of {self.dynamics}")

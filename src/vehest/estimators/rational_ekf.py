@@ -136,9 +136,7 @@ class RationalFilter(SideslipFilter):
         self._seed = 0
 
     def check(self) -> None:
-        """Raises:
-        ConfigurationError: a gate of the unscented filter, or levels or curves that are given in part.
-        """
+        """Raises `ConfigurationError`: a gate of the unscented filter, or levels or curves that are given in part."""
         if self.gate is not None and self.filter != "extended":
             raise ConfigurationError(
                 "estimator.gate is there for estimator.filter=extended only; set gate to null, or the filter to extended"
@@ -460,9 +458,7 @@ class RationalFilter(SideslipFilter):
         return found
 
     def require_fitted(self, levels: Mapping[str, float] | None = None) -> None:
-        """Raises:
-        ConfigurationError: curves or levels are neither given nor fitted.
-        """
+        """Raises `ConfigurationError`: curves or levels are neither given nor fitted."""
         has_no_curves = np.isnan(self.axle_curves).any()
         if has_no_curves or any(math.isnan(level) for level in (self.values if levels is None else levels).values()):
             raise ConfigurationError(
@@ -488,11 +484,7 @@ class RationalFilter(SideslipFilter):
         self.values = dict(zip(LEVELS, weights["levels"].tolist(), strict=True))
 
     def c_values(self) -> dict[str, Any]:
-        """Its car, curves, levels of noise and gate.
-
-        Raises:
-            ConfigurationError: its filter is unscented.
-        """
+        """Its car, curves, levels of noise and gate; raises `ConfigurationError`: its filter is unscented."""
         if self.filter != "extended":
             raise ConfigurationError("estimator 'rational_ekf' with estimator.filter=unscented has no C; train it with filter=extended")
         adapted = [_slope_in_c(name) for name in self.adapted]

@@ -151,9 +151,7 @@ class Recursive(Estimator):
         return float(np.mean(np.square(np.concatenate(errors)))) if errors else math.nan
 
     def require_fitted(self) -> None:
-        """Raises:
-        ConfigurationError: a number is neither given nor fitted.
-        """
+        """Raises `ConfigurationError`: a number is neither given nor fitted."""
         if any(math.isnan(value) for value in self.values.values()):
             raise ConfigurationError(f"estimator '{self.name}' has not been fitted yet; fit or load it first")
 
@@ -162,11 +160,7 @@ class Recursive(Estimator):
         return {name: np.array([value]) for name, value in self.values.items()} or {"none": np.zeros(1)}
 
     def load_weights(self, weights: Mapping[str, np.ndarray[Any, Any]]) -> None:
-        """Take the numbers back.
-
-        Raises:
-            DataError: one is missing or unknown.
-        """
+        """Take the numbers back; raises `DataError`: one is missing or unknown."""
         require_shapes(self, weights, {name: values.shape for name, values in self.weights().items()})
         self.values = {name: float(weights[name][0]) for name in self.values}
 

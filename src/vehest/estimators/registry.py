@@ -27,11 +27,7 @@ def estimator_names() -> list[str]:
 
 @cache
 def estimator_class(name: str) -> type[Estimator]:
-    """The class behind a name.
-
-    Raises:
-        ConfigurationError: the name is unknown.
-    """
+    """The class behind a name; raises `ConfigurationError`: the name is unknown."""
     own = _own_class(name)
     if own is not None:
         return own

@@ -117,9 +117,7 @@ class SelfCalibrating(Recursive):
         self.network, self._width = _shipped_network()
 
     def check(self) -> None:
-        """Raises:
-        ConfigurationError: a centre of gravity outside of the wheelbase, or grip limits that are none.
-        """
+        """Raises `ConfigurationError`: a centre of gravity outside of the wheelbase, or grip limits that are none."""
         if self.cg_to_rear_axle is not None and not 0.0 < self.cg_to_rear_axle < self.wheelbase:
             raise ConfigurationError(
                 f"estimator.cg_to_rear_axle must lie between 0 and the wheelbase ({self.wheelbase} m), not at {self.cg_to_rear_axle}"
@@ -236,11 +234,7 @@ class SelfCalibrating(Recursive):
         return {"network": self.network, "yaw_rate_max": np.array([self._width])}
 
     def load_weights(self, weights: Mapping[str, np.ndarray[Any, Any]]) -> None:
-        """Take the network back.
-
-        Raises:
-            DataError: a part is missing, or has another shape.
-        """
+        """Take the network back; raises `DataError`: a part is missing, or has another shape."""
         require_shapes(self, weights, {name: values.shape for name, values in self.weights().items()})
         self.network, self._width = np.ascontiguousarray(weights["network"]), float(weights["yaw_rate_max"][0])
 

@@ -32,11 +32,7 @@ class SigmaPointEstimator(GatedFilter):
 
     @abstractmethod
     def new_filter(self, first: FilterStep) -> UnscentedStepper:
-        """The filter before its first sample.
-
-        Raises:
-            ConfigurationError: it has not been fitted.
-        """
+        """The filter before its first sample; raises `ConfigurationError`: it has not been fitted."""
 
     def online(self) -> Stepper:
         """A stepper that starts from the first sample it sees."""

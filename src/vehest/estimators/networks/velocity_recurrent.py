@@ -148,9 +148,7 @@ class RecurrentVelocityEstimator(HiddenStateEstimator):
         self._columns = np.array([self.channels.index(name) for name in self.inputs])
 
     def check(self) -> None:
-        """Raises:
-        ConfigurationError: inputs or outputs that repeat or are unknown, or a reference among the inputs.
-        """
+        """Raises `ConfigurationError`: inputs or outputs that repeat or are unknown, or a reference among the inputs."""
         for name in ("inputs", "outputs"):
             if len(set(getattr(self, name))) != len(getattr(self, name)) or not getattr(self, name):
                 raise ConfigurationError(f"estimator.{name} must be a list of different channels, not {getattr(self, name)!r}")
