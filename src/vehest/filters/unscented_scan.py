@@ -185,27 +185,22 @@ def unscented_scan(
         mean, covariance = initial.mean.expand(sequences, n), initial.covariance.expand(sequences, n, n)
     except RuntimeError:
         raise ValueError(f"the initial state, mean {tuple(initial.mean.shape)}, does not fit {sequences} sequences") from None
-    dtype = measurements.dtype
-    numpy_dtype = np.float32 if dtype == torch.float32 else np.float64
-    setting = _setting(model, rule, n, numpy_dtype, repair, gate)
+    dtype = np.float32 if measurements.dtype == torch.float32 else np.float64
+    setting = _setting(model, rule, n, dtype, repair, gate)
     noises = [process_noise, observation_noise]
     functions = [noise if not isinstance(noise, Tensor) else None for noise in noises]
     tensors = [
         noise.expand(sequences, steps, size, size) if isinstance(noise, Tensor) else measurements.new_empty(0, 0, 0, 0)
         for noise, size in zip(noises, (n, m), strict=True)
     ]
-    tape = tape_of(steps, sequences, n, m, numpy_dtype)
+    tape = tape_of(steps, sequences, n, m, dtype)
     post_mean, post_covariance = _Scan.apply(  # type: ignore[no-untyped-call]
         model, setting, share or _alone, tape, functions, measurements, inputs, mean, covariance, *tensors, *model.parameters
     )
-    outside = [_by_sequence(values) for values in (tape.prior_mean, tape.prior_covariance, tape.innovation, tape.own)]
-    filtered = Filtered(
-        Gaussian(outside[0], outside[1]),
-        Gaussian(post_mean, post_covariance),
-        outside[2],
-        outside[3],
-        ~(torch.isnan(measurements) | _by_sequence(tape.gone)),
-    )
+    outside = (tape.prior_mean, tape.prior_covariance, tape.innovation, tape.own)
+    prior_mean, prior_covariance, innovation, own = (_by_sequence(values) for values in outside)
+    measured = ~(torch.isnan(measurements) | _by_sequence(tape.gone))
+    filtered = Filtered(Gaussian(prior_mean, prior_covariance), Gaussian(post_mean, post_covariance), innovation, own, measured)
     return NonlinearFiltered(filtered, _by_sequence(tape.repaired))
 
 

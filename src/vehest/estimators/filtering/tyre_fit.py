@@ -112,7 +112,7 @@ def axle_motion(
     Raises:
         DataError: a channel is missing, or hardly any samples are left.
     """
-    slips, forces, blocks, driven = [], [], [], []
+    parts: list[AxleMotion] = []
     first_block = 0
     for recording in recordings:
         length = 2 * round(0.5 * SMOOTHING_SECONDS * recording.rate_hz) + 1
@@ -124,18 +124,15 @@ def axle_motion(
         block = first_block + np.arange(len(recording)) // round(BLOCK_SECONDS * recording.rate_hz)
         first_block = int(block[-1]) + 1
         usable = (recording["vx"] >= minimum_speed) & np.isfinite(slip).all(0) & np.isfinite(force).all(0)
-        slips.append(slip[:, usable])
-        forces.append(force[:, usable])
-        blocks.append(block[usable])
-        driven.append(inputs[:, usable])
-    count = sum(slip.shape[1] for slip in slips)
+        parts.append(AxleMotion(slip[:, usable], force[:, usable], block[usable], inputs[:, usable]))
+    count = sum(len(part.block) for part in parts)
     if count < FEWEST_SAMPLES:
         named = ", ".join(f"'{recording.id}'" for recording in recordings) or "none"
         raise DataError(
             f"tyre curves: {count} samples faster than {minimum_speed:g} m/s with all channels known, {FEWEST_SAMPLES} are needed "
             f"(recordings: {named})"
         )
-    return AxleMotion(np.concatenate(slips, axis=1), np.concatenate(forces, axis=1), np.concatenate(blocks), np.concatenate(driven, axis=1))
+    return AxleMotion(*(np.concatenate(own, axis=-1) for own in zip(*parts, strict=True)))
 
 
 def _motion_of(
@@ -183,9 +180,8 @@ def fit_motion(motion: AxleMotion, kind: Kind = "rational") -> TyreFit:
     Source: Di Biase, Lenzo & Timpone 2020, section III.B, Figure 3 and Table 1; blocks as in Liang & Zeger, Biometrika 73 (1), 1986.
     """
     axles = [_fitted(kind, slip, force, motion.block) for slip, force in zip(motion.slip, motion.force, strict=True)]
-    (front, front_covariance, front_rms), (rear, rear_covariance, rear_rms) = axles
-    covariance = np.stack([front_covariance, rear_covariance])
-    return TyreFit(kind, front, rear, covariance, np.array([front_rms, rear_rms]), motion.slip, motion.force)
+    (front, rear), covariances, rms = zip(*axles, strict=True)
+    return TyreFit(kind, front, rear, np.stack(covariances), np.array(rms), motion.slip, motion.force)
 
 
 def _fitted(kind: Kind, slip: FloatArray, force: FloatArray, block: NDArray[np.int64]) -> tuple[FloatArray, FloatArray, float]:
