@@ -76,15 +76,9 @@ class TyreFit:
 
 
 def axle_force(kind: Kind, parameters: FloatArray, slip: FloatArray) -> FloatArray:
-    """Lateral force of an axle: C α (Eq. 3), or c₂ α · 2c₁/(α² + 2c₁) (Eq. 4 at friction 1 and the load at rest).
+    """Lateral force of an axle at slip angles (...) [rad], (...) [N]; parameters in the order of `PARAMETERS`, (P,).
 
-    Args:
-        kind: ``linear`` or ``rational``.
-        parameters: in the order of `PARAMETERS`, (P,).
-        slip: slip angles (...) [rad].
-
-    Returns:
-        Forces (...) [N].
+    C α (Eq. 3), or c₂ α · 2c₁/(α² + 2c₁) (Eq. 4 at friction 1 and the load at rest).
     """
     c1, c2 = (math.inf, parameters[0]) if kind == "linear" else parameters
     force: FloatArray = rational_axle(slip, c1, c2, 1.0).force
