@@ -41,7 +41,7 @@ CASES = {28: (8.0, 3, 2), 256: (4.0, 2, 2)}  # sequences: ratio that is asked fo
 TRAINED_ON = {"f1tenth": "iros", "sim_tyre_sets": "learn"}  # how the names of training recordings begin
 MOST_MEMORY, MOST_DIFFERENCE, MOST_COMPILING = 0.5, 1e-3, 90.0  # of the plain one's, relative, s
 MEDIAN_STEP, WORST_STEP = 2.0, 10.0  # ms
-FORCE_SIGN_STEEPNESS, STILL, KAPPA, GAP, LEAST_ENTROPY = 100.0, 1e-6, -2.0, 0.01, -9.0
+FORCE_SIGN_STEEPNESS, STILL, KAPPA, GAP, LEAST_ENTROPY, FLOOR, SCALE = 100.0, 1e-6, -2.0, 0.01, -9.0, 1e-7, 0.01
 
 
 class Problem(NamedTuple):
@@ -126,7 +126,7 @@ def pretrain(file: str) -> None:
 
 def ours(task: Problem) -> Any:
     """The loss by vehest."""
-    estimated = task.estimator.filter.estimated(task.drives, task.drives.states[:, 0], None)
+    estimated, _ = task.estimator.filter.estimated(task.drives, task.drives.states[:, 0], None)
     return ((estimated - task.drives.states).square() @ task.weights).mean()
 
 
@@ -139,7 +139,7 @@ def plain(task: Problem) -> Any:
 
     fixed_grid.rk4_alt_step_func = rk_common.rk4_step_func
     car_filter, drives = task.estimator.filter, task.drives
-    car, chassis, network = car_filter.dynamics.car.learnt, car_filter.dynamics.car.chassis, car_filter.dynamics.network
+    car, chassis, network = car_filter.dynamics.car.learnt, car_filter.dynamics.car, car_filter.dynamics.network
     p = {name.removeprefix("log_"): logarithm.exp() for name, logarithm in car.named_parameters()}
     rear = p["cg_to_rear_axle"]
     front = chassis.wheelbase - rear
@@ -239,7 +239,7 @@ def _noise(noise: Any, states: Any, least_entropy: float | None = None) -> Any:
     constant = _factor(noise.constant.factor, noise.constant.unit)
     varying = _factor(torch.nn.functional.linear(states / noise.state_unit, noise.weight, noise.offset), noise.unit)
     n = len(noise.unit)
-    covariance = constant @ constant.mT + noise.constant.floor * torch.eye(n) + noise.scale * varying @ varying.mT
+    covariance = constant @ constant.mT + FLOOR * torch.eye(n) + SCALE * varying @ varying.mT
     if least_entropy is None:
         return covariance
     entropy = 0.5 * (n * math.log(2.0 * math.pi * math.e) + torch.logdet(covariance))

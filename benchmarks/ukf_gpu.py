@@ -28,7 +28,7 @@ from torch.utils.checkpoint import checkpoint
 ROOT = Path(__file__).parents[1]
 RESULT = Path(os.environ.get("OUT", ROOT / "results" / "benchmarks")) / "ukf_gpu.json"
 STEPS, SEQUENCES, REPEATS = 500, (4096, 256), 3
-STEEPNESS, STILL, KAPPA, GAP, LEAST_ENTROPY = 100.0, 1e-6, -2.0, 0.01, -9.0
+STEEPNESS, STILL, KAPPA, GAP, LEAST_ENTROPY, FLOOR, SCALE = 100.0, 1e-6, -2.0, 0.01, -9.0, 1e-7, 0.01
 
 
 def write(file: str) -> None:
@@ -107,7 +107,7 @@ class Filter(torch.nn.Module):
 
     def motion(self, x: Tensor, u: Tensor, parts: list[Tensor]) -> tuple[Tensor, ...]:
         """ax, ay, yaw and rim acceleration, (B, P) each."""
-        chassis = self.own.dynamics.car.chassis
+        chassis = self.own.dynamics.car
         numbers, w1, b1, w2, b2, w3, b3, in_scale, out_scale = parts
         rear, drag_0, drag_1, drag_2, viscous, coulomb, torque_constant, yaw_inertia, power_inertia = numbers.unbind()
         front = chassis.wheelbase - rear
@@ -174,10 +174,8 @@ class Filter(torch.nn.Module):
             n = noise.constant.n
             rows = torch.tril_indices(n, n, device=states.device)[0]
             varying = functional.linear(states / noise.state_unit, noise.weight, noise.offset) * noise.unit[rows]
-            constant = product(noise.constant.factor * noise.constant.unit[rows], n) + noise.constant.floor * torch.eye(
-                n, device=states.device
-            )
-            found.append(constant + noise.scale * product(varying, n))
+            constant = product(noise.constant.factor * noise.constant.unit[rows], n) + FLOOR * torch.eye(n, device=states.device)
+            found.append(constant + SCALE * product(varying, n))
         n = found[0].shape[-1]
         diagonal = factor(found[0].flatten(0, 1), n).diagonal(dim1=-2, dim2=-1).reshape(*states.shape[:2], n)
         entropy = 0.5 * n * math.log(2.0 * math.pi * math.e) + diagonal.log().sum(-1)
@@ -257,7 +255,7 @@ def run(file: str) -> None:
         drives = drawn_sequences(held["drives"], count)
 
         def on_cores(drives: list[Tensor] = drives) -> Tensor:
-            estimated = cpu.estimated(Drive(*drives), drives[0][:, 0], None)
+            estimated, _ = cpu.estimated(Drive(*drives), drives[0][:, 0], None)
             return ((estimated - drives[0]).square() @ weights).mean()
 
         on_cores().backward()

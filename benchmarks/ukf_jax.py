@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 import torch
 
-STILL, STEEPNESS, KAPPA, GAP, LEAST_ENTROPY = 1e-6, 100.0, -2.0, 0.01, -9.0  # as in ukf.py
+STILL, STEEPNESS, KAPPA, GAP, LEAST_ENTROPY, FLOOR, SCALE = 1e-6, 100.0, -2.0, 0.01, -9.0, 1e-7, 0.01  # as in ukf.py
 
 
 def loss_of(task: Any) -> torch.Tensor:
@@ -25,11 +25,10 @@ class _Loss(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, task: Any, names: list[str], *values: torch.Tensor) -> torch.Tensor:
         parameters = {name: jnp.asarray(value.detach().numpy()) for name, value in zip(names, values, strict=True)}
-        chassis = task.estimator.filter.dynamics.car.chassis
+        car = task.estimator.filter.dynamics.car
         known = {name: jnp.asarray(value.numpy()) for name, value in task.estimator.filter.named_buffers()}
         noise = task.estimator.filter
-        floors = noise.process_noise.constant.floor, noise.observation_noise.constant.floor, noise.initial_noise.floor
-        fixed = (chassis.mass, chassis.wheelbase, chassis.wheel_radius, *floors, noise.process_noise.scale, *noise.lower)
+        fixed = (car.mass, car.wheelbase, car.wheel_radius, FLOOR, FLOOR, FLOOR, SCALE, *noise.lower)
         data = [jnp.asarray(part.numpy()) for part in (task.drives.states, task.drives.inputs, task.drives.measurements, task.weights)]
         loss, gradients = _compiled(fixed)(parameters, known, *data)
         ctx.gradients = [torch.from_numpy(np.array(gradients[name])) for name in names]

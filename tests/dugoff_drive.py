@@ -12,8 +12,8 @@ TYRES = {f"{name}_{axle}": value for axle, own in (("front", FRONT), ("rear", RE
 NOISE = {"ay": 0.06, "yaw_rate": 0.002, "fy": 70.0}
 
 
-def dugoff_track(tyres="plain", *, sees_sideslip=False):
-    return DugoffTrack(LoadedCar(), FRONT, REAR, 0.01, tyres, 3.0, sees_sideslip)
+def dugoff_track(tyres="plain"):
+    return DugoffTrack(LoadedCar(), FRONT, REAR, 0.01, tyres, 3.0)
 
 
 def driven(inputs):

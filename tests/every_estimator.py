@@ -12,8 +12,7 @@ from vehest.estimators.ensemble_ukf import EnsembleSettings
 from vehest.estimators.networks.velocity_recurrent import SequenceSettings
 from vehest.estimators.registry import estimator_class
 from vehest.training.context import NoTraining
-from vehest.training.identification import IdentificationSettings
-from vehest.training.noise_tuning import NoiseTuningSettings
+from vehest.training.noise_tuning import IdentificationSettings, NoiseTuningSettings
 from vehest.training.samples import SampleSettings
 from vehest.training.search import DirectSearchSettings
 from vehest.training.sequences import PhaseSettings

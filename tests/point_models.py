@@ -1,8 +1,8 @@
-"""Entries of a `PointModel` called with arrays that lie sequence by sequence."""
+"""Entries of a `PointModel` and of noise, called with arrays that lie sequence by sequence."""
 
 import numpy as np
 
-from vehest.filters.unscented_scan import _beside
+from vehest.filters.unscented_scan import CompiledNoise, _apart, _beside
 from vehest.filters.unscented_steps import room
 
 
@@ -12,4 +12,20 @@ def called(model, entry, points, inputs, size, upstream=None, gradients=()):
     given = [] if upstream is None else [_beside(upstream)]
     learnt = [] if upstream is None else [model.learnt(gradients)]
     model.entries[entry](_beside(points), _beside(inputs), model.car, *given, out, *learnt, 0, len(points))
+    return np.ascontiguousarray(np.moveaxis(out, -1, 0))
+
+
+def noise_by(function):
+    """Noise that a function of states (B, n) and inputs (B, p) says, (B, k, k)."""
+
+    def write(states, inputs, _, out, first, end):
+        out[..., first:end] = _beside(function(_apart(states, first, end), _apart(inputs, first, end)))
+
+    return CompiledNoise(write, ())
+
+
+def covariances(noise, states, inputs):
+    """What a `CompiledNoise` of `vehest.filters.noise_models` says at states (B, n) under inputs (B, p): (B, k, k)."""
+    out = room((*noise.car[0].shape, len(states)), states.dtype)
+    noise.entry(_beside(states), _beside(inputs), noise.car, out, 0, len(states))
     return np.ascontiguousarray(np.moveaxis(out, -1, 0))

@@ -13,33 +13,19 @@ LARGEST = 1e12  # of a setting, in SI units: far beyond what any of them means, 
 
 @dataclass(frozen=True)
 class Declaration:
-    """What is declared of a setting beside its type and default.
+    """What is declared of a setting beside its type and default."""
 
-    Args:
-        doc: text for people.
-        unit: SI unit; empty for what has none.
-        positive: whether it has to be more than 0.
-        least: smallest value; none: no such bound.
-        most: largest value.
-        above: value that it has to exceed.
-        below: value that it has to stay under.
-        start: values that the search for a fitted number starts from; empty where it has a closed form.
-        box: range that the search stays within.
-        of_largest: channel whose largest absolute value in training multiplies start and box; empty: none.
-        is_fitted: whether the fit determines it unless it is given.
-    """
-
-    doc: str
-    unit: str = ""
-    positive: bool = False
-    least: float | None = None
-    most: float | None = None
-    above: float | None = None
-    below: float | None = None
-    start: tuple[float, ...] = ()
-    box: tuple[float, float] = (0.0, 0.0)
-    of_largest: str = ""
-    is_fitted: bool = False
+    doc: str  # text for people
+    unit: str = ""  # SI unit; empty for what has none
+    positive: bool = False  # whether it has to be more than 0
+    least: float | None = None  # smallest value; none: no such bound
+    most: float | None = None  # largest value
+    above: float | None = None  # value that it has to exceed
+    below: float | None = None  # value that it has to stay under
+    start: tuple[float, ...] = ()  # values that the search for a fitted number starts from; empty where it has a closed form
+    box: tuple[float, float] = (0.0, 0.0)  # range that the search stays within
+    of_largest: str = ""  # channel whose largest absolute value in training multiplies start and box; empty: none
+    is_fitted: bool = False  # whether the fit determines it unless it is given
 
     def problem(self, value: Any) -> str:
         """What is wrong with a value, in words that follow its name; empty where nothing is."""

@@ -13,7 +13,7 @@ from vehest.estimators.cnn_ukf import CnnUkf, EndToEndSettings
 from vehest.estimators.dugoff_ukf import DugoffUkf
 from vehest.estimators.filtering.track_filter import groups_of, in_nonlinear_range
 from vehest.training.context import FitContext
-from vehest.training.identification import IdentificationSettings
+from vehest.training.noise_tuning import IdentificationSettings
 from vehest.training.search import optuna_search
 
 LEVELS = {"ay": 0.06, "yaw_rate": 0.002, "process_vy": 1e-3, "process_yaw_rate": 1e-3}

@@ -12,10 +12,10 @@ from conftest import planar_drive
 from vehest.data.windows import windows_of
 from vehest.estimators.gru import Gru
 from vehest.estimators.kernels.activation import arctan, rational_tanh, softplus
-from vehest.estimators.kernels.luenberger import implicit_euler_observer, observe
 from vehest.estimators.kernels.threads import over_members
 from vehest.estimators.ksnn import Ksnn
 from vehest.estimators.lstm import Lstm
+from vehest.estimators.luenberger import implicit_euler_observer, observe
 from vehest.run import group
 from vehest.training.members import FlatParameters, predict_members, prepare
 

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import torch
 
+from point_models import covariances
 from small_car_drive import small_car_drive
 from vehest.data.errors import ConfigurationError, DataError
 from vehest.data.recording import Recording
@@ -245,8 +246,8 @@ def test_diagonal_noise_in_use_is_that_of_its_training():
     with torch.no_grad():
         expected = made.filter.observation_noise(torch.from_numpy(states), nothing).numpy()
         of_process = with_entropy(made.filter.process_noise(torch.from_numpy(states), nothing), LEAST_ENTROPY).numpy()
-    np.testing.assert_allclose(observation(states, np.zeros((4, 2))), expected, rtol=1e-9, atol=0)
-    np.testing.assert_allclose(process(states, np.zeros((4, 2))), of_process, rtol=1e-9, atol=0)
+    np.testing.assert_allclose(covariances(observation, states, np.zeros((4, 2))), expected, rtol=1e-9, atol=0)
+    np.testing.assert_allclose(covariances(process, states, np.zeros((4, 2))), of_process, rtol=1e-9, atol=0)
 
 
 def test_curvature_starts_at_pacejkas_curves_without_it_and_is_learnt():

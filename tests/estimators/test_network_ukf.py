@@ -21,7 +21,7 @@ from vehest.estimators.networks.sample_network import learnt_samples
 from vehest.estimators.registry import estimator_class
 from vehest.filters.unscented_scan import TorchModel
 from vehest.training.context import FitContext
-from vehest.training.identification import IdentificationSettings
+from vehest.training.noise_tuning import IdentificationSettings
 from vehest.training.samples import Draw
 from vehest.training.sequences import PhaseSettings
 
@@ -166,7 +166,7 @@ def test_gradients_end_to_end_are_those_of_automatic_differentiation():
     estimator, training = end_to_end()
     batch = next(iter(training.batches(torch.Generator().manual_seed(2))))
     found = training.loss(batch)
-    track = estimator.track(sees_sideslip=True)
+    track = estimator.track()
     expected_filter = TrackFilter(track)
     expected_filter.model = TorchModel(track.transition, track.observation)
     ours, training.filter = training.filter, expected_filter

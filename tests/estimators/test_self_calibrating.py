@@ -194,7 +194,7 @@ def test_goes_without_ax():
 
 def test_refuses_weights_of_another_network():
     model = model_of()
-    with pytest.raises(DataError, match="weights of 'self_calibrating' must be network, yaw_rate_max"):
+    with pytest.raises(DataError, match="weights of 'self_calibrating' do not fit its settings"):
         model.load_weights({"network": np.zeros((3, 20)), "yaw_rate_max": np.ones(1)})
 
 

@@ -5,19 +5,25 @@ import pytest
 import torch
 from scipy.stats import multivariate_normal
 
-from vehest.filters.compiled_noise import compiled_noise
+from point_models import covariances
 from vehest.filters.noise_levels import high_passed_level
-from vehest.filters.noise_models import FLOOR, ConstantNoise, StateDependentNoise, entropy, with_entropy
+from vehest.filters.noise_models import DEVIATION, FLOOR, ConstantNoise, StateDependentNoise, compiled_noise, entropy, with_entropy
 
 STATE, INPUTS = torch.randn(7, 5, generator=torch.Generator().manual_seed(0)), torch.zeros(7, 2)
 START = [1e-3, 1e-3, 1e-2, 1e-2, 1e-5]
+
+
+def drawn(noise, deviation, seed):
+    noise.reset(torch.Generator().manual_seed(seed))
+    noise.weight.data.mul_(deviation / DEVIATION)
+    return noise
 
 
 @pytest.fixture(params=["constant", "state dependent"])
 def noise(request):
     return {
         "constant": lambda: ConstantNoise(START),
-        "state dependent": lambda: StateDependentNoise(START, 5, generator=torch.Generator().manual_seed(1)),
+        "state dependent": lambda: drawn(StateDependentNoise(START, 5), DEVIATION, 1),
     }[request.param]()
 
 
@@ -46,7 +52,7 @@ def test_factors_of_zero_leave_the_floor_and_numbers_of_parameters_are_those_of_
 
 
 def test_state_dependent_noise_is_the_formula_written_out():
-    noise = StateDependentNoise([0.2, 0.3], 5, generator=torch.Generator().manual_seed(3), deviation=0.5)
+    noise = drawn(StateDependentNoise([0.2, 0.3], 5), 0.5, 3)
     a, b, c = (noise.weight @ STATE[2]).tolist()
     lower = torch.tensor([[a, 0.0], [b, c]])
     assert torch.allclose(noise(STATE, INPUTS)[2], torch.diag(torch.tensor([0.2, 0.3])) + 0.01 * lower @ lower.mT, atol=1e-6)
@@ -68,14 +74,14 @@ def test_entropy_is_that_of_a_library_and_is_raised_to_its_floor():
 @pytest.mark.parametrize(("dtype", "tolerance"), [(torch.float64, 1e-14), (torch.float32, 1e-5)])
 def test_compiled_it_is_the_same_with_and_without_a_floor(dtype, tolerance):
     generator = torch.Generator().manual_seed(2)
-    noise = StateDependentNoise(START, 3, deviation=1.0, generator=generator)
+    noise = drawn(StateDependentNoise(START, 3), 1.0, 1)
     noise.begin(torch.tensor([0.1, 0.2, 0.3, 0.1, 0.2]).diag(), 10.0, torch.tensor([2.0, 0.5, 1.0]))
     noise.to(dtype)
     states = torch.randn(7, 3, generator=generator).to(dtype)
     known = noise(states, states).detach()
     floor = float(entropy(known).median())
     for expected, own in ((known, compiled_noise(noise)), (with_entropy(known, floor), compiled_noise(noise, floor))):
-        assert own(states.numpy(), states.numpy()) == pytest.approx(expected.numpy(), rel=tolerance, abs=tolerance)
+        assert covariances(own, states.numpy(), states.numpy()) == pytest.approx(expected.numpy(), rel=tolerance, abs=tolerance)
     assert float((with_entropy(known, floor) - known).abs().max()) > 0.01, "the floor is met"
 
 

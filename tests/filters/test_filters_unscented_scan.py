@@ -12,6 +12,7 @@ from readable_filters import unscented_filter
 from test_filters_nonlinear import RULES, STEP, constant, measured_pendulum, pendulum_with_radar, sharp
 from torch import Tensor
 
+from point_models import noise_by
 from vehest.filters.gaussian import Gaussian
 from vehest.filters.sigma_points import symmetric_rule
 from vehest.filters.unscented_scan import TorchModel, UnscentedStepper, moved, unscented_scan
@@ -187,7 +188,7 @@ def test_noise_that_depends_on_the_estimate_is_that_of_the_filter_and_has_no_gra
     readable = dataclasses.replace(model, process_noise=process, observation_noise=observation)
     filtered = unscented_filter(readable, measurements, inputs, first, RULES["symmetric"])
     start = Gaussian(first.mean.clone().requires_grad_(), first.covariance)
-    own = [noise(base.detach().numpy()) for base in (p.process, p.observation)]
+    own = [noise_by(noise(base.detach().numpy())) for base in (p.process, p.observation)]
     scanned = unscented_scan(TorchModel(model.transition, model.observation), measurements, inputs, start, *own, RULES["symmetric"])
     assert torch.allclose(filtered.steps.filtered.mean, scanned.steps.filtered.mean, rtol=0, atol=1e-11)
     with pytest.raises(RuntimeError, match="has no gradients; give it as a tensor"):
@@ -203,7 +204,7 @@ def test_one_sample_at_a_time_it_is_the_same_filter():
     stepper = UnscentedStepper(points, first.mean.numpy(), first.covariance.numpy(), 2, RULES["symmetric"])
     process, observation = (noise[None].numpy() for noise in noises)
     for k in range(20):
-        mean = stepper.step(measurements[0, k].numpy(), inputs[0, k].numpy(), process, lambda x, u: observation)
+        mean = stepper.step(measurements[0, k].numpy(), inputs[0, k].numpy(), process, noise_by(lambda x, u: observation))
         assert mean == pytest.approx(state.mean[0, k].numpy(), abs=1e-12), k
         assert stepper.state.covariance == pytest.approx(state.covariance[0, k].numpy(), abs=1e-12), k
 

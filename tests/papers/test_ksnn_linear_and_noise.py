@@ -10,8 +10,7 @@ from trained_ksnn import ksnn_with_weights
 
 from conftest import planar_drive
 from vehest.data.errors import DataError
-from vehest.estimators.kernels.luenberger import observe
-from vehest.estimators.luenberger import Luenberger
+from vehest.estimators.luenberger import Luenberger, observe
 from vehest_papers.ksnn.linear_system import LocalModels, decomposed, decomposed_estimate
 from vehest_papers.ksnn.noise_sensitivity import ksnn_sensitivity, luenberger_sensitivity
 

@@ -63,7 +63,7 @@ def test_braking_loads_the_front_axle():
 
 @BOTH
 def test_the_compiled_track_is_the_readable_one(tyres):
-    track = dugoff_track(tyres, sees_sideslip=True)
+    track = dugoff_track(tyres)
     readable, compiled = TorchModel(track.transition, track.observation), CompiledDugoffTrack(track)
     points, inputs = (part.numpy() for part in driven(300))
     for entry, size in enumerate((2, 5)):
@@ -77,7 +77,7 @@ def test_the_compiled_track_is_the_readable_one(tyres):
 
 def test_gradients_through_the_filter_reach_measurements_and_both_noises():
     """Of compiled code, and of automatic differentiation through readable code."""
-    track = dugoff_track("smooth", sees_sideslip=True)
+    track = dugoff_track("smooth")
     inputs = torch.stack([torch.tensor([[20.0], [2.0], [28.0]]).expand(3, 8), 0.05 * torch.ones(3, 8), torch.zeros(3, 8)], -1).double()
     inputs[1, 4:, 0] = 8.0  # rolls, then drives
     sizes = torch.tensor([0.3, 0.02, 300.0, 300.0, 0.02])
@@ -110,7 +110,7 @@ def test_gradients_through_the_filter_reach_measurements_and_both_noises():
 
 def test_a_sequence_has_the_same_digits_alone_as_beside_others():
     """Eleven sequences fill one vector of eight and a part of another; one of them is repaired, one not measured."""
-    track, count = dugoff_track("smooth", sees_sideslip=True), 11
+    track, count = dugoff_track("smooth"), 11
     inputs = torch.tensor([20.0, 0.05, 0.0]) + drawn(count, 6, 3) * torch.tensor([2.0, 0.03, 0.5])
     sizes = torch.tensor([0.3, 0.02, 300.0, 300.0, 0.02])
     measurements = torch.tensor([3.0, 0.2, 3000.0, 3000.0, -0.01]) + drawn(count, 6, 5, seed=3) * sizes

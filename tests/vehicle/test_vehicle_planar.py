@@ -10,7 +10,7 @@ from scipy.integrate import solve_ivp
 from vehest.constants import GRAVITY
 from vehest.vehicle.dynamics import rk4
 from vehest.vehicle.parameters import SingleTrackParameters
-from vehest.vehicle.planar import F1TENTH, F1TENTH_START, PlanarCar
+from vehest.vehicle.planar import F1TENTH, LEARNT, PlanarCar
 from vehest.vehicle.single_track import lateral_model
 from vehest.vehicle.tyres import PacejkaTyres, PositiveParameters, TyreForces, magic_formula
 
@@ -50,7 +50,7 @@ def test_rolling_cars_feel_drag_and_accelerometers_what_they_read(car):
     state, inputs = tensor(4.0, 0.0, 0.0, 4.0), tensor(0.0, 0.0)
     own = rates(car, state, inputs)
     drag = 0.1 + 0.01 * 4.0 + 0.1 * 16.0
-    assert float(own[0]) == pytest.approx(-drag / F1TENTH.mass)
+    assert float(own[0]) == pytest.approx(-drag / F1TENTH["mass"])
     assert own[1:3].abs().max() < 1e-12
     assert float(own[3]) == pytest.approx(-0.05 / 0.2 * (0.304115174 * 4.0 + 0.50421894))
     # ax = dvx/dt - r vy and ay = dvy/dt + r vx (Węgrzynowski et al. 2024, Section III-B.1).
@@ -71,14 +71,14 @@ def test_loads_carry_the_weight_and_mirrored_drives_give_mirrored_rates(car):
     mirror = tensor(1.0, -1.0, -1.0, 1.0)
     assert torch.allclose(rates(car, mirror * state, tensor(-0.2, 8.0)), mirror * rates(car, state, inputs), atol=1e-12)
     front, rear = car[0].loads()
-    assert float(front + rear) == pytest.approx(F1TENTH.mass * GRAVITY)
-    assert float(front * (F1TENTH.wheelbase - 0.115)) == pytest.approx(float(rear * 0.115))
+    assert float(front + rear) == pytest.approx(F1TENTH["mass"] * GRAVITY)
+    assert float(front * (F1TENTH["wheelbase"] - 0.115)) == pytest.approx(float(rear * 0.115))
 
 
 def test_for_small_slips_it_is_the_linear_single_track(car):
     chassis, tyres = car
     front, rear = (float(load) * 0.8916 * 0.8095 * 5.948 * 2.2754 for load in chassis.loads())
-    linear = SingleTrackParameters(F1TENTH.mass, 0.46, F1TENTH.wheelbase - 0.115, 0.115, front, rear)
+    linear = SingleTrackParameters(F1TENTH["mass"], 0.46, F1TENTH["wheelbase"] - 0.115, 0.115, front, rear)
     speed, sideslip, yaw_rate, steer = 4.0, 2e-4, 3e-3, 1e-3
     state, inputs = tensor(speed, speed * math.tan(sideslip), yaw_rate, speed), tensor(steer, 0.0)
     own = chassis.motion(state, inputs, tyres(chassis.slips(state, inputs), chassis.loads()))
@@ -136,7 +136,7 @@ def test_gradients_reach_every_parameter_and_batches_work(car):
     for parameter in (*chassis.parameters(), *tyres.parameters()):
         assert parameter.grad is not None
         assert torch.isfinite(parameter.grad).all()
-    assert all(chassis.learnt.get_parameter(f"log_{name}").grad.abs() > 0 for name in F1TENTH_START)
+    assert all(chassis.learnt.get_parameter(f"log_{name}").grad.abs() > 0 for name in LEARNT)
 
 
 def test_positive_parameters_stay_positive():

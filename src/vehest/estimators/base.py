@@ -63,30 +63,19 @@ def require_learnable(
 
 
 class Trial(NamedTuple):
-    """A family in the first comparison on a car without a trained model (`vehest new`).
+    """A family in the first comparison on a car without a trained model (`vehest new`)."""
 
-    Attributes:
-        place: among the trials of all families, the most promising and cheap first; those that differ in place alone are one sweep.
-        about: text for people.
-        overrides: of settings and training; ``{wheelbase}`` and ``{mass}`` are those of the car, ``{car}`` all of its parameters that the
-            family's settings have.
-        samples: that some range for training, and each for validation, has to have at the family's rate.
-    """
-
-    place: float
-    about: str
+    place: float  # among the trials of all families, the promising and cheap first; those that differ in place alone are one sweep
+    about: str  # text for people
+    # of settings and training; ``{wheelbase}`` and ``{mass}`` are those of the car, ``{car}`` all of its parameters that the settings have
     overrides: str = ""
-    samples: int = 0
+    samples: int = 0  # that some range for training, and each for validation, has to have at the family's rate
 
 
 class Stepper(ABC):
-    """An estimator that runs along with the drive, one sample after another.
+    """An estimator that runs along with the drive, one sample after another."""
 
-    Attributes:
-        horizon_steps: how many sampling intervals after the sample the returned estimate holds.
-    """
-
-    horizon_steps: ClassVar[int] = 0
+    horizon_steps: ClassVar[int] = 0  # sampling intervals after the sample for which the returned estimate holds
 
     @abstractmethod
     def step(self, sample: Mapping[str, float]) -> dict[str, float]:
@@ -103,45 +92,29 @@ class Estimator(ABC):
     """A method that estimates lateral velocity and sideslip from measured channels.
 
     A family declares itself in its class: settings by `setting`, fitted numbers by `fitted`, and what follows. Settings are then an
-    attribute of the estimator each, and together ``settings``, of the dataclass ``settings_type`` that is made of them.
-
-    Attributes:
-        name: name in conf/estimator and in the registry.
-        title: name for people.
-        channels: measured channels it reads.
-        training_type: dataclass of the settings of its fit.
-        learns_from: reference channels that its fit reads.
-        skippable: channels of ``channels`` that may have gaps, because the method does without a sample.
-        refuses: which measurements of a sample are errors: ``NaN`` where it is not skippable, ``infinite``.
-        may_be_nan: weights that may stay NaN, because each recording tells them.
-        covariance_of: quantities that the covariances of `run` are of.
-        ignores_initial_state: whether an initial state is left aside; else it is used, or refused as an error.
-        slow_kernel: ``module:function`` that takes tens of seconds to compile; empty: none.
-        offline: error of `online` where its settings make it not causal, with those that make it causal.
-        trials: in the first comparison on a new car; none: it is left out.
-        notice: lines for users of the method, such as a patent.
-        template: C template of a step, in ``export/templates/methods`` or beside the family's module; empty: it has none.
-        version: raised when weights or estimates change; a version of ``training_type`` alone when the fit does.
-        preparation: how recordings are brought to its rate before it sees them (method, transforms).
+    attribute of the estimator each, and together ``settings``, of the dataclass ``settings_type`` that is made of them. ``preparation`` is
+    how recordings are brought to its rate before it sees them (method, transforms).
     """
 
-    name: ClassVar[str]
-    title: ClassVar[str]
-    channels: ClassVar[tuple[str, ...]]
+    name: ClassVar[str]  # in conf/estimator and in the registry
+    title: ClassVar[str]  # name for people
+    channels: ClassVar[tuple[str, ...]]  # measured channels it reads
     settings_type: ClassVar[Any] = EstimatorSettings
-    training_type: ClassVar[type]
-    learns_from: tuple[str, ...] = ("vy_ref",)
-    skippable: ClassVar[tuple[str, ...]] = ()
-    refuses: ClassVar[tuple[str, ...]] = ()
-    may_be_nan: ClassVar[tuple[str, ...]] = ()
-    covariance_of: ClassVar[tuple[str, ...]] = ()
-    ignores_initial_state: ClassVar[bool] = False
-    slow_kernel: ClassVar[str] = ""
+    training_type: ClassVar[type]  # dataclass of the settings of its fit
+    learns_from: tuple[str, ...] = ("vy_ref",)  # reference channels that its fit reads
+    skippable: ClassVar[tuple[str, ...]] = ()  # channels of ``channels`` that may have gaps, because the method does without a sample
+    refuses: ClassVar[tuple[str, ...]] = ()  # measurements of a sample that are errors: ``NaN`` where it is not skippable, ``infinite``
+    may_be_nan: ClassVar[tuple[str, ...]] = ()  # weights that may stay NaN, because each recording tells them
+    covariance_of: ClassVar[tuple[str, ...]] = ()  # quantities that the covariances of `run` are of
+    ignores_initial_state: ClassVar[bool] = False  # whether an initial state is left aside; else it is used, or refused as an error
+    slow_kernel: ClassVar[str] = ""  # ``module:function`` that takes tens of seconds to compile; empty: none
+    # error of `online` where its settings make it not causal, with those that make it causal
     offline: ClassVar[str] = "an estimator that is not causal cannot run along with a drive"
-    trials: ClassVar[tuple[Trial, ...]] = ()
-    notice: ClassVar[tuple[str, ...]] = ()
-    template: ClassVar[str] = ""
-    version: ClassVar[str] = "1"
+    trials: ClassVar[tuple[Trial, ...]] = ()  # in the first comparison on a new car; none: it is left out
+    notice: ClassVar[tuple[str, ...]] = ()  # lines for users of the method, such as a patent
+    style: ClassVar[tuple[str, str, str] | None] = None  # see `line_style`
+    template: ClassVar[str] = ""  # C template of a step, in ``export/templates/methods`` or beside the family's module; empty: none
+    version: ClassVar[str] = "1"  # raised when weights or estimates change; a version of ``training_type`` alone when the fit does
 
     def __init_subclass__(cls, **options: Any) -> None:
         super().__init_subclass__(**options)
@@ -163,11 +136,7 @@ class Estimator(ABC):
         self.check()
 
     def check(self) -> None:  # noqa: B027 (most families have nothing to check)
-        """Check settings against each other.
-
-        Raises:
-            ConfigurationError: they do not fit.
-        """
+        """Check settings against each other; raises `ConfigurationError`: they do not fit."""
 
     @property
     def rate_hz(self) -> float:
@@ -176,11 +145,7 @@ class Estimator(ABC):
 
     @classmethod
     def from_config(cls, config: Mapping[str, Any]) -> Estimator:
-        """Build one from plain values.
-
-        Raises:
-            ConfigurationError: an unknown setting or a value out of range.
-        """
+        """Build one from plain values; raises `ConfigurationError`: an unknown setting or a value out of range."""
         return cls(settings_from_config(cls.settings_type, config, "estimator"))
 
     @property
@@ -216,7 +181,7 @@ class Estimator(ABC):
     @classmethod
     def line_style(cls, variant: str) -> tuple[str, str, str] | None:
         """Colour, dash and marker of its lines in figures; none: a colour that follows from its name."""
-        return None
+        return cls.style
 
     @property
     def batch_key(self) -> tuple[Any, ...]:
@@ -232,11 +197,7 @@ class Estimator(ABC):
         return ()
 
     def c_values(self) -> Mapping[str, Any]:
-        """Values that ``template`` needs of the fitted estimator.
-
-        Raises:
-            ConfigurationError: these settings have no C.
-        """
+        """Values that ``template`` needs of the fitted estimator; raises `ConfigurationError`: these settings have no C."""
         raise NotImplementedError(f"{type(self).__name__} has a template and no method 'c_values'")
 
     @property
@@ -311,11 +272,7 @@ class Estimator(ABC):
         return recording.select(self.channels)
 
     def checked_sample(self, sample: Mapping[str, float]) -> FloatArray:
-        """Values of ``channels`` at one instant, (C,).
-
-        Raises:
-            DataError: one is missing, or is refused.
-        """
+        """Values of ``channels`` at one instant, (C,); raises `DataError`: one is missing, or is refused."""
         try:
             values = [float(sample[name]) for name in self.channels]
         except KeyError as error:
@@ -368,9 +325,7 @@ class Estimator(ABC):
         raise NotImplementedError(f"{type(self).__name__} has no method 'run'")
 
     def require_fitted(self) -> None:  # noqa: B027 (most networks are complete when they are made)
-        """Raises:
-        ConfigurationError: a number is neither given nor fitted.
-        """
+        """Raises `ConfigurationError`: a number is neither given nor fitted."""
 
     def _estimate_one(self, recording: Recording, initial_state: Mapping[str, float] | None) -> Estimate:
         self.require_fitted()
@@ -382,11 +337,7 @@ class Estimator(ABC):
         return self._wrapped(recording, found.pop("vy"), covariance, self.covariance_of if covariance is not None else (), **found)
 
     def online(self) -> Stepper:
-        """A stepper in its initial state.
-
-        Raises:
-            ConfigurationError: it has not been fitted, or is not causal.
-        """
+        """A stepper in its initial state; raises `ConfigurationError`: it has not been fitted, or is not causal."""
         if not self.causal:
             raise ConfigurationError(self.offline)
         self.require_fitted()
@@ -398,11 +349,7 @@ class Estimator(ABC):
 
     @abstractmethod
     def load_weights(self, weights: Mapping[str, np.ndarray[Any, Any]]) -> None:
-        """Take weights back.
-
-        Raises:
-            DataError: a name or shape does not fit the settings.
-        """
+        """Take weights back; raises `DataError`: a name or shape does not fit the settings."""
 
 
 def require_shapes(of: Estimator, weights: Mapping[str, np.ndarray[Any, Any]], expected: Mapping[str, tuple[int, ...]]) -> None:

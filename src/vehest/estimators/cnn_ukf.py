@@ -23,7 +23,7 @@ from vehest.estimators.network_ukf import LEAST_VARIANCE, NetworkUkf
 from vehest.estimators.networks.sample_network import SampleNetwork, clip_sideslip, learnt_samples, reference_sideslip
 from vehest.filters.gaussian import Gaussian
 from vehest.training.context import FitContext
-from vehest.training.identification import IdentificationSettings
+from vehest.training.noise_tuning import IdentificationSettings
 from vehest.training.samples import Draw, Samples, sample_phase
 from vehest.training.sequences import Phase, PhaseSettings, drawn_starts, record_of_phases, train_phases
 
@@ -58,17 +58,11 @@ class EndToEndSettings(Group):
 
 
 class NetworkOutput(NamedTuple):
-    """The network's angle and noise of samples, differentiable, in double precision.
+    """The network's angle and noise of samples, differentiable, in double precision."""
 
-    Attributes:
-        sideslip: β_DD (...) [rad].
-        distrust: σ_DD (...) [rad].
-        process: σ_Vy and σ_ψ̇ (..., 2) [m/s, rad/s], of one sample's step.
-    """
-
-    sideslip: Tensor
-    distrust: Tensor
-    process: Tensor
+    sideslip: Tensor  # β_DD (...) [rad]
+    distrust: Tensor  # σ_DD (...) [rad]
+    process: Tensor  # σ_Vy and σ_ψ̇ (..., 2) [m/s, rad/s], of one sample's step
 
     @property
     def variance(self) -> Tensor:
@@ -77,27 +71,16 @@ class NetworkOutput(NamedTuple):
 
 
 class Cuts(NamedTuple):
-    """Training sequences of one length, cut from recordings.
+    """Training sequences of one length, cut from recordings."""
 
-    Attributes:
-        inputs: scaled, (B, T, C).
-        sideslip: reference, (B, T) [rad].
-        measured: of the four sensors, (B, T, 4).
-        driven: inputs of the filter, (B, T, 3).
-        trusted: whether forces are trusted, bool (B, T).
-        start: true state at the first sample, (B, 2).
-        seeds: of dropout, int64 (1,).
-        firsts: where they begin in all training samples, int64 (B,).
-    """
-
-    inputs: Tensor
-    sideslip: Tensor
-    measured: Tensor
-    driven: Tensor
-    trusted: Tensor
-    start: Tensor
-    seeds: Tensor
-    firsts: Tensor
+    inputs: Tensor  # scaled, (B, T, C)
+    sideslip: Tensor  # reference, (B, T) [rad]
+    measured: Tensor  # of the four sensors, (B, T, 4)
+    driven: Tensor  # inputs of the filter, (B, T, 3)
+    trusted: Tensor  # whether forces are trusted, bool (B, T)
+    start: Tensor  # true state at the first sample, (B, 2)
+    seeds: Tensor  # of dropout, int64 (1,)
+    firsts: Tensor  # where they begin in all training samples, int64 (B,)
 
 
 class CnnUkf(NetworkUkf):
@@ -234,7 +217,7 @@ class EndToEnd:
 
     def __init__(self, estimator: CnnUkf, samples: Samples, recordings: Sequence[Recording], training: EndToEndSettings) -> None:
         self.estimator, self.samples, self.recordings, self.training = estimator, samples, recordings, training
-        self.filter = TrackFilter(estimator.track(sees_sideslip=True))
+        self.filter = TrackFilter(estimator.track())
         self.sensors = estimator.noise_covariances(estimator.levels)[1]
         self.lengths = [len(recording) for recording in recordings]
         self.offsets = np.concatenate([[0], np.cumsum(self.lengths)])

@@ -38,9 +38,7 @@ class DataSheet(Recursive):
     cornering_coefficient: float = setting(10.0, "cornering stiffness of the rear axle over its load", unit="1/rad", positive=True)
 
     def check(self) -> None:
-        """Raises:
-        ConfigurationError: no wheelbase, or a centre of gravity outside of it.
-        """
+        """Raises `ConfigurationError`: no wheelbase, or a centre of gravity outside of it."""
         if self.wheelbase is None:
             raise ConfigurationError("estimator 'data_sheet' needs your car's wheelbase: estimator.wheelbase=2.7 [m]")
         if self.cg_to_rear_axle is not None and not 0.0 < self.cg_to_rear_axle < self.wheelbase:

@@ -40,7 +40,7 @@ from vehest.filters.noise_levels import quiet_level
 from vehest.filters.sigma_points import symmetric_rule
 from vehest.filters.unscented_scan import MARGIN, UnscentedStepper
 from vehest.training.context import FitContext
-from vehest.training.identification import LEAST_PROCESS_YAW_RATE, IdentificationSettings
+from vehest.training.noise_tuning import LEAST_PROCESS_YAW_RATE, IdentificationSettings, finite
 from vehest.training.search import SearchRecord
 from vehest.vehicle.dugoff import (
     BMW_545I,
@@ -68,7 +68,6 @@ BOXES = {"process_vy": (-5.0, 0.0), "force_factor": (0.0, 2.0)}  # powers of ten
 STARTS = {"process_vy": (-4.0, -2.0), "process_yaw_rate": (-4.0, -2.0), "force_factor": (0.3, 1.0)}
 QUIET_SECONDS = 0.5  # of the pieces of drives in which the steering angle deviates least from a straight line
 MOST_TOGETHER = 200_000  # samples that are filtered at a time
-BAD = 1e6  # rad², instead of a cost that is not finite
 
 
 @dataclass(frozen=True)
@@ -111,16 +110,11 @@ TYRES = tuple(entry.name for entry in fields(AxleTyres))
 
 
 class PseudoMeasurement(NamedTuple):
-    """What a network adds to T samples.
+    """What a network adds to T samples."""
 
-    Attributes:
-        sideslip: β_DD, (T,) [rad].
-        variance: of the measurement that the filter takes it for, (T,) [rad²].
-        process: variances of a step of lateral velocity and yaw rate, (T, 2) [m²/s², rad²/s²]; none: the filter's own.
-    """
-
-    sideslip: FloatArray
-    variance: FloatArray
+    sideslip: FloatArray  # β_DD, (T,) [rad]
+    variance: FloatArray  # of the measurement that the filter takes it for, (T,) [rad²]
+    # variances of a step of lateral velocity and yaw rate, (T, 2) [m²/s², rad²/s²]; none: the filter's own
     process: FloatArray | None = None
 
 
@@ -175,9 +169,7 @@ class DugoffUkf(SigmaPointEstimator):
         self._seed = 0
 
     def check(self) -> None:
-        """Raises:
-        ConfigurationError: thresholds of the non-linear range in the wrong order.
-        """
+        """Raises `ConfigurationError`: thresholds of the non-linear range in the wrong order."""
         if not self.linear_below <= self.nonlinear_from:
             raise ConfigurationError(
                 f"estimator.linear_below must lie between 0 and nonlinear_from ({self.nonlinear_from:g}), not at {self.linear_below:g}"
@@ -222,9 +214,7 @@ class DugoffUkf(SigmaPointEstimator):
         return [name for name in names if getattr(self.noise, name) is None]
 
     def require_fitted(self) -> None:
-        """Raises:
-        ConfigurationError: tyres or levels are neither given nor found.
-        """
+        """Raises `ConfigurationError`: tyres or levels are neither given nor found."""
         self.track()
         self.noise_covariances(self.levels)
 
@@ -232,17 +222,13 @@ class DugoffUkf(SigmaPointEstimator):
         """Seed of the genetic searches and of Optuna's trials."""
         self._seed = seed
 
-    def track(self, *, sees_sideslip: bool = False) -> DugoffTrack:
-        """The model, with a sideslip angle among its measurements or without.
-
-        Raises:
-            ConfigurationError: the tyres are neither given nor identified.
-        """
+    def track(self) -> DugoffTrack:
+        """The model; raises `ConfigurationError`: the tyres are neither given nor identified."""
         if np.isnan(self.axle_tyres).any():
             raise ConfigurationError(f"estimator '{self.name}' has no tyres yet; fit or load it first, or give estimator.tyres")
         s = self.settings
         front, rear = (DugoffAxle(*self.axle_tyres[part].tolist()) for part in (slice(0, 3), slice(3, 6)))
-        return DugoffTrack(s.car, front, rear, 1.0 / s.rate_hz, s.curve, s.minimum_speed, sees_sideslip)
+        return DugoffTrack(s.car, front, rear, 1.0 / s.rate_hz, s.curve, s.minimum_speed)
 
     @classmethod
     def fit_members(cls, members: Sequence[Any], data: FitData, training: Any, context: FitContext) -> list[FitRecord]:
@@ -382,7 +368,7 @@ class DugoffUkf(SigmaPointEstimator):
 
         Levels are found, and networks learn, without a gate: noise that is too small would close it.
         """
-        model = TrackFilter(self.track(sees_sideslip=pseudo is not None))
+        model = TrackFilter(self.track())
         process, sensors = self.noise_covariances(self.levels if levels is None else levels)
         for rows in groups_of([len(recording) for recording in recordings], MOST_TOGETHER):
             parts = [self.taken(recordings[row].stack(self.channels)) for row in rows]
@@ -403,8 +389,11 @@ class DugoffUkf(SigmaPointEstimator):
                 yield rows, model.filtered(measurements, inputs, steps_noise, noise, initial, gate).steps
 
     def taken(self, samples: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Samples (T, n) of ``channels`` as the filter takes them: measurements of sensors (T, 4), inputs (T, 3)."""
-        return samples_of(samples[:, : len(CHANNELS[self.inputs])])
+        """Samples (T, n) of ``channels`` as the filter takes them: measurements (T, 4), NaN where there are no forces; inputs (T, 3)."""
+        yaw_rate, vx, ay, steer, ax = samples.T[: len(INERTIAL)]
+        wheels = samples[:, len(INERTIAL) : len(CHANNELS[self.inputs])]
+        forces = [wheels[:, 0] + wheels[:, 1], wheels[:, 2] + wheels[:, 3]] if wheels.shape[1] else [np.full(len(samples), np.nan)] * 2
+        return np.stack([ay, yaw_rate, *forces], 1), np.stack([vx, steer, ax], 1)
 
     def trusts_forces(self, ay: FloatArray, before: bool = False) -> NDArray[np.bool_]:
         """Where forces are trusted, (T,), given the measured lateral acceleration (T,) [m/s²]; see `in_nonlinear_range`."""
@@ -426,7 +415,7 @@ class DugoffUkf(SigmaPointEstimator):
 
     def new_filter(self, first: FilterStep) -> UnscentedStepper:
         """Straight ahead and unknown, or rolling."""
-        own = TrackFilter(self.track(sees_sideslip=len(first.measurement) > 4))
+        own = TrackFilter(self.track())
         mean, covariance = (part[0].numpy() for part in own.start(torch.as_tensor(first.inputs)[None]))
         return UnscentedStepper(own.model, mean, covariance, len(first.measurement), own.rule, gate=self.gate_in_use())
 
@@ -518,26 +507,6 @@ def with_variance(sensors: Tensor, variance: Tensor) -> Tensor:
         variance: of the network's angle (...) [rad²].
     """
     return torch.diag_embed(torch.cat([sensors.diagonal(dim1=-2, dim2=-1), variance.unsqueeze(-1)], -1))
-
-
-def finite(error: float) -> float:
-    """An error, or a large one instead of one that is not finite."""
-    return error if math.isfinite(error) else BAD
-
-
-def samples_of(samples: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Samples of ``channels`` as the filter takes them.
-
-    Args:
-        samples: (T, 9), or (T, 5) without forces.
-
-    Returns:
-        Measurements (T, 4), NaN where there are no forces, and inputs (T, 3).
-    """
-    yaw_rate, vx, ay, steer, ax = samples.T[: len(INERTIAL)]
-    wheels = samples[:, len(INERTIAL) :]
-    forces = [wheels[:, 0] + wheels[:, 1], wheels[:, 2] + wheels[:, 3]] if wheels.shape[1] else [np.full(len(samples), np.nan)] * 2
-    return np.stack([ay, yaw_rate, *forces], 1), np.stack([vx, steer, ax], 1)
 
 
 ESTIMATOR = DugoffUkf

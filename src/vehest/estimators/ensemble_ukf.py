@@ -13,12 +13,12 @@ from vehest.data.errors import ConfigurationError, DataError
 from vehest.data.recording import Recording
 from vehest.declared import setting
 from vehest.estimators.base import FitData, FitRecord, Trial
-from vehest.estimators.dugoff_ukf import PseudoMeasurement, finite
+from vehest.estimators.dugoff_ukf import PseudoMeasurement
 from vehest.estimators.kernels.sample_network import gaussian_likelihood
 from vehest.estimators.network_ukf import LEAST_VARIANCE, NetworkUkf
 from vehest.estimators.networks.sample_network import SampleNetwork, clip_sideslip
 from vehest.training.context import FitContext
-from vehest.training.identification import IdentificationSettings
+from vehest.training.noise_tuning import IdentificationSettings, finite
 from vehest.training.samples import SampleSettings
 from vehest.training.search import SearchRecord
 from vehest.training.sequences import PhaseSettings

@@ -58,9 +58,7 @@ class FactorGraph(SideslipFilter):
     noise: FactorNoise = setting(FactorNoise(), "standard deviations of the factors")
 
     def check(self) -> None:
-        """Raises:
-        ConfigurationError: a window shorter than a sampling interval, or a gate without a window.
-        """
+        """Raises `ConfigurationError`: a window shorter than a sampling interval, or a gate without a window."""
         if self.window is not None and self.intervals < 1:
             raise ConfigurationError(
                 f"estimator.window must be null or at least one sampling interval, {1 / self.rate_hz:g} s, not {self.window} s"

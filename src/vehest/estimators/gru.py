@@ -39,11 +39,7 @@ class Gru(RecurrentEstimator):
     name, title = "gru", "GRU"
     trials = (TRIAL,)
     network_type = GruNetwork
-
-    @classmethod
-    def line_style(cls, variant: str) -> tuple[str, str, str]:
-        """Purple."""
-        return "#8e24aa", "solid", "D"
+    style = "#8e24aa", "solid", "D"
 
 
 ESTIMATOR = Gru

@@ -137,43 +137,31 @@ class KalmanFilter(SideslipFilter):
     def filter_samples(
         self, samples: FloatArray, first: Gaussian[FloatArray], gate: Gate | None = None, refused: NDArray[np.int64] | None = None
     ) -> FilteredStates:
-        """Filter by `kalman_scan`; a_y is measured first."""
+        """Filter by `kalman_scan`; a_y is measured first. With offsets as states that is a_y + b_ay, and wheels stand at δ - b_δ."""
         yaw_rate, vx, ay, steer = samples.T
         A, B, C, D = self.sampled_model(vx)
-        observation = np.zeros((len(samples), 2, 2))
-        observation[:, 0], observation[:, 1, 1] = C, 1.0
-        spread = self.values["steer"] * self.noise.steer_factor * B
-        model = LinearModel(
-            transition=A,
-            transition_offset=B * steer[:, None],
-            process_noise=spread[:, :, None] * spread[:, None, :],
-            observation=observation,
-            observation_offset=np.stack([D * steer, np.zeros_like(steer)], axis=1),
-            observation_noise=np.diag([self.values["ay"] ** 2, self.values["yaw_rate"] ** 2]),
-        )
-        found = kalman_scan(self._with_offsets(model, B, D), np.stack([ay, yaw_rate], axis=1), first, gate, refused)
-        mean, covariance = found.filtered
-        innovations = (found.innovation, found.innovation_covariance, np.asarray(found.measured))
-        return FilteredStates(mean, covariance[:, :2, :2], *innovations, Gaussian(mean[-1], covariance[-1]))
-
-    def _with_offsets(self, model: LinearModel[FloatArray], B: FloatArray, D: FloatArray) -> LinearModel[FloatArray]:
-        """The model with offsets as states: what is measured is a_y + b_ay, and the wheels stand at δ - b_δ."""
-        offsets = self.offsets
-        if not offsets.given:
-            return model
-        steps, n = len(B), 2 + len(offsets.given)
-        kept = math.exp(-1.0 / (offsets.seconds * self.rate_hz))
+        offsets, steps = self.offsets, len(samples)
+        n = 2 + len(offsets.given)
         transition, noise, observation = np.zeros((steps, n, n)), np.zeros((steps, n, n)), np.zeros((steps, 2, n))
-        transition[:, :2, :2], noise[:, :2, :2], observation[:, :, :2] = model.transition, model.process_noise, model.observation
+        spread = self.values["steer"] * self.noise.steer_factor * B
+        transition[:, :2, :2], noise[:, :2, :2] = A, spread[:, :, None] * spread[:, None, :]
+        observation[:, 0, :2], observation[:, 1, 1] = C, 1.0
+        kept = math.exp(-1.0 / (offsets.seconds * self.rate_hz))
         for row, name in enumerate(offsets.given, 2):
-            transition[:, row, row] = kept
-            noise[:, row, row] = getattr(offsets, name) ** 2 * (1.0 - kept**2)
+            transition[:, row, row], noise[:, row, row] = kept, getattr(offsets, name) ** 2 * (1.0 - kept**2)
             if name == "ay":
                 observation[:, 0, row] = 1.0
             else:
                 transition[:, :2, row], observation[:, 0, row] = -B, -D
-        offset = np.concatenate([model.transition_offset, np.zeros((steps, n - 2))], axis=1)
-        return LinearModel(transition, offset, noise, observation, model.observation_offset, model.observation_noise)
+        driven = np.zeros((steps, n))
+        driven[:, :2] = B * steer[:, None]
+        expected = np.stack([D * steer, np.zeros_like(steer)], axis=1)
+        sensors = np.diag([self.values["ay"] ** 2, self.values["yaw_rate"] ** 2])
+        model = LinearModel(transition, driven, noise, observation, expected, sensors)
+        found = kalman_scan(model, np.stack([ay, yaw_rate], axis=1), first, gate, refused)
+        mean, covariance = found.filtered
+        innovations = (found.innovation, found.innovation_covariance, np.asarray(found.measured))
+        return FilteredStates(mean, None, covariance[:, :2, :2], *innovations, Gaussian(mean[-1], covariance[-1]))
 
     def c_values(self) -> dict[str, Any]:
         """Its car, levels of noise, offsets and gate."""

@@ -10,7 +10,7 @@ from typing import Any, ClassVar, Literal
 
 import numpy as np
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from vehest.constants import GRAVITY, FloatArray
 from vehest.data.errors import ConfigurationError
@@ -18,18 +18,16 @@ from vehest.data.estimate import Estimate
 from vehest.data.recording import Recording
 from vehest.declared import Group, setting
 from vehest.estimators.base import Estimator, FitData, FitRecord, Trial, require_learnable
-from vehest.estimators.filtering.car_filter import LEAST_ENTROPY, CarFilter
+from vehest.estimators.filtering.car_filter import CarFilter
 from vehest.estimators.filtering.sigma_point_stepper import FilterStep, SigmaPointEstimator
 from vehest.estimators.network import Network
 from vehest.filters.gaussian import Gaussian
-from vehest.filters.noise_models import StateDependentNoise
-from vehest.filters.unscented_scan import MARGIN, UnscentedStepper
+from vehest.filters.unscented_scan import MARGIN, CompiledNoise, StepNoise, UnscentedStepper
 from vehest.training.context import FitContext
 from vehest.training.sequences import PhaseRecord, record_of_phases, train_phases
 from vehest.training.through_filter import Drive, ThroughFilterSettings, Weights, filter_phases, one_step_phase
 from vehest.vehicle.dynamics import (
     PACEJKA,
-    PHYSICAL,
     STATES,
     TURN,
     UNSCALED,
@@ -41,7 +39,7 @@ from vehest.vehicle.dynamics import (
     TyreNetworkCar,
     physical_of,
 )
-from vehest.vehicle.planar import F1TENTH_START, Chassis
+from vehest.vehicle.planar import F1TENTH, LEARNT
 from vehest.vehicle.tyres import STILL
 
 SHORT = {"pacejka": "pc", "residual": "pcr", "neural": "nn", "tyre_network": "nnt", "friction_tyre_network": "nntf"}
@@ -68,30 +66,20 @@ class CarSettings(Group):
     mass: float = setting(5.1, "known", unit="kg", positive=True)
     wheelbase: float = setting(0.33, "known", unit="m", positive=True)
     wheel_radius: float = setting(0.05, "known", unit="m", positive=True)
-    yaw_inertia: float = setting(F1TENTH_START["yaw_inertia"], "learnt from here on", unit="kg m²", positive=True)
-    cg_to_rear_axle: float = setting(F1TENTH_START["cg_to_rear_axle"], "learnt from here on", unit="m", positive=True)
-    drag_constant: float = setting(F1TENTH_START["drag_constant"], "learnt from here on", unit="N", positive=True)
-    drag_linear: float = setting(F1TENTH_START["drag_linear"], "learnt from here on", unit="N s/m", positive=True)
-    drag_quadratic: float = setting(F1TENTH_START["drag_quadratic"], "learnt from here on", unit="N s²/m²", positive=True)
-    powertrain_inertia: float = setting(F1TENTH_START["powertrain_inertia"], "learnt from here on", unit="kg m²", positive=True)
-    torque_constant: float = setting(F1TENTH_START["torque_constant"], "learnt from here on", unit="N m/A", positive=True)
-    friction_viscous: float = setting(F1TENTH_START["friction_viscous"], "learnt from here on", unit="N s", positive=True)
-    friction_coulomb: float = setting(F1TENTH_START["friction_coulomb"], "learnt from here on", unit="N m", positive=True)
+    yaw_inertia: float = setting(F1TENTH["yaw_inertia"], "learnt from here on", unit="kg m²", positive=True)
+    cg_to_rear_axle: float = setting(F1TENTH["cg_to_rear_axle"], "learnt from here on", unit="m", positive=True)
+    drag_constant: float = setting(F1TENTH["drag_constant"], "learnt from here on", unit="N", positive=True)
+    drag_linear: float = setting(F1TENTH["drag_linear"], "learnt from here on", unit="N s/m", positive=True)
+    drag_quadratic: float = setting(F1TENTH["drag_quadratic"], "learnt from here on", unit="N s²/m²", positive=True)
+    powertrain_inertia: float = setting(F1TENTH["powertrain_inertia"], "learnt from here on", unit="kg m²", positive=True)
+    torque_constant: float = setting(F1TENTH["torque_constant"], "learnt from here on", unit="N m/A", positive=True)
+    friction_viscous: float = setting(F1TENTH["friction_viscous"], "learnt from here on", unit="N s", positive=True)
+    friction_coulomb: float = setting(F1TENTH["friction_coulomb"], "learnt from here on", unit="N m", positive=True)
 
     def __post_init__(self) -> None:
         super().__post_init__()
         if self.cg_to_rear_axle >= self.wheelbase:
             raise ConfigurationError(f"estimator.car.cg_to_rear_axle must be less than the wheelbase, not {self.cg_to_rear_axle}")
-
-    @property
-    def chassis(self) -> Chassis:
-        """What is known."""
-        return Chassis(self.mass, self.wheelbase, self.wheel_radius)
-
-    @property
-    def start(self) -> dict[str, float]:
-        """What is learnt."""
-        return {name: getattr(self, name) for name in F1TENTH_START}
 
 
 class LearnedUkf(Network, SigmaPointEstimator):
@@ -138,9 +126,7 @@ class LearnedUkf(Network, SigmaPointEstimator):
     car: CarSettings = setting(CarSettings(), "known of the car, and where learning starts")
 
     def check(self) -> None:
-        """Raises:
-        ConfigurationError: friction that starts below its smallest value.
-        """
+        """Raises `ConfigurationError`: friction that starts below its smallest value."""
         if self.start_friction is not None and not self.start_friction > self.least_friction:
             raise ConfigurationError(f"estimator.start_friction must lie above least_friction, not at {self.start_friction}")
 
@@ -149,10 +135,7 @@ class LearnedUkf(Network, SigmaPointEstimator):
         """Its network: the filter whose dynamics and noise are learnt."""
         return self.network
 
-    @property
-    def adapts(self) -> bool:
-        """Friction is a state."""
-        return True
+    adapts = True  # friction is a state
 
     @property
     def variant(self) -> str:
@@ -205,7 +188,8 @@ class LearnedUkf(Network, SigmaPointEstimator):
     ) -> list[PhaseRecord]:
         dtype = getattr(torch, training.dtype)
         train, validation = ([self.drive(recording, dtype) for recording in part] for part in (data.train, data.validation))
-        self.network = self.new_network(repair=True).to(dtype)
+        self.network = self.new_network().to(dtype)
+        self.network.repair = True
         if self.scaled:
             self._scale(train)
         self.filter.reset(torch.Generator().manual_seed(self._seed))
@@ -230,7 +214,7 @@ class LearnedUkf(Network, SigmaPointEstimator):
         self.filter.repair = self.repair
         return records
 
-    def new_network(self, repair: bool | None = None) -> CarFilter:
+    def new_network(self) -> CarFilter:
         """The filter before it learns."""
         s = self.settings
         return CarFilter(
@@ -239,20 +223,20 @@ class LearnedUkf(Network, SigmaPointEstimator):
             step=1.0 / s.rate_hz,
             least=(s.least_speed, s.least_friction),
             correlated=self.correlated_noise,
-            repair=s.repair if repair is None else repair,
+            repair=s.repair,
         )
 
     def _new_dynamics(self) -> Dynamics:
         s = self.settings
-        chassis, start = s.car.chassis, s.car.start
+        car = vars(s.car)
         width = s.width or (64 if "tyre" in s.dynamics else 256)
         if s.dynamics == "pacejka":
-            return PacejkaCar(chassis, start)
+            return PacejkaCar(car)
         if s.dynamics == "residual":
-            return ResidualCar(chassis, start, hidden=(width, width))
+            return ResidualCar(car, hidden=(width, width))
         if s.dynamics == "neural":
             return NeuralCar(hidden=(width, width))
-        return TyreNetworkCar(chassis, start, friction_scaled=s.dynamics == "friction_tyre_network", hidden=(width, width))
+        return TyreNetworkCar(car, friction_scaled=s.dynamics == "friction_tyre_network", hidden=(width, width))
 
     def _scale(self, train: Sequence[Drive]) -> None:
         """Networks' inputs by their root mean square in training; forces by an axle's share of the weight, rates by theirs."""
@@ -355,7 +339,7 @@ class LearnedUkf(Network, SigmaPointEstimator):
         s = self.settings
         own = deepcopy(self.filter).double()
         with torch.no_grad():
-            process, observation = own.process_noise, own.observation_noise
+            process, observation = own.noise_at()
             return {
                 **super().c_values(),
                 **_dynamics_in_c(own.dynamics),
@@ -375,8 +359,8 @@ class LearnedUkf(Network, SigmaPointEstimator):
                 "unscaled": UNSCALED,
                 "friction": s.friction if s.start_friction is None else s.start_friction,
                 "initial": _numbers(own.initial_covariance()) + np.diag([*np.square(UNKNOWN), 0.0]),
-                "process": _noise_in_c(process, LEAST_ENTROPY, own.noise_at()[0]),
-                "observation": _noise_in_c(observation, None, own.noise_at()[1]),
+                "process": _noise_in_c(process),
+                "observation": _noise_in_c(observation),
             }
 
 
@@ -386,15 +370,15 @@ def _held(values: FloatArray) -> FloatArray:
     return np.take_along_axis(np.concatenate([np.zeros_like(values[:1]), values]), last, axis=0)
 
 
-def _dynamics_in_c(dynamics: nn.Module) -> dict[str, Any]:
+def _dynamics_in_c(dynamics: Dynamics) -> dict[str, Any]:
     """Physical numbers, curves, and the network's layers, inputs first."""
-    physical = physical_of(dynamics)  # type: ignore[arg-type]
-    p = dict(zip((*PHYSICAL, *PACEJKA), physical.values.tolist(), strict=True))
-    weight = physical.mass * GRAVITY / physical.wheelbase
-    front_arm = physical.wheelbase - p["cg_to_rear_axle"]
-    values: dict[str, Any] = {
+    values, (mass, wheelbase, _) = physical_of(dynamics)
+    p = dict(zip((*LEARNT, *PACEJKA), values.tolist(), strict=True))
+    weight = mass * GRAVITY / wheelbase
+    front_arm = wheelbase - p["cg_to_rear_axle"]
+    found: dict[str, Any] = {
         "p": p,
-        "mass": physical.mass,
+        "mass": mass,
         "front_arm": front_arm,
         "front_load": weight * p["cg_to_rear_axle"],
         "rear_load": weight * front_arm,
@@ -403,26 +387,19 @@ def _dynamics_in_c(dynamics: nn.Module) -> dict[str, Any]:
     network = getattr(dynamics, "network", None)
     if isinstance(network, Perceptron):
         for number, (matrix, offset) in enumerate(network.layers(), 1):
-            values |= {f"W{number}": _numbers(matrix.T), f"b{number}": _numbers(offset)}
-    return values
+            found |= {f"W{number}": _numbers(matrix.T), f"b{number}": _numbers(offset)}
+    return found
 
 
-def _noise_in_c(noise: nn.Module, least: float | None, at: Any) -> dict[str, Any]:
+def _noise_in_c(noise: StepNoise) -> dict[str, Any]:
     """A covariance that is constant, or linear in the state by its factor; see `compiled_noise`."""
-    if not isinstance(noise, StateDependentNoise):
-        nothing = np.zeros((1, len(STATES)))
-        return {"constant": at(nothing, nothing)[0], "weight": None}
-    n = noise.constant.n
-    unit = noise.unit[torch.tril_indices(n, n)[0]]
-    return {
-        "constant": _numbers(noise.constant(noise.state_unit, noise.state_unit)),
-        "weight": _numbers(noise.weight / noise.state_unit * unit[:, None]),
-        "offset": _numbers(noise.offset * unit),
-        "scale": noise.scale,
-        "least": least,
-        "units": n * math.log(2.0 * math.pi * math.e),
-        "size": n,
-    }
+    if not isinstance(noise, CompiledNoise):
+        return {"constant": noise[0], "weight": None}
+    constant, weight, offset, *numbers = noise.car
+    scale, least = map(float, numbers)
+    n = len(constant)
+    values = {"constant": constant, "weight": weight, "offset": offset, "scale": scale, "least": least if math.isfinite(least) else None}
+    return {**values, "units": n * math.log(2.0 * math.pi * math.e), "size": n}
 
 
 def _numbers(values: Tensor) -> np.ndarray[Any, Any]:

@@ -24,9 +24,7 @@ class LearnedUkfVariant(LearnedUkf):
     curvature: bool = setting(False, "whether Pacejka's curves have the E terms of Eq. 3, learnt from 0 on; of dynamics=pacejka alone")
 
     def check(self) -> None:
-        """Raises:
-        ConfigurationError: a curvature of other dynamics.
-        """
+        """Raises `ConfigurationError`: a curvature of other dynamics."""
         super().check()
         if self.curvature and self.dynamics != "pacejka":
             raise ConfigurationError(f"estimator.curvature is of estimator.dynamics=pacejka, not of {self.dynamics}")
@@ -50,8 +48,7 @@ class LearnedUkfVariant(LearnedUkf):
         return super().n_parameters - held * (not self.correlated_noise)
 
     def _new_dynamics(self) -> Dynamics:
-        car = self.car
-        return PacejkaCar(car.chassis, car.start, with_curvature=True) if self.curvature else super()._new_dynamics()
+        return PacejkaCar(vars(self.car), with_curvature=True) if self.curvature else super()._new_dynamics()
 
 
 ESTIMATOR = LearnedUkfVariant

@@ -38,11 +38,7 @@ class Lstm(RecurrentEstimator):
     name, title = "lstm", "LSTM"
     trials = (TRIAL,)
     network_type = LstmNetwork
-
-    @classmethod
-    def line_style(cls, variant: str) -> tuple[str, str, str]:
-        """Light purple."""
-        return "#c792dd", "dashed", "v"
+    style = "#c792dd", "dashed", "v"
 
 
 ESTIMATOR = Lstm

@@ -24,10 +24,10 @@ from vehest.estimators.filtering.tyre_fit import NORMAL_95, AxleMotion, TyreFit,
 from vehest.estimators.kernels.rational_ekf import _roll, scan
 from vehest.filters.gating import Gate
 from vehest.filters.gaussian import Gaussian
-from vehest.filters.sigma_points import cubature_rule
+from vehest.filters.sigma_points import symmetric_rule
 from vehest.filters.unscented_scan import TorchModel, UnscentedStepper
 from vehest.training.context import FitContext
-from vehest.training.noise_tuning import NoiseTuningSettings
+from vehest.training.noise_tuning import NoiseTuningSettings, finite
 from vehest.training.search import SearchRecord
 from vehest.vehicle.tyre_track import MOTION, TYRE_PARAMETERS, TyreTrack
 
@@ -47,7 +47,6 @@ BOXES = {"ay": (-1.0, 5.0), "steer": (-4.0, 4.0), "tyres": (-8.0, 1.0)}  # power
 EDGE = 0.01  # of a box's width: a search that ends nearer to its end has ended on it
 STARTS = {"ay": (1.5, 2.0), "steer": (0.0, 1.5), "tyres": (-3.5, -2.0)}
 FIRST_SCALE, CALIBRATIONS = 0.01, 2  # rad/s: where the level of the yaw rate starts, and how often it is scaled
-BAD = 1e6  # rad², instead of a cost that is not finite
 
 Tyres = Literal["linear", "rational", "rational_adaptive", "rational_friction"]
 KINDS: dict[str, tuple[str, str, tuple[str, ...]]] = {
@@ -137,9 +136,7 @@ class RationalFilter(SideslipFilter):
         self._seed = 0
 
     def check(self) -> None:
-        """Raises:
-        ConfigurationError: a gate of the unscented filter, or levels or curves that are given in part.
-        """
+        """Raises `ConfigurationError`: a gate of the unscented filter, or levels or curves that are given in part."""
         if self.gate is not None and self.filter != "extended":
             raise ConfigurationError(
                 "estimator.gate is there for estimator.filter=extended only; set gate to null, or the filter to extended"
@@ -193,26 +190,25 @@ class RationalFilter(SideslipFilter):
     @property
     def learns(self) -> bool:
         """Whether curves or levels are not given."""
-        return not (self._curves_given and self._levels_given)
+        return not self._curves_given or bool(self._unknown)
 
     @property
     def n_parameters(self) -> int:
         """Parameters of curves and levels of noise that are not given."""
-        unknown = [name for name in self.level_names if getattr(self.noise, name) is None]
-        return len(self.curve_names) * (not self._curves_given) + len(unknown)
+        return len(self.curve_names) * (not self._curves_given) + len(self._unknown)
 
     @property
     def _curves_given(self) -> bool:
         return self.curves.c2_front is not None
 
     @property
-    def _levels_given(self) -> bool:
-        return all(getattr(self.noise, name) is not None for name in self.level_names)
+    def _unknown(self) -> tuple[str, ...]:
+        return tuple(name for name in self.level_names if getattr(self.noise, name) is None)
 
     @property
     def _searched(self) -> tuple[str, ...]:
         """Levels that are tuned: the sensors' as ratios to the first, whose size follows from the innovations."""
-        return tuple(name for name in self.level_names[1:] if getattr(self.noise, name) is None)
+        return tuple(name for name in self._unknown if name != LEVELS[0])
 
     def seed(self, seed: int) -> None:
         """Seed of Optuna's trials; nothing else is random."""
@@ -278,9 +274,8 @@ class RationalFilter(SideslipFilter):
         return {**found, **intervals, **rms}
 
     def _levels_of(self, recordings: Sequence[Recording]) -> dict[str, float]:
-        unknown = [name for name in self.level_names if getattr(self.noise, name) is None]
-        assumed = {name: value for name, value in ASSUMED.items() if name in unknown}
-        return self.values | assumed | read_levels(recordings, [name for name in LEVELS[:2] if name in unknown], CUTOFF)
+        assumed = {name: value for name, value in ASSUMED.items() if name in self._unknown}
+        return self.values | assumed | read_levels(recordings, [name for name in LEVELS[:2] if name in self._unknown], CUTOFF)
 
     def _extended(self) -> RationalFilter:
         """The extended filter of the same model, by which levels are found: a search through the unscented one would take hours."""
@@ -332,8 +327,7 @@ class RationalFilter(SideslipFilter):
             error = (self.filter_samples(samples, levels=levels).mean[:, 0] - reference)[skip:]
             counted = (samples[skip:, 1] >= self.minimum_speed) & np.isfinite(reference[skip:])
             total, count = total + float(np.square(error[counted]).sum()), count + int(counted.sum())
-        value = total / max(count, 1)
-        return value if math.isfinite(value) else BAD
+        return finite(total / max(count, 1))
 
     def first_gaussian(self, sample: FloatArray, given: Mapping[str, float]) -> Gaussian[FloatArray]:
         """At rest on its course, or what a protocol hands over; parameters as they were fitted."""
@@ -398,8 +392,7 @@ class RationalFilter(SideslipFilter):
         gated = limit, patience, np.zeros(2, np.int64) if refused is None else refused
         bounds = np.append(bounds, [math.inf] * len(pull))
         scan(np.ascontiguousarray(samples), track, variances, bounds, self.start_tyres(), guessed, gated, (mean, covariance), out)
-        means, deviation, *others = out
-        return FilteredStates(means, *others, Gaussian(mean, covariance), deviation)  # type: ignore[call-arg, arg-type]
+        return FilteredStates(*out, Gaussian(mean, covariance))
 
     def _unscented(self, samples: FloatArray, first: Gaussian[FloatArray], levels: Mapping[str, float]) -> FilteredStates:
         """The same by sigma points; what is held keeps its variance (Schmidt's consider state)."""
@@ -409,17 +402,12 @@ class RationalFilter(SideslipFilter):
             lambda points, inputs: track.transition(points.clamp_(-limit, limit), inputs),
             lambda points, inputs: track.observation(points.clamp_(-limit, limit), inputs),
         )
-        filtered = UnscentedStepper(model, *first, 2, cubature_rule(len(bound)))
+        filtered = UnscentedStepper(model, *first, 2, symmetric_rule(len(bound), 0.0))
         prior, (mean, covariance) = filtered.prior, filtered.state
         mean[:], covariance[:] = first
         sensors = np.square([[levels["yaw_rate"], levels["ay"]]])[..., None] * np.eye(2)
         geometry = np.array([car.mass, car.yaw_inertia, car.cg_to_front_axle, car.cg_to_rear_axle])
         out = _empty(len(samples), len(bound))
-
-        def process_noise(states: FloatArray, inputs: FloatArray) -> FloatArray:
-            turn = inputs[0, 0] * (states[0, 1] + track.step * states[0, 3])
-            tyres = levels["tyres"] if abs(turn) >= self.adapt_above else 0.0
-            return track.process_noise(torch.as_tensor(states), torch.as_tensor(inputs), levels["steer"], tyres).numpy()
 
         for k, (yaw_rate, vx, ay, steer) in enumerate(samples):
             if vx < self.minimum_speed:
@@ -427,7 +415,11 @@ class RationalFilter(SideslipFilter):
                 innovation, spread, measured = np.zeros(2), np.eye(2), np.zeros(2, bool)
             else:
                 if k:
-                    filtered.predict(np.array([max(samples[k - 1, 1], self.minimum_speed), samples[k - 1, 3]]), process_noise)
+                    before = np.array([max(samples[k - 1, 1], self.minimum_speed), samples[k - 1, 3]])
+                    wanders = abs(before[0] * (mean[1] + track.step * mean[3])) >= self.adapt_above
+                    spreads = levels["steer"], levels["tyres"] * wanders
+                    at = torch.as_tensor(mean[None]), torch.as_tensor(before[None])
+                    filtered.predict(before, track.process_noise(*at, *spreads).numpy())
                     prior.mean.clip(-bound, bound, out=prior.mean)
                     diverged = not abs(prior.mean[0]) < self.largest_sideslip
                     if diverged or not prior.covariance[0, 0] < LOST**2:
@@ -446,8 +438,7 @@ class RationalFilter(SideslipFilter):
             deviation = np.sqrt(np.maximum(np.diagonal(covariance), 0.0))
             for target, values in zip(out, (mean, deviation, covariance[:2, :2], innovation, spread, measured), strict=True):
                 target[k] = values
-        means, deviations, *others = out
-        return FilteredStates(means, *others, Gaussian(mean.copy(), covariance.copy()), deviations)  # type: ignore[call-arg, arg-type]
+        return FilteredStates(*out, Gaussian(mean.copy(), covariance.copy()))
 
     def parameters_of(self, states: FloatArray) -> dict[str, FloatArray]:
         """Tyre parameters of states, (T, n), in SI units: name -> (T,)."""
@@ -467,9 +458,7 @@ class RationalFilter(SideslipFilter):
         return found
 
     def require_fitted(self, levels: Mapping[str, float] | None = None) -> None:
-        """Raises:
-        ConfigurationError: curves or levels are neither given nor fitted.
-        """
+        """Raises `ConfigurationError`: curves or levels are neither given nor fitted."""
         has_no_curves = np.isnan(self.axle_curves).any()
         if has_no_curves or any(math.isnan(level) for level in (self.values if levels is None else levels).values()):
             raise ConfigurationError(
@@ -495,11 +484,7 @@ class RationalFilter(SideslipFilter):
         self.values = dict(zip(LEVELS, weights["levels"].tolist(), strict=True))
 
     def c_values(self) -> dict[str, Any]:
-        """Its car, curves, levels of noise and gate.
-
-        Raises:
-            ConfigurationError: its filter is unscented.
-        """
+        """Its car, curves, levels of noise and gate; raises `ConfigurationError`: its filter is unscented."""
         if self.filter != "extended":
             raise ConfigurationError("estimator 'rational_ekf' with estimator.filter=unscented has no C; train it with filter=extended")
         adapted = [_slope_in_c(name) for name in self.adapted]

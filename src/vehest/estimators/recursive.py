@@ -31,17 +31,13 @@ class Recursive(Estimator):
 
     Numbers that it declares by `fitted` are attributes, NaN before the fit; one that is given as a setting is not fitted. A family has
     either a compiled ``step(numbers, state, sample)``, which returns the state after a sample, or its own `run`.
-
-    Attributes:
-        states: quantities of an `Estimate` that the state of ``step`` consists of, ``vy`` first.
-        values: fitted numbers by name.
     """
 
     training_type: ClassVar[type] = NoTraining
-    states: ClassVar[tuple[str, ...]] = ("vy",)
+    states: ClassVar[tuple[str, ...]] = ("vy",)  # quantities of an `Estimate` that the state of ``step`` consists of, ``vy`` first
     refuses: ClassVar[tuple[str, ...]] = ("NaN",)
     step: ClassVar[Any]
-    values: dict[str, float]
+    values: dict[str, float]  # fitted numbers by name
 
     def __init_subclass__(cls, **options: Any) -> None:
         super().__init_subclass__(**options)
@@ -57,12 +53,7 @@ class Recursive(Estimator):
         self.unknown = tuple(name for name, value in given.items() if value is None)
 
     def first_state(self, sample: FloatArray, given: Mapping[str, float]) -> Any:
-        """The state before the first sample: what is given, else what is measured, else 0.
-
-        Args:
-            sample: values of ``channels``, (C,).
-            given: what a protocol hands over of ``vy``, ``vx`` [m/s] and ``yaw_rate`` [rad/s]; empty otherwise.
-        """
+        """The state before the first sample: what is given, else what is measured, else 0; see `Estimator.first_state`."""
         measured = dict(zip(self.channels, sample.tolist(), strict=True)) | {"vy": 0.0}
         return tuple(float(given.get(name, measured.get(name, 0.0))) for name in self.states)
 
@@ -160,9 +151,7 @@ class Recursive(Estimator):
         return float(np.mean(np.square(np.concatenate(errors)))) if errors else math.nan
 
     def require_fitted(self) -> None:
-        """Raises:
-        ConfigurationError: a number is neither given nor fitted.
-        """
+        """Raises `ConfigurationError`: a number is neither given nor fitted."""
         if any(math.isnan(value) for value in self.values.values()):
             raise ConfigurationError(f"estimator '{self.name}' has not been fitted yet; fit or load it first")
 
@@ -171,11 +160,7 @@ class Recursive(Estimator):
         return {name: np.array([value]) for name, value in self.values.items()} or {"none": np.zeros(1)}
 
     def load_weights(self, weights: Mapping[str, np.ndarray[Any, Any]]) -> None:
-        """Take the numbers back.
-
-        Raises:
-            DataError: one is missing or unknown.
-        """
+        """Take the numbers back; raises `DataError`: one is missing or unknown."""
         require_shapes(self, weights, {name: values.shape for name, values in self.weights().items()})
         self.values = {name: float(weights[name][0]) for name in self.values}
 

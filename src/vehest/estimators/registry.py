@@ -9,7 +9,7 @@ from __future__ import annotations
 import importlib
 import pkgutil
 from functools import cache
-from importlib.metadata import EntryPoint, entry_points
+from importlib.metadata import entry_points
 
 import vehest.estimators as package
 from vehest.data.errors import ConfigurationError
@@ -27,17 +27,13 @@ def estimator_names() -> list[str]:
 
 @cache
 def estimator_class(name: str) -> type[Estimator]:
-    """The class behind a name.
-
-    Raises:
-        ConfigurationError: the name is unknown.
-    """
+    """The class behind a name; raises `ConfigurationError`: the name is unknown."""
     own = _own_class(name)
     if own is not None:
         return own
-    point = _entry_point(name)
-    if point is not None:
-        loaded: type[Estimator] = point.load()
+    points = entry_points(group=ENTRY_POINTS, name=name)
+    if points:
+        loaded: type[Estimator] = next(iter(points)).load()
         return loaded
     raise ConfigurationError(f"estimator '{name}' is not one of: {', '.join(estimator_names())}")
 
@@ -47,7 +43,3 @@ def _own_class(name: str) -> type[Estimator] | None:
         return None
     found: type[Estimator] | None = getattr(importlib.import_module(f"{package.__name__}.{name}"), "ESTIMATOR", None)
     return found
-
-
-def _entry_point(name: str) -> EntryPoint | None:
-    return next((point for point in entry_points(group=ENTRY_POINTS) if point.name == name), None)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections import namedtuple
 from collections.abc import Mapping
+from dataclasses import fields
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -12,9 +13,9 @@ from typing import Any
 import numpy as np
 
 from vehest.constants import FloatArray
-from vehest.data.errors import ConfigurationError, DataError
+from vehest.data.errors import ConfigurationError
 from vehest.declared import setting
-from vehest.estimators.base import Stepper, rate
+from vehest.estimators.base import rate, require_shapes
 from vehest.estimators.kernels import self_calibrating as kernel
 from vehest.estimators.kernels.ksnn import packed
 from vehest.estimators.ksnn import Ksnn
@@ -34,16 +35,6 @@ UNLIKELY = 1e-300  # weight of what does not count
 PARAMETERS = slice(kernel.LEAKAGE, kernel.ERROR)  # among the states
 UNMEASURED = 20.0  # m/s per √s: process noise of u where ax is not measured
 
-NAMES = (
-    "rate_hz wheelbase measured_ax grip grip_deviation grip_excess exponent largest_share compliance compliance_deviation "
-    "leakage leakage_deviation rear_deviation imu_deviation rear_share offset_ay offset_ay_time offset_ax offset_ax_time "
-    "noise_vy noise_delay noise_vx noise_speed axle_lag axle_error_time axle_constant axle_per_speed axle_per_slip "
-    "axle_per_bend axle_per_slope axle_white axle_white_share gate memory minimum_speed variance_share residual_share angle_floor "
-    "residual_time slow_time residual_floor largest_leakage lateral_power longitudinal_power network_odds steady_odds decision_time "
-    "network_start dt point rear rear_known yaw_rate_max without_ax"
-)
-Numbers: Any = namedtuple("Numbers", NAMES)  # type: ignore[misc]  # importable by its name, else compiled code is not found again
-
 
 class SelfCalibrating(Recursive):
     """A bank of Kalman filters over grip limits of the rear axle, weighed against a network and steady cornering.
@@ -61,6 +52,7 @@ class SelfCalibrating(Recursive):
     channels: tuple[str, ...] = ("yaw_rate", "vx", "ay", "ax")  # type: ignore[misc]  # ax may be absent
     notice = Ksnn.notice
     slow_kernel = "vehest.estimators.kernels.self_calibrating:scan"
+    offline = "estimator 'self_calibrating' smooths a whole drive and cannot run online; use estimator.smoothed=false"
     template = "self_calibrating"
     refuses = ("NaN", "infinite")
     rate_hz: float = rate(20.0)
@@ -125,9 +117,7 @@ class SelfCalibrating(Recursive):
         self.network, self._width = _shipped_network()
 
     def check(self) -> None:
-        """Raises:
-        ConfigurationError: a centre of gravity outside of the wheelbase, or grip limits that are none.
-        """
+        """Raises `ConfigurationError`: a centre of gravity outside of the wheelbase, or grip limits that are none."""
         if self.cg_to_rear_axle is not None and not 0.0 < self.cg_to_rear_axle < self.wheelbase:
             raise ConfigurationError(
                 f"estimator.cg_to_rear_axle must lie between 0 and the wheelbase ({self.wheelbase} m), not at {self.cg_to_rear_axle}"
@@ -144,12 +134,6 @@ class SelfCalibrating(Recursive):
     def full_title(self) -> str:
         """Title with whether it smooths."""
         return f"{self.title}, smoothed" if self.smoothed else self.title
-
-    def online(self) -> Stepper:
-        """A stepper in its initial state; raises `ConfigurationError` where it smooths."""
-        if self.smoothed:
-            raise ConfigurationError(f"estimator '{self.name}' smooths a whole drive and cannot run online; use estimator.smoothed=false")
-        return super().online()
 
     @property
     def rear(self) -> float:
@@ -250,14 +234,8 @@ class SelfCalibrating(Recursive):
         return {"network": self.network, "yaw_rate_max": np.array([self._width])}
 
     def load_weights(self, weights: Mapping[str, np.ndarray[Any, Any]]) -> None:
-        """Take the network back.
-
-        Raises:
-            DataError: a part is missing, or has another shape.
-        """
-        expected = self.weights()
-        if {name: values.shape for name, values in weights.items()} != {name: values.shape for name, values in expected.items()}:
-            raise DataError(f"weights of '{self.name}' must be {', '.join(expected)} of the network that comes with vehest")
+        """Take the network back; raises `DataError`: a part is missing, or has another shape."""
+        require_shapes(self, weights, {name: values.shape for name, values in self.weights().items()})
         self.network, self._width = np.ascontiguousarray(weights["network"]), float(weights["yaw_rate_max"][0])
 
 
@@ -265,7 +243,7 @@ class SelfCalibrating(Recursive):
 def _shipped_network() -> tuple[FloatArray, float]:
     """Rows of the network that comes with vehest, (P, 8 + 6 Q), and the yaw rate of its last local model [rad/s]."""
     weights = load_model(Path(__file__).parents[1] / "pretrained").weights()
-    return packed(np, {name: values.astype(np.float64) for name, values in weights.items()}), float(weights["yaw_rate_max"])
+    return packed({name: values.astype(np.float64) for name, values in weights.items()}), float(weights["yaw_rate_max"])
 
 
 def _smoothed(estimator: Any, samples: FloatArray, state: kernel.State) -> FloatArray:
@@ -327,5 +305,9 @@ def _smoothed(estimator: Any, samples: FloatArray, state: kernel.State) -> Float
     variance = found[:, 2] + (shares * np.square(values - vy[:, None])).sum(axis=1)
     return np.column_stack([vy, variance + np.square(n.angle_floor * rows[:, 1]) + np.square(n.point * rows[:, 0])])
 
+
+NUMERIC = [own.name for own in fields(SelfCalibrating.settings_type) if isinstance(own.default, int | float)]
+DERIVED = ["dt", "point", "rear", "rear_known", "yaw_rate_max", "without_ax"]
+Numbers: Any = namedtuple("Numbers", NUMERIC + DERIVED)  # type: ignore[misc]  # importable by its name, else compiled code is not found again
 
 ESTIMATOR = SelfCalibrating

@@ -35,11 +35,7 @@ class StaticMap(Recursive):
     k: float = fitted("slip of the rear axle per lateral acceleration", unit="s²/m")
 
     def closed_form(self, recordings: Sequence[Recording]) -> dict[str, float]:
-        """Least squares.
-
-        Raises:
-            DataError: the car hardly turns, or always at one speed.
-        """
+        """Least squares; raises `DataError`: the car hardly turns, or always at one speed."""
         yaw_rate, vx, vy = (np.concatenate([recording[name] for recording in recordings]) for name in ("yaw_rate", "vx", "vy_ref"))
         columns = {"b": yaw_rate, "k": -yaw_rate * np.square(vx)}
         for name in set(columns) - set(self.unknown):

@@ -17,15 +17,11 @@ class Gate(NamedTuple):
     the filter is lost: the gate opens, until the measurement has agreed as long as it was open, half a second at most. Samples without it
     count neither way.
 
-    Attributes:
-        deviations: standard deviations of the innovation [1].
-        patience: samples, 1 at least.
-
     Source: Bar-Shalom, Li & Kirubarajan 2001 (validation gate).
     """
 
-    deviations: float
-    patience: int
+    deviations: float  # standard deviations of the innovation [1]
+    patience: int  # samples, 1 at least
 
     @classmethod
     def of(cls, deviations: float | None, rate_hz: float) -> Gate | None:

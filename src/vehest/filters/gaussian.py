@@ -15,31 +15,18 @@ Array = TypeVar("Array", "Tensor", NDArray[np.float64])
 
 
 class Gaussian(NamedTuple, Generic[Array]):
-    """A normal distribution of a state, or one a sample.
+    """A normal distribution of a state, or one a sample."""
 
-    Attributes:
-        mean: (..., n).
-        covariance: (..., n, n), symmetric.
-    """
-
-    mean: Array
-    covariance: Array
+    mean: Array  # (..., n)
+    covariance: Array  # (..., n, n), symmetric
 
 
 class Filtered(NamedTuple, Generic[Array]):
-    """What a filter knows after a sequence of T samples.
+    """What a filter knows after a sequence of T samples."""
 
-    Attributes:
-        predicted: state at each sample before its measurement; mean (..., T, n). The first is the initial state.
-        filtered: state at each sample after its measurement.
-        innovation: measurement minus what was expected of it, (..., T, m); 0 where nothing was measured.
-        innovation_covariance: (..., T, m, m); rows and columns of what was not measured are those of the identity, so that
-            eᵀS⁻¹e counts what was measured only.
-        measured: whether there was a measurement, bool, (..., T, m).
-    """
-
-    predicted: Gaussian[Array]
-    filtered: Gaussian[Array]
-    innovation: Array
+    predicted: Gaussian[Array]  # state at each sample before its measurement; mean (..., T, n); the first is the initial state
+    filtered: Gaussian[Array]  # state at each sample after its measurement
+    innovation: Array  # measurement minus what was expected of it, (..., T, m); 0 where nothing was measured
+    # (..., T, m, m); rows and columns of what was not measured are those of the identity, so that eᵀS⁻¹e counts what was measured only
     innovation_covariance: Array
-    measured: Tensor | NDArray[np.bool_]
+    measured: Tensor | NDArray[np.bool_]  # whether there was a measurement, bool, (..., T, m)

@@ -17,22 +17,14 @@ class LinearModel(NamedTuple, Generic[Array]):
     y[k]   = C[k] x[k] + d[k] + v[k],  v[k] ~ N(0, R[k])
 
     Known inputs are part of b and d. What is constant over time needs no dimension for it.
-
-    Attributes:
-        transition: A, (T, n, n); A[k] leads from sample k to k+1, so the last one is not used.
-        transition_offset: b, (T, n).
-        process_noise: Q, (T, n, n).
-        observation: C, (T, m, n).
-        observation_offset: d, (T, m).
-        observation_noise: R, (T, m, m), positive definite.
     """
 
-    transition: Array
-    transition_offset: Array
-    process_noise: Array
-    observation: Array
-    observation_offset: Array
-    observation_noise: Array
+    transition: Array  # A, (T, n, n); A[k] leads from sample k to k+1, so the last one is not used
+    transition_offset: Array  # b, (T, n)
+    process_noise: Array  # Q, (T, n, n)
+    observation: Array  # C, (T, m, n)
+    observation_offset: Array  # d, (T, m)
+    observation_noise: Array  # R, (T, m, m), positive definite
 
 
 def smoothed_means(model: LinearModel[FloatArray], filtered: Filtered[FloatArray]) -> FloatArray:
@@ -53,8 +45,3 @@ def smoothed_means(model: LinearModel[FloatArray], filtered: Filtered[FloatArray
     for k in range(len(means) - 2, -1, -1):
         means[k] += gains[k] @ (means[k + 1] - ahead.mean[k + 1])
     return means
-
-
-def shapes_of(n: int, m: int) -> tuple[tuple[int, ...], ...]:
-    """Shapes of a `LinearModel`'s parts at one sample, for n states and m measurements."""
-    return (n, n), (n,), (n, n), (m, n), (m,), (m, m)

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from typing import Any
 
 import numba
 import numpy as np
@@ -13,7 +11,7 @@ from numpy.typing import NDArray
 from vehest.constants import FloatArray
 from vehest.filters.gating import Gate, refuses
 from vehest.filters.gaussian import Filtered, Gaussian
-from vehest.filters.kalman import LinearModel, shapes_of
+from vehest.filters.kalman import LinearModel
 
 
 def kalman_scan(
@@ -38,36 +36,24 @@ def kalman_scan(
 
     Source: Kalman 1960; Joseph's form of the update (Bucy & Joseph 1968), with which covariances stay symmetric and positive.
     """
-    require_samples(measurements)
-    steps, m = measurements.shape
-    parts = [
-        contiguous(part, (steps, *shape), name)
-        for name, part, shape in zip(LinearModel._fields, model, shapes_of(model.transition.shape[-1], m), strict=True)
-    ]
-    taken = contiguous(measurements, (steps, m), "measurements").copy()
-    limit, patience = (math.inf, 0) if gate is None else (gate.deviations**2, gate.patience)
-    return filtered_by(_scan, parts, taken, initial, limit, patience, np.zeros(m, np.int64) if refused is None else refused)
-
-
-def require_samples(measurements: FloatArray) -> None:
-    """Raise `ValueError` for measurements that are not of shape (T, m), T > 0."""
     if measurements.ndim != 2 or len(measurements) == 0:
         raise ValueError(f"measurements must be of shape (T, m) with T > 0, not {measurements.shape}")
-
-
-def filtered_by(scan: Any, given: Sequence[Any], y: FloatArray, initial: Gaussian[FloatArray], *gate: Any) -> Filtered[FloatArray]:
-    """What a compiled scan makes of measurements y, (T, m), from an initial state; raises `numpy.linalg.LinAlgError` where it gives up."""
-    (steps, m), n = y.shape, initial.mean.shape[-1]
+    (steps, m), n = measurements.shape, model.transition.shape[-1]
+    shapes = ((n, n), (n,), (n, n), (m, n), (m,), (m, m))
+    parts = [_contiguous(part, (steps, *shape), name) for name, part, shape in zip(LinearModel._fields, model, shapes, strict=True)]
+    y = _contiguous(measurements, (steps, m), "measurements").copy()
+    start = _contiguous(initial.mean, (n,), "initial.mean"), _contiguous(initial.covariance, (n, n), "initial.covariance")
+    limit, patience = (math.inf, 0) if gate is None else (gate.deviations**2, gate.patience)
     predicted, filtered = (Gaussian(np.empty((steps, n)), np.empty((steps, n, n))) for _ in range(2))
     innovation, covariance = np.empty((steps, m)), np.empty((steps, m, m))
-    start = contiguous(initial.mean, (n,), "initial.mean"), contiguous(initial.covariance, (n, n), "initial.covariance")
-    failed = scan(*given, y, start, tuple(predicted), tuple(filtered), innovation, covariance, *gate)
+    gated = limit, patience, np.zeros(m, np.int64) if refused is None else refused
+    failed = _scan(*parts, y, start, tuple(predicted), tuple(filtered), innovation, covariance, *gated)
     if failed >= 0:
         raise np.linalg.LinAlgError(f"the innovation covariance is not positive definite at sample {failed}")
     return Filtered(predicted, filtered, innovation, covariance, ~np.isnan(y))
 
 
-def contiguous(values: FloatArray, shape: tuple[int, ...], name: str) -> FloatArray:
+def _contiguous(values: FloatArray, shape: tuple[int, ...], name: str) -> FloatArray:
     """An array in float64 that is of a shape or broadcasts to it; raises `ValueError`, which names it."""
     if values.shape == shape and values.dtype == np.float64:
         return np.ascontiguousarray(values)
@@ -85,7 +71,8 @@ def _scan(A, b, Q, C, d, R, y, start, predicted, filtered, innovation, innovatio
     """
     (steps, m), (mean, cov), (prior_mean, prior_cov), (post_mean, post_cov) = y.shape, start, predicted, filtered
     n = len(mean)
-    seen, room = np.empty((m, n)), scratch(m, n)
+    seen, of_both = np.empty((m, n)), (np.empty((m, n)), np.empty((n, m)), np.empty((n, m)))
+    room = of_both, (np.empty((n, n)), np.empty((n, n)), np.empty((n, n))), (np.empty((m, m)), np.empty((m, m)), np.empty(m))
     for k in range(steps):
         if k == 0:
             for i in range(n):  # a slice would double the time to compile
@@ -93,7 +80,7 @@ def _scan(A, b, Q, C, d, R, y, start, predicted, filtered, innovation, innovatio
                 for j in range(n):
                     prior_cov[0, i, j] = cov[i, j]
         else:
-            move(A[k - 1], post_cov[k - 1], Q[k - 1], prior_cov[k], room)
+            _move(A[k - 1], post_cov[k - 1], Q[k - 1], prior_cov[k], room)
             for i in range(n):
                 total = b[k - 1, i]
                 for j in range(n):
@@ -109,20 +96,13 @@ def _scan(A, b, Q, C, d, R, y, start, predicted, filtered, innovation, innovatio
                 error -= seen[i, j] * prior_mean[k, j]
             innovation[k, i] = error
         prior, post = (prior_mean[k], prior_cov[k]), (post_mean[k], post_cov[k])
-        if not update(prior, post, y[k], R[k], innovation[k], innovation_cov[k], seen, room):
+        if not _update(prior, post, y[k], R[k], innovation[k], innovation_cov[k], seen, room):
             return k
     return -1
 
 
 @numba.njit(inline="always")
-def scratch(m, n):  # type: ignore[no-untyped-def]
-    """Room for `move` and `update` of n states by m measurements."""
-    pairs = np.empty((m, n)), np.empty((n, m)), np.empty((n, m))
-    return pairs, (np.empty((n, n)), np.empty((n, n)), np.empty((n, n))), (np.empty((m, m)), np.empty((m, m)), np.empty(m))
-
-
-@numba.njit(inline="always")
-def move(slope, cov, noise, out, room):  # type: ignore[no-untyped-def]
+def _move(slope, cov, noise, out, room):  # type: ignore[no-untyped-def]
     """F P Fᵀ + Q into ``out``."""
     left = room[1][0]
     _multiply(slope, cov, left)
@@ -134,7 +114,7 @@ def move(slope, cov, noise, out, room):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(inline="always")
-def update(prior, post, y, R, innovation, S, seen, room):  # type: ignore[no-untyped-def]
+def _update(prior, post, y, R, innovation, S, seen, room):  # type: ignore[no-untyped-def]
     """Write mean and covariance after a measurement, from those before, by Joseph's form, and S; False where S is not definite.
 
     What is NaN in ``y`` (m,) was not measured: its ``innovation`` and its row of ``seen``, H (m, n), are 0.

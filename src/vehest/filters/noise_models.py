@@ -1,24 +1,29 @@
-"""Covariances of noise that can be learnt: constant or linear in the state; and a floor for their entropy."""
+"""Covariances of noise that can be learnt, constant or linear in the state, in torch and compiled for use; a floor for their entropy."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
 
+import numba
+import numpy as np
 import torch
 from torch import Tensor, nn
 
+from vehest.filters.unscented_scan import CompiledNoise
+
 FLOOR = 1e-7
 """Added to the diagonal, so that a covariance stays positive definite (Węgrzynowski et al. 2024, Eq. 7)."""
+SCALE = 0.01  # weight of the part that depends on the state; as in the authors' code, like the next
+DEVIATION = 1e-3  # of the random weights of L to begin with; its offsets start at 0
 
 
 class ConstantNoise(nn.Module):
-    """A full covariance L Lᵀ + floor · I with a lower triangular factor that is learnt, row by row in units that `begin` may set.
+    """A full covariance L Lᵀ + `FLOOR` · I with a lower triangular factor that is learnt, row by row in units that `begin` may set.
 
     Args:
         variances: its diagonal to begin with, n of them.
         correlated: whether entries off the diagonal are learnt; otherwise they stay zero.
-        floor: see `FLOOR`.
 
     Source: Węgrzynowski et al. 2024, Eq. 7.
     """
@@ -26,10 +31,9 @@ class ConstantNoise(nn.Module):
     unit: Tensor
     learnt: Tensor
 
-    def __init__(self, variances: Sequence[float], correlated: bool = True, floor: float = FLOOR) -> None:
+    def __init__(self, variances: Sequence[float], correlated: bool = True) -> None:
         super().__init__()
         start = torch.tensor(list(variances))
-        self.floor = floor
         self.n = len(start)
         self.factor = nn.Parameter(start.sqrt().diag()[_lower(self.n)])
         self.register_buffer("unit", torch.ones(self.n))
@@ -47,18 +51,15 @@ class ConstantNoise(nn.Module):
     def forward(self, state: Tensor, inputs: Tensor) -> Tensor:
         """The covariance, (..., n, n), the same for every state (..., k)."""
         factor = self.factor * self.unit[_lower(self.n)[0]] * self.learnt
-        return _product(factor, self.n, self.floor).expand(*state.shape[:-1], self.n, self.n)
+        return _product(factor, self.n, FLOOR).expand(*state.shape[:-1], self.n, self.n)
 
 
 class StateDependentNoise(nn.Module):
-    """A constant covariance and a part of which the factor is linear in the state: Q + scale · L(x) L(x)ᵀ.
+    """A constant covariance and a part of which the factor is linear in the state: Q + `SCALE` · L(x) L(x)ᵀ.
 
     Args:
         variances: diagonal of the constant part to begin with, n of them.
         n_states: length k of the state.
-        scale: weight of the part that depends on the state.
-        deviation: of the random weights of L to begin with; its offsets start at 0.
-        generator: of these.
         correlated: whether both parts have entries off their diagonals.
 
     Source: Węgrzynowski et al. 2024, Section III-B.3; scale and start values as in its authors' code.
@@ -67,45 +68,34 @@ class StateDependentNoise(nn.Module):
     unit: Tensor
     state_unit: Tensor
 
-    def __init__(
-        self,
-        variances: Sequence[float],
-        n_states: int,
-        *,
-        scale: float = 0.01,
-        deviation: float = 1e-3,
-        generator: torch.Generator | None = None,
-        correlated: bool = True,
-    ) -> None:
+    def __init__(self, variances: Sequence[float], n_states: int, correlated: bool = True) -> None:
         super().__init__()
         self.constant = ConstantNoise(variances, correlated)
-        self.scale = scale
         count = self.constant.n * (self.constant.n + 1) // 2
-        self.deviation = deviation
         self.register_buffer("unit", torch.ones(self.constant.n))
         self.register_buffer("state_unit", torch.ones(n_states))
         self.weight = nn.Parameter(torch.empty(count, n_states))
         self.offset = nn.Parameter(torch.zeros(count))
-        self.reset(generator)
+        self.reset()
 
     def begin(self, covariance: Tensor, pace: float, state_unit: Tensor) -> None:
         """Start from a covariance, (n, n); see `ConstantNoise.begin`. L sees states in units, (k,)."""
         self.constant.begin(covariance, pace)
         with torch.no_grad():
-            self.unit.copy_(self.constant.unit / self.scale**0.5)
+            self.unit.copy_(self.constant.unit / SCALE**0.5)
             self.state_unit.copy_(state_unit)
 
     def reset(self, generator: torch.Generator | None = None) -> None:
         """Draw the weights anew."""
         with torch.no_grad():
-            drawn = self.deviation * torch.randn(self.weight.shape, generator=generator)
+            drawn = DEVIATION * torch.randn(self.weight.shape, generator=generator)
             self.weight.copy_(torch.where(self.constant.learnt.unsqueeze(-1), drawn, 0.0))
 
     def forward(self, state: Tensor, inputs: Tensor) -> Tensor:
         """The covariance of each state, (..., n, n)."""
         factor = nn.functional.linear(state / self.state_unit, self.weight, self.offset) * self.unit[_lower(self.constant.n)[0]]
         factor = factor * self.constant.learnt
-        return self.constant(state, inputs) + self.scale * _product(factor, self.constant.n, 0.0)
+        return self.constant(state, inputs) + SCALE * _product(factor, self.constant.n, 0.0)
 
 
 def entropy(covariance: Tensor) -> Tensor:
@@ -131,3 +121,56 @@ def _product(factor: Tensor, n: int, floor: float) -> Tensor:
 def _lower(n: int) -> tuple[Tensor, Tensor]:
     rows, columns = torch.tril_indices(n, n)
     return rows, columns
+
+
+def compiled_noise(noise: StateDependentNoise, least_entropy: float = -math.inf) -> CompiledNoise:
+    """What `StateDependentNoise` and `with_entropy` return, as a function of arrays of the noise's precision.
+
+    Args:
+        noise: as it is now; later changes of its parameters are not seen.
+        least_entropy: see `with_entropy` [nat]; none: entropy as it is.
+    """
+    unit = noise.unit[_lower(noise.constant.n)[0]]
+    parts = (noise.constant(noise.state_unit, noise.state_unit), noise.weight / noise.state_unit * unit[:, None], noise.offset * unit)
+    constant, weight, offset = (part.detach().contiguous().numpy() for part in parts)
+    scalar = constant.dtype.type
+    return CompiledNoise(_covariances, (constant, weight, offset, scalar(SCALE), scalar(least_entropy)))
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _covariances(states, inputs, car, out, first, end):  # type: ignore[no-untyped-def]
+    constant, weight, offset, scale, least = car
+    n = constant.shape[0]
+    lower, factor = np.zeros_like(constant), np.zeros_like(constant)
+    for b in range(first, end):
+        entry = 0
+        for i in range(n):
+            for j in range(i + 1):
+                total = offset[entry]
+                for k in range(states.shape[0]):
+                    total += weight[entry, k] * states[k, b]
+                lower[i, j] = total
+                entry += 1
+        for i in range(n):
+            for j in range(i + 1):
+                total = constant[0, 0] * 0
+                for k in range(j + 1):
+                    total += lower[i, k] * lower[j, k]
+                out[i, j, b] = constant[i, j] + scale * total
+                out[j, i, b] = out[i, j, b]
+        if least > -np.inf:
+            log_determinant = constant[0, 0] * 0
+            for j in range(n):
+                total = out[j, j, b]
+                for k in range(j):
+                    total -= factor[j, k] * factor[j, k]
+                factor[j, j] = math.sqrt(total)
+                log_determinant += 2 * math.log(factor[j, j])
+                for i in range(j + 1, n):
+                    total = out[i, j, b]
+                    for k in range(j):
+                        total -= factor[i, k] * factor[j, k]
+                    factor[i, j] = total / factor[j, j]
+            short = least - 0.5 * (n * math.log(2 * math.pi * math.e) + log_determinant)
+            if short > 0:
+                out[:, :, b] *= math.exp(2 * short / n)

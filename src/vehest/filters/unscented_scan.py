@@ -43,44 +43,33 @@ MARGIN = 1e-6
 Array = NDArray[Any]
 Function = Callable[[Tensor, Tensor], Tensor]
 """Of states (..., n) and inputs (..., p); leading dimensions of both are equal or broadcast."""
-NoiseAt = Callable[[Array, Array], Array]
-"""Covariances of noise at estimated states, (B, n) under inputs (B, p) -> (B, k, k)."""
 Share = Callable[[Callable[[int, int], None], int], None]
 """Calls work(first, end) on stretches of so many sequences, side by side if it likes."""
 
 
 class NonlinearFiltered(NamedTuple):
-    """What a nonlinear filter knows after a sequence.
-
-    Attributes:
-        steps: see `Filtered`.
-        repaired: bool, (..., T): a covariance had lost its definiteness at this sample, and was repaired or, in a scan without repair,
-            made everything from there on NaN.
-    """
+    """What a nonlinear filter knows after a sequence."""
 
     steps: Filtered[Tensor]
+    # bool, (..., T): a covariance had lost its definiteness at this sample, and was repaired or, in a scan without repair, made everything
+    # from there on NaN
     repaired: Tensor
 
 
 class PointModel:
     """How sigma points move and what is expected at them, with adjoints; arrays of one precision, float32 or float64.
 
-    Attributes:
-        entries: transition and observation, called with (points, inputs, car, out, first, end), and their adjoints, called with
-            (points, inputs, car, upstream, out, gradients, first, end), which add to the gradients of parameters. Sequences lie side by
-            side in points (S, n, B), inputs (p, B), what is expected (S, m, B) and gradients, each followed by room for a vector; ``out``
-            is written from ``first`` to ``end``.
-        car: what all are given.
-        is_compiled: whether the entries are, so that the loop over samples runs without Python.
-        parameters: what gradients are wanted for.
-        lower: smallest possible value of each state, (n,); none: everything is possible.
+    Entries are transition and observation, called with (points, inputs, car, out, first, end), and their adjoints, called with (points,
+    inputs, car, upstream, out, gradients, first, end), which add to the gradients of parameters. Sequences lie side by side in points
+    (S, n, B), inputs (p, B), what is expected (S, m, B) and gradients, each followed by room for a vector; ``out`` is written from
+    ``first`` to ``end``.
     """
 
     entries: Sequence[Any]
-    car: Any = None
-    is_compiled = False
-    parameters: Sequence[Tensor] = ()
-    lower: Sequence[float] | None = None
+    car: Any = None  # what all are given
+    is_compiled = False  # whether the entries are, so that the loop over samples runs without Python
+    parameters: Sequence[Tensor] = ()  # what gradients are wanted for
+    lower: Sequence[float] | None = None  # smallest possible value of each state, (n,); none: everything is possible
 
     def working(self) -> AbstractContextManager[object]:
         """What the entries are called within, by one thread for all."""
@@ -134,24 +123,15 @@ def _of_torch(points: Array, inputs: Array, first: int, end: int) -> tuple[Tenso
 
 @dataclass(frozen=True, eq=False)
 class CompiledNoise:
-    """A `NoiseAt` that is compiled.
+    """Covariances of noise at estimated states."""
 
-    Attributes:
-        entry: compiled, called with (states (n, B), inputs (p, B), car, out, first, end); writes covariances (k, k, B) from sequence
-            ``first`` to ``end``.
-        car: what else it is given.
-        size: k.
-    """
-
+    # called with (states (n, B), inputs (p, B), car, out, first, end), compiled where the model is; writes covariances (k, k, B)
     entry: Any
-    car: tuple[Any, ...]
-    size: int
+    car: tuple[Any, ...]  # what else it is given
 
-    def __call__(self, states: Array, inputs: Array) -> Array:
-        """Covariances at states."""
-        out = room((self.size, self.size, len(states)), states.dtype)
-        self.entry(_beside(states), _beside(inputs), self.car, out, 0, len(states))
-        return _apart(out)
+
+StepNoise = Array | CompiledNoise
+"""Of one sample: (1, k, k), or at the state."""
 
 
 def _setting(model: PointModel, rule: SigmaRule, n: int, dtype: Any, repair: bool, gate: Gate | None) -> Setting:
@@ -165,8 +145,8 @@ def unscented_scan(
     measurements: Tensor,
     inputs: Tensor,
     initial: Gaussian[Tensor],
-    process_noise: Tensor | NoiseAt,
-    observation_noise: Tensor | NoiseAt,
+    process_noise: Tensor | CompiledNoise,
+    observation_noise: Tensor | CompiledNoise,
     rule: SigmaRule,
     *,
     repair: bool = True,
@@ -205,27 +185,22 @@ def unscented_scan(
         mean, covariance = initial.mean.expand(sequences, n), initial.covariance.expand(sequences, n, n)
     except RuntimeError:
         raise ValueError(f"the initial state, mean {tuple(initial.mean.shape)}, does not fit {sequences} sequences") from None
-    dtype = measurements.dtype
-    numpy_dtype = np.float32 if dtype == torch.float32 else np.float64
-    setting = _setting(model, rule, n, numpy_dtype, repair, gate)
+    dtype = np.float32 if measurements.dtype == torch.float32 else np.float64
+    setting = _setting(model, rule, n, dtype, repair, gate)
     noises = [process_noise, observation_noise]
     functions = [noise if not isinstance(noise, Tensor) else None for noise in noises]
     tensors = [
         noise.expand(sequences, steps, size, size) if isinstance(noise, Tensor) else measurements.new_empty(0, 0, 0, 0)
         for noise, size in zip(noises, (n, m), strict=True)
     ]
-    tape = tape_of(steps, sequences, n, m, numpy_dtype)
+    tape = tape_of(steps, sequences, n, m, dtype)
     post_mean, post_covariance = _Scan.apply(  # type: ignore[no-untyped-call]
         model, setting, share or _alone, tape, functions, measurements, inputs, mean, covariance, *tensors, *model.parameters
     )
-    outside = [_by_sequence(values) for values in (tape.prior_mean, tape.prior_covariance, tape.innovation, tape.own)]
-    filtered = Filtered(
-        Gaussian(outside[0], outside[1]),
-        Gaussian(post_mean, post_covariance),
-        outside[2],
-        outside[3],
-        ~(torch.isnan(measurements) | _by_sequence(tape.gone)),
-    )
+    outside = (tape.prior_mean, tape.prior_covariance, tape.innovation, tape.own)
+    prior_mean, prior_covariance, innovation, own = (_by_sequence(values) for values in outside)
+    measured = ~(torch.isnan(measurements) | _by_sequence(tape.gone))
+    filtered = Filtered(Gaussian(prior_mean, prior_covariance), Gaussian(post_mean, post_covariance), innovation, own, measured)
     return NonlinearFiltered(filtered, _by_sequence(tape.repaired))
 
 
@@ -264,18 +239,18 @@ class UnscentedStepper:
         self.state = Gaussian(tape.post_mean[0, :, 0], tape.post_covariance[0, :, :, 0])
         self.prior.mean[:], self.prior.covariance[:] = mean, covariance
         self._inputs: Array | None = None
-        self._runs: dict[NoiseAt | None, Callable[..., None]] = {}
+        self._runs: dict[CompiledNoise | None, Callable[..., None]] = {}
         self._scratch = forward_scratch(tape)
         self.innovation, self.innovation_covariance, self.gain = tape.innovation[0, :, 0], tape.own[0, :, :, 0], tape.gain[0, :, :, 0]
 
-    def step(self, measurement: Array, inputs: Array, process_noise: Array | NoiseAt, observation_noise: Array | NoiseAt) -> Array:
+    def step(self, measurement: Array, inputs: Array, process_noise: StepNoise, observation_noise: StepNoise) -> Array:
         """The filtered mean, (n,), valid until the next step.
 
         Args:
             measurement: (m,); what is NaN was not measured.
             inputs: (p,); they act from this sample to the next.
-            process_noise: Q of the step that led here, (1, n, n), or as a function of the state before.
-            observation_noise: R, (1, m, m), or as a function of the predicted state.
+            process_noise: Q of the step that led here, (1, n, n), or at the state before.
+            observation_noise: R, (1, m, m), or at the predicted state.
         """
         if self._inputs is not None:
             self.predict(self._inputs, process_noise)
@@ -283,15 +258,15 @@ class UnscentedStepper:
         self._inputs = inputs
         return self.state.mean
 
-    def predict(self, inputs: Array, process_noise: Array | NoiseAt) -> None:
+    def predict(self, inputs: Array, process_noise: StepNoise) -> None:
         """Move the state to the next sample by inputs of this one."""
         self._run(0, self.innovation, inputs, process_noise)
 
-    def update(self, measurement: Array, inputs: Array, observation_noise: Array | NoiseAt) -> None:
+    def update(self, measurement: Array, inputs: Array, observation_noise: StepNoise) -> None:
         """Take in the measurement."""
         self._run(1, measurement, inputs, observation_noise)
 
-    def _run(self, half: int, measurement: Array, inputs: Array, noise: Array | NoiseAt) -> None:
+    def _run(self, half: int, measurement: Array, inputs: Array, noise: StepNoise) -> None:
         given, at = (noise[0], None) if isinstance(noise, np.ndarray) else (self.innovation_covariance, noise)
         y, u, given = (_alone_by_time(part) for part in (measurement, inputs, given))
         if at not in self._runs:
@@ -333,7 +308,7 @@ class _Scan(torch.autograd.Function):
         setting: Setting,
         share: Share,
         tape: Tape,
-        functions: Sequence[NoiseAt | None],
+        functions: Sequence[CompiledNoise | None],
         measurements: Tensor,
         inputs: Tensor,
         mean: Tensor,
@@ -377,17 +352,17 @@ class _Scan(torch.autograd.Function):
         return (None, None, None, None, None, y_bar, None, *first_bars, *noise_bars, *summed)
 
 
-def _forward_by(model: PointModel, functions: Sequence[NoiseAt | None], like: tuple[Tape, Array] | None = None) -> Callable[..., None]:
+def _forward_by(model: PointModel, functions: Sequence[CompiledNoise | None], like: tuple[Tape, Array] | None = None) -> Any:
     """The loop over samples with a model and noise, compiled for arrays like a tape's and inputs, (p, B), where both are compiled."""
-    entries, cars = [*model.entries[:2]], [at.car if isinstance(at, CompiledNoise) else None for at in functions]
-    at_states = [at.entry if isinstance(at, CompiledNoise) else at and _written(at) for at in functions]
+    entries, at_states = [*model.entries[:2]], [at and at.entry for at in functions]
     loop, steps = getattr(forward, "py_func", forward), cast(tuple[Any, ...], FORWARD)
-    if like and model.is_compiled and not config.DISABLE_JIT and all(at is None or isinstance(at, CompiledNoise) for at in functions):
+    if like and model.is_compiled and not config.DISABLE_JIT:
         (tape, inputs), loop, steps = like, forward, steps_by_address(FORWARD, like[1].dtype)
         given = (tape.moved[0], inputs, model.car), (tape.post_mean[0], inputs)
         entries = [by_address(entry, *given[0], out, 0, 0) for entry, out in zip(entries, (tape.moved[0], tape.expected[0]), strict=True)]
-        at_states = [at and by_address(at, *given[1], car, tape.post_covariance[0], 0, 0) for at, car in zip(at_states, cars, strict=True)]
-    return partial(loop, Forward._make((*steps, *entries, model.car)), at_states[0], cars[0], at_states[1], cars[1])
+        at_states = [at and by_address(at.entry, *given[1], at.car, tape.post_covariance[0], 0, 0) for at in functions]
+    noises = [part for at, entry in zip(functions, at_states, strict=True) for part in (entry, at and at.car)]
+    return partial(loop, Forward._make((*steps, *entries, model.car)), *noises)
 
 
 def _backward_by(model: PointModel, tape: Tape, u: Array, gradients: Sequence[Array]) -> tuple[Callable[..., None], Any]:
@@ -401,15 +376,6 @@ def _backward_by(model: PointModel, tape: Tape, u: Array, gradients: Sequence[Ar
         for entry, upstream in zip(model.entries[2:], (points, tape.expected[0]), strict=True)
     ]
     return partial(backward, Backward._make((*steps_by_address(BACKWARD, points.dtype), *called, model.car))), own
-
-
-def _written(function: Callable[[Array, Array], Array]) -> Callable[..., None]:
-    """A function of arrays that lie sequence by sequence, as the loop calls it."""
-
-    def write(values: Array, inputs: Array, _: Any, out: Array, first: int, end: int) -> None:
-        out[..., first:end] = _beside(function(_apart(values, first, end), _apart(inputs, first, end)))
-
-    return write
 
 
 def _beside(values: Array) -> Array:

@@ -491,12 +491,18 @@ def _cholesky(A, L, n):  # type: ignore[no-untyped-def]
 @compiled
 def _repaired(A, L, lane, n, margin, repair):  # type: ignore[no-untyped-def]
     """Lift the matrix (n · n, W) of a lane and write its factor, or NaN where that fails; whether its values were finite."""
-    own, factor = np.empty((n, n), A.dtype), np.empty((n, n), A.dtype)
+    own, factor = np.empty((n, n), A.dtype), np.zeros((n, n), A.dtype)
     for i in range(n):
         for j in range(n):
             own[i, j] = A[i * n + j, lane]
-    finite = _all_finite(own)
-    sound = repair and finite and _lifted(own, factor, margin)
+    finite = np.isfinite(own).all()
+    sound = repair and finite
+    if sound:
+        eigenvalues = np.linalg.eigvalsh(own)
+        lift = margin * np.abs(eigenvalues).max() - eigenvalues[0]
+        for i in range(n):
+            own[i, i] += lift
+        sound = _cholesky_of_one(own, factor)
     for i in range(n):
         for j in range(n):
             A[i * n + j, lane] = own[i, j] if sound else np.nan
@@ -506,7 +512,7 @@ def _repaired(A, L, lane, n, margin, repair):  # type: ignore[no-untyped-def]
 
 @compiled
 def _cholesky_of_one(A, L):  # type: ignore[no-untyped-def]
-    """Lower factor of a matrix into L; whether it is positive definite."""
+    """Lower factor of a matrix into L, zeros at first; whether it is positive definite."""
     n = A.shape[0]
     for j in range(n):
         total = A[j, j]
@@ -515,35 +521,13 @@ def _cholesky_of_one(A, L):  # type: ignore[no-untyped-def]
         if not total > 0:
             return False
         pivot = np.sqrt(total)
-        if not np.isfinite(pivot):
-            return False
         L[j, j] = pivot
-        for i in range(j):
-            L[i, j] = 0
         for i in range(j + 1, n):
             total = A[i, j]
             for k in range(j):
                 total -= L[i, k] * L[j, k]
             L[i, j] = total / pivot
-    return _all_finite(L)
-
-
-@compiled
-def _all_finite(A):  # type: ignore[no-untyped-def]
-    for value in A.flat:  # noqa: SIM110 - compiled
-        if not np.isfinite(value):
-            return False
-    return True
-
-
-@compiled
-def _lifted(A, L, margin):  # type: ignore[no-untyped-def]
-    """Add to A's eigenvalues what a margin needs, and factorise."""
-    eigenvalues = np.linalg.eigvalsh(A)
-    lift = margin * np.abs(eigenvalues).max() - eigenvalues[0]
-    for i in range(A.shape[0]):
-        A[i, i] += lift
-    return _cholesky_of_one(A, L)
+    return np.isfinite(L).all()
 
 
 @piece

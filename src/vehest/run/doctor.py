@@ -71,7 +71,7 @@ def _kernels() -> Item:
     try:
         import numpy as np
 
-        from vehest.estimators.kernels.luenberger import observe
+        from vehest.estimators.luenberger import observe
 
         observe(np.array([[0.5, 20.0, 9.0, 0.0]]), 5.0, 0.1, 0.01)
     except Exception as error:

@@ -1,13 +1,18 @@
-"""How a filter's noise levels are tuned, as conf/training/noise_tuning.yaml states it."""
+"""How a filter's noise levels are tuned and its tyres identified, as conf/training/noise_tuning.yaml and identification.yaml state it."""
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import ClassVar, Literal
 
+from vehest.data.errors import ConfigurationError
 from vehest.declared import Group, setting
 from vehest.training.context import FitContext
 from vehest.training.search import Box, Cost, DirectSearchSettings, SearchRecord, nelder_mead_over_grid, optuna_search
+
+BAD = 1e6  # rad², instead of a cost that is not finite
+LEAST_PROCESS_YAW_RATE = 1e-5  # [rad/s], of the search for the yaw rate's process noise
 
 
 @dataclass(frozen=True)
@@ -35,3 +40,39 @@ class NoiseTuningSettings(Group):
             return optuna_search(cost, boxes, trials or self.trials, seed, context, **staged)
         limits = DirectSearchSettings(self.grid, self.max_evaluations, self.tolerance)
         return nelder_mead_over_grid(cost, boxes, starts, limits, context)
+
+
+@dataclass(frozen=True)
+class IdentificationSettings(NoiseTuningSettings):
+    """How a filter comes by its tyres and its noise levels (Bertipaglia et al. 2024, Section III-B)."""
+
+    group = "identification"
+    method: Literal["data", "nelder_mead", "optuna"] = setting("optuna", "as above; data takes process noise as the paper has it")
+    trials: int = setting(60, "evaluations of Optuna in all stages together", least=1)
+    stages: int = setting(2, "of Optuna; after the first, the box shrinks around the best so far", least=1)
+    shrink: float = setting(0.3, "width of the box of a stage, relative to that of the stage before", above=0.0, most=1.0)
+    tyres_from: str = setting("*skidpad*", "pattern of the names of those training recordings that tyres are identified on")
+    restarts: int = setting(5, "genetic searches for the tyres, of which the best counts", least=1)
+    generations: int = setting(200, "of each, at most", least=1)
+    most_process_yaw_rate: float = setting(
+        10.0,
+        "upper limit of the search for the yaw rate's process noise, of one sample's step; with a level far beyond the yaw rate's own "
+        "changes a filter follows the gyroscope whatever its model says",
+        unit="rad/s",
+        above=LEAST_PROCESS_YAW_RATE,
+    )
+    error: Literal["samples", "recordings"] = setting(
+        "samples",
+        "what searches, and the choice of an epoch behind a filter, make small: the mean squared error over all samples, or the squared "
+        "mean of the recordings' root mean squared errors, which one recording decides less",
+    )
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.stages > self.trials:
+            raise ConfigurationError(f"identification.stages must be at most its trials ({self.trials}), not {self.stages}")
+
+
+def finite(error: float) -> float:
+    """An error, or a large one instead of one that is not finite."""
+    return error if math.isfinite(error) else BAD

@@ -1,6 +1,7 @@
 """Training of a filter's model: as a one-step predictor, and through the filter, on sequences that start at the true state.
 
-Knows neither cars nor which filter it is: a `Filtering` says how states move and how a sequence is filtered.
+Knows neither cars nor which filter it is: ``filtering`` is a module with ``mirror``, ``moved``, ``begin_noise``, ``estimated`` and
+``estimate_for_validation``, as `vehest.estimators.filtering.car_filter.CarFilter` has them.
 
 Source: Węgrzynowski et al. 2024, Section III-B.4.
 """
@@ -8,13 +9,12 @@ Source: Węgrzynowski et al. 2024, Section III-B.4.
 from __future__ import annotations
 
 import math
-from abc import abstractmethod
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
-from typing import ClassVar, Literal, NamedTuple
+from typing import Any, ClassVar, Literal, NamedTuple
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from vehest.data.errors import ConfigurationError, DataError
 from vehest.declared import Group, setting
@@ -27,36 +27,6 @@ class Drive(NamedTuple):
     states: Tensor  # true ones, (..., T, n)
     inputs: Tensor  # (..., T, p)
     measurements: Tensor  # (..., T, m); NaN where nothing was measured
-
-
-class Filtering(nn.Module):
-    """A filter that can be trained.
-
-    Attributes:
-        mirror: signs of states (n,), inputs (p,) and measurements (m,) in a mirror, in which what is filtered obeys the same laws.
-    """
-
-    mirror: ClassVar[tuple[Sequence[float], Sequence[float], Sequence[float]]]
-
-    @abstractmethod
-    def moved(self, states: Tensor, inputs: Tensor) -> Tensor:
-        """States one sample later, (..., n)."""
-
-    @abstractmethod
-    def begin_noise(self, drives: Sequence[Drive], start_spread: float) -> None:
-        """Start noise from what the model, as it is, leaves unexplained in drives, and from how far off the last state may start."""
-
-    @abstractmethod
-    def estimated(self, drives: Drive, start: Tensor, steps: int | None) -> Tensor:
-        """Estimated states, (B, T, n), of sequences that start at ``start``, (B, n); gradients reach ``steps`` samples back (none: all)."""
-
-    @abstractmethod
-    def estimate_with_covariance(self, drives: Drive, start: Tensor, steps: int | None) -> tuple[Tensor, Tensor]:
-        """The same with their covariances, (B, T, n, n), both differentiable."""
-
-    @abstractmethod
-    def estimate_for_validation(self, drives: Drive) -> Tensor:
-        """Estimated states, (B, T, n), as in use: without gradients, and without knowing any true state but the first."""
 
 
 @dataclass(frozen=True)
@@ -119,7 +89,7 @@ class Weights(NamedTuple):
 
 
 def one_step_phase(
-    filtering: Filtering,
+    filtering: Any,
     train: Sequence[Drive],
     validation: Sequence[Drive],
     weights: Weights,
@@ -147,7 +117,7 @@ def one_step_phase(
 
 
 def filter_phases(
-    filtering: Filtering,
+    filtering: Any,
     train: Sequence[Drive],
     validation: Sequence[Drive],
     weights: Weights,
@@ -191,12 +161,13 @@ def filter_phases(
         def loss(batch: tuple[Drive, Tensor]) -> Tensor:
             drives, start = batch
             truncated, kept = settings.truncate_steps or None, slice(settings.drop_steps, None)
-            if not settings.likelihood:
-                return _weighted((filtering.estimated(drives, start, truncated) - drives.states)[:, kept], weights.training)
-            estimated, covariance = filtering.estimate_with_covariance(drives, start, truncated)
+            estimated, covariance = filtering.estimated(drives, start, truncated)
             error = (estimated - drives.states)[:, kept]
-            surprise = gaussian_surprise(error[..., judged_by], covariance[:, kept][..., judged_by, :][..., judged_by])
-            return _weighted(error, weights.training) + settings.likelihood * surprise
+            squares = _weighted(error, weights.training)
+            if not settings.likelihood:
+                return squares
+            covariance = covariance[:, kept][..., judged_by, :][..., judged_by]
+            return squares + settings.likelihood * gaussian_surprise(error[..., judged_by], covariance)
 
         own = PhaseSettings(**{**vars(how), "max_epochs": epochs})
         return Phase(label, own, filtering, batches, loss, judge, trainable, prepare if first else None)

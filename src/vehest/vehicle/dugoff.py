@@ -108,7 +108,6 @@ class DugoffTrack:
     step: float  # Δt [s]
     tyres: Tyres = "plain"  # ``plain`` (Eq. 9) or ``smooth`` (Eq. 10).
     minimum_speed: float = 3.0  # see above [m/s]
-    sees_sideslip: bool = False  # whether the sideslip angle is among the measurements (β_DD of Eq. 4).
 
     def forces(self, states: Tensor, inputs: Tensor) -> tuple[Tensor, Tensor]:
         """Forces of both axles across the body, F_F cos δ and F_R, of states (..., 2) and inputs (..., 3): (...) [N] each."""
@@ -140,12 +139,10 @@ class DugoffTrack:
         return torch.stack([self.car.cg_to_rear_axle * turn, turn], -1)
 
     def observation(self, states: Tensor, inputs: Tensor) -> Tensor:
-        """What is measured, `TRACK_MEASUREMENTS`, of states (..., 2) and inputs (..., 3): (..., 4), or (..., 5) with the sideslip; Eq. 4.
+        """What is measured, `TRACK_MEASUREMENTS`, of states (..., 2) and inputs (..., 3): (..., 5); Eq. 4.
 
         Axle forces are those across the body, as the channels hold them; the paper's transducers turn with the wheels.
         """
         front, rear = self.forces(states, inputs)
-        seen = [(front + rear) / self.car.mass, states[..., 1] + torch.zeros_like(front), front, rear]
-        if self.sees_sideslip:
-            seen.append(torch.atan(states[..., 0] / inputs[..., 0].clamp(min=self.minimum_speed)))
-        return torch.stack(seen, -1)
+        sideslip = torch.atan(states[..., 0] / inputs[..., 0].clamp(min=self.minimum_speed))
+        return torch.stack([(front + rear) / self.car.mass, states[..., 1] + torch.zeros_like(front), front, rear, sideslip], -1)

@@ -8,17 +8,16 @@ from __future__ import annotations
 from abc import abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from itertools import pairwise
-from typing import NamedTuple
 
 import torch
 from torch import Tensor, nn
 
-from vehest.vehicle.planar import F1TENTH, F1TENTH_START, Chassis, Motion, PlanarCar
+from vehest.vehicle.planar import F1TENTH, KNOWN, LEARNT, Motion, PlanarCar
 from vehest.vehicle.tyres import PacejkaTyres, Slips, TyreForces
 
 STATES = ("vx", "vy", "yaw_rate", "rim_speed", "friction")
 
-PACEJKA_START: Mapping[str, float] = {
+PACEJKA: Mapping[str, float] = {
     "friction": 0.8916,
     **{"B_x": 2.8, "C_x": 1.2, "D_x": 0.8095},
     **{f"{name}_{axle}": value for axle in ("front", "rear") for name, value in (("B", 5.948), ("C", 2.2754), ("D", 0.8095))},
@@ -113,10 +112,10 @@ class Dynamics(nn.Module):
 class PacejkaCar(Dynamics):
     """PC: single track with Pacejka's curves (Eqs. 2 and 3). Its friction is learnt once and not the state's."""
 
-    def __init__(self, chassis: Chassis = F1TENTH, start: Mapping[str, float] = F1TENTH_START, *, with_curvature: bool = False) -> None:
+    def __init__(self, car: Mapping[str, float] = F1TENTH, *, with_curvature: bool = False) -> None:
         super().__init__()
-        self.car = PlanarCar(chassis, start)
-        self.tyres = PacejkaTyres(PACEJKA_START, with_curvature=with_curvature)
+        self.car = PlanarCar(car)
+        self.tyres = PacejkaTyres(PACEJKA, with_curvature=with_curvature)
 
     def motion(self, state: Tensor, inputs: Tensor) -> Motion:
         """See `Dynamics.motion`."""
@@ -126,10 +125,8 @@ class PacejkaCar(Dynamics):
 class ResidualCar(PacejkaCar):
     """PCR: the same, and a network that adds to its rates."""
 
-    def __init__(
-        self, chassis: Chassis = F1TENTH, start: Mapping[str, float] = F1TENTH_START, *, hidden: Sequence[int] = (256, 256)
-    ) -> None:
-        super().__init__(chassis, start)
+    def __init__(self, car: Mapping[str, float] = F1TENTH, *, hidden: Sequence[int] = (256, 256)) -> None:
+        super().__init__(car)
         self.network = Perceptron(6, *hidden, 4)
 
     def motion(self, state: Tensor, inputs: Tensor) -> Motion:
@@ -159,16 +156,9 @@ class TyreNetworkCar(Dynamics):
         friction_scaled: whether forces are scaled by friction (NNTF).
     """
 
-    def __init__(
-        self,
-        chassis: Chassis = F1TENTH,
-        start: Mapping[str, float] = F1TENTH_START,
-        *,
-        friction_scaled: bool = True,
-        hidden: Sequence[int] = (64, 64),
-    ) -> None:
+    def __init__(self, car: Mapping[str, float] = F1TENTH, *, friction_scaled: bool = True, hidden: Sequence[int] = (64, 64)) -> None:
         super().__init__()
-        self.car = PlanarCar(chassis, start)
+        self.car = PlanarCar(car)
         self.friction_scaled = friction_scaled
         self.network = Perceptron(9 if friction_scaled else 10, *hidden, 4)
 
@@ -193,41 +183,16 @@ class TyreNetworkCar(Dynamics):
         return self.car.motion(state, inputs, self.forces(state, inputs, self.car.slips(state, inputs)))
 
 
-class Physical(NamedTuple):
-    """What compiled code is given of a planar car, in this order."""
-
-    values: Tensor
-    mass: float
-    wheelbase: float
-    wheel_radius: float
-
-
-PHYSICAL = (
-    "cg_to_rear_axle",
-    "yaw_inertia",
-    "drag_constant",
-    "drag_linear",
-    "drag_quadratic",
-    "powertrain_inertia",
-    "torque_constant",
-    "friction_viscous",
-    "friction_coulomb",
-)
-
-
-PACEJKA = ("friction", *(f"{letter}_{where}" for where in ("x", "front", "rear") for letter in "BCD"))
-
-
-def physical_of(dynamics: Dynamics) -> Physical:
-    """Learnt values in the order of `PHYSICAL` and `PACEJKA`, differentiable, and known ones; 0 and 1 where a car has none."""
+def physical_of(dynamics: Dynamics) -> tuple[Tensor, tuple[float, ...]]:
+    """Learnt values in the order of `LEARNT` and `PACEJKA`, differentiable, and known ones as `KNOWN`; 0 and 1 where a car has none."""
     car, tyres = getattr(dynamics, "car", None), getattr(dynamics, "tyres", None)
     if not isinstance(car, PlanarCar):
-        return Physical(torch.zeros(len(PHYSICAL) + len(PACEJKA)), 1.0, 1.0, 1.0)
-    learnt = torch.stack([car.learnt[name] for name in PHYSICAL])
+        return torch.zeros(len(LEARNT) + len(PACEJKA)), (1.0,) * len(KNOWN)
+    learnt = torch.stack([car.learnt[name] for name in LEARNT])
     curves = (
         torch.stack([tyres.parameters_of[name] for name in PACEJKA]) if isinstance(tyres, PacejkaTyres) else learnt.new_zeros(len(PACEJKA))
     )
-    return Physical(torch.cat([learnt, curves]), car.chassis.mass, car.chassis.wheelbase, car.chassis.wheel_radius)
+    return torch.cat([learnt, curves]), (car.mass, car.wheelbase, car.wheel_radius)
 
 
 def _kinematic(state: Tensor, rates: Tensor) -> Motion:

@@ -7,11 +7,7 @@ from dataclasses import dataclass, fields
 
 @dataclass(frozen=True)
 class SingleTrackParameters:
-    """A car as a single track: each axle one tyre on the centre line.
-
-    Raises:
-        ValueError: a number that is not positive.
-    """
+    """A car as a single track: each axle one tyre on the centre line; raises `ValueError`: a number that is not positive."""
 
     mass: float  # [kg]
     yaw_inertia: float  # about the vertical axis through the centre of gravity [kg m²]

@@ -11,7 +11,6 @@ Source: Węgrzynowski et al. 2024, Eq. 2; drag and powertrain as in its authors'
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import torch
@@ -20,21 +19,12 @@ from torch import Tensor, nn
 from vehest.constants import GRAVITY
 from vehest.vehicle.tyres import STILL, PositiveParameters, Slips, TyreForces
 
-
-@dataclass(frozen=True)
-class Chassis:
-    """What of a car is known."""
-
-    mass: float  # [kg]
-    wheelbase: float  # [m]
-    wheel_radius: float  # R [m]
-
-
-F1TENTH = Chassis(mass=5.1, wheelbase=0.33, wheel_radius=0.05)  # as in the public code of Węgrzynowski et al. 2024; the paper says 4.5 kg
-
-F1TENTH_START: Mapping[str, float] = {
-    "yaw_inertia": 0.46,
+F1TENTH: Mapping[str, float] = {
+    "mass": 5.1,
+    "wheelbase": 0.33,
+    "wheel_radius": 0.05,
     "cg_to_rear_axle": 0.115,
+    "yaw_inertia": 0.46,
     "drag_constant": 0.1,
     "drag_linear": 0.01,
     "drag_quadratic": 0.1,
@@ -43,7 +33,9 @@ F1TENTH_START: Mapping[str, float] = {
     "friction_viscous": 0.304115174,
     "friction_coulomb": 0.50421894,
 }
-"""What is learnt of it, and from where learning starts; the same source."""
+"""A car: what is known, and from where on the rest is learnt; as in the public code of Węgrzynowski et al. 2024, whose paper has 4.5 kg."""
+KNOWN = ("mass", "wheelbase", "wheel_radius")  # [kg, m, m]
+LEARNT = tuple(name for name in F1TENTH if name not in KNOWN)
 
 
 class Motion(NamedTuple):
@@ -58,19 +50,18 @@ class PlanarCar(nn.Module):
     """The car without its tyres.
 
     Args:
-        chassis: what is known.
-        start: what is learnt, as `F1TENTH_START`.
+        car: values by name, as `F1TENTH`.
     """
 
-    def __init__(self, chassis: Chassis = F1TENTH, start: Mapping[str, float] = F1TENTH_START) -> None:
+    def __init__(self, car: Mapping[str, float] = F1TENTH) -> None:
         super().__init__()
-        self.chassis = chassis
-        self.learnt = PositiveParameters(start)
+        self.mass, self.wheelbase, self.wheel_radius = (car[name] for name in KNOWN)
+        self.learnt = PositiveParameters({name: car[name] for name in LEARNT})
 
     @property
     def to_front_axle(self) -> Tensor:
         """Distance of the front axle from the centre of gravity [m]."""
-        return self.chassis.wheelbase - self.learnt["cg_to_rear_axle"]
+        return self.wheelbase - self.learnt["cg_to_rear_axle"]
 
     def slips(self, state: Tensor, inputs: Tensor) -> Slips:
         """How the tyres slide; as in the authors' code."""
@@ -84,7 +75,7 @@ class PlanarCar(nn.Module):
 
     def loads(self) -> tuple[Tensor, Tensor]:
         """Static load of the front and the rear axle [N]."""
-        weight = self.chassis.mass * GRAVITY / self.chassis.wheelbase
+        weight = self.mass * GRAVITY / self.wheelbase
         return weight * self.learnt["cg_to_rear_axle"], weight * self.to_front_axle
 
     def motion(self, state: Tensor, inputs: Tensor, forces: TyreForces) -> Motion:
@@ -95,16 +86,16 @@ class PlanarCar(nn.Module):
             inputs: steering angle [rad], motor current [A], (..., 2).
             forces: of both axles.
         """
-        p, chassis = self.learnt, self.chassis
+        p = self.learnt
         vx, vy, yaw_rate, rim_speed = state[..., :4].unbind(-1)
         steer, current = inputs.unbind(-1)
         sine, cosine = torch.sin(steer), torch.cos(steer)
         drag = p["drag_constant"] * torch.sign(vx) + p["drag_linear"] * vx + p["drag_quadratic"] * vx.square()
         sideways = forces.front_x * sine + forces.front_y * cosine
-        ax = (forces.rear_x + forces.front_x * cosine - forces.front_y * sine - drag) / chassis.mass
-        ay = (sideways + forces.rear_y) / chassis.mass
+        ax = (forces.rear_x + forces.front_x * cosine - forces.front_y * sine - drag) / self.mass
+        ay = (sideways + forces.rear_y) / self.mass
         turning = (sideways * self.to_front_axle - forces.rear_y * p["cg_to_rear_axle"]) / p["yaw_inertia"]
         lost = p["friction_viscous"] * rim_speed + p["friction_coulomb"] * torch.sign(rim_speed)
-        torque = p["torque_constant"] * current - chassis.wheel_radius * (forces.front_x + forces.rear_x) - lost
-        spinning = chassis.wheel_radius / p["powertrain_inertia"] * torque
+        torque = p["torque_constant"] * current - self.wheel_radius * (forces.front_x + forces.rear_x) - lost
+        spinning = self.wheel_radius / p["powertrain_inertia"] * torque
         return Motion(torch.stack([ax + vy * yaw_rate, ay - vx * yaw_rate, turning, spinning], -1), ax, ay)

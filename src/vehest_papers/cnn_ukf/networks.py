@@ -18,7 +18,7 @@ from vehest.estimators.model_files import load_model
 from vehest.estimators.network_ukf import LEAST_VARIANCE, NetworkUkf
 from vehest.evaluation.metrics import Scored
 from vehest.training.context import FitContext
-from vehest.training.identification import IdentificationSettings
+from vehest.training.noise_tuning import IdentificationSettings
 from vehest_papers.cnn_ukf import paper
 from vehest_papers.cnn_ukf.manoeuvres import is_nonlinear
 from vehest_papers.cnn_ukf.subjects import TEST, Prepared, Run, Runs

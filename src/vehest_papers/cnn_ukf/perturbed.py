@@ -15,13 +15,13 @@ from vehest.data.errors import DataError
 from vehest.data.recording import Recording
 from vehest.data.splits import VALIDATION
 from vehest.estimators.base import Estimator
-from vehest.estimators.dugoff_ukf import finite
 from vehest.estimators.ensemble_ukf import BOX, EnsembleUkf, scaled_variance
 from vehest.estimators.model_files import load_model
 from vehest.estimators.network_ukf import LEAST_VARIANCE
 from vehest.report.document import Column, Figure, Table
 from vehest.report.style import DOUBLE_COLUMN, new_figure
 from vehest.training.context import FitContext
+from vehest.training.noise_tuning import finite
 from vehest.training.search import optuna_search
 from vehest.vehicle.dugoff import DugoffAxle
 from vehest_papers.cnn_ukf import paper

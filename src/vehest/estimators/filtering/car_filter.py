@@ -7,17 +7,16 @@ from functools import partial
 from typing import Any, Literal
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from vehest.estimators.kernels.planar_car import CompiledPlanarCar, is_compilable
 from vehest.estimators.kernels.threads import over_members
-from vehest.filters.compiled_noise import compiled_noise
 from vehest.filters.gating import Gate
 from vehest.filters.gaussian import Gaussian
-from vehest.filters.noise_models import ConstantNoise, StateDependentNoise, with_entropy
+from vehest.filters.noise_models import ConstantNoise, StateDependentNoise, compiled_noise, with_entropy
 from vehest.filters.sigma_points import symmetric_rule
-from vehest.filters.unscented_scan import NoiseAt, NonlinearFiltered, PointModel, TorchModel, moved, unscented_scan
-from vehest.training.through_filter import Drive, Filtering
+from vehest.filters.unscented_scan import NonlinearFiltered, PointModel, StepNoise, TorchModel, moved, unscented_scan
+from vehest.training.through_filter import Drive
 from vehest.vehicle.dynamics import STATES, Dynamics
 
 NoiseKind = Literal["constant", "state_dependent"]
@@ -32,7 +31,7 @@ KAPPA = -2.0  # of the symmetric sigma points
 LEAST_ENTROPY = -9.0  # [nat] of the process noise
 
 
-class CarFilter(Filtering):
+class CarFilter(nn.Module):
     """States vx, vy, yaw rate, rim speed and friction; measured are ax, ay, yaw rate and rim speed.
 
     Args:
@@ -48,7 +47,7 @@ class CarFilter(Filtering):
 
     process_noise: Any
     observation_noise: Any
-    mirror = (  # left for right
+    mirror = (  # signs of states, inputs and measurements, left for right
         (1.0, -1.0, -1.0, 1.0, 1.0),
         (-1.0, 1.0),
         (1.0, -1.0, -1.0, 1.0),
@@ -125,33 +124,32 @@ class CarFilter(Filtering):
         """
         if states is not None or self.constant:
             at = initial.mean.new_zeros(1, 1, len(STATES)) if states is None else states
-            noises: list[Tensor | NoiseAt] = [self._process_noise(at, inputs), self.observation_noise(at, inputs)]
+            process, observation = self._process_noise(at, inputs), self.observation_noise(at, inputs)
         else:
-            noises = list(self.noise_at())
+            process, observation = self.noise_at()  # type: ignore[assignment]
         return unscented_scan(
             model or self.point_model(),
             measurements,
             inputs,
             initial,
-            noises[0],
-            noises[1],
+            process,
+            observation,
             self.rule,
             repair=self.repair,
             share=partial(over_members, pieces=1),
             gate=gate,
         )
 
-    def noise_at(self) -> tuple[NoiseAt, NoiseAt]:
-        """Process and observation noise as functions of arrays of states."""
+    def noise_at(self) -> tuple[StepNoise, StepNoise]:
+        """Process and observation noise of filters at work."""
         if not self.constant:
             return compiled_noise(self.process_noise, LEAST_ENTROPY), compiled_noise(self.observation_noise)
         nothing = self.initial_noise.unit.new_zeros(1, len(STATES))
         with torch.no_grad():
-            values = [noise(nothing, nothing).contiguous().numpy() for noise in (self._process_noise, self.observation_noise)]
-        return (lambda states, inputs: values[0]), (lambda states, inputs: values[1])
+            return self._process_noise(nothing, nothing).numpy(), self.observation_noise(nothing, nothing).numpy()
 
     def begin_noise(self, drives: Sequence[Drive], start_spread: float) -> None:
-        """Start noise from one-step and measurement residuals at the true states; see `Filtering`.
+        """Start noise from one-step and measurement residuals at the true states of drives.
 
         The friction, which the true states hold as a constant, and the initial state keep the variances that they have, but for a friction
         that may start anywhere within a spread: it has the variance of that.
@@ -170,12 +168,14 @@ class CarFilter(Filtering):
         initial[friction, friction] = torch.clamp(initial[friction, friction], min=start_spread**2 / 3.0)
         self.initial_noise.begin(initial, PACE)
 
-    def estimated(self, drives: Drive, start: Tensor, steps: int | None) -> Tensor:
-        """Estimated states of training sequences, (B, T, 5), differentiable; see `Filtering`."""
-        return self.estimate_with_covariance(drives, start, steps)[0]
+    def estimated(self, drives: Drive, start: Tensor, steps: int | None) -> tuple[Tensor, Tensor]:
+        """States of training sequences and their covariances, (B, T, 5, 5), differentiable.
 
-    def estimate_with_covariance(self, drives: Drive, start: Tensor, steps: int | None) -> tuple[Tensor, Tensor]:
-        """The same with their covariances, (B, T, 5, 5), differentiable too."""
+        Args:
+            drives: sequences.
+            start: states that estimates start from, (B, 5).
+            steps: samples that gradients reach back; none: all.
+        """
         total = drives.states.shape[1]
         initial = Gaussian(start, self.initial_covariance())
         model = self.point_model()
@@ -194,7 +194,7 @@ class CarFilter(Filtering):
         return torch.cat(means, 1), torch.cat(covariances, 1)
 
     def estimate_for_validation(self, drives: Drive) -> Tensor:
-        """Estimated states of sequences, (B, T, 5), from the true state of their first sample."""
+        """Estimated states, (B, T, 5), as in use: without gradients, and without any true state but the first."""
         with torch.no_grad():
             initial = Gaussian(drives.states[:, 0], self.initial_covariance())
             return self.filtered(drives.measurements, drives.inputs, initial).steps.filtered.mean

@@ -22,17 +22,11 @@ POPULATION = 15  # a parameter
 
 
 class DugoffFit(NamedTuple):
-    """Tyres of the front and of the rear axle, in the order of `DugoffAxle`.
+    """Tyres of the front and of the rear axle, in the order of `DugoffAxle`."""
 
-    Attributes:
-        parameters: (2, 3).
-        spread: half of the range of each over restarts, (2, 3).
-        residual_rms: of the forces, (2,) [N].
-    """
-
-    parameters: FloatArray
-    spread: FloatArray
-    residual_rms: FloatArray
+    parameters: FloatArray  # (2, 3)
+    spread: FloatArray  # half of the range of each over restarts, (2, 3)
+    residual_rms: FloatArray  # of the forces, (2,) [N]
 
 
 def fit_dugoff(

@@ -27,25 +27,15 @@ KNOWN = 1e-6  # rad and rad/s, standard deviation of a state that a protocol han
 
 
 class FilteredStates(NamedTuple):
-    """What a filter knows after T samples.
+    """What a filter knows after T samples."""
 
-    Attributes:
-        mean: states, sideslip angle [rad] and yaw rate [rad/s] first, (T, n).
-        covariance: of sideslip angle and yaw rate, (T, 2, 2).
-        innovation: of yaw rate and lateral acceleration in the filter's order, 0 where nothing was measured, (T, 2).
-        innovation_covariance: (T, 2, 2).
-        measured: bool, (T, 2).
-        last: state after the last sample.
-        deviation: standard deviations of all states, (T, n), where the filter gives them.
-    """
-
-    mean: FloatArray
-    covariance: FloatArray
-    innovation: FloatArray
-    innovation_covariance: FloatArray
-    measured: NDArray[np.bool_]
-    last: Gaussian[FloatArray]
-    deviation: FloatArray | None = None
+    mean: FloatArray  # states, sideslip angle [rad] and yaw rate [rad/s] first, (T, n)
+    deviation: FloatArray | None  # standard deviations of all states, (T, n), where the filter gives them
+    covariance: FloatArray  # of sideslip angle and yaw rate, (T, 2, 2)
+    innovation: FloatArray  # of yaw rate and lateral acceleration in the filter's order, 0 where nothing was measured, (T, 2)
+    innovation_covariance: FloatArray  # (T, 2, 2)
+    measured: NDArray[np.bool_]  # (T, 2)
+    last: Gaussian[FloatArray]  # state after the last sample
 
     def nis(self) -> tuple[FloatArray, FloatArray]:
         """Normalised innovation squared, eᵀS⁻¹e, and how many numbers were measured; (T,) each."""
@@ -56,17 +46,11 @@ class FilteredStates(NamedTuple):
 
 
 class FilterState(NamedTuple):
-    """What a filter carries from sample to sample: the last one, which is filtered again without its measurements, and the state after it.
+    """What a filter carries on: the last sample, which is filtered again without its measurements, and the state after it."""
 
-    Attributes:
-        sample: values of ``channels``, (C,); none before the first.
-        state: after that sample, or before the first.
-        refused: how often on end each measurement was refused, see `Gate`.
-    """
-
-    sample: FloatArray | None
-    state: Gaussian[FloatArray]
-    refused: NDArray[np.int64]
+    sample: FloatArray | None  # values of ``channels``, (C,); none before the first
+    state: Gaussian[FloatArray]  # after that sample, or before the first
+    refused: NDArray[np.int64]  # how often on end each measurement was refused, see `Gate`
 
 
 class SideslipFilter(GatedFilter, Recursive):

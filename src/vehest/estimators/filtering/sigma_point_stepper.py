@@ -9,33 +9,22 @@ from typing import Any, ClassVar, NamedTuple
 from vehest.constants import FloatArray
 from vehest.estimators.base import Stepper
 from vehest.estimators.filtering.gated import GatedFilter
-from vehest.filters.unscented_scan import NoiseAt, UnscentedStepper
+from vehest.filters.unscented_scan import StepNoise, UnscentedStepper
 
 
 class FilterStep(NamedTuple):
-    """A sample as a filter takes it; see `UnscentedStepper.step`.
+    """A sample as a filter takes it; see `UnscentedStepper.step`."""
 
-    Attributes:
-        measurement: (m,).
-        inputs: (p,).
-        process_noise: of the step that led to the sample.
-        observation_noise: of the measurement.
-    """
-
-    measurement: FloatArray
-    inputs: FloatArray
-    process_noise: FloatArray | NoiseAt
-    observation_noise: FloatArray | NoiseAt
+    measurement: FloatArray  # (m,)
+    inputs: FloatArray  # (p,)
+    process_noise: StepNoise  # of the step that led to the sample
+    observation_noise: StepNoise  # of the measurement
 
 
 class SigmaPointEstimator(GatedFilter):
-    """An estimator by an unscented filter.
+    """An estimator by an unscented filter."""
 
-    Attributes:
-        states: names of the filter's states, ``vy`` among them.
-    """
-
-    states: ClassVar[tuple[str, ...]]
+    states: ClassVar[tuple[str, ...]]  # names of the filter's states, ``vy`` among them
 
     @abstractmethod
     def filter_step(self, sample: FloatArray, memory: dict[str, Any]) -> FilterStep:
@@ -43,11 +32,7 @@ class SigmaPointEstimator(GatedFilter):
 
     @abstractmethod
     def new_filter(self, first: FilterStep) -> UnscentedStepper:
-        """The filter before its first sample.
-
-        Raises:
-            ConfigurationError: it has not been fitted.
-        """
+        """The filter before its first sample; raises `ConfigurationError`: it has not been fitted."""
 
     def online(self) -> Stepper:
         """A stepper that starts from the first sample it sees."""

@@ -30,7 +30,7 @@ KAPPA = 1.0  # n + κ = 3
 
 
 class TrackFilter:
-    """States v and r; measured are those of `TRACK_MEASUREMENTS` that the track sees; inputs are forward speed, steering angle and ax.
+    """States v and r; measured are `TRACK_MEASUREMENTS`, the last one optional; inputs are forward speed, steering angle and ax.
 
     Where the car is slower than the track's minimum speed, nothing counts as measured, and the state is that of rolling wheels, with the
     deviations `UNKNOWN`.

@@ -45,42 +45,25 @@ NORMAL_95 = 1.959964
 
 
 class AxleMotion(NamedTuple):
-    """What the axles do along drives; slips and forces have a row an axle, front and rear.
+    """What the axles do along drives; slips and forces have a row an axle, front and rear."""
 
-    Attributes:
-        slip: slip angles, positive where they make a force to the left, (2, N) [rad].
-        force: lateral forces, (2, N) [N].
-        block: number of the stretch of time a sample belongs to, (N,).
-        driven: forward speed [m/s], steering angle [rad] and longitudinal acceleration [m/s²], (3, N); NaN where none was measured.
-    """
-
-    slip: FloatArray
-    force: FloatArray
-    block: NDArray[np.int64]
-    driven: FloatArray
+    slip: FloatArray  # slip angles, positive where they make a force to the left, (2, N) [rad]
+    force: FloatArray  # lateral forces, (2, N) [N]
+    block: NDArray[np.int64]  # number of the stretch of time a sample belongs to, (N,)
+    driven: FloatArray  # forward speed [m/s], steering angle [rad] and longitudinal acceleration [m/s²], (3, N); NaN: not measured
 
 
 @dataclass(frozen=True, eq=False)
 class TyreFit:
-    """Curves of both axles.
-
-    Args:
-        kind: ``linear`` or ``rational``.
-        front: parameters of the front axle in the order of `PARAMETERS`, (P,).
-        rear: those of the rear axle.
-        covariance: of the front and of the rear parameters, (2, P, P).
-        residual_rms: of the front and of the rear force, (2,) [N].
-        slip: slip angles that were fitted to, (2, N) [rad].
-        force: forces that were fitted to, (2, N) [N].
-    """
+    """Curves of both axles."""
 
     kind: Kind
-    front: FloatArray
-    rear: FloatArray
-    covariance: FloatArray
-    residual_rms: FloatArray
-    slip: FloatArray
-    force: FloatArray
+    front: FloatArray  # parameters of the front axle in the order of `PARAMETERS`, (P,)
+    rear: FloatArray  # those of the rear axle
+    covariance: FloatArray  # of the front and of the rear parameters, (2, P, P)
+    residual_rms: FloatArray  # of the front and of the rear force, (2,) [N]
+    slip: FloatArray  # slip angles that were fitted to, (2, N) [rad]
+    force: FloatArray  # forces that were fitted to, (2, N) [N]
 
     @property
     def interval(self) -> FloatArray:
@@ -93,15 +76,9 @@ class TyreFit:
 
 
 def axle_force(kind: Kind, parameters: FloatArray, slip: FloatArray) -> FloatArray:
-    """Lateral force of an axle: C α (Eq. 3), or c₂ α · 2c₁/(α² + 2c₁) (Eq. 4 at friction 1 and the load at rest).
+    """Lateral force of an axle at slip angles (...) [rad], (...) [N]; parameters in the order of `PARAMETERS`, (P,).
 
-    Args:
-        kind: ``linear`` or ``rational``.
-        parameters: in the order of `PARAMETERS`, (P,).
-        slip: slip angles (...) [rad].
-
-    Returns:
-        Forces (...) [N].
+    C α (Eq. 3), or c₂ α · 2c₁/(α² + 2c₁) (Eq. 4 at friction 1 and the load at rest).
     """
     c1, c2 = (math.inf, parameters[0]) if kind == "linear" else parameters
     force: FloatArray = rational_axle(slip, c1, c2, 1.0).force
@@ -129,7 +106,7 @@ def axle_motion(
     Raises:
         DataError: a channel is missing, or hardly any samples are left.
     """
-    slips, forces, blocks, driven = [], [], [], []
+    parts: list[AxleMotion] = []
     first_block = 0
     for recording in recordings:
         length = 2 * round(0.5 * SMOOTHING_SECONDS * recording.rate_hz) + 1
@@ -141,18 +118,15 @@ def axle_motion(
         block = first_block + np.arange(len(recording)) // round(BLOCK_SECONDS * recording.rate_hz)
         first_block = int(block[-1]) + 1
         usable = (recording["vx"] >= minimum_speed) & np.isfinite(slip).all(0) & np.isfinite(force).all(0)
-        slips.append(slip[:, usable])
-        forces.append(force[:, usable])
-        blocks.append(block[usable])
-        driven.append(inputs[:, usable])
-    count = sum(slip.shape[1] for slip in slips)
+        parts.append(AxleMotion(slip[:, usable], force[:, usable], block[usable], inputs[:, usable]))
+    count = sum(len(part.block) for part in parts)
     if count < FEWEST_SAMPLES:
         named = ", ".join(f"'{recording.id}'" for recording in recordings) or "none"
         raise DataError(
             f"tyre curves: {count} samples faster than {minimum_speed:g} m/s with all channels known, {FEWEST_SAMPLES} are needed "
             f"(recordings: {named})"
         )
-    return AxleMotion(np.concatenate(slips, axis=1), np.concatenate(forces, axis=1), np.concatenate(blocks), np.concatenate(driven, axis=1))
+    return AxleMotion(*(np.concatenate(own, axis=-1) for own in zip(*parts, strict=True)))
 
 
 def _motion_of(
@@ -200,9 +174,8 @@ def fit_motion(motion: AxleMotion, kind: Kind = "rational") -> TyreFit:
     Source: Di Biase, Lenzo & Timpone 2020, section III.B, Figure 3 and Table 1; blocks as in Liang & Zeger, Biometrika 73 (1), 1986.
     """
     axles = [_fitted(kind, slip, force, motion.block) for slip, force in zip(motion.slip, motion.force, strict=True)]
-    (front, front_covariance, front_rms), (rear, rear_covariance, rear_rms) = axles
-    covariance = np.stack([front_covariance, rear_covariance])
-    return TyreFit(kind, front, rear, covariance, np.array([front_rms, rear_rms]), motion.slip, motion.force)
+    (front, rear), covariances, rms = zip(*axles, strict=True)
+    return TyreFit(kind, front, rear, np.stack(covariances), np.array(rms), motion.slip, motion.force)
 
 
 def _fitted(kind: Kind, slip: FloatArray, force: FloatArray, block: NDArray[np.int64]) -> tuple[FloatArray, FloatArray, float]:

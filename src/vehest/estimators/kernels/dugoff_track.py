@@ -8,7 +8,6 @@ from __future__ import annotations
 import math
 
 import numpy as np
-import torch
 
 from vehest.constants import GRAVITY
 from vehest.filters.unscented_scan import PointModel
@@ -20,21 +19,15 @@ PLAIN, SMOOTH = LARGEST_RATIO["plain"], LARGEST_RATIO["smooth"]
 
 
 class CompiledDugoffTrack(PointModel):
-    """A `DugoffTrack` for the unscented filter; nothing of the car is learnt.
-
-    Args:
-        track: the model.
-        dtype: precision of the arrays.
-    """
+    """A `DugoffTrack` for the unscented filter; nothing of the car is learnt."""
 
     is_compiled = True
 
-    def __init__(self, track: DugoffTrack, dtype: torch.dtype = torch.float64) -> None:
+    def __init__(self, track: DugoffTrack) -> None:
         car = track.car
-        scalar = np.float32 if dtype == torch.float32 else np.float64
         numbers = [car.mass, car.yaw_inertia, car.cg_to_front_axle, car.cg_to_rear_axle, car.cg_height, track.step, track.minimum_speed]
         axles = [[axle.cornering_stiffness, axle.friction, axle.reduction] for axle in (track.front, track.rear)]
-        self.car = (np.array(numbers, scalar), np.array(axles, scalar), track.tyres == "smooth")
+        self.car = (np.array(numbers), np.array(axles), track.tyres == "smooth")
         self.entries = (_transition, _observation, _transition_adjoint, _observation_adjoint)
 
 

@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 
+from vehest.constants import FloatArray
 from vehest.estimators.kernels.activation import tanh
 from vehest.estimators.kernels.compiling import entry, part
 from vehest.estimators.kernels.recursion import Recursion, add, gather, slopes_of, squared_error, step_of_adam
@@ -34,21 +35,18 @@ def shapes_of(n_local: int, n_hidden: int, *, bias: bool) -> dict[str, tuple[int
     return shapes
 
 
-def packed(library: Any, parameters: Mapping[str, Any]) -> Any:
-    """Parameters by name, (..., P, 2) or (..., P, 2, Q), as rows of local models, (..., P, 8 + 6 Q).
-
-    ``library`` is the one whose arrays they are, NumPy or PyTorch.
-    """
+def packed(parameters: Mapping[str, FloatArray]) -> FloatArray:
+    """Parameters by name, (..., P, 2) or (..., P, 2, Q), as rows of local models, (..., P, 8 + 6 Q)."""
     p, gamma = parameters, parameters["gamma"]
-    bias = p.get("linear_bias", library.zeros_like(gamma))
+    bias = p.get("linear_bias", np.zeros_like(gamma))
     if "output_bias" in p:
         bias = bias + p["output_bias"]
-    pieces = [gamma, p["beta"], library.stack([p["linear_weight"], bias], -1).reshape(*gamma.shape[:-1], 4)]
+    pieces = [gamma, p["beta"], np.stack([p["linear_weight"], bias], -1).reshape(*gamma.shape[:-1], 4)]
     if "hidden_weight" in p:
         weight = p["hidden_weight"]
-        neurons = library.stack([weight, p.get("hidden_bias", library.zeros_like(weight)), p["output_weight"]], -1)
+        neurons = np.stack([weight, p.get("hidden_bias", np.zeros_like(weight)), p["output_weight"]], -1)
         pieces.append(neurons.reshape(*gamma.shape[:-1], -1))
-    return library.concatenate(pieces, -1)
+    return np.concatenate(pieces, -1)
 
 
 def recursion_of(settings: Any, yaw_rate_max: float) -> Recursion:
@@ -59,7 +57,7 @@ def recursion_of(settings: Any, yaw_rate_max: float) -> Recursion:
     for name, shape in shapes.items():
         views[name] = one[:, first : first + int(np.prod(shape))].reshape(-1, *shape)
         first += int(np.prod(shape))
-    slots = packed(np, views).reshape(len(one), -1).argmax(1)
+    slots = packed(views).reshape(len(one), -1).argmax(1)
     step, per_width = 1.0 / own.rate_hz, (own.n_local - 1) / yaw_rate_max
     return Recursion(loop, lambda number: (slots, own.n_local, own.n_hidden, own.window, number(step), number(per_width)))
 

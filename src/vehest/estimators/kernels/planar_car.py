@@ -6,7 +6,7 @@ fast for a few points as for many. The adjoint computes stages again instead of 
 core's own cache; matrix products stay on their thread.
 
 In the compiled code ``car`` is (layers, theta, constants, kind): weights and offsets of the three layers, then their weights transposed;
-learnt numbers in the order of `PHYSICAL` and `PACEJKA`; known ones; and which car. ``room`` is what a motion leaves for its adjoint
+learnt numbers in the order of `LEARNT` and `PACEJKA`; known ones; and which car. ``room`` is what a motion leaves for its adjoint
 (`_room`).
 """
 
@@ -64,15 +64,15 @@ class CompiledPlanarCar(PointModel):
             layers = [W1.mT, b1, W2.mT, b2, W3, b3]  # as their gradients are fastest
         else:
             layers = [torch.zeros(0, 0), torch.zeros(0)] * 3
-        physical = physical_of(dynamics)
-        tensors = [tensor.to(dtype) for tensor in (*layers, physical.values)]
+        learnt, known = physical_of(dynamics)
+        tensors = [tensor.to(dtype) for tensor in (*layers, learnt)]
         arrays = [tensor.detach().contiguous().numpy() for tensor in tensors]
         learning = any(tensor.requires_grad for tensor in tensors)
         self.parameters = tensors if learning else ()
         self.lower = lower
         scalar = arrays[0].dtype.type
         flat = 4.0 * np.finfo(scalar).eps
-        numbers = [physical.mass, physical.wheelbase, physical.wheel_radius, step, TURN, UNSCALED, STILL, flat, GRAVITY]
+        numbers = [*known, step, TURN, UNSCALED, STILL, flat, GRAVITY]
         matrices = tuple(np.ascontiguousarray(arrays[place].T) for place in (0, 2, 4))
         self.car = ((*arrays[:6], *matrices), arrays[6], np.array(numbers, scalar), _kind_of(dynamics))
         self.entries = (_transition, _observation, _transition_adjoint, _observation_adjoint)

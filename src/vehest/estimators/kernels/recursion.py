@@ -46,38 +46,22 @@ class Recursion(NamedTuple):
         return gradient
 
     def descend(
-        self,
-        flat: Floats,
-        moments: tuple[Floats, Floats, Floats],
-        steps: float,
-        series: Floats,
-        starts: NDArray[np.int64],
-        targets: Floats,
-        batch: int,
-        rate: float,
-        bounds: Floats,
-        averaging: float,
+        self, flat: Floats, series: Floats, starts: NDArray[np.int64], targets: Floats, batch: int, adam: tuple[Any, ...]
     ) -> Floats:
-        """Steps of Adam on mean squared errors, in place.
+        """Steps of Adam on mean squared errors, in place; returns sums of squared errors, (M,), float64.
 
         Args:
             flat: parameters, (M, K).
-            moments: averages of the gradient and of its square, and of the parameters, which is used with averaging alone.
-            steps: number of steps before these.
             series: measurements as the network takes them, (T, C).
             starts: first row of each window in the order of the batches, (M, B).
             targets: values to learn of each, (M, B).
             batch: windows in a batch.
-            rate: step size.
-            bounds: least and largest admissible value of each parameter, (2, K).
-            averaging: see `vehest.training.supervised_settings.SupervisedSettings`.
-
-        Returns:
-            Sums of squared errors, (M,), float64.
+            adam: averages of the gradient, of its square and of the parameters, (M, K) each, the last one used with averaging alone; least
+                and largest admissible values, (2, K); number of steps before these; step size; averaging, see
+                `vehest.training.supervised_settings.SupervisedSettings`.
         """
         losses = np.zeros(len(flat))
-        adam = (*moments, bounds, steps, rate, *DECAYS, EPSILON, averaging)
-        self._over(flat, series, starts, targets, batch, np.empty_like(flat), losses, adam)
+        self._over(flat, series, starts, targets, batch, np.empty_like(flat), losses, (*adam, *DECAYS, EPSILON))
         return losses
 
     def _over(
@@ -139,7 +123,7 @@ def step_of_adam(flat, gradient, adam, m, batches):  # type: ignore[no-untyped-d
 
     The average of the parameters is θ̄ₜ = (1 − a)/(1 − aᵗ)·Σᵢ aᵗ⁻ⁱ θᵢ over the steps i = 1 … t (Section 7.2).
     """
-    first, second, average, bounds, before, rate, decay, decay_of_squares, epsilon, averaging = adam
+    first, second, average, bounds, before, rate, averaging, decay, decay_of_squares, epsilon = adam
     number, t = flat.dtype.type, before + batches
     size, root = number(rate / (1 - decay**t)), number(np.sqrt(1 - decay_of_squares**t))
     for j in range(flat.size):

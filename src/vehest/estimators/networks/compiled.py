@@ -30,10 +30,10 @@ class CompiledNetwork(ABC):
     ) -> Tensor:
         """See `Recursion.descend`; ``moments`` are Adam's ``step``, ``exp_avg`` and ``exp_avg_sq`` as torch names them, and ``average``."""
         rate, bounds, averaging = rest
-        own = (moments["exp_avg"].numpy(), moments["exp_avg_sq"].numpy(), moments["average" if "average" in moments else "exp_avg"].numpy())
+        names = ("exp_avg", "exp_avg_sq", "average" if "average" in moments else "exp_avg")
+        adam = (*(moments[name].numpy() for name in names), bounds.numpy(), float(moments["step"]), float(rate), float(averaging))
         series, rows, wanted = (tensor.contiguous().numpy() for tensor in (prepared, starts, targets))
-        numbers = float(rate), bounds.numpy(), float(averaging)
-        losses = self.recursion().descend(flat.numpy(), own, float(moments["step"]), series, rows, wanted, batch, *numbers)
+        losses = self.recursion().descend(flat.numpy(), series, rows, wanted, batch, adam)
         moments["step"] += -(-starts.shape[1] // batch)
         return torch.from_numpy(losses)
 

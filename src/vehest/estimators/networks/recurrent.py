@@ -48,15 +48,12 @@ class RecurrentNetwork(CompiledNetwork, StandardisedNetwork):
     Args:
         settings: sizes.
 
-    Attributes:
-        n_gates: gates of the cell.
-
     Shapes:
         prepared windows: (..., N, C), standardised.
         returns: (...) lateral velocity [m/s] one step after the window.
     """
 
-    n_gates: ClassVar[int]
+    n_gates: ClassVar[int]  # of the cell
 
     def __init__(self, settings: Any) -> None:
         channels, states = len(RecurrentEstimator.channels), settings.n_states

@@ -36,14 +36,10 @@ STEEPEST = 1.5  # rad, beyond which sideslip angles of a network are clipped
 
 
 class SampleNetworkEstimator(Network):
-    """An estimator with a `SampleNetwork`.
-
-    Attributes:
-        network_inputs: measured channels that the network sees.
-    """
+    """An estimator with a `SampleNetwork`."""
 
     network: SampleNetwork
-    network_inputs: tuple[str, ...]
+    network_inputs: tuple[str, ...]  # measured channels that the network sees
     hidden: tuple[int, int] = setting((250, 125), "widths of the network's hidden layers")
     dropout: float = setting(0.2, "share of hidden values that are hidden in training", least=0.0, below=1.0)
     normalisation: Normalisation = setting("range", "range: inputs in [0, 1]; standard: a mean of 0 and a deviation of 1")

@@ -148,9 +148,7 @@ class RecurrentVelocityEstimator(HiddenStateEstimator):
         self._columns = np.array([self.channels.index(name) for name in self.inputs])
 
     def check(self) -> None:
-        """Raises:
-        ConfigurationError: inputs or outputs that repeat or are unknown, or a reference among the inputs.
-        """
+        """Raises `ConfigurationError`: inputs or outputs that repeat or are unknown, or a reference among the inputs."""
         for name in ("inputs", "outputs"):
             if len(set(getattr(self, name))) != len(getattr(self, name)) or not getattr(self, name):
                 raise ConfigurationError(f"estimator.{name} must be a list of different channels, not {getattr(self, name)!r}")
@@ -219,23 +217,14 @@ class RecurrentVelocityEstimator(HiddenStateEstimator):
 
 
 class _Batch(NamedTuple):
-    """Sequences side by side.
+    """Sequences side by side."""
 
-    Attributes:
-        starts: velocities to start from, (B, O).
-        inputs: measurements, (B, T, C).
-        targets: references, (B, T, O).
-        mask: of dropout, (B, T, H).
-        counted: which samples the loss is taken of, (B, T), 0 or 1; none: all but the dropped ones.
-        goes_on: whether the batch continues the one before, whose hidden state it starts from.
-    """
-
-    starts: Tensor
-    inputs: Tensor
-    targets: Tensor
-    mask: Tensor | None = None
-    counted: Tensor | None = None
-    goes_on: bool = False
+    starts: Tensor  # velocities to start from, (B, O)
+    inputs: Tensor  # measurements, (B, T, C)
+    targets: Tensor  # references, (B, T, O)
+    mask: Tensor | None = None  # of dropout, (B, T, H)
+    counted: Tensor | None = None  # which samples the loss is taken of, (B, T), 0 or 1; none: all but the dropped ones
+    goes_on: bool = False  # whether the batch continues the one before, whose hidden state it starts from
 
     def stretch(self, first: int, end: int) -> _Batch:
         """Its samples from ``first`` to ``end``."""
