@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from conftest import stop_after
 from dugoff_drive import NOISE, TYRES, dugoff_drive
 from vehest.data.errors import ConfigurationError, DataError, MissingError
 from vehest.estimators.base import FitData
@@ -157,8 +158,7 @@ def test_a_network_is_not_trained_behind_an_identification_that_was_stopped():
     estimator = CnnUkf.from_config({"inputs": "imu", "tyres": TYRES, "hidden": [4, 3]})
     before = {name: values.copy() for name, values in estimator.weights().items() if name.startswith("network.")}
     identification = IdentificationSettings(method="nelder_mead", grid=2, max_evaluations=3)
-    answers = iter([False])
-    context = FitContext(should_stop=lambda: next(answers, True))
+    context = FitContext(should_stop=stop_after(1))
     record = estimator.fit(FitData(drives, drives), EndToEndSettings(identification=identification), context)
     assert record.interrupted
     assert record.metrics == {"best_epoch": 0}

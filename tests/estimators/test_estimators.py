@@ -8,13 +8,12 @@ import numpy as np
 import pytest
 
 import vehest
-from conftest import planar_drive
+from conftest import flat_weights, planar_drive
 from every_estimator import drive_for, fitted
 from vehest.data.errors import ConfigurationError, DataError, MissingError
 from vehest.data.transforms import Resample
 from vehest.estimators.base import FitData
 from vehest.estimators.model_files import load_model, save_model
-from vehest.estimators.networks.windowed import WindowedEstimator
 from vehest.estimators.registry import estimator_class, estimator_names
 from vehest.run.config import compose_config
 from vehest.training.search import DirectSearchSettings
@@ -235,18 +234,15 @@ def drives():
     return [planar_drive(30.0, 20.0, seed=seed) for seed in (1, 2)]
 
 
-def weights(model):
-    assert isinstance(model, WindowedEstimator)
-    return np.concatenate([values.ravel() for values in model.weights().values()])
 
 
 def test_a_training_that_does_not_move_ends_where_it_started_and_other_settings_are_refused(drives):
     from vehest.run.estimate import pretrained_folder
 
     started = vehest.train("ksnn", drives[:1], drives[1:], [*OF_SHIPPED, *STANDING, f"training.start_from={pretrained_folder()}"])
-    assert weights(started) == pytest.approx(weights(vehest.load_model()), abs=1e-6)
+    assert flat_weights(started) == pytest.approx(flat_weights(vehest.load_model()), abs=1e-6)
     scratch = vehest.train("ksnn", drives[:1], drives[1:], [*OF_SHIPPED, *STANDING])
-    assert np.abs(weights(scratch) - weights(started)).max() > 0.01
+    assert np.abs(flat_weights(scratch) - flat_weights(started)).max() > 0.01
 
     with pytest.raises(ConfigurationError, match=r"training\.start_from: 'pretrained' is KS-NN .*'n_hidden': 2.*'n_hidden': 0"):
         vehest.train("ksnn", drives[:1], drives[1:], ["estimator.n_hidden=0", f"training.start_from={pretrained_folder()}"])

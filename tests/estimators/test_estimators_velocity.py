@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from conftest import planar_drive
+from conftest import flat_weights, planar_drive, stop_after
 from vehest.data.errors import ConfigurationError, DataError
 from vehest.data.recording import Recording
 from vehest.estimators.base import FitData
@@ -35,8 +35,6 @@ def _estimator(name, seed=0, **config):
     return estimator
 
 
-def _weights(estimator):
-    return np.concatenate([values.ravel() for values in estimator.weights().values()])
 
 
 def _drives(estimator, recordings):
@@ -76,7 +74,7 @@ def test_error_in_dropped_samples_teaches_nothing(name):
             patch.setattr(velocity_recurrent.VelocityNetwork, "standardise", lambda *_: None)
             estimator.fit(FitData([drive], DATA.validation), training)
         estimators.append(estimator)
-    assert np.array_equal(_weights(estimators[0]), _weights(estimators[1]))
+    assert np.array_equal(flat_weights(estimators[0]), flat_weights(estimators[1]))
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -86,20 +84,19 @@ def test_members_train_as_if_alone_and_seeds_differ(name):
     for seed, member in enumerate(together):
         alone = _estimator(name, seed)
         alone.fit(DATA, QUICK)
-        assert np.array_equal(_weights(alone), _weights(member))
-    assert not np.allclose(_weights(together[0]), _weights(together[1]))
+        assert np.array_equal(flat_weights(alone), flat_weights(member))
+    assert not np.allclose(flat_weights(together[0]), flat_weights(together[1]))
 
 
 def test_training_that_is_stopped_goes_on_to_the_same_weights_dropout_included(tmp_path):
     whole = _estimator("velocity_gru", dropout=0.3)
     record = whole.fit(DATA, QUICK)
-    questions = iter(range(100))
-    stopped = _estimator("velocity_gru", dropout=0.3).fit(DATA, QUICK, FitContext([tmp_path], should_stop=lambda: next(questions) > 3))
+    stopped = _estimator("velocity_gru", dropout=0.3).fit(DATA, QUICK, FitContext([tmp_path], should_stop=stop_after(4)))
     assert stopped.interrupted
     assert 0 < stopped.metrics["epochs"] < 3
     resumed = _estimator("velocity_gru", dropout=0.3)
     assert resumed.fit(DATA, QUICK, FitContext([tmp_path])).history == record.history
-    assert np.array_equal(_weights(whole), _weights(resumed))
+    assert np.array_equal(flat_weights(whole), flat_weights(resumed))
 
 
 def test_sequences_start_elsewhere_each_epoch_within_their_recordings_and_dropout_keeps_the_mean():

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import torch
 
+from single_track_drive import with_gaps
 from small_car_drive import small_car_drive
 from vehest.data.errors import ConfigurationError, DataError
 from vehest.data.recording import Recording
@@ -56,12 +57,6 @@ def drive(seed=3, seconds=6.0):
     return small_car_drive(seconds, seed).without_references()
 
 
-def with_gaps(recording, gaps):
-    channels = dict(recording.channels)
-    for name, samples in gaps.items():
-        channels[name] = channels[name].copy()
-        channels[name][samples] = np.nan
-    return Recording(recording.id, recording.vehicle, recording.rate_hz, recording.start_time, channels, "simulated", frozenset(gaps))
 
 
 def online(made, recording):
