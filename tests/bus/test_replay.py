@@ -10,9 +10,10 @@ import pytest
 
 import vehest
 from conftest import planar_drive
+from refusals import refusal
 from vehest.bus.mapping import from_dataset, from_names
 from vehest.bus.view import Figures, View, rows_of
-from vehest.data.errors import ConfigurationError, DataError, MissingError, VehestError
+from vehest.data.errors import ConfigurationError, DataError, VehestError
 from vehest.run.replay import replay_log
 
 can = pytest.importorskip("can", reason="python-can is not installed: pip install 'vehest[bus]'")
@@ -152,10 +153,7 @@ def test_signals_called_like_channels_need_no_map_and_a_data_set_says_the_same_a
 )
 def test_words_that_make_no_sense_are_one_line(tmp_path, words, said):
     written = write_log(drive(2.0), tmp_path)
-    with pytest.raises(VehestError, match=said) as caught:
-        replayed(written, **words)
-    assert "\n" not in str(caught.value)
-    assert isinstance(caught.value, ConfigurationError | DataError | MissingError)
+    assert said in refusal(lambda: replayed(written, **words), VehestError)
 
 
 def test_a_damaged_log_ends_a_replay_in_one_line_in_real_time_too_and_is_never_written_over(tmp_path):

@@ -8,6 +8,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from refusals import refusal
 from vehest.data.channels import CHANNELS, channel
 from vehest.data.errors import DataError
 from vehest.data.estimate import Estimate
@@ -82,10 +83,7 @@ def test_samples_are_copied_and_cannot_be_written_to():
 )
 def test_what_cannot_be_a_recording_is_refused(changes, what):
     arguments = {"id": "r", "vehicle": "car", "rate_hz": 10.0, "start_time": 0.0, "channels": {"ay": np.zeros(3)}}
-    with pytest.raises(DataError) as error:
-        Recording(**(arguments | changes))
-    assert what in str(error.value)
-    assert "\n" not in str(error.value)
+    assert what in refusal(lambda: Recording(**(arguments | changes)))
 
 
 def test_estimators_see_no_references():

@@ -8,6 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
+from refusals import refusal
 from vehest.data import transforms
 from vehest.data.derived import AccelerationFromSpeed, ScaleToWheelbase, SideslipFromVelocity, SpeedFromWheels, VelocityFromSideslip
 from vehest.data.errors import ConfigurationError, DataError, VehestError
@@ -218,10 +219,7 @@ def test_transforms_are_built_from_plain_values():
     ],
 )
 def test_a_misspelt_transform_is_refused_in_one_line(config, what):
-    with pytest.raises(ConfigurationError) as error:
-        transform_from_config(config)
-    assert what in str(error.value)
-    assert "\n" not in str(error.value)
+    assert what in refusal(lambda: transform_from_config(config), ConfigurationError)
 
 
 WHEELS = SpeedFromWheels(wheel_radius=0.48, track_front=2.1, track_rear=2.0)
@@ -355,11 +353,10 @@ def lap(rate_hz=100.0, n_samples=400):
 )
 def test_what_asks_for_too_much_is_refused_by_the_name_of_the_limit(config, limit):
     long = config.get("channels") == "long"
-    with pytest.raises(VehestError) as error:
-        transform_from_config({key: value for key, value in config.items() if value != "long"})(lap(n_samples=600 if long else 400))
-    assert f"limits.{limit}=NUMBER" in str(error.value)
-    assert "recording 'lap'" in str(error.value)
-    assert "\n" not in str(error.value)
+    changed = transform_from_config({key: value for key, value in config.items() if value != "long"})
+    message = refusal(lambda: changed(lap(n_samples=600 if long else 400)), VehestError)
+    assert f"limits.{limit}=NUMBER" in message
+    assert "recording 'lap'" in message
 
 
 def test_what_is_computed_in_pieces_or_through_spectra_is_the_whole(monkeypatch):

@@ -14,13 +14,6 @@ from vehest.run.config_files import GROUPS, choices
 from vehest.run.study import jobs_of, read_study
 
 
-@pytest.fixture
-def elsewhere(tmp_path, monkeypatch):
-    """An empty working folder."""
-    monkeypatch.chdir(tmp_path)
-    return tmp_path
-
-
 def test_estimator_chooses_its_training_and_the_user_may_choose_another(elsewhere):
     assert compose_config("train", ["estimator=luenberger"])["training"]["name"] == "nelder_mead"
     assert compose_config("train", ["estimator=gru"])["training"]["name"] == "supervised"
