@@ -7,7 +7,6 @@ import shlex
 from dataclasses import dataclass, fields
 from pathlib import Path
 
-import click
 import make_reference
 import numpy as np
 import pytest
@@ -173,23 +172,38 @@ def command_lines(file):
 
 def taken_apart(line):
     """Command, arguments and overrides; none where only a command is named. Unknown commands and options fail."""
-    words, path = shlex.split(line, comments=True)[1:], []
+    words = shlex.split(line, comments=True)[1:]
     command = typer.main.get_command(app)
-    while hasattr(command, "commands") and words and not words[0].startswith("-"):
+    options = {option: parameter for parameter in command.params for option in parameter.opts}
+    if words[0].startswith("-"):
+        assert words[0] in {*options, "-h", "--help"}, f"vehest has no option {words[0]}"
+        return None
+    path = []
+    while hasattr(command, "commands"):
+        if not words:
+            return None
         assert words[0] in command.commands, f"vehest has no command {words[0]}"
         path.append(words[0])
         command, words = command.commands[path[-1]], words[1:]
-    values, rest, _ = command.make_parser(click.Context(command)).parse_args(words)
-    assert not rest, f"vehest {' '.join(path)} takes no overrides"
-    named = [(parameter, values[parameter.name]) for parameter in command.params if parameter.param_type_name == "argument"]
-    positional = [word for _, own in named if own for word in ([own] if isinstance(own, str) else own)]
-    if hasattr(command, "commands") or not positional:
+    options = {option: parameter for parameter in command.params for option in parameter.opts if parameter.param_type_name == "option"}
+    fixed = [parameter for parameter in command.params if parameter.param_type_name == "argument" and parameter.nargs == 1]
+    positional = []
+    waiting = iter(words)
+    for word in waiting:
+        if word.startswith("-") and word != "-":
+            assert word in {*options, "-h", "--help"}, f"vehest {' '.join(path)} has no option {word}"
+            if word in options and not options[word].is_flag:
+                next(waiting, None)
+        else:
+            positional.append(word)
+    if not positional:
         return None
-    fixed = [parameter for parameter, _ in named if parameter.nargs == 1]
     needed = [parameter for parameter in fixed if parameter.required]
     assert len(positional) >= len(needed), f"vehest {' '.join(path)} needs {', '.join(parameter.name for parameter in needed)}"
     if len(positional) > len(needed) and any("=" in word for word in positional[len(needed) : len(fixed)]):
         fixed = needed  # what may be left out is left out
+    takes_overrides = any(parameter.name == "overrides" or parameter.nargs == -1 for parameter in command.params)
+    assert takes_overrides or len(needed) <= len(positional) <= len(fixed), f"vehest {' '.join(path)} takes no overrides"
     return Given(tuple(path), positional[: len(fixed)], positional[len(fixed) :])
 
 
@@ -245,7 +259,7 @@ def test_make_targets_exist():
 def test_command_lines_are_found_and_wrong_ones_would_be_noticed():
     assert len(of_pages(command_lines)) > 60
     for line in ("vehest trian", "vehest train --fast", "vehest doctor now", "vehest data look", "vehest --quick"):
-        with pytest.raises((AssertionError, click.UsageError)):
+        with pytest.raises(AssertionError):
             taken_apart(line)
 
 

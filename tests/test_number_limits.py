@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from every_estimator import drive_for, fitted
+from refusals import refusal
 from vehest.data.errors import ConfigurationError, DataError
 from vehest.data.recording import Recording
 from vehest.estimators.luenberger import Luenberger
@@ -46,8 +47,7 @@ def test_two_rows_a_minute_apart_are_no_drive():
 def test_a_damaged_calibration_names_its_file(tmp_path):
     text = (Path(read_trust.__code__.co_filename).parents[1] / "pretrained" / "trust.yaml").read_text(encoding="utf-8")
     (tmp_path / "trust.yaml").write_text(text.replace("yaw_rate", "foreign"), encoding="utf-8")
-    with pytest.raises(DataError, match=r"trust\.yaml'"):
-        read_trust(tmp_path)
+    assert "trust.yaml'" in refusal(lambda: read_trust(tmp_path))
 
 
 def test_tables_to_download_start_no_formula():

@@ -291,12 +291,9 @@ def test_gaps_short_recordings_and_slow_ones_are_refused():
     gap = recording["ax"].copy()
     gap[100] = np.nan
     holed = replace(recording, channels={**recording.channels, "ax": gap}, gappy=frozenset({"ax"}))
-    with pytest.raises(DataError, match="'ax' has gaps"):
-        align(holed, COVERED)
-    with pytest.raises(DataError, match="needs at least"):
-        align(recording.cut(0.0, 15.0), COVERED)
-    with pytest.raises(ConfigurationError, match=r"too high for 50 Hz; use at most"):
-        align(recording, replace(COVERED, cutoff_hz=10.0))
+    assert "'ax' has gaps" in refusal(lambda: align(holed, COVERED))
+    assert "needs at least" in refusal(lambda: align(recording.cut(0.0, 15.0), COVERED))
+    assert "too high for 50 Hz; use at most" in refusal(lambda: align(recording, replace(COVERED, cutoff_hz=10.0)), ConfigurationError)
 
 
 @pytest.mark.parametrize(
@@ -367,10 +364,8 @@ def test_steering_without_calm_driving_without_a_channel_or_without_relation_is_
     settings = AlignmentSettings(("steering_ratio",), wheelbase=WHEELBASE)
     with pytest.raises(DataError, match=r"only .* s are above 40 m/s"):
         align(road, replace(settings, min_speed=40.0))
-    with pytest.raises(DataError, match="no channel 'steer'"):
-        align(road.select(["vx", "yaw_rate", "ay"]), settings)
-    with pytest.raises(DataError, match="no channel 'roll'"):
-        align(road, replace(settings, steering_channel="roll"))
+    assert "no channel 'steer'" in refusal(lambda: align(road.select(["vx", "yaw_rate", "ay"]), settings))
+    assert "no channel 'roll'" in refusal(lambda: align(road, replace(settings, steering_channel="roll")))
     noise = np.random.default_rng(0).standard_normal(len(road))
     with pytest.raises(DataError, match="does not follow the curvature"):
         align(replace(road, channels={**road.channels, "handwheel": noise}), settings)
@@ -406,13 +401,10 @@ def test_delay_correction_cuts_what_it_cannot_reach_and_keeps_clock_and_constant
     assert corrected.start_time == pytest.approx(recording.start_time + 0.12)  # 16 samples of reach less the 4 that the delay gives
     assert corrected.end_time == pytest.approx(recording.end_time - 0.20)
     np.testing.assert_array_equal(DelayCorrection(0.0)(recording)["ay"], recording["ay"])
-    with pytest.raises(DataError, match="too short to be shifted by 20 s"):
-        DelayCorrection(20.0)(recording)
-    with pytest.raises(DataError, match="no channel 'ax'"):
-        DelayCorrection(0.01, ("ax",))(recording)
+    assert "too short to be shifted by 20 s" in refusal(lambda: DelayCorrection(20.0)(recording))
+    assert "no channel 'ax'" in refusal(lambda: DelayCorrection(0.01, ("ax",))(recording))
     holed = Recording("gap", "car", 100.0, 0.0, {"ay": np.array([0.0, np.nan] * 50)}, gappy=frozenset({"ay"}))
-    with pytest.raises(DataError, match="has gaps"):
-        DelayCorrection(0.013)(holed)
+    assert "has gaps" in refusal(lambda: DelayCorrection(0.013)(holed))
     recording = Recording("flat", "car", 100.0, 0.0, {"ay": np.full(100, 9.81)})
     np.testing.assert_allclose(DelayCorrection(0.0137)(recording)["ay"], 9.81, rtol=1e-14)
 
@@ -422,8 +414,7 @@ def test_offsets_ratios_and_curves_are_applied_exactly_and_gaps_stay_gaps():
     corrected = OffsetCorrection({"ax": 0.25, "ay": -1.0})(recording)
     np.testing.assert_array_equal(corrected["ax"], [0.75, np.nan])
     np.testing.assert_array_equal(corrected["ay"], [2.0, 3.0])
-    with pytest.raises(DataError, match="no channel 'yaw_rate'"):
-        OffsetCorrection({"yaw_rate": 0.1})(recording)
+    assert "no channel 'yaw_rate'" in refusal(lambda: OffsetCorrection({"yaw_rate": 0.1})(recording))
     recording = Recording(
         "lap", "car", 10.0, 0.0, {"handwheel": np.array([1.6, np.nan]), "steer": np.zeros(2)}, gappy=frozenset({"handwheel"})
     )
@@ -431,8 +422,7 @@ def test_offsets_ratios_and_curves_are_applied_exactly_and_gaps_stay_gaps():
     np.testing.assert_allclose(corrected["steer"], [0.1, np.nan])
     assert corrected.gappy == {"handwheel", "steer"}
     np.testing.assert_array_equal(SteeringRatio(-1.0, 0.1, "steer")(recording)["steer"], [0.1, 0.1])
-    with pytest.raises(DataError, match="no channel 'roll'"):
-        SteeringRatio(15.0, channel="roll")(recording)
+    assert "no channel 'roll'" in refusal(lambda: SteeringRatio(15.0, channel="roll")(recording))
     recording = Recording("a", "car", 100.0, 0.0, {"steer": np.array([-2.0, -0.5, 0.0, 0.5, 2.0])})
     curve = SteeringCurve((-1.0, 0.0, 1.0), (-0.4, 0.0, 0.3))
     np.testing.assert_allclose(curve(recording)["steer"], [-0.4, -0.2, 0.0, 0.15, 0.3])

@@ -66,8 +66,6 @@ def assert_same_recording(read, written):
     assert dict(read.provenance) == dict(written.provenance)
 
 
-
-
 @PROPERTY
 @given(recordings())
 def test_a_recording_comes_back_bit_for_bit_with_all_it_says_about_itself(recording):

@@ -10,6 +10,7 @@ import pytest
 import vehest
 from conftest import flat_weights, planar_drive
 from every_estimator import drive_for, fitted
+from refusals import refusal
 from vehest.data.errors import ConfigurationError, DataError, MissingError
 from vehest.data.transforms import Resample
 from vehest.estimators.base import FitData
@@ -88,25 +89,20 @@ def test_model_read_back_estimates_the_same(tmp_path, name):
 
 @pytest.mark.parametrize("size", [0, 40, -8])
 def test_truncated_weights_are_one_clear_error(tmp_path, size):
-    with pytest.raises(MissingError, match="holds no model"):
-        load_model(tmp_path)
+    assert "holds no model" in refusal(lambda: load_model(tmp_path), MissingError)
     save_model(known("ksnn", "float64"), tmp_path)
     weights = tmp_path / "model.safetensors"
     weights.write_bytes(weights.read_bytes()[:size])
-    with pytest.raises(DataError, match="truncated or damaged"):
-        load_model(tmp_path)
+    assert "truncated or damaged" in refusal(lambda: load_model(tmp_path))
 
 
 def test_estimator_refuses_wrong_rate_missing_channel_and_gaps(drive):
     estimator = known("ksnn", "float64")
-    with pytest.raises(DataError, match="works at 20 Hz; resample it first"):
-        estimator.estimate([Resample(10).__call__(drive)])
-    with pytest.raises(DataError, match="no channel 'ax'"):
-        estimator.estimate([drive.select(["vx", "yaw_rate", "ay"])])
+    assert "works at 20 Hz; resample it first" in refusal(lambda: estimator.estimate([Resample(10).__call__(drive)]))
+    assert "no channel 'ax'" in refusal(lambda: estimator.estimate([drive.select(["vx", "yaw_rate", "ay"])]))
     gaps = {**drive.channels, "ay": np.where(np.arange(len(drive)) == 7, np.nan, drive["ay"])}
     gappy = type(drive)(drive.id, drive.vehicle, drive.rate_hz, 0.0, gaps, "simulated", frozenset({"ay"}))
-    with pytest.raises(DataError, match="has gaps"):
-        estimator.estimate([gappy])
+    assert "has gaps" in refusal(lambda: estimator.estimate([gappy]))
 
 
 def test_a_model_of_another_version_is_refused_and_one_without_loads(tmp_path, monkeypatch):
@@ -131,8 +127,7 @@ def test_a_number_that_is_given_is_not_fitted(drive):
 
 
 def test_recordings_start_from_their_own_states_or_all_from_one_and_forget_them(monkeypatch, drive):
-    with pytest.raises(ConfigurationError, match="no state to start from"):
-        known("ksnn", "float64").estimate([drive], {"vy": 1.0})
+    assert "no state to start from" in refusal(lambda: known("ksnn", "float64").estimate([drive], {"vy": 1.0}), ConfigurationError)
     estimator = fitted("luenberger")
     estimator.threshold, drive = 0.0, drive_for(estimator)
     free = estimator.estimate([drive])[0]["vy"]
@@ -146,8 +141,7 @@ def test_recordings_start_from_their_own_states_or_all_from_one_and_forget_them(
         assert np.array_equal(own["vy"], estimator.estimate([drive], state)[0]["vy"])
     one = estimator.estimate([drive, drive], states[0])
     assert np.array_equal(one[0]["vy"], one[1]["vy"])
-    with pytest.raises(DataError, match="2 initial states for 1 recordings"):
-        estimator.estimate([drive], states)
+    assert "2 initial states for 1 recordings" in refusal(lambda: estimator.estimate([drive], states))
     monkeypatch.setattr(type(estimator), "ignores_initial_state", True)
     assert np.array_equal(estimator.estimate([drive], states[0])[0]["vy"], estimator.estimate([drive])[0]["vy"])
 
@@ -155,8 +149,7 @@ def test_recordings_start_from_their_own_states_or_all_from_one_and_forget_them(
 def test_registry_refuses_names_that_it_does_not_know():
     with pytest.raises(ConfigurationError, match=f"is not one of: {', '.join(sorted(estimator_names()))}"):
         estimator_class("kalman_filter_from_the_future")
-    with pytest.raises(ConfigurationError, match="'windowed' is not one of"):
-        estimator_class("windowed")
+    assert "'windowed' is not one of" in refusal(lambda: estimator_class("windowed"), ConfigurationError)
 
 
 @pytest.mark.parametrize(
@@ -232,8 +225,6 @@ STANDING = ["training.max_epochs=1", "training.learning_rate=1e-12"]
 @pytest.fixture(scope="module")
 def drives():
     return [planar_drive(30.0, 20.0, seed=seed) for seed in (1, 2)]
-
-
 
 
 def test_a_training_that_does_not_move_ends_where_it_started_and_other_settings_are_refused(drives):

@@ -5,6 +5,7 @@ import pytest
 import torch
 
 from conftest import flat_weights, planar_drive, stop_after
+from refusals import refusal
 from vehest.data.errors import ConfigurationError, DataError
 from vehest.data.recording import Recording
 from vehest.estimators.base import FitData
@@ -33,8 +34,6 @@ def _estimator(name, seed=0, **config):
     estimator = estimator_class(name).from_config({"inputs": INPUTS, "n_states": 6} | config)
     estimator.seed(seed)
     return estimator
-
-
 
 
 def _drives(estimator, recordings):
@@ -236,5 +235,4 @@ def test_recordings_too_short_or_with_gaps_are_one_clear_error():
     drive = _drive()
     holes = {**drive.channels, "vy_ref": np.where(np.arange(250) == 7, np.nan, drive["vy_ref"])}
     gappy = Recording(drive.id, drive.vehicle, 100.0, 0.0, holes, "simulated", frozenset({"vy_ref"}))
-    with pytest.raises(DataError, match="'vy_ref' has gaps"):
-        _estimator("velocity_gru").fit(FitData([gappy], DATA.validation), QUICK)
+    assert "'vy_ref' has gaps" in refusal(lambda: _estimator("velocity_gru").fit(FitData([gappy], DATA.validation), QUICK))

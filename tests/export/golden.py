@@ -103,7 +103,5 @@ def _alike(own, other):
     return bool(np.allclose(*numbers, rtol=1e-9, atol=1e-12))
 
 
-
-
 if __name__ == "__main__":
     write(sources(), FOLDER)

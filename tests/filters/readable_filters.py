@@ -40,7 +40,7 @@ def symmetric(matrix):
 def factorised(covariance):
     """A covariance, its Cholesky factor L, and whether it was lifted first since it was not positive definite.
 
-    Lifting adds the same to every eigenvalue, as much as is needed for a margin of `MARGIN`; what is added counts as a constant in gradients.
+    Lifting adds the same to every eigenvalue, as much as a margin of `MARGIN` needs; what is added counts as a constant in gradients.
     """
     factor, lost = torch.linalg.cholesky_ex(covariance)
     if not lost:
@@ -121,7 +121,7 @@ def filtered_of(rows):
 
 
 def _updated(model, state, factor, y, u, rule):
-    """The state given a measurement, of which NaN is skipped; innovation, its covariance, what was measured, and whether it was repaired."""
+    """The state given a measurement, of which NaN is skipped; innovation, its covariance, what was measured, whether it was repaired."""
     drawn = model.possible(sigma_points(rule, state.mean, factor))
     expected = model.observation(drawn, u[None])
     mean, measured = mean_of(rule, expected), ~torch.isnan(y)

@@ -5,9 +5,9 @@ from itertools import chain
 from pathlib import Path
 
 import pytest
-from refusals import refusal
 
 from place import run_vehest
+from refusals import refusal
 from vehest.data.errors import ConfigurationError, MissingError
 from vehest.run.config import compose_config, expand
 from vehest.run.config_files import GROUPS, choices
@@ -100,8 +100,7 @@ def test_pipeline_overrides_reach_the_sweeps_that_have_the_key(elsewhere):
     assert rates == {**fitted_otherwise, "ksnn": 0.01, "gru": 0.01, "lstm": 0.01}
     seeds = [job.config["seed"] for job in jobs_of(read_study("quickstart"), ["seed=7"])[""]]
     assert set(seeds) == {7}
-    with pytest.raises(ConfigurationError, match=r"suits no sweep"):
-        jobs_of(read_study("quickstart"), ["training.momentum=0.9"])
+    assert "suits no sweep" in refusal(lambda: jobs_of(read_study("quickstart"), ["training.momentum=0.9"]), ConfigurationError)
 
 
 @pytest.mark.parametrize(

@@ -11,7 +11,6 @@ import yaml
 from test_self_calibrating import RATE, drive
 
 from refusals import refusal
-from vehest.data.errors import DataError
 from vehest.data.recording import Recording
 from vehest.estimators.model_files import load_model
 from vehest.run.car_record import LIMITS, Number, calibrated, read_car, with_settings

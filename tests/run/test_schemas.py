@@ -14,10 +14,10 @@ import torch
 import yaml
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from refusals import refusal
 from safetensors.numpy import load_file, save_file
 from safetensors.torch import save_file as save_tensors
 
+from refusals import refusal
 from vehest.data.errors import ConfigurationError, MissingError, VehestError
 from vehest.data.estimate import Estimate
 from vehest.data.recording import Recording
@@ -398,8 +398,7 @@ def test_whole_numbers_stay_what_they_are_where_anything_may_stand():
     "override", ["hydra.searchpath=[pkg://antigravity]", "++hydra.searchpath=[pkg://antigravity]", "+hydra/launcher=evil"]
 )
 def test_no_override_reaches_hydra_itself(override):
-    with pytest.raises(ConfigurationError, match="is an option of Hydra itself"):
-        compose_config("train", [override])
+    assert "is an option of Hydra itself" in refusal(lambda: compose_config("train", [override]), ConfigurationError)
     assert "antigravity" not in sys.modules
 
 

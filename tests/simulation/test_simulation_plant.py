@@ -15,6 +15,7 @@ from scipy.integrate import solve_ivp
 from vehiclemodels.init_mb import init_mb
 from vehiclemodels.vehicle_dynamics_mb import vehicle_dynamics_mb
 
+from refusals import refusal
 from vehest.constants import GRAVITY
 from vehest.data.errors import ConfigurationError
 from vehest.simulation.errors import SimulationError
@@ -343,10 +344,8 @@ def test_states_and_starts_that_make_no_sense_are_errors_and_the_published_bmw_r
     state.values[VY] = np.nan
     with pytest.raises(SimulationError):
         plant.advance(state, inputs_of(), 1)
-    with pytest.raises(ConfigurationError, match="step"):
-        MultiBodyPlant(LOWERED, step=0.0)
-    with pytest.raises(ConfigurationError, match="-1"):
-        MultiBodyPlant(LOWERED).initial_state(0.0, 0.0, 0.0, -1.0)
+    assert "step" in refusal(lambda: MultiBodyPlant(LOWERED, step=0.0), ConfigurationError)
+    assert "-1" in refusal(lambda: MultiBodyPlant(LOWERED).initial_state(0.0, 0.0, 0.0, -1.0), ConfigurationError)
 
 
 def test_lifted_wheel_carries_nothing_and_does_not_outrun_the_engine():

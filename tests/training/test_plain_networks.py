@@ -96,8 +96,6 @@ def fit(network, seeds, context=None, **training):
     return members, type(members[0]).fit_members(members, DATA, settings, context or FitContext())
 
 
-
-
 @pytest.mark.parametrize("name", NETWORKS)
 def test_members_equal_training_each_alone(name):
     together, records = fit(NETWORKS[name], [0, 1, 2], max_epochs=12, patience=2)

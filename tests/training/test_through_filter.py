@@ -32,8 +32,6 @@ def estimator(seed=0, **config):
     return made
 
 
-
-
 def drives(made, steps=40):
     """Sequences, and the filter made ready for them."""
     parts = [made.drive(recording, torch.float64) for recording in DATA.train]

@@ -37,8 +37,6 @@ def _fit(name, config, seeds, settings, context=None, data=DATA):
     return members, records
 
 
-
-
 @pytest.mark.parametrize(("name", "config"), SHAPES)
 def test_members_equal_training_each_alone_over_the_whole_training_in_float64(name, config):
     settings = SupervisedSettings(dtype="float64", max_epochs=30, patience=3, learning_rate=1e-2)
@@ -61,8 +59,6 @@ def test_early_stopping_keeps_the_best_weights_on_validation():
     windows = windows_of(DATA.validation, member.channels, "vy_ref", member.settings.window)
     error = member._predict(windows.series, windows.starts) - windows.targets
     assert np.mean(error**2) == pytest.approx(losses[best], rel=1e-9)
-
-
 
 
 @pytest.mark.parametrize(("name", "config"), SHAPES)

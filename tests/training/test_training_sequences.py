@@ -7,6 +7,7 @@ import torch
 from torch import nn
 
 from conftest import die_after, stop_after
+from refusals import refusal
 from vehest.data.errors import ConfigurationError, DataError
 from vehest.data.schema import settings_from_config
 from vehest.training.adam import Adam
@@ -42,8 +43,6 @@ def _two_phases(network):
     """The read-out first, then all together from a wrapper that shares its parameters."""
     first = _phase(network, "read-out", lambda name: name.startswith("2."), max_epochs=7, validate_every=2)
     return [first, _phase(nn.ModuleDict({"inner": network})["inner"], "all", patience=6, schedule="cosine")]
-
-
 
 
 def _flat(network):
@@ -241,8 +240,7 @@ def test_stop_leaves_the_best_so_far_and_says_so(tmp_path):
 
 def test_phases_that_make_no_sense_are_refused():
     network = _network()
-    with pytest.raises(ConfigurationError, match="different names"):
-        train_phases([_phase(network), _phase(network)], 0, FitContext())
+    assert "different names" in refusal(lambda: train_phases([_phase(network), _phase(network)], 0, FitContext()), ConfigurationError)
     with pytest.raises(ConfigurationError, match="no parameters to learn"):
         train_phases([_phase(network, trainable=lambda name: False)], 0, FitContext())
     for settings in ({"learning_rate": 0.0}, {"validate_every": 0}, {"clip": -1.0}, {"schedule": "linear"}):
