@@ -4,9 +4,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from refusals import refusal
 
 from every_estimator import drive_for, fitted
-from refusals import refusal
 from vehest.data.errors import ConfigurationError, DataError
 from vehest.data.recording import Recording
 from vehest.estimators.luenberger import Luenberger

@@ -11,12 +11,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 import yaml
+from refusals import refusal
 from scipy.interpolate import CubicSpline
 from scipy.signal import lfilter
 
 from place import run_vehest
 from real_drives import real_drive
-from refusals import refusal
 from vehest.alignment.align import align
 from vehest.alignment.imu import smoothing_of
 from vehest.alignment.settings import QUANTITIES, AlignmentSettings

@@ -4,8 +4,8 @@ import math
 
 import numpy as np
 import pytest
-
 from refusals import refusal
+
 from vehest.data.errors import ConfigurationError
 from vehest.trust.health import NO_ESTIMATE, reason_in_words
 

@@ -7,10 +7,10 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import pytest
+from refusals import refusal
 
 import vehest
 from conftest import planar_drive
-from refusals import refusal
 from vehest.bus.mapping import from_dataset, from_names
 from vehest.bus.view import Figures, View, rows_of
 from vehest.data.errors import ConfigurationError, DataError, VehestError

@@ -2,8 +2,8 @@
 
 import numpy as np
 import pytest
-
 from refusals import refusal
+
 from vehest.bus.sampling import Sampler, Timing, timing_of
 from vehest.data.errors import ConfigurationError
 

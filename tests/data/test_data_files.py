@@ -7,8 +7,8 @@ import sys
 from pathlib import Path
 
 import pytest
-
 from refusals import refusal
+
 from vehest.data.errors import MissingError
 from vehest.data.files import ASIDE_PREFIX, remove_leftovers, sha256_of, written_aside
 

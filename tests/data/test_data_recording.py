@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-
 from refusals import refusal
+
 from vehest.data.channels import CHANNELS, channel
 from vehest.data.errors import DataError
 from vehest.data.estimate import Estimate

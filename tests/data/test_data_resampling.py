@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from refusals import refusal
 from scipy import signal
 
-from refusals import refusal
 from vehest.data.errors import ConfigurationError, DataError
 from vehest.data.recording import Recording
 from vehest.data.transforms import Resample, windowed_sinc

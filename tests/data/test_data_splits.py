@@ -10,8 +10,8 @@ import pytest
 import yaml
 from hypothesis import given, settings
 from hypothesis import strategies as st
-
 from refusals import refusal as one_line
+
 from vehest.data.errors import ConfigurationError, DataError
 from vehest.data.laps import laps_of
 from vehest.data.recording import Recording

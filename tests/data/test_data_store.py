@@ -12,8 +12,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
-
 from refusals import refusal
+
 from vehest.data.channels import CHANNELS
 from vehest.data.errors import MissingError
 from vehest.data.estimate import QUANTITIES, Estimate

@@ -7,8 +7,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
-
 from refusals import refusal
+
 from vehest.data import transforms
 from vehest.data.derived import AccelerationFromSpeed, ScaleToWheelbase, SideslipFromVelocity, SpeedFromWheels, VelocityFromSideslip
 from vehest.data.errors import ConfigurationError, DataError, VehestError

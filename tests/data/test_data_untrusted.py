@@ -11,8 +11,8 @@ from typing import Annotated
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-
 from refusals import refusal
+
 from vehest.data.errors import ConfigurationError, DataError, MissingError, printable
 from vehest.data.files import file_name, regular_file
 from vehest.data.limits import Limits, check_limit, check_unpacked, current_limits, limits_from_config, use_limits

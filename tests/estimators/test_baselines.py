@@ -4,10 +4,10 @@ import itertools
 
 import numpy as np
 import pytest
+from refusals import refusal
 from scipy.integrate import solve_ivp
 
 from conftest import planar_drive
-from refusals import refusal
 from vehest.data.errors import ConfigurationError, DataError
 from vehest.data.recording import Recording
 from vehest.estimators.base import FitData

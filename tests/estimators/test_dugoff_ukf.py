@@ -5,10 +5,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from refusals import refusal
 
 from conftest import stop_after
 from dugoff_drive import NOISE, TYRES, dugoff_drive
-from refusals import refusal
 from vehest.data.errors import ConfigurationError, DataError, MissingError
 from vehest.estimators.base import FitData
 from vehest.estimators.cnn_ukf import CnnUkf, EndToEndSettings

@@ -6,11 +6,11 @@ from functools import cache
 
 import numpy as np
 import pytest
+from refusals import refusal
 
 import vehest
 from conftest import flat_weights, planar_drive
 from every_estimator import drive_for, fitted
-from refusals import refusal
 from vehest.data.errors import ConfigurationError, DataError, MissingError
 from vehest.data.transforms import Resample
 from vehest.estimators.base import FitData

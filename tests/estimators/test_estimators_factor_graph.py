@@ -4,10 +4,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from refusals import refusal
 from scipy import sparse
 from scipy.sparse.linalg import spsolve
 
-from refusals import refusal
 from single_track_drive import linear_drive, with_gaps
 from vehest.data.errors import ConfigurationError
 from vehest.estimators.base import FitData

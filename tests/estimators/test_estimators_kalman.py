@@ -4,8 +4,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-
 from refusals import refusal
+
 from single_track_drive import NOISE, linear_drive, with_gaps
 from vehest.data.errors import ConfigurationError, DataError
 from vehest.estimators.base import FitData

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 import torch
 from readable_filters import extended_filter, rational_model
+from refusals import refusal
 
 from rational_drive import CURVES, NOISE, changed, rational_drive
-from refusals import refusal
 from vehest.data.errors import ConfigurationError
 from vehest.estimators.base import FitData
 from vehest.estimators.model_files import load_model, save_model

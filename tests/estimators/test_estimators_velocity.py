@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 import torch
+from refusals import refusal
 
 from conftest import flat_weights, planar_drive, stop_after
-from refusals import refusal
 from vehest.data.errors import ConfigurationError, DataError
 from vehest.data.recording import Recording
 from vehest.estimators.base import FitData

@@ -8,11 +8,11 @@ from itertools import product
 import numpy as np
 import pytest
 import torch
+from refusals import refusal
 
 from dugoff_drive import TYRES, dugoff_drive
 from every_estimator import fitted
 from rational_drive import CURVES, rational_drive
-from refusals import refusal
 from single_track_drive import NOISE, linear_drive
 from small_car_drive import small_car_drive
 from vehest.data.errors import ConfigurationError, DataError

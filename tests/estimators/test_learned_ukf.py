@@ -5,8 +5,8 @@ from functools import cache
 import numpy as np
 import pytest
 import torch
-
 from refusals import refusal
+
 from single_track_drive import with_gaps
 from small_car_drive import small_car_drive
 from vehest.data.errors import ConfigurationError, DataError

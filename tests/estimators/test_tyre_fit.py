@@ -5,8 +5,8 @@ from functools import cache
 
 import numpy as np
 import pytest
-
 from refusals import refusal
+
 from vehest.data.errors import DataError
 from vehest.data.recording import Recording
 from vehest.estimators.filtering.tyre_fit import KNOWN_C1, axle_force, axle_motion, fit_motion

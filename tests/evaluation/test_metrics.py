@@ -5,10 +5,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from refusals import refusal
 from scipy import optimize
 
 from conftest import planar_drive
-from refusals import refusal
 from vehest.data.estimate import Estimate
 from vehest.data.recording import Recording
 from vehest.data.splits import Span

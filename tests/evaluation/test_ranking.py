@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 from arch.bootstrap import optimal_block_length
+from refusals import refusal
 from scipy import signal
 
-from refusals import refusal
 from vehest.evaluation.blocks import (
     COLUMNS,
     _length,

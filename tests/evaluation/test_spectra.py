@@ -4,9 +4,9 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from refusals import refusal
 
 from conftest import planar_drive
-from refusals import refusal
 from vehest_papers.kit.spectra import decibels, lateral_velocity_rate, mean_bias, periodogram, process_noise
 
 RATE = 20.0

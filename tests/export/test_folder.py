@@ -7,9 +7,9 @@ from dataclasses import replace
 
 import pytest
 from exports import command, model, tool, trust
+from refusals import refusal
 
 from every_estimator import fitted
-from refusals import refusal
 from vehest.data.errors import ConfigurationError
 from vehest.estimators.model_files import save_model
 from vehest.export.folder import FILES, export_model

@@ -10,12 +10,12 @@ import numpy as np
 import pytest
 import torch
 from c_build import COMPILERS, OUTPUTS, built
+from refusals import refusal
 
 from dugoff_drive import TYRES, driven
 from every_estimator import drive_for, fitted
 from example_package import forget_examples, install_examples
 from real_drives import real_drive
-from refusals import refusal
 from vehest.data.errors import ConfigurationError, DataError
 from vehest.data.transforms import Resample
 from vehest.estimators.base import Estimator, FitData

@@ -5,11 +5,11 @@ import math
 import numpy as np
 import pytest
 import torch
+from refusals import refusal
 from scipy import signal
 from trained_ksnn import ksnn_with_weights
 
 from conftest import planar_drive
-from refusals import refusal
 from vehest.data.errors import DataError
 from vehest.estimators.kernels.luenberger import observe
 from vehest.estimators.luenberger import Luenberger

@@ -5,11 +5,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from refusals import refusal
 from study_parts import metric_rows, part_of
 
 from conftest import planar_drive
 from place import undrawn
-from refusals import refusal
 from vehest.data.errors import DataError
 from vehest.data.estimate import Estimate
 from vehest.data.splits import Span, Split

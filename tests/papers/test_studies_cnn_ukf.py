@@ -9,12 +9,12 @@ import numpy as np
 import pandas as pd
 import pytest
 import yaml
+from refusals import refusal
 from study_parts import metric_rows, part_of, stored
 from test_network_ukf import LEVELS, TRAININGS, estimator_of
 from test_sample_network import loaded_drive
 
 from dugoff_drive import TYRES
-from refusals import refusal
 from vehest.data.errors import DataError
 from vehest.data.splits import Span, Split
 from vehest.data.store import write_estimate

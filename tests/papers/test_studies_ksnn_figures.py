@@ -7,10 +7,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from refusals import refusal
 from trained_ksnn import ksnn_with_weights
 
 from conftest import planar_drive
-from refusals import refusal
 from vehest.data.errors import ConfigurationError
 from vehest.data.recording import Recording
 from vehest.estimators.lstm import Lstm

@@ -5,9 +5,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from refusals import refusal
 from study_parts import metric_rows, part_of
 
-from refusals import refusal
 from vehest.data.splits import Span, Split
 from vehest.evaluation.metrics import Protocol
 from vehest.studies.artefacts import EvaluatedModel

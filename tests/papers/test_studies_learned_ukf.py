@@ -8,10 +8,10 @@ import numpy as np
 import pandas as pd
 import pytest
 import torch
+from refusals import refusal
 from study_parts import metric_rows, part_of, stored
 
 from place import undrawn
-from refusals import refusal
 from vehest.data.estimate import Estimate
 from vehest.data.recording import Recording
 from vehest.data.splits import VALIDATION, Span, Split

@@ -6,9 +6,9 @@ import math
 import numpy as np
 import pandas as pd
 import pytest
+from refusals import refusal
 
 from conftest import planar_drive
-from refusals import refusal
 from vehest.data.errors import DataError
 from vehest.data.estimate import Estimate
 from vehest.data.recording import Recording

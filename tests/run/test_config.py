@@ -5,9 +5,9 @@ from itertools import chain
 from pathlib import Path
 
 import pytest
+from refusals import refusal
 
 from place import run_vehest
-from refusals import refusal
 from vehest.data.errors import ConfigurationError, MissingError
 from vehest.run.config import compose_config, expand
 from vehest.run.config_files import GROUPS, choices

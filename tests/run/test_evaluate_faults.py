@@ -9,8 +9,8 @@ import numpy as np
 import pandas as pd
 import pytest
 import yaml
-
 from refusals import refusal
+
 from vehest.data.errors import ConfigurationError
 from vehest.data.store import read_recording
 from vehest.run.config import compose_config

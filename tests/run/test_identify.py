@@ -8,9 +8,9 @@ import numpy as np
 import pandas as pd
 import pytest
 import yaml
+from refusals import refusal
 from test_self_calibrating import RATE, drive
 
-from refusals import refusal
 from vehest.data.recording import Recording
 from vehest.estimators.model_files import load_model
 from vehest.run.car_record import LIMITS, Number, calibrated, read_car, with_settings

@@ -7,8 +7,8 @@ import time
 from dataclasses import replace
 
 import pytest
-
 from refusals import refusal
+
 from vehest.data import files
 from vehest.data.errors import ConfigurationError, DataError, MissingError
 from vehest.data.files import ASIDE_PREFIX, aside_of, remove_leftovers

@@ -14,10 +14,10 @@ import torch
 import yaml
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from refusals import refusal
 from safetensors.numpy import load_file, save_file
 from safetensors.torch import save_file as save_tensors
 
-from refusals import refusal
 from vehest.data.errors import ConfigurationError, MissingError, VehestError
 from vehest.data.estimate import Estimate
 from vehest.data.recording import Recording

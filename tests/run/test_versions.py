@@ -3,6 +3,7 @@
 import re
 
 from refusals import refusal
+
 from vehest.data.errors import ConfigurationError
 from vehest.estimators.ksnn import Ksnn
 from vehest.estimators.registry import estimator_class, estimator_names

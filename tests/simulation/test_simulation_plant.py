@@ -11,11 +11,11 @@ import numpy as np
 import pytest
 from cars import ALL, shipped
 from numba.core.dispatcher import Dispatcher
+from refusals import refusal
 from scipy.integrate import solve_ivp
 from vehiclemodels.init_mb import init_mb
 from vehiclemodels.vehicle_dynamics_mb import vehicle_dynamics_mb
 
-from refusals import refusal
 from vehest.constants import GRAVITY
 from vehest.data.errors import ConfigurationError
 from vehest.simulation.errors import SimulationError

@@ -6,9 +6,9 @@ from dataclasses import asdict, fields, replace
 import numpy as np
 import pytest
 import yaml
+from refusals import refusal
 from scipy import signal, stats
 
-from refusals import refusal
 from vehest.data.channels import CHANNELS
 from vehest.data.errors import ConfigurationError
 from vehest.simulation.plant.motion import WHEELS, Motion

@@ -5,8 +5,8 @@ import tempfile
 import zipfile
 
 import pytest
-
 from refusals import refusal
+
 from vehest.data.limits import Limits, use_limits
 from vehest.sources.archive import unpacked
 

@@ -6,9 +6,9 @@ import zlib
 
 import numpy as np
 import pytest
+from refusals import refusal
 
 from conftest import planar_drive
-from refusals import refusal
 from vehest.data.limits import Limits, use_limits
 from vehest.sources.base import open_source
 

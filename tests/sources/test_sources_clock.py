@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-
 from refusals import refusal
+
 from vehest.data.errors import ConfigurationError, DataError
 from vehest.data.limits import Limits, use_limits
 from vehest.data.recording import Recording

@@ -14,9 +14,9 @@ from urllib.parse import unquote
 import numpy as np
 import pytest
 import yaml
+from refusals import refusal
 
 from place import run_vehest
-from refusals import refusal
 from vehest.data.errors import ConfigurationError, DataError, MissingError
 from vehest.data.store import read_recording
 from vehest.sources import resuming

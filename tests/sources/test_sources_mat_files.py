@@ -4,9 +4,9 @@ import struct
 import zlib
 
 import numpy as np
+from refusals import refusal
 from scipy.io import savemat
 
-from refusals import refusal
 from vehest.data.limits import Limits, use_limits
 from vehest.sources.columns import Column
 from vehest.sources.readers.mat_files import read_channels

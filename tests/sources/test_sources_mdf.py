@@ -5,8 +5,8 @@ import tempfile
 import numpy as np
 import pytest
 from mdf_log import ONE, read_mdf, write_mdf
-
 from refusals import refusal
+
 from vehest.data.errors import ConfigurationError
 from vehest.sources.unit_spellings import plain_unit
 

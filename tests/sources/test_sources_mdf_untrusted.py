@@ -7,8 +7,8 @@ import zlib
 import numpy as np
 import pytest
 from mdf_log import read_mdf, write_mdf
-
 from refusals import refusal
+
 from vehest.data.limits import Limits, use_limits
 from vehest.sources.mdf import read_measurement
 

@@ -3,8 +3,8 @@
 import numpy as np
 import pandas as pd
 import pytest
-
 from refusals import refusal
+
 from vehest.data.errors import ConfigurationError, DataError, MissingError
 from vehest.sources.base import origin_in_words
 from vehest.sources.tabular import TabularSource

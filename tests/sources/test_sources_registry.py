@@ -5,8 +5,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 import yaml
-
 from refusals import refusal
+
 from vehest.alignment.checks import checks_of_recording
 from vehest.data.errors import ConfigurationError
 from vehest.run.config import compose_config, missing_keys

@@ -2,9 +2,9 @@
 
 import numpy as np
 import pytest
+from refusals import refusal
 
 from real_drives import real_drive
-from refusals import refusal
 from vehest.alignment.checks import checks_of_recording
 from vehest.data.errors import DataError, MissingError
 from vehest.sources.base import open_source

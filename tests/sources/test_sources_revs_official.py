@@ -4,9 +4,9 @@ import re
 
 import numpy as np
 import pytest
+from refusals import refusal
 from scipy.io import savemat
 
-from refusals import refusal
 from revs_files import COLUMNS, PREAMBLE, Drive, smooth_drive, write_csv, write_mat, write_vehicle_parameters
 from vehest.run.config import compose_config
 from vehest.sources.base import open_source

@@ -15,8 +15,8 @@ import numpy as np
 import pytest
 import yaml
 from numpy.typing import NDArray
-
 from refusals import refusal
+
 from vehest.data.errors import ConfigurationError, DataError
 from vehest.data.limits import Limits, use_limits
 from vehest.sources.base import open_source

@@ -5,8 +5,8 @@ import gzip
 import numpy as np
 import pandas as pd
 import pytest
-
 from refusals import refusal
+
 from vehest.data.errors import ConfigurationError, MissingError
 from vehest.data.limits import Limits, use_limits
 from vehest.data.recording import Recording

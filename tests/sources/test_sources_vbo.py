@@ -4,9 +4,9 @@ import re
 
 import numpy as np
 import pytest
+from refusals import refusal
 from vbo_log import COLUMNS, UNITS, dataset, drive, write_log
 
-from refusals import refusal
 from vehest.data.errors import DataError
 from vehest.sources.base import open_source
 from vehest.sources.surveys import survey

@@ -4,10 +4,10 @@ import math
 
 import pytest
 import torch
+from refusals import refusal
 from torch import nn
 
 from conftest import die_after, stop_after
-from refusals import refusal
 from vehest.data.errors import ConfigurationError, DataError
 from vehest.data.schema import settings_from_config
 from vehest.training.adam import Adam

@@ -5,9 +5,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from refusals import refusal
 
 from conftest import planar_drive
-from refusals import refusal
 from vehest.data.channels import CHANNELS
 from vehest.data.errors import ConfigurationError
 from vehest.trust.faults import KINDS, SEVERITIES, Fault, applies, inject, is_fault, size_of, window

@@ -12,9 +12,9 @@ import numpy as np
 import pytest
 import yaml
 from measured_drive import CHANNELS, RATE, WHEELS, measured_drive
+from refusals import refusal
 
 from real_drives import real_drive
-from refusals import refusal
 from small_car_drive import small_car_drive
 from vehest.data.schema import validated
 from vehest.run.downsample import transforms_of

@@ -5,8 +5,8 @@ import math
 import numpy as np
 import pytest
 from measured_drive import CHANNELS, RATE, measured_drive
-
 from refusals import refusal
+
 from vehest.trust.autoregression import Autoregression, fit_autoregression, learn_noise_levels
 from vehest_papers.trust.oracle import filtered, known_test, learn_oracle, levels_at
 
