@@ -93,7 +93,7 @@ pilots-compare: $(INSTALLED) ## tables of two such runs, cell by cell (A=FOLDER 
 	$(BIN)/python tests/pilots/pilots.py --compare $(A) $(B)
 
 kills: $(INSTALLED) ## kill the quickstart 100 times (KILLS=100, SEED=0), every run after it must end in the same numbers; half an hour
-	$(BIN)/python tests/kills/kills.py --kills $(KILLS) --seed $(SEED)
+	PYTHONPATH=tests $(BIN)/python tests/kills/kills.py --kills $(KILLS) --seed $(SEED)
 
 fuzz: $(INSTALLED) ## try 3,000 malformed inputs on the command line, a row each in results/reliability/fuzz.csv (FUZZ=3000, SEED=0; ten minutes)
 	PYTHONPATH=tests:tests/sources $(BIN)/python -m fuzz --inputs $(FUZZ) --seed $(SEED) --jobs $(JOBS) --out results/reliability/fuzz.csv

@@ -90,6 +90,28 @@ def planar_drive(seconds=60.0, rate_hz=20.0, seed=0, noise=0.0, name="drive"):
     return Recording(name, "test car", rate_hz, 0.0, {**noisy, **references}, "simulated")
 
 
+def flat_weights(estimator):
+    """All weights of an estimator, one after the other."""
+    return np.concatenate([values.ravel() for values in estimator.weights().values()])
+
+
+def stop_after(questions):
+    """Asks a training to stop after so many questions."""
+    left = iter(range(questions))
+    return lambda: next(left, None) is None
+
+
+def die_after(reports):
+    """Ends a training at the last of so many reports of its progress, as a kill does."""
+    left = iter(range(reports - 1))
+
+    def die(progress):
+        if next(left, None) is None:
+            raise KeyboardInterrupt
+
+    return die
+
+
 @pytest.fixture
 def drive():
     """One minute at 20 Hz without noise."""
@@ -102,14 +124,20 @@ def drawn():
 
 
 @pytest.fixture
-def place(request, tmp_path, monkeypatch, capsys):
-    """A fresh place to work in, without a data root or a tracking server from outside; figures are drawn for tests that use `drawn`."""
+def elsewhere(tmp_path, monkeypatch):
+    """An empty working folder, without a data root, an output root or a tracking server from outside."""
+    monkeypatch.chdir(tmp_path)
+    for name in ("VEHEST_DATA", "VEHEST_OUTPUT", "MLFLOW_TRACKING_URI"):
+        monkeypatch.delenv(name, raising=False)
+    return tmp_path
+
+
+@pytest.fixture
+def place(request, elsewhere, monkeypatch, capsys):
+    """A fresh place to work in; figures are drawn for tests that use `drawn`."""
     from place import Place, undrawn
 
     if "drawn" not in request.fixturenames:
         undrawn(monkeypatch)
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.setenv("VEHEST_DATA", str(tmp_path / "raw"))
-    monkeypatch.delenv("VEHEST_OUTPUT", raising=False)
-    monkeypatch.delenv("MLFLOW_TRACKING_URI", raising=False)
-    return Place(tmp_path, capsys)
+    monkeypatch.setenv("VEHEST_DATA", str(elsewhere / "raw"))
+    return Place(elsewhere, capsys)

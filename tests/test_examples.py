@@ -7,6 +7,7 @@ import numpy as np
 import pandas as pd
 import pytest
 import yaml
+from refusals import refusal
 
 import vehest
 from conftest import planar_drive
@@ -63,8 +64,7 @@ def test_entry_points_of_another_package_are_found_and_only_while_it_is_there(ex
     assert [estimator_class(name).__module__ for name in NAMES] == list(NAMES)
     monkeypatch.undo()
     forget_examples()
-    with pytest.raises(ConfigurationError, match="estimator 'sliding_mode' is not one of"):
-        estimator_class("sliding_mode")
+    assert "estimator 'sliding_mode' is not one of" in refusal(lambda: estimator_class("sliding_mode"), ConfigurationError)
 
 
 @pytest.mark.parametrize("name", NAMES)

@@ -4,6 +4,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from refusals import refusal
 
 from every_estimator import drive_for, fitted
 from vehest.data.errors import ConfigurationError, DataError
@@ -46,8 +47,7 @@ def test_two_rows_a_minute_apart_are_no_drive():
 def test_a_damaged_calibration_names_its_file(tmp_path):
     text = (Path(read_trust.__code__.co_filename).parents[1] / "pretrained" / "trust.yaml").read_text(encoding="utf-8")
     (tmp_path / "trust.yaml").write_text(text.replace("yaw_rate", "foreign"), encoding="utf-8")
-    with pytest.raises(DataError, match=r"trust\.yaml'"):
-        read_trust(tmp_path)
+    assert "trust.yaml'" in refusal(lambda: read_trust(tmp_path))
 
 
 def test_tables_to_download_start_no_formula():

@@ -5,11 +5,13 @@ import json
 import math
 import re
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 import pytest
 import yaml
+from refusals import refusal
 from scipy.interpolate import CubicSpline
 from scipy.signal import lfilter
 
@@ -274,9 +276,8 @@ def test_low_pass_differentiates_and_keeps_the_right_samples(order):
 @pytest.mark.parametrize("missing", ["vy_ref", "ax", "ay", "yaw_rate"])
 def test_missing_channel_is_one_clear_line(motion, missing):
     recording = recorded(motion, {})
-    with pytest.raises(DataError, match=f"no (reference )?channel '{missing}'") as error:
-        align(recording.select([name for name in recording.channels if name != missing]), AlignmentSettings(IMU))
-    assert "\n" not in str(error.value)
+    refused = refusal(lambda: align(recording.select([name for name in recording.channels if name != missing]), AlignmentSettings(IMU)))
+    assert re.search(f"no (reference )?channel '{missing}'", refused)
 
 
 def test_forward_speed_stands_in_for_its_reference_and_the_report_says_so(motion):
@@ -290,12 +291,9 @@ def test_gaps_short_recordings_and_slow_ones_are_refused():
     gap = recording["ax"].copy()
     gap[100] = np.nan
     holed = replace(recording, channels={**recording.channels, "ax": gap}, gappy=frozenset({"ax"}))
-    with pytest.raises(DataError, match="'ax' has gaps"):
-        align(holed, COVERED)
-    with pytest.raises(DataError, match="needs at least"):
-        align(recording.cut(0.0, 15.0), COVERED)
-    with pytest.raises(ConfigurationError, match=r"too high for 50 Hz; use at most"):
-        align(recording, replace(COVERED, cutoff_hz=10.0))
+    assert "'ax' has gaps" in refusal(lambda: align(holed, COVERED))
+    assert "needs at least" in refusal(lambda: align(recording.cut(0.0, 15.0), COVERED))
+    assert "too high for 50 Hz; use at most" in refusal(lambda: align(recording, replace(COVERED, cutoff_hz=10.0)), ConfigurationError)
 
 
 @pytest.mark.parametrize(
@@ -366,10 +364,8 @@ def test_steering_without_calm_driving_without_a_channel_or_without_relation_is_
     settings = AlignmentSettings(("steering_ratio",), wheelbase=WHEELBASE)
     with pytest.raises(DataError, match=r"only .* s are above 40 m/s"):
         align(road, replace(settings, min_speed=40.0))
-    with pytest.raises(DataError, match="no channel 'steer'"):
-        align(road.select(["vx", "yaw_rate", "ay"]), settings)
-    with pytest.raises(DataError, match="no channel 'roll'"):
-        align(road, replace(settings, steering_channel="roll"))
+    assert "no channel 'steer'" in refusal(lambda: align(road.select(["vx", "yaw_rate", "ay"]), settings))
+    assert "no channel 'roll'" in refusal(lambda: align(road, replace(settings, steering_channel="roll")))
     noise = np.random.default_rng(0).standard_normal(len(road))
     with pytest.raises(DataError, match="does not follow the curvature"):
         align(replace(road, channels={**road.channels, "handwheel": noise}), settings)
@@ -405,13 +401,10 @@ def test_delay_correction_cuts_what_it_cannot_reach_and_keeps_clock_and_constant
     assert corrected.start_time == pytest.approx(recording.start_time + 0.12)  # 16 samples of reach less the 4 that the delay gives
     assert corrected.end_time == pytest.approx(recording.end_time - 0.20)
     np.testing.assert_array_equal(DelayCorrection(0.0)(recording)["ay"], recording["ay"])
-    with pytest.raises(DataError, match="too short to be shifted by 20 s"):
-        DelayCorrection(20.0)(recording)
-    with pytest.raises(DataError, match="no channel 'ax'"):
-        DelayCorrection(0.01, ("ax",))(recording)
+    assert "too short to be shifted by 20 s" in refusal(lambda: DelayCorrection(20.0)(recording))
+    assert "no channel 'ax'" in refusal(lambda: DelayCorrection(0.01, ("ax",))(recording))
     holed = Recording("gap", "car", 100.0, 0.0, {"ay": np.array([0.0, np.nan] * 50)}, gappy=frozenset({"ay"}))
-    with pytest.raises(DataError, match="has gaps"):
-        DelayCorrection(0.013)(holed)
+    assert "has gaps" in refusal(lambda: DelayCorrection(0.013)(holed))
     recording = Recording("flat", "car", 100.0, 0.0, {"ay": np.full(100, 9.81)})
     np.testing.assert_allclose(DelayCorrection(0.0137)(recording)["ay"], 9.81, rtol=1e-14)
 
@@ -421,8 +414,7 @@ def test_offsets_ratios_and_curves_are_applied_exactly_and_gaps_stay_gaps():
     corrected = OffsetCorrection({"ax": 0.25, "ay": -1.0})(recording)
     np.testing.assert_array_equal(corrected["ax"], [0.75, np.nan])
     np.testing.assert_array_equal(corrected["ay"], [2.0, 3.0])
-    with pytest.raises(DataError, match="no channel 'yaw_rate'"):
-        OffsetCorrection({"yaw_rate": 0.1})(recording)
+    assert "no channel 'yaw_rate'" in refusal(lambda: OffsetCorrection({"yaw_rate": 0.1})(recording))
     recording = Recording(
         "lap", "car", 10.0, 0.0, {"handwheel": np.array([1.6, np.nan]), "steer": np.zeros(2)}, gappy=frozenset({"handwheel"})
     )
@@ -430,8 +422,7 @@ def test_offsets_ratios_and_curves_are_applied_exactly_and_gaps_stay_gaps():
     np.testing.assert_allclose(corrected["steer"], [0.1, np.nan])
     assert corrected.gappy == {"handwheel", "steer"}
     np.testing.assert_array_equal(SteeringRatio(-1.0, 0.1, "steer")(recording)["steer"], [0.1, 0.1])
-    with pytest.raises(DataError, match="no channel 'roll'"):
-        SteeringRatio(15.0, channel="roll")(recording)
+    assert "no channel 'roll'" in refusal(lambda: SteeringRatio(15.0, channel="roll")(recording))
     recording = Recording("a", "car", 100.0, 0.0, {"steer": np.array([-2.0, -0.5, 0.0, 0.5, 2.0])})
     curve = SteeringCurve((-1.0, 0.0, 1.0), (-0.4, 0.0, 0.3))
     np.testing.assert_allclose(curve(recording)["steer"], [-0.4, -0.2, 0.0, 0.15, 0.3])
@@ -451,37 +442,25 @@ def test_offsets_ratios_and_curves_are_applied_exactly_and_gaps_stay_gaps():
     ],
 )
 def test_transforms_that_make_no_sense_are_refused_in_one_line(config):
-    with pytest.raises(ConfigurationError) as error:
-        transform_from_config(config)
-    assert "\n" not in str(error.value)
+    refusal(lambda: transform_from_config(config), ConfigurationError)
 
 
-class Called:
-    """Runs `vehest data align` in a folder of its own."""
-
-    def __init__(self, folder, capsys):
-        self.folder, self._capsys = folder, capsys
-
-    def __call__(self, *arguments):
-        return run_vehest(self._capsys, "data", "align", *arguments)
-
-    def files(self):
-        return {str(file.relative_to(self.folder)): file.read_bytes() for file in self.folder.rglob("*") if file.is_file()}
+def files():
+    return {str(file): file.read_bytes() for file in Path().rglob("*") if file.is_file()}
 
 
 @pytest.fixture
-def called(tmp_path, monkeypatch, capsys):
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.delenv("VEHEST_OUTPUT", raising=False)
-    write_recording(weaving(0), tmp_path / "weave.parquet")
-    return Called(tmp_path, capsys)
+def called(elsewhere, capsys):
+    """Runs `vehest data align` in a folder that holds weave.parquet."""
+    write_recording(weaving(0), elsewhere / "weave.parquet")
+    return partial(run_vehest, capsys, "data", "align")
 
 
 ASKED = ("weave.parquet", "--estimate", "lever_arm,mounting,delay,offsets", "--cutoff", "1.5", "--max-delay", "0.2")
 
 
 def test_command_prints_a_table_or_json_and_an_override_and_touches_nothing(called):
-    before = called.files()
+    before = files()
     code, out, err = called(*ASKED)
     assert (code, err) == (0, "")
     lines = out.splitlines()
@@ -493,7 +472,7 @@ def test_command_prints_a_table_or_json_and_an_override_and_touches_nothing(call
     assert any(line.startswith("yaw ") and "deg" in line for line in lines)
     assert any(line.startswith("ay ") for line in lines)
     assert lines[-1].startswith("to correct it: 'downsample.transforms=[{name: delay_correction, ")
-    assert called.files() == before
+    assert files() == before
     code, out, _ = called(*ASKED, "--json")
     assert code == 0
     told = json.loads(out)
@@ -520,9 +499,9 @@ def test_printed_override_is_one_that_downsample_takes(called):
 
 def test_command_writes_a_folder_whole_and_replaces_its_own_only(called):
     assert called(*ASKED, "-o", "found")[0] == 0
-    folder = called.folder / "found"
+    folder = Path("found")
     assert {file.name for file in folder.iterdir()} == set(FILES)
-    assert {path.name for path in called.folder.iterdir()} == {"weave.parquet", "found"}
+    assert {path.name for path in Path().iterdir()} == {"weave.parquet", "found"}
     told = yaml.safe_load((folder / "alignment.yaml").read_text(encoding="utf-8"))
     assert len([transform_from_config(entry) for entry in told["transforms"]]) == 3
     rows = list(csv.DictReader((folder / "alignment.csv").open(encoding="utf-8")))
@@ -532,20 +511,20 @@ def test_command_writes_a_folder_whole_and_replaces_its_own_only(called):
     assert "nothing is applied" in report
     assert "| delay |" in report
     (folder / "notes.txt").write_text("mine", encoding="utf-8")
-    before = called.files()
+    before = files()
     code, _, err = called(*ASKED, "-o", "found")
     assert (code, err) == (2, "error: folder 'found' holds other files ('notes.txt'); name a new one\n")
-    assert called.files() == before
+    assert files() == before
 
 
 def test_steering_alone_is_written_too(called):
-    write_recording(single_track(15.5, 0.05), called.folder / "road.parquet")
+    write_recording(single_track(15.5, 0.05), Path("road.parquet"))
     for _ in range(2):  # its own files may be replaced
         code, out, _ = called("road.parquet", "-e", "steering_ratio", "--wheelbase", "2.6", "-o", "found")
         assert code == 0
     assert "steering_ratio " in out
     assert "{name: steering_ratio, ratio: 15." in out
-    assert {file.name for file in (called.folder / "found").iterdir()} == set(FILES)
+    assert {file.name for file in Path("found").iterdir()} == set(FILES)
 
 
 @pytest.mark.parametrize(
@@ -559,13 +538,13 @@ def test_steering_alone_is_written_too(called):
     ],
 )
 def test_command_refuses_in_one_line_and_writes_nothing(called, arguments, code, what):
-    before = called.files()
+    before = files()
     left, out, err = called(*arguments)
     assert (left, out) == (code, "")
     assert err.startswith("error: ")
     assert what in err
     assert err.count("\n") == 1
-    assert called.files() == before
+    assert files() == before
 
 
 @pytest.fixture(scope="module")

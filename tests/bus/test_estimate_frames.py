@@ -4,6 +4,7 @@ import math
 
 import numpy as np
 import pytest
+from refusals import refusal
 
 from vehest.data.errors import ConfigurationError
 from vehest.trust.health import NO_ESTIMATE, reason_in_words
@@ -49,8 +50,7 @@ def test_what_there_is_not_is_said_to_be_not_available_and_values_beyond_a_signa
     ends = {"LateralVelocity": 262.1435, "SideslipAngle": -262.1435, "YawRate": -13.1071, "LateralVelocityBand": 524.287}
     assert {name: found[name] for name in ends} == pytest.approx(ends)
     assert decoded({"vy": 1.0, "sideslip": 0.0}, 0x123)["LateralVelocity"] == pytest.approx(1.0)
-    with pytest.raises(ConfigurationError, match="must lie between"):
-        dbc_text(0x7FF)
+    assert "must lie between" in refusal(lambda: dbc_text(0x7FF), ConfigurationError)
 
 
 def test_the_alive_counter_counts_estimates_modulo_16_in_both_frames():

@@ -7,8 +7,9 @@ import sys
 from pathlib import Path
 
 import pytest
+from refusals import refusal
 
-from vehest.data.errors import DataError, MissingError
+from vehest.data.errors import MissingError
 from vehest.data.files import ASIDE_PREFIX, remove_leftovers, sha256_of, written_aside
 
 
@@ -86,5 +87,4 @@ def test_a_killed_writer_leaves_only_what_is_swept(tmp_path):
 def test_the_digest_is_that_of_the_bytes_of_a_file_that_can_be_read(tmp_path):
     (tmp_path / "file").write_bytes(b"abc")
     assert sha256_of(tmp_path / "file") == hashlib.sha256(b"abc").hexdigest()
-    with pytest.raises(DataError, match="cannot read"):
-        sha256_of(tmp_path / "none")
+    assert "cannot read" in refusal(lambda: sha256_of(tmp_path / "none"))

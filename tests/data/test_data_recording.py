@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from refusals import refusal
 
 from vehest.data.channels import CHANNELS, channel
 from vehest.data.errors import DataError
@@ -82,17 +83,13 @@ def test_samples_are_copied_and_cannot_be_written_to():
 )
 def test_what_cannot_be_a_recording_is_refused(changes, what):
     arguments = {"id": "r", "vehicle": "car", "rate_hz": 10.0, "start_time": 0.0, "channels": {"ay": np.zeros(3)}}
-    with pytest.raises(DataError) as error:
-        Recording(**(arguments | changes))
-    assert what in str(error.value)
-    assert "\n" not in str(error.value)
+    assert what in refusal(lambda: Recording(**(arguments | changes)))
 
 
 def test_estimators_see_no_references():
     recording = Recording("r", "car", 10.0, 0.0, {name: np.zeros(2) for name in ("vx", "vy_ref", "ay", "sideslip_ref")})
     assert list(recording.without_references().channels) == ["vx", "ay"]
-    with pytest.raises(DataError, match="reference channels only"):
-        recording.select(["vy_ref"]).without_references()
+    assert "reference channels only" in refusal(lambda: recording.select(["vy_ref"]).without_references())
 
 
 @PROPERTY
@@ -123,16 +120,14 @@ def test_a_covariance_is_held_like_its_quantities_and_read_by_name():
     assert np.isnan(held[[0, 3]]).all()
     assert (held[1] == [[17.0, 15.0], [11.0, 9.0]]).all()
     assert (held[2] == held[1]).all()
-    with pytest.raises(DataError, match="a covariance of vx, vy, friction, not of yaw_rate"):
-        estimate.covariance_at(np.zeros(1), ["yaw_rate"])
+    assert "a covariance of vx, vy, friction, not of yaw_rate" in refusal(lambda: estimate.covariance_at(np.zeros(1), ["yaw_rate"]))
 
 
 def test_an_estimate_of_unknown_or_unequal_quantities_is_refused():
     for channels, said in (({"vz": np.zeros(3)}, "unknown quantity 'vz'"), ({"vy": np.zeros(3), "vx": np.zeros(2)}, "one common length")):
         with pytest.raises(DataError, match=said):
             Estimate("r", "ekf", 20.0, 0.0, channels)
-    with pytest.raises(DataError, match=r"not None and \(vy\)"):
-        Estimate("r", "ekf", 20.0, 0.0, {"vy": np.zeros(3)}, covariance_of=("vy",))
+    assert "not None and (vy)" in refusal(lambda: Estimate("r", "ekf", 20.0, 0.0, {"vy": np.zeros(3)}, covariance_of=("vy",)))
 
 
 def test_units_of_something_else_and_unknown_channels_are_refused():
@@ -140,12 +135,9 @@ def test_units_of_something_else_and_unknown_channels_are_refused():
         assert name == described.name
         assert described.low < described.high
         assert factor_to_si(described.unit, described.unit) == 1.0
-    with pytest.raises(DataError, match="'vz' is not known"):
-        channel("vz")
-    with pytest.raises(DataError, match="'deg' cannot be converted to 'm/s'"):
-        factor_to_si("deg", "m/s")
-    with pytest.raises(DataError, match="'furlong' is not known"):
-        factor_to_si("furlong", "m/s")
+    assert "'vz' is not known" in refusal(lambda: channel("vz"))
+    assert "'deg' cannot be converted to 'm/s'" in refusal(lambda: factor_to_si("deg", "m/s"))
+    assert "'furlong' is not known" in refusal(lambda: factor_to_si("furlong", "m/s"))
 
 
 @pytest.mark.parametrize(

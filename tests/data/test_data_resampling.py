@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from refusals import refusal
 from scipy import signal
 
 from vehest.data.errors import ConfigurationError, DataError
@@ -78,8 +79,7 @@ def test_ratios_that_a_method_cannot_make_are_refused():
     for new_rate, rate in ((20.0, 99.997), (1e-9, 100.0)):
         with pytest.raises(DataError, match="not a ratio of whole numbers"):
             Resample(new_rate)(recorded(np.zeros(10), rate))
-    with pytest.raises(ConfigurationError, match="method=polyphase"):
-        Resample(30.0, method="decimate")(recorded(np.zeros(10), 50.0))
+    assert "method=polyphase" in refusal(lambda: Resample(30.0, method="decimate")(recorded(np.zeros(10), 50.0)), ConfigurationError)
     for rate_hz in (0.0, math.nan):
         with pytest.raises(ConfigurationError, match="rate_hz must be a positive number"):
             Resample(rate_hz)

@@ -12,9 +12,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
+from refusals import refusal
 
 from vehest.data.channels import CHANNELS
-from vehest.data.errors import DataError, MissingError
+from vehest.data.errors import MissingError
 from vehest.data.estimate import QUANTITIES, Estimate
 from vehest.data.recording import Recording
 from vehest.data.store import is_stored_recording, read_estimate, read_recording, write_estimate, write_recording
@@ -65,13 +66,6 @@ def assert_same_recording(read, written):
     assert dict(read.provenance) == dict(written.provenance)
 
 
-def one_line(error):
-    message = str(error.value)
-    assert message
-    assert "\n" not in message
-    return message
-
-
 @PROPERTY
 @given(recordings())
 def test_a_recording_comes_back_bit_for_bit_with_all_it_says_about_itself(recording):
@@ -107,9 +101,8 @@ def test_chosen_channels_are_read_in_the_order_asked_for_and_missing_ones_named(
     assert list(read.channels) == ["ay", "vx"]
     assert read.gappy == frozenset()
     write_recording(simple(), tmp_path / "r.parquet")
-    with pytest.raises(DataError, match="no channel 'vx'") as error:
-        read_recording(tmp_path / "r.parquet", ["vx"])
-    assert "it has ay" in one_line(error)
+    message = refusal(lambda: read_recording(tmp_path / "r.parquet", ["vx"]))
+    assert all(words in message for words in ("no channel 'vx'", "it has ay"))
 
 
 @PROPERTY
@@ -144,17 +137,12 @@ def test_an_estimate_comes_back_with_its_covariance(length, n_states, data):
 
 
 def test_what_cannot_be_read_or_written_is_refused_in_one_line_and_leaves_nothing(tmp_path):
-    with pytest.raises(DataError, match="JSON") as error:
-        write_recording(simple(provenance={"when": object()}), tmp_path / "r.parquet")
-    one_line(error)
+    assert "JSON" in refusal(lambda: write_recording(simple(provenance={"when": object()}), tmp_path / "r.parquet"))
     assert list(tmp_path.iterdir()) == []
-    with pytest.raises(MissingError, match="there is no file") as error:
-        read_recording(tmp_path / "none.parquet")
-    assert "none.parquet" in one_line(error)
+    message = refusal(lambda: read_recording(tmp_path / "none.parquet"), MissingError)
+    assert all(words in message for words in ("there is no file", "none.parquet"))
     (tmp_path / "file").write_text("not a folder")
-    with pytest.raises(MissingError, match="cannot write") as error:
-        write_recording(simple(), tmp_path / "file" / "r.parquet")
-    one_line(error)
+    assert "cannot write" in refusal(lambda: write_recording(simple(), tmp_path / "file" / "r.parquet"), MissingError)
     assert (tmp_path / "file").read_text() == "not a folder"
 
 
@@ -162,9 +150,7 @@ def test_what_cannot_be_read_or_written_is_refused_in_one_line_and_leaves_nothin
 def test_a_truncated_file_is_refused_in_one_line(tmp_path, kept):
     write_recording(simple(np.arange(300.0)), tmp_path / "r.parquet")
     (tmp_path / "r.parquet").write_bytes((tmp_path / "r.parquet").read_bytes()[:kept])
-    with pytest.raises(DataError, match="truncated or damaged") as error:
-        read_recording(tmp_path / "r.parquet")
-    assert "r.parquet" in one_line(error)
+    assert "r.parquet' is truncated or damaged" in refusal(lambda: read_recording(tmp_path / "r.parquet"))
     assert not is_stored_recording(tmp_path / "r.parquet")
 
 
@@ -176,9 +162,7 @@ def test_no_flipped_bit_in_the_samples_goes_unnoticed(tmp_path):
         damaged = bytearray(intact)
         damaged[position] ^= 0x10
         (tmp_path / "r.parquet").write_bytes(damaged)
-        with pytest.raises(DataError, match="damaged") as error:
-            read_recording(tmp_path / "r.parquet")
-        one_line(error)
+        assert "damaged" in refusal(lambda: read_recording(tmp_path / "r.parquet"))
 
 
 @pytest.mark.parametrize(
@@ -186,18 +170,14 @@ def test_no_flipped_bit_in_the_samples_goes_unnoticed(tmp_path):
 )
 def test_a_foreign_parquet_file_is_refused_in_one_line(tmp_path, metadata):
     pq.write_table(pa.table({"ay": [1.0, 2.0]}).replace_schema_metadata(metadata), tmp_path / "foreign.parquet")
-    with pytest.raises(DataError) as error:
-        read_recording(tmp_path / "foreign.parquet")
-    assert "foreign.parquet" in one_line(error)
+    assert "foreign.parquet" in refusal(lambda: read_recording(tmp_path / "foreign.parquet"))
 
 
 def test_a_recording_is_not_an_estimate_nor_the_other_way_round(tmp_path):
     write_recording(simple(), tmp_path / "r.parquet")
     write_estimate(Estimate("r", "gru", 20.0, 0.0, {"vy": np.zeros(3), "sideslip": np.zeros(3)}), tmp_path / "e.parquet")
-    with pytest.raises(DataError, match="not an estimate"):
-        read_estimate(tmp_path / "r.parquet")
-    with pytest.raises(DataError, match="not a recording"):
-        read_recording(tmp_path / "e.parquet")
+    assert "not an estimate" in refusal(lambda: read_estimate(tmp_path / "r.parquet"))
+    assert "not a recording" in refusal(lambda: read_recording(tmp_path / "e.parquet"))
     assert is_stored_recording(tmp_path / "r.parquet")
     assert not is_stored_recording(tmp_path / "e.parquet")
     assert not is_stored_recording(tmp_path / "none.parquet")

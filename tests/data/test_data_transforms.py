@@ -7,6 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
+from refusals import refusal
 
 from vehest.data import transforms
 from vehest.data.derived import AccelerationFromSpeed, ScaleToWheelbase, SideslipFromVelocity, SpeedFromWheels, VelocityFromSideslip
@@ -56,10 +57,8 @@ def test_low_pass_has_the_gain_and_phase_of_a_butterworth_filter(frequency):
 
 @pytest.mark.parametrize("cutoff_hz", [0.0, -1.0, 50.0, 80.0, math.nan])
 def test_low_pass_beyond_nyquist_is_refused(cutoff_hz):
-    with pytest.raises(ConfigurationError, match="between 0 and 50 Hz"):
-        LowPass(cutoff_hz)(recorded(ay=np.zeros(10)))
-    with pytest.raises(ConfigurationError, match="use design=butterworth for a causal one"):
-        LowPass(5.0, direction="causal", design="fir")
+    assert "between 0 and 50 Hz" in refusal(lambda: LowPass(cutoff_hz)(recorded(ay=np.zeros(10))), ConfigurationError)
+    assert "use design=butterworth for a causal one" in refusal(lambda: LowPass(5.0, direction="causal", design="fir"), ConfigurationError)
 
 
 @pytest.mark.parametrize("frequency", [0.5, 2.0, 5.0, 9.0, 20.0])
@@ -136,8 +135,7 @@ def test_outlier_removal_of_short_recordings_stays_within_their_values(length, h
 
 @pytest.mark.parametrize("arguments", [{"half_window": 0}, {"threshold": 0.0}, {"half_window": -3}])
 def test_outlier_removal_without_neighbours_or_threshold_is_refused(arguments):
-    with pytest.raises(ConfigurationError, match="greater than 0"):
-        transform_from_config({"name": "remove_outliers", **arguments})
+    assert "greater than 0" in refusal(lambda: transform_from_config({"name": "remove_outliers", **arguments}), ConfigurationError)
 
 
 def rigid_body(lever_x, lever_y, yaw):
@@ -218,10 +216,7 @@ def test_transforms_are_built_from_plain_values():
     ],
 )
 def test_a_misspelt_transform_is_refused_in_one_line(config, what):
-    with pytest.raises(ConfigurationError) as error:
-        transform_from_config(config)
-    assert what in str(error.value)
-    assert "\n" not in str(error.value)
+    assert what in refusal(lambda: transform_from_config(config), ConfigurationError)
 
 
 WHEELS = SpeedFromWheels(wheel_radius=0.48, track_front=2.1, track_rear=2.0)
@@ -256,15 +251,13 @@ def test_speed_from_wheels_inverts_what_rolling_wheels_do_also_of_the_rear_wheel
     np.testing.assert_allclose(WHEELS.corrected(drive), np.tile(u, (4, 1)), atol=1e-12)
     np.testing.assert_allclose(WHEELS(drive)["vx"], u, atol=1e-12)
     missing = np.full(2000, math.nan)
-    with pytest.raises(DataError, match="no wheel speed was measured"):
-        WHEELS(rolling(yaw_rate=missing)[0])
+    assert "no wheel speed was measured" in refusal(lambda: WHEELS(rolling(yaw_rate=missing)[0]))
     whole, u = rolling()
     rear = whole.select(["wheel_speed_rl", "wheel_speed_rr"])
     np.testing.assert_allclose(SpeedFromWheels(wheel_radius=0.48)(rear)["vx"], u, atol=1e-12)  # left and right make up for the track
     one = whole.select(["wheel_speed_rl"])
     np.testing.assert_allclose(SpeedFromWheels(wheel_radius=0.48)(one)["vx"], 0.48 * whole["wheel_speed_rl"], atol=1e-12)
-    with pytest.raises(DataError, match="has no wheel speed to make vx of"):
-        SpeedFromWheels(wheel_radius=0.48)(whole.select(["yaw_rate"]))
+    assert "has no wheel speed to make vx of" in refusal(lambda: SpeedFromWheels(wheel_radius=0.48)(whole.select(["yaw_rate"])))
 
 
 @pytest.mark.parametrize("value", [0.0, 60.0, math.nan])
@@ -300,8 +293,7 @@ def test_acceleration_from_speed_is_its_derivative_late_by_the_filters_delay_or_
         np.testing.assert_allclose(made["ax"][300:-300], expected[300:-300], atol=0.005 * amplitude)
     causal = AccelerationFromSpeed()
     np.testing.assert_array_equal(causal(drive.cut(0.0, 9.0))["ax"], causal(drive)["ax"][:900])
-    with pytest.raises(DataError, match="cutoff_hz must lie below half of 100 Hz"):
-        AccelerationFromSpeed(cutoff_hz=50.0)(drive)
+    assert "cutoff_hz must lie below half of 100 Hz" in refusal(lambda: AccelerationFromSpeed(cutoff_hz=50.0)(drive))
 
 
 def test_velocity_and_sideslip_follow_from_each_other_gaps_included():
@@ -311,8 +303,7 @@ def test_velocity_and_sideslip_follow_from_each_other_gaps_included():
     np.testing.assert_allclose(there["vy_ref"], drive["vx"] * np.tan(angle))
     back = SideslipFromVelocity()(there.select(["vx", "vy_ref"]))
     np.testing.assert_allclose(back["sideslip_ref"], angle, atol=1e-15)
-    with pytest.raises(DataError, match="less than 90 degrees"):
-        VelocityFromSideslip()(recorded(vx=np.ones(2), sideslip_ref=np.array([0.1, 1.6])))
+    assert "less than 90 degrees" in refusal(lambda: VelocityFromSideslip()(recorded(vx=np.ones(2), sideslip_ref=np.array([0.1, 1.6]))))
     channels = {"vx": np.full(3, 20.0), "sideslip_ref": np.array([0.1, math.nan, 0.2])}
     drive = Recording("lap", "car", RATE, 0.0, channels, gappy=frozenset({"sideslip_ref"}))
     made = VelocityFromSideslip()(drive)
@@ -355,11 +346,10 @@ def lap(rate_hz=100.0, n_samples=400):
 )
 def test_what_asks_for_too_much_is_refused_by_the_name_of_the_limit(config, limit):
     long = config.get("channels") == "long"
-    with pytest.raises(VehestError) as error:
-        transform_from_config({key: value for key, value in config.items() if value != "long"})(lap(n_samples=600 if long else 400))
-    assert f"limits.{limit}=NUMBER" in str(error.value)
-    assert "recording 'lap'" in str(error.value)
-    assert "\n" not in str(error.value)
+    changed = transform_from_config({key: value for key, value in config.items() if value != "long"})
+    message = refusal(lambda: changed(lap(n_samples=600 if long else 400)), VehestError)
+    assert f"limits.{limit}=NUMBER" in message
+    assert "recording 'lap'" in message
 
 
 def test_what_is_computed_in_pieces_or_through_spectra_is_the_whole(monkeypatch):

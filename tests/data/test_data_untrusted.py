@@ -11,6 +11,7 @@ from typing import Annotated
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from refusals import refusal
 
 from vehest.data.errors import ConfigurationError, DataError, MissingError, printable
 from vehest.data.files import file_name, regular_file
@@ -79,8 +80,7 @@ def test_yaml_that_explodes_by_aliases_is_refused_at_once(tmp_path):
     file = tmp_path / "bomb.yaml"
     file.write_text("\n".join(lines))
     started = time.process_time()
-    with pytest.raises(DataError, match=r"bomb.yaml' nests deeper than 60 levels or holds more than 500000 values"):
-        read_yaml(file)
+    assert "bomb.yaml' nests deeper than 60 levels or holds more than 500000 values" in refusal(lambda: read_yaml(file))
     assert time.process_time() - started < 5.0  # processor time of a bomb that would take hours
 
 
@@ -105,8 +105,7 @@ def test_honest_yaml_with_anchors_is_read():
 
 @pytest.mark.parametrize("text", ["[" * 100000, b"\xff\xfe"])
 def test_json_that_is_none_is_one_line(text):
-    with pytest.raises(DataError, match="cannot be read as JSON"):
-        parse_json(text, "'f'")
+    assert "cannot be read as JSON" in refusal(lambda: parse_json(text, "'f'"))
 
 
 def test_only_regular_files_of_utf8_and_bounded_length_are_read(tmp_path):
@@ -121,8 +120,7 @@ def test_only_regular_files_of_utf8_and_bounded_length_are_read(tmp_path):
         regular_file(Path("a" * 5000))
     (tmp_path / "latin").write_bytes("ä".encode("latin-1"))
     (tmp_path / "long").write_text("x" * 100)
-    with pytest.raises(DataError, match="is not UTF-8 text"):
-        read_text(tmp_path / "latin")
+    assert "is not UTF-8 text" in refusal(lambda: read_text(tmp_path / "latin"))
     with (
         use_limits(Limits(text_bytes=50)),
         pytest.raises(DataError, match=r"long' is 100 bytes long, more than the limit of 50; .*limits.text_bytes"),
@@ -133,8 +131,7 @@ def test_only_regular_files_of_utf8_and_bounded_length_are_read(tmp_path):
 def test_limits_come_from_a_configuration_and_end_with_their_block():
     with use_limits(limits_from_config({"samples": 5})):
         assert current_limits().samples == 5
-        with pytest.raises(DataError, match=r"6 samples, more than the limit of 5"):
-            check_limit("samples", 6, "'f' holds 6 samples")
+        assert "6 samples, more than the limit of 5" in refusal(lambda: check_limit("samples", 6, "'f' holds 6 samples"))
     assert current_limits() == Limits()
     for wrong in ({"values": 1}, {"samples": 0}, {"samples": "many"}, {"samples": True}):
         with pytest.raises(

@@ -6,15 +6,15 @@ from functools import cache
 
 import numpy as np
 import pytest
+from refusals import refusal
 
 import vehest
-from conftest import planar_drive
+from conftest import flat_weights, planar_drive
 from every_estimator import drive_for, fitted
 from vehest.data.errors import ConfigurationError, DataError, MissingError
 from vehest.data.transforms import Resample
 from vehest.estimators.base import FitData
 from vehest.estimators.model_files import load_model, save_model
-from vehest.estimators.networks.windowed import WindowedEstimator
 from vehest.estimators.registry import estimator_class, estimator_names
 from vehest.run.config import compose_config
 from vehest.training.search import DirectSearchSettings
@@ -89,25 +89,20 @@ def test_model_read_back_estimates_the_same(tmp_path, name):
 
 @pytest.mark.parametrize("size", [0, 40, -8])
 def test_truncated_weights_are_one_clear_error(tmp_path, size):
-    with pytest.raises(MissingError, match="holds no model"):
-        load_model(tmp_path)
+    assert "holds no model" in refusal(lambda: load_model(tmp_path), MissingError)
     save_model(known("ksnn", "float64"), tmp_path)
     weights = tmp_path / "model.safetensors"
     weights.write_bytes(weights.read_bytes()[:size])
-    with pytest.raises(DataError, match="truncated or damaged"):
-        load_model(tmp_path)
+    assert "truncated or damaged" in refusal(lambda: load_model(tmp_path))
 
 
 def test_estimator_refuses_wrong_rate_missing_channel_and_gaps(drive):
     estimator = known("ksnn", "float64")
-    with pytest.raises(DataError, match="works at 20 Hz; resample it first"):
-        estimator.estimate([Resample(10).__call__(drive)])
-    with pytest.raises(DataError, match="no channel 'ax'"):
-        estimator.estimate([drive.select(["vx", "yaw_rate", "ay"])])
+    assert "works at 20 Hz; resample it first" in refusal(lambda: estimator.estimate([Resample(10).__call__(drive)]))
+    assert "no channel 'ax'" in refusal(lambda: estimator.estimate([drive.select(["vx", "yaw_rate", "ay"])]))
     gaps = {**drive.channels, "ay": np.where(np.arange(len(drive)) == 7, np.nan, drive["ay"])}
     gappy = type(drive)(drive.id, drive.vehicle, drive.rate_hz, 0.0, gaps, "simulated", frozenset({"ay"}))
-    with pytest.raises(DataError, match="has gaps"):
-        estimator.estimate([gappy])
+    assert "has gaps" in refusal(lambda: estimator.estimate([gappy]))
 
 
 def test_a_model_of_another_version_is_refused_and_one_without_loads(tmp_path, monkeypatch):
@@ -132,8 +127,7 @@ def test_a_number_that_is_given_is_not_fitted(drive):
 
 
 def test_recordings_start_from_their_own_states_or_all_from_one_and_forget_them(monkeypatch, drive):
-    with pytest.raises(ConfigurationError, match="no state to start from"):
-        known("ksnn", "float64").estimate([drive], {"vy": 1.0})
+    assert "no state to start from" in refusal(lambda: known("ksnn", "float64").estimate([drive], {"vy": 1.0}), ConfigurationError)
     estimator = fitted("luenberger")
     estimator.threshold, drive = 0.0, drive_for(estimator)
     free = estimator.estimate([drive])[0]["vy"]
@@ -147,8 +141,7 @@ def test_recordings_start_from_their_own_states_or_all_from_one_and_forget_them(
         assert np.array_equal(own["vy"], estimator.estimate([drive], state)[0]["vy"])
     one = estimator.estimate([drive, drive], states[0])
     assert np.array_equal(one[0]["vy"], one[1]["vy"])
-    with pytest.raises(DataError, match="2 initial states for 1 recordings"):
-        estimator.estimate([drive], states)
+    assert "2 initial states for 1 recordings" in refusal(lambda: estimator.estimate([drive], states))
     monkeypatch.setattr(type(estimator), "ignores_initial_state", True)
     assert np.array_equal(estimator.estimate([drive], states[0])[0]["vy"], estimator.estimate([drive])[0]["vy"])
 
@@ -156,8 +149,7 @@ def test_recordings_start_from_their_own_states_or_all_from_one_and_forget_them(
 def test_registry_refuses_names_that_it_does_not_know():
     with pytest.raises(ConfigurationError, match=f"is not one of: {', '.join(sorted(estimator_names()))}"):
         estimator_class("kalman_filter_from_the_future")
-    with pytest.raises(ConfigurationError, match="'windowed' is not one of"):
-        estimator_class("windowed")
+    assert "'windowed' is not one of" in refusal(lambda: estimator_class("windowed"), ConfigurationError)
 
 
 @pytest.mark.parametrize(
@@ -235,18 +227,13 @@ def drives():
     return [planar_drive(30.0, 20.0, seed=seed) for seed in (1, 2)]
 
 
-def weights(model):
-    assert isinstance(model, WindowedEstimator)
-    return np.concatenate([values.ravel() for values in model.weights().values()])
-
-
 def test_a_training_that_does_not_move_ends_where_it_started_and_other_settings_are_refused(drives):
     from vehest.run.estimate import pretrained_folder
 
     started = vehest.train("ksnn", drives[:1], drives[1:], [*OF_SHIPPED, *STANDING, f"training.start_from={pretrained_folder()}"])
-    assert weights(started) == pytest.approx(weights(vehest.load_model()), abs=1e-6)
+    assert flat_weights(started) == pytest.approx(flat_weights(vehest.load_model()), abs=1e-6)
     scratch = vehest.train("ksnn", drives[:1], drives[1:], [*OF_SHIPPED, *STANDING])
-    assert np.abs(weights(scratch) - weights(started)).max() > 0.01
+    assert np.abs(flat_weights(scratch) - flat_weights(started)).max() > 0.01
 
     with pytest.raises(ConfigurationError, match=r"training\.start_from: 'pretrained' is KS-NN .*'n_hidden': 2.*'n_hidden': 0"):
         vehest.train("ksnn", drives[:1], drives[1:], ["estimator.n_hidden=0", f"training.start_from={pretrained_folder()}"])

@@ -4,11 +4,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from refusals import refusal
 from scipy import sparse
 from scipy.sparse.linalg import spsolve
 
 from single_track_drive import linear_drive, with_gaps
-from vehest.data.errors import ConfigurationError, DataError
+from vehest.data.errors import ConfigurationError
 from vehest.estimators.base import FitData
 from vehest.estimators.factor_graph import MEASURED, FactorGraph
 from vehest.estimators.registry import estimator_class
@@ -105,12 +106,10 @@ def test_variants_say_how_they_are_solved_and_learn_nothing():
     record = estimator.fit(FitData([], []), NoTraining())
     assert record.metrics["epochs"] == 0
     assert (estimator.learns, estimator.n_parameters, estimator.weights()) == (False, 0, {})
-    with pytest.raises(DataError, match="'gain' is missing, unknown or of another shape"):
-        estimator.load_weights({"gain": np.ones(1)})
+    assert "'gain' is missing, unknown or of another shape" in refusal(lambda: estimator.load_weights({"gain": np.ones(1)}))
     assert (factor_graph().variant, factor_graph().causal) == ("factor_graph_batch", False)
     assert (factor_graph(window=0.05).variant, factor_graph(window=0.05).causal) == ("factor_graph_lag_0.05s", True)
-    with pytest.raises(ConfigurationError, match=r"cannot run along with a drive; set estimator\.window"):
-        factor_graph().online()
+    assert "cannot run along with a drive; set estimator.window" in refusal(lambda: factor_graph().online(), ConfigurationError)
 
 
 def test_with_a_long_window_its_gate_is_that_of_the_kalman_filter():

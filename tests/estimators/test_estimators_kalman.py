@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from refusals import refusal
 
 from single_track_drive import NOISE, linear_drive, with_gaps
 from vehest.data.errors import ConfigurationError, DataError
@@ -25,8 +26,7 @@ def kalman(**config):
 def test_levels_are_those_of_the_high_passed_signals_of_training_or_of_the_recording_itself():
     drives = [linear_drive(60.0, seed=seed, noise={**NOISE, "steer": 1e-3})[0] for seed in (1, 2)]
     estimator = kalman()
-    with pytest.raises(ConfigurationError, match="has not been fitted yet"):
-        estimator.online()
+    assert "has not been fitted yet" in refusal(lambda: estimator.online(), ConfigurationError)
     record = estimator.fit(FitData(drives, []), NoTraining())
     assert estimator.values["ay"] == high_passed_level([drive["ay"] for drive in drives], 0.2)
     assert estimator.values["yaw_rate"] == pytest.approx(NOISE["yaw_rate"] * np.sqrt(0.8), rel=0.05)
@@ -39,8 +39,7 @@ def test_levels_are_those_of_the_high_passed_signals_of_training_or_of_the_recor
     assert np.array_equal(one["vy"], other["vy"])
     assert (one.mode, other.mode) == ("offline", "causal")
     assert (own.learns, own.n_parameters, own.variant) == (False, 0, "kalman_own_noise")
-    with pytest.raises(ConfigurationError, match="cannot run along with a drive"):
-        own.online()
+    assert "cannot run along with a drive" in refusal(lambda: own.online(), ConfigurationError)
 
 
 def test_levels_that_are_given_are_not_read_and_need_no_training():
@@ -75,8 +74,7 @@ def test_speed_and_steering_may_not_be_missing():
         kalman(**GIVEN).online().step({"vx": np.nan, "yaw_rate": 0.0, "ay": 0.0, "steer": 0.0})
     with pytest.raises(DataError, match="channel 'steer' has gaps"):
         kalman(**GIVEN).estimate([with_gaps(linear_drive(2.0)[0], {"steer": slice(3, 5)})])
-    with pytest.raises(DataError, match="no channel 'steer'"):
-        kalman(**GIVEN).online().step({"vx": 1.0, "yaw_rate": 0.0, "ay": 0.0})
+    assert "no channel 'steer'" in refusal(lambda: kalman(**GIVEN).online().step({"vx": 1.0, "yaw_rate": 0.0, "ay": 0.0}))
 
 
 def test_a_car_that_stands_has_an_estimate_and_a_state_handed_over_is_believed():

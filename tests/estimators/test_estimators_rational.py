@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 import torch
 from readable_filters import extended_filter, rational_model
+from refusals import refusal
 
 from rational_drive import CURVES, NOISE, changed, rational_drive
-from vehest.data.errors import ConfigurationError, DataError
+from vehest.data.errors import ConfigurationError
 from vehest.estimators.base import FitData
 from vehest.estimators.model_files import load_model, save_model
 from vehest.estimators.rational_ekf import BOXES, KINDS, LEVELS, RationalFilter
@@ -204,8 +205,7 @@ def test_fit_finds_curves_and_levels_and_innovations_become_as_large_as_expected
     train, held_out = rational_drive(60.0, seed=4), rational_drive(40.0, seed=5)
     estimator = estimator_class("rational_ekf").from_config({"tyres": "rational"})
     assert (estimator.learns, estimator.n_parameters, estimator.variant) == (True, 7, "ratt")
-    with pytest.raises(ConfigurationError, match="has no axle curves yet; fit or load it first"):
-        estimator.online()
+    assert "has no axle curves yet; fit or load it first" in refusal(lambda: estimator.online(), ConfigurationError)
     record = estimator.fit(FitData([train], [held_out]), QUICK)
     for name, value in CURVES.items():
         assert record.metrics[name] == pytest.approx(value, rel=0.15)
@@ -255,8 +255,7 @@ def test_curves_come_from_the_recordings_that_are_named_and_need_a_reference(dri
     np.testing.assert_allclose(both.curve_covariance - alone.curve_covariance, 0.04 * np.eye(4), atol=1e-12)
     with pytest.raises(ConfigurationError, match=r"curves_from 'fit_\*' matches no training recording \(rational4\)"):
         both.fit(FitData([train], []), NoiseTuningSettings(curves_from="fit_*"))
-    with pytest.raises(DataError, match="sideslip_ref"):
-        rational(noise={"tyres": 0.01}).fit(FitData([drive.without_references()], []), QUICK)
+    assert "sideslip_ref" in refusal(lambda: rational(noise={"tyres": 0.01}).fit(FitData([drive.without_references()], []), QUICK))
 
 
 def test_levels_of_the_data_need_no_search_and_everything_given_no_fit():

@@ -3,8 +3,9 @@
 import numpy as np
 import pytest
 import torch
+from refusals import refusal
 
-from conftest import planar_drive
+from conftest import flat_weights, planar_drive, stop_after
 from vehest.data.errors import ConfigurationError, DataError
 from vehest.data.recording import Recording
 from vehest.estimators.base import FitData
@@ -33,10 +34,6 @@ def _estimator(name, seed=0, **config):
     estimator = estimator_class(name).from_config({"inputs": INPUTS, "n_states": 6} | config)
     estimator.seed(seed)
     return estimator
-
-
-def _weights(estimator):
-    return np.concatenate([values.ravel() for values in estimator.weights().values()])
 
 
 def _drives(estimator, recordings):
@@ -76,7 +73,7 @@ def test_error_in_dropped_samples_teaches_nothing(name):
             patch.setattr(velocity_recurrent.VelocityNetwork, "standardise", lambda *_: None)
             estimator.fit(FitData([drive], DATA.validation), training)
         estimators.append(estimator)
-    assert np.array_equal(_weights(estimators[0]), _weights(estimators[1]))
+    assert np.array_equal(flat_weights(estimators[0]), flat_weights(estimators[1]))
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -86,20 +83,19 @@ def test_members_train_as_if_alone_and_seeds_differ(name):
     for seed, member in enumerate(together):
         alone = _estimator(name, seed)
         alone.fit(DATA, QUICK)
-        assert np.array_equal(_weights(alone), _weights(member))
-    assert not np.allclose(_weights(together[0]), _weights(together[1]))
+        assert np.array_equal(flat_weights(alone), flat_weights(member))
+    assert not np.allclose(flat_weights(together[0]), flat_weights(together[1]))
 
 
 def test_training_that_is_stopped_goes_on_to_the_same_weights_dropout_included(tmp_path):
     whole = _estimator("velocity_gru", dropout=0.3)
     record = whole.fit(DATA, QUICK)
-    questions = iter(range(100))
-    stopped = _estimator("velocity_gru", dropout=0.3).fit(DATA, QUICK, FitContext([tmp_path], should_stop=lambda: next(questions) > 3))
+    stopped = _estimator("velocity_gru", dropout=0.3).fit(DATA, QUICK, FitContext([tmp_path], should_stop=stop_after(4)))
     assert stopped.interrupted
     assert 0 < stopped.metrics["epochs"] < 3
     resumed = _estimator("velocity_gru", dropout=0.3)
     assert resumed.fit(DATA, QUICK, FitContext([tmp_path])).history == record.history
-    assert np.array_equal(_weights(whole), _weights(resumed))
+    assert np.array_equal(flat_weights(whole), flat_weights(resumed))
 
 
 def test_sequences_start_elsewhere_each_epoch_within_their_recordings_and_dropout_keeps_the_mean():
@@ -239,5 +235,4 @@ def test_recordings_too_short_or_with_gaps_are_one_clear_error():
     drive = _drive()
     holes = {**drive.channels, "vy_ref": np.where(np.arange(250) == 7, np.nan, drive["vy_ref"])}
     gappy = Recording(drive.id, drive.vehicle, 100.0, 0.0, holes, "simulated", frozenset({"vy_ref"}))
-    with pytest.raises(DataError, match="'vy_ref' has gaps"):
-        _estimator("velocity_gru").fit(FitData([gappy], DATA.validation), QUICK)
+    assert "'vy_ref' has gaps" in refusal(lambda: _estimator("velocity_gru").fit(FitData([gappy], DATA.validation), QUICK))

@@ -8,6 +8,7 @@ from itertools import product
 import numpy as np
 import pytest
 import torch
+from refusals import refusal
 
 from dugoff_drive import TYRES, dugoff_drive
 from every_estimator import fitted
@@ -132,8 +133,7 @@ def test_online_with_a_gate_is_batch_with_a_gate(name):
 def test_a_variant_with_a_gate_is_called_another_and_a_gate_of_nothing_refused(name):
     assert estimator(name, 5.0).variant.replace("_gate5", "") == estimator(name).variant != estimator(name, 5.0).variant
     assert "gated at 5 sigma" in estimator(name, 5.0).full_title
-    with pytest.raises(ConfigurationError, match=r"estimator\.gate must be positive"):
-        estimator(name, 0.0)
+    assert "estimator.gate must be positive" in refusal(lambda: estimator(name, 0.0), ConfigurationError)
 
 
 def test_learned_filters_share_their_training_with_gates_and_unscented_ones_have_none():

@@ -5,8 +5,10 @@ from functools import cache
 import numpy as np
 import pytest
 import torch
+from refusals import refusal
 
 from point_models import covariances
+from single_track_drive import with_gaps
 from small_car_drive import small_car_drive
 from vehest.data.errors import ConfigurationError, DataError
 from vehest.data.recording import Recording
@@ -55,14 +57,6 @@ def trained(dtype="float64"):
 
 def drive(seed=3, seconds=6.0):
     return small_car_drive(seconds, seed).without_references()
-
-
-def with_gaps(recording, gaps):
-    channels = dict(recording.channels)
-    for name, samples in gaps.items():
-        channels[name] = channels[name].copy()
-        channels[name][samples] = np.nan
-    return Recording(recording.id, recording.vehicle, recording.rate_hz, recording.start_time, channels, "simulated", frozenset(gaps))
 
 
 def online(made, recording):
@@ -186,14 +180,12 @@ def test_pure_noise_stays_finite_and_within_what_is_possible(dtype):
 
 
 def test_weights_and_drives_that_do_not_fit_are_one_clear_error():
-    with pytest.raises(DataError, match=r"do not fit its settings: 'dynamics\.network\.0\.bias'"):
-        estimator(width=8).load_weights(trained().weights())
+    assert "do not fit its settings: 'dynamics.network.0.bias'" in refusal(lambda: estimator(width=8).load_weights(trained().weights()))
     missing = small_car_drive(1.2, 0).without_references()
     with pytest.raises(DataError, match="has no channel 'vx_ref', which estimator 'learned_ukf' learns from"):
         estimator().fit(FitData([missing], [missing]), quick())
     gappy = with_gaps(small_car_drive(1.2, 0), {"steer": slice(3, 5)})
-    with pytest.raises(DataError, match="channel 'steer' has gaps"):
-        estimator().fit(FitData([gappy], [gappy]), quick())
+    assert "channel 'steer' has gaps" in refusal(lambda: estimator().fit(FitData([gappy], [gappy]), quick()))
 
 
 def variant_of(seed=0, **config):
@@ -209,8 +201,7 @@ def test_variant_without_its_options_is_the_learned_filter_to_the_bit():
     assert other.variant == "nntf_uh"
     assert other.n_parameters == one.n_parameters
     assert all(np.array_equal(values, other.weights()[name]) for name, values in one.weights().items())
-    with pytest.raises(ConfigurationError, match=r"estimator\.curvature is of estimator\.dynamics=pacejka"):
-        variant_of(curvature=True)
+    assert "estimator.curvature is of estimator.dynamics=pacejka" in refusal(lambda: variant_of(curvature=True), ConfigurationError)
 
 
 @pytest.mark.parametrize("noise", ["constant", "state_dependent"])

@@ -7,6 +7,7 @@ import pytest
 import torch
 from test_sample_network import loaded_drive
 
+from conftest import stop_after
 from dugoff_drive import TYRES
 from vehest.data.errors import ConfigurationError, DataError
 from vehest.data.schema import settings_from_config
@@ -136,8 +137,7 @@ def test_pre_training_has_the_loss_of_the_formulas_and_starts_process_noise_wher
     expected = (0.5 * variance.log() + 0.5 * error**2 / variance).mean() + ((sigma[:, 1:] - levels) ** 2).sum(1).mean()
     assert phase.loss(Draw(rows, torch.tensor([5]))).item() == pytest.approx(expected.item(), rel=1e-12)
     estimator = estimator_of("cnn_ukf")
-    stopping = iter([False])
-    estimator.fit(DATA, TRAININGS["cnn_ukf"], FitContext(should_stop=lambda: next(stopping, True)))  # before its first step
+    estimator.fit(DATA, TRAININGS["cnn_ukf"], FitContext(should_stop=stop_after(1)))  # before its first step
     assert isinstance(estimator, CnnUkf)
     estimator.network.get_parameter("weight_3").data.zero_()
     word = estimator.pseudo_of(DATA.validation[0].stack(estimator.network_inputs)[:3])
@@ -210,9 +210,9 @@ def test_lost_sequences_and_gradients_teach_nothing_and_too_many_stop_the_traini
 def test_a_stopped_training_goes_on_to_the_same_weights(name, tmp_path):
     whole = estimator_of(name)
     whole.fit(DATA, TRAININGS[name])
-    for answers in (iter([False] * 9), iter([False] * 10_000)):
+    for questions in (9, 10_000):
         estimator = estimator_of(name)
-        record = estimator.fit(DATA, TRAININGS[name], FitContext([tmp_path], lambda own=answers: next(own, True)))
+        record = estimator.fit(DATA, TRAININGS[name], FitContext([tmp_path], stop_after(questions)))
     assert not record.interrupted
     for key, values in whole.weights().items():
         assert np.array_equal(values, estimator.weights()[key]), key

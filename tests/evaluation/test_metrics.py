@@ -5,10 +5,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from refusals import refusal
 from scipy import optimize
 
 from conftest import planar_drive
-from vehest.data.errors import DataError
 from vehest.data.estimate import Estimate
 from vehest.data.recording import Recording
 from vehest.data.splits import Span
@@ -74,8 +74,7 @@ def test_weighted_metrics_have_the_values_of_a_hand_calculation_where_all_parts_
     assert "rmse_vx" in accuracy([with_vx])
     assert "mse_weighted" not in accuracy([with_vx])
     assert not {"rmse_vx", "rmse_yaw_rate", "nees", "nis"} & set(accuracy([with_vx, without]))
-    with pytest.raises(DataError, match="there is none of yaw_rate"):
-        weighted_squared_errors(with_vx)
+    assert "there is none of yaw_rate" in refusal(lambda: weighted_squared_errors(with_vx))
 
 
 def test_faster_estimates_are_held_never_interpolated_from_the_future(drive):
@@ -104,8 +103,7 @@ def test_standstill_has_no_sideslip_and_holes_no_better_score(drive):
     assert (counted > 80.0, without) == (True, 0.0)
     vy = drive["vy_ref"].copy()
     vy[500] = np.nan
-    with pytest.raises(DataError, match="has no estimate for 1 of"):
-        score(_estimate(drive.time, vy, 20.0, 0.0), drive, Span("d", "drive"), Protocol())
+    assert "has no estimate for 1 of" in refusal(lambda: score(_estimate(drive.time, vy, 20.0, 0.0), drive, Span("d", "drive"), Protocol()))
 
 
 def test_without_lateral_acceleration_all_but_the_nonlinear_range_is_scored(drive):
@@ -212,8 +210,7 @@ def test_manoeuvres_are_recordings_grouped_by_their_names():
     together = manoeuvres_of(spans, [CALM, HARD])
     assert kpis(together).manoeuvres == 1
     assert kpis(together).max_error == pytest.approx(4.0)
-    with pytest.raises(DataError, match="1 scored parts do not belong to 2 ranges"):
-        manoeuvres_of(spans, [CALM])
+    assert "1 scored parts do not belong to 2 ranges" in refusal(lambda: manoeuvres_of(spans, [CALM]))
     assert group_of("test_lane_change_2_off_001") == "lane change"
     assert group_of("20140222_01") == "other"
     groups = kpis_by_group(SET | {"train_slalom_30_off_003": [HARD]})
@@ -228,5 +225,4 @@ def test_distribution_counts_errors_in_bins_of_a_quarter_of_a_degree():
     np.testing.assert_array_equal(found.counts, [1, 0, 0, 1, 0, 2])
     hard = error_distribution([CALM, HARD])
     assert (hard.counts.sum(), hard.mean, hard.deviation) == (2, pytest.approx(-1.0), pytest.approx(3.0))
-    with pytest.raises(DataError, match="no sample has a lateral acceleration"):
-        error_distribution([CALM])
+    assert "no sample has a lateral acceleration" in refusal(lambda: error_distribution([CALM]))

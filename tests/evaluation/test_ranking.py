@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 from arch.bootstrap import optimal_block_length
+from refusals import refusal
 from scipy import signal
 
-from vehest.data.errors import DataError
 from vehest.evaluation.blocks import (
     COLUMNS,
     _length,
@@ -54,8 +54,7 @@ def test_segments_hold_what_the_metrics_are_made_of(tmp_path):
     back = read_segments(tmp_path / "blocks.csv")["test"]
     assert all(np.array_equal(getattr(back, name), getattr(segments, name)) for name in COLUMNS)
     (tmp_path / "blocks.csv").write_text("test_set,piece\ntest,0\n")
-    with pytest.raises(DataError, match="start"):
-        read_segments(tmp_path / "blocks.csv")
+    assert "start" in refusal(lambda: read_segments(tmp_path / "blocks.csv"))
 
 
 @pytest.mark.parametrize("memory", [0.3, 0.5, 0.9, 0.95])

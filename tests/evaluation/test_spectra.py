@@ -4,9 +4,9 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from refusals import refusal
 
 from conftest import planar_drive
-from vehest.data.errors import DataError
 from vehest_papers.kit.spectra import decibels, lateral_velocity_rate, mean_bias, periodogram, process_noise
 
 RATE = 20.0
@@ -38,12 +38,9 @@ def test_sinusoids_stand_in_their_bin_and_recordings_count_by_segments():
 
 
 def test_series_that_cannot_be_read_are_refused():
-    with pytest.raises(DataError, match=r"series 1 lasts 25\.0 s"):
-        periodogram([np.zeros(600), np.zeros(500)], RATE)
-    with pytest.raises(DataError, match="series 0 has gaps"):
-        periodogram([np.full(600, np.nan)], RATE)
-    with pytest.raises(DataError, match="at least one"):
-        periodogram([], RATE)
+    assert "series 1 lasts 25.0 s" in refusal(lambda: periodogram([np.zeros(600), np.zeros(500)], RATE))
+    assert "series 0 has gaps" in refusal(lambda: periodogram([np.full(600, np.nan)], RATE))
+    assert "at least one" in refusal(lambda: periodogram([], RATE))
 
 
 def test_planted_biases_and_noise_are_the_process_noise_of_the_documented_rate(drive):
@@ -70,5 +67,4 @@ def test_level_is_the_mean_of_a_third_of_an_octave_and_differences_are_in_decibe
     inside = [density for hz, density in zip(own.frequency, own.density, strict=True) if 0.8909 <= hz <= 1.1225]
     assert own.level(1.0) == pytest.approx(np.mean(inside))
     assert decibels(10.0 * own.level(1.0), own.level(1.0)) == pytest.approx(10.0)
-    with pytest.raises(DataError, match="has no line at 15 Hz"):
-        own.level(15.0)
+    assert "has no line at 15 Hz" in refusal(lambda: own.level(15.0))

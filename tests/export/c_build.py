@@ -63,18 +63,24 @@ class Library:
         return out.astype(np.float64), fine.astype(bool)
 
 
-def write(estimator, precision, folder):
-    folder.mkdir(parents=True, exist_ok=True)
+def method_files(estimator, precision):
+    """Name of a file -> the C of an estimator's method."""
     source = method_source(estimator, precision)
-    (folder / "vehest_types.h").write_text(render("types.h.j2", precision, **_common(estimator)), encoding="ascii")
-    (folder / "vehest_method.h").write_text(source.header, encoding="ascii")
-    (folder / "vehest_method.c").write_text(source.source, encoding="ascii")
+    types = render("types.h.j2", precision, **_common(estimator))
+    return {"vehest_types.h": types, "vehest_method.h": source.header, "vehest_method.c": source.source}
+
+
+def write(files, folder):
+    """Write texts, by name; names may lead into folders."""
+    for name, text in files.items():
+        path = folder / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(text, encoding="utf-8")
 
 
 def built(estimator, precision, folder, compiler="gcc"):
     """A library; a warning is an error."""
-    write(estimator, precision, folder)
-    (folder / "replay.c").write_text(REPLAY)
+    write(method_files(estimator, precision) | {"replay.c": REPLAY}, folder)
     flags = [*FLAGS, *(["-Wdouble-promotion"] if precision == "float" else [])]
     library = folder / f"{compiler}.so"
     command = [compiler, *flags, "-fPIC", "-shared", "vehest_method.c", "replay.c", "-lm", "-o", str(library)]

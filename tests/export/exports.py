@@ -126,6 +126,12 @@ class Export:
         command([tool(compiler), *flags, *options, main, *self.sources, "-lm", "-o", out], self.folder)
         return self.folder / out
 
+    def agreement(self, *, faults=False):
+        """Write, build and run; see `compared`."""
+        self.write().build("gcc", "-O2")
+        self.vectors(faults=faults)
+        return self.differences(["./main"])
+
     def differences(self, program):
         """Run the vectors; see `compared`."""
         command([*program, "in.csv", "out.csv"], self.folder)

@@ -8,11 +8,10 @@ if __name__ == "__main__":
     sys.path[:0] = [str(Path(__file__).parents[1] / part) for part in (".", "estimators", "export")]
 
 import numpy as np
+from c_build import method_files, write
 from exports import LARGEST, WEIGHTS, model
 
-from vehest.export.method import _common, method_source
 from vehest.export.program import program_files
-from vehest.export.rendering import render
 from vehest.trust.bands import Bands, Quantity
 from vehest.trust.contract import GuardedStepper
 from vehest.trust.guard import ChannelLimits, GuardLimits
@@ -67,13 +66,7 @@ def trust_by_hand():
 
 def methods(families):
     """Name of a file -> the C of a family's method."""
-    found = {}
-    for name in families:
-        own = by_hand(name)
-        method = method_source(own, "double")
-        found[f"{name}/vehest_types.h"] = render("types.h.j2", "double", **_common(own))
-        found |= {f"{name}/vehest_method.h": method.header, f"{name}/vehest_method.c": method.source}
-    return found
+    return {f"{name}/{file}": text for name in families for file, text in method_files(by_hand(name), "double").items()}
 
 
 def contract():
@@ -108,13 +101,6 @@ def _alike(own, other):
         return False
     numbers = [[float(number.rstrip("f")) for number in NUMBER.findall(line)] for line in (own, other)]
     return bool(np.allclose(*numbers, rtol=1e-9, atol=1e-12))
-
-
-def write(files, folder):
-    for name, text in files.items():
-        path = folder / name
-        path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_text(text, encoding="utf-8")
 
 
 if __name__ == "__main__":

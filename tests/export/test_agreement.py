@@ -15,10 +15,7 @@ IN_FAULTS = 1e-7  # of bands beside faults: Python's own covariances lose digits
 @pytest.mark.parametrize("family", FAMILIES)
 @pytest.mark.parametrize("faults", [False, True], ids=["vectors", "faults"])
 def test_double_agrees_with_python_and_gives_every_reason_alike(tmp_path, family, faults):
-    export = Export(family, "double", tmp_path).write()
-    export.build("gcc", "-O2")
-    export.vectors(faults=faults)
-    largest, others = export.differences(["./main"])
+    largest, others = Export(family, "double", tmp_path).agreement(faults=faults)
     assert largest[:2].max() <= TOLERANCES["double"]
     assert largest[2:].max() <= (IN_FAULTS if faults else TOLERANCES["double"])
     assert others == 0
@@ -26,10 +23,7 @@ def test_double_agrees_with_python_and_gives_every_reason_alike(tmp_path, family
 
 @pytest.mark.parametrize("family", [name for name in FAMILIES if name not in NOT_IN_FLOAT])
 def test_float_agrees_to_a_millimetre_a_second_on_the_vectors(tmp_path, family):
-    export = Export(family, "float", tmp_path).write()
-    export.build("gcc", "-O2")
-    export.vectors()
-    largest, others = export.differences(["./main"])
+    largest, others = Export(family, "float", tmp_path).agreement()
     assert largest[:2].max() <= TOLERANCES["float"]
     assert others <= 0.01 * len((tmp_path / "expected.csv").read_text().splitlines())
 
@@ -37,10 +31,7 @@ def test_float_agrees_to_a_millimetre_a_second_on_the_vectors(tmp_path, family):
 @pytest.mark.parametrize("bus_rate_hz", [100.0, 250.0, 1000.0 / 3.0])
 @pytest.mark.parametrize("faults", [False, True], ids=["vectors", "faults"])
 def test_the_front_end_passes_on_the_same_rows_at_the_same_samples(tmp_path, bus_rate_hz, faults):
-    export = Export("kinematic", "double", tmp_path, bus_rate_hz).write()
-    export.build("gcc", "-O2")
-    export.vectors(faults=faults)
-    largest, others = export.differences(["./main"])
+    largest, others = Export("kinematic", "double", tmp_path, bus_rate_hz).agreement(faults=faults)
     assert largest.max() <= TOLERANCES["double"]
     assert others == 0
 

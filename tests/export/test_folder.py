@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import pytest
 from exports import command, model, tool, trust
+from refusals import refusal
 
 from every_estimator import fitted
 from vehest.data.errors import ConfigurationError
@@ -37,13 +38,11 @@ def test_an_export_takes_the_place_of_an_earlier_one_and_of_nothing_else(tmp_pat
     export_model(model("zero"), None, out)
     assert not (out / "vehest_health.c").exists()
     (out / "mine.c").write_text("")
-    with pytest.raises(ConfigurationError, match=r"holds 'mine\.c', which is no part of an export"):
-        export_model(model("zero"), None, out)
+    assert "holds 'mine.c', which is no part of an export" in refusal(lambda: export_model(model("zero"), None, out), ConfigurationError)
     other = tmp_path / "project"
     other.mkdir()
     (other / "main.c").write_text("int main(void) { return 0; }")
-    with pytest.raises(ConfigurationError, match=r"holds 'main\.c'"):
-        export_model(model("zero"), None, other)
+    assert "holds 'main.c'" in refusal(lambda: export_model(model("zero"), None, other), ConfigurationError)
     assert [path.name for path in other.iterdir()] == ["main.c"]
 
 
@@ -63,8 +62,7 @@ def test_families_and_channels_that_c_cannot_have_are_refused_and_leave_nothing(
     with pytest.raises(ConfigurationError, match=r"'steer' follows the others to .* which float cannot resolve"):
         export_model(model("kalman"), replace(own, health=health), tmp_path / "c", "float")
     assert not list(tmp_path.iterdir())
-    with pytest.raises(ConfigurationError, match="cannot be exported"):
-        export_model(fitted("factor_graph"), None, tmp_path / "c")
+    assert "cannot be exported" in refusal(lambda: export_model(fitted("factor_graph"), None, tmp_path / "c"), ConfigurationError)
 
 
 def test_the_command_finds_a_model_by_its_folder_and_says_what_it_takes(tmp_path):

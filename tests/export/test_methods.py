@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import torch
 from c_build import COMPILERS, OUTPUTS, built
+from refusals import refusal
 
 from dugoff_drive import TYRES, driven
 from every_estimator import drive_for, fitted
@@ -210,13 +211,11 @@ def test_every_family_but_the_factor_graph_can_be_exported():
 
 def test_what_cannot_be_exported_is_said_in_one_line():
     offline = estimator_class("kalman").from_config({"noise": {"read_from": "recording"}})
-    with pytest.raises(ConfigurationError, match="cannot run along with a drive"):
-        method_source(offline, "double")
+    assert "cannot run along with a drive" in refusal(lambda: method_source(offline, "double"), ConfigurationError)
     unscented = estimator_class("rational_ekf").from_config(
         {"filter": "unscented", "noise": {"yaw_rate": 0.01, "ay": 0.1, "steer": 0.01, "tyres": 0.01}, "curves": CURVES}
     )
-    with pytest.raises(ConfigurationError, match="has no C; train it with filter=extended"):
-        method_source(unscented, "double")
+    assert "has no C; train it with filter=extended" in refusal(lambda: method_source(unscented, "double"), ConfigurationError)
 
 
 CURVES = {"c1_front": 0.1, "c2_front": 0.7e5, "c1_rear": 0.1, "c2_rear": 1.2e5}

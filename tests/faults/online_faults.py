@@ -14,26 +14,25 @@ estimator's first sample on. What is asked of a case:
 from __future__ import annotations
 
 import argparse
-import csv
-import json
 import math
 import os
-import subprocess
-import sys
 import time
 import warnings
 from concurrent.futures import ProcessPoolExecutor
-from dataclasses import dataclass
+from functools import cache
+from itertools import product
 from multiprocessing import get_context
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
+import pandas as pd
 import torch
 
 import vehest
-from vehest.data.files import written_aside
-from vehest.data.store import read_recording
+from vehest.run.config import compose_config
 from vehest.run.downsample import transforms_of
+from vehest.sources.base import open_source
 from vehest.trust.faults import KINDS, SEVERITIES, Fault, applies, inject
 from vehest.trust.guard import learn_limits
 from vehest.trust.watch import STARTED
@@ -81,44 +80,36 @@ FERRARI = {
     ),
 }
 SMALL_CAR = {"learned_ukf": ("estimator.dynamics=pacejka", "training.one_step.max_epochs=60", "training.noise.max_epochs=3")}
+SLOW = ("learned_ukf", "kalman", "dugoff_ukf", "factor_graph", "cnn_ukf", "ensemble_ukf")
 
 
-@dataclass(frozen=True)
-class Ground:
-    """Where a family is tried: a data set, ranges to learn from and to be tried on, in seconds after the first sample."""
+class Ground(NamedTuple):
+    """Where families are tried: ranges of a data set to learn from and to be tried on, in seconds after the first sample."""
 
-    name: str
-    dataset: str
+    data: str
     kind: str
     train: tuple[str, float, float]
     validation: tuple[str, float, float]
     trial: tuple[str, float]
     families: dict[str, tuple[str, ...]]
-    overrides: tuple[str, ...] = ()
 
 
-def grounds(data_root):
+def grounds():
     """A simulated drive always, the real ones where the recordings are."""
     bmw = {**FERRARI, "data_sheet": ("estimator.wheelbase=2.579", "estimator.cg_to_rear_axle=1.423")}
     own = "estimator.car={mass: 1093, yaw_inertia: 1791, cg_to_front_axle: 1.156, cg_to_rear_axle: 1.423, cg_height: 0.42}"
     bmw = {name: tuple(own if word == CAR else word for word in words) for name, words in bmw.items()}
-    found = [Ground("sim_quickstart", "sim_quickstart", "simulated", ("drive_1", 0, 150), ("drive_2", 0, 90), ("drive_3", 40.0), bmw)]
-    if data_root:
-        ferrari = "20140222_01_01_03_250lm"
-        found.append(Ground("ferrari_250lm", "ferrari_250lm", "real", (ferrari, 0, 300), (ferrari, 300, 400), (ferrari, 450.0), FERRARI))
-        hoons = "iros_hoons_1_with_friction_run_"
-        found.append(
-            Ground("f1tenth", "f1tenth", "real", (f"{hoons}1", 0, 60), (f"{hoons}0", 0, 40), ("hoons_all_test_run_4", 10.0), SMALL_CAR)
-        )
-    return found
+    yield Ground("sim_quickstart", "simulated", ("drive_1", 0, 150), ("drive_2", 0, 90), ("drive_3", 40.0), bmw)
+    if os.environ.get("VEHEST_DATA"):
+        day, hoons = "20140222_01_01_03_250lm", "iros_hoons_1_with_friction_run_"
+        yield Ground("ferrari_250lm", "real", (day, 0, 300), (day, 300, 400), (day, 450.0), FERRARI)
+        yield Ground("f1tenth", "real", (f"{hoons}1", 0, 60), (f"{hoons}0", 0, 40), ("hoons_all_test_run_4", 10.0), SMALL_CAR)
 
 
-def recordings(ground, output):
-    """Id -> recording at its native rate, of those that the ground needs."""
-    asked = [sys.executable, "-m", "vehest", "ingest", ground.dataset, f"output={output}", "--json", "--quiet"]
-    folder = Path(json.loads(subprocess.run(asked, check=True, capture_output=True, text=True).stdout)["folder"])
-    wanted = {ground.train[0], ground.validation[0], ground.trial[0]}
-    return {path.stem: read_recording(path) for path in sorted(folder.glob("*.parquet")) if path.stem in wanted}
+@cache
+def recording(data, name):
+    """A recording at its native rate."""
+    return open_source(compose_config("ingest", [f"dataset={data}"])["dataset"]).read(name)
 
 
 def stretch(recording, start, stop):
@@ -140,35 +131,32 @@ def sideslip(vy, vx):
 def walk(estimator, limits, samples):
     """v after each sample, held for the time that it is made for, with exceptions, starts, and whether the speed bounds it."""
     stepper = vehest.online(estimator)
-    names, steps = list(samples), len(next(iter(samples.values())))
-    said, exceptions, starts = np.full(steps, np.nan), 0, 0
-    rows = np.stack([samples[name] for name in names], 1).tolist()
+    rows = [dict(zip(samples, row, strict=True)) for row in zip(*(values.tolist() for values in samples.values()), strict=True)]
+    said, exceptions, starts = np.full(len(rows), np.nan), 0, 0
     fastest, bounded = 1.0, True
-    at = names.index("vx") if "vx" in names else -1
     for k, row in enumerate(rows):
         try:
-            said[k] = stepper.step(dict(zip(names, row, strict=True)))["vy"]
+            said[k] = stepper.step(row)["vy"]
         except Exception:  # whatever reaches the caller is what is counted
             exceptions += 1
         starts += bool(stepper.marks & STARTED)
-        if at >= 0 and math.isfinite(row[at]) and abs(row[at]) < 140.0:
-            fastest = max(fastest, abs(row[at]))
-        if math.isfinite(said[k]) and abs(said[k]) > limits.largest_tan_sideslip * min(fastest, limits.top_speed) * (1 + 1e-9):
-            bounded = False
-    shift = estimator.horizon_steps
-    return np.concatenate([np.full(shift, np.nan), said])[:steps], exceptions, starts, bounded
+        speed = abs(row.get("vx", math.nan))
+        if speed < 140.0:
+            fastest = max(fastest, speed)
+        bounded &= not abs(said[k]) > limits.largest_tan_sideslip * min(fastest, limits.top_speed) * (1 + 1e-9) or math.isinf(said[k])
+    return np.concatenate([np.full(estimator.horizon_steps, np.nan), said])[: len(rows)], exceptions, starts, bounded
 
 
-def try_family(ground, name, output):
+def try_family(ground, name):
     """Fit a family and walk it through every case; a row each."""
     torch.set_num_threads(1)
     warnings.filterwarnings("ignore")
-    by_id = recordings(ground, output)
-    train, validation = (stretch(by_id[part[0]], part[1], part[2]) for part in (ground.train, ground.validation))
-    estimator = vehest.train(name, [train], [validation], [*ground.overrides, *ground.families[name]])
+    train, validation = (stretch(recording(ground.data, own), start, stop) for own, start, stop in (ground.train, ground.validation))
+    estimator = vehest.train(name, [train], [validation], ground.families[name])
     rate = estimator.settings.rate_hz
     limits = learn_limits([at_rate(train, estimator)], estimator.channels, rate)
-    drive = stretch(at_rate(by_id[ground.trial[0]], estimator), ground.trial[1], ground.trial[1] + SETTLE + LASTS + COMES_BACK)
+    drive, start = at_rate(recording(ground.data, ground.trial[0]), estimator), ground.trial[1]
+    drive = stretch(drive, start, start + SETTLE + LASTS + COMES_BACK)
     samples = {channel: drive[channel].copy() for channel in estimator.channels}
     speed = drive["vx_ref"] if "vx_ref" in drive else drive["vx"]
     reference = sideslip(drive["vy_ref"], speed)
@@ -183,71 +171,42 @@ def try_family(ground, name, output):
     settled = np.arange(len(drive)) >= max(warm, round(2.0 * rate))
     after, during = seconds >= back, (seconds >= SETTLE) & (seconds < SETTLE + LASTS)
     usual = max(error(nominal, settled), error(nominal, after))
+    measured = [channel for channel, values in samples.items() if not np.isnan(values).all()]
     rows = []
-    for channel in estimator.channels:
-        if np.isnan(samples[channel]).all():
+    for channel, kind, severity in product(measured, KINDS, SEVERITIES):
+        if not applies(kind, channel):
             continue
-        for kind in KINDS:
-            if not applies(kind, channel):
-                continue
-            for severity in SEVERITIES:
-                fault = Fault(kind, channel, severity, SETTLE, LASTS)
-                vy, exceptions, starts, bounded = walk(estimator, limits, inject(samples, rate, fault))
-                finite = bool(np.isfinite(vy[warm:]).all())
-                later = error(np.nan_to_num(vy, nan=1e9), after)
-                row = (ground.name, ground.kind, name, f"{rate:g}", kind, channel, severity, finite, exceptions, bounded, starts)
-                figures = (usual, error(np.nan_to_num(vy, nan=1e9), during), later)
-                rows.append((*row, *(f"{figure:.4g}" for figure in figures), later <= TIMES_USUAL * usual))
+        vy, exceptions, starts, bounded = walk(estimator, limits, inject(samples, rate, Fault(kind, channel, severity, SETTLE, LASTS)))
+        finite, vy = bool(np.isfinite(vy[warm:]).all()), np.nan_to_num(vy, nan=1e9)
+        row = (ground.data, ground.kind, name, f"{rate:g}", kind, channel, severity, finite, exceptions, bounded, starts)
+        figures = (f"{figure:.4g}" for figure in (usual, error(vy, during), error(vy, after)))
+        rows.append((*row, *figures, error(vy, after) <= TIMES_USUAL * usual))
     return rows
 
 
-def cases(data_root):
-    """What is tried, the slow families last."""
-    slow = ("learned_ukf", "kalman", "dugoff_ukf", "factor_graph", "cnn_ukf", "ensemble_ukf")
-    found = [(ground, name) for ground in grounds(data_root) for name in ground.families]
-    return iter(sorted(found, key=lambda case: slow.index(case[1]) if case[1] in slow else -1))
-
-
-def write_table(path, rows):
-    """Write all rows at once, or nothing."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with written_aside(path) as aside, open(aside, "w", newline="", encoding="utf-8") as stream:
-        writer = csv.writer(stream, lineterminator="\n")
-        writer.writerow(HEADER)
-        writer.writerows(rows)
-
-
-def main(words=None):
-    """Write the table; the last lines count what did not hold."""
+def main():
+    """Write the table; the last line counts what did not hold."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--out", type=Path, required=True)
-    parser.add_argument("--output", type=Path, default=Path(os.environ.get("VEHEST_OUTPUT", "outputs")), help="output root of recordings")
     parser.add_argument("--jobs", type=int, default=2)
     parser.add_argument("--only", help="one estimator")
     parser.add_argument("--data", help="one data set")
-    asked = parser.parse_args(words)
-    chosen = (case for case in cases(os.environ.get("VEHEST_DATA")) if asked.only in (None, case[1]))
-    wanted = [case for case in chosen if asked.data in (None, case[0].name)]
-    for ground in {case[0].name: case[0] for case in wanted}.values():
-        recordings(ground, asked.output)
+    asked = parser.parse_args()
+    cases = [(ground, name) for ground in grounds() if asked.data in (None, ground.data) for name in ground.families]
+    cases = [case for case in cases if asked.only in (None, case[1])]
+    cases.sort(key=lambda case: SLOW.index(case[1]) if case[1] in SLOW else -1)
     started, tables = time.monotonic(), {}
+    asked.out.parent.mkdir(parents=True, exist_ok=True)
     with ProcessPoolExecutor(asked.jobs, mp_context=get_context("spawn")) as pool:
-        futures = {(ground.name, name): pool.submit(try_family, ground, name, asked.output) for ground, name in wanted}
-        for key, future in futures.items():
-            tables[key] = future.result()
-            bad = sum(not (row[7] and not row[8] and row[9] and row[14]) for row in tables[key])
-            print(f"{key[0]:16s} {key[1]:14s} {len(tables[key]):4d} cases, {bad} not held, {time.monotonic() - started:.0f} s", flush=True)
-            rows = [row for done in sorted(tables) for row in tables[done]]
-            write_table(asked.out, rows)  # so that what is done stands there if the rest is not awaited
-    counts = {
-        "with a value that is not finite": sum(not row[7] for row in rows),
-        "with an exception": sum(row[8] > 0 for row in rows),
-        "beyond the speed": sum(not row[9] for row in rows),
-        "not back within twice the usual error": sum(not row[14] for row in rows),
-    }
-    print(f"{len(rows)} cases: " + ", ".join(f"{count} {what}" for what, count in counts.items()))
-    return 0
+        for (ground, name), rows in zip(cases, pool.map(try_family, *zip(*cases, strict=True)), strict=True):
+            tables[ground.data, name] = rows
+            table = pd.DataFrame([row for done in sorted(tables) for row in tables[done]], columns=HEADER)
+            table.to_csv(asked.out, index=False)  # so that what is done stands there if the rest is not awaited
+            print(f"{ground.data:16s} {name:14s} {len(rows):4d} cases, {time.monotonic() - started:.0f} s", flush=True)
+    held = {"finite": table["finite"], "without an exception": table["exceptions"] == 0, "within the speed": table["within_speed"]}
+    held["back within twice the usual error"] = table["recovered"]
+    print(f"{len(table)} cases: " + ", ".join(f"{(~own.astype(bool)).sum()} not {what}" for what, own in held.items()))
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    main()

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -18,60 +17,39 @@ from vehest.filters.unscented_scan import MARGIN, Function, NonlinearFiltered
 
 
 def sigma_points(rule, mean, factor):
-    """Points of N(mean, L Lᵀ), the mean first, (..., 2n + 1, n), of a mean (..., n) and L, lower triangular, (..., n, n)."""
+    """Points of N(mean, L Lᵀ), the mean first, (2n + 1, n), of a mean (n,) and L, lower triangular, (n, n)."""
     offsets = rule.spread * factor.mT
-    centre = mean.unsqueeze(-2)
-    return torch.cat([centre, centre + offsets, centre - offsets], dim=-2)
+    return torch.cat([mean[None], mean + offsets, mean - offsets])
 
 
 def mean_of(rule, values):
-    """Weighted mean of values at the points, (..., 2n + 1, m) -> (..., m)."""
-    return rule.centre_mean * values[..., 0, :] + rule.other * values[..., 1:, :].sum(-2)
+    """Weighted mean of values at the points, (2n + 1, m) -> (m,)."""
+    return rule.centre_mean * values[0] + rule.other * values[1:].sum(0)
 
 
 def covariance_of(rule, deviations, others):
-    """Weighted Σ w d eᵀ of deviations from the mean, (..., 2n + 1, m) and (..., 2n + 1, k) -> (..., m, k)."""
-    centre = deviations[..., 0, :].unsqueeze(-1) * others[..., 0, :].unsqueeze(-2)
-    return rule.centre_covariance * centre + rule.other * (deviations[..., 1:, :].mT @ others[..., 1:, :])
-
-
-def stacked(states, axis):
-    """States of successive samples as one, with the samples along an axis of the means."""
-    return Gaussian(torch.stack([state.mean for state in states], axis), torch.stack([state.covariance for state in states], axis))
+    """Weighted Σ w d eᵀ of deviations from the mean, (2n + 1, m) and (2n + 1, k) -> (m, k)."""
+    return rule.centre_covariance * torch.outer(deviations[0], others[0]) + rule.other * (deviations[1:].mT @ others[1:])
 
 
 def symmetric(matrix):
-    """The symmetric part, which rounding has left a little (..., n, n)."""
+    """The symmetric part, which rounding has left a little."""
     return 0.5 * (matrix + matrix.mT)
 
 
-class Factor(NamedTuple):
-    """A covariance, NaN where it could not be repaired, L with L Lᵀ = covariance, both (..., n, n), and whether it was repaired, (...)."""
-
-    covariance: Tensor
-    factor: Tensor
-    repaired: Tensor
-
-
 def factorised(covariance):
-    """Cholesky factor of a covariance, lifted first where it is not positive definite.
+    """A covariance, its Cholesky factor L, and whether it was lifted first since it was not positive definite.
 
-    Lifting adds the same to every eigenvalue, as much as is needed for a margin of `MARGIN`; what is added counts as a constant in
-    gradients. Covariances that are not finite stay NaN, each for itself: the others of a batch go on.
+    Lifting adds the same to every eigenvalue, as much as a margin of `MARGIN` needs; what is added counts as a constant in gradients.
     """
-    finite = torch.isfinite(covariance).all(-1).all(-1)
-    identity = torch.eye(covariance.shape[-1], dtype=covariance.dtype, device=covariance.device)
-    safe = torch.where(finite[..., None, None], covariance, identity)
-    factor, info = torch.linalg.cholesky_ex(safe)
-    lost = info > 0
-    if bool(lost.any()):
-        with torch.no_grad():
-            eigenvalues = torch.linalg.eigvalsh(safe)
-            lift = MARGIN * eigenvalues.abs().amax(-1) - eigenvalues[..., 0]
-        safe = safe + torch.where(lost, lift, 0.0)[..., None, None] * identity
-        factor, info = torch.linalg.cholesky_ex(safe)
-    whole = (finite & (info == 0))[..., None, None]
-    return Factor(torch.where(whole, safe, torch.nan), torch.where(whole, factor, torch.nan), lost & finite)
+    factor, lost = torch.linalg.cholesky_ex(covariance)
+    if not lost:
+        return covariance, factor, False
+    with torch.no_grad():
+        eigenvalues = torch.linalg.eigvalsh(covariance)
+        lift = MARGIN * eigenvalues.abs().max() - eigenvalues[0]
+    lifted = covariance + lift * torch.eye(len(covariance), dtype=covariance.dtype)
+    return lifted, torch.linalg.cholesky(lifted), True
 
 
 @dataclass(frozen=True)
@@ -98,13 +76,6 @@ class NonlinearModel:
         return state if self.constrain is None else self.constrain(state)
 
 
-class _Updated(NamedTuple):
-    state: Gaussian[Tensor]
-    innovation: Tensor
-    innovation_covariance: Tensor
-    lost: Tensor
-
-
 def log_likelihood(steps):
     """Of each sample's measurements given those before, (..., T), by innovations and their covariances; 0 where nothing was measured."""
     errors, covariances, measured = (torch.as_tensor(part) for part in (steps.innovation, steps.innovation_covariance, steps.measured))
@@ -113,92 +84,61 @@ def log_likelihood(steps):
 
 
 def unscented_filter(model, measurements, inputs, initial, rule):
-    """The unscented Kalman filter with additive noise; sigma points are drawn again before each update.
+    """The unscented Kalman filter with additive noise of one sequence, (T, m) and (T, p), or of several, each by itself.
 
-    Covariances that are not positive definite are repaired. Where a negative weight of the mean point is what takes the definiteness of an
-    update, the update goes without it; everything else is lifted.
-    Measurements (..., T, m) that are NaN are skipped, and gradients stay finite; ``initial`` is the state before the first of them.
+    Sigma points are drawn again before each update. Covariances that are not positive definite are repaired. Where a negative weight of the
+    mean point is what takes the definiteness of an update, the update goes without it; everything else is lifted.
+    Measurements that are NaN are skipped, and gradients stay finite; ``initial`` is the state before the first of them.
 
     Source: Julier & Uhlmann 1997; van der Merwe 2004, Algorithm 3.1 with the points drawn again.
     """
-    batch, n = measurements.shape[:-2], initial.mean.shape[-1]
-    state = Gaussian(initial.mean.expand(*batch, n), initial.covariance.expand(*batch, n, n))
-    predictions, updates, lost = [], [], []
-    for k in range(measurements.shape[-2]):
-        repaired = torch.zeros(batch, dtype=torch.bool, device=measurements.device)
+    if measurements.dim() == 3:
+        several, n = len(measurements), initial.mean.shape[-1]
+        each = zip(measurements, inputs, initial.mean.expand(several, n), initial.covariance.expand(several, n, n), strict=True)
+        found = [unscented_filter(model, y, u, Gaussian(*first), rule) for y, u, *first in each]
+        rows = [(*steps.predicted, *steps.filtered, *steps[2:]) for steps, _ in found]
+        return NonlinearFiltered(filtered_of(rows), torch.stack([repaired for _, repaired in found]))
+    state, rows, repaired = initial, [], torch.zeros(len(measurements), dtype=torch.bool)
+    for k, (y, u) in enumerate(zip(measurements, inputs, strict=True)):
         if k > 0:
-            state, repaired = _predicted(model, state, inputs[..., k - 1, :], rule)
-            state = state if model.restart is None else model.restart(state, inputs[..., k, :])
-        predictions.append(state)
-        prior, factor, again = factorised(state.covariance)
-        update = _updated(model, Gaussian(state.mean, prior), factor, measurements[..., k, :], inputs[..., k, :], rule)
-        updates.append(update)
-        lost.append(repaired | again | update.lost)
-        state = update.state
-    axis = len(batch)
-    steps = Filtered(
-        stacked(predictions, axis),
-        stacked([update.state for update in updates], axis),
-        torch.stack([update.innovation for update in updates], axis),
-        torch.stack([update.innovation_covariance for update in updates], axis),
-        ~torch.isnan(measurements),
-    )
-    return NonlinearFiltered(steps, torch.stack(lost, axis))
+            _, factor, repaired[k] = factorised(state.covariance)
+            after = model.transition(model.possible(sigma_points(rule, state.mean, factor)), inputs[k - 1 : k])
+            mean = mean_of(rule, after)
+            covariance = covariance_of(rule, after - mean, after - mean) + model.process_noise(state.mean, inputs[k - 1])
+            state = Gaussian(model.possible(mean), symmetric(covariance))
+        prior, factor, lifted = factorised(state.covariance)
+        posterior, *update, lost = _updated(model, Gaussian(state.mean, prior), factor, y, u, rule)
+        rows.append((*state, *posterior, *update))
+        repaired[k] |= lifted or lost
+        state = posterior
+    return NonlinearFiltered(filtered_of(rows), repaired)
 
 
-def _predicted(model, state, u, rule):
-    """The state one sample later, and whether its covariance had to be repaired."""
-    _, factor, repaired = factorised(state.covariance)
-    drawn = model.possible(sigma_points(rule, state.mean, factor))
-    after = model.transition(drawn, u.unsqueeze(-2))
-    mean = mean_of(rule, after)
-    deviations = after - mean.unsqueeze(-2)
-    covariance = symmetric(covariance_of(rule, deviations, deviations) + model.process_noise(state.mean, u))
-    return Gaussian(model.possible(mean), covariance), repaired
+def filtered_of(rows):
+    """What a filter leaves of rows of predicted and filtered state, innovation, its covariance and what was measured."""
+    parts = [torch.stack(part) for part in zip(*rows, strict=True)]
+    return Filtered(Gaussian(*parts[:2]), Gaussian(*parts[2:4]), *parts[4:])
 
 
 def _updated(model, state, factor, y, u, rule):
-    """The state given a measurement, of which NaN is skipped."""
+    """The state given a measurement, of which NaN is skipped; innovation, its covariance, what was measured, whether it was repaired."""
     drawn = model.possible(sigma_points(rule, state.mean, factor))
-    expected = model.observation(drawn, u.unsqueeze(-2))
-    mean = mean_of(rule, expected)
-    measured = ~torch.isnan(y)
-    zero = torch.zeros((), dtype=y.dtype, device=y.device)
-    identity = torch.eye(y.shape[-1], dtype=y.dtype, device=y.device)
-    spread = torch.where(measured.unsqueeze(-2), expected - mean.unsqueeze(-2), zero)
-    deviations = drawn - state.mean.unsqueeze(-2)
-    noise = torch.where(measured.unsqueeze(-1) & measured.unsqueeze(-2), model.observation_noise(state.mean, u), identity)
-    innovation = torch.where(measured, torch.where(measured, y, zero) - mean, zero)
+    expected = model.observation(drawn, u[None])
+    mean, measured = mean_of(rule, expected), ~torch.isnan(y)
+    spread = torch.where(measured, expected - mean, 0.0)
+    noise = torch.where(measured[:, None] & measured, model.observation_noise(state.mean, u), torch.eye(len(y), dtype=y.dtype))
+    innovation = torch.where(measured, torch.where(measured, y, 0.0) - mean, 0.0)
 
     def conditioned(rule):
         covariance, factor, lost = factorised(symmetric(covariance_of(rule, spread, spread) + noise))
-        cross = covariance_of(rule, deviations, spread)
-        gain = torch.cholesky_solve(cross.mT, factor).mT
-        reduction = gain @ covariance @ gain.mT
-        if model.free is not None:
-            gain = torch.where(model.free(state.mean, u).unsqueeze(-1), gain, zero)
-            both = gain @ cross.mT
-            reduction = both + both.mT - gain @ covariance @ gain.mT
-        posterior = model.possible(state.mean + (gain @ innovation.unsqueeze(-1)).squeeze(-1))
-        return _Updated(Gaussian(posterior, symmetric(state.covariance - reduction)), innovation, covariance, lost)
+        gain = torch.cholesky_solve(covariance_of(rule, drawn - state.mean, spread).mT, factor).mT
+        left = symmetric(state.covariance - gain @ covariance @ gain.mT)
+        return Gaussian(model.possible(state.mean + gain @ innovation), left), covariance, lost
 
-    updated = conditioned(rule)
-    if rule.centre_covariance >= 0.0:
-        return updated
-    lost = updated.lost | factorised(updated.state.covariance).repaired
-    if not bool(lost.any()):
-        return updated
-    without = conditioned(replace(rule, centre_covariance=0.0))
-
-    def chosen(one, other):
-        return torch.where(lost.reshape(*lost.shape, *[1] * (one.dim() - lost.dim())), one, other)
-
-    return _Updated(
-        Gaussian(*map(chosen, without.state, updated.state)),
-        innovation,
-        chosen(without.innovation_covariance, updated.innovation_covariance),
-        lost,
-    )
+    posterior, covariance, lost = conditioned(rule)
+    if rule.centre_covariance < 0.0 and (lost or factorised(posterior.covariance)[2]):
+        (posterior, covariance, _), lost = conditioned(replace(rule, centre_covariance=0.0)), True
+    return posterior, innovation, covariance, measured, lost
 
 
 def extended_filter(model, measurements, inputs, initial):
@@ -206,7 +146,7 @@ def extended_filter(model, measurements, inputs, initial):
 
     Source: Jazwinski 1970, Chapter 8; the update holds for any gain, also that of a consider state (Schmidt).
     """
-    state, samples = initial, []
+    state, rows = initial, []
     for k, (y, u) in enumerate(zip(measurements, inputs, strict=True)):
         if k > 0:
             before, pushed = state.mean, inputs[k - 1]
@@ -224,10 +164,9 @@ def extended_filter(model, measurements, inputs, initial):
             gain = torch.where(model.free(state.mean, u)[:, None], gain, 0.0)
         covariance = state.covariance - gain @ cross.mT - cross @ gain.mT + gain @ S @ gain.mT
         posterior = Gaussian(model.possible(state.mean + gain @ innovation), 0.5 * (covariance + covariance.mT))
-        samples.append((*state, *posterior, innovation, S, measured))
+        rows.append((*state, *posterior, innovation, S, measured))
         state = posterior
-    parts = [torch.stack(part) for part in zip(*samples, strict=True)]
-    return Filtered(Gaussian(*parts[:2]), Gaussian(*parts[2:4]), *parts[4:])
+    return filtered_of(rows)
 
 
 def rational_model(estimator):

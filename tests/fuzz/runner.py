@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import csv
 import gc
 import io
 import json
@@ -18,8 +17,10 @@ import sys
 import time
 import traceback
 from collections import Counter
-from dataclasses import astuple, dataclass, fields
+from dataclasses import dataclass
 from pathlib import Path
+
+import pandas as pd
 
 from fuzz.case import GENERATORS, PLANTED, TEMPLATES, Case, is_honest, load_families, schedule
 from fuzz.verdicts import Outcome, differences, judge, last_line, refusal_lines, snapshot
@@ -258,10 +259,7 @@ def _quiet(folder):
 def write_rows(rows, path):
     """Rows as CSV, in the order of their index."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    with open(path, "w", newline="", encoding="utf-8") as stream:
-        writer = csv.writer(stream, lineterminator="\n")
-        writer.writerow(field.name for field in fields(Row))
-        writer.writerows(astuple(row) for row in sorted(rows, key=lambda one: one.index))
+    pd.DataFrame(sorted(rows, key=lambda one: one.index)).to_csv(path, index=False)
 
 
 def described(row):

@@ -5,33 +5,33 @@ through training, evaluation and report; the last run is left to end. So the kil
 root, and what is checked at the end of a round is said of each of its kills. Signals are SIGKILL, SIGTERM and SIGINT in turn. A moment
 is an event that can be seen from outside (an artefact is locked, begun or made, a checkpoint is there, a run of MLflow is begun or
 marked) and a delay of up to 60 ms from there; how far a run has come by then is the machine's own, and is not the same twice. A run that
-ends before its moment comes is no kill: another round makes up for it.
-
-This process imports everything once, and every run is a fork of it that calls the command line, so that a hundred runs do not spend
-their time on imports. In every fourth round jobs run side by side, in processes that a run starts itself.
+ends before its moment comes is no kill: another round makes up for it. In every fourth round jobs run side by side.
 """
 
 import argparse
 import csv
-import ctypes
 import fcntl
-import gc
-import importlib
 import json
 import os
 import random
 import shutil
 import signal
 import sqlite3
+import subprocess
 import sys
 import tempfile
 import time
-import traceback
 from collections import Counter
-from dataclasses import dataclass, field
+from contextlib import suppress
+from dataclasses import dataclass
+from glob import glob
 from pathlib import Path
 
-STAGES = ("ingest", "downsample", "train", "evaluate", "report")
+from processes import is_alive, start
+from vehest.data.errors import VehestError
+from vehest.run.artefacts import read_artefact
+from vehest.run.evaluate import TIMES
+
 EXIT_CODES = {signal.SIGKILL: -9, signal.SIGTERM: 143, signal.SIGINT: 130}
 SIGNALS = tuple(EXIT_CODES)
 STUDY = ("run", "quickstart", "training.max_epochs=3", "training.checkpoint_seconds=0")
@@ -42,14 +42,22 @@ MOMENTS = {
     "evaluate": ("locked", "begun", "made", "tracking"),
     "report": ("begun", "file", "made"),
 }
-PR_SET_PDEATHSIG = 1  # of Linux's prctl: a run ends with this process
+STAGES = tuple(MOMENTS)
+EVENTS = {  # what there is once more when it happens
+    "begun": "{stage}/.writing-*",
+    "part": "{stage}/.parts-*/*",
+    "file": "{stage}/.writing-*/*",
+    "made": "{stage}/*",
+    "locked": "locks/{stage}-*",
+    "checkpoint": "checkpoints/*/*",
+    "store": ".*mlflow.db",
+    "tracking": "mlartifacts/*",
+}
 MAX_DELAY = 0.06  # s
 COUNTS = 3  # a moment is one of the first so many of its kind
 RUN_SECONDS, LOOK_SECONDS = 1800.0, 0.002  # after the first a run hangs
 HEADER = ("number", "round", "jobs", "signal", "stage", "moment", "exit_code", "resumed_runs", "metrics_equal", "tracking_complete")
 HEADER += ("leftovers", "outcome")
-HEAVY = ("mlflow", "matplotlib.pyplot", "vehest.run.study_run", "vehest.studies.drive", "vehest.report.document")
-HEAVY += ("vehest.report.figures",)
 
 
 @dataclass(frozen=True)
@@ -63,72 +71,19 @@ class Kill:
     at_once: tuple[str, ...]
 
 
-@dataclass
-class Round:
-    """One output root with the kills in it and what was found at its end."""
-
-    position: int
-    kills: list[Kill] = field(default_factory=list)
-    metrics: list[str] = field(default_factory=list)
-    tracking: list[str] = field(default_factory=list)
-    leftovers: list[str] = field(default_factory=list)
-    failed: list[str] = field(default_factory=list)
-
-    @property
-    def jobs(self):
-        return 2 if self.position % 4 == 3 else 1
-
-
-def started(output, jobs, log):
-    """Fork a run of the study into ``output``; returns its process, which leads a session of its own."""
-    sys.stdout.flush()
-    process = os.fork()
-    if process:
-        return process
-    code = 1
-    try:
-        os.setsid()
-        ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGKILL)
-        out = os.open(log, os.O_WRONLY | os.O_CREAT | os.O_APPEND)
-        for number, stream in ((out, 1), (out, 2), (os.open(os.devnull, os.O_RDONLY), 0)):
-            os.dup2(number, stream)
-        signal.signal(signal.SIGINT, signal.default_int_handler)
-        sys.argv = ["vehest", *STUDY, f"output={output}", "--jobs", str(jobs)]
-        importlib.import_module("vehest.cli").main()
-        code = 0
-    except SystemExit as leave:
-        code = int(leave.code or 0)
-    except BaseException:
-        traceback.print_exc()
-    finally:
-        sys.stdout.flush()
-        sys.stderr.flush()
-        os._exit(code)
-
-
-def ended(process, *, at_once=False):
-    """Exit code of a run, negative where a signal ended it; none if it goes on and is not waited for."""
-    end = time.monotonic() + RUN_SECONDS
-    while True:
-        found, status = os.waitpid(process, os.WNOHANG)
-        if found or at_once:
-            return os.waitstatus_to_exitcode(status) if found else None
-        if time.monotonic() > end:
-            os.killpg(process, signal.SIGKILL)
-            raise SystemExit(f"a run hangs: process {process}")
-        time.sleep(LOOK_SECONDS)
+def started(output, jobs):
+    """Start the study in ``output``, in a process that leads a session of its own and says what it says in a log beside."""
+    with open(output.with_suffix(".log"), "ab") as log:
+        words = ["-m", "vehest", *STUDY, f"output={output}", "--jobs", jobs]
+        return start([sys.executable, *words], stdin=subprocess.DEVNULL, stdout=log, stderr=log)
 
 
 def session(leader):
     """Living processes that a run started, itself included."""
     alive = []
-    for entry in Path("/proc").glob("[0-9]*/stat"):
-        try:
-            fields = entry.read_text().rpartition(")")[2].split()
-        except OSError:
-            continue
-        if int(fields[3]) == leader and fields[0] not in "ZX":
-            alive.append(int(entry.parent.name))
+    for entry in Path("/proc").glob("[0-9]*"):
+        with suppress(OSError):
+            alive += [int(entry.name)] if os.getsid(int(entry.name)) == leader and is_alive(entry.name) else []
     return alive
 
 
@@ -142,49 +97,25 @@ def strays(leader, patience=20.0):
     return [f"process {process}" for process in found]
 
 
-def names(folder, start="", hidden=True):
-    """Names in a folder that begin so; none where it is not there."""
-    try:
-        return {name for name in os.listdir(folder) if name.startswith(start) and (hidden or not name.startswith("."))}
-    except OSError:
-        return set()
-
-
-def seen(output, stage, moment):
-    """What there is of a kind of event; one more of them is the event."""
-    own = output / stage
-    found = {
-        "begun": lambda: names(own, ".writing-"),
-        "made": lambda: names(own, hidden=False),
-        "part": lambda: {file for folder in names(own, ".parts-") for file in names(own / folder, hidden=False)},
-        "file": lambda: {file for folder in names(own, ".writing-") for file in names(own / folder)},
-        "locked": lambda: names(output / "locks", f"{stage}-"),
-        "checkpoint": lambda: {name for name in names(output / "checkpoints") if names(output / "checkpoints" / name)},
-        "store": lambda: {name for name in names(output) if name.endswith("mlflow.db")},
-        "tracking": lambda: names(output / "mlartifacts"),
-    }
-    return found[moment]()
-
-
-def killed(output, stage, number, jobs, draw, log):
+def killed(output, stage, number, jobs, draw):
     """Start a run, kill it at a moment of a stage; none if it ended before."""
     moment, count, delay = draw.choice(MOMENTS[stage]), draw.randint(1, COUNTS), draw.uniform(0.0, MAX_DELAY)
     count = 1 if (stage in {"ingest", "report"} and moment != "file") or moment == "store" else count
     count = min(count, 2) if stage == "downsample" else count
-    before, met = seen(output, stage, moment), set[str]()
-    process = started(output, jobs, log)
+    event = EVENTS[moment].format(stage=stage)
+    before, met = set(glob(event, root_dir=output)), set[str]()
+    process = started(output, jobs)
     while len(met) < count:
-        met |= seen(output, stage, moment) - before
-        code = ended(process, at_once=True)
-        if code is not None:
-            strays(process)
-            if code != 0:
-                raise SystemExit(f"a run failed by itself with exit code {code}, see '{log}'")
+        met |= set(glob(event, root_dir=output)) - before
+        if process.poll() is not None:
+            strays(process.pid)
+            if process.returncode != 0:
+                raise SystemExit(f"a run failed by itself with exit code {process.returncode}, see '{output.with_suffix('.log')}'")
             return None
         time.sleep(LOOK_SECONDS)
     time.sleep(delay)
-    os.kill(process, number)
-    code, left = ended(process), strays(process)
+    process.send_signal(number)
+    code, left = process.wait(RUN_SECONDS), strays(process.pid)
     if code == 0:
         return None
     left += locks_held(output) + broken(output)
@@ -194,14 +125,11 @@ def killed(output, stage, number, jobs, draw, log):
 
 def artefacts(output):
     """Folders of all stages."""
-    return [output / stage / name for stage in STAGES for name in sorted(names(output / stage, hidden=False))]
+    return [folder for stage in STAGES for folder in sorted((output / stage).glob("[!.]*"))]
 
 
 def broken(output):
     """Folders that are not whole."""
-    from vehest.data.errors import VehestError
-    from vehest.run.artefacts import read_artefact
-
     found = []
     for folder in artefacts(output):
         try:
@@ -225,9 +153,6 @@ def locks_held(output):
 
 def content(output):
     """Artefact -> what it holds, times aside: the digest of its files, of a report the metrics that it publishes."""
-    from vehest.run.artefacts import read_artefact
-    from vehest.run.evaluate import TIMES
-
     found = {}
     for folder in artefacts(output):
         artefact = read_artefact(folder)
@@ -269,33 +194,26 @@ def tracked(output):
 def leftovers(output):
     """What killed runs left and nobody needs: half-written things, parts, checkpoints, locks."""
     found = [str(path.relative_to(output)) for path in output.rglob(".*") if path.name.startswith((".writing-", ".parts-"))]
-    return [*found, *(f"checkpoints/{name}" for name in names(output / "checkpoints")), *locks_held(output)]
+    return [*found, *glob("checkpoints/*", root_dir=output), *locks_held(output)]
 
 
 def one_round(position, wanted, output, reference, draw):
-    """Kill runs in one output root, let the last one end, and look at what there is."""
-    own, log = Round(position), output.with_suffix(".log")
-    made = (killed(output, stage, number, own.jobs, draw, log) for stage, number in wanted)
-    own.kills = [kill for kill in made if kill is not None]
-    last = started(output, own.jobs, log)
-    code, own.leftovers = ended(last), strays(last)
-    if code != 0:
-        own.failed = [f"the last run left with {code}, see '{log}'"]
-        return own
-    own.metrics = differences(content(output), content(reference))
-    own.tracking = differences(tracked(output), tracked(reference))
-    own.leftovers += leftovers(output)
-    return own
-
-
-def rows_of(own, first):
-    """A row a kill."""
-    for position, kill in enumerate(own.kills):
-        equal, complete = ("yes" if not (own.failed or found) else "no" for found in (own.metrics, own.tracking))
-        left = "; ".join([*own.leftovers, *kill.at_once])
-        faults = "; ".join([*own.failed, *own.metrics, *own.tracking]) or left
-        head = [first + position, own.position, own.jobs, kill.number.name, kill.stage, kill.moment, kill.exit_code]
-        yield [*head, len(own.kills) - position, equal, complete, left or "none", f"bad: {faults}" if faults else "good"]
+    """Kill runs in one output root, let the last one end, and look at what there is: kills, and a row of the table for each, unnumbered."""
+    jobs = 2 if position % 4 == 3 else 1
+    kills = [kill for kill in (killed(output, *each, jobs, draw) for each in wanted) if kill is not None]
+    last = started(output, jobs)
+    code, left = last.wait(RUN_SECONDS), strays(last.pid)
+    failed = [f"the last run left with {code}, see '{output.with_suffix('.log')}'"] if code != 0 else []
+    metrics, tracking = ([] if failed else differences(of(output), of(reference)) for of in (content, tracked))
+    left += [] if failed else leftovers(output)
+    equal, complete = ("no" if failed or found else "yes" for found in (metrics, tracking))
+    rows = []
+    for place, kill in enumerate(kills):
+        remains = "; ".join([*left, *kill.at_once])
+        faults = "; ".join([*failed, *metrics, *tracking]) or remains
+        head = [position, jobs, kill.number.name, kill.stage, kill.moment, kill.exit_code, len(kills) - place]
+        rows.append([*head, equal, complete, remains or "none", f"bad: {faults}" if faults else "good"])
+    return kills, rows
 
 
 def still_wanted(missing):
@@ -308,7 +226,7 @@ def rounds(missing, draw, scratch, out):
     """Run rounds until every kill was made; how many were bad."""
     os.chdir(scratch)  # runs find the configuration that came with the package
     begun, reference = time.monotonic(), scratch / "reference"
-    if ended(started(reference, 1, reference.with_suffix(".log"))) != 0:
+    if started(reference, 1).wait(RUN_SECONDS) != 0:
         raise SystemExit(f"the study does not run by itself:\n{reference.with_suffix('.log').read_text()}")
     print(f"reference: {time.monotonic() - begun:.0f} s", flush=True)
     position, bad, number, limit = 0, 0, 1, 3 * missing.total()
@@ -318,10 +236,9 @@ def rounds(missing, draw, scratch, out):
         while missing.total() > 0:
             if position > limit:
                 raise SystemExit("moments are missed again and again")
-            own = one_round(position, still_wanted(missing), scratch / f"round{position}", reference, draw)
-            missing -= Counter((kill.stage, kill.number) for kill in own.kills)
-            rows = list(rows_of(own, number))
-            writer.writerows(rows)
+            kills, rows = one_round(position, still_wanted(missing), scratch / f"round{position}", reference, draw)
+            missing -= Counter((kill.stage, kill.number) for kill in kills)
+            writer.writerows([number + place, *row] for place, row in enumerate(rows))
             stream.flush()
             worse = sum(row[-1] != "good" for row in rows)
             bad, number = bad + worse, number + len(rows)
@@ -341,9 +258,6 @@ def main():
     given = parser.parse_args()
     os.environ |= {"MLFLOW_DISABLE_TELEMETRY": "true", "DO_NOT_TRACK": "true", "MPLBACKEND": "agg"}
     os.environ.pop("MLFLOW_TRACKING_URI", None)
-    for module in HEAVY:
-        importlib.import_module(module)
-    gc.freeze()
     out = given.out.resolve()
     out.parent.mkdir(parents=True, exist_ok=True)
     missing = Counter((STAGES[k % len(STAGES)], SIGNALS[k // len(STAGES) % len(SIGNALS)]) for k in range(given.kills))

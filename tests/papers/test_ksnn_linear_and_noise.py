@@ -5,6 +5,7 @@ import math
 import numpy as np
 import pytest
 import torch
+from refusals import refusal
 from scipy import signal
 from trained_ksnn import ksnn_with_weights
 
@@ -107,8 +108,7 @@ def test_recording_at_another_rate_or_too_short_is_refused():
     estimator = ksnn_with_weights()
     with pytest.raises(DataError, match=r"100 Hz.*20 Hz"):
         decomposed_estimate(estimator, planar_drive(seconds=5.0, rate_hz=100.0))
-    with pytest.raises(DataError, match="30 samples"):
-        decomposed_estimate(estimator, planar_drive(seconds=1.5))
+    assert "30 samples" in refusal(lambda: decomposed_estimate(estimator, planar_drive(seconds=1.5)))
 
 
 FREQUENCY = np.linspace(0.0, 10.0, 101)

@@ -8,10 +8,10 @@ import numpy as np
 import pandas as pd
 import pytest
 import torch
+from refusals import refusal
 from study_parts import metric_rows, part_of, stored
 
 from place import undrawn
-from vehest.data.errors import DataError
 from vehest.data.estimate import Estimate
 from vehest.data.recording import Recording
 from vehest.data.splits import VALIDATION, Span, Split
@@ -131,14 +131,12 @@ def test_candidates_have_the_papers_names(settings, candidate):
 
 def test_candidates_keep_the_papers_names_one_model_a_seed(part):
     twice = replace(part, models=[part.models[0], part.models[0]])
-    with pytest.raises(DataError, match="NNT was trained twice with one seed"):
-        models_by_candidate(twice)
+    assert "NNT was trained twice with one seed" in refusal(lambda: models_by_candidate(twice))
     (name,) = models_by_candidate(only(part, "NNTF_UH", {"one_step": {**PHASE, "max_epochs": 0}}))
     assert name == "NNTF_UH from scratch"
     assert candidate_of(EvaluatedModel("learned_ukf_variant", "pc_curved", "", 0, Path(), Path())) == "PC with E"
     metrics = part.metrics[~((part.metrics["metric"] == "mae_weighted") & (part.metrics["seed"] == 1))]
-    with pytest.raises(DataError, match=r"seed1 has no mae_weighted\.tyre_a; evaluate it again"):
-        runs_of(replace(part, metrics=metrics))
+    assert "seed1 has no mae_weighted.tyre_a; evaluate it again" in refusal(lambda: runs_of(replace(part, metrics=metrics)))
 
 
 def test_report_shows_every_table_and_figure_of_the_paper_and_says_what_its_data_are(part, tmp_path, monkeypatch):
@@ -191,11 +189,9 @@ def of_length(part, steps):
 
 
 def test_study_without_its_parts_or_test_sets_is_refused(part):
-    with pytest.raises(DataError, match="needs one of the parts: real, simulated"):
-        documents(StudyArtefacts("s", "t", "a", "c", {}, {}, []))
+    assert "needs one of the parts: real, simulated" in refusal(lambda: documents(StudyArtefacts("s", "t", "a", "c", {}, {}, [])))
     other = replace(part, split=Split("s", SPLIT.train, SPLIT.validation, {"wet": SPLIT.tests["tyre_a"]}))
-    with pytest.raises(DataError, match="must be called tyre_a and tyre_d"):
-        documents(StudyArtefacts("s", "t", "a", "c", {}, {"real": other}, []))
+    assert "must be called tyre_a and tyre_d" in refusal(lambda: documents(StudyArtefacts("s", "t", "a", "c", {}, {"real": other}, [])))
 
 
 @pytest.mark.parametrize("candidate", ["NNT", "NNTF_U", "NNTF_UH", "NNTF_UH*"])
@@ -392,8 +388,7 @@ def test_lengths_and_samples_are_those_of_trainings_through_the_filter(part):
     assert (row.steps, row.epochs) == (500, 1000)
     (row,) = lengths({"length_50": of_length(part, 50)})
     assert (row.sequences, row.batches) == (6, 3), "a drive of 3.2 s"
-    with pytest.raises(DataError, match="was not trained through the filter"):
-        lengths({"length_500": replace(part, models=[model(part, "GRU")])})
+    assert "was not trained through the filter" in refusal(lambda: lengths({"length_500": replace(part, models=[model(part, "GRU")])}))
     training = {"one_step": {**PHASE, "max_epochs": 10}, "through": {**PHASE, "max_epochs": 3}, "steps": 50}
     own = Subject.of(only(part, "NNTF_UH", training), "NNTF_UH")
     assert samples_seen(own) == 10 * 319 + 3 * 300

@@ -5,19 +5,19 @@ logs at hand, and revised after their outcome was seen. How it does on logs that
 """
 
 import argparse
-import csv
-import json
 import os
-import subprocess
-import sys
 import tempfile
 from pathlib import Path
 
+import pandas as pd
 import yaml
 from dressed_logs import LOGS, write_log
 
 from vehest.alignment.proposals.proposal import LATERAL
 from vehest.data.files import written_aside
+from vehest.run.own_car.inspect import inspect
+from vehest.run.own_car.questions import questions_of
+from vehest.run.own_car.write import write
 
 ANSWERS = Path(__file__).parent / "answers.yaml"
 COLUMNS = ("log", "column", "right answer", "proposed", "evidence", "decided/asked", "correct")
@@ -29,13 +29,10 @@ LONGEST_UNPLANTED = 60.0  # ms that a channel may be late by itself
 Row = dict[str, str]
 
 
-def proposed_for(files, folder):
-    """What `vehest new --json` says of files, run in an empty folder."""
-    command = [sys.executable, "-m", "vehest", "new", "my_car", *map(str, files), "--json", "--dry-run"]
-    ran = subprocess.run(command, cwd=folder, capture_output=True, text=True, check=False)
-    if ran.returncode:
-        raise SystemExit(f"{files[0]}: {ran.stderr.strip()}")
-    return dict(json.loads(ran.stdout))
+def outcome_of(files):
+    """What `vehest new --json --dry-run` says of files."""
+    examined = inspect("my_car", files)
+    return write(examined, tuple(questions_of(examined)), dry_run=True)[0]
 
 
 def rows_of(log, answers, proposed):
@@ -109,12 +106,9 @@ def main():
     rows = []
     with tempfile.TemporaryDirectory(prefix="vehest-") as folder:
         for log in LOGS:
-            files = write_log(log, Path(data), Path(folder))
-            rows += rows_of(log, answers[log], proposed_for(files, Path(folder)))
-    with written_aside(out) as aside, open(aside, "w", newline="", encoding="utf-8") as stream:
-        writer = csv.DictWriter(stream, COLUMNS, lineterminator="\n")
-        writer.writeheader()
-        writer.writerows(rows)
+            rows += rows_of(log, answers[log], outcome_of(write_log(log, Path(data), Path(folder))))
+    with written_aside(out) as aside:
+        pd.DataFrame(rows, columns=COLUMNS).to_csv(aside, index=False)
     wrong = [row for row in rows if row["correct"] == "no"]
     for row in wrong:
         print(f"wrong: {row['log']}: {row['column']}: {row['proposed']} ({row['decided/asked']}), not {row['right answer']}")

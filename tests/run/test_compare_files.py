@@ -6,6 +6,7 @@ import math
 import numpy as np
 import pandas as pd
 import pytest
+from refusals import refusal
 
 from conftest import planar_drive
 from vehest.data.errors import DataError
@@ -73,8 +74,7 @@ def test_other_clocks_and_columns_are_refused_with_the_file_that_has_them(drive,
     with pytest.raises(DataError, match=r"'late' goes from .* are the clocks the same"):
         compare_estimates(drive, {"late": read_estimate_table(late, drive)})
     pd.read_csv(late)[["time"]].assign(other=1.0).to_csv(late, index=False)
-    with pytest.raises(DataError, match=r"has no column vy \[m/s\]"):
-        read_estimate_table(late, drive)
+    assert "has no column vy [m/s]" in refusal(lambda: read_estimate_table(late, drive))
 
 
 def test_the_command_prints_a_row_an_estimate_and_says_where_a_model_learnt(place, tmp_path):

@@ -14,13 +14,6 @@ from vehest.run.config_files import GROUPS, choices
 from vehest.run.study import jobs_of, read_study
 
 
-@pytest.fixture
-def elsewhere(tmp_path, monkeypatch):
-    """An empty working folder."""
-    monkeypatch.chdir(tmp_path)
-    return tmp_path
-
-
 def test_estimator_chooses_its_training_and_the_user_may_choose_another(elsewhere):
     assert compose_config("train", ["estimator=luenberger"])["training"]["name"] == "nelder_mead"
     assert compose_config("train", ["estimator=gru"])["training"]["name"] == "supervised"
@@ -107,8 +100,7 @@ def test_pipeline_overrides_reach_the_sweeps_that_have_the_key(elsewhere):
     assert rates == {**fitted_otherwise, "ksnn": 0.01, "gru": 0.01, "lstm": 0.01}
     seeds = [job.config["seed"] for job in jobs_of(read_study("quickstart"), ["seed=7"])[""]]
     assert set(seeds) == {7}
-    with pytest.raises(ConfigurationError, match=r"suits no sweep"):
-        jobs_of(read_study("quickstart"), ["training.momentum=0.9"])
+    assert "suits no sweep" in refusal(lambda: jobs_of(read_study("quickstart"), ["training.momentum=0.9"]), ConfigurationError)
 
 
 @pytest.mark.parametrize(

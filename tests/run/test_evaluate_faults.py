@@ -9,6 +9,7 @@ import numpy as np
 import pandas as pd
 import pytest
 import yaml
+from refusals import refusal
 
 from vehest.data.errors import ConfigurationError
 from vehest.data.store import read_recording
@@ -55,8 +56,7 @@ def test_a_list_takes_what_it_does_not_say_from_the_kind_stands_before_the_choic
     assert faults_of(compose_config("eval")) == ()
     fault = FaultSettings("bias", "ay", "mild")
     assert all_of([[fault], [fault]]) == (fault,)
-    with pytest.raises(ConfigurationError, match="two faults are both called bias:ay:mild"):
-        all_of([[fault], [replace(fault, start=4.0)]])
+    assert "two faults are both called bias:ay:mild" in refusal(lambda: all_of([[fault], [replace(fault, start=4.0)]]), ConfigurationError)
     assert len(all_of([[fault], [replace(fault, start=4.0, seed=1)]])) == 2
 
 

@@ -8,9 +8,9 @@ import numpy as np
 import pandas as pd
 import pytest
 import yaml
+from refusals import refusal
 from test_self_calibrating import RATE, drive
 
-from vehest.data.errors import DataError
 from vehest.data.recording import Recording
 from vehest.estimators.model_files import load_model
 from vehest.run.car_record import LIMITS, Number, calibrated, read_car, with_settings
@@ -182,16 +182,13 @@ def test_no_real_car_is_denied_its_wheelbase_and_no_small_one_passes_for_a_large
         ("just text", "no record of a car"),
     ],
 )
-def test_a_record_that_is_damaged_or_of_no_car_is_refused_in_one_line(tmp_path, monkeypatch, change, words):
-    monkeypatch.chdir(tmp_path)
+def test_a_record_that_is_damaged_or_of_no_car_is_refused_in_one_line(elsewhere, change, words):
     number = {"value": 0.01, "deviation": 0.01}
     numbers = {"leakage": number, "rear_axle": number, "compliance": number, "grip": {"value": 9.0, "deviation": 1.0}}
     honest = {"format": 1, "wheelbase": 2.7, "cg_to_rear_axle": None, **numbers, "offsets": {}}
-    file = tmp_path / "car.yaml"
+    file = elsewhere / "car.yaml"
     file.write_text(yaml.safe_dump(honest))
     assert read_car(file).wheelbase == 2.7
     file.write_text(change if isinstance(change, str) else yaml.safe_dump(honest | change))
-    with pytest.raises(DataError, match=words) as refused:
-        read_car(file)
-    assert "\n" not in str(refused.value)
-    assert list(tmp_path.iterdir()) == [file]
+    assert words in refusal(lambda: read_car(file))
+    assert list(elsewhere.iterdir()) == [file]

@@ -44,11 +44,8 @@ class Log:
 
 
 @pytest.fixture
-def log(tmp_path, monkeypatch, capsys):
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.setenv("VEHEST_OUTPUT", str(tmp_path / "outputs"))
-    monkeypatch.delenv("VEHEST_DATA", raising=False)
-    return Log(tmp_path, capsys)
+def log(elsewhere, capsys):
+    return Log(elsewhere, capsys)
 
 
 def held(position):

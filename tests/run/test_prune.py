@@ -115,9 +115,7 @@ def test_links_and_what_vehest_has_not_made_stay(root, tmp_path):
 
 
 @pytest.fixture
-def outdated(root, monkeypatch, tmp_path):
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.delenv("VEHEST_OUTPUT", raising=False)
+def outdated(root, elsewhere):
     return root.add("train", "one", {"estimator": {"name": "luenberger"}}, {}, "0" * 16).folder
 
 

@@ -87,11 +87,9 @@ def test_a_description_that_does_not_fit_is_one_line_that_names_file_and_key(mod
     path = model / "model.yaml"
     text = changes if isinstance(changes, bytes) else yaml.safe_dump(changed(yaml.safe_load(path.read_text()), **changes)).encode()
     path.write_bytes(text)
-    with pytest.raises(VehestError) as caught:
-        load_model(model)
-    assert says in str(caught.value)
-    assert "\n" not in str(caught.value)
-    assert "model.yaml" in str(caught.value) or "transform" in says or "fit its settings" in says
+    message = refusal(lambda: load_model(model), VehestError)
+    assert says in message
+    assert "model.yaml" in message or "transform" in says or "fit its settings" in says
 
 
 def test_numbers_that_are_not_finite_are_counted_by_tensor_and_levels_that_each_recording_tells_may_be_open(model, tmp_path):
@@ -287,15 +285,14 @@ def test_a_published_study_that_is_damaged_shows_nothing(tmp_path):
 
 
 @pytest.mark.parametrize("link", ["results", "results/study"])
-def test_nothing_is_published_through_a_link(tmp_path, monkeypatch, link):
-    monkeypatch.chdir(tmp_path)
-    report = made(tmp_path / "out")
-    (tmp_path / "elsewhere").mkdir()
+def test_nothing_is_published_through_a_link(elsewhere, link):
+    report = made(elsewhere / "out")
+    Path("target").mkdir()
     Path(link).parent.mkdir(exist_ok=True)
-    Path(link).symlink_to(tmp_path / "elsewhere")
+    Path(link).symlink_to(elsewhere / "target")
     with pytest.raises(ConfigurationError, match="through a link"):
         publish_study(Publication("study", {}, {}), report, Messages(silent=True))
-    assert not list((tmp_path / "elsewhere").iterdir())
+    assert not list(Path("target").iterdir())
 
 
 PIPELINE = {"study": "mine", "report": "drive", "split": "quickstart", "sweeps": [["estimator=luenberger"]]}
@@ -331,10 +328,9 @@ def test_a_pipeline_that_does_not_fit_is_one_line(tmp_path, changes, says):
 
 
 @pytest.fixture
-def conf(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    (tmp_path / "conf" / "dataset").mkdir(parents=True)
-    return tmp_path / "conf"
+def conf(elsewhere):
+    (elsewhere / "conf" / "dataset").mkdir(parents=True)
+    return elsewhere / "conf"
 
 
 @pytest.mark.parametrize("text", ["hydra:\n  searchpath: [pkg://antigravity]", "a: &a {hydra: {searchpath: [pkg://antigravity]}}\n<<: *a"])
@@ -402,8 +398,7 @@ def test_whole_numbers_stay_what_they_are_where_anything_may_stand():
     "override", ["hydra.searchpath=[pkg://antigravity]", "++hydra.searchpath=[pkg://antigravity]", "+hydra/launcher=evil"]
 )
 def test_no_override_reaches_hydra_itself(override):
-    with pytest.raises(ConfigurationError, match="is an option of Hydra itself"):
-        compose_config("train", [override])
+    assert "is an option of Hydra itself" in refusal(lambda: compose_config("train", [override]), ConfigurationError)
     assert "antigravity" not in sys.modules
 
 

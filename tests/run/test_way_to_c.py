@@ -13,18 +13,15 @@ from place import run_vehest, undrawn
 
 
 @pytest.fixture
-def log(tmp_path, monkeypatch):
+def log(elsewhere, monkeypatch):
     """Four minutes of a simulated car in a logger's dress, in an empty folder."""
     undrawn(monkeypatch)
-    monkeypatch.chdir(tmp_path)
-    for name in ("VEHEST_DATA", "VEHEST_OUTPUT", "MLFLOW_TRACKING_URI"):
-        monkeypatch.delenv(name, raising=False)
     drive = planar_drive(240.0, 50.0, seed=5, noise=0.02)
     beta = np.degrees(np.arctan2(drive["vy_ref"], drive["vx"]))
     columns = {"Time": drive.time, "Speed": 3.6 * drive["vx"], "GyroZ": np.degrees(drive["yaw_rate"])}
     columns |= {"AccX": drive["ax"] / 9.80665, "AccY": drive["ay"] / 9.80665, "Beta": beta}
-    pd.DataFrame(columns).to_csv(tmp_path / "lap.csv", index=False)
-    return tmp_path
+    pd.DataFrame(columns).to_csv(elsewhere / "lap.csv", index=False)
+    return elsewhere
 
 
 def test_two_commands_lead_to_a_verdict_and_those_it_names_to_an_estimate_and_to_c(log, capsys):

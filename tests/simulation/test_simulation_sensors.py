@@ -6,6 +6,7 @@ from dataclasses import asdict, fields, replace
 import numpy as np
 import pytest
 import yaml
+from refusals import refusal
 from scipy import signal, stats
 
 from vehest.data.channels import CHANNELS
@@ -339,9 +340,7 @@ def test_switching_off_takes_parts_wholes_and_kinds():
 
 @pytest.mark.parametrize("name", ["az", "ay.slope", "ay.noise.much", "ay.drift_time", "reference.kind", "*.lever_x", ""])
 def test_switching_off_what_there_is_not_names_what_there_is(name):
-    with pytest.raises(ConfigurationError, match="cannot switch off") as error:
-        switched_off(SensorLevels(), name)
-    assert "\n" not in str(error.value)
+    assert "cannot switch off" in refusal(lambda: switched_off(SensorLevels(), name), ConfigurationError)
 
 
 def test_the_seed_decides_every_sample_and_a_longer_drive_begins_alike():
@@ -392,10 +391,7 @@ def test_configurations_mean_what_they_say(spelt, meant):
     ],
 )
 def test_configuration_that_makes_no_sense_is_refused_in_one_line(spelt, said):
-    with pytest.raises(ConfigurationError) as error:
-        sensor_levels_from_config(yaml.safe_load(spelt))
-    assert said in str(error.value)
-    assert "\n" not in str(error.value)
+    assert said in refusal(lambda: sensor_levels_from_config(yaml.safe_load(spelt)), ConfigurationError)
 
 
 def test_density_is_found_beside_a_resonance_and_jolts():

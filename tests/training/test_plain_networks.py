@@ -7,7 +7,7 @@ import pytest
 import torch
 from torch import nn
 
-from conftest import planar_drive
+from conftest import flat_weights, planar_drive, stop_after
 from vehest.data.errors import ConfigurationError
 from vehest.estimators.base import FitData
 from vehest.estimators.networks.standardised import StandardisedNetwork
@@ -96,18 +96,14 @@ def fit(network, seeds, context=None, **training):
     return members, type(members[0]).fit_members(members, DATA, settings, context or FitContext())
 
 
-def flat(member):
-    return np.concatenate([values.ravel() for values in member.weights().values()])
-
-
 @pytest.mark.parametrize("name", NETWORKS)
 def test_members_equal_training_each_alone(name):
     together, records = fit(NETWORKS[name], [0, 1, 2], max_epochs=12, patience=2)
     for seed, member, record in zip(range(3), together, records, strict=True):
         (alone,), (own,) = fit(NETWORKS[name], [seed], max_epochs=12, patience=2)
         assert own.metrics["epochs"] == record.metrics["epochs"]
-        assert np.allclose(flat(alone), flat(member), rtol=0, atol=1e-8)
-    assert not np.allclose(flat(together[0]), flat(together[1]), atol=1e-2)
+        assert np.allclose(flat_weights(alone), flat_weights(member), rtol=0, atol=1e-8)
+    assert not np.allclose(flat_weights(together[0]), flat_weights(together[1]), atol=1e-2)
 
 
 @pytest.mark.parametrize(("name", "one_by_one"), [("perceptron", False), ("convolution", False), ("attention", False), ("gru", True)])
@@ -164,19 +160,18 @@ def test_global_random_state_neither_matters_nor_changes(name):
     torch.manual_seed(1)
     again, _ = fit(NETWORKS[name], [0, 1])
     for one, other in zip(first, again, strict=True):
-        assert np.array_equal(flat(one), flat(other))
+        assert np.array_equal(flat_weights(one), flat_weights(other))
 
 
 @pytest.mark.parametrize("name", ["perceptron", "dropout", "lstm"])
 def test_interrupted_training_goes_on_to_the_same_result(tmp_path, name):
     whole, _ = fit(NETWORKS[name], [0, 1])
-    left = iter(range(15))
     folders = [tmp_path / str(seed) for seed in range(2)]
-    _, records = fit(NETWORKS[name], [0, 1], FitContext(folders, should_stop=lambda: next(left, None) is None))
+    _, records = fit(NETWORKS[name], [0, 1], FitContext(folders, should_stop=stop_after(15)))
     assert all(record.interrupted and record.metrics["epochs"] > 0 for record in records)
     resumed, _ = fit(NETWORKS[name], [0, 1], FitContext(folders))
     for one, other in zip(whole, resumed, strict=True):
-        assert np.array_equal(flat(one), flat(other))
+        assert np.array_equal(flat_weights(one), flat_weights(other))
 
 
 class Frozen(Perceptron):
@@ -201,7 +196,7 @@ def test_frozen_parameters_and_buffers_stay_each_member_s_own():
         assert torch.equal(member.network.offset, start.offset)
         assert not torch.allclose(member.network.layers[4].weight, start.layers[4].weight)
         (alone,), _ = fit(Frozen, [seed], learning_rate=1e-2)
-        assert np.allclose(flat(alone), flat(member), rtol=0, atol=1e-8)
+        assert np.allclose(flat_weights(alone), flat_weights(member), rtol=0, atol=1e-8)
     assert together[0].n_parameters == 6 + 1
 
 

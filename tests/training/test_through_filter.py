@@ -5,6 +5,7 @@ import pytest
 import torch
 from scipy import stats
 
+from conftest import die_after, flat_weights
 from small_car_drive import small_car_drive
 from vehest.data.errors import ConfigurationError, DataError
 from vehest.data.schema import settings_from_config
@@ -29,10 +30,6 @@ def estimator(seed=0, **config):
     made = LearnedUkf.from_config({"width": 8} | config)
     made.seed(seed)
     return made
-
-
-def weights_of(made):
-    return np.concatenate([values.ravel() for values in made.weights().values()])
 
 
 def drives(made, steps=40):
@@ -207,19 +204,11 @@ def test_a_curriculum_trains_on_shorter_sequences_first():
 def test_killed_training_goes_on_to_the_same_weights(tmp_path, stop):
     whole = estimator(seed=3)
     record = whole.fit(DATA, settings())
-    left = stop
-
-    def die(progress):
-        nonlocal left
-        left -= 1
-        if not left:
-            raise KeyboardInterrupt
-
     with pytest.raises(KeyboardInterrupt):
-        estimator(seed=3).fit(DATA, settings(checkpoint_seconds=0.0), FitContext([tmp_path], on_progress=die))
+        estimator(seed=3).fit(DATA, settings(checkpoint_seconds=0.0), FitContext([tmp_path], on_progress=die_after(stop)))
     resumed = estimator(seed=3)
     again = resumed.fit(DATA, settings(checkpoint_seconds=0.0), FitContext([tmp_path]))
-    assert np.array_equal(weights_of(resumed), weights_of(whole))
+    assert np.array_equal(flat_weights(resumed), flat_weights(whole))
     assert again.history == record.history
 
 

@@ -5,7 +5,7 @@ import pytest
 import torch
 from scipy import optimize
 
-from conftest import planar_drive
+from conftest import flat_weights, planar_drive, stop_after
 from vehest.data.errors import ConfigurationError, DataError
 from vehest.data.schema import settings_from_config
 from vehest.data.windows import windows_of
@@ -37,10 +37,6 @@ def _fit(name, config, seeds, settings, context=None, data=DATA):
     return members, records
 
 
-def _weights(member):
-    return np.concatenate([values.astype(np.float64).ravel() for values in member.weights().values()])
-
-
 @pytest.mark.parametrize(("name", "config"), SHAPES)
 def test_members_equal_training_each_alone_over_the_whole_training_in_float64(name, config):
     settings = SupervisedSettings(dtype="float64", max_epochs=30, patience=3, learning_rate=1e-2)
@@ -49,7 +45,7 @@ def test_members_equal_training_each_alone_over_the_whole_training_in_float64(na
     for seed, member, record in zip(range(4), together, records, strict=True):
         (alone,), (own,) = _fit(name, config, [seed], settings)
         assert own.metrics["epochs"] == record.metrics["epochs"]
-        assert np.allclose(_weights(alone), _weights(member), rtol=0, atol=1e-8)
+        assert np.allclose(flat_weights(alone), flat_weights(member), rtol=0, atol=1e-8)
         assert np.allclose(own.history["validation_loss"], record.history["validation_loss"], rtol=0, atol=1e-8)
 
 
@@ -65,23 +61,12 @@ def test_early_stopping_keeps_the_best_weights_on_validation():
     assert np.mean(error**2) == pytest.approx(losses[best], rel=1e-9)
 
 
-class _StopAfter:
-    """Asks to stop after so many batches."""
-
-    def __init__(self, batches):
-        self.left = batches
-
-    def __call__(self):
-        self.left -= 1
-        return self.left < 0
-
-
 @pytest.mark.parametrize(("name", "config"), SHAPES)
 def test_how_many_batches_are_taken_together_changes_no_bit(name, config, monkeypatch):
     (one,), _ = _fit(name, config, [0], SupervisedSettings(max_epochs=3))
     monkeypatch.setattr(supervised, "BATCHES", 4)  # of nine
     (other,), _ = _fit(name, config, [0], SupervisedSettings(max_epochs=3))
-    assert np.array_equal(_weights(one), _weights(other))
+    assert np.array_equal(flat_weights(one), flat_weights(other))
 
 
 @pytest.mark.parametrize(("name", "config", "averaging"), [*((*shape, 0.0) for shape in SHAPES), (*SHAPES[2], 0.95)])
@@ -89,14 +74,14 @@ def test_interrupted_training_goes_on_to_the_same_result(tmp_path, name, config,
     settings = SupervisedSettings(max_epochs=12, patience=4, averaging=averaging)
     whole, whole_records = _fit(name, config, [0, 1, 2], settings)
     folders = [tmp_path / str(seed) for seed in range(3)]
-    _, records = _fit(name, config, [0, 1, 2], settings, FitContext(folders, should_stop=_StopAfter(25)))
+    _, records = _fit(name, config, [0, 1, 2], settings, FitContext(folders, should_stop=stop_after(25)))
     assert all(record.interrupted for record in records)
     assert records[0].metrics["epochs"] < whole_records[0].metrics["epochs"]
     losses = records[0].history["validation_loss"]
     assert records[0].metrics["best_validation_loss"] == min(losses)
     resumed, resumed_records = _fit(name, config, [0, 1, 2], settings, FitContext(folders))
     for one, other, record, resumed_record in zip(whole, resumed, whole_records, resumed_records, strict=True):
-        assert np.array_equal(_weights(one), _weights(other))
+        assert np.array_equal(flat_weights(one), flat_weights(other))
         assert record.history == resumed_record.history
 
 
@@ -104,18 +89,18 @@ def test_a_member_goes_on_alone_and_a_damaged_checkpoint_starts_anew(tmp_path):
     settings = SupervisedSettings(max_epochs=10, patience=10)
     (whole,), _ = _fit("ksnn", {}, [1], settings)
     folders = [tmp_path / str(seed) for seed in range(3)]
-    _fit("ksnn", {}, [0, 1, 2], settings, FitContext(folders, should_stop=_StopAfter(30)))
+    _fit("ksnn", {}, [0, 1, 2], settings, FitContext(folders, should_stop=stop_after(30)))
     assert resume_epoch(folders[1]) > 0
     (resumed,), _ = _fit("ksnn", {}, [1], settings, FitContext([folders[1]]))
-    assert np.array_equal(_weights(whole), _weights(resumed))
+    assert np.array_equal(flat_weights(whole), flat_weights(resumed))
     settings = SupervisedSettings(max_epochs=4)
-    _fit("ksnn", {}, [0], settings, FitContext([tmp_path], should_stop=_StopAfter(20)))
+    _fit("ksnn", {}, [0], settings, FitContext([tmp_path], should_stop=stop_after(20)))
     file = tmp_path / "checkpoint.safetensors"
     file.write_bytes(file.read_bytes()[:100])
     assert resume_epoch(tmp_path) == 0
     (resumed,), _ = _fit("ksnn", {}, [0], settings, FitContext([tmp_path]))
     (whole,), _ = _fit("ksnn", {}, [0], settings)
-    assert np.array_equal(_weights(whole), _weights(resumed))
+    assert np.array_equal(flat_weights(whole), flat_weights(resumed))
 
 
 def test_diverging_training_is_one_clear_error():

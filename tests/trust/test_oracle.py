@@ -5,8 +5,8 @@ import math
 import numpy as np
 import pytest
 from measured_drive import CHANNELS, RATE, measured_drive
+from refusals import refusal
 
-from vehest.data.errors import DataError
 from vehest.trust.autoregression import Autoregression, fit_autoregression, learn_noise_levels
 from vehest_papers.trust.oracle import filtered, known_test, learn_oracle, levels_at
 
@@ -39,8 +39,7 @@ def test_the_planted_autoregression_is_found_with_its_order_whatever_outliers_do
     samples = planted(20_000)
     samples[[500, 7000, 12_000], 0] += 500.0
     np.testing.assert_allclose(fit_autoregression([samples], max_order=4).coefficients[:2], COEFFICIENTS, atol=0.05)
-    with pytest.raises(DataError, match="too few for an autoregression of order 10 in 2 channels"):
-        fit_autoregression([planted(60)], max_order=10)
+    assert "too few for an autoregression of order 10 in 2 channels" in refusal(lambda: fit_autoregression([planted(60)], max_order=10))
 
 
 def test_innovations_move_by_what_the_filter_makes_of_a_signature():
