@@ -16,6 +16,7 @@ from vbo_log import clock
 from vehest.alignment.proposals.names import hints
 from vehest.alignment.proposals.proposal import Proposal, Proposals
 from vehest.data.errors import DataError, MissingError, VehestError
+from vehest.data.transforms import Resample
 from vehest.run.own_car.dataset import draft
 from vehest.run.own_car.inspect import inspect
 from vehest.run.own_car.questions import questions_of
@@ -327,31 +328,53 @@ def test_a_pause_ends_a_recording_and_no_line_crosses_it(tmp_path):
     table.loc[np.arange(len(table)) % 5 != 0, "Beta"] = np.nan
     made = drafted(tmp_path, table[(table["Time [s]"] < 50.0) | (table["Time [s]"] >= 53.0)])
     assert np.isfinite(open_source(made.dataset).read("lap_run_0")["sideslip_ref"]).all()
-    assert (made.dataset["max_gap"], [round(own) for own in made.durations]) == (1.0, [50, 67])
+    assert (made.dataset["max_gap"], [round(own) for own in made.durations.values()]) == (1.0, [50, 67])
     assert any("makes 2 recordings" in note for note in made.notes)
+
+
+
+
+def written(file, table):
+    """A table as a VBOX or as a measuring system writes it, or as it is."""
+    if file.suffix == ".csv":
+        return write(file, table)
+    t, units = table["Time [s]"].to_numpy(), dict(zip(usual(drive()).columns[1:], ("km/h", "deg/s", "g", "g", "deg", "deg"), strict=True))
+    if file.suffix == ".vbo":
+        rows = pd.DataFrame({"time": clock(36_000.0 + t)}).join(table[[*units]].round(5).reset_index(drop=True))
+        text = rows.to_csv(None, sep=" ", header=False, index=False, na_rep="nan")
+        head = ["[channel units]", *units.values(), "", "[column names]", " ".join(rows), "", "[data]", ""]
+        file.write_text("\n".join(head) + text)
+    else:
+        asammdf = pytest.importorskip("asammdf")
+        write_mdf(file, {"All": [asammdf.Signal(table[name].to_numpy(), t, name=name, unit=unit) for name, unit in units.items()]})
+    return file
 
 
 @pytest.mark.parametrize("suffix", [".vbo", ".mf4"])
 def test_pauses_of_a_vbox_and_of_a_measurement_end_recordings_too(tmp_path, suffix):
     table = usual(drive())
-    table, file = table[(table["Time [s]"] < 50.0) | (table["Time [s]"] >= 53.0)], tmp_path / f"lap{suffix}"
-    t, units = table.pop("Time [s]").to_numpy(), dict(zip(table.columns, ("km/h", "deg/s", "g", "g", "deg", "deg"), strict=True))
-    if suffix == ".vbo":
-        rows = pd.DataFrame({"time": clock(36_000.0 + t)}).join(table.round(5).reset_index(drop=True))
-        text = rows.to_csv(None, sep=" ", header=False, index=False)
-        head = ["[channel units]", *units.values(), "", "[column names]", " ".join(rows), "", "[data]", ""]
-        file.write_text("\n".join(head) + text)
-    else:
-        asammdf = pytest.importorskip("asammdf")
-        signals = [asammdf.Signal(table[name].to_numpy(), t, name=name, unit=unit) for name, unit in units.items()]
-        write_mdf(file, {"All": signals})
-    examined = inspect("my_car", [file])
-    made = draft(examined)
+    made = draft(inspect("my_car", [written(tmp_path / f"lap{suffix}", table[(table["Time [s]"] < 50.0) | (table["Time [s]"] >= 53.0)])]))
     assert {"vx", "yaw_rate", "ay"} <= made.channels
-    assert (made.dataset["max_gap"], [round(own) for own in made.durations]) == (1.0, [50, 67])
+    assert (made.dataset["max_gap"], [round(own) for own in made.durations.values()]) == (1.0, [50, 67])
     assert any("makes 2 recordings" in note for note in made.notes)
 
 
+@pytest.mark.parametrize("suffix", [".vbo", ".mf4", ".csv"])
+def test_a_channel_with_gaps_that_nothing_bridges_is_left_out_so_that_the_others_can_be_resampled(tmp_path, suffix):
+    """Half a second in a VBOX's log and in a measurement, two in a table without times."""
+    table = usual(drive())
+    table.loc[1000 : 1100 if suffix == ".csv" else 1025, "Steer"] = np.nan
+    table = table.drop(columns="Time [s]") if suffix == ".csv" else table
+    made = draft(inspect("my_car", [written(tmp_path / f"lap{suffix}", table)]))
+    assert any(note.startswith("'Steer' (handwheel) is left out: samples are missing") for note in made.notes)
+    assert Resample(20.0)(read_back(made)).channels.keys() == {"vx", "yaw_rate", "ay", "ax", "sideslip_ref", "vy_ref"}
+
+
+def test_a_measurement_whose_reference_is_invalid_for_long_makes_recordings_of_the_rest(tmp_path):
+    table = usual(drive())
+    table.loc[(table["Time [s]"] < 20.0) | ((table["Time [s]"] > 70.0) & (table["Time [s]"] < 75.0)), "Beta"] = np.nan
+    made = draft(inspect("my_car", [written(tmp_path / "lap.mf4", table)]))
+    assert ("vy_ref" in made.channels, [round(own) for own in made.durations.values()]) == (True, [50, 45])
 def standing():
     random, names = np.random.default_rng(0), ("Speed [km/h]", "Gyro [deg/s]", "LatAcc [m/s^2]")
     return pd.DataFrame({"Time [s]": np.arange(3000) / 50.0} | {name: 0.02 * random.standard_normal(3000) for name in names})
@@ -455,7 +478,7 @@ def test_rows_without_a_sample_for_longer_than_lines_bridge_are_left_out_and_end
     table.to_parquet(tmp_path / "lap.parquet")
     for made in (drafted(tmp_path, table), draft(inspect("other", [tmp_path / "lap.parquet"]))):
         assert made.dataset["drop_rows"] == {"lap": ["1-500", "2502-2650"]}
-        assert ([round(own) for own in made.durations], made.dataset["gappy"], made.dataset["max_gap"]) == ([40, 67], [], 1.0)
+        assert ([round(own) for own in made.durations.values()], made.dataset["max_gap"]) == ([40, 67], 1.0)
         assert any("1-500" in note for note in made.notes)
 
 
