@@ -56,9 +56,7 @@ BY_NAME_ALONE = ("motor_current", "brake_pressure_front", "brake_pressure_rear",
 """Channels that no relation is known of."""
 
 
-def propose(
-    columns: Sequence[tuple[str, str, FloatArray, str]], rate_hz: float | None, *, is_vbo: bool = False
-) -> Proposals:
+def propose(columns: Sequence[tuple[str, str, FloatArray, str]], rate_hz: float | None, *, is_vbo: bool = False) -> Proposals:
     """Propose channels for the columns of a log.
 
     Args:

@@ -96,15 +96,21 @@ def inspect(name: str, files: Sequence[Path], vehicle: Mapping[str, float | None
     proposals = propose(columns, rate, is_vbo=longest.source == "vbo")
     if longest.source not in TABLES:  # other sources make no reference of positions
         proposals = replace(proposals, pose=())
-    used = {one.column for one in proposals.channels}
     for log in others:
-        missing = sorted(used - {column.name for column in log.columns})
-        if missing:
-            raise DataError(f"'{log.file}' has no column '{missing[0]}', which '{longest.file}' has; give files of the same columns")
-        proposals = possible(proposals, {column.name: column.values for column in log.columns})
+        held = {column.name: column for column in log.columns}
+        lacking = [one for one in proposals.channels if one.column not in held]
+        notes = [f"'{one.column}' ({one.channel}) is left out: '{log.file}' has no numbers in it" for one in lacking]
+        kept = tuple(one for one in proposals.channels if one not in lacking)
+        proposals = replace(proposals, channels=kept, notes=(*proposals.notes, *notes))
+        for own in longest.columns:
+            if own.name in {one.column for one in kept} and held[own.name].unit != own.unit:
+                what = f"has '{own.name}' in '{held[own.name].unit}', '{longest.file}' in '{own.unit}'"
+                raise DataError(f"'{log.file}' {what}; write both alike, or make a data set of each")
+        proposals = possible(proposals, {name: column.values for name, column in held.items()})
     if not proposals.channels:
         names = counted([column.name for column in longest.columns])
-        raise DataError(f"'{longest.file}': no column is recognised as a channel, by name or by motion, of {names}")
+        unread = f"; not read: {longest.skipped[0]}" if longest.skipped else ""
+        raise DataError(f"'{longest.file}': no column is recognised as a channel, by name or by motion, of {names}{unread}")
     computed = [f"'{own}' is left out: the difference of '{of}' from row to row, and no measurement" for own, of in differences.items()]
     shadowed = [f"'{name}' is a data set that comes with vehest, too; in this folder it is yours"] if name in choices("dataset") else []
     proposals = replace(proposals, notes=(*proposals.notes, *computed, *_notes(longest, logs), *(shadowed if not existing else [])))

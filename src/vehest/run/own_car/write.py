@@ -123,7 +123,7 @@ def write(
     }
     purposes = ("channels, units and signs of the columns", "ranges for training, validation and test")
     lines = _words(made, plan, left)
-    for file, purpose in zip(files, (*purposes, f"estimators: {', '.join(plan.estimators)}"), strict=False):
+    for file, purpose in zip(files, (*purposes, f"estimators: {', '.join(dict.fromkeys(plan.estimators))}"), strict=False):
         lines.append(f"{'would write' if dry_run else 'wrote'} {file}: {purpose}")
     lines += [f"{'would remove' if dry_run else 'removed'} {file}: these recordings do not allow it" for file in stale]
     return plain, [*lines, "next:", *(f"  {command}" for command in following)]

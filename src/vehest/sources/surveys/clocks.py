@@ -72,7 +72,6 @@ def between_pauses(seconds: FloatArray, step: float) -> tuple[list[slice], dict[
     return ([*cut.values()], {"max_gap": longest}) if cut else (runs, {})
 
 
-
 def plain_name(name: str) -> str:
     """In lower case, without marks, words apart."""
     apart = re.sub(r"(?<=[a-z])(?=[A-Z])", " ", name)

@@ -28,7 +28,7 @@ from vehest.data.text_files import first_line
 from vehest.sources.clock_times import seconds_of_text
 from vehest.sources.surveys.clocks import NAMED, SPELLINGS, find_clock, plain_name
 from vehest.sources.surveys.log import Log, RawColumn
-from vehest.sources.tables import TextLayout, is_parquet, parse_table, read_head, require_columns, table_stream
+from vehest.sources.tables import TextLayout, is_parquet, parse_table, read_head, table_stream
 from vehest.sources.text_log import CLOCK
 from vehest.sources.unit_spellings import plain_unit
 
@@ -120,7 +120,6 @@ def shape_of(file: Path) -> Shape:
     if not best.names:
         raise DataError(f"'{file}' has no line of names above its first numbers; write one there")
     check_limit("columns", len(best.names), f"'{file}' has {len(best.names)} columns")
-    require_columns(file, best.names, filter(None, best.names))
     return best
 
 
@@ -204,6 +203,8 @@ def _columns(file: Path, shape: Shape) -> tuple[dict[str, FloatArray], dict[str,
             skipped += [f"column '{printable(name)}' is empty"] if name else []
         elif not name:
             skipped.append(f"column {place} has no name")
+        elif (count := shape.names.count(name)) > 1:
+            skipped.append(f"column {place}, one of {count} columns called '{printable(name)}'")
         elif (numbers := _numbers(column, shape.layout.decimal)) is not None:
             values[name] = numbers[0]
             marks |= numbers[1]
