@@ -154,7 +154,10 @@ def _dataset(examined: Examined) -> dict[str, Any]:
         short = max(float(own[own <= BRIDGED].max(initial=0.0)) for own in gaps.values())
         dataset |= {"source": "text_log", "bridge": math.ceil(100.0 * short * 1.05) / 100.0} if short else {}
         if log.clock is not None:
-            holes = {stem: [f"{first + 1}-{last}" for first, last in true_runs((own > BRIDGED).any(axis=0))] for stem, own in gaps.items()}
+            holes = {
+                stem: [f"{first + 1}-{last}" for first, last in true_runs(np.asarray(own.max(axis=0) > BRIDGED))]
+                for stem, own in gaps.items()
+            }
             dropped = {own.file.stem: [*holes[own.file.stem], *_stray_rows(own, proposals.channels)] for own in examined.logs}
             dataset |= {"drop_rows": named} if (named := {stem: rows for stem, rows in dropped.items() if rows}) else {}
             if any(holes.values()) and "runs" not in log.options:

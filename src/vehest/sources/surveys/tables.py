@@ -68,8 +68,8 @@ def survey_table(file: Path) -> Log:
     else:
         shape = shape_of(file)
         values, clocks, marks, skipped = _columns(file, shape)
-        units, always, plain = dict(shape.units), ("delimiter", "decimal"), asdict(TextLayout())
-        options = {name: option for name, option in asdict(shape.layout).items() if name in always or option != plain[name]}
+        units, always, usual = dict(shape.units), ("delimiter", "decimal"), asdict(TextLayout())
+        options = {name: option for name, option in asdict(shape.layout).items() if name in always or option != usual[name]}
         options |= {"missing": sorted(marks)} if marks else {}
     if not values:
         raise DataError(f"'{file}' holds no column of numbers{f' ({skipped[0]})' if skipped else ''}")
