@@ -304,6 +304,8 @@ def test_velocity_and_sideslip_follow_from_each_other_gaps_included():
     back = SideslipFromVelocity()(there.select(["vx", "vy_ref"]))
     np.testing.assert_allclose(back["sideslip_ref"], angle, atol=1e-15)
     assert "less than 90 degrees" in refusal(lambda: VelocityFromSideslip()(recorded(vx=np.ones(2), sideslip_ref=np.array([0.1, 1.6]))))
+    standing = VelocityFromSideslip()(recorded(vx=np.array([0.01, 0.05, 20.0]), sideslip_ref=np.array([3.1, 0.2, 0.1])))
+    np.testing.assert_allclose(standing["vy_ref"], [0.0, 0.05 * np.tan(0.2), 20.0 * np.tan(0.1)])
     channels = {"vx": np.full(3, 20.0), "sideslip_ref": np.array([0.1, math.nan, 0.2])}
     drive = Recording("lap", "car", RATE, 0.0, channels, gappy=frozenset({"sideslip_ref"}))
     made = VelocityFromSideslip()(drive)

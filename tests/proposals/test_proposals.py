@@ -16,6 +16,7 @@ from vbo_log import clock
 from vehest.alignment.proposals.names import hints
 from vehest.alignment.proposals.proposal import Proposal, Proposals
 from vehest.data.errors import DataError, MissingError, VehestError
+from vehest.data.transforms import Resample
 from vehest.run.own_car.dataset import draft
 from vehest.run.own_car.inspect import inspect
 from vehest.run.own_car.questions import questions_of
@@ -192,7 +193,11 @@ def test_a_reference_is_made_of_positions_and_yaw_where_there_is_no_other(tmp_pa
         ("lap.csv", b"speed\n" + b"1.0\n2.0\n" * 50, "no rows of two numbers"),
         ("lap.csv", bytes(range(256)) * 40, "no table of text"),
         ("lap.csv", b"1,2,3\n2,3,4\n3,4,5\n" * 20, "no line of names"),
-        ("lap.csv", b"t,v,v\n" + b"1,2,3\n2,3,4\n" * 20, "2 columns called 'v'"),
+        (
+            "lap.csv",
+            b"t,v,v\n" + b"1,2,3\n2,3,4\n" * 20,
+            "of 1 (t); not read: column 2, one of 2 columns called 'v'",
+        ),
         ("lap.csv", b"t,v\n1,2\n", "1 row of numbers"),
         ("lap.mat", b"MATLAB 5.0 MAT-file", "writetable"),
         ("lap.asc", b"base hex timestamps absolute", "of a CAN bus"),
@@ -325,29 +330,51 @@ def test_a_pause_ends_a_recording_and_no_line_crosses_it(tmp_path):
     table.loc[np.arange(len(table)) % 5 != 0, "Beta"] = np.nan
     made = drafted(tmp_path, table[(table["Time [s]"] < 50.0) | (table["Time [s]"] >= 53.0)])
     assert np.isfinite(open_source(made.dataset).read("lap_run_0")["sideslip_ref"]).all()
-    assert (made.dataset["max_gap"], [round(own) for own in made.durations]) == (1.0, [50, 67])
+    assert (made.dataset["max_gap"], [round(own) for own in made.durations.values()]) == (1.0, [50, 67])
     assert any("makes 2 recordings" in note for note in made.notes)
+
+
+def written(file, table):
+    """A table as a VBOX or as a measuring system writes it, or as it is."""
+    if file.suffix == ".csv":
+        return write(file, table)
+    t, units = table["Time [s]"].to_numpy(), dict(zip(usual(drive()).columns[1:], ("km/h", "deg/s", "g", "g", "deg", "deg"), strict=True))
+    if file.suffix == ".vbo":
+        rows = pd.DataFrame({"time": clock(36_000.0 + t)}).join(table[[*units]].round(5).reset_index(drop=True))
+        text = rows.to_csv(None, sep=" ", header=False, index=False, na_rep="nan")
+        head = ["[channel units]", *units.values(), "", "[column names]", " ".join(rows), "", "[data]", ""]
+        file.write_text("\n".join(head) + text)
+    else:
+        asammdf = pytest.importorskip("asammdf")
+        write_mdf(file, {"All": [asammdf.Signal(table[name].to_numpy(), t, name=name, unit=unit) for name, unit in units.items()]})
+    return file
 
 
 @pytest.mark.parametrize("suffix", [".vbo", ".mf4"])
 def test_pauses_of_a_vbox_and_of_a_measurement_end_recordings_too(tmp_path, suffix):
     table = usual(drive())
-    table, file = table[(table["Time [s]"] < 50.0) | (table["Time [s]"] >= 53.0)], tmp_path / f"lap{suffix}"
-    t, units = table.pop("Time [s]").to_numpy(), dict(zip(table.columns, ("km/h", "deg/s", "g", "g", "deg", "deg"), strict=True))
-    if suffix == ".vbo":
-        rows = pd.DataFrame({"time": clock(36_000.0 + t)}).join(table.round(5).reset_index(drop=True))
-        text = rows.to_csv(None, sep=" ", header=False, index=False)
-        head = ["[channel units]", *units.values(), "", "[column names]", " ".join(rows), "", "[data]", ""]
-        file.write_text("\n".join(head) + text)
-    else:
-        asammdf = pytest.importorskip("asammdf")
-        signals = [asammdf.Signal(table[name].to_numpy(), t, name=name, unit=unit) for name, unit in units.items()]
-        write_mdf(file, {"All": signals})
-    examined = inspect("my_car", [file])
-    made = draft(examined)
+    made = draft(inspect("my_car", [written(tmp_path / f"lap{suffix}", table[(table["Time [s]"] < 50.0) | (table["Time [s]"] >= 53.0)])]))
     assert {"vx", "yaw_rate", "ay"} <= made.channels
-    assert (made.dataset["max_gap"], [round(own) for own in made.durations]) == (1.0, [50, 67])
+    assert (made.dataset["max_gap"], [round(own) for own in made.durations.values()]) == (1.0, [50, 67])
     assert any("makes 2 recordings" in note for note in made.notes)
+
+
+@pytest.mark.parametrize("suffix", [".vbo", ".mf4", ".csv"])
+def test_a_channel_with_gaps_that_nothing_bridges_is_left_out_so_that_the_others_can_be_resampled(tmp_path, suffix):
+    """Half a second in a VBOX's log and in a measurement, two in a table without times."""
+    table = usual(drive())
+    table.loc[1000 : 1100 if suffix == ".csv" else 1025, "Steer"] = np.nan
+    table = table.drop(columns="Time [s]") if suffix == ".csv" else table
+    made = draft(inspect("my_car", [written(tmp_path / f"lap{suffix}", table)]))
+    assert any(note.startswith("'Steer' (handwheel) is left out: samples are missing") for note in made.notes)
+    assert Resample(20.0)(read_back(made)).channels.keys() == {"vx", "yaw_rate", "ay", "ax", "sideslip_ref", "vy_ref"}
+
+
+def test_a_measurement_whose_reference_is_invalid_for_long_makes_recordings_of_the_rest(tmp_path):
+    table = usual(drive())
+    table.loc[(table["Time [s]"] < 20.0) | ((table["Time [s]"] > 70.0) & (table["Time [s]"] < 75.0)), "Beta"] = np.nan
+    made = draft(inspect("my_car", [written(tmp_path / "lap.mf4", table)]))
+    assert ("vy_ref" in made.channels, [round(own) for own in made.durations.values()]) == (True, [50, 45])
 
 
 def standing():
@@ -364,11 +391,12 @@ POSE = {f"pose_{name}": np.random.default_rng(seed).standard_normal(6000).cumsum
     [
         (lambda: usual(drive()).sample(frac=1.0, random_state=0), r"'Time \[s\]' as the time: it goes backwards.*sort the rows", ""),
         (lambda: usual(drive()).rename(columns={"Beta": ""}), "^not read: column 7 has no name$", "sideslip_ref"),
+        (lambda: pd.concat([usual(drive()), usual(drive())[["Steer"]]], axis=1), "column 8, one of 2 columns called 'Steer'", "handwheel"),
         (lambda: usual(drive()).assign(**ROLL), r"'roll \(rad\)' is named as roll.*left out", "roll"),
         (lambda: usual(drive()).drop(columns="Beta").assign(**POSE), "no reference is made of 'pose_x', 'pose_y', 'pose_yaw'", "vy_ref"),
         (standing, "stands all the time", ""),
     ],
-    ids=["no clock", "no name", "impossible angle", "unrelated pose", "standing"],
+    ids=["no clock", "no name", "twice", "impossible angle", "unrelated pose", "standing"],
 )
 def test_what_is_left_out_is_noted(tmp_path, table, said, absent):
     proposals = proposals_of(tmp_path, table())
@@ -398,12 +426,25 @@ def test_a_second_file_in_another_unit_is_told_of_and_a_mark_in_it_alone_is_read
             {},
             r"has times 'Time \[ms\] in ms'",
         ),
-        (lambda table: table.rename(columns={"LongAcc": "Acc"}), {}, "has no column 'LongAcc'"),
     ],
 )
 def test_files_that_are_laid_out_otherwise_are_refused(tmp_path, change, options, said):
     with pytest.raises(DataError, match=said):
         in_two_files(tmp_path, change, **options)
+
+
+def test_a_file_with_another_unit_below_its_names_is_refused(tmp_path):
+    names, _, numbers = usual(drive()).round(5).to_csv(index=False).partition("\n")
+    for name, unit in (("lap_1", "km/h"), ("lap_2", "m/s")):
+        (tmp_path / f"{name}.csv").write_text(f"{names}\ns,{unit},deg/s,g,g,deg,deg\n{numbers}")
+    with pytest.raises(DataError, match=r"lap_2.csv' has 'Speed' in 'm/s', .*lap_1.csv' in 'km/h'; write both alike"):
+        inspect("my_car", [tmp_path / "lap_1.csv", tmp_path / "lap_2.csv"])
+
+
+def test_a_column_that_is_empty_in_another_file_is_left_out(tmp_path):
+    found = in_two_files(tmp_path, lambda table: table.assign(Steer=np.nan)).proposals
+    assert ("handwheel" in found.by_channel, "ax" in found.by_channel) == (False, True)
+    assert any(re.search(r"'Steer' \(handwheel\) is left out: '.*lap_2.csv' has no numbers in it", note) for note in found.notes)
 
 
 def test_a_yaw_rate_that_is_named_as_made_of_yaw_is_the_references(tmp_path):
@@ -453,7 +494,7 @@ def test_rows_without_a_sample_for_longer_than_lines_bridge_are_left_out_and_end
     table.to_parquet(tmp_path / "lap.parquet")
     for made in (drafted(tmp_path, table), draft(inspect("other", [tmp_path / "lap.parquet"]))):
         assert made.dataset["drop_rows"] == {"lap": ["1-500", "2502-2650"]}
-        assert ([round(own) for own in made.durations], made.dataset["gappy"], made.dataset["max_gap"]) == ([40, 67], [], 1.0)
+        assert ([round(own) for own in made.durations.values()], made.dataset["max_gap"]) == ([40, 67], 1.0)
         assert any("1-500" in note for note in made.notes)
 
 

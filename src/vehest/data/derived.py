@@ -17,6 +17,7 @@ from vehest.data.errors import ConfigurationError, DataError
 from vehest.data.recording import Recording
 
 WHEELS = ("fl", "fr", "rl", "rr")
+STANDSTILL_SPEED = 0.1  # m/s
 
 
 def _known(name: str) -> str:
@@ -179,13 +180,18 @@ class VelocityFromSideslip:
     """
 
     def __call__(self, recording: Recording) -> Recording:
-        """Set ``vy_ref``, by ``vx_ref`` or, without one, ``vx``; it has gaps where the angle or the speed has them."""
+        """Set ``vy_ref``, by ``vx_ref`` or, without one, ``vx``; it has gaps where the angle or the speed has them.
+
+        At standstill, where the angle means nothing, 90 degrees and more become 0.
+        """
         angle, speed = recording["sideslip_ref"], speed_of_reference(recording)
-        if np.nanmax(np.abs(angle), initial=0.0) >= 0.5 * np.pi:
-            worst = int(np.nanargmax(np.abs(angle)))
+        beyond = np.abs(angle) >= 0.5 * np.pi
+        moving = beyond & ~(np.abs(recording[speed]) < STANDSTILL_SPEED)
+        if moving.any():
+            worst = int(np.argmax(np.where(moving, np.abs(angle), 0.0)))
             what = f"sideslip_ref is {angle[worst]:.4g} rad at {recording.time[worst]:.12g} s"
             raise DataError(f"recording '{recording.id}': {what}; lateral velocity follows from less than 90 degrees only")
-        return recording.with_channels({"vy_ref": recording[speed] * np.tan(angle)}, made_of=("sideslip_ref", speed))
+        return recording.with_channels({"vy_ref": recording[speed] * np.tan(np.where(beyond, 0.0, angle))}, made_of=("sideslip_ref", speed))
 
 
 @dataclass(frozen=True)

@@ -31,14 +31,14 @@ REFERENCES = ("zero", "static_map", "kinematic", "data_sheet")  # baselines, in 
 
 
 def documents(artefacts: StudyArtefacts) -> dict[str, Document]:
-    """Report: what carried over, a table estimator x vehicle, baselines first, each vehicle alone, how it was made; raises `DataError`."""
+    """Report: errors as a figure, what carried over, a table estimator x vehicle, each vehicle, how it was made; raises `DataError`."""
     parts = artefacts.parts
     rankings = {(name, test_set): ranking_of(part, test_set) for name, part in parts.items() for test_set in part.split.tests}
     board = overview(parts, rankings)
-    blocks: list[Block] = [artefacts.about] if artefacts.about.strip() else []
+    blocks: list[Block] = [transfer_figure_of(board), *([artefacts.about] if artefacts.about.strip() else [])]
     absent = [as_text(title) for name, title in artefacts.titles.items() if name not in parts]
     blocks.append(carried_over(board) + (f"\n\nNot here, since nothing could be trained or scored: {listed(absent)}." if absent else ""))
-    blocks += [_matrix(board), transfer_figure_of(board)]
+    blocks.append(_matrix(board))
     for name, part in parts.items():
         blocks += _part(name, part, board[board["part"] == name], rankings)
     blocks += [block for name, part in parts.items() for block in appendix_of(name, part)]

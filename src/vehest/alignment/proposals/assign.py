@@ -56,32 +56,24 @@ BY_NAME_ALONE = ("motor_current", "brake_pressure_front", "brake_pressure_rear",
 """Channels that no relation is known of."""
 
 
-def propose(
-    columns: Sequence[tuple[str, str, FloatArray]],
-    rate_hz: float | None,
-    *,
-    devices: Mapping[str, str] | None = None,
-    compass: str = "",
-    west_positive: bool = False,
-) -> Proposals:
+def propose(columns: Sequence[tuple[str, str, FloatArray, str]], rate_hz: float | None, *, is_vbo: bool = False) -> Proposals:
     """Propose channels for the columns of a log.
 
     Args:
-        columns: name, unit as vehest spells it (empty where the file has none), values on an even clock, (T,) each.
+        columns: name, unit as vehest spells it (empty where the file has none), values on an even clock, (T,) each, and ``car`` or
+            ``reference`` where the file says which of them measured it, `COMPUTED` where nothing did, else nothing.
         rate_hz: of that clock; None where it is unknown.
-        devices: column -> ``car`` or ``reference``, where the file says which of them measured it.
-        compass: column that counts the heading clockwise by its file's format; empty where there is none.
-        west_positive: whether longitudes count to the west.
+        is_vbo: whether the column ``heading`` counts clockwise and longitudes to the west, as in a VBOX's log.
     """
     rate = rate_hz or NOMINAL_RATE
-    found = candidates(columns, rate, devices or {})
+    found = candidates(columns, rate)
     wheels = find_wheels(found)
     found += speed_of_wheels(found, wheels, rate)
     stands = _stands(found)
     turning = [] if stands else find_turning(found)
     guessed = _rate_by_ax(_of(found, turning[0], rate)) if turning and rate_hz is None else None
     if guessed is not None:
-        return replace(propose(columns, guessed, devices=devices, compass=compass, west_positive=west_positive), rate_hz=guessed)
+        return replace(propose(columns, guessed, is_vbo=is_vbo), rate_hz=guessed)
     search = None if stands else _search(found, turning, rate)
     proposals = _assigned(found, search, wheels)
     notes = [*proposals.notes]
@@ -97,11 +89,11 @@ def propose(
     if search is not None:
         proposals, more = _speedometer(proposals, search.turning, wheels)
         notes += more
-    clues = () if known is None else _clues(found, wheels, known, compass, west_positive)
+    clues = () if known is None else _clues(found, wheels, known, is_vbo)
     proposals = _as_most_count(_left_and_right(replace(proposals, notes=tuple(notes)), found, known, clues))
     proposals = possible(proposals, {column.name: column.values for column in found})
     used = {one.column for one in proposals.channels} | {column for _, column, _ in proposals.pose}
-    unused = tuple(name for name, _, _ in columns if name not in used)
+    unused = tuple(name for name, *_ in columns if name not in used)
     return replace(proposals, unused=unused, rate_hz=NOMINAL_RATE if rate_hz is None else None)
 
 
@@ -214,9 +206,7 @@ def _assigned(columns: Sequence[Candidate], search: Search | None, wheels: Wheel
         found |= {one.channel: one for one in made}
         free = [one for one in free if one not in wheels.values()]
     found |= {one.channel: one for one in _named_channels(free, found, moves=search is not None)}
-    gappy = {column.name for column in columns if column.gappy}
-    channels = tuple(replace(one, gappy=one.column in gappy) for one in found.values())
-    return Proposals(channels, wheel_radius=radius, notes=notes)
+    return Proposals(tuple(found.values()), wheel_radius=radius, notes=notes)
 
 
 def _named_channels(columns: Sequence[Candidate], held: Collection[str], *, moves: bool) -> list[Proposal]:
@@ -324,16 +314,16 @@ def _as_most_count(proposals: Proposals) -> Proposals:
     return replace(proposals, channels=tuple(changed.get(one.channel, one) for one in proposals.channels))
 
 
-def _clues(columns: Sequence[Candidate], wheels: Wheels, known: Motion, compass: str, west_positive: bool) -> Iterator[tuple[str, float]]:
+def _clues(columns: Sequence[Candidate], wheels: Wheels, known: Motion, is_vbo: bool) -> Iterator[tuple[str, float]]:
     """Texts with a place for the sign of the yaw rate, and correlations with the sign by which it counts to the left."""
     yield "right wheels are faster where yaw_rate, sign {}, counts up", turning_left(wheels, known)
     for column in columns:
-        if column.name == compass:
-            yield f"'{compass}', clockwise by its format, runs against yaw_rate, sign {{}}", -turning_of(column, "deg", known)
+        if is_vbo and column.name == "heading":
+            yield "'heading', clockwise by its format, runs against yaw_rate, sign {}", -turning_of(column, "deg", known)
     latitude, longitude = (next((one.slow for one in columns if role in one.hints), None) for role in ("latitude", "longitude"))
     if latitude is None or longitude is None:
         return
-    east = longitude * (-1.0 if west_positive else 1.0) * math.cos(math.radians(min(abs(float(latitude.mean())), 89.0)))
+    east = longitude * (-1.0 if is_vbo else 1.0) * math.cos(math.radians(min(abs(float(latitude.mean())), 89.0)))
     steps = np.gradient(east), np.gradient(latitude)
     turned = -np.gradient(np.unwrap(np.arctan2(*steps)))
     usual = (np.abs(turned) < 1.0) & (np.hypot(*steps) > 0.0)

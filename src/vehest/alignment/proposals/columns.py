@@ -48,7 +48,6 @@ class Candidate:
     values: FloatArray  # in the file's unit, without gaps, (T,)
     slow: FloatArray  # low-passed, at `KEPT_HZ` or less, (S,)
     hints: Mapping[str, float]  # role -> strength with which the name suggests it
-    gappy: bool = False  # whether samples were missing
     is_made: bool = False  # whether it is the mean of wheels, and no column of the log
     device: str = ""  # ``car`` or ``reference`` where the file says which of them measured it, `COMPUTED` where nothing did
 
@@ -93,20 +92,19 @@ def si_factor(unit: str, channel: str) -> float:
     return factor_to_si(unit, CHANNELS[channel].unit)
 
 
-def candidates(columns: Sequence[tuple[str, str, FloatArray]], rate_hz: float, devices: Mapping[str, str]) -> list[Candidate]:
+def candidates(columns: Sequence[tuple[str, str, FloatArray, str]], rate_hz: float) -> list[Candidate]:
     """Columns that change, are mostly there, and are neither clocks nor distances; see `vehest.alignment.proposals.assign.propose`."""
     found = []
-    for name, unit, values in columns:
+    for name, unit, values, device in columns:
         known = np.isfinite(values) & (np.abs(values) < 1e15)
         if 1.0 - known.mean() > MOST_MISSING or not np.ptp(values[known]) > 0.0 or len(np.unique(values[known][:200_000])) < FEWEST_LEVELS:
             continue
         only_grows = len(values) > LONG and np.min(np.diff(values[known])) >= 0.0
         if only_grows and not {"latitude", "longitude", "position_x", "position_y"} & set(hints(name)):
             continue
-        gappy = not known.all()
         known[known] = ~_stray(values[known])
         whole = values if known.all() else np.interp(np.arange(len(values)), np.flatnonzero(known), values[known])
-        found.append(Candidate(name, unit, whole, slow_of(whole, rate_hz), hints(name), gappy, device=devices.get(name, "")))
+        found.append(Candidate(name, unit, whole, slow_of(whole, rate_hz), hints(name), device=device))
     return found
 
 

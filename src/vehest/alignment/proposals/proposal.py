@@ -29,7 +29,6 @@ class Proposal:
     offset: float = 0.0  # value of the column at zero, in its own unit
     others: tuple[str, ...] = ()  # channels or units that would do as well
     delay: float = 0.0  # by which it is late, as far as it is known [s]
-    gappy: bool = False  # whether samples are missing
 
     @property
     def in_words(self) -> str:

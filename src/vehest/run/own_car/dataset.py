@@ -35,6 +35,7 @@ POLICIES = {"vbo": ("strict", "interpolate"), **dict.fromkeys(TABLES, ("strict",
 BAG_HZ = 100.0
 LEAST_GAP = 0.05  # s
 LONGEST_GAP = 1.0  # s that signals of a measurement may be missing
+GAPS = "samples are missing; only a table with a column of times may lack some, which are bridged, or cut out beyond one second"
 MOST_STRAY = 0.002  # of the rows
 POSE_SECONDS = 0.15  # of the filter that differentiates poses
 CONTRADICTIONS = ("sign", "unit", "impossible", "kinematics")  # checks that contradict a proposal
@@ -52,12 +53,12 @@ class Draft:
     remarks: list[str]  # findings of the checks that concern the proposals
     ratio: tuple[float, float] | None  # estimated steering ratio and its uncertainty; None where it is given or not needed
     notes: list[str]  # further remarks
-    durations: list[float]  # of the recordings [s]
+    durations: dict[str, float]  # recording -> its length [s]
 
     @property
     def seconds(self) -> float:
         """Of all recordings."""
-        return sum(self.durations)
+        return sum(self.durations.values())
 
     @property
     def channels(self) -> frozenset[str]:
@@ -67,6 +68,9 @@ class Draft:
 
 def draft(examined: Examined) -> Draft:
     """A data set by the proposals, read as an ingest reads it; raises `VehestError` where it cannot be read."""
+    whole = [one for one in examined.proposals.channels if not any(_has_gaps(examined, own, one.column) for own in examined.logs)]
+    gaps = [f"'{one.column}' ({one.channel}) is left out: {GAPS}" for one in examined.proposals.channels if one not in whole]
+    examined = replace(examined, proposals=replace(examined.proposals, channels=tuple(whole)))
     proposals, vehicle = examined.proposals, examined.vehicle
     if not proposals.channels:
         raise ConfigurationError("no column is left that would be a channel")
@@ -74,7 +78,7 @@ def draft(examined: Examined) -> Draft:
     speed = [{"name": "speed_from_wheels", "wheel_radius": proposals.wheel_radius}] if proposals.wheel_radius is not None else []
     dataset, recordings = _read_strictest(dataset | {"transforms": speed})
     longest = max(recordings, key=lambda own: own.duration)
-    late, ratio, notes = late_channels(longest), None, [*proposals.notes]
+    late, ratio, notes = late_channels(longest), None, [*proposals.notes, *gaps]
     for stem, rows in dataset.get("drop_rows", {}).items():
         why = f"beyond what a vehicle can do, or {BRIDGED:g} s and more without a sample"
         notes.append(f"left out of '{stem}' by drop_rows, {why}: data rows: {counted([str(row) for row in rows])}")
@@ -101,7 +105,7 @@ def draft(examined: Examined) -> Draft:
         _remarks(longest, recordings),
         ratio,
         notes,
-        [own.duration for own in recordings],
+        {own.id: own.duration for own in recordings},
     )
 
 
@@ -145,20 +149,20 @@ def _dataset(examined: Examined) -> dict[str, Any]:
         dataset["time"] = None if log.clock is None else {"column": log.clock.column, "unit": log.clock.unit}
         dataset |= {"rate_hz": examined.rate_hz} if log.clock is None else {}
     dataset["clock"] = "strict"
-    gaps = {one.channel: [_gaps(examined, own, one.column) for own in examined.logs] for one in proposals.channels}
-    longest = {name: max(float(own.max()) for own in of_files) for name, of_files in gaps.items()}
     if log.source in TABLES:
-        short = max((float(own[own <= BRIDGED].max(initial=0.0)) for of_files in gaps.values() for own in of_files), default=0.0)
+        gaps = {own.file.stem: np.array([_gaps(examined, own, one.column) for one in proposals.channels]) for own in examined.logs}
+        short = max(float(own[own <= BRIDGED].max(initial=0.0)) for own in gaps.values())
         dataset |= {"source": "text_log", "bridge": math.ceil(100.0 * short * 1.05) / 100.0} if short else {}
-    if log.source in TABLES and log.clock is not None:
-        holes = {own.file.stem: _holes([of_files[k] for of_files in gaps.values()]) for k, own in enumerate(examined.logs)}
-        dropped = {stem: [*rows, *stray] for stem, stray in _stray_rows(examined).items() if (rows := holes[stem]) or stray}
-        dataset |= {"drop_rows": dropped} if dropped else {}
-        if any(holes.values()) and "runs" not in log.options:
-            dataset["max_gap"] = log.options.get("max_gap", MAX_GAP)
-        longest = {}
+        if log.clock is not None:
+            holes = {
+                stem: [f"{first + 1}-{last}" for first, last in true_runs(np.asarray(own.max(axis=0) > BRIDGED))]
+                for stem, own in gaps.items()
+            }
+            dropped = {own.file.stem: [*holes[own.file.stem], *_stray_rows(own, proposals.channels)] for own in examined.logs}
+            dataset |= {"drop_rows": named} if (named := {stem: rows for stem, rows in dropped.items() if rows}) else {}
+            if any(holes.values()) and "runs" not in log.options:
+                dataset["max_gap"] = log.options.get("max_gap", MAX_GAP)
     dataset["channels"] = {one.channel: _entry(one, columns[one.column].place) for one in proposals.channels}
-    dataset["gappy"] = [name for name, gap in longest.items() if gap > (BRIDGED if log.source in TABLES else 0.0)]
     if proposals.pose:
         rate = rate_of(log.seconds) if log.seconds is not None else float(examined.rate_hz or EVIDENCE_HZ)
         parts = {part: {"column": column, "unit": unit} for part, column, unit in proposals.pose}
@@ -172,19 +176,22 @@ def _entry(one: Proposal, place: Mapping[str, Any]) -> dict[str, Any]:
     return {**place, "unit": one.unit} | sign | ({"factor": one.factor} if one.factor != 1.0 else {})
 
 
-def _stray_rows(examined: Examined) -> dict[str, list[int]]:
-    """File's stem -> rows, from 1, in which a channel is beyond what a vehicle can do, where they are as few as spikes."""
-    found = {}
-    for log in examined.logs:
-        columns = {column.name: column.values for column in log.columns}
-        beyond = np.any([one.beyond(columns[one.column]) for one in examined.proposals.channels], axis=0)
-        found[log.file.stem] = (np.flatnonzero(beyond) + 1).tolist() if beyond.mean() <= MOST_STRAY else []
-    return found
+def _stray_rows(log: Log, channels: Sequence[Proposal]) -> list[int]:
+    """Rows, from 1, in which a channel is beyond what a vehicle can do, where they are as few as spikes."""
+    columns = {column.name: column.values for column in log.columns}
+    beyond = np.any([one.beyond(columns[one.column]) for one in channels], axis=0)
+    return (np.flatnonzero(beyond) + 1).tolist() if beyond.mean() <= MOST_STRAY else []
 
 
-def _holes(gaps: Sequence[FloatArray]) -> list[str]:
-    """Ranges of rows, from 1, in which a channel has no sample for longer than lines bridge."""
-    return [f"{first + 1}-{last}" for first, last in true_runs(np.any([own > BRIDGED for own in gaps], axis=0))]
+def _has_gaps(examined: Examined, log: Log, column: str) -> bool:
+    """Whether a column lacks samples that neither lines bridge nor pauses cut out; a recording with such gaps cannot be resampled."""
+    own = next(own for own in log.columns if own.name == column)
+    known = np.flatnonzero(np.isfinite(own.values))
+    if log.source in TABLES:
+        return not len(known) or (log.clock is None and bool(_gaps(examined, log, column).max() > BRIDGED))
+    if log.source != "mdf" or own.stamps is None or not len(known):
+        return len(known) < len(own.values)
+    return bool((np.diff(own.stamps[known])[np.diff(known) > 1] <= LONGEST_GAP).any())
 
 
 def _gaps(examined: Examined, log: Log, column: str) -> FloatArray:
@@ -209,9 +216,8 @@ def _mdf_options(columns: Mapping[str, RawColumn], proposals: Sequence[Proposal]
         channels[one.channel] = _entry(one, columns[one.column].place)
         if 3.0 / rate < gap:
             channels[one.channel]["max_gap"] = math.ceil(100.0 * gap) / 100.0
-    gappy = [one.channel for one in proposals if one.gappy]
     pause = {"max_gap": float(f"{max(MAX_GAP, FEWEST_STEPS / min(rates)):.3g}")} if paused else {}
-    return {"rate_hz": plain_rate(max(rates), RATE_TOLERANCE), **pause, "channels": channels, "gappy": gappy}
+    return {"rate_hz": plain_rate(max(rates), RATE_TOLERANCE), **pause, "channels": channels}
 
 
 def _bag_options(columns: Mapping[str, RawColumn], proposals: Sequence[Proposal]) -> dict[str, Any]:
@@ -232,10 +238,11 @@ def _bag_options(columns: Mapping[str, RawColumn], proposals: Sequence[Proposal]
 
 
 def _rate_and_gap(column: RawColumn, shorter: float = math.inf) -> tuple[float, float]:
-    """Median rate [Hz] and longest gap [s], of those up to ``shorter``, of a column with times of its own."""
+    """Median rate [Hz] and longest gap [s], of those up to ``shorter``, of the valid samples of a column with times of its own."""
     assert column.stamps is not None
-    gaps = np.diff(column.stamps)
-    return rate_of(column.stamps), float(gaps[gaps <= shorter].max(initial=0.0))
+    stamps = column.stamps[np.isfinite(column.values)]
+    gaps = np.diff(stamps)
+    return rate_of(stamps), float(gaps[gaps <= shorter].max(initial=0.0))
 
 
 def _transforms(
@@ -252,7 +259,7 @@ def _transforms(
         made.append({"name": "offset_correction", "offsets": offsets})
     made += speed
     for name in ("vy_ref", "ax"):
-        supply = derivation_of(name, longest.channels, longest.gappy, longest.rate_hz) if name not in longest else None
+        supply = derivation_of(name, longest.channels, (), longest.rate_hz) if name not in longest else None
         if supply is not None and not supply.meanings:  # no value is unknown
             made += map(dict, supply.transforms)
     if "handwheel" in longest and "steer" not in longest and ratio:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import glob
 import math
 import os
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from fnmatch import filter as matching
 from itertools import product
@@ -27,7 +27,7 @@ from vehest.run.config_files import choices
 from vehest.run.printing import counted
 from vehest.sources.base import source_names
 from vehest.sources.clocks import plain_rate
-from vehest.sources.surveys import Log, RawColumn, survey
+from vehest.sources.surveys import Log, survey
 from vehest.sources.surveys.clocks import between_pauses
 from vehest.sources.text_log import bridged
 from vehest.sources.unit_spellings import plain_unit
@@ -91,22 +91,26 @@ def inspect(name: str, files: Sequence[Path], vehicle: Mapping[str, float | None
         logs = [survey(file) for file in files]
     longest = _longest(logs)
     others = [log for log in logs if log.file != longest.file]
-    columns, rate = _evidence(longest)
-    is_vbo = longest.source == "vbo"  # whose headings count clockwise, and longitudes to the west
     differences = _differences(longest)
-    devices = {column.name: COMPUTED if column.name in differences else column.device for column in longest.columns}
-    proposals = propose(columns, rate, devices=devices, compass="heading" if is_vbo else "", west_positive=is_vbo)
+    columns, rate = _evidence(longest, differences)
+    proposals = propose(columns, rate, is_vbo=longest.source == "vbo")
     if longest.source not in TABLES:  # other sources make no reference of positions
         proposals = replace(proposals, pose=())
-    used = {one.column for one in proposals.channels}
     for log in others:
-        missing = sorted(used - {column.name for column in log.columns})
-        if missing:
-            raise DataError(f"'{log.file}' has no column '{missing[0]}', which '{longest.file}' has; give files of the same columns")
-        proposals = possible(proposals, {column.name: column.values for column in log.columns})
+        held = {column.name: column for column in log.columns}
+        lacking = [one for one in proposals.channels if one.column not in held]
+        notes = [f"'{one.column}' ({one.channel}) is left out: '{log.file}' has no numbers in it" for one in lacking]
+        kept = tuple(one for one in proposals.channels if one not in lacking)
+        proposals = replace(proposals, channels=kept, notes=(*proposals.notes, *notes))
+        for own in longest.columns:
+            if own.name in {one.column for one in kept} and held[own.name].unit != own.unit:
+                what = f"has '{own.name}' in '{held[own.name].unit}', '{longest.file}' in '{own.unit}'"
+                raise DataError(f"'{log.file}' {what}; write both alike, or make a data set of each")
+        proposals = possible(proposals, {name: column.values for name, column in held.items()})
     if not proposals.channels:
         names = counted([column.name for column in longest.columns])
-        raise DataError(f"'{longest.file}': no column is recognised as a channel, by name or by motion, of {names}")
+        unread = f"; not read: {longest.skipped[0]}" if longest.skipped else ""
+        raise DataError(f"'{longest.file}': no column is recognised as a channel, by name or by motion, of {names}{unread}")
     computed = [f"'{own}' is left out: the difference of '{of}' from row to row, and no measurement" for own, of in differences.items()]
     shadowed = [f"'{name}' is a data set that comes with vehest, too; in this folder it is yours"] if name in choices("dataset") else []
     proposals = replace(proposals, notes=(*proposals.notes, *computed, *_notes(longest, logs), *(shadowed if not existing else [])))
@@ -188,21 +192,24 @@ def _place(files: Sequence[Path], source: str) -> dict[str, Any]:
     return {"path": path, "files": pattern} | ({"exclude": others} if others else {})
 
 
-def _evidence(log: Log) -> tuple[list[tuple[str, str, FloatArray]], float | None]:
+def _evidence(log: Log, differences: Collection[str]) -> tuple[list[tuple[str, str, FloatArray, str]], float | None]:
     """Columns of a log's longest run on an even clock of at most `EVIDENCE_HZ`, and its rate [Hz]; without times rows as they are.
 
     Of a long drive the minutes in which columns change most are taken.
     """
-    columns = [column for column in log.columns if column.stamps is None or len(column.stamps) > 1]
-    samples, rate = _on_one_clock(log, columns)
+    samples, rate = _on_one_clock(log)
     if rate is not None:
         n_rows = samples.shape[1]
         cut = round(ENDS * rate) if n_rows > 20.0 * ENDS * rate else 0
         factor = max(math.floor(rate / EVIDENCE_HZ), 1)
         whole = (n_rows - 2 * cut) // factor * factor
-        samples, rate = samples[:, cut : cut + whole].reshape(len(columns), -1, factor).mean(axis=2), rate / factor
+        samples, rate = samples[:, cut : cut + whole].reshape(len(samples), -1, factor).mean(axis=2), rate / factor
         samples = _busiest(samples, round(LONGEST_EVIDENCE * rate), max(round(60.0 * rate), 1))
-    return [(own.name, plain_unit(own.unit) or "", values) for own, values in zip(columns, samples, strict=True)], rate
+    found = [
+        (own.name, plain_unit(own.unit) or "", values, COMPUTED if own.name in differences else own.device)
+        for own, values in zip(log.columns, samples, strict=True)
+    ]
+    return found, rate
 
 
 def _differences(log: Log) -> dict[str, str]:
@@ -223,8 +230,8 @@ def _differences(log: Log) -> dict[str, str]:
     return found
 
 
-def _on_one_clock(log: Log, columns: Sequence[RawColumn]) -> tuple[FloatArray, float | None]:
-    timed = [(column.values, column.stamps) for column in columns if column.stamps is not None]
+def _on_one_clock(log: Log) -> tuple[FloatArray, float | None]:
+    timed = [(column.values, column.stamps) for column in log.columns if column.stamps is not None]
     if timed:
         sampled = np.unique(np.concatenate([stamps for _, stamps in timed]))
         runs, _ = between_pauses(sampled, 1.0 / max(rate_of(stamps) for _, stamps in timed))
@@ -236,9 +243,9 @@ def _on_one_clock(log: Log, columns: Sequence[RawColumn]) -> tuple[FloatArray, f
         return np.stack([np.interp(grid, stamps, values) for values, stamps in timed]), rate
     run = log.runs[0]
     if log.seconds is None:
-        return np.stack([column.values[run] for column in columns]), None
+        return np.stack([column.values[run] for column in log.columns]), None
     stamps = log.seconds[run]
-    rows = [bridged(column.values[run], stamps, BRIDGED) for column in columns]
+    rows = [bridged(column.values[run], stamps, BRIDGED) for column in log.columns]
     step = float(np.median(np.diff(stamps))) or float(stamps[-1] - stamps[0]) / max(len(stamps) - 1, 1)
     rate = plain_rate(1.0 / step, RATE_TOLERANCE)
     is_even = np.abs(stamps - stamps[0] - np.arange(len(stamps)) / rate).max() <= 1.0 / rate

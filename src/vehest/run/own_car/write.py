@@ -10,7 +10,6 @@ from importlib.metadata import entry_points
 from itertools import cycle, pairwise
 from typing import Any
 
-import numpy as np
 import yaml
 
 from vehest.alignment.standstill import STANDSTILL_SPEED
@@ -50,7 +49,6 @@ DATASET_COMMENTS = {
     "clock": "strict | interpolate (bridges gaps and jitter) | uniform",
     "bridge": "longest time without a sample that a straight line bridges [s]",
     "channels": "sign: -1 where a column counts the other way than ISO 8855 (x forward, y left)",
-    "gappy": "channels with missing samples",
     "pose": "the reference is made of positions and yaw (z up); yaw_offset, lever_x and lever_y where the markers sit askew",
     "reference_point": "{x: …, y: …} ahead and to the left of the centre of gravity [m], where it is known",
     "imu_point": "likewise",
@@ -125,7 +123,7 @@ def write(
     }
     purposes = ("channels, units and signs of the columns", "ranges for training, validation and test")
     lines = _words(made, plan, left)
-    for file, purpose in zip(files, (*purposes, f"estimators: {', '.join(plan.estimators)}"), strict=False):
+    for file, purpose in zip(files, (*purposes, f"estimators: {', '.join(dict.fromkeys(plan.estimators))}"), strict=False):
         lines.append(f"{'would write' if dry_run else 'wrote'} {file}: {purpose}")
     lines += [f"{'would remove' if dry_run else 'removed'} {file}: these recordings do not allow it" for file in stale]
     return plain, [*lines, "next:", *(f"  {command}" for command in following)]
@@ -133,12 +131,12 @@ def write(
 
 def _kept(made: Draft) -> list[str]:
     """Recordings that a split takes; pieces that are too short even whole are left out."""
-    return [one.id for one, duration in zip(made.contents, made.durations, strict=True) if duration >= LEAST_BLOCK]
+    return [own for own, duration in made.durations.items() if duration >= LEAST_BLOCK]
 
 
 def _cut(made: Draft) -> list[str]:
     """Recordings that are long enough to be cut; none where most of the time is in short ones."""
-    long = {one.id: own for one, own in zip(made.contents, made.durations, strict=True) if 0.2 * own >= LEAST_BLOCK}
+    long = {own: duration for own, duration in made.durations.items() if 0.2 * duration >= LEAST_BLOCK}
     return list(long) if sum(long.values()) >= 0.5 * made.seconds else []
 
 
@@ -166,7 +164,7 @@ def _split_text(made: Draft) -> str:
 
 
 def _next_commands(made: Draft, plan: Plan) -> list[str]:
-    name, file, longest = made.examined.name, made.examined.files[0], made.contents[int(np.argmax(made.durations))]
+    name, file, longest = made.examined.name, made.examined.files[0], max(made.contents, key=lambda own: made.durations[own.id])
     commands = [f"vehest data check {name}", f"vehest data usable {name}"]
     if plan.sweeps:
         return [*commands, f"vehest run {name} --minutes 15"]
@@ -181,13 +179,12 @@ def _next_commands(made: Draft, plan: Plan) -> list[str]:
 def found_in(examined: Examined) -> dict[str, Any]:
     """What the files hold, for JSON."""
     found = examined.proposals
-    channels = [{key: value for key, value in asdict(one).items() if key != "gappy"} for one in found.channels]
     return {
         "name": examined.name,
         "files": [str(file) for file in examined.files],
         "source": examined.log.source,
         "time": None if examined.log.clock is None else asdict(examined.log.clock),
-        "channels": [one | {"asked": one["asked"] or None} for one in channels],
+        "channels": [asdict(one) | {"asked": one.asked or None} for one in found.channels],
         "left_right": found.left_right or None,
         "pose": {part: {"column": column, "unit": unit} for part, column, unit in found.pose},
         "unused": list(found.unused),
@@ -265,10 +262,9 @@ def _car(vehicle: Mapping[str, float | None]) -> dict[str, str]:
 
 def _shortest_range(made: Draft) -> float:
     """Of the longest range for training and all those for validation, the shortest [s]."""
-    durations = dict(zip((one.id for one in made.contents), made.durations, strict=True))
     if cut := _cut(made):
-        return 0.2 * min(durations[own] for own in cut)
-    return min((durations[own] for own in _kept(made)), default=0.0)
+        return 0.2 * min(made.durations[own] for own in cut)
+    return min((made.durations[own] for own in _kept(made)), default=0.0)
 
 
 def _lack(name: str, words: Sequence[str], contents: Sequence[RecordingSummary], samples: int, seconds: float) -> str:
@@ -279,7 +275,7 @@ def _lack(name: str, words: Sequence[str], contents: Sequence[RecordingSummary],
         return str(error)
     needed = samples / (found.rate_hz or math.inf)
     short = [f"{needed:.3g} s in each range for validation (the shortest has {seconds:.3g} s)"] if needed > seconds else []
-    return ", ".join([*found.missing.in_words(), *(f"{channel} without gaps" for channel in found.gaps), *short]) or found.to_give
+    return ", ".join([*found.missing.in_words(), *short]) or found.to_give
 
 
 def _pipeline_of(name: str, plan: Plan, minutes: float, contents: Sequence[RecordingSummary]) -> dict[str, Any]:

@@ -66,20 +66,18 @@ def read(file: Path, wanted: Mapping[str, tuple[str, int | str | None]] | None) 
         _refuse_formulas(measurement, file)
         places = _located(measurement, wanted, file) if wanted is not None else _numbered(measurement, file)
         arrays: Arrays = {}
-        signals: dict[str, Any] = {}
-        skipped: list[str] = []
+        skipped: list[str] | None = [] if wanted is None else None
         for group in dict.fromkeys(group for group, _ in places.values()):
-            own = {key: index for key, (at, index) in places.items() if at == group}
-            with _or_skip(skipped if wanted is None else None, file):
-                found = _group_of(measurement, group, own, file, skipped if wanted is None else None)
-                arrays |= found
-                for key in own.keys() & found.keys():
-                    channel = measurement.groups[group].channels[own[key]]
-                    unit = str((channel.conversion and channel.conversion.unit) or channel.unit or "")
-                    signals[key] = {"name": channel.name, "group": group, "title": _title(measurement, group), "unit": unit}
-        signals = {key: signals[key] for key in places if key in signals}
-        start = measurement.header.start_time
-        return arrays, {"version": measurement.version, "start": start.isoformat(), "signals": signals, "skipped": skipped}
+            with _or_skip(skipped, file):
+                arrays |= _group_of(measurement, group, {key: index for key, (at, index) in places.items() if at == group}, file, skipped)
+        signals = {}
+        for key, (group, index) in places.items():
+            if key in arrays:
+                channel = measurement.groups[group].channels[index]
+                unit = str((channel.conversion and channel.conversion.unit) or channel.unit or "")
+                signals[key] = {"name": channel.name, "group": group, "title": _title(measurement, group), "unit": unit}
+        start = measurement.header.start_time.isoformat()
+        return arrays, {"version": measurement.version, "start": start, "signals": signals, "skipped": skipped or []}
 
 
 def with_signals(

@@ -15,10 +15,10 @@ from vehest.data.errors import DataError, MissingError
 from vehest.data.store import is_stored_recording
 from vehest.sources.base import require_no_spreadsheet
 from vehest.sources.clocks import clock_fault, span_fault
-from vehest.sources.surveys.bags import survey_bag
+from vehest.sources.mdf import read_measurement
+from vehest.sources.rosbag.topics import read_bag
 from vehest.sources.surveys.clocks import between_pauses
 from vehest.sources.surveys.log import Log, RawColumn, Stamps
-from vehest.sources.surveys.mdf import survey_mdf
 from vehest.sources.surveys.tables import survey_table
 from vehest.sources.vbo import SLIP_AT_A_POINT, read_log, require_slip_offsets
 
@@ -26,6 +26,16 @@ __all__ = ["Log", "RawColumn", "Stamps", "survey"]
 
 MDF, BAGS, CAN = (".mf4", ".mdf", ".dat"), (".db3", ".mcap", ".zip"), (".blf", ".asc", ".trc")
 DEGREES = {"heading": "deg"}  # of a VBOX, which does not say so: a compass's, clockwise from north
+IGNORED = ("rosout", "parameter_events", "tf", "tf_static", "diagnostics")  # topics
+MOST_FIELDS = 60  # of a message
+UNITS = {  # of ROS's own types, REP 103
+    "sensor_msgs/msg/Imu": {"angular_velocity": "rad/s", "linear_acceleration": "m/s²"},
+    "geometry_msgs/msg/Twist": {"linear": "m/s", "angular": "rad/s"},
+    "geometry_msgs/msg/TwistStamped": {"twist.linear": "m/s", "twist.angular": "rad/s"},
+    "geometry_msgs/msg/TwistWithCovarianceStamped": {"twist.twist.linear": "m/s", "twist.twist.angular": "rad/s"},
+    "nav_msgs/msg/Odometry": {"twist.twist.linear": "m/s", "twist.twist.angular": "rad/s"},
+    "geometry_msgs/msg/AccelStamped": {"accel.linear": "m/s²", "accel.angular": "rad/s²"},
+}
 
 
 def survey(path: Path) -> Log:
@@ -38,10 +48,10 @@ def survey(path: Path) -> Log:
         if log.seconds is not None and run.stop - run.start > 1 and (fault := span_fault(log.seconds[run])):
             raise DataError(f"'{path}': {fault}")
     faults = {one.name: clock_fault(one.stamps, may_repeat=True) for one in log.columns if one.stamps is not None}
-    skipped = tuple(f"'{name}': {fault}" for name, fault in faults.items() if fault)
-    log = replace(log, columns=tuple(one for one in log.columns if not faults.get(one.name)), skipped=log.skipped + skipped)
+    skipped = log.skipped + tuple(f"'{name}': {fault}" for name, fault in faults.items() if fault)
+    log = replace(log, columns=tuple(one for one in log.columns if not faults.get(one.name)), skipped=skipped)
     if not log.columns:
-        raise DataError(f"'{path}' holds no column of numbers{f' ({skipped[0]})' if skipped else ''}")
+        raise DataError(f"'{path}' holds no column of numbers ({'; '.join(skipped[:3]) or 'it is empty'})")
     return log
 
 
@@ -55,16 +65,42 @@ def _survey(path: Path) -> Log:
     if ending == ".bag":
         raise DataError(f"'{path}' is a bag of ROS 1; convert it by 'rosbags-convert --src {path.name} --dst {path.stem}'")
     if path.is_dir() or ending in BAGS:
-        return survey_bag(path)
+        return _survey_bag(path)
     if path.stat().st_size == 0:
         raise MissingError(f"file '{path}' is empty")
     if ending in MDF and _begins_as_mdf(path):
-        return survey_mdf(path)
+        return _survey_mdf(path)
     if ending == ".vbo":
         return _survey_vbo(path)
     if is_stored_recording(path):
         raise DataError(f"'{path}' is a recording of vehest's own already, with channels; try 'vehest data usable {path}'")
     return survey_table(path)
+
+
+def _survey_bag(path: Path) -> Log:
+    """Numbers in messages of ROS's own types, each field with the times of its messages."""
+    reading = read_bag(path, "survey_topics", ignored=IGNORED, most_fields=MOST_FIELDS)
+    arrays, topics, columns = reading.arrays, reading.summary["topics"], []
+    times = {name: arrays.get(f"{name}@stamped", arrays[f"{name}@received"]).astype(np.float64) * 1e-9 for name, *_ in topics}
+    start = min((own[0] for own in times.values() if len(own) > 1), default=0.0)
+    for topic, kind, fields in topics:
+        clock = "header" if f"{topic}@stamped" in arrays else "received"
+        for field in fields if len(times[topic]) > 1 else ():
+            unit = UNITS.get(kind, {}).get(field.rpartition(".")[0], "")
+            place = {"topic": topic, "type": kind, "stamps": clock, "field": field}
+            columns.append(RawColumn(f"{topic} {field}", unit, arrays[f"{topic}.{field}"], place, times[topic] - start))
+    return Log(path, "rosbag", tuple(columns), skipped=tuple(reading.summary["skipped"]))
+
+
+def _survey_mdf(file: Path) -> Log:
+    """Signals of numbers, each with the times of its group."""
+    signals, skipped, about = read_measurement(file, None)
+    columns = []
+    for key, signal in signals.items():
+        place = about["signals"][key]
+        entry = {"column": place["name"]} | ({} if key == place["name"] else {"group": place["group"]})
+        columns.append(RawColumn(key, signal.unit, signal.values, entry, signal.stamps))
+    return Log(file, "mdf", tuple(columns), skipped=tuple(skipped))
 
 
 def _survey_vbo(file: Path) -> Log:
@@ -84,9 +120,9 @@ def _survey_vbo(file: Path) -> Log:
         RawColumn(name, units.get(name, ""), samples, {"column": name}, None, devices.get(name, "")) for name, samples in wanted.items()
     )
     clock, seconds = Stamps("time", "s", "clock time of the format"), log.seconds - log.seconds[0]
-    runs, max_gap = between_pauses(seconds, float(np.median(np.diff(seconds))))
+    runs, options = between_pauses(seconds, float(np.median(np.diff(seconds))))
     runs.sort(key=lambda rows: rows.start - rows.stop)
-    return Log(file, "vbo", columns, {} if max_gap is None else {"max_gap": max_gap}, clock, seconds, tuple(runs), skipped)
+    return Log(file, "vbo", columns, options, clock, seconds, tuple(runs), skipped)
 
 
 def _begins_as_mdf(path: Path) -> bool:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -33,19 +33,13 @@ REGULAR = 0.8  # share of the steps within half a median step
 MOST_RESTARTS = 0.01  # of the rows
 
 
-@dataclass(frozen=True)
-class Found:
-    """The clock of a table."""
+def find_clock(
+    columns: Mapping[str, FloatArray], units: Mapping[str, str]
+) -> tuple[Stamps | None, FloatArray | None, tuple[slice, ...], dict[str, Any]]:
+    """The column, (N,), that grows evenly, by name or unit before another; None where none looks like a clock.
 
-    stamps: Stamps | None  # its column; None where none looks like a clock
-    seconds: FloatArray | None  # times of the rows [s], (N,)
-    runs: tuple[slice, ...]  # rows of each run, the longest first
-    counted_by: str = ""  # column that counts the runs; empty where none does
-    max_gap: float | None = None  # s without a row, in which a run ends; None where none does
-
-
-def find_clock(columns: Mapping[str, FloatArray], units: Mapping[str, str]) -> Found:
-    """The column, (N,), that grows evenly, by name or unit before another."""
+    With it the times of the rows [s], (N,), rows of each run, the longest first, and the source's options by which runs begin.
+    """
     best, likely, step = None, -1, 0.0
     for name, values in columns.items():
         own = _step(values)
@@ -56,21 +50,26 @@ def find_clock(columns: Mapping[str, FloatArray], units: Mapping[str, str]) -> F
             best, likely, step = stamps, 2 * bool(unit) + named, own
     n_rows = len(next(iter(columns.values())))
     if best is None:
-        return Found(None, None, (slice(0, n_rows),))
+        return None, None, (slice(0, n_rows),), {}
     values = columns[best.column]
     steps, seconds = np.diff(values), (values - values[0]) * UNITS[best.unit]
     starts, counted_by = _run_starts(columns, best.column, steps, step)
-    runs, max_gap = (stretches(starts, n_rows), None) if counted_by else between_pauses(seconds, step * UNITS[best.unit])
-    return Found(best, seconds, tuple(sorted(runs, key=lambda rows: rows.start - rows.stop)), counted_by, max_gap)
+    options: dict[str, Any] = {"runs": counted_by}
+    if counted_by:
+        runs = stretches(starts, n_rows)
+    else:
+        runs, pause = between_pauses(seconds, step * UNITS[best.unit])
+        options = pause | ({"time_restarts": True} if starts.any() else {})
+    return best, seconds, tuple(sorted(runs, key=lambda rows: rows.start - rows.stop)), options
 
 
-def between_pauses(seconds: FloatArray, step: float) -> tuple[list[slice], float | None]:
-    """Rows of each run of times [s], (N,), which ends where they restart or pause, and the shortest pause [s], if there is one."""
+def between_pauses(seconds: FloatArray, step: float) -> tuple[list[slice], dict[str, Any]]:
+    """Rows of each run of times [s], (N,), which ends where they restart or pause, and the option ``max_gap``, if they pause."""
     steps, longest = np.diff(seconds), float(f"{max(MAX_GAP, FEWEST_STEPS * step):.3g}")
     runs, pauses = stretches(steps < 0, len(seconds)), steps > longest
     stray = any(span_fault(seconds[run]) for run in runs if run.stop - run.start > 1)
     cut = timed_runs(seconds, longest, restarts=True) if pauses.any() and pauses.mean() <= MOST_RESTARTS and not stray else {}
-    return ([*cut.values()], longest) if cut else (runs, None)
+    return ([*cut.values()], {"max_gap": longest}) if cut else (runs, {})
 
 
 def plain_name(name: str) -> str:

@@ -28,7 +28,7 @@ from vehest.data.text_files import first_line
 from vehest.sources.clock_times import seconds_of_text
 from vehest.sources.surveys.clocks import NAMED, SPELLINGS, find_clock, plain_name
 from vehest.sources.surveys.log import Log, RawColumn
-from vehest.sources.tables import TextLayout, is_parquet, parse_table, read_head, require_columns, table_stream
+from vehest.sources.tables import TextLayout, is_parquet, parse_table, read_head, table_stream
 from vehest.sources.text_log import CLOCK
 from vehest.sources.unit_spellings import plain_unit
 
@@ -56,52 +56,37 @@ class Shape:
 
 def survey_table(file: Path) -> Log:
     """What a table holds; raises `DataError` where it is no table, has no names, or holds no numbers."""
+    clocks: dict[str, FloatArray] = {}
+    options: dict[str, Any] = {}
+    skipped: list[str] = []
     if is_parquet(file):
         with parquet_file(file) as table:
-            dates = {field.name: field.type.unit for field in table.schema_arrow if pa.types.is_timestamp(field.type)}
-            names = [field.name for field in table.schema_arrow if field.name in dates or _is_numeric(field.type)]
+            units = {field.name: field.type.unit for field in table.schema_arrow if pa.types.is_timestamp(field.type)}
+            names = [field.name for field in table.schema_arrow if field.name in units or _is_numeric(field.type)]
             check_limit("columns", len(names), f"'{file}' has {len(names)} columns")
-            return _log(file, read_numbers(file, table, names), {}, dates, {}, [])
-    shape = shape_of(file)
-    values, clocks, marks, skipped = _columns(file, shape)
-    always, plain = ("delimiter", "decimal"), asdict(TextLayout())
-    options = {name: option for name, option in asdict(shape.layout).items() if name in always or option != plain[name]}
-    options |= {"missing": sorted(marks)} if marks else {}
-    return _log(file, values, clocks, shape.units, options, skipped)
-
-
-def _log(
-    file: Path,
-    values: dict[str, FloatArray],
-    clocks: dict[str, FloatArray],
-    units: Mapping[str, str],
-    options: dict[str, Any],
-    skipped: list[str],
-) -> Log:
-    """The log of columns of numbers and of clock times [s], (N,), units below the names, options of the source and what was not read."""
+            values = read_numbers(file, table, names)
+    else:
+        shape = shape_of(file)
+        values, clocks, marks, skipped = _columns(file, shape)
+        units, always, usual = dict(shape.units), ("delimiter", "decimal"), asdict(TextLayout())
+        options = {name: option for name, option in asdict(shape.layout).items() if name in always or option != usual[name]}
+        options |= {"missing": sorted(marks)} if marks else {}
     if not values:
         raise DataError(f"'{file}' holds no column of numbers{f' ({skipped[0]})' if skipped else ''}")
     n_rows = len(next(iter(values.values())))
     if n_rows < 2:
         raise DataError(f"'{file}' has {n_rows or 'no'} row{'s' * (n_rows != 1)} of numbers below its names")
     written = {name: units.get(name) or unit_in_name(name) for name in values}
-    found = find_clock({**clocks, **values}, {**written, **dict.fromkeys(clocks, "s")})
-    stamps = found.stamps
+    stamps, seconds, runs, cuts = find_clock({**clocks, **values}, {**written, **dict.fromkeys(clocks, "s")})
     if stamps is not None and stamps.column in clocks:
         stamps = replace(stamps, unit=CLOCK, evidence=stamps.evidence.replace("unit in the header", "times of a clock"), asked=False)
     named = {name: times for name, times in values.items() if stamps is None and NAMED.match(plain_name(name))}
     faults = [_fault(name, times) for name, times in {**clocks, **named}.items() if stamps is None or name != stamps.column]
-    if found.max_gap is not None:
-        options = {**options, "max_gap": found.max_gap}
-    if found.counted_by:
-        options = {**options, "runs": found.counted_by}
-    elif found.seconds is not None and (np.diff(found.seconds) < 0).any():
-        options = {**options, "time_restarts": True}
-    beside = {stamps.column if stamps else None, found.counted_by or None}
+    options, beside = {**options, **cuts}, {stamps.column if stamps else None, cuts.get("runs")}
     columns = [RawColumn(name, written[name], samples, {"column": name}) for name, samples in values.items() if name not in beside]
     plain = not {"rows_below_names", "missing"} & set(options) and (stamps is None or stamps.unit != CLOCK)
     source = "tabular" if plain else "text_log"
-    return Log(file, source, tuple(columns), options, stamps, found.seconds, found.runs, (*skipped, *faults))
+    return Log(file, source, tuple(columns), options, stamps, seconds, runs, (*skipped, *faults))
 
 
 def _fault(name: str, times: FloatArray) -> str:
@@ -135,7 +120,6 @@ def shape_of(file: Path) -> Shape:
     if not best.names:
         raise DataError(f"'{file}' has no line of names above its first numbers; write one there")
     check_limit("columns", len(best.names), f"'{file}' has {len(best.names)} columns")
-    require_columns(file, best.names, filter(None, best.names))
     return best
 
 
@@ -219,6 +203,8 @@ def _columns(file: Path, shape: Shape) -> tuple[dict[str, FloatArray], dict[str,
             skipped += [f"column '{printable(name)}' is empty"] if name else []
         elif not name:
             skipped.append(f"column {place} has no name")
+        elif (count := shape.names.count(name)) > 1:
+            skipped.append(f"column {place}, one of {count} columns called '{printable(name)}'")
         elif (numbers := _numbers(column, shape.layout.decimal)) is not None:
             values[name] = numbers[0]
             marks |= numbers[1]
