@@ -318,8 +318,9 @@ def _page(document: Document, numbers: Mapping[int, str], images: Mapping[str, b
             blocks.append({"kind": "table", **shared, **_page_table(block)})
         else:
             alternative = {"image": _data_uri(_for_both_schemes(images[block.name]), "image/svg+xml"), "alt": _spoken(block.caption)}
-            blocks.append({"kind": "figure", **shared, **alternative, "json": _json_of(block.interactive)})
-    interactive = any(block.get("json") for block in blocks)
+            interactive = Markup(block.interactive.to_json()) if block.interactive else None
+            blocks.append({"kind": "figure", **shared, **alternative, "json": interactive})
+    explored = any(block.get("json") for block in blocks)
     environment = Environment(
         loader=PackageLoader("vehest.report", "templates"),
         autoescape=True,
@@ -334,8 +335,8 @@ def _page(document: Document, numbers: Mapping[int, str], images: Mapping[str, b
         open_blocks=document.open_blocks,
         style=Markup(_packaged("page.css")),
         script=Markup(_packaged("page.js")),
-        plots=Markup(_packaged("uplot.js") + _packaged("explorer.js")) if interactive else "",
-        plots_style=Markup(_packaged("uplot.css")) if interactive else "",
+        plots=Markup(_packaged("uplot.js") + _packaged("explorer.js")) if explored else "",
+        plots_style=Markup(_packaged("uplot.css")) if explored else "",
         missing=MISSING,
     )
 
@@ -380,13 +381,6 @@ def bars_of(values: Sequence[float], lows: Sequence[float], highs: Sequence[floa
         else None
         for value, low, high in zip(values, lows, highs, strict=True)
     ]
-
-
-def _json_of(explorer: Explorer | None) -> Any:
-    """An explorer as JSON that can stand inside a script element."""
-    from markupsafe import Markup
-
-    return None if explorer is None else Markup(explorer.to_json())
 
 
 def _packaged(name: str) -> str:

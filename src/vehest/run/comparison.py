@@ -97,7 +97,8 @@ class Comparison:
             if evaluated and checked:
                 self.evaluation = runner.evaluation(usable[0].config, {})
         except DryRunStop:
-            runner.would_train(_names(self.usable))
+            for name in _names(self.usable):
+                runner.messages.line("plan", "train", name)
             raise
         if not self.usable:
             reasons = "; ".join(dict.fromkeys(job.failure.message for job in usable if job.failure is not None))

@@ -22,7 +22,6 @@ from rich.progress import (
 from rich.text import Text
 
 from vehest.data.errors import printable
-from vehest.training.context import Progress as FitProgress
 
 WARNING = "warn"
 MARKS = {
@@ -104,14 +103,6 @@ class Bars(Progress):
             self._named[name] = self.add_task(printable(name), total=total, note="")
         if name in self._named:
             self.update(self._named[name], completed=done, total=total, note=printable(note))
-
-    def fit(self, name: str, progress: FitProgress | None) -> None:
-        """Move the bar of a training."""
-        if progress is None:
-            self.step(name, 0, 1, "starting")
-        else:
-            note = f"{progress.active}/{progress.members} active, best validation loss {progress.best_validation_loss:.4g}"
-            self.step(name, progress.epoch, progress.max_epochs, note)
 
     def close(self, name: str) -> None:
         """Remove a bar."""

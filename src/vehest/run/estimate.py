@@ -125,12 +125,19 @@ def estimate_file(words: Sequence[str], out: Path, *, strict: bool = False, car:
     config = compose_config("estimate", overrides)
     folder, model, trust = open_model(name, Path(config["output"]), note)
     with use_limits(limits_from_config(config["limits"])):
-        parts = _checked_parts(config, file)
+        dataset = _without_references(config["dataset"])
+        accepted, source = dataset.get("accept") or (), source_of_file(dataset, file)
+        parts = ((part, refuse_errors(part, accepted, f"'{file}'")) for part in source.file_parts(file))
         first, known = next(parts)
         remarks: list[str] = []
         if name == SELF_CALIBRATING:
-            assumed, remarks = _assumed(settings, first, model.settings.wheelbase if car is None else None)
-            settings |= assumed
+            if car is None and "wheelbase" not in settings:
+                remarks.append(
+                    f"the wheelbase is taken for {model.settings.wheelbase:g} m; give your car's, such as estimator.wheelbase=2.9"
+                )
+            if "ax" not in first and "measured_ax" not in settings:
+                settings["measured_ax"] = False
+                remarks.append("there is no channel ax: estimator.measured_ax=false")
         if settings:
             model = with_settings(model, settings)
             if trust is not None and trust.health is not None and trust.health.channels != model.channels:
@@ -142,7 +149,7 @@ def estimate_file(words: Sequence[str], out: Path, *, strict: bool = False, car:
         if any(key_of(override).split(".")[0] == "downsample" for override in overrides):
             model.preparation = config["downsample"]
         run, log = _run_on(model, trust, first), out.suffix.lower() in LOGS
-        report = _Report(model, trust, config["dataset"].get("accept") or (), f"'{file}'" if strict else None)
+        report = _Report(model, trust, accepted, f"'{file}'" if strict else None)
         drive = report.checked(chain([(first, known)], parts))
         if log or not run.takes_parts:
             first = joined(list(drive))
@@ -169,23 +176,6 @@ def estimate_file(words: Sequence[str], out: Path, *, strict: bool = False, car:
         "findings": findings,
         **({"note": pretrained_note(name)} if name in WITH_VEHEST else {}),
     }
-
-
-def _checked_parts(config: Config, file: Path) -> Iterator[tuple[Recording, list[Finding]]]:
-    """A recording in parts that follow one another, each with the findings of its checks; raises as `read_table` does."""
-    dataset = _without_references(config["dataset"])
-    for part in source_of_file(dataset, file).file_parts(file):
-        yield part, refuse_errors(part, dataset.get("accept") or (), f"'{file}'")
-
-
-def _assumed(settings: Mapping[str, Any], drive: Recording, wheelbase: float | None) -> tuple[dict[str, Any], list[str]]:
-    """Settings of the self-calibrating filter that a drive without ax needs, and remarks on these and on an assumed wheelbase [m]."""
-    remarks = []
-    if wheelbase is not None and "wheelbase" not in settings:
-        remarks.append(f"the wheelbase is taken for {wheelbase:g} m; give your car's, such as estimator.wheelbase=2.9")
-    if "ax" in drive or "measured_ax" in settings:
-        return {}, remarks
-    return {"measured_ax": False}, [*remarks, "there is no channel ax: estimator.measured_ax=false"]
 
 
 def split_settings(overrides: Sequence[str]) -> tuple[dict[str, Any], list[str]]:

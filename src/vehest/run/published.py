@@ -48,7 +48,12 @@ State = Literal["up to date", "stale", "not known"]
 def keys_of_study(study: Study, jobs: Jobs, absent: Collection[str], runner: Runner, inputs: Mapping[str, Mapping[str, str]]) -> Keys:
     """Keys of everything that determines the results of a study."""
     ingests = _ingests(study, jobs, absent, runner)
-    keys = {f"ingest {name}": _of_ingest(config["dataset"], inputs.get(name)) for name, config in ingests.items()}
+    keys: Keys = {}
+    for name, config in ingests.items():
+        content = {key: value for key, value in config["dataset"].items() if key not in PROSE}
+        keys[f"ingest {name}"] = {CODE: code_of_ingest(config["dataset"]), CONFIGURATION: _hash(content)}
+        if name in inputs:
+            keys[f"ingest {name}"][DATA] = _hash(dict(inputs[name]))
     about: dict[str, Any] = {name: getattr(study, name) for name in ("study", "title", "about", "report")} | {"file": study.file.name}
     if study.datasets:
         about["datasets"] = [_titled(job.config) for job in jobs[""]]
@@ -89,12 +94,6 @@ def _of_jobs(configs: Sequence[Config]) -> Iterator[tuple[str, dict[str, str]]]:
         if faults:
             code, conditions = code_under_faults(code), [conditions, *map(asdict, faults)]
         yield f"evaluate {name}", {CODE: code, CONFIGURATION: _hash(conditions)}
-
-
-def _of_ingest(dataset: Mapping[str, Any], inputs: Mapping[str, str] | None) -> dict[str, str]:
-    content = {key: value for key, value in dataset.items() if key not in PROSE}
-    entry = {CODE: code_of_ingest(dataset), CONFIGURATION: _hash(content)}
-    return entry if inputs is None else entry | {DATA: _hash(dict(inputs))}
 
 
 def _titled(config: Config) -> list[str]:

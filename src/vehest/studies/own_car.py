@@ -51,7 +51,7 @@ def documents(artefacts: StudyArtefacts) -> dict[str, Document]:
     """Verdict, errors as bars, traces with the estimator that is named and the next commands; folded on the page: the whole comparison."""
     part = artefacts.first
     models = {name: verdict_of(part, name).model for name in part.split.tests}
-    compared = drive.comparison(part, {name: (own.estimator, own.variant) for name, own in models.items() if own is not None})
+    compared = drive.comparison(part, {name: own.name for name, own in models.items() if own is not None})
     verdicts = [f"{'**On test set ' + as_code(name) + ':** ' if len(part.split.tests) > 1 else ''}{text}" for name, text in _verdicts(part)]
     opening = next(n for n, block in enumerate(compared.blocks) if isinstance(block, str))  # bars, and traces where there are any
     blocks: list[Block] = ["## Verdict\n\n" + "\n\n".join(verdicts), *compared.blocks[:opening]]
@@ -97,7 +97,7 @@ def verdict_of(part: PartArtefacts, test_set: str) -> Verdict:
     if silent:
         return Verdict((f"**These recordings cannot rank estimators**, because {listed(silent)}.", _wanted(part)), None)
     model = _to_go_on_with(part, ranking)
-    name = (model.estimator, model.variant)
+    name = model.name
     expected = f"RMSE(β) {_figure(ranking, name)} for {_reach(part, test_set)}"
     best, level = titles[ranking.order[0]], [titles[own] for own in ranking.not_told_apart]
     if ranking.winner is not None:
@@ -149,7 +149,7 @@ def _to_go_on_with(part: PartArtefacts, ranking: Ranking) -> EvaluatedModel:
 def _counted(part: PartArtefacts, test_set: str) -> str:
     """How much of a test the score counts, and the sideslip that the start of each range hides."""
     protocol, scored, hidden, standing = part.protocol, list[FloatArray](), list[FloatArray](), 0
-    ranges = pieces_of(part.split.tests[test_set], lambda span: read_recording(part.references[span.dataset, span.recording]), protocol)
+    ranges = pieces_of(part.split.tests[test_set], part.reference, protocol)
     for recording, piece in ranges:
         begin, (first, end) = recording.index_range(piece.start, piece.stop)[0], scored_range(recording, piece, protocol)
         still = np.hypot(recording["vx"], recording["vy_ref"]) < protocol.least_speed

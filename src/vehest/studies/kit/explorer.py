@@ -10,7 +10,6 @@ from vehest.constants import FloatArray
 from vehest.data.channels import CHANNELS
 from vehest.data.recording import Recording
 from vehest.data.splits import Span
-from vehest.data.store import read_recording
 from vehest.evaluation.metrics import Scored, pieces_of, scored_range
 from vehest.report.explorer import Candidate, Explorer, Signal, reckoned_course
 from vehest.report.style import Line
@@ -40,7 +39,7 @@ def explorer_of(
     """
     start, label, gap, zoom = axis
     spans = artefacts.split.tests[test_set]
-    pieces = list(pieces_of(spans, lambda span: read_recording(artefacts.references[span.dataset, span.recording]), artefacts.protocol))
+    pieces = list(pieces_of(spans, artefacts.reference, artefacts.protocol))
     skip = artefacts.protocol.skip_seconds
     parts = [recording.cut(max(piece.start, recording.start_time) + skip, piece.stop) for recording, piece in pieces]
 
