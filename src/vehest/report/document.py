@@ -178,7 +178,8 @@ def formatted(table: Table) -> tuple[list[str], list[list[str]], list[bool]]:
         values = table.frame[name]
         is_number = bool(is_numeric_dtype(values) and not is_bool_dtype(values))
         numeric.append(is_number)
-        columns.append(_number_cells(values.tolist(), column) if is_number else [_text_cell(value) for value in values.tolist()])
+        texts = (MISSING if value is None or value != value else printable(str(value)) for value in values.tolist())
+        columns.append(_number_cells(values.tolist(), column) if is_number else list(texts))
     return [printable(column.header) for column in shown.values()], [list(row) for row in zip(*columns, strict=True)], numeric
 
 
@@ -190,10 +191,6 @@ def _number_cells(values: list[Any], column: Column) -> list[str]:
         return [fixed(number, 0) if number.is_integer() else significant(number, column.digits) for number in numbers]
     decimals = decimals_for(numbers, column.digits) if column.decimals is None else column.decimals
     return [fixed(number, decimals) for number in numbers]
-
-
-def _text_cell(value: Any) -> str:
-    return MISSING if value is None or value != value else printable(str(value))
 
 
 def _numbers(document: Document) -> dict[int, str]:

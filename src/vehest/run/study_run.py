@@ -23,7 +23,6 @@ from vehest.run.console import Messages
 from vehest.run.estimate import find_model, model_artefact, preparation_of
 from vehest.run.evaluate import fault_figures, test_figures
 from vehest.run.evaluate_faults import check_channels, faults_of
-from vehest.run.group import Group
 from vehest.run.ingest import STAGE as INGEST
 from vehest.run.ingest import plan_ingest
 from vehest.run.launchers.base import RunOptions, chosen_launcher
@@ -201,7 +200,7 @@ def train_one(overrides: Sequence[str], options: RunOptions) -> dict[str, Any]:
     """Train and calibrate one estimator; empty where it was stopped before its first epoch was over; raises `VehestError`."""
     config = compose_config("train", overrides)
     with open_runner(config, options, ("train", "calibrate")) as runner:
-        members, failures = runner.run([_only_group(config, runner)])
+        members, failures = runner.run(Comparison([Job(config)]).plan(runner))
         for failure in failures.values():
             if failure.detail:
                 runner.messages.warn(failure.detail)
@@ -228,7 +227,7 @@ def evaluate_one(overrides: Sequence[str], model: str | None, options: RunOption
             how = runner.evaluation(config, runner.data_for(split, trained_rate(trained), config), faults_of(config))
             check_channels(how.faults, split, how.data)
         else:
-            group = _only_group(config, runner)
+            (group,) = Comparison([Job(config)]).plan(runner)
             plan = group.jobs[0].plan
             if (found := find(plan)) is None:
                 raise MissingError(f"{plan.label} has not been trained; run 'vehest train {' '.join(overrides)}' first")
@@ -238,13 +237,6 @@ def evaluate_one(overrides: Sequence[str], model: str | None, options: RunOption
         artefact = runner.ensure(*how.of(trained, calibration))
         runner.tracker.log(calibration, artefact)
     return {"folder": str(artefact.folder), "skipped": artefact.skipped, **test_figures(artefact.folder), **fault_figures(artefact.folder)}
-
-
-def _only_group(config: Config, runner: Runner) -> Group:
-    """The training of a configuration, at a rate that the recordings have."""
-    comparison = Comparison([Job(config)])
-    comparison.plan(runner)
-    return comparison.groups[0]
 
 
 def _calibration(model: Artefact, split: Split, data: Mapping[str, Artefact], runner: Runner) -> Artefact | None:

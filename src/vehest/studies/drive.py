@@ -137,7 +137,10 @@ def _headline(artefacts: PartArtefacts) -> list[Block]:
 
 def _where(artefacts: PartArtefacts, test_set: str) -> str:
     spans = artefacts.split.tests[test_set]
-    return f"test set `{test_set}` ({artefacts.kinds_of(spans)}; {_spans_in_words(artefacts, spans)})"
+    ranges = "; ".join(f"recording {as_text(span.recording)}, {_range_in_words(artefacts, span)}" for span in spans[:3])
+    if len(spans) > 3:
+        ranges = f"{len(spans)} ranges of {len({(span.dataset, span.recording) for span in spans})} recordings"
+    return f"test set `{test_set}` ({artefacts.kinds_of(spans)}; {ranges})"
 
 
 def data_sentence(artefacts: PartArtefacts) -> str:
@@ -227,12 +230,6 @@ def _range_in_words(artefacts: PartArtefacts, span: Span) -> str:
     if span.start == -math.inf:
         return "all of it" if span.stop == math.inf else f"up to {stop:.7g} s{after}"
     return f"from {start:.7g} s{after}" if span.stop == math.inf else f"{start:.7g} to {stop:.7g} s{after}"
-
-
-def _spans_in_words(artefacts: PartArtefacts, spans: Sequence[Span]) -> str:
-    if len(spans) > 3:
-        return f"{len(spans)} ranges of {len({(span.dataset, span.recording) for span in spans})} recordings"
-    return "; ".join(f"recording {as_text(span.recording)}, {_range_in_words(artefacts, span)}" for span in spans)
 
 
 # One test set

@@ -106,24 +106,20 @@ def _place(row: Mapping[Any, Any], board: pd.DataFrame) -> str:
 
 
 def _matrix(board: pd.DataFrame) -> Table:
-    places = list(dict.fromkeys(zip(board["part"], board["test_set"], strict=True)))
-    titles = list(dict.fromkeys(board["estimator_title"]))
-    rows = []
-    for title in titles:
-        row: dict[str, Any] = {"estimator": title}
-        for place, (part, test_set) in enumerate(places):
-            found = board[(board["estimator_title"] == title) & (board["part"] == part) & (board["test_set"] == test_set)]
-            row[f"place_{place}"] = _cell(found.to_dict("records")[0]) if len(found) else MISSING
-        rows.append(row)
-    firsts = [board[(board["part"] == part) & (board["test_set"] == test_set)].to_dict("records")[0] for part, test_set in places]
+    rows: dict[str, dict[str, Any]] = {title: {"estimator": title} for title in board["estimator_title"]}
     columns = {"estimator": Column("estimator")}
-    columns |= {f"place_{place}": Column(_place(row, board)) for place, row in enumerate(firsts)}
+    for place, (_, own) in enumerate(board.groupby(["part", "test_set"], sort=False)):
+        found = own.drop_duplicates("estimator_title").to_dict("records")
+        cells = {row["estimator_title"]: _cell(row) for row in found}
+        columns[f"place_{place}"] = Column(_place(found[0], board))
+        for title, row in rows.items():
+            row[f"place_{place}"] = cells.get(title, MISSING)
     caption = (
         "RMSE(β) [deg] over all seeds, with its 95 % interval over blocks of the drives and seeds. * beats v = 0 and the static map, each "
         "by more than chance, corrected by Holm within the test. – lacks a channel, failed or has no finite error. Inputs may differ from "
         "vehicle to vehicle under one name; they stand in the pipeline's file."
     )
-    return Table("overview", caption, pd.DataFrame(rows), columns)
+    return Table("overview", caption, pd.DataFrame(list(rows.values())), columns)
 
 
 def _cell(row: Mapping[Any, Any]) -> str:
