@@ -23,7 +23,7 @@ from vehest.run.launchers.local import LocalLauncher
 from vehest.run.signals import StopSignals
 from vehest.run.train import TrainJob
 
-FINE = Messages(silent=True)
+FINE = Messages(quiet=True)
 SPLIT = Split("any", (), (), {"test": (Span("any", "one", 0.0, 1.0),)})
 
 

@@ -294,7 +294,7 @@ def test_nothing_is_published_through_a_link(tmp_path, monkeypatch, link):
     Path(link).parent.mkdir(exist_ok=True)
     Path(link).symlink_to(tmp_path / "elsewhere")
     with pytest.raises(ConfigurationError, match="through a link"):
-        publish_study(Publication("study", {}, {}), report, Messages(silent=True))
+        publish_study(Publication("study", {}, {}), report, Messages(quiet=True))
     assert not list((tmp_path / "elsewhere").iterdir())
 
 

@@ -47,15 +47,15 @@ class _Console(Console):
 
 
 class Messages:
-    """Lines and bars on standard error; warnings alone if ``quiet``, nothing at all if ``silent``.
+    """Lines and bars on standard error; warnings alone if ``quiet``.
 
     Attributes:
         printed: (status, stage, label, detail) of every line, a warning's text in the last; also where nothing is shown.
     """
 
-    def __init__(self, *, quiet: bool = False, silent: bool = False) -> None:
-        self.console = _Console(stderr=True, highlight=False, soft_wrap=True, quiet=silent)
-        self.quiet = quiet or silent
+    def __init__(self, *, quiet: bool = False) -> None:
+        self.console = _Console(stderr=True, highlight=False, soft_wrap=True)
+        self.quiet = quiet
         self.printed: list[tuple[str, str, str, str]] = []
 
     def warn(self, text: str) -> None:

@@ -164,7 +164,7 @@ def estimate_file(words: Sequence[str], out: Path, *, strict: bool = False, car:
             write_estimate_table(estimates, out)
     for remark in remarks:
         note(remark)
-    findings = [_in_words(finding) for finding in merged_findings(report.findings)]
+    findings = [finding_in_words(finding) for finding in merged_findings(report.findings)]
     for finding in findings:
         complain(f"warning: {finding}")
     return {
@@ -231,17 +231,13 @@ def _without_references(dataset: dict[str, Any]) -> dict[str, Any]:
     return {key: value for key, value in dataset.items() if key not in changed} | {key: new for key, new in changed.items() if new}
 
 
-def findings_of(recording: Recording, model: Estimator, accepted: Sequence[str]) -> list[str]:
-    """Findings in the channels that a model reads; raises `DataError` where they contradict each other, so that no estimate is right."""
-    return [_in_words(finding) for finding in _model_findings(recording, model, accepted, None)]
-
-
-def _in_words(finding: Finding) -> str:
+def finding_in_words(finding: Finding) -> str:
+    """A finding, with the channel that it is about."""
     return f"{finding.channel}: {finding.message}" if finding.channel else finding.message
 
 
-def _model_findings(recording: Recording, model: Estimator, accepted: Sequence[str], known: Sequence[Finding] | None) -> list[Finding]:
-    """`findings_of`; ``known`` are those of all channels: where these have none, nor have fewer channels."""
+def findings_of(recording: Recording, model: Estimator, accepted: Sequence[str], known: Sequence[Finding] | None = None) -> list[Finding]:
+    """Findings in the channels that a model reads, given those of all channels, if they are known; raises `DataError` on contradictions."""
     read = [name for name in model.channels if name in recording]
     if known is not None and (set(read) == set(recording.channels) or all(finding.level == "note" for finding in known)):
         findings = list(known)
@@ -252,11 +248,10 @@ def _model_findings(recording: Recording, model: Estimator, accepted: Sequence[s
         if finding.check in CONTRADICTIONS and finding.check not in accepted:
             what = f"channels contradict each other: {finding.message}"
             raise DataError(f"recording '{recording.id}': {what} (or dataset.accept=[{finding.check}])")
-    too_small = wheelbase_findings(recording, getattr(model.settings, "wheelbase", None))
-    return findings + [Finding("warning", "wheelbase", "", message) for message in too_small]
+    return findings + wheelbase_findings(recording, getattr(model.settings, "wheelbase", None))
 
 
-def wheelbase_findings(recording: Recording, wheelbase: float | None) -> list[str]:
+def wheelbase_findings(recording: Recording, wheelbase: float | None) -> list[Finding]:
     """A finding where a drive above 1 m/s turns too sharply, or is too fast, for any car of a wheelbase [m]; None: not known."""
     if wheelbase is None or not {"vx", "yaw_rate"} <= set(recording.channels):
         return []
@@ -265,12 +260,12 @@ def wheelbase_findings(recording: Recording, wheelbase: float | None) -> list[st
     if not moving.any():
         return []
     speed, turn = speed[moving], float(np.quantile(yaw_rate[moving] / speed[moving], 0.9))
-    what = f"the drive does not fit a wheelbase of {wheelbase:g} m: a car of that size"
+    what, remedy = f"the drive does not fit a wheelbase of {wheelbase:g} m: a car of that size", "give estimator.wheelbase"
     if wheelbase * turn > SHARPEST_TURN:
-        return [f"{what} does not turn within {1.0 / turn:.2g} m, as in a tenth of it; give estimator.wheelbase"]
+        return [Finding("warning", "wheelbase", "", f"{what} does not turn within {1.0 / turn:.2g} m, as in a tenth of it; {remedy}")]
     fast = float(np.quantile(speed, 0.99))
     if fast**2 > LARGEST_FROUDE * GRAVITY * wheelbase:
-        return [f"{what} does not reach {fast:.0f} m/s; give estimator.wheelbase"]
+        return [Finding("warning", "wheelbase", "", f"{what} does not reach {fast:.0f} m/s; {remedy}")]
     return []
 
 
@@ -354,9 +349,9 @@ class _Report:
     def checked(self, parts: Iterable[tuple[Recording, list[Finding]]]) -> Iterator[Recording]:
         """The parts, once they are checked; raises `DataError` as `findings_of` does, and where it is strict."""
         for part, known in parts:
-            found = _model_findings(part, self.model, self.accepted, known)
+            found = findings_of(part, self.model, self.accepted, known)
             if self.strict and found:
-                raise DataError(f"{self.strict}: {_in_words(found[0])}")
+                raise DataError(f"{self.strict}: {finding_in_words(found[0])}")
             self.findings.append(found)
             self.seconds += part.duration
             if self.health is not None:

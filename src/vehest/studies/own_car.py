@@ -50,12 +50,15 @@ class Verdict:
 def documents(artefacts: StudyArtefacts) -> dict[str, Document]:
     """Verdict, errors as bars, traces with the estimator that is named and the next commands; folded on the page: the whole comparison."""
     part = artefacts.first
-    models = {name: verdict_of(part, name).model for name in part.split.tests}
-    compared = drive.comparison(part, {name: own.name for name, own in models.items() if own is not None})
-    verdicts = [f"{'**On test set ' + as_code(name) + ':** ' if len(part.split.tests) > 1 else ''}{text}" for name, text in _verdicts(part)]
+    verdicts = {name: verdict_of(part, name) for name in part.split.tests}
+    compared = drive.comparison(part, {name: own.model.name for name, own in verdicts.items() if own.model is not None})
+    texts = [
+        f"{'**On test set ' + as_code(name) + ':** ' if len(verdicts) > 1 else ''}{' '.join(own.sentences)}"
+        for name, own in verdicts.items()
+    ]
     opening = next(n for n, block in enumerate(compared.blocks) if isinstance(block, str))  # bars, and traces where there are any
-    blocks: list[Block] = ["## Verdict\n\n" + "\n\n".join(verdicts), *compared.blocks[:opening]]
-    commands = "\n".join(_commands(part, artefacts.study))
+    blocks: list[Block] = ["## Verdict\n\n" + "\n\n".join(texts), *compared.blocks[:opening]]
+    commands = "\n".join(_commands(part, verdicts, artefacts.study))
     if commands:
         blocks.append(f"What to do next:\n\n```sh\n{commands}\n```")
     absent = not_compared(part)
@@ -71,13 +74,10 @@ def documents(artefacts: StudyArtefacts) -> dict[str, Document]:
 def verdict(artefacts: StudyArtefacts) -> list[str]:
     """The verdict as lines of plain text, next commands last."""
     part = artefacts.first
-    lines = [text.replace("**", "").replace("`", "") for _, text in _verdicts(part)]
-    commands = _commands(part, artefacts.study)
+    verdicts = {name: verdict_of(part, name) for name in part.split.tests}
+    lines = [" ".join(own.sentences).replace("**", "").replace("`", "") for own in verdicts.values()]
+    commands = _commands(part, verdicts, artefacts.study)
     return [*lines, *(["next:", *(f"  {command}" for command in commands)] if commands else [])]
-
-
-def _verdicts(part: PartArtefacts) -> list[tuple[str, str]]:
-    return [(name, " ".join(verdict_of(part, name).sentences)) for name in part.split.tests]
 
 
 def verdict_of(part: PartArtefacts, test_set: str) -> Verdict:
@@ -169,9 +169,9 @@ def _counted(part: PartArtefacts, test_set: str) -> str:
     return f"{words}."
 
 
-def _commands(part: PartArtefacts, study: str) -> list[str]:
+def _commands(part: PartArtefacts, verdicts: Mapping[str, Verdict], study: str) -> list[str]:
     """What to run next, with the model of the first test set that has a verdict."""
-    models = [(own, spans[0].dataset) for name, spans in part.split.tests.items() if (own := verdict_of(part, name).model) is not None]
+    models = [(own.model, part.split.tests[name][0].dataset) for name, own in verdicts.items() if own.model is not None]
     if not models:
         return []
     name, dataset = models[0][0].model_folder.name, models[0][1]
