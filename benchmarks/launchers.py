@@ -39,7 +39,7 @@ from vehest.run.study import sweep_of
 
 RESULT = Path(__file__).parents[1] / "results" / "benchmarks" / "launchers.json"
 CORES = 2
-QUIET = Messages(silent=True)
+QUIET = Messages(quiet=True)
 STUDIES = (20, 200, 2000)  # tasks of a study, for which the break-even is computed
 
 

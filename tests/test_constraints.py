@@ -38,4 +38,4 @@ def test_libraries_that_numbers_depend_on_are_installed_as_locked():
 
 
 def test_provenance_names_the_lock():
-    assert provenance(0.0)["constraints"] == {"constraints.txt": sha256_of(LOCK)}
+    assert provenance()["constraints"] == {"constraints.txt": sha256_of(LOCK)}

@@ -14,14 +14,31 @@ import warnings
 from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
+from typing import Any
 from weakref import WeakKeyDictionary
 
 from vehest.data.estimate import Estimate
 from vehest.data.files import written_aside
 from vehest.data.recording import Recording
-from vehest.estimators.base import Estimator
+from vehest.data.schema import settings_from_config
+from vehest.data.splits import Span
+from vehest.estimators.base import Estimator, FitData
 from vehest.estimators.model_files import save_model as _save_model
-from vehest.run.estimate import PRETRAINED, estimate_recording, open_model, read_table, write_estimate_table
+from vehest.evaluation import metrics
+from vehest.run.calibrate import Stretch, learn_trust
+from vehest.run.config import compose_config
+from vehest.run.downsample import resampled
+from vehest.run.estimate import (
+    PRETRAINED,
+    estimate_recording,
+    find_model,
+    open_model,
+    prepared_recording,
+    read_table,
+    require_estimate,
+    write_estimate_table,
+)
+from vehest.run.train import new_estimator
 from vehest.trust.contract import GuardedStepper
 from vehest.trust.health import reason_in_words
 from vehest.trust.record import Trust, write_trust
@@ -80,9 +97,17 @@ def train(
         ConfigurationError: an unknown name or setting.
         DataError: a channel is missing, or the recordings are too short or sampled too slowly.
     """
-    from vehest.run.fitting import train_on
-
-    model, _TRUST[model] = train_on(estimator, train, validation, overrides, seed)
+    config = compose_config("train", [f"estimator={estimator}", *overrides])
+    model, training = new_estimator(config["estimator"]), config["training"]
+    if training.get("start_from") is not None:
+        training["start_from"] = str(find_model(str(training["start_from"]), Path(config["output"]), warnings.warn))
+    settings: Any = settings_from_config(model.training_type, training, "training")
+    model.preparation = {"method": config["downsample"]["method"], "transforms": list(config["downsample"]["transforms"] or [])}
+    model.seed(seed)
+    parts = [[resampled(recording, model.settings.rate_hz, model.preparation) for recording in part] for part in (train, validation)]
+    model.fit(FitData(*parts), settings)
+    learnt, stopped = ([Stretch(own, own.start_time, "", own.id) for own in part] for part in parts)
+    _TRUST[model] = learn_trust(model, learnt, stopped)
     return model
 
 
@@ -96,9 +121,16 @@ def score(model: Estimator, recordings: Sequence[Recording]) -> dict[str, float]
     Raises:
         DataError: a channel is missing or has gaps, or a recording is too short or sampled too slowly.
     """
-    from vehest.run.fitting import score_on
+    from vehest.run.evaluate import protocol_from_config
 
-    return score_on(model, recordings)
+    evaluation = compose_config("eval")["evaluation"]
+    protocol = protocol_from_config({**evaluation, "warm_up_seconds": 0.0, "sequence_seconds": None, "initial_state": False})
+    parts = []
+    for recording in recordings:
+        needed = prepared_recording(model, recording.without_references())
+        own = require_estimate(model, recording, model.estimate([needed])[0])
+        parts.append(metrics.score(own, resampled(recording, protocol.rate_hz, model.preparation), Span("", recording.id), protocol))
+    return metrics.accuracy(parts)
 
 
 def save_model(model: Estimator, folder: str | Path) -> None:

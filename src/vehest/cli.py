@@ -13,8 +13,8 @@ from typing import TYPE_CHECKING, Annotated, Any, NoReturn
 import typer
 
 from vehest.data.errors import ConfigurationError, VehestError, printable
-from vehest.run.config_files import GROUPS, choices, pipeline_names
-from vehest.run.launchers.base import LAUNCHERS, LauncherOptions, RunOptions
+from vehest.run.config_files import GROUPS, choices, is_file_name, pipeline_names
+from vehest.run.launchers.base import LAUNCHERS, RunOptions
 from vehest.run.printing import OutputClosed, TerminalTable, as_json_text, complain, counted, echo, emit, note, open_streams, silence
 from vehest.version import __version__
 
@@ -519,8 +519,7 @@ def run(
     Existing artefacts are skipped, and trained weights that the study has published are taken where their keys are the same. Overrides
     apply to every sweep that has their key. Sweeps are worked off in the order of the file.
     """
-    chosen = LauncherOptions(launcher, address, tuple(slurm or ()))
-    options = RunOptions(force, dry_run, quiet, jobs, minutes=minutes, launcher=chosen, retrain=retrain)
+    options = RunOptions(force, dry_run, quiet, jobs, False, minutes, retrain, launcher, address, slurm or ())
     _run_study(pipeline, overrides or [], options, as_json)
 
 
@@ -554,22 +553,15 @@ def report(
     Exit code 3 unless all are up to date.
     """
     if check:
-        _check_published([word for word in (pipeline, *(overrides or [])) if word is not None], as_json)
-        return
+        from vehest.run.published import check_published
+
+        words = [word for word in (pipeline, *(overrides or [])) if word is not None]
+        verdicts = check_published([word for word in words if is_file_name(word)], [word for word in words if not is_file_name(word)])
+        emit(as_json, [asdict(verdict) for verdict in verdicts], [verdict.in_words() for verdict in verdicts])
+        raise typer.Exit(3 if any(verdict.state != "up to date" for verdict in verdicts) else 0)
     if pipeline is None:
         raise ConfigurationError(f"no pipeline is named; there are: {', '.join(pipeline_names())}; or use --check")
     _run_study(pipeline, overrides or [], RunOptions(force, dry_run, quiet, 1), as_json, only_report=True)
-
-
-def _check_published(words: list[str], as_json: bool) -> None:
-    """Say of published studies whether they are those of today; exit code 3 unless all are."""
-    from vehest.run.config_files import is_file_name
-    from vehest.run.published import check_published
-
-    verdicts = check_published([word for word in words if is_file_name(word)], [word for word in words if not is_file_name(word)])
-    emit(as_json, [asdict(verdict) for verdict in verdicts], [verdict.in_words() for verdict in verdicts])
-    if any(verdict.state != "up to date" for verdict in verdicts):
-        raise typer.Exit(3)
 
 
 @app.command(epilog=_offered("split", "estimator", "training", "fault", "tracking"))
@@ -592,7 +584,7 @@ def sweep(
     Prints the mean RMSE(β) of each combination over its seeds with a 95 % confidence interval (Student's t), and marks the one that is best
     on the validation range. Existing artefacts are skipped, a failed job stops no other, the same command finishes what is missing.
     """
-    options = RunOptions(force, dry_run, quiet, jobs, launcher=LauncherOptions(launcher, address, tuple(slurm or ())))
+    options = RunOptions(force, dry_run, quiet, jobs, launcher=launcher, address=address, slurm=slurm or ())
     _run_study(name, overrides or [], options, as_json, sweep=True)
 
 
@@ -770,7 +762,14 @@ def main() -> None:
     except (KeyboardInterrupt, typer.Abort):
         _fail("stopped", 130)
     except Exception as error:
-        _fail_with(error)
+        from vehest.run.failures import failure_of
+
+        failure = failure_of(error)
+        if failure.exit_code != 1:
+            _fail(failure.message, failure.exit_code)
+        if os.environ.get("VEHEST_DEBUG"):
+            raise
+        _fail(f"this is a defect of vehest ({failure.message}); VEHEST_DEBUG=1 shows where", 1)
     if code == 130:
         _fail("stopped", 130)
     sys.exit(code if isinstance(code, int) else 0)
@@ -791,17 +790,6 @@ def _fail_usage(error: Any) -> None:
     else:
         hint = f"'{context.command_path if context else 'vehest'} --help' lists commands and options"
     _fail(f"{words[:1].lower()}{words[1:]}{'' if words.endswith('?') else ';'} {hint}", error.exit_code)
-
-
-def _fail_with(error: Exception) -> None:
-    from vehest.run.failures import failure_of
-
-    failure = failure_of(error)
-    if failure.exit_code != 1:
-        _fail(failure.message, failure.exit_code)
-    if os.environ.get("VEHEST_DEBUG"):
-        raise error
-    _fail(f"this is a defect of vehest ({failure.message}); VEHEST_DEBUG=1 shows where", 1)
 
 
 def _fail(message: str, exit_code: int) -> NoReturn:

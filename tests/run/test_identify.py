@@ -152,9 +152,9 @@ def test_a_wheelbase_that_the_drive_rules_out_is_found(scale, wheelbase, words):
     speed, curvature = np.interp(time, [0.0, 30.0, 60.0], [5.0, 5.0, 25.0]), np.where(time < 20.0, 0.09, 0.01)
     channels = {"yaw_rate": speed * curvature * scale**-0.5, "vx": speed * scale**0.5, "ay": speed**2 * curvature, "ax": 0.0 * time}
     sized = with_settings(load_model(pretrained_folder("self_calibrating")), {"wheelbase": wheelbase})
-    found = [one for one in findings_of(recording("lap", channels), sized, ["sign", "unit"]) if "wheelbase" in one]
+    found = [one for one in findings_of(recording("lap", channels), sized, ["sign", "unit"]) if one.check == "wheelbase"]
     assert len(found) == (words is not None)
-    assert words is None or re.search(words, found[0])
+    assert words is None or re.search(words, found[0].message)
 
 
 @pytest.mark.parametrize(

@@ -18,13 +18,13 @@ from vehest.run.artefacts import MANIFEST, StagePlan, find, make, read_artefact
 from vehest.run.console import Messages
 from vehest.run.failures import Failure
 from vehest.run.group import Group
-from vehest.run.launchers.base import LauncherOptions, chosen_launcher
+from vehest.run.launchers.base import RunOptions, chosen_launcher
 from vehest.run.launchers.clusters import NotShared, pack, run_task, slurm_parameters, task_of, unpack, versions_here
 from vehest.run.launchers.local import LocalLauncher
 from vehest.run.signals import StopSignals
 from vehest.run.train import TrainJob
 
-FINE = Messages(silent=True)
+FINE = Messages(quiet=True)
 SPLIT = Split("any", (), (), {"test": (Span("any", "one", 0.0, 1.0),)})
 
 
@@ -41,7 +41,7 @@ def made_in(output):
 def test_progress_has_no_more_bars_than_fit_a_terminal():
     with FINE.bars() as bars:
         for number in range(console.MOST_BARS + 5):
-            bars.fit(f"training {number}", None)
+            bars.step(f"training {number}", 0, 1, "starting")
         assert len(bars.tasks) == console.MOST_BARS
 
 
@@ -96,7 +96,7 @@ def test_what_another_host_writes_is_left_alone_for_a_day(tmp_path, monkeypatch)
 def test_without_ray_one_line_says_how_to_get_it_and_the_local_launcher_hands_back_failures_as_values(place, monkeypatch):
     place.refused("run", "small", "--slurm", "minutes=5", says="--slurm is for --launcher slurm, not for local")
     place.refused("sweep", "split=mine", "--launcher", "dask", says="--launcher must be one of local, ray, slurm")
-    launcher = chosen_launcher(LauncherOptions(), 1, place.folder, FINE)
+    launcher = chosen_launcher(RunOptions(jobs=1), place.folder, FINE)
     assert isinstance(launcher, LocalLauncher)
     (done,) = launcher.launch([Group([job(place.folder)], SPLIT)], StopSignals(), lambda *_: None)
     assert isinstance(done.outcome, Failure)
@@ -108,16 +108,19 @@ def test_without_ray_one_line_says_how_to_get_it_and_the_local_launcher_hands_ba
 @pytest.mark.parametrize(
     ("where", "says"),
     [
-        (LauncherOptions("local", address="auto"), "--address is for --launcher ray and slurm, not for local"),
-        (LauncherOptions("ray", slurm=("minutes=5",)), "--slurm is for --launcher slurm, not for ray"),
-        (LauncherOptions("slurm", address="host:6379"), "must be left out for --launcher slurm, or be 'local'"),
-        (LauncherOptions("slurm", "local", slurm=("minutes=soon",)), "--slurm minutes must be a positive number, not 'soon'"),
-        (LauncherOptions("slurm", "local", slurm=("nodes=4",)), "--slurm 'nodes=4' must be NAME=VALUE with one of the names account"),
+        (RunOptions(address="auto"), "--address is for --launcher ray and slurm, not for local"),
+        (RunOptions(launcher="ray", slurm=("minutes=5",)), "--slurm is for --launcher slurm, not for ray"),
+        (RunOptions(launcher="slurm", address="host:6379"), "must be left out for --launcher slurm, or be 'local'"),
+        (RunOptions(launcher="slurm", address="local", slurm=("minutes=soon",)), "--slurm minutes must be a positive number, not 'soon'"),
+        (
+            RunOptions(launcher="slurm", address="local", slurm=("nodes=4",)),
+            "--slurm 'nodes=4' must be NAME=VALUE with one of the names account",
+        ),
     ],
 )
 def test_options_that_a_launcher_does_not_take_are_refused(where, says, tmp_path):
     with pytest.raises(ConfigurationError) as told:
-        chosen_launcher(where, None, tmp_path, FINE)
+        chosen_launcher(where, tmp_path, FINE)
     assert says in str(told.value)
     assert not list(tmp_path.iterdir())
 
@@ -127,4 +130,4 @@ def test_what_jobs_ask_of_slurm_has_the_names_of_submitit_and_without_slurm_a_li
     assert asked == {"slurm_partition": "long", "timeout_min": 90, "mem_gb": 1.5, "cpus_per_task": 1, "name": "vehest"}
     pytest.importorskip("submitit")
     monkeypatch.setenv("PATH", str(tmp_path))
-    assert "there is no SLURM here" in refusal(lambda: chosen_launcher(LauncherOptions("slurm"), None, tmp_path, FINE), MissingError)
+    assert "there is no SLURM here" in refusal(lambda: chosen_launcher(RunOptions(launcher="slurm"), tmp_path, FINE), MissingError)

@@ -291,7 +291,7 @@ def test_nothing_is_published_through_a_link(elsewhere, link):
     Path(link).parent.mkdir(exist_ok=True)
     Path(link).symlink_to(elsewhere / "target")
     with pytest.raises(ConfigurationError, match="through a link"):
-        publish_study(Publication("study", {}, {}), report, Messages(silent=True))
+        publish_study(Publication("study", {}, {}), report, Messages(quiet=True))
     assert not list(Path("target").iterdir())
 
 

@@ -178,7 +178,8 @@ def formatted(table: Table) -> tuple[list[str], list[list[str]], list[bool]]:
         values = table.frame[name]
         is_number = bool(is_numeric_dtype(values) and not is_bool_dtype(values))
         numeric.append(is_number)
-        columns.append(_number_cells(values.tolist(), column) if is_number else [_text_cell(value) for value in values.tolist()])
+        texts = (MISSING if value is None or value != value else printable(str(value)) for value in values.tolist())
+        columns.append(_number_cells(values.tolist(), column) if is_number else list(texts))
     return [printable(column.header) for column in shown.values()], [list(row) for row in zip(*columns, strict=True)], numeric
 
 
@@ -190,10 +191,6 @@ def _number_cells(values: list[Any], column: Column) -> list[str]:
         return [fixed(number, 0) if number.is_integer() else significant(number, column.digits) for number in numbers]
     decimals = decimals_for(numbers, column.digits) if column.decimals is None else column.decimals
     return [fixed(number, decimals) for number in numbers]
-
-
-def _text_cell(value: Any) -> str:
-    return MISSING if value is None or value != value else printable(str(value))
 
 
 def _numbers(document: Document) -> dict[int, str]:
@@ -318,8 +315,9 @@ def _page(document: Document, numbers: Mapping[int, str], images: Mapping[str, b
             blocks.append({"kind": "table", **shared, **_page_table(block)})
         else:
             alternative = {"image": _data_uri(_for_both_schemes(images[block.name]), "image/svg+xml"), "alt": _spoken(block.caption)}
-            blocks.append({"kind": "figure", **shared, **alternative, "json": _json_of(block.interactive)})
-    interactive = any(block.get("json") for block in blocks)
+            interactive = Markup(block.interactive.to_json()) if block.interactive else None
+            blocks.append({"kind": "figure", **shared, **alternative, "json": interactive})
+    explored = any(block.get("json") for block in blocks)
     environment = Environment(
         loader=PackageLoader("vehest.report", "templates"),
         autoescape=True,
@@ -334,8 +332,8 @@ def _page(document: Document, numbers: Mapping[int, str], images: Mapping[str, b
         open_blocks=document.open_blocks,
         style=Markup(_packaged("page.css")),
         script=Markup(_packaged("page.js")),
-        plots=Markup(_packaged("uplot.js") + _packaged("explorer.js")) if interactive else "",
-        plots_style=Markup(_packaged("uplot.css")) if interactive else "",
+        plots=Markup(_packaged("uplot.js") + _packaged("explorer.js")) if explored else "",
+        plots_style=Markup(_packaged("uplot.css")) if explored else "",
         missing=MISSING,
     )
 
@@ -380,13 +378,6 @@ def bars_of(values: Sequence[float], lows: Sequence[float], highs: Sequence[floa
         else None
         for value, low, high in zip(values, lows, highs, strict=True)
     ]
-
-
-def _json_of(explorer: Explorer | None) -> Any:
-    """An explorer as JSON that can stand inside a script element."""
-    from markupsafe import Markup
-
-    return None if explorer is None else Markup(explorer.to_json())
 
 
 def _packaged(name: str) -> str:

@@ -17,6 +17,9 @@ if TYPE_CHECKING:
 
 STATIC_POINTS = 500
 LEAST_SAMPLES = 20
+LOSSES = ("epoch", "train_loss", "validation_loss")  # columns of a training history
+
+Errors = tuple[str, Line, FloatArray]  # name of an estimator, its line, and its sideslip errors, estimate minus reference [deg], (K,)
 
 
 @dataclass(frozen=True, eq=False)
@@ -27,38 +30,6 @@ class Traces:
     line: Line
     vy: FloatArray  # lateral velocity [m/s], shape (K,)
     sideslip: FloatArray  # [deg], shape (K,)
-
-
-@dataclass(frozen=True, eq=False)
-class Errors:
-    """Sideslip errors of one estimator."""
-
-    label: str  # name of the estimator
-    line: Line
-    error: FloatArray  # estimate minus reference [deg], shape (K,)
-
-    @property
-    def rmse(self) -> float:
-        """Root mean square [deg]."""
-        return _rms(self.error)
-
-
-@dataclass(frozen=True, eq=False)
-class Learning:
-    """Losses of one training run."""
-
-    label: str  # name of the estimator
-    line: Line
-    epoch: FloatArray  # shape (E,)
-    train: FloatArray  # training loss, shape (E,)
-    validation: FloatArray  # validation loss, shape (E,)
-
-    @classmethod
-    def of(cls, label: str, line: Line, history: pd.DataFrame | None) -> Learning | None:
-        """The losses of a training history; none where a fit has no epochs."""
-        if history is None or history.empty or not {"epoch", "train_loss", "validation_loss"} <= set(history.columns):
-            return None
-        return cls(label, line, *(history[name].to_numpy(np.float64) for name in ("epoch", "train_loss", "validation_loss")))
 
 
 def traces_figure(time: FloatArray, reference: Traces, estimates: Sequence[Traces], time_label: str) -> MatplotlibFigure:
@@ -113,20 +84,20 @@ def error_histogram(estimates: Sequence[Errors]) -> MatplotlibFigure:
     """Density of the sideslip error of each estimator on common bins; those beyond the axis count in the outermost bins."""
     with new_figure(DOUBLE_COLUMN, 3.2) as figure:
         axes = figure.add_subplot()
-        limit = max(float(np.quantile(np.abs(estimate.error), 0.995)) for estimate in estimates)
+        limit = max(float(np.quantile(np.abs(error), 0.995)) for _, _, error in estimates)
         limit = limit if limit > 0 else 1.0
         edges = np.linspace(-limit, limit, 81)
-        for estimate in reversed(estimates):
-            counts, _ = np.histogram(np.clip(estimate.error, -limit, limit), edges)
-            density = counts / len(estimate.error) / np.diff(edges)
-            label = f"{estimate.label}: {significant(estimate.rmse)}°"
-            axes.stairs(density, edges, color=estimate.line.colour, linestyle=estimate.line.dash, linewidth=1.2, label=label)
+        for name, line, error in reversed(estimates):
+            counts, _ = np.histogram(np.clip(error, -limit, limit), edges)
+            density = counts / len(error) / np.diff(edges)
+            label = f"{name}: {significant(_rms(error))}°"
+            axes.stairs(density, edges, color=line.colour, linestyle=line.dash, linewidth=1.2, label=label)
         axes.axvline(0.0, color=REFERENCE.colour, linewidth=0.7)
         axes.set_xlabel("sideslip error, estimate - reference [deg]".replace("-", "\N{MINUS SIGN}"))
         axes.set_ylabel("density [1/deg]")
         axes.set_xlim(-limit, limit)
         axes.set_ylim(bottom=0.0)
-        samples = len(estimates[0].error) * (edges[1] - edges[0])
+        samples = len(estimates[0][2]) * (edges[1] - edges[0])
         counts_axis = axes.secondary_yaxis("right", functions=(lambda density: density * samples, lambda count: count / samples))
         counts_axis.set_ylabel("samples a bin")
         handles, labels = axes.get_legend_handles_labels()
@@ -143,11 +114,10 @@ def error_over_ay(ay: FloatArray, estimates: Sequence[Errors]) -> MatplotlibFigu
     counts = np.bincount(index, minlength=n_bins)
     with new_figure(DOUBLE_COLUMN, 3.4) as figure:
         axes, below = figure.subplots(2, 1, sharex=True, height_ratios=(3.2, 1))
-        for estimate in reversed(estimates):
-            squares = np.bincount(index, weights=np.square(estimate.error), minlength=n_bins)
+        for name, line, error in reversed(estimates):
+            squares = np.bincount(index, weights=np.square(error), minlength=n_bins)
             rmse = np.sqrt(np.divide(squares, counts, out=np.full(n_bins, np.nan), where=counts >= LEAST_SAMPLES))
-            line = estimate.line
-            axes.plot(centres, rmse, color=line.colour, linestyle=line.dash, marker=line.marker, label=estimate.label)
+            axes.plot(centres, rmse, color=line.colour, linestyle=line.dash, marker=line.marker, label=name)
         below.bar(centres, counts, width=0.9, color="#b5b9be")
         axes.set_ylabel("RMSE(β) [deg]")
         axes.set_ylim(bottom=0.0)
@@ -159,25 +129,24 @@ def error_over_ay(ay: FloatArray, estimates: Sequence[Errors]) -> MatplotlibFigu
     return figure
 
 
-def learning_curves(runs: Sequence[Learning], quantity: str) -> MatplotlibFigure:
-    """Training and validation loss over the epochs, logarithmic; a marker where the validation loss is lowest."""
+def learning_curves(runs: Sequence[tuple[str, Line, pd.DataFrame]]) -> MatplotlibFigure:
+    """Losses over the epochs, logarithmic, of runs with name, line and history; a marker where the validation loss is lowest."""
     with new_figure(DOUBLE_COLUMN, 3.0) as figure:
         left, right = figure.subplots(1, 2, sharex=True, sharey=True)
-        for run in reversed(runs):
-            looks = {"color": run.line.colour, "linestyle": run.line.dash}
-            best = int(np.nanargmin(run.validation)) if np.isfinite(run.validation).any() else 0
-            left.plot(run.epoch, run.train, label=run.label, **looks)
-            right.plot(run.epoch, run.validation, **looks)
-            for axes, losses in ((left, run.train), (right, run.validation)):
-                axes.plot(
-                    run.epoch[best], losses[best], color=run.line.colour, marker=run.line.marker, markeredgecolor="black", markersize=4.5
-                )
+        for name, line, history in reversed(runs):
+            epoch, train, validation = (history[column].to_numpy(np.float64) for column in LOSSES)
+            looks = {"color": line.colour, "linestyle": line.dash}
+            best = int(np.nanargmin(validation)) if np.isfinite(validation).any() else 0
+            left.plot(epoch, train, label=name, **looks)
+            right.plot(epoch, validation, **looks)
+            for axes, losses in ((left, train), (right, validation)):
+                axes.plot(epoch[best], losses[best], color=line.colour, marker=line.marker, markeredgecolor="black", markersize=4.5)
         for axes, title in ((left, "training"), (right, "validation")):
             axes.set_title(title, loc="left")
             axes.set_yscale("log")
             axes.set_xlabel("epoch")
             axes.set_xlim(left=0)
-        left.set_ylabel(quantity)
+        left.set_ylabel("loss [m²/s²]")
         _legend_above(figure, left)
     return figure
 

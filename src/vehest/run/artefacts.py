@@ -26,7 +26,7 @@ from typing import Annotated, Any, Literal
 from pydantic import Field
 
 from vehest.data.errors import DataError, MissingError
-from vehest.data.files import file_name, remove_leftovers, sha256_of, written_aside
+from vehest.data.files import file_name, remove, remove_leftovers, sha256_of, written_aside
 from vehest.data.schema import check_format, validated
 from vehest.data.text_files import read_json
 from vehest.run.locks import Lock, Waiting, held
@@ -63,21 +63,24 @@ class StagePlan:
     @property
     def folder(self) -> Path:
         """Folder of the artefact."""
-        return self.output / file_name(self.stage) / self._folder_name
+        return self.output / file_name(self.stage) / file_name(self.label, f"-{self.key[:12]}")
 
     @property
     def lock(self) -> Lock:
         """Held by the process that makes the artefact."""
-        return Lock(self.output, self.stage, self._folder_name)
+        return Lock(self.output, self.stage, self.folder.name)
 
     @property
     def checkpoint_folder(self) -> Path:
         """Folder of the state of an unfinished run of this stage."""
-        return self.output / "checkpoints" / self._folder_name
+        return self.output / "checkpoints" / self.folder.name
 
-    @property
-    def _folder_name(self) -> str:
-        return file_name(self.label, f"-{self.key[:12]}")
+    def drop(self, unfinished: Path) -> None:
+        """Remove what an unfinished run left in a folder, unless a process runs the stage."""
+        if unfinished.exists():
+            with held(self.lock) as free:
+                if free:
+                    remove(unfinished)
 
 
 @dataclass(frozen=True)
@@ -113,7 +116,7 @@ class Output:
 
 @dataclass(frozen=True)
 class Manifest:
-    """Keys of manifest.json (docs/cli.md); a format of 0, where none is stated, is otherwise the same as 1."""
+    """Keys of manifest.json (docs/cli.md) beside its format; one of 0, where none is stated, is otherwise the same as 1."""
 
     stage: str
     label: str
@@ -124,7 +127,6 @@ class Manifest:
     outputs: dict[str, Output]
     provenance: dict[str, Any]
     code: str = ""
-    format: int = 0
 
 
 def find(plan: StagePlan) -> Artefact | None:
@@ -145,15 +147,14 @@ def read_artefact(folder: Path) -> Artefact:
         raise MissingError(f"'{folder}' is not something that vehest made: there is no {MANIFEST} in it") from None
     if not isinstance(content, dict):
         raise DataError(f"'{path}' is damaged (it is no mapping); remove the folder and run the stage again")
-    check_format(content.get("format", 0), FORMAT, f"'{path}'", oldest=0)
+    check_format(content.pop("format", 0), FORMAT, f"'{path}'", oldest=0)
     manifest = validated(Manifest, content, f"'{path}'")
     files = {file.relative_to(folder).as_posix(): file.stat().st_size for file in _files(folder)}
     for name, output in manifest.outputs.items():
         if files.get(name) != output.bytes:
             raise DataError(f"'{path}': {name[:80]!r} is gone or truncated, or is a link; run the stage '{manifest.stage}' again")
-    about = {**vars(manifest), "outputs": {name: output.sha256 for name, output in manifest.outputs.items()}}
-    del about["format"]
-    return Artefact(folder, skipped=True, **about)
+    outputs = {name: output.sha256 for name, output in manifest.outputs.items()}
+    return Artefact(folder, skipped=True, **{**vars(manifest), "outputs": outputs})
 
 
 def _files(folder: Path) -> list[Path]:
@@ -180,7 +181,7 @@ def make(plan: StagePlan, write: Callable[[Path], Status | None]) -> Artefact:
             "status": status,
             **plan.content,
             "outputs": {file.relative_to(aside).as_posix(): {"sha256": sha256_of(file), "bytes": file.stat().st_size} for file in files},
-            "provenance": provenance(time.monotonic() - started),
+            "provenance": provenance() | {"seconds": round(time.monotonic() - started, 3)},
         }
         (aside / MANIFEST).write_text(json.dumps(manifest, indent=1, default=str), encoding="utf-8")
     return replace(read_artefact(plan.folder), skipped=False)
@@ -200,16 +201,16 @@ def ensured(
         return (None if force else find(plan)) or make(plan, write)
 
 
-def provenance(seconds: float) -> dict[str, Any]:
-    """Circumstances that do not determine the content."""
+def provenance() -> dict[str, Any]:
+    """Circumstances that do not determine the content, with the digest of the checkout's file of locked versions, where there is one."""
+    lock = CHECKOUT / "constraints.txt"
     return {
         "created": datetime.now(UTC).isoformat(timespec="seconds"),
-        "seconds": round(seconds, 3),
         "vehest": __version__,
         "commit": commit(),
         "python": platform.python_version(),
         "libraries": library_versions(),
-        "constraints": constraints(),
+        "constraints": {lock.name: sha256_of(lock)} if lock.is_file() else {},
         "platform": platform.platform(),
         "cpu_count": os.cpu_count(),
     }
@@ -224,13 +225,6 @@ def library_versions() -> dict[str, str]:
         with suppress(metadata.PackageNotFoundError):
             versions[name] = metadata.version(name)
     return versions
-
-
-@cache
-def constraints() -> dict[str, str]:
-    """Name and digest of the checkout's file of locked versions; empty without a checkout."""
-    file = CHECKOUT / "constraints.txt"
-    return {file.name: sha256_of(file)} if file.is_file() else {}
 
 
 @cache

@@ -69,8 +69,8 @@ class Comparison:
         """Name of what is left out -> why."""
         return {name: failure.message for name, failure in named_failures(self.jobs)} | dict.fromkeys(self.unfinished, NO_TIME)
 
-    def plan(self, runner: Runner) -> None:
-        """Fit jobs to the recordings of their split, find those that lack something, and plan trainings; data are made on the way.
+    def plan(self, runner: Runner) -> Sequence[Group]:
+        """Fit jobs to the recordings of their split, find those that lack something, and plan groups of trainings; makes data on the way.
 
         Raises `ConfigurationError` for a wrong setting, `DataError` where no job can be done, `DryRunStop` where a dry run would make data.
         """
@@ -97,7 +97,8 @@ class Comparison:
             if evaluated and checked:
                 self.evaluation = runner.evaluation(usable[0].config, {})
         except DryRunStop:
-            runner.would_train(_names(self.usable))
+            for name in _names(self.usable):
+                runner.messages.line("plan", "train", name)
             raise
         if not self.usable:
             reasons = "; ".join(dict.fromkeys(job.failure.message for job in usable if job.failure is not None))
@@ -113,6 +114,7 @@ class Comparison:
             self.facts = [*training_facts(configs), resampling_fact(configs), *(f"{what} {text}" for what, text in notes)]
             datasets = {name: runner.dataset_config(name, usable[0].config)["dataset"] for name in split.datasets}
             self.data_titles = {name: str(dataset.get("title", name)) for name, dataset in datasets.items()}
+        return self.groups
 
     def _groups(self, split: Split, force: frozenset[str], *, evaluated: bool) -> list[Group]:
         """Combinations of a sweep that differ in their fault alone share a training."""

@@ -99,21 +99,21 @@ def compose_config(command: str, overrides: Sequence[str] = ()) -> Config:
     Returns:
         Plain dicts, lists, strings and numbers; and under `GIVEN` the rates that overrides name, if any.
     """
-    parsed = parse(overrides)
-    for override in parsed:
+    read = [parsed(text) for text in overrides]
+    for override in read:
         _check(override)
     if _LocalFirst not in Plugins.instance().discover(SearchPathPlugin):
         Plugins.instance().register(_LocalFirst)
     try:
         with initialize_config_dir(config_dir=str(packaged("conf")), version_base="1.3"):
-            composed = compose(command, overrides=[OWN_SEARCH_PATH, *(override.input_line for override in parsed)])
+            composed = compose(command, overrides=[OWN_SEARCH_PATH, *(override.input_line for override in read)])
         resolved: Any = OmegaConf.to_container(composed, resolve=True, throw_on_missing=False)
     except Exception as error:  # Hydra raises nearly anything for a file that is no configuration
         if isinstance(error, FileNotFoundError) and error.filename is None:
             raise  # the working folder is missing
         raise ConfigurationError(_one_line(error, command)) from None
     validated(Root, resolved, "", error=ConfigurationError)
-    chosen = [key for key in RATES if any(override.key_or_group == key for override in parsed)]
+    chosen = [key for key in RATES if any(override.key_or_group == key for override in read)]
     return {str(key): value for key, value in resolved.items()} | ({GIVEN: chosen} if chosen else {})
 
 
@@ -146,13 +146,9 @@ def _one_line(error: Exception, command: str) -> str:
     return f"{key}: {text.splitlines()[0]}" if key else " ".join(line.strip() for line in text.splitlines()[:2])
 
 
-def parse(overrides: Sequence[str]) -> list[Override]:
-    """Overrides, read in Hydra's grammar; raises `ConfigurationError` for bad syntax."""
-    return [_parsed(text) for text in overrides]
-
-
 @lru_cache(maxsize=4096)
-def _parsed(text: str) -> Override:
+def parsed(text: str) -> Override:
+    """An override, read in Hydra's grammar; raises `ConfigurationError` for bad syntax."""
     try:
         override = OverridesParser.create().parse_override(text)
         if override.key_or_group in GROUPS and isinstance(override.value(), float):  # a choice called nan or inf
@@ -166,13 +162,13 @@ def _parsed(text: str) -> Override:
 
 def count(overrides: Sequence[str]) -> int:
     """Number of combinations that `expand` gives; of one override at most ``limits.jobs`` + 1 values count."""
-    return math.prod(map(len, map(_values, parse(overrides))))
+    return math.prod(map(len, map(_values, map(parsed, overrides))))
 
 
 def expand(overrides: Sequence[str]) -> list[list[str]]:
     """All combinations of overrides with several values, the last one varying fastest; `ConfigurationError` above ``limits.jobs``."""
     check_jobs(count(overrides), "these overrides stand")
-    return [list(job) for job in product(*map(_values, parse(overrides)))]
+    return [list(job) for job in product(*map(_values, map(parsed, overrides)))]
 
 
 def _values(override: Override) -> list[str]:
@@ -203,12 +199,12 @@ def limits_of(overrides: Sequence[str]) -> Limits:
 
 def value_of(override: str) -> Any:
     """The value that an override sets."""
-    return _parsed(override).value()
+    return parsed(override).value()
 
 
 def key_of(override: str) -> str:
     """The key that an override sets, for example ``training.patience``."""
-    return str(_parsed(override).key_or_group)
+    return str(parsed(override).key_or_group)
 
 
 def option_hint(key: str) -> str:

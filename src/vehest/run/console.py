@@ -22,7 +22,6 @@ from rich.progress import (
 from rich.text import Text
 
 from vehest.data.errors import printable
-from vehest.training.context import Progress as FitProgress
 
 WARNING = "warn"
 MARKS = {
@@ -48,15 +47,15 @@ class _Console(Console):
 
 
 class Messages:
-    """Lines and bars on standard error; warnings alone if ``quiet``, nothing at all if ``silent``.
+    """Lines and bars on standard error; warnings alone if ``quiet``.
 
     Attributes:
         printed: (status, stage, label, detail) of every line, a warning's text in the last; also where nothing is shown.
     """
 
-    def __init__(self, *, quiet: bool = False, silent: bool = False) -> None:
-        self.console = _Console(stderr=True, highlight=False, soft_wrap=True, quiet=silent)
-        self.quiet = quiet or silent
+    def __init__(self, *, quiet: bool = False) -> None:
+        self.console = _Console(stderr=True, highlight=False, soft_wrap=True)
+        self.quiet = quiet
         self.printed: list[tuple[str, str, str, str]] = []
 
     def warn(self, text: str) -> None:
@@ -104,14 +103,6 @@ class Bars(Progress):
             self._named[name] = self.add_task(printable(name), total=total, note="")
         if name in self._named:
             self.update(self._named[name], completed=done, total=total, note=printable(note))
-
-    def fit(self, name: str, progress: FitProgress | None) -> None:
-        """Move the bar of a training."""
-        if progress is None:
-            self.step(name, 0, 1, "starting")
-        else:
-            note = f"{progress.active}/{progress.members} active, best validation loss {progress.best_validation_loss:.4g}"
-            self.step(name, progress.epoch, progress.max_epochs, note)
 
     def close(self, name: str) -> None:
         """Remove a bar."""

@@ -125,12 +125,19 @@ def estimate_file(words: Sequence[str], out: Path, *, strict: bool = False, car:
     config = compose_config("estimate", overrides)
     folder, model, trust = open_model(name, Path(config["output"]), note)
     with use_limits(limits_from_config(config["limits"])):
-        parts = _checked_parts(config, file)
+        dataset = _without_references(config["dataset"])
+        accepted, source = dataset.get("accept") or (), source_of_file(dataset, file)
+        parts = ((part, refuse_errors(part, accepted, f"'{file}'")) for part in source.file_parts(file))
         first, known = next(parts)
         remarks: list[str] = []
         if name == SELF_CALIBRATING:
-            assumed, remarks = _assumed(settings, first, model.settings.wheelbase if car is None else None)
-            settings |= assumed
+            if car is None and "wheelbase" not in settings:
+                remarks.append(
+                    f"the wheelbase is taken for {model.settings.wheelbase:g} m; give your car's, such as estimator.wheelbase=2.9"
+                )
+            if "ax" not in first and "measured_ax" not in settings:
+                settings["measured_ax"] = False
+                remarks.append("there is no channel ax: estimator.measured_ax=false")
         if settings:
             model = with_settings(model, settings)
             if trust is not None and trust.health is not None and trust.health.channels != model.channels:
@@ -142,7 +149,7 @@ def estimate_file(words: Sequence[str], out: Path, *, strict: bool = False, car:
         if any(key_of(override).split(".")[0] == "downsample" for override in overrides):
             model.preparation = config["downsample"]
         run, log = _run_on(model, trust, first), out.suffix.lower() in LOGS
-        report = _Report(model, trust, config["dataset"].get("accept") or (), f"'{file}'" if strict else None)
+        report = _Report(model, trust, accepted, f"'{file}'" if strict else None)
         drive = report.checked(chain([(first, known)], parts))
         if log or not run.takes_parts:
             first = joined(list(drive))
@@ -157,7 +164,7 @@ def estimate_file(words: Sequence[str], out: Path, *, strict: bool = False, car:
             write_estimate_table(estimates, out)
     for remark in remarks:
         note(remark)
-    findings = [_in_words(finding) for finding in merged_findings(report.findings)]
+    findings = [finding_in_words(finding) for finding in merged_findings(report.findings)]
     for finding in findings:
         complain(f"warning: {finding}")
     return {
@@ -169,23 +176,6 @@ def estimate_file(words: Sequence[str], out: Path, *, strict: bool = False, car:
         "findings": findings,
         **({"note": pretrained_note(name)} if name in WITH_VEHEST else {}),
     }
-
-
-def _checked_parts(config: Config, file: Path) -> Iterator[tuple[Recording, list[Finding]]]:
-    """A recording in parts that follow one another, each with the findings of its checks; raises as `read_table` does."""
-    dataset = _without_references(config["dataset"])
-    for part in source_of_file(dataset, file).file_parts(file):
-        yield part, refuse_errors(part, dataset.get("accept") or (), f"'{file}'")
-
-
-def _assumed(settings: Mapping[str, Any], drive: Recording, wheelbase: float | None) -> tuple[dict[str, Any], list[str]]:
-    """Settings of the self-calibrating filter that a drive without ax needs, and remarks on these and on an assumed wheelbase [m]."""
-    remarks = []
-    if wheelbase is not None and "wheelbase" not in settings:
-        remarks.append(f"the wheelbase is taken for {wheelbase:g} m; give your car's, such as estimator.wheelbase=2.9")
-    if "ax" in drive or "measured_ax" in settings:
-        return {}, remarks
-    return {"measured_ax": False}, [*remarks, "there is no channel ax: estimator.measured_ax=false"]
 
 
 def split_settings(overrides: Sequence[str]) -> tuple[dict[str, Any], list[str]]:
@@ -241,17 +231,13 @@ def _without_references(dataset: dict[str, Any]) -> dict[str, Any]:
     return {key: value for key, value in dataset.items() if key not in changed} | {key: new for key, new in changed.items() if new}
 
 
-def findings_of(recording: Recording, model: Estimator, accepted: Sequence[str]) -> list[str]:
-    """Findings in the channels that a model reads; raises `DataError` where they contradict each other, so that no estimate is right."""
-    return [_in_words(finding) for finding in _model_findings(recording, model, accepted, None)]
-
-
-def _in_words(finding: Finding) -> str:
+def finding_in_words(finding: Finding) -> str:
+    """A finding, with the channel that it is about."""
     return f"{finding.channel}: {finding.message}" if finding.channel else finding.message
 
 
-def _model_findings(recording: Recording, model: Estimator, accepted: Sequence[str], known: Sequence[Finding] | None) -> list[Finding]:
-    """`findings_of`; ``known`` are those of all channels: where these have none, nor have fewer channels."""
+def findings_of(recording: Recording, model: Estimator, accepted: Sequence[str], known: Sequence[Finding] | None = None) -> list[Finding]:
+    """Findings in the channels that a model reads, given those of all channels, if they are known; raises `DataError` on contradictions."""
     read = [name for name in model.channels if name in recording]
     if known is not None and (set(read) == set(recording.channels) or all(finding.level == "note" for finding in known)):
         findings = list(known)
@@ -262,11 +248,10 @@ def _model_findings(recording: Recording, model: Estimator, accepted: Sequence[s
         if finding.check in CONTRADICTIONS and finding.check not in accepted:
             what = f"channels contradict each other: {finding.message}"
             raise DataError(f"recording '{recording.id}': {what} (or dataset.accept=[{finding.check}])")
-    too_small = wheelbase_findings(recording, getattr(model.settings, "wheelbase", None))
-    return findings + [Finding("warning", "wheelbase", "", message) for message in too_small]
+    return findings + wheelbase_findings(recording, getattr(model.settings, "wheelbase", None))
 
 
-def wheelbase_findings(recording: Recording, wheelbase: float | None) -> list[str]:
+def wheelbase_findings(recording: Recording, wheelbase: float | None) -> list[Finding]:
     """A finding where a drive above 1 m/s turns too sharply, or is too fast, for any car of a wheelbase [m]; None: not known."""
     if wheelbase is None or not {"vx", "yaw_rate"} <= set(recording.channels):
         return []
@@ -275,12 +260,12 @@ def wheelbase_findings(recording: Recording, wheelbase: float | None) -> list[st
     if not moving.any():
         return []
     speed, turn = speed[moving], float(np.quantile(yaw_rate[moving] / speed[moving], 0.9))
-    what = f"the drive does not fit a wheelbase of {wheelbase:g} m: a car of that size"
+    what, remedy = f"the drive does not fit a wheelbase of {wheelbase:g} m: a car of that size", "give estimator.wheelbase"
     if wheelbase * turn > SHARPEST_TURN:
-        return [f"{what} does not turn within {1.0 / turn:.2g} m, as in a tenth of it; give estimator.wheelbase"]
+        return [Finding("warning", "wheelbase", "", f"{what} does not turn within {1.0 / turn:.2g} m, as in a tenth of it; {remedy}")]
     fast = float(np.quantile(speed, 0.99))
     if fast**2 > LARGEST_FROUDE * GRAVITY * wheelbase:
-        return [f"{what} does not reach {fast:.0f} m/s; give estimator.wheelbase"]
+        return [Finding("warning", "wheelbase", "", f"{what} does not reach {fast:.0f} m/s; {remedy}")]
     return []
 
 
@@ -364,9 +349,9 @@ class _Report:
     def checked(self, parts: Iterable[tuple[Recording, list[Finding]]]) -> Iterator[Recording]:
         """The parts, once they are checked; raises `DataError` as `findings_of` does, and where it is strict."""
         for part, known in parts:
-            found = _model_findings(part, self.model, self.accepted, known)
+            found = findings_of(part, self.model, self.accepted, known)
             if self.strict and found:
-                raise DataError(f"{self.strict}: {_in_words(found[0])}")
+                raise DataError(f"{self.strict}: {finding_in_words(found[0])}")
             self.findings.append(found)
             self.seconds += part.duration
             if self.health is not None:

@@ -9,9 +9,9 @@ from __future__ import annotations
 
 import csv
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
-from functools import cached_property, partial
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -87,62 +87,48 @@ class Evaluation:
     output: Path
     faults: tuple[FaultSettings, ...] = ()
 
-    def of(self, model: Artefact, calibration: Artefact | None) -> EvaluateJob:
-        """The evaluation of a model, calibrated or not."""
-        return EvaluateJob(self, model, calibration)
-
-
-@dataclass(frozen=True)
-class EvaluateJob:
-    """The evaluation of one model."""
-
-    how: Evaluation
-    model: Artefact
-    calibration: Artefact | None = None
-
-    @cached_property
-    def plan(self) -> StagePlan:
-        """The artefact that it becomes; raises `ConfigurationError` where a test range was used for training."""
-        how, model = self.how, self.model
-        for name, spans in how.split.tests.items():
+    def of(self, model: Artefact, calibration: Artefact | None) -> tuple[StagePlan, Callable[[Path], None]]:
+        """The evaluation of a model, as `artefacts.make` takes it; raises `ConfigurationError` where it was trained on a test range."""
+        for name, spans in self.split.tests.items():
             for learnt in learnt_spans(model):
                 if any(span.overlaps(learnt) for span in spans):
                     raise ConfigurationError(
                         f"test set '{name}' shares samples with the ranges that {model.label} was trained or chosen on "
                         f"({learnt.describe()}); test it on something else"
                     )
-        inputs = {"model": model.digest} | ({} if self.calibration is None else {"calibration": self.calibration.digest})
-        scored = scored_spans(how.split)
-        inputs |= {f"{span.dataset}/{span.recording}": file_digest(how.data[span.dataset], span) for span in scored}
-        compared = [*scored, *(span for span in learnt_spans(model, "train") if span.dataset in how.references)]
-        inputs |= {f"reference of {span.dataset}/{span.recording}": file_digest(how.references[span.dataset], span) for span in compared}
+        inputs = {"model": model.digest} | ({} if calibration is None else {"calibration": calibration.digest})
+        scored = scored_spans(self.split)
+        inputs |= {f"{span.dataset}/{span.recording}": file_digest(self.data[span.dataset], span) for span in scored}
+        compared = [*scored, *(span for span in learnt_spans(model, "train") if span.dataset in self.references)]
+        inputs |= {f"reference of {span.dataset}/{span.recording}": file_digest(self.references[span.dataset], span) for span in compared}
         config: dict[str, Any] = {
-            "sets": {name: [str(span) for span in spans] for name, spans in test_sets(how.split).items()},
-            "protocol": how.protocol.plain,
-            "kinds": dict(how.kinds),
-            "split": how.split.name,
+            "sets": {name: [str(span) for span in spans] for name, spans in test_sets(self.split).items()},
+            "protocol": self.protocol.plain,
+            "kinds": dict(self.kinds),
+            "split": self.split.name,
         }
         code = code_of_evaluation(read_description(model.folder).estimator)
-        if how.faults:
-            config["faults"], code = [asdict(fault) for fault in how.faults], code_under_faults(code)
-        return StagePlan(STAGE, f"{model.label}-on-{how.split.name}", config, inputs, code, how.output)
+        if self.faults:
+            config["faults"], code = [asdict(fault) for fault in self.faults], code_under_faults(code)
+        plan = StagePlan(STAGE, f"{model.label}-on-{self.split.name}", config, inputs, code, self.output)
+        return plan, partial(_write, self, model, calibration)
 
     def reference(self, span: Span) -> Recording:
         """The recording of a range at the evaluation rate, references included."""
-        return read_recording(recording_file(self.how.references[span.dataset], span))
+        return read_recording(recording_file(self.references[span.dataset], span))
 
     def measured(self, span: Span) -> Recording:
         """A range as the estimator sees it: no references, and a warm-up before it."""
-        recording = read_recording(recording_file(self.how.data[span.dataset], span))
-        return recording.cut(span.start - self.how.protocol.warm_up_seconds, span.stop).without_references()
+        recording = read_recording(recording_file(self.data[span.dataset], span))
+        return recording.cut(span.start - self.protocol.warm_up_seconds, span.stop).without_references()
 
     def state(self, piece: Span) -> dict[str, float] | None:
         """The state that the protocol passes to an estimator at the start of a piece, if any."""
-        return reference_state(self.reference(piece), piece) if self.how.protocol.initial_state else None
+        return reference_state(self.reference(piece), piece) if self.protocol.initial_state else None
 
     def score(self, spans: Sequence[Span], estimates: Sequence[Estimate]) -> list[Scored]:
         """Estimates of a test set beside the reference."""
-        return score_all(estimates.__getitem__, spans, self.reference, self.how.protocol)
+        return score_all(estimates.__getitem__, spans, self.reference, self.protocol)
 
 
 def code_of_evaluation(estimator: str) -> str:
@@ -160,40 +146,40 @@ def scored_spans(split: Split) -> list[Span]:
     return [span for spans in test_sets(split).values() for span in spans]
 
 
-def write_evaluation(job: EvaluateJob, folder: Path) -> None:
+def _write(how: Evaluation, model: Artefact, calibration: Artefact | None, folder: Path) -> None:
     """Estimate and score every range, under faults too; write estimates, metrics and, in a file of their own, times into ``folder``."""
-    estimator, protocol = load_model(job.model.folder), job.how.protocol
-    without_fit = job.model.outputs and FIT_METRICS not in job.model.outputs  # such as a model that was saved from Python
+    estimator, protocol = load_model(model.folder), how.protocol
+    without_fit = model.outputs and FIT_METRICS not in model.outputs  # such as a model that was saved from Python
     fit = {"n_parameters": float(estimator.n_parameters), "epochs": 0.0, "train_seconds": 0.0}
-    fit |= {} if without_fit else read_fit_metrics(job.model.folder)
-    trust = None if job.calibration is None else read_trust(job.calibration.folder)
+    fit |= {} if without_fit else read_fit_metrics(model.folder)
+    trust = None if calibration is None else read_trust(calibration.folder)
     bands = None if trust is None else trust.bands
     rows: list[dict[str, Any]] = []
     under_faults: list[dict[str, Any]] = []
     blocks = {}
-    for name, spans in test_sets(job.how.split).items():
-        head = _head(job, estimator, name, spans)
-        pieces = sequences(spans, job.reference, protocol)
-        estimates = _estimates(estimator, job, pieces)
+    for name, spans in test_sets(how.split).items():
+        head = _head(how, model, estimator, name, spans)
+        pieces = sequences(spans, how.reference, protocol)
+        estimates = _estimates(estimator, how, pieces)
         for position, piece in enumerate(pieces):
             if bands is not None:  # wider on vehicles without calibration and on test sets that the protocol names
-                measured = job.measured(piece)
+                measured = how.measured(piece)
                 other_vehicle = not bands.are_of(measured.vehicle) or name in protocol.sets_elsewhere
                 estimates[position] = with_bands(estimates[position], measured, bands, elsewhere=other_vehicle)
             write_estimate(estimates[position], folder / name / f"{position}.parquet")
-        scored = job.score(spans, estimates)
+        scored = how.score(spans, estimates)
         blocks[name] = segments_of(scored, protocol.rate_hz)
         figures = accuracy(scored)
         if protocol.sequence_seconds is not None:
             figures["n_sequences"] = len(pieces)
         if name != VALIDATION:
-            figures |= {key: fit[key] for key in FIT_FIGURES} | _floors(estimator, job, spans)
+            figures |= {key: fit[key] for key in FIT_FIGURES} | _floors(estimator, how, spans)
             if estimator.causal:
-                figures["step_seconds"] = _step_seconds(estimator, job.measured(pieces[0]))
+                figures["step_seconds"] = _step_seconds(estimator, how.measured(pieces[0]))
         rows += _rows(head, figures, figure_intervals(blocks[name]))
-        rows += _rows_of_parts(job, head, spans, scored, bands)
-        under_faults += _rows_under_faults(estimator, job, head, spans, scored, trust)
-    rows += _training_rows(estimator, job)
+        rows += _rows_of_parts(how, head, spans, scored, bands)
+        under_faults += _rows_under_faults(estimator, how, head, spans, scored, trust)
+    rows += _training_rows(how, model, estimator)
     write_segments(folder / BLOCKS, blocks)
     for file, timed in ((METRICS, False), (TIMINGS, True)):
         with open(folder / file, "w", newline="", encoding="utf-8") as stream:
@@ -203,14 +189,14 @@ def write_evaluation(job: EvaluateJob, folder: Path) -> None:
 
 
 def _rows_of_parts(
-    job: EvaluateJob, head: Mapping[str, Any], spans: Sequence[Span], scored: Sequence[Scored], bands: Bands | None
+    how: Evaluation, head: Mapping[str, Any], spans: Sequence[Span], scored: Sequence[Scored], bands: Bands | None
 ) -> list[dict[str, Any]]:
     """Rows of the best lever arm, of regimes of lateral acceleration except on validation, and of bands, over all samples and by regime."""
-    protocol, masks, turns = job.how.protocol, [], []
-    for reference, piece in pieces_of(spans, job.reference, protocol):
+    protocol, masks, turns = how.protocol, [], []
+    for reference, piece in pieces_of(spans, how.reference, protocol):
         masks.append(regimes_of(reference, piece, protocol))
         turns.append(reference["yaw_rate"][slice(*scored_range(reference, piece, protocol))] if "yaw_rate" in reference else None)
-    rows = _rows(head, lever_arm_figures(scored, pieces_of(spans, job.reference, protocol), protocol), condition=CONDITION)
+    rows = _rows(head, lever_arm_figures(scored, pieces_of(spans, how.reference, protocol), protocol), condition=CONDITION)
     if head["test_set"] != VALIDATION:
         for regime, own in errors_by_regime(scored, masks, protocol.rate_hz).items():
             rows += _rows(head, own, subset=regime)
@@ -224,28 +210,28 @@ def _rows_of_parts(
 
 
 def _rows_under_faults(
-    estimator: Estimator, job: EvaluateJob, head: Mapping[str, Any], spans: Sequence[Span], nominal: Sequence[Scored], trust: Trust | None
+    estimator: Estimator, how: Evaluation, head: Mapping[str, Any], spans: Sequence[Span], nominal: Sequence[Scored], trust: Trust | None
 ) -> list[dict[str, Any]]:
-    if not job.how.faults:
+    if not how.faults:
         return []
     rows: list[dict[str, Any]] = []
-    pieces = [(piece, job.measured(piece), job.state(piece)) for piece in sequences(spans, job.reference, job.how.protocol)]
-    other_vehicle = head["test_set"] in job.how.protocol.sets_elsewhere
-    score, rate_hz = partial(job.score, spans), job.how.protocol.rate_hz
-    for fault in job.how.faults:
+    pieces = [(piece, how.measured(piece), how.state(piece)) for piece in sequences(spans, how.reference, how.protocol)]
+    other_vehicle = head["test_set"] in how.protocol.sets_elsewhere
+    score, rate_hz = partial(how.score, spans), how.protocol.rate_hz
+    for fault in how.faults:
         for subset, own in errors_under(fault, estimator, pieces, trust, nominal, score, rate_hz, other_vehicle=other_vehicle).items():
             rows += _rows(head, own, subset=subset, condition=fault.condition)
     return rows
 
 
-def _head(job: EvaluateJob, estimator: Estimator, name: str, spans: Sequence[Span]) -> dict[str, Any]:
-    about = read_description(job.model.folder).about
+def _head(how: Evaluation, model: Artefact, estimator: Estimator, name: str, spans: Sequence[Span]) -> dict[str, Any]:
+    about = read_description(model.folder).about
     datasets = dict.fromkeys(span.dataset for span in spans)
-    kinds = dict.fromkeys(job.how.kinds[name] for name in datasets)
+    kinds = dict.fromkeys(how.kinds[name] for name in datasets)
     mode = "causal" if estimator.causal else "offline"
-    model = (estimator.name, estimator.variant, "+".join(about.datasets))
-    test = ("+".join(datasets), "+".join(kinds), name, "all", "nominal", job.how.protocol.rate_hz, mode, about.seed)
-    return dict(zip(HEAD, (*model, *test), strict=True))
+    learnt = (estimator.name, estimator.variant, "+".join(about.datasets))
+    test = ("+".join(datasets), "+".join(kinds), name, "all", "nominal", how.protocol.rate_hz, mode, about.seed)
+    return dict(zip(HEAD, (*learnt, *test), strict=True))
 
 
 def _rows(
@@ -260,19 +246,19 @@ def _rows(
     return rows
 
 
-def _estimates(estimator: Estimator, job: EvaluateJob, pieces: Sequence[Span]) -> list[Estimate]:
+def _estimates(estimator: Estimator, how: Evaluation, pieces: Sequence[Span]) -> list[Estimate]:
     """An estimate each; sequences in one go, since a method may then take them all at once."""
-    batches = [pieces] if job.how.protocol.sequence_seconds is not None else [[piece] for piece in pieces]
+    batches = [pieces] if how.protocol.sequence_seconds is not None else [[piece] for piece in pieces]
     estimates: list[Estimate] = []
     for batch in batches:
-        states = [state for piece in batch if (state := job.state(piece)) is not None]
-        estimates += estimator.estimate([job.measured(piece) for piece in batch], states or None)
+        states = [state for piece in batch if (state := how.state(piece)) is not None]
+        estimates += estimator.estimate([how.measured(piece) for piece in batch], states or None)
     return estimates
 
 
-def _floors(estimator: Estimator, job: EvaluateJob, spans: Sequence[Span]) -> dict[str, float]:
+def _floors(estimator: Estimator, how: Evaluation, spans: Sequence[Span]) -> dict[str, float]:
     """The noise of the reference, and the bound for the inputs of a causal estimator, as far as they are known."""
-    drives = drives_of(spans, job.reference, job.how.protocol)
+    drives = drives_of(spans, how.reference, how.protocol)
     inputs = inputs_of(estimator.channels) if estimator.causal else None
     floors = {"floor_reference": reference_floor(drives)} | ({"floor_cramer_rao": cramer_rao_floor(drives, inputs)} if inputs else {})
     known = {name: floor for name, floor in floors.items() if floor is not None}
@@ -292,35 +278,25 @@ def _step_seconds(estimator: Estimator, recording: Recording) -> float:
     return float(np.median(times))
 
 
-def _training_rows(estimator: Estimator, job: EvaluateJob) -> list[dict[str, Any]]:
+def _training_rows(how: Evaluation, model: Artefact, estimator: Estimator) -> list[dict[str, Any]]:
     """Errors on the training ranges; none where the reference has gaps there or nothing was learnt."""
-    spans = [span for span in learnt_spans(job.model, "train") if span.dataset in job.how.data]
+    spans = [span for span in learnt_spans(model, "train") if span.dataset in how.data]
     if not spans:
         return []
     try:
-        estimates = _estimates(estimator, job, sequences(spans, job.reference, job.how.protocol))
-        figures = accuracy(job.score(spans, estimates))
+        estimates = _estimates(estimator, how, sequences(spans, how.reference, how.protocol))
+        figures = accuracy(how.score(spans, estimates))
     except DataError:
         return []
-    return _rows(_head(job, estimator, TRAINING, spans), {name: figures[name] for name in TRAINING_METRICS})
-
-
-def read_metrics(folder: Path) -> pd.DataFrame:
-    """Metrics and times of an evaluation, one row a figure, with `COLUMNS`."""
-    tables = [read_frame(folder / file, COLUMNS, numbers=("value",)) for file in (METRICS, TIMINGS)]
-    return pd.concat([table for table in tables if len(table)], ignore_index=True)
+    return _rows(_head(how, model, estimator, TRAINING, spans), {name: figures[name] for name in TRAINING_METRICS})
 
 
 def test_figures(folder: Path) -> dict[str, float]:
-    """Metrics of an evaluation over all samples of each test set, ``METRIC.TEST_SET`` -> value."""
-    table = read_metrics(folder)
+    """Metrics and times of an evaluation over all samples of each test set, ``METRIC.TEST_SET`` -> value."""
+    tables = [read_frame(folder / file, COLUMNS, numbers=("value",)) for file in (METRICS, TIMINGS)]
+    table = pd.concat([own for own in tables if len(own)], ignore_index=True)
     tested = table[~table["test_set"].isin((VALIDATION, TRAINING)) & (table["subset"] == "all") & (table["condition"] == "nominal")]
     return dict(zip(tested["metric"] + "." + tested["test_set"], map(float, tested["value"]), strict=True))
-
-
-def rmse_of_tests(folder: Path) -> dict[str, float]:
-    """RMSE(β) of an evaluation on each test set [deg]."""
-    return {name: value for name, value in test_figures(folder).items() if name.startswith("rmse_sideslip")}
 
 
 def fault_figures(folder: Path) -> dict[str, float]:

@@ -161,11 +161,9 @@ def errors_under(
     scored = score(counted)
     found = errors_under_fault(scored, nominal, windows)
     if trust is not None and FAULTED in found:
-        flags = [_flags(*pair) for pair in zip(guarded, scored, strict=True)]
+        flags = []
+        for estimate, part in zip(guarded, scored, strict=True):
+            band = estimate.held_at(part.time, "band_sideslip") if "band_sideslip" in estimate.channels else np.full(len(part.time), np.nan)
+            flags.append(Flagged(band, estimate.held_at(part.time, "health")))
         found[FAULTED] |= flags_under_fault(scored, flags, windows, rate_hz)
     return found
-
-
-def _flags(estimate: Estimate, part: Scored) -> Flagged:
-    band = estimate.held_at(part.time, "band_sideslip") if "band_sideslip" in estimate.channels else np.full(len(part.time), np.nan)
-    return Flagged(band, estimate.held_at(part.time, "health"))

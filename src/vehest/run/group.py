@@ -6,9 +6,8 @@ Group -> existing artefacts -> locks -> fit -> model -> calibration -> evaluatio
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import ExitStack, contextmanager
+from contextlib import AbstractContextManager, ExitStack, contextmanager, nullcontext
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 
 import torch
@@ -18,7 +17,7 @@ from vehest.estimators.kernels.blas import one_blas_thread
 from vehest.estimators.kernels.compiling import has_to_compile
 from vehest.run.artefacts import Artefact, StagePlan, Status, ensured, find, make
 from vehest.run.calibrate import plan_calibrate
-from vehest.run.evaluate import Evaluation, write_evaluation
+from vehest.run.evaluate import Evaluation
 from vehest.run.locks import Lock, Waiting, held
 from vehest.run.train import STAGE, TrainJob, fit_jobs, write_model
 from vehest.training.checkpoints import drop_checkpoint, resume_epoch
@@ -38,6 +37,11 @@ class Member:
     evaluation: Artefact | None = None
     calibration: Artefact | None = None
     finished: bool = False  # nothing of it is missing
+
+    @property
+    def made(self) -> list[Artefact]:
+        """What exists of it, in the order in which it was made."""
+        return [own for own in (self.model, self.calibration, self.evaluation) if own is not None]
 
 
 @dataclass(frozen=True)
@@ -115,27 +119,14 @@ def _member(
         if calibration is None:
             return Member(job, model)
     if group.evaluation is not None:
-        scoring = group.evaluation.of(model, calibration)
-        evaluation = made(scoring.plan, partial(write_evaluation, scoring))
+        evaluation = made(*group.evaluation.of(model, calibration))
     return Member(job, model, evaluation, calibration, finished=group.evaluation is None or evaluation is not None)
 
 
-@contextmanager
-def _compiled_by_one(output: Path, should_stop: Callable[[], bool]) -> Iterator[None]:
+def _compiled_by_one(output: Path, should_stop: Callable[[], bool]) -> AbstractContextManager[object]:
     """While kernels of calibration and evaluation are not in the compile cache, one process compiles them, and others wait for it."""
-    if any(map(has_to_compile, (SLOW_KERNEL, FLOOR_KERNEL))):
-        with held(Lock(output, "compile", "health"), should_stop):
-            yield
-    else:
-        yield
-
-
-def drop_finished_checkpoint(job: TrainJob) -> None:
-    """Remove the checkpoint of a model that is there, which a killed process left, unless another process holds the training."""
-    if job.plan.checkpoint_folder.exists():
-        with held(job.plan.lock) as free:
-            if free:
-                drop_checkpoint(job.plan.checkpoint_folder)
+    missing = any(map(has_to_compile, (SLOW_KERNEL, FLOOR_KERNEL)))
+    return held(Lock(output, "compile", "health"), should_stop) if missing else nullcontext()
 
 
 @contextmanager

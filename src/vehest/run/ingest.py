@@ -16,7 +16,7 @@ from typing import Any
 
 from vehest.alignment.checks import refuse_errors
 from vehest.data.errors import ConfigurationError, DataError, printable
-from vehest.data.files import remove, remove_leftovers, sha256_of
+from vehest.data.files import remove_leftovers, sha256_of
 from vehest.data.store import read_recording, write_recording
 from vehest.run.artefacts import Artefact, StagePlan
 from vehest.run.config import Config, compose_config, key_of, missing_keys
@@ -24,7 +24,6 @@ from vehest.run.config_files import choices
 from vehest.run.console import Messages
 from vehest.run.failures import Failure
 from vehest.run.launchers.local import launch
-from vehest.run.locks import held
 from vehest.run.signals import DryRunStop, StopSignals
 from vehest.sources.base import SIMULATED, Source, open_source, source_class
 
@@ -68,7 +67,7 @@ def write_ingest(config: Config, plan: StagePlan, folder: Path, jobs: int, stop:
             report(position, len(ids), recording_id)
             _make(source, recording_id, folder)
         return
-    parts = _parts_of(plan)
+    parts = parts_of(plan)
     parts.mkdir(parents=True, exist_ok=True)
     remove_leftovers(parts)
     missing = [recording_id for recording_id in ids if not (parts / recording_file(recording_id)).is_file()]
@@ -92,7 +91,11 @@ def write_ingest(config: Config, plan: StagePlan, folder: Path, jobs: int, stop:
         error.exit_code = failures[0].exit_code
         raise error
     for recording_id in ids:
-        _link(parts / recording_file(recording_id), folder / recording_file(recording_id))
+        file = recording_file(recording_id)
+        try:
+            os.link(parts / file, folder / file)
+        except OSError:  # not every file system has links
+            shutil.copyfile(parts / file, folder / file)
 
 
 def _make_part(dataset: Mapping[str, Any], recording_id: str, parts: Path, *_: object) -> None:
@@ -106,22 +109,8 @@ def _make(source: Source, recording_id: str, folder: Path) -> None:
     write_recording(recording, folder / recording_file(recording_id))
 
 
-def _link(source: Path, target: Path) -> None:
-    try:
-        os.link(source, target)
-    except OSError:  # not every file system has links
-        shutil.copyfile(source, target)
-
-
-def drop_parts(plan: StagePlan) -> None:
-    """Remove the parts of a finished ingest, unless another process makes it once more."""
-    if _parts_of(plan).exists():
-        with held(plan.lock) as free:
-            if free:
-                remove(_parts_of(plan))
-
-
-def _parts_of(plan: StagePlan) -> Path:
+def parts_of(plan: StagePlan) -> Path:
+    """Folder of the recordings that are made, beside the artefact, while others are not."""
     return plan.folder.with_name(f"{PARTS_PREFIX}{plan.folder.name}")
 
 

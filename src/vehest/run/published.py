@@ -48,7 +48,12 @@ State = Literal["up to date", "stale", "not known"]
 def keys_of_study(study: Study, jobs: Jobs, absent: Collection[str], runner: Runner, inputs: Mapping[str, Mapping[str, str]]) -> Keys:
     """Keys of everything that determines the results of a study."""
     ingests = _ingests(study, jobs, absent, runner)
-    keys = {f"ingest {name}": _of_ingest(config["dataset"], inputs.get(name)) for name, config in ingests.items()}
+    keys: Keys = {}
+    for name, config in ingests.items():
+        content = {key: value for key, value in config["dataset"].items() if key not in PROSE}
+        keys[f"ingest {name}"] = {CODE: code_of_ingest(config["dataset"]), CONFIGURATION: _hash(content)}
+        if name in inputs:
+            keys[f"ingest {name}"][DATA] = _hash(dict(inputs[name]))
     about: dict[str, Any] = {name: getattr(study, name) for name in ("study", "title", "about", "report")} | {"file": study.file.name}
     if study.datasets:
         about["datasets"] = [_titled(job.config) for job in jobs[""]]
@@ -89,12 +94,6 @@ def _of_jobs(configs: Sequence[Config]) -> Iterator[tuple[str, dict[str, str]]]:
         if faults:
             code, conditions = code_under_faults(code), [conditions, *map(asdict, faults)]
         yield f"evaluate {name}", {CODE: code, CONFIGURATION: _hash(conditions)}
-
-
-def _of_ingest(dataset: Mapping[str, Any], inputs: Mapping[str, str] | None) -> dict[str, str]:
-    content = {key: value for key, value in dataset.items() if key not in PROSE}
-    entry = {CODE: code_of_ingest(dataset), CONFIGURATION: _hash(content)}
-    return entry if inputs is None else entry | {DATA: _hash(dict(inputs))}
 
 
 def _titled(config: Config) -> list[str]:
@@ -180,7 +179,7 @@ def _verdict(study: str, pipeline: Study | None, overrides: Sequence[str]) -> Ve
 
 
 def _compared(study: Study, jobs: Jobs, published: Published) -> Verdict:
-    runner = Runner(Path(str(next(iter(jobs.values()))[0].config["output"])), Messages(silent=True), StopSignals())
+    runner = Runner(Path(str(next(iter(jobs.values()))[0].config["output"])), Messages(quiet=True), StopSignals())
     ingests, inputs = _ingests(study, jobs, published.absent, runner), {}
     for name, config in ingests.items():
         with suppress(MissingError):
@@ -190,17 +189,10 @@ def _compared(study: Study, jobs: Jobs, published: Published) -> Verdict:
     changes = [Change(what, cause) for what in then for cause, own in today.get(what, {}).items() if then[what].get(cause) != own]
     changes += [Change(f"{what} added", CONFIGURATION) for what in today if what not in then]
     changes += [Change(f"{what} removed", CONFIGURATION) for what in then if what not in today]
-    changes += _found_since(study, jobs, published, runner)
+    parts = {name: jobs[name][0].config for name in study.parts} or _by_dataset(jobs[""])
+    for name in sorted(parts.keys() & set(published.absent)):  # that the study had to go on without
+        with suppress(MissingError):
+            runner.look_for_files(parts[name]) if study.parts else plan_ingest(parts[name])
+            changes.append(Change(f"{name}, which was not here", DATA))
     note = f"raw files not here, not compared: {', '.join(missing)}" if missing else ""
     return Verdict(study.study, "stale" if changes else "up to date", tuple(changes), note)
-
-
-def _found_since(study: Study, jobs: Jobs, published: Published, runner: Runner) -> list[Change]:
-    """Parts and data sets that a study had to go on without, and whose raw files are here today."""
-    configs = {name: jobs[name][0].config for name in study.parts} or _by_dataset(jobs[""])
-    found = []
-    for name in sorted(configs.keys() & set(published.absent)):
-        with suppress(MissingError):
-            runner.look_for_files(configs[name]) if study.parts else plan_ingest(configs[name])
-            found.append(Change(f"{name}, which was not here", DATA))
-    return found

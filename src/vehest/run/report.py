@@ -70,35 +70,9 @@ def draw_report(
         datasets=[dataset for dataset in datasets if isinstance(dataset, StoredDataset)],
         absent_datasets=[dataset for dataset in datasets if isinstance(dataset, AbsentDataset)],
     )
-    ingested = [artefact for artefact in runner.artefacts.values() if study.datasets and artefact.stage == INGEST]
-    plan = _plan(artefacts, study.report, shown, ingested, runner.output)
-    if study.publish:
-        plan = replace(plan, config={**plan.config, "weights": True})
-    models = [member.model for part in shown.values() for member in part.members if member.model is not None]
-
-    def write(folder: Path) -> None:
-        _write(artefacts, study.report, _recordings(shown, ingested), folder)
-        if study.publish and models:
-            write_weights(models, folder / PUBLISHED_WEIGHTS)
-
-    report = runner.ensure(plan, write)
-    module = study_module(study.report)
-    if not hasattr(module, "leaderboard"):
-        return report, summary_of_overview(read_frame(report.folder / OVERVIEW), left_out)
-    verdict: list[str] = module.verdict(artefacts) if hasattr(module, "verdict") else []
-    return report, summary_of_leaderboard(study.title, module.leaderboard(artefacts.first), left_out, verdict)
-
-
-def _plan(
-    artefacts: StudyArtefacts, module: str, comparisons: Mapping[str, Comparison], ingested: Sequence[Artefact], output: Path
-) -> StagePlan:
     config: dict[str, Any] = {
-        "study": artefacts.study,
-        "title": artefacts.title,
-        "about": artefacts.about,
-        "command": artefacts.command,
-        "module": module,
-        "titles": artefacts.titles,
+        **{key: getattr(artefacts, key) for key in ("study", "title", "about", "command", "titles")},
+        "module": study.report,
         "absent": [{"name": name, "title": artefacts.titles[name]} for name in artefacts.absent],
         "parts": {
             name: {"training": list(part.facts), "failed": part.failed, "data_titles": part.data_titles, "protocol": part.protocol.plain}
@@ -106,13 +80,26 @@ def _plan(
         },
         "datasets": {dataset.name: [dataset.title, dataset.kind] for dataset in artefacts.datasets},
         "absent_datasets": [asdict(dataset) for dataset in artefacts.absent_datasets],
+        **({"weights": True} if study.publish else {}),
     }
+    ingested = [artefact for artefact in runner.artefacts.values() if study.datasets and artefact.stage == INGEST]
     inputs = {artefact.label: artefact.digest for artefact in ingested}
-    for name, part in comparisons.items():
-        prefix = f"{name}: " if name else ""
-        made = [own for member in part.members for own in (member.model, member.evaluation, member.calibration) if own is not None]
-        inputs |= {f"{prefix}{artefact.label}": artefact.digest for artefact in made}
-    return StagePlan(stage=STAGE, label=artefacts.study, config=config, inputs=inputs, code=code_of_report(module), output=output)
+    for name, part in shown.items():
+        made = [own for member in part.members for own in member.made]
+        inputs |= {f"{name}: {artefact.label}" if name else artefact.label: artefact.digest for artefact in made}
+    models = [member.model for part in shown.values() for member in part.members if member.model is not None]
+
+    def write(folder: Path) -> None:
+        _write(artefacts, study.report, _recordings(shown, ingested), folder)
+        if study.publish and models:
+            write_weights(models, folder / PUBLISHED_WEIGHTS)
+
+    report = runner.ensure(StagePlan(STAGE, study.study, config, inputs, code_of_report(study.report), runner.output), write)
+    module = study_module(study.report)
+    if not hasattr(module, "leaderboard"):
+        return report, summary_of_overview(read_frame(report.folder / OVERVIEW), left_out)
+    verdict: list[str] = module.verdict(artefacts) if hasattr(module, "verdict") else []
+    return report, summary_of_leaderboard(study.title, module.leaderboard(artefacts.first), left_out, verdict)
 
 
 def code_of_report(study: str) -> str:
@@ -131,11 +118,11 @@ def _write(artefacts: StudyArtefacts, name: str, recordings: Mapping[str, str], 
     module = study_module(name)
     timings = {name: _timings_of(part) for name, part in artefacts.parts.items()}
     times = [
-        (artefacts.titles[name], timings[name], {(model.estimator, model.variant): model.title for model in part.models})
+        (artefacts.titles[name], timings[name], {model.name: model.title for model in part.models})
         for name, part in artefacts.parts.items()
     ]
     with one_blas_thread():
-        write_documents(module.documents(artefacts), folder, on_page=timings_of_study(times) if times else ())
+        write_documents(module.documents(artefacts), folder, on_page=timings_of_study(times))
     if not hasattr(module, "leaderboard") and not (folder / OVERVIEW).is_file():
         raise ConfigurationError(f"the study module '{name}' gives no table 'overview', which the terminal shows")
     if artefacts.parts:
@@ -145,7 +132,7 @@ def _write(artefacts: StudyArtefacts, name: str, recordings: Mapping[str, str], 
         for file, written in ((METRICS, table), (TIMINGS, of_parts(timings))):
             written.to_csv(folder / file, index=False, lineterminator="\n", errors="backslashreplace")
     kinds = {name: kind for part in artefacts.parts.values() for name, kind in part.kinds.items()}
-    about: dict[str, Any] = {key: value for key, value in provenance(0.0).items() if key != "seconds"}
+    about = provenance()
     about |= {
         "study": artefacts.study,
         "command": artefacts.command,

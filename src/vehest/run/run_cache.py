@@ -14,12 +14,12 @@ import json
 import os
 import re
 import sys
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass
 from importlib import metadata
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from vehest.data.errors import JobsFailedError, VehestError
 from vehest.data.files import file_name, remove_leftovers, written_aside
@@ -114,11 +114,9 @@ class RunCache:
     def save(
         self, runner: Runner, report: Artefact, summary: TerminalSummary, raw: dict[str, str], publication: Publication | None
     ) -> None:
-        """Record a finished study, unless runs are left to track or files changed meanwhile; ``raw``: `stamps_of`, from before reading."""
+        """Record a finished study, unless runs are left to track or files changed meanwhile; ``raw``: stamps from before reading."""
         tracker, output = runner.tracker, runner.output
-        if self.file is None or not self.key or output != self.file.parents[1] or self._key() != self.key:
-            return
-        if tracker is not None and not tracker.complete:
+        if self.file is None or not self.key or output != self.file.parents[1] or not tracker.complete or self._key() != self.key:
             return
         made = [*(own for own in runner.artefacts.values() if own.folder != report.folder), report]
         record = Record(
@@ -128,7 +126,7 @@ class RunCache:
             lines=tuple(_next_time(runner.messages.printed, made)),
             summary=summary,
             publication=publication,
-            store=tracker.store if tracker is not None else "",
+            store=tracker.store,
         )
         try:
             remove_leftovers(self.file.parent)
@@ -153,11 +151,6 @@ class RunCache:
                 return ""  # its value may differ each time
             digest.update(repr((variable, os.environ.get(variable))).encode("utf-8", "surrogateescape"))
         return digest.hexdigest()
-
-
-def stamps_of(datasets: Mapping[str, Mapping[str, Any]]) -> dict[str, str]:
-    """Folder of raw files of each data set -> its stamp, from the configuration of each by name."""
-    return {str(dataset["path"]): stamp_of(str(dataset["path"])) for dataset in datasets.values() if "path" in dataset}
 
 
 def stamp_of(path: str) -> str:

@@ -24,11 +24,11 @@ from vehest.run.artefacts import Artefact, StagePlan, Status, ensured, find
 from vehest.run.config import Config, compose_config, missing_keys
 from vehest.run.console import Bars, Messages
 from vehest.run.downsample import plan_downsample, write_downsample
-from vehest.run.evaluate import Evaluation, protocol_from_config, rmse_of_tests
+from vehest.run.evaluate import Evaluation, protocol_from_config, test_figures
 from vehest.run.evaluate_faults import FaultSettings
 from vehest.run.failures import Failure
-from vehest.run.group import Group, Member, drop_finished_checkpoint, existing
-from vehest.run.ingest import drop_parts, plan_ingest, write_ingest
+from vehest.run.group import Group, Member, existing
+from vehest.run.ingest import parts_of, plan_ingest, write_ingest
 from vehest.run.launchers.base import Launcher
 from vehest.run.launchers.local import LocalLauncher
 from vehest.run.locks import Waiting
@@ -56,7 +56,7 @@ class Runner:
     jobs: int = 1  # processes of an ingest
     force: frozenset[str] = frozenset()  # stages to run although their artefacts are there
     dry_run: bool = False
-    tracker: Tracker | None = None
+    tracker: Tracker = field(default_factory=lambda: Tracker({}, Path(), print))  # by default it logs nothing
     launcher: Launcher = field(default_factory=LocalLauncher)
     until: float | None = None  # reading of ``time.monotonic`` at which trainings have to end
     weights: PublishedWeights | None = None  # of a published study, which are taken instead of training
@@ -78,7 +78,7 @@ class Runner:
         with self.messages.bars() as bars:
             report = partial(bars.step, f"ingest {plan.label}")
             made = self.ensure(plan, lambda folder: write_ingest(config, plan, folder, self.jobs, self.stop, report))
-        drop_parts(plan)
+        plan.drop(parts_of(plan))
         return made
 
     def downsample(self, ingested: Artefact, rate_hz: float, options: Mapping[str, Any]) -> Artefact:
@@ -91,13 +91,13 @@ class Runner:
         root = [] if config.get("root") is None else [f"root={_quoted(config['root'])}"]
         return self._once("dataset", name, lambda: {**compose_config("ingest", [f"dataset={name}", *root]), "output": config["output"]})
 
-    def datasets_of(self, config: Config) -> dict[str, Config]:
-        """The configuration of every data set of a split, by its name."""
-        return {name: self.dataset_config(name, config)["dataset"] for name in dataset_names(config["split"])}
+    def datasets_of(self, config: Config) -> list[Config]:
+        """The configuration of every data set of a split."""
+        return [self.dataset_config(name, config)["dataset"] for name in dataset_names(config["split"])]
 
     def look_for_files(self, config: Config) -> None:
         """Make sure that the raw files of every data set of a split are here; read nothing; raises `MissingError` where some are not."""
-        for dataset in self.datasets_of(config).values():
+        for dataset in self.datasets_of(config):
             if not missing_keys(dict(dataset)):  # which its ingest reports
                 open_source(dataset).inputs()
 
@@ -165,7 +165,7 @@ class Runner:
         waiting: list[Group] = []
         for group in groups:
             found = existing(group)
-            members |= self._received(group, [member for member in found if member.finished])
+            members |= self._received([member for member in found if member.finished])
             missing = [member.job for member in found if not member.finished]
             waiting += [replace(group, jobs=missing)] if missing else []
         failures: dict[str, Failure] = {}
@@ -187,7 +187,7 @@ class Runner:
                     bars.close(group.name)
                     bars.step(ALL, ended, len(waiting))
                     if not isinstance(outcome, Failure):
-                        members |= self._received(group, outcome)
+                        members |= self._received(outcome)
                     elif outcome.exit_code != DataError.exit_code or len(group.jobs) == 1:
                         failures |= {job.plan.key: outcome for job in group.jobs}
                         self.messages.line("fail", "train", group.name, outcome.message)
@@ -210,7 +210,8 @@ class Runner:
         """Print what groups are going to do; a dry run ends here."""
         if self.dry_run:
             labels = [job.plan.label for group in waiting for job in group.jobs]
-            self.would_train(labels)
+            for label in labels:
+                self.messages.line("plan", "train", label)
             self.messages.line("plan", "train", f"{len(labels)} in all", f"{n_there} more are there")
             raise DryRunStop
         for name in dict.fromkeys(str(group.jobs[0].estimator["name"]) for group in waiting):
@@ -221,33 +222,30 @@ class Runner:
         for split in dict.fromkeys(group.split.name for group in waiting if not group.split.validation):
             self.messages.line("note", "calibrate", split, "has no validation range: no bands")
 
-    def would_train(self, labels: Sequence[str]) -> None:
-        """Print what a dry run leaves out."""
-        for label in labels:
-            self.messages.line("plan", "train", label)
-
-    def _received(self, group: Group, outcome: Sequence[Member]) -> dict[str, Member]:
+    def _received(self, outcome: Sequence[Member]) -> dict[str, Member]:
         """Members by the keys of their trainings, printed and tracked."""
         for member in outcome:
             if member.finished and not self.dry_run:
-                drop_finished_checkpoint(member.job)
+                member.job.plan.drop(member.job.plan.checkpoint_folder)
             if member.model is None:
                 self.messages.line("stop", "train", member.job.plan.label, "before its first epoch was over; the next run goes on")
-            for made in (member.model, member.calibration, member.evaluation):
-                if made is not None:
-                    self.artefacts[made.folder] = made
-                    status, detail = _in_words(made)
-                    self.messages.line(status, made.stage, made.label, detail)
-            if self.tracker is not None:
-                self.tracker.log(member.model, member.calibration, member.evaluation)
+            for made in member.made:
+                self.artefacts[made.folder] = made
+                status, detail = _in_words(made)
+                self.messages.line(status, made.stage, made.label, detail)
+            self.tracker.log(*member.made)
         return {member.job.plan.key: member for member in outcome}
 
     def _report(self, groups: Sequence[Group], bars: Bars, at: int, news: Progress | Waiting | None) -> None:
         """Draw the progress of a group, or print for whom it waits."""
+        name = groups[at].name
         if isinstance(news, Waiting):
             self._print_waiting(news)
+        elif news is None:
+            bars.step(name, 0, 1, "starting")
         else:
-            bars.fit(groups[at].name, news)
+            note = f"{news.active}/{news.members} active, best validation loss {news.best_validation_loss:.4g}"
+            bars.step(name, news.epoch, news.max_epochs, note)
 
     def _print_waiting(self, waiting: Waiting) -> None:
         self.messages.line("wait", waiting.stage, waiting.label, f"for {waiting.holder}, which makes it")
@@ -265,7 +263,8 @@ def _in_words(made: Artefact) -> tuple[str, str]:
         epochs = f"{fit['epochs']:.0f} epochs, " if fit.get("epochs") else ""
         return "done", epochs + (f"{fit['n_parameters']:.0f} parameters" if loss is None else f"validation loss {loss:.4g}")
     if made.stage == "evaluate":
-        return "done", ", ".join(f"{name} {value:.3f}°" for name, value in rmse_of_tests(made.folder).items())
+        errors = {name: error for name, error in test_figures(made.folder).items() if name.startswith("rmse_sideslip")}
+        return "done", ", ".join(f"{name} {error:.3f}°" for name, error in errors.items())
     trust = read_trust(made.folder)
     if trust.bands is None:
         return "note", f"no bands: {trust.about.note}"

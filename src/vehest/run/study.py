@@ -31,7 +31,7 @@ from vehest.run.config import (
     key_of,
     limits_of,
     option_hint,
-    parse,
+    parsed,
     value_of,
 )
 from vehest.run.config_files import find_pipeline, pipeline_names
@@ -267,7 +267,7 @@ def sweep_of(overrides: Sequence[str], name: str | None = None) -> tuple[Study, 
         for key in keys:
             if keys.count(key) > 1:
                 raise ConfigurationError(f"'{key}' is named twice; give all its values at once: {key}=1,2")
-        swept = [str(one.key_or_group) for one in parse(overrides) if one.is_sweep_override()]
+        swept = [str(one.key_or_group) for one in map(parsed, overrides) if one.is_sweep_override()]
         for key in swept:
             if key.split(".")[0] in ONE_VALUE:
                 raise ConfigurationError(

@@ -9,7 +9,6 @@ import time
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager, suppress
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -22,9 +21,8 @@ from vehest.run.comparison import Comparison, lower_rate, named_failures, print_
 from vehest.run.config import Config, compose_config, key_of
 from vehest.run.console import Messages
 from vehest.run.estimate import find_model, model_artefact, preparation_of
-from vehest.run.evaluate import fault_figures, test_figures, write_evaluation
+from vehest.run.evaluate import fault_figures, test_figures
 from vehest.run.evaluate_faults import check_channels, faults_of
-from vehest.run.group import Group
 from vehest.run.ingest import STAGE as INGEST
 from vehest.run.ingest import plan_ingest
 from vehest.run.launchers.base import RunOptions, chosen_launcher
@@ -33,7 +31,7 @@ from vehest.run.published import keys_of_study
 from vehest.run.publishing import RESULTS, Publication, publish_study
 from vehest.run.report import STAGE as REPORT
 from vehest.run.report import SWEEP, draw_report, draw_sweep
-from vehest.run.run_cache import Ran, RunCache, stamps_of
+from vehest.run.run_cache import Ran, RunCache, stamp_of
 from vehest.run.runner import Runner
 from vehest.run.signals import DryRunStop, StopSignals
 from vehest.run.study import Job, Jobs, Study, content_overrides, jobs_of, read_study, sweep_of
@@ -48,9 +46,9 @@ from vehest.studies.artefacts import AbsentDataset, StoredDataset
 def open_runner(config: Config, options: RunOptions, stages: Collection[str], study: str = "") -> Iterator[Runner]:
     """A runner that listens to signals, runs ``stages`` anew under ``options.force``, and logs runs under a study, if there is one."""
     messages, stop, output = Messages(quiet=options.quiet), StopSignals(), Path(config["output"])
-    tracker = Tracker(config["tracking"], output, messages.warn, stop.requested, study) if options.track or study else None
+    tracker = Tracker(config["tracking"] if options.track or study else {}, output, messages.warn, stop.requested, study)
     forced = frozenset(stages if options.force else ())
-    launcher = chosen_launcher(options.launcher, options.jobs, output, messages)
+    launcher = chosen_launcher(options, output, messages)
     runner = Runner(output, messages, stop, options.jobs or default_jobs(), forced, options.dry_run, tracker, launcher)
     with closing(launcher), use_limits(limits_from_config(config["limits"])), stop.installed():
         yield runner
@@ -88,10 +86,10 @@ def run_study(
             runner.weights = PublishedWeights(RESULTS / study.study / PUBLISHED_WEIGHTS)
         runner.train_first = f"vehest run {study.file}" if only_report else ""
         shown = [job.config for job in jobs[""]] if study.datasets else []
-        configs = {str(config["dataset"]["name"]): config["dataset"] for config in shown}
+        used = [config["dataset"] for config in shown]
         for part in study.parts:
-            configs |= runner.datasets_of(_first(jobs[part]))
-        raw = stamps_of(configs)
+            used += runner.datasets_of(_first(jobs[part]))
+        raw = {path: stamp_of(path) for path in dict.fromkeys(str(dataset["path"]) for dataset in used if "path" in dataset)}
         datasets: list[StoredDataset | AbsentDataset] = []
         for config in shown:
             with suppress(DryRunStop):
@@ -112,7 +110,10 @@ def run_study(
         if error is None and not runner.dry_run and not any(own.unfinished for own in comparisons.values()):
             publication = None
             if study.publish and not content_overrides(overrides):
-                publication = _publication(study, jobs, comparisons, datasets, runner)
+                gone = {name: f"part '{name}'" for name in study.parts if name not in comparisons}
+                gone |= {own.name: f"data set '{own.name}'" for own in datasets if isinstance(own, AbsentDataset)}
+                inputs = {own.label: own.inputs for own in runner.artefacts.values() if own.stage == INGEST}  # raw files as they were
+                publication = Publication(study.study, gone, keys_of_study(study, jobs, gone, runner, inputs))
             cache.save(runner, report, summary, raw, publication)
             published = publish_study(publication, report, runner.messages)
     return Ran(summary, report.folder, report.skipped, published, None if sweep and runner.dry_run else error)
@@ -195,21 +196,11 @@ def _error_of(study: Study, comparisons: Sequence[Comparison], runner: Runner) -
     return error
 
 
-def _publication(
-    study: Study, jobs: Jobs, comparisons: Collection[str], datasets: Sequence[StoredDataset | AbsentDataset], runner: Runner
-) -> Publication:
-    """What is published, with what determined it: raw files as they were ingested."""
-    gone = {name: f"part '{name}'" for name in study.parts if name not in comparisons}
-    gone |= {own.name: f"data set '{own.name}'" for own in datasets if isinstance(own, AbsentDataset)}
-    inputs = {artefact.label: artefact.inputs for artefact in runner.artefacts.values() if artefact.stage == INGEST}
-    return Publication(study.study, gone, keys_of_study(study, jobs, gone, runner, inputs))
-
-
 def train_one(overrides: Sequence[str], options: RunOptions) -> dict[str, Any]:
     """Train and calibrate one estimator; empty where it was stopped before its first epoch was over; raises `VehestError`."""
     config = compose_config("train", overrides)
     with open_runner(config, options, ("train", "calibrate")) as runner:
-        members, failures = runner.run([_only_group(config, runner)])
+        members, failures = runner.run(Comparison([Job(config)]).plan(runner))
         for failure in failures.values():
             if failure.detail:
                 runner.messages.warn(failure.detail)
@@ -236,25 +227,16 @@ def evaluate_one(overrides: Sequence[str], model: str | None, options: RunOption
             how = runner.evaluation(config, runner.data_for(split, trained_rate(trained), config), faults_of(config))
             check_channels(how.faults, split, how.data)
         else:
-            group = _only_group(config, runner)
+            (group,) = Comparison([Job(config)]).plan(runner)
             plan = group.jobs[0].plan
             if (found := find(plan)) is None:
                 raise MissingError(f"{plan.label} has not been trained; run 'vehest train {' '.join(overrides)}' first")
             assert group.evaluation is not None
             trained, how = found, group.evaluation
         calibration = _calibration(trained, split, how.data, runner)
-        scoring = how.of(trained, calibration)
-        artefact = runner.ensure(scoring.plan, partial(write_evaluation, scoring))
-        if runner.tracker is not None:
-            runner.tracker.log(calibration, artefact)
+        artefact = runner.ensure(*how.of(trained, calibration))
+        runner.tracker.log(calibration, artefact)
     return {"folder": str(artefact.folder), "skipped": artefact.skipped, **test_figures(artefact.folder), **fault_figures(artefact.folder)}
-
-
-def _only_group(config: Config, runner: Runner) -> Group:
-    """The training of a configuration, at a rate that the recordings have."""
-    comparison = Comparison([Job(config)])
-    comparison.plan(runner)
-    return comparison.groups[0]
 
 
 def _calibration(model: Artefact, split: Split, data: Mapping[str, Artefact], runner: Runner) -> Artefact | None:

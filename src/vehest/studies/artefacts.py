@@ -13,7 +13,7 @@ import pandas as pd
 from vehest.data.errors import DataError
 from vehest.data.estimate import Estimate
 from vehest.data.recording import Recording
-from vehest.data.splits import Split
+from vehest.data.splits import Span, Split
 from vehest.data.store import read_estimate, read_recording
 from vehest.data.text_files import first_line, number_in, read_rows, read_text
 from vehest.evaluation.blocks import Segments, read_segments
@@ -53,6 +53,11 @@ class EvaluatedModel:
     evaluation_folder: Path
     training: Mapping[str, Any] = field(default_factory=dict)  # how it was trained, as configured
     calibration_folder: Path | None = None  # where trust.yaml lies, if it was calibrated
+
+    @property
+    def name(self) -> tuple[str, str]:
+        """Estimator and variant, which models that differ in their seed share."""
+        return self.estimator, self.variant
 
     def history(self) -> pd.DataFrame | None:
         """Training history, one row an epoch (or a search); none if the method has none."""
@@ -99,15 +104,18 @@ class PartArtefacts:
     facts: Sequence[str]  # further lines on how it was made: training budget, versions, machine
     failed: Mapping[str, str] = field(default_factory=dict)  # name of what is left out, since it failed or is not there -> why
 
+    def reference(self, span: Span, channels: Iterable[str] | None = None) -> Recording:
+        """The recording of a range at the evaluation rate, with all or some of its channels."""
+        return read_recording(self.references[span.dataset, span.recording], channels)
+
+    def kinds_of(self, spans: Iterable[Span]) -> str:
+        """Whether ranges are ``real``, ``simulated`` or ``real and simulated``."""
+        return " and ".join(sorted({self.kinds[span.dataset] for span in spans}))
+
     def scored(self, model: EvaluatedModel, test_set: str) -> list[Scored]:
         """Estimate and reference of a model on each range of a test set, or on each sequence if the protocol cuts ranges."""
         spans = self.split.validation if test_set == "validation" else self.split.tests[test_set]
-        return score_all(
-            lambda position: model.estimate(test_set, position),
-            spans,
-            lambda span: read_recording(self.references[span.dataset, span.recording]),
-            self.protocol,
-        )
+        return score_all(lambda position: model.estimate(test_set, position), spans, self.reference, self.protocol)
 
 
 def of_parts(tables: Mapping[str, pd.DataFrame]) -> pd.DataFrame:
@@ -159,12 +167,6 @@ class StudyArtefacts:
     absent: Sequence[str] = ()  # parts whose raw files were not here
     datasets: Sequence[StoredDataset] = ()  # of a study of recordings alone, in the order of the pipeline file
     absent_datasets: Sequence[AbsentDataset] = ()  # data sets that could not be read
-
-    @property
-    def only(self) -> PartArtefacts:
-        """What was compared in a study that is not in parts."""
-        (part,) = self.parts.values()
-        return part
 
     @property
     def first(self) -> PartArtefacts:

@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 import pandas as pd
@@ -20,7 +20,6 @@ from vehest.data.store import read_recording
 from vehest.evaluation.metrics import Scored
 from vehest.report import figures
 from vehest.report.document import PATENT_NOTE, REPORT, Block, Column, Document, Figure, ModelLink, Table, as_code, as_text
-from vehest.report.explorer import Explorer
 from vehest.report.style import REFERENCE, Line, decimals_for, fixed, lines_of
 from vehest.studies.artefacts import PartArtefacts, StudyArtefacts
 from vehest.studies.kit.bands import band_blocks
@@ -44,7 +43,7 @@ _SPREAD = ("rmse_sideslip_median", "rmse_sideslip_min", "rmse_sideslip_max", "rm
 
 def documents(artefacts: StudyArtefacts) -> dict[str, Document]:
     """The report of a study that is not in parts; see `comparison`."""
-    return {REPORT: comparison(artefacts.only)}
+    return {REPORT: comparison(artefacts.first)}
 
 
 def comparison(artefacts: PartArtefacts, named: Mapping[str, Name] | None = None) -> Document:
@@ -57,7 +56,7 @@ def comparison(artefacts: PartArtefacts, named: Mapping[str, Name] | None = None
         DataError: metrics are missing or ambiguous, or an estimate does not cover its range.
     """
     board = leaderboard(artefacts)
-    lines = lines_of(dict.fromkeys((model.estimator, model.variant) for model in artefacts.models))
+    lines = lines_of(dict.fromkeys(model.name for model in artefacts.models))
     blocks: list[Block] = [*_headline(artefacts)]
     for test_set in artefacts.split.tests:
         blocks += _test_set(artefacts, board[board["test_set"] == test_set], test_set, lines, (named or {}).get(test_set))
@@ -83,12 +82,12 @@ def leaderboard(artefacts: PartArtefacts) -> pd.DataFrame:
     Sideslip in deg, velocities in m/s. Raises `DataError` where a run has two values of a metric, or no validation metrics.
     """
     runs, start = runs_of(artefacts), "reference" if artefacts.protocol.initial_state else "own"
-    rankings = {test_set: ranking_of(artefacts, test_set) for test_set in artefacts.split.tests}
-    rows = []
-    for name, models in by_name(artefacts.models).items():
-        seeds = sorted(model.seed for model in models)
-        seed = chosen_seed(seeds, name, runs)
-        for test_set, ranking in rankings.items():
+    rows: list[dict[str, object]] = []
+    for test_set in artefacts.split.tests:
+        ranking, placed = ranking_of(artefacts, test_set), list[tuple[float, dict[str, object]]]()
+        for name, models in by_name(artefacts.models).items():
+            seeds = sorted(model.seed for model in models)
+            seed = chosen_seed(seeds, name, runs)
             own = {metric: values_of(runs, name, seeds, test_set, metric) for metric in _ACCURACY}
             shown = {metric: values[seeds.index(seed)] for metric, values in own.items()}
             row: dict[str, object] = {"estimator": name[0], "variant": name[1], "title": models[0].title, "test_set": test_set}
@@ -101,20 +100,14 @@ def leaderboard(artefacts: PartArtefacts) -> pd.DataFrame:
             row |= {"rmse_vy": shown["rmse_vy"], "rmse_vy_validation": values_of(runs, name, [seed], VALIDATION, "rmse_vy")[0]}
             row |= {**shown, _BOUND: values_of(runs, name, [seed], test_set, _BOUND)[0]}
             row |= {metric: of_model(runs, name, seed, metric) for metric in _OF_MODEL}
-            row["_place"] = ranking.order.index(name) if finite else math.inf
-            rows.append(row)
+            placed.append((ranking.order.index(name) if finite else math.inf, row))
+        rows += [row for _, row in sorted(placed, key=lambda pair: pair[0])]
     board = pd.DataFrame(rows)
     board["epochs"] = board["epochs"].where(board["epochs"] > 0)
-    order = {test_set: position for position, test_set in enumerate(artefacts.split.tests)}
-    board["_position"] = board["test_set"].map(order)
-    board = board.sort_values(["_position", "_place"], kind="stable")
-    return board.drop(columns=["_position", "_place"]).reset_index(drop=True)
+    return board
 
 
 _BOUND_SENTENCE = " Bound: the Cramér-Rao bound for what the estimator reads, as in the table of floors."
-
-
-# The leaderboard's parts
 
 
 def _spread_of(values: FloatArray) -> dict[str, float]:
@@ -144,8 +137,10 @@ def _headline(artefacts: PartArtefacts) -> list[Block]:
 
 def _where(artefacts: PartArtefacts, test_set: str) -> str:
     spans = artefacts.split.tests[test_set]
-    kind = " and ".join(sorted({artefacts.kinds[span.dataset] for span in spans}))
-    return f"test set `{test_set}` ({kind}; {_spans_in_words(artefacts, spans)})"
+    ranges = "; ".join(f"recording {as_text(span.recording)}, {_range_in_words(artefacts, span)}" for span in spans[:3])
+    if len(spans) > 3:
+        ranges = f"{len(spans)} ranges of {len({(span.dataset, span.recording) for span in spans})} recordings"
+    return f"test set `{test_set}` ({artefacts.kinds_of(spans)}; {ranges})"
 
 
 def data_sentence(artefacts: PartArtefacts) -> str:
@@ -163,10 +158,10 @@ def budget_sentence(artefacts: PartArtefacts) -> str:
     """How many estimators, seeds and epochs stand behind the numbers."""
     groups = by_name(artefacts.models)
     counts = sorted({len(models) for models in groups.values()})
-    seeds = f"{counts[0]} {_plural('seed', counts[0])} each" if len(counts) == 1 else f"{counts[0]} to {counts[-1]} seeds each"
-    words = f"Compared are {len(groups)} {_plural('estimator', len(groups))} with {seeds}, {len(artefacts.models)} fits in all"
+    seeds = f"{counts[0]} seed{'s' * (counts[0] != 1)} each" if len(counts) == 1 else f"{counts[0]} to {counts[-1]} seeds each"
+    words = f"Compared are {len(groups)} estimator{'s' * (len(groups) != 1)} with {seeds}, {len(artefacts.models)} fits in all"
     runs = runs_of(artefacts)
-    epochs = np.array([of_model(runs, (model.estimator, model.variant), model.seed, "epochs") for model in artefacts.models])
+    epochs = np.array([of_model(runs, model.name, model.seed, "epochs") for model in artefacts.models])
     if (epochs > 0).any():
         fewest, most = (fixed(float(limit), 0) for limit in (epochs[epochs > 0].min(), epochs[epochs > 0].max()))
         words += f"; training took {fewest} epochs a network" if fewest == most else f"; training took {fewest} to {most} epochs a network"
@@ -175,15 +170,15 @@ def budget_sentence(artefacts: PartArtefacts) -> str:
 
 def appendix_of(name: str, part: PartArtefacts) -> list[Block]:
     """How one of several parts was made; its tables are called after it."""
-    made = how_it_was_made(part)
-    lines = str(made[0]).replace("## Appendix: how it was made", f"## Appendix: {as_text(part.title)}, how it was made")
-    return [lines, *(replace(block, name=f"{block.name}_{name}") for block in made[1:] if isinstance(block, Table))]
+    made, ranges = how_it_was_made(part)
+    title = f"## Appendix: {as_text(part.title)}, how it was made"
+    return [made.replace("## Appendix: how it was made", title), replace(ranges, name=f"ranges_{name}")]
 
 
 CHOICE = "Seeds: of several seeds, the one with the lowest RMSE(v) on the validation range is shown. Test data choose nothing."
 
 
-def how_it_was_made(artefacts: PartArtefacts, choice: Sequence[str] = (CHOICE,)) -> list[Block]:
+def how_it_was_made(artefacts: PartArtefacts, choice: Sequence[str] = (CHOICE,)) -> tuple[str, Table]:
     """The appendix: command, protocol, how seeds or settings are chosen, budgets, and the table ``ranges``."""
     protocol = artefacts.protocol
     lines = [
@@ -195,10 +190,24 @@ def how_it_was_made(artefacts: PartArtefacts, choice: Sequence[str] = (CHOICE,))
         *choice,
         *artefacts.facts,
     ]
+    split = artefacts.split
+    roles = {"training": split.train, "validation": split.validation, **{f"test: {name}": spans for name, spans in split.tests.items()}}
+    rows = [
+        {
+            "role": role,
+            "dataset": artefacts.data_titles.get(span.dataset, span.dataset),
+            "kind": artefacts.kinds[span.dataset],
+            "recording": printable(span.recording),
+            "range": _range_in_words(artefacts, span),
+            "seconds": span.stop - span.start if math.isfinite(span.stop - span.start) else math.nan,
+        }
+        for role, spans in roles.items()
+        for span in spans
+    ]
     ranges = Table(
         "ranges",
         "What was used for what.",
-        _ranges(artefacts),
+        pd.DataFrame(rows),
         {
             "role": Column("role"),
             "dataset": Column("data set"),
@@ -208,53 +217,19 @@ def how_it_was_made(artefacts: PartArtefacts, choice: Sequence[str] = (CHOICE,))
             "seconds": Column("length [s]", decimals=0),
         },
     )
-    return ["## Appendix: how it was made\n\n" + "\n".join(f"- {line}" for line in lines), ranges]
+    return "## Appendix: how it was made\n\n" + "\n".join(f"- {line}" for line in lines), ranges
 
 
-def _ranges(artefacts: PartArtefacts) -> pd.DataFrame:
-    split = artefacts.split
-    roles = [("training", split.train), ("validation", split.validation)]
-    roles += [(f"test: {name}", spans) for name, spans in split.tests.items()]
-    rows = [
-        {
-            "role": role,
-            "dataset": artefacts.data_titles.get(span.dataset, span.dataset),
-            "kind": artefacts.kinds[span.dataset],
-            "recording": printable(span.recording),
-            "range": _range_in_words(span, _begin_of(artefacts, span)),
-            "seconds": span.stop - span.start if math.isfinite(span.stop - span.start) else math.nan,
-        }
-        for role, spans in roles
-        for span in spans
-    ]
-    return pd.DataFrame(rows)
-
-
-def _range_in_words(span: Span, begin: float = 0.0) -> str:
-    """A range; ``begin`` is where its recording starts if times are unix time, and is taken off [s]."""
+def _range_in_words(artefacts: PartArtefacts, span: Span) -> str:
+    """A range; of a recording in unix time, seconds after its start."""
+    file, begin = artefacts.references.get((span.dataset, span.recording)), 0.0
+    bounds = [bound for bound in (span.start, span.stop) if math.isfinite(bound)]
+    if file is not None and bounds and min(bounds) >= EARLIEST_UNIX:
+        begin = read_recording(file, ["vx"]).start_time
     start, stop, after = span.start - begin, span.stop - begin, " after its start" if begin else ""
     if span.start == -math.inf:
         return "all of it" if span.stop == math.inf else f"up to {stop:.7g} s{after}"
     return f"from {start:.7g} s{after}" if span.stop == math.inf else f"{start:.7g} to {stop:.7g} s{after}"
-
-
-def _begin_of(artefacts: PartArtefacts, span: Span) -> float:
-    """Where a recording in unix time starts [s]; 0 where its clock is another one."""
-    file = artefacts.references.get((span.dataset, span.recording))
-    bounds = [bound for bound in (span.start, span.stop) if math.isfinite(bound)]
-    if file is None or not bounds or min(bounds) < EARLIEST_UNIX:
-        return 0.0
-    return read_recording(file, ["vx"]).start_time
-
-
-def _spans_in_words(artefacts: PartArtefacts, spans: Sequence[Span]) -> str:
-    if len(spans) > 3:
-        return f"{len(spans)} ranges of {len({(span.dataset, span.recording) for span in spans})} recordings"
-    return "; ".join(f"recording {as_text(span.recording)}, {_range_in_words(span, _begin_of(artefacts, span))}" for span in spans)
-
-
-def _plural(word: str, count: int) -> str:
-    return word if count == 1 else f"{word}s"
 
 
 # One test set
@@ -280,14 +255,13 @@ def _test_set(artefacts: PartArtefacts, board: pd.DataFrame, test_set: str, line
     if by_regime is not None:
         blocks.append(by_regime)
     shown = _shown(finite, named)
-    drive = _Drive.of(artefacts, shown, test_set, lines)
     if len(shown) < len(finite):
         first = dict.fromkeys([chosen[named][0], finite.iloc[0]["title"]]) if named is not None and named in chosen else ()
         which = f"{', '.join(first)} and those" if first else "those"
         lowest = "with the lowest RMSE(v) on the validation range"
         blocks.append(f"The following figures show {len(shown)} of {len(finite)} estimators: {which} {lowest}.")
-    in_bands = {name: chosen[name] for name in drive.estimates}
-    return [*blocks, *band_blocks(artefacts, test_set, in_bands, lines, file), *_figures_of(drive, shown, file, lines)]
+    in_bands = {name: chosen[name] for name in zip(shown["estimator"], shown["variant"], strict=True)}
+    return [*blocks, *band_blocks(artefacts, test_set, in_bands, lines, file), *_figures_of(artefacts, shown, test_set, lines, file)]
 
 
 _INTERVAL = Column("95 % interval [deg]", bar=("rmse_sideslip", "rmse_sideslip_low", "rmse_sideslip_high"))
@@ -353,7 +327,7 @@ def _leaderboard_table(artefacts: PartArtefacts, board: pd.DataFrame, name: str,
 
 def _links(artefacts: PartArtefacts, board: pd.DataFrame) -> list[ModelLink]:
     """The chosen seed's model of each row; a report lies beside the other stages' folders, at OUTPUT/report/STUDY-KEY."""
-    folders = {(model.estimator, model.variant, model.seed): model.model_folder for model in artefacts.models}
+    folders = {(*model.name, model.seed): model.model_folder for model in artefacts.models}
     rows = [folders[row["estimator"], row["variant"], row["seed"]] for row in board.to_dict("records")]
     return [ModelLink(f"../../{own.parent.name}/{own.name}/", f"vehest estimate {own.name} lap.csv -o out.parquet") for own in rows]
 
@@ -365,46 +339,6 @@ def _shown(board: pd.DataFrame, named: Name | None = None) -> pd.DataFrame:
     sure = ours | (board.index == board.index[0]) if named else ours
     kept = board["rmse_vy_validation"].where(~sure, -math.inf).sort_values(kind="stable", na_position="last").index[:MOST_SHOWN]
     return board.loc[sorted(kept, key=lambda row: (not ours[row], row))]
-
-
-@dataclass(frozen=True, eq=False)
-class _Drive:
-    """All scored ranges of a test set on one time axis, with a gap of NaN between two ranges."""
-
-    time: FloatArray  # [s], shape (K,)
-    time_label: str  # label of that axis
-    reference: Scored  # measured; every array of shape (K,)
-    estimates: dict[Name, Scored]  # (estimator, variant) -> estimated
-    zoom: tuple[float, float]  # `ZOOM_SECONDS` with the largest mean square of the reference sideslip [s]
-    explorer: Explorer  # all of it and what was measured, for the page
-
-    @classmethod
-    def of(cls, artefacts: PartArtefacts, board: pd.DataFrame, test_set: str, lines: dict[Name, Line]) -> _Drive:
-        """Read the chosen seeds' estimates."""
-        models = {(model.estimator, model.variant, model.seed): model for model in artefacts.models}
-        rows = {(row["estimator"], row["variant"]): row for row in board.to_dict("records")}
-        shown = {name: (models[*name, row["seed"]], row["title"], lines[name]) for name, row in rows.items()}
-        parts = {name: artefacts.scored(model, test_set) for name, (model, _, _) in shown.items()}
-        step = 1.0 / artefacts.protocol.rate_hz
-        joined = {name: _joined(own, step) for name, own in parts.items()}
-        first = next(iter(parts.values()))
-        reference = next(iter(joined.values()))
-        label = "time [s]" if len(first) == 1 else "time, ranges end to end [s]"
-        zoom = _busiest(first, reference.time, step)
-        start = float(reference.time[0])
-        begin, words = (start, "time after the start [s]") if start >= EARLIEST_UNIX else (0.0, label)
-        axis = (start - begin, words, _gap_of(first), (zoom[0] - begin, zoom[1] - begin))
-        return cls(reference.time, label, reference, joined, zoom, explorer_of(artefacts, test_set, shown, parts, axis))
-
-    @property
-    def scored(self) -> np.ndarray[tuple[int], np.dtype[np.bool_]]:
-        """Which samples are samples, not gaps; shape (K,)."""
-        return ~np.isnan(self.reference.vy_ref)
-
-    @property
-    def has_ay(self) -> bool:
-        """Whether lateral acceleration was measured at every scored sample."""
-        return bool(np.isfinite(self.reference.ay[self.scored]).all())
 
 
 def _joined(parts: Sequence[Scored], step: float) -> Scored:
@@ -438,70 +372,71 @@ def _busiest(parts: Sequence[Scored], time: FloatArray, step: float) -> tuple[fl
     return float(time[first]), float(time[first + length - 1])
 
 
-def _figures_of(drive: _Drive, board: pd.DataFrame, file: str, lines: dict[Name, Line]) -> list[Block]:
-    titles = {(row["estimator"], row["variant"]): row["title"] for row in board.to_dict("records")}
-    reference = figures.Traces("measured", REFERENCE, drive.reference.vy_ref, np.degrees(drive.reference.sideslip_ref))
-    traces = [figures.Traces(titles[name], lines[name], own.vy, np.degrees(own.sideslip)) for name, own in drive.estimates.items()]
-    inside = (drive.time >= drive.zoom[0]) & (drive.time <= drive.zoom[1])
+def _figures_of(artefacts: PartArtefacts, board: pd.DataFrame, test_set: str, lines: dict[Name, Line], file: str) -> list[Block]:
+    """Traces and errors of the board's rows over all scored ranges of a test set, on one time axis with a gap of NaN between two ranges."""
+    models = {(*model.name, model.seed): model for model in artefacts.models}
+    rows = {(row["estimator"], row["variant"]): row for row in board.to_dict("records")}
+    shown = {name: (models[*name, row["seed"]], row["title"], lines[name]) for name, row in rows.items()}
+    parts = {name: artefacts.scored(model, test_set) for name, (model, _, _) in shown.items()}
+    step = 1.0 / artefacts.protocol.rate_hz
+    drives = {name: _joined(own, step) for name, own in parts.items()}
+    first, drive = next(iter(parts.values())), next(iter(drives.values()))
+    label = "time [s]" if len(first) == 1 else "time, ranges end to end [s]"
+    zoom, start = _busiest(first, drive.time, step), float(drive.time[0])
+    begin, words = (start, "time after the start [s]") if start >= EARLIEST_UNIX else (0.0, label)
+    axis = (start - begin, words, _gap_of(first), (zoom[0] - begin, zoom[1] - begin))
+    reference = figures.Traces("measured", REFERENCE, drive.vy_ref, np.degrees(drive.sideslip_ref))
+    traces = [figures.Traces(rows[name]["title"], lines[name], own.vy, np.degrees(own.sideslip)) for name, own in drives.items()]
+    inside = (drive.time >= zoom[0]) & (drive.time <= zoom[1])
     zoomed = [figures.Traces(t.label, t.line, t.vy[inside], t.sideslip[inside]) for t in (reference, *traces)]
-    scored = drive.scored
-    errors = [
-        figures.Errors(titles[name], lines[name], np.degrees(own.sideslip - own.sideslip_ref)[scored])
-        for name, own in drive.estimates.items()
-    ]
-    return [
+    scored = ~np.isnan(drive.vy_ref)  # samples, not gaps
+    errors = [(str(rows[name]["title"]), lines[name], np.degrees(own.sideslip - own.sideslip_ref)[scored]) for name, own in drives.items()]
+    has_ay = bool(np.isfinite(drive.ay[scored]).all())
+    found: list[Block] = [
         Figure(
             f"traces_{file}",
             "Lateral velocity and sideslip over the whole test set: measured (black, white on a dark page) and estimated "
             "(coloured), of each estimator the seed chosen on validation.",
-            figures.traces_figure(drive.time, reference, traces, drive.time_label),
-            drive.explorer,
+            figures.traces_figure(drive.time, reference, traces, label),
+            explorer_of(artefacts, test_set, shown, parts, axis),
         ),
         Figure(
             f"zoom_{file}",
-            f"The {drive.zoom[1] - drive.zoom[0]:.0f} s with the largest mean square of the measured sideslip: lateral velocity, sideslip, "
-            f"its error (estimate − measured){', and the measured lateral acceleration' * drive.has_ay}.",
-            figures.zoom_figure(
-                drive.time[inside], drive.reference.ay[inside] if drive.has_ay else None, zoomed[0], zoomed[1:], drive.time_label
-            ),
+            f"The {zoom[1] - zoom[0]:.0f} s with the largest mean square of the measured sideslip: lateral velocity, sideslip, "
+            f"its error (estimate − measured){', and the measured lateral acceleration' * has_ay}.",
+            figures.zoom_figure(drive.time[inside], drive.ay[inside] if has_ay else None, zoomed[0], zoomed[1:], label),
         ),
         Figure(
             f"errors_{file}",
             "Distribution of the sideslip error; the few errors beyond the axis are counted in its outermost bins.",
             figures.error_histogram(errors),
         ),
-        *([_errors_over_ay(drive, errors, file)] if drive.has_ay else []),
     ]
-
-
-def _errors_over_ay(drive: _Drive, errors: Sequence[figures.Errors], file: str) -> Figure:
-    return Figure(
-        f"errors_over_ay_{file}",
-        f"Sideslip error against the size of the measured lateral acceleration, in bins of 1 m/s²; bins of fewer than "
-        f"{figures.LEAST_SAMPLES} samples show no error.",
-        figures.error_over_ay(drive.reference.ay[drive.scored], errors),
-    )
+    if has_ay:
+        caption = (
+            "Sideslip error against the size of the measured lateral acceleration, in bins of 1 m/s²; bins of fewer than "
+            f"{figures.LEAST_SAMPLES} samples show no error."
+        )
+        found.append(Figure(f"errors_over_ay_{file}", caption, figures.error_over_ay(drive.ay[scored], errors)))
+    return found
 
 
 # The training
 
 
 def _training(artefacts: PartArtefacts, board: pd.DataFrame, lines: dict[Name, Line]) -> list[Block]:
-    models = {(model.estimator, model.variant, model.seed): model for model in artefacts.models}
+    models = {(*model.name, model.seed): model for model in artefacts.models}
     first = board[board["test_set"] == next(iter(artefacts.split.tests), "")]
     runs = []
     for row in _shown(first).to_dict("records"):
         name = (row["estimator"], row["variant"])
-        runs.append(figures.Learning.of(row["title"], lines[name], models[*name, row["seed"]].history()))
-    known = [run for run in runs if run is not None]
-    if not known:
+        history = models[*name, row["seed"]].history()
+        if history is not None and len(history) and set(figures.LOSSES) <= set(history):
+            runs.append((row["title"], lines[name], history))
+    if not runs:
         return []
-    return [
-        "## Training",
-        Figure(
-            "learning",
-            "Loss over the epochs of each chosen seed: mean squared error of v on training and validation ranges. The marker is where the "
-            "validation loss is lowest, whose weights are kept.",
-            figures.learning_curves(known, "loss [m²/s²]"),
-        ),
-    ]
+    caption = (
+        "Loss over the epochs of each chosen seed: mean squared error of v on training and validation ranges. The marker is where the "
+        "validation loss is lowest, whose weights are kept."
+    )
+    return ["## Training", Figure("learning", caption, figures.learning_curves(runs))]

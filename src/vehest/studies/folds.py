@@ -36,7 +36,7 @@ def documents(artefacts: StudyArtefacts) -> dict[str, Document]:
     folds = segments_of_folds(parts)
     first = next(iter(parts.values()))
     ranking = rank({name: [joined(own) for own in seeds] for name, seeds in folds.items()}, first.protocol.rate_hz)
-    titles = {(model.estimator, model.variant): as_text(model.title) for part in parts.values() for model in part.models}
+    titles = {model.name: as_text(model.title) for part in parts.values() for model in part.models}
     kinds = " and ".join(sorted(set(first.kinds.values())))
     number = f"all {len(parts)} folds" if set(artefacts.titles) <= set(parts) else f"{len(parts)} of {len(artefacts.titles)} folds"
     where = f"{number} ({kinds} data), each estimated by models that had not seen it"
@@ -52,7 +52,7 @@ def documents(artefacts: StudyArtefacts) -> dict[str, Document]:
     for name, part in parts.items():
         warned = [line for line in warnings_of(part) if "is left out" not in line]
         blocks.append(f"## Appendix: {as_text(part.title)}\n\n" + "\n".join(f"- {line}" for line in warned))
-        blocks += [replace(block, name=f"{block.name}_{name}") for block in how_it_was_made(part)[1:] if isinstance(block, Table)]
+        blocks.append(replace(how_it_was_made(part)[1], name=f"ranges_{name}"))
     if any(name[0] == "ksnn" for name in folds):
         blocks.append(PATENT_NOTE)
     return {REPORT: Document(artefacts.title, blocks)}

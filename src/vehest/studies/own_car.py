@@ -50,12 +50,15 @@ class Verdict:
 def documents(artefacts: StudyArtefacts) -> dict[str, Document]:
     """Verdict, errors as bars, traces with the estimator that is named and the next commands; folded on the page: the whole comparison."""
     part = artefacts.first
-    models = {name: verdict_of(part, name).model for name in part.split.tests}
-    compared = drive.comparison(part, {name: (own.estimator, own.variant) for name, own in models.items() if own is not None})
-    verdicts = [f"{'**On test set ' + as_code(name) + ':** ' if len(part.split.tests) > 1 else ''}{text}" for name, text in _verdicts(part)]
+    verdicts = {name: verdict_of(part, name) for name in part.split.tests}
+    compared = drive.comparison(part, {name: own.model.name for name, own in verdicts.items() if own.model is not None})
+    texts = [
+        f"{'**On test set ' + as_code(name) + ':** ' if len(verdicts) > 1 else ''}{' '.join(own.sentences)}"
+        for name, own in verdicts.items()
+    ]
     opening = next(n for n, block in enumerate(compared.blocks) if isinstance(block, str))  # bars, and traces where there are any
-    blocks: list[Block] = ["## Verdict\n\n" + "\n\n".join(verdicts), *compared.blocks[:opening]]
-    commands = "\n".join(_commands(part, artefacts.study))
+    blocks: list[Block] = ["## Verdict\n\n" + "\n\n".join(texts), *compared.blocks[:opening]]
+    commands = "\n".join(_commands(part, verdicts, artefacts.study))
     if commands:
         blocks.append(f"What to do next:\n\n```sh\n{commands}\n```")
     absent = not_compared(part)
@@ -71,13 +74,10 @@ def documents(artefacts: StudyArtefacts) -> dict[str, Document]:
 def verdict(artefacts: StudyArtefacts) -> list[str]:
     """The verdict as lines of plain text, next commands last."""
     part = artefacts.first
-    lines = [text.replace("**", "").replace("`", "") for _, text in _verdicts(part)]
-    commands = _commands(part, artefacts.study)
+    verdicts = {name: verdict_of(part, name) for name in part.split.tests}
+    lines = [" ".join(own.sentences).replace("**", "").replace("`", "") for own in verdicts.values()]
+    commands = _commands(part, verdicts, artefacts.study)
     return [*lines, *(["next:", *(f"  {command}" for command in commands)] if commands else [])]
-
-
-def _verdicts(part: PartArtefacts) -> list[tuple[str, str]]:
-    return [(name, " ".join(verdict_of(part, name).sentences)) for name in part.split.tests]
 
 
 def verdict_of(part: PartArtefacts, test_set: str) -> Verdict:
@@ -97,7 +97,7 @@ def verdict_of(part: PartArtefacts, test_set: str) -> Verdict:
     if silent:
         return Verdict((f"**These recordings cannot rank estimators**, because {listed(silent)}.", _wanted(part)), None)
     model = _to_go_on_with(part, ranking)
-    name = (model.estimator, model.variant)
+    name = model.name
     expected = f"RMSE(β) {_figure(ranking, name)} for {_reach(part, test_set)}"
     best, level = titles[ranking.order[0]], [titles[own] for own in ranking.not_told_apart]
     if ranking.winner is not None:
@@ -149,7 +149,7 @@ def _to_go_on_with(part: PartArtefacts, ranking: Ranking) -> EvaluatedModel:
 def _counted(part: PartArtefacts, test_set: str) -> str:
     """How much of a test the score counts, and the sideslip that the start of each range hides."""
     protocol, scored, hidden, standing = part.protocol, list[FloatArray](), list[FloatArray](), 0
-    ranges = pieces_of(part.split.tests[test_set], lambda span: read_recording(part.references[span.dataset, span.recording]), protocol)
+    ranges = pieces_of(part.split.tests[test_set], part.reference, protocol)
     for recording, piece in ranges:
         begin, (first, end) = recording.index_range(piece.start, piece.stop)[0], scored_range(recording, piece, protocol)
         still = np.hypot(recording["vx"], recording["vy_ref"]) < protocol.least_speed
@@ -169,9 +169,9 @@ def _counted(part: PartArtefacts, test_set: str) -> str:
     return f"{words}."
 
 
-def _commands(part: PartArtefacts, study: str) -> list[str]:
+def _commands(part: PartArtefacts, verdicts: Mapping[str, Verdict], study: str) -> list[str]:
     """What to run next, with the model of the first test set that has a verdict."""
-    models = [(own, spans[0].dataset) for name, spans in part.split.tests.items() if (own := verdict_of(part, name).model) is not None]
+    models = [(own.model, part.split.tests[name][0].dataset) for name, own in verdicts.items() if own.model is not None]
     if not models:
         return []
     name, dataset = models[0][0].model_folder.name, models[0][1]

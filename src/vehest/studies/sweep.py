@@ -144,7 +144,7 @@ def heat_maps(artefacts: SweepArtefacts, table: pd.DataFrame) -> list[Figure]:
         for key, own in table.groupby(switches, sort=False) if switches else [((), table)]:
             title = ", ".join(f"{names[switch]} = {shown_value(value)}" for switch, value in zip(switches, key, strict=True))
             panels.append(_panel(own, title, name, numeric, cells))
-        where = "the validation range" if name == VALIDATION else f"test set `{name}`"
+        where = _set_in_words(name)
         caption = (
             f"RMSE(β) on {where} over {across} and {up} ({_kinds(artefacts, name)}). In each cell the mean over seeds and, "
             f"below it, half its 95 % confidence interval. The frame marks the combination chosen on the validation range."
@@ -249,8 +249,7 @@ def _draw(axes: Any, panel: Panel, colours: Any, decimals: int) -> None:
 
 def _kinds(artefacts: SweepArtefacts, name: str) -> str:
     part = artefacts.part
-    spans = part.split.validation if name == VALIDATION else part.split.tests[name]
-    return " and ".join(sorted({part.kinds[span.dataset] for span in spans}))
+    return part.kinds_of(part.split.validation if name == VALIDATION else part.split.tests[name])
 
 
 def _chosen_sentence(artefacts: SweepArtefacts, table: pd.DataFrame) -> str:

@@ -35,7 +35,11 @@ def documents(artefacts: StudyArtefacts) -> dict[str, Document]:
     parts = artefacts.parts
     rankings = {(name, test_set): ranking_of(part, test_set) for name, part in parts.items() for test_set in part.split.tests}
     board = overview(parts, rankings)
-    blocks: list[Block] = [transfer_figure_of(board), *([artefacts.about] if artefacts.about.strip() else [])]
+    caption = (
+        "RMSE(β) over that of v = 0, with 95 % intervals: left of 1, an estimator knows more than nothing. The vertical line in each row "
+        "is the static map, which learns two numbers from the same ranges."
+    )
+    blocks: list[Block] = [Figure("transfer", caption, _drawn(board)), *([artefacts.about] if artefacts.about.strip() else [])]
     absent = [as_text(title) for name, title in artefacts.titles.items() if name not in parts]
     blocks.append(carried_over(board) + (f"\n\nNot here, since nothing could be trained or scored: {listed(absent)}." if absent else ""))
     blocks.append(_matrix(board))
@@ -49,6 +53,8 @@ def documents(artefacts: StudyArtefacts) -> dict[str, Document]:
 
 def overview(parts: Mapping[str, PartArtefacts], rankings: Mapping[tuple[str, str], Ranking]) -> pd.DataFrame:
     """One row an estimator, part and test set, baselines first: RMSE(β) over all seeds with its interval [deg], and what it beats."""
+    nothing: dict[str, Any] = dict.fromkeys(("rmse_sideslip_low", "rmse_sideslip_high"), math.nan)
+    nothing |= dict.fromkeys((*(f"beats_{baseline}" for baseline in BASELINES), "against_best"), MISSING)
     rows = []
     for (part, test_set), ranking in rankings.items():
         titles = {name: as_text(models[0].title) for name, models in by_name(parts[part].models).items()}
@@ -58,7 +64,7 @@ def overview(parts: Mapping[str, PartArtefacts], rankings: Mapping[tuple[str, st
             row: dict[str, Any] = {"part": part, "title": as_text(parts[part].title), "test_set": test_set}
             row |= {"estimator": name[0], "variant": name[1], "estimator_title": titles[name]}
             row |= {"rmse_sideslip": ranking.rmse.get(name, math.nan)}
-            row |= standing_columns(ranking, name) if name in ranking.rmse else _nothing()
+            row |= standing_columns(ranking, name) if name in ranking.rmse else nothing
             row |= _with_best_lever(parts[part], name, test_set)
             rows.append(row)
     return pd.DataFrame(rows)
@@ -75,31 +81,23 @@ def _with_best_lever(part: PartArtefacts, name: Name, test_set: str) -> dict[str
     return {"rmse_sideslip_best_lever": float(np.sqrt(np.mean(np.square(errors)))), "lever_arm": float(np.mean(arms))}
 
 
-def _nothing() -> dict[str, Any]:
-    missing = dict.fromkeys((*(f"beats_{baseline}" for baseline in BASELINES), "against_best"), MISSING)
-    return {"rmse_sideslip_low": math.nan, "rmse_sideslip_high": math.nan, **missing}
-
-
 def carried_over(board: pd.DataFrame) -> str:
     """Sentences: on which vehicles an estimator beats v = 0 and the static map, each by more than chance."""
     places = list(dict.fromkeys(zip(board["part"], board["test_set"], strict=True)))
     tested = board[~board["estimator"].isin(BASELINES)]
     beaten = tested[(tested["beats_zero"] == "yes") & (tested["beats_static_map"] == "yes")]
-    lines = []
+    lines, everywhere = [], []
     for title, own in tested.groupby("estimator_title", sort=False):
         names = beaten[beaten["estimator_title"] == title]
         where = [_place(row, board) for row in names.to_dict("records")]
+        if len(names) == len(own) == len(places):
+            everywhere.append(str(title))
         lines.append(f"- {title}: {len(names)} of {len(own)}{f' ({listed(where)})' if where else ''}")
-    everywhere = [str(title) for title, own in tested.groupby("estimator_title", sort=False) if _all_beaten(own, beaten, len(places))]
     if everywhere:
         first = f"On every one of {len(places)} tests {listed(everywhere)} beat v = 0 and the static map, each by more than chance."
     else:
         first = f"**No estimator beats both v = 0 and the static map on each of the {len(places)} tests.**"
     return f"{first} Vehicles are few, so nothing here is an interval over vehicles. Tests on which both are beaten:\n\n" + "\n".join(lines)
-
-
-def _all_beaten(own: pd.DataFrame, beaten: pd.DataFrame, number: int) -> bool:
-    return len(own) == number and len(beaten[beaten["estimator_title"].isin(own["estimator_title"])]) == number
 
 
 def _place(row: Mapping[Any, Any], board: pd.DataFrame) -> str:
@@ -108,24 +106,20 @@ def _place(row: Mapping[Any, Any], board: pd.DataFrame) -> str:
 
 
 def _matrix(board: pd.DataFrame) -> Table:
-    places = list(dict.fromkeys(zip(board["part"], board["test_set"], strict=True)))
-    titles = list(dict.fromkeys(board["estimator_title"]))
-    rows = []
-    for title in titles:
-        row: dict[str, Any] = {"estimator": title}
-        for place, (part, test_set) in enumerate(places):
-            found = board[(board["estimator_title"] == title) & (board["part"] == part) & (board["test_set"] == test_set)]
-            row[f"place_{place}"] = _cell(found.to_dict("records")[0]) if len(found) else MISSING
-        rows.append(row)
-    firsts = [board[(board["part"] == part) & (board["test_set"] == test_set)].to_dict("records")[0] for part, test_set in places]
+    rows: dict[str, dict[str, Any]] = {title: {"estimator": title} for title in board["estimator_title"]}
     columns = {"estimator": Column("estimator")}
-    columns |= {f"place_{place}": Column(_place(row, board)) for place, row in enumerate(firsts)}
+    for place, (_, own) in enumerate(board.groupby(["part", "test_set"], sort=False)):
+        found = own.drop_duplicates("estimator_title").to_dict("records")
+        cells = {row["estimator_title"]: _cell(row) for row in found}
+        columns[f"place_{place}"] = Column(_place(found[0], board))
+        for title, row in rows.items():
+            row[f"place_{place}"] = cells.get(title, MISSING)
     caption = (
         "RMSE(β) [deg] over all seeds, with its 95 % interval over blocks of the drives and seeds. * beats v = 0 and the static map, each "
         "by more than chance, corrected by Holm within the test. – lacks a channel, failed or has no finite error. Inputs may differ from "
         "vehicle to vehicle under one name; they stand in the pipeline's file."
     )
-    return Table("overview", caption, pd.DataFrame(rows), columns)
+    return Table("overview", caption, pd.DataFrame(list(rows.values())), columns)
 
 
 def _cell(row: Mapping[Any, Any]) -> str:
@@ -136,15 +130,6 @@ def _cell(row: Mapping[Any, Any]) -> str:
     low, high = row["rmse_sideslip_low"], row["rmse_sideslip_high"]
     interval = f" [{fixed(low, decimals)}, {fixed(high, decimals)}]" if math.isfinite(low) else ""
     return f"{fixed(row['rmse_sideslip'], decimals)}{interval}{mark}"
-
-
-def transfer_figure_of(board: pd.DataFrame) -> Figure:
-    """Errors of every estimator on every test over that of v = 0."""
-    caption = (
-        "RMSE(β) over that of v = 0, with 95 % intervals: left of 1, an estimator knows more than nothing. The vertical line in each row "
-        "is the static map, which learns two numbers from the same ranges."
-    )
-    return Figure("transfer", caption, _drawn(board))
 
 
 def _drawn(board: pd.DataFrame) -> MatplotlibFigure:
@@ -200,7 +185,7 @@ def _part(name: str, part: PartArtefacts, board: pd.DataFrame, rankings: Mapping
     titles: dict[Name, str] = {own: as_text(models[0].title) for own, models in by_name(part.models).items()}
     blocks: list[Block] = [f"## {as_text(part.title)}", data_sentence(part)]
     for test_set in part.split.tests:
-        kinds = " and ".join(sorted({part.kinds[span.dataset] for span in part.split.tests[test_set]}))
+        kinds = part.kinds_of(part.split.tests[test_set])
         blocks.append(verdict_sentences(rankings[name, test_set], titles, f"test set `{test_set}` ({kinds})"))
     warned = warnings_of(part)
     if warned:

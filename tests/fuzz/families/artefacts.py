@@ -4,6 +4,7 @@ import json
 import os
 import sqlite3
 import struct
+from unittest.mock import patch
 
 import yaml
 
@@ -101,14 +102,11 @@ def model(case):
 def unfinished(folder):
     """An output root with the checkpoint of a training that was killed."""
     from vehest.run import group
+    from vehest.run.artefacts import StagePlan
 
     drives(folder)
-    kept = group.drop_checkpoint
-    group.drop_checkpoint = lambda path: None
-    try:
+    with patch.object(group, "drop_checkpoint"), patch.object(StagePlan, "drop"):
         run("train", *KSNN, "training.checkpoint_seconds=1e-9", "--quiet")
-    finally:
-        group.drop_checkpoint = kept
     if not list((folder / "outputs" / "checkpoints").rglob("*.safetensors")):
         raise RuntimeError("no checkpoint was left")
     for file in (folder / "outputs" / "train").glob("*/*"):

@@ -61,7 +61,7 @@ class Recursion(NamedTuple):
                 `vehest.training.supervised_settings.SupervisedSettings`.
         """
         losses = np.zeros(len(flat))
-        self._over(flat, series, starts, targets, batch, np.empty_like(flat), losses, (*adam, *DECAYS, EPSILON))
+        self._over(flat, series, starts, targets, batch, np.empty_like(flat), losses, (*adam[:-1], *DECAYS, EPSILON, adam[-1]))
         return losses
 
     def _over(
@@ -123,7 +123,7 @@ def step_of_adam(flat, gradient, adam, m, batches):  # type: ignore[no-untyped-d
 
     The average of the parameters is θ̄ₜ = (1 − a)/(1 − aᵗ)·Σᵢ aᵗ⁻ⁱ θᵢ over the steps i = 1 … t (Section 7.2).
     """
-    first, second, average, bounds, before, rate, averaging, decay, decay_of_squares, epsilon = adam
+    first, second, average, bounds, before, rate, decay, decay_of_squares, epsilon, averaging = adam
     number, t = flat.dtype.type, before + batches
     size, root = number(rate / (1 - decay**t)), number(np.sqrt(1 - decay_of_squares**t))
     for j in range(flat.size):

@@ -23,15 +23,6 @@ LAUNCHERS = ("local", "ray", "slurm")
 
 
 @dataclass(frozen=True)
-class LauncherOptions:
-    """Where trainings run: one of `LAUNCHERS`, the address of a cluster, and resources of SLURM jobs as ``NAME=VALUE``."""
-
-    launcher: str = "local"
-    address: str | None = None
-    slurm: Sequence[str] = ()
-
-
-@dataclass(frozen=True)
 class RunOptions:
     """Options of a command that runs stages: as `vehest run --help` describes them; no ``jobs`` is one a core, ``track`` logs runs."""
 
@@ -41,8 +32,10 @@ class RunOptions:
     jobs: int | None = None
     track: bool = False
     minutes: float | None = None
-    launcher: LauncherOptions = LauncherOptions()
     retrain: bool = False
+    launcher: str = "local"  # one of `LAUNCHERS`
+    address: str | None = None  # of a cluster
+    slurm: Sequence[str] = ()  # resources of SLURM jobs, NAME=VALUE
 
 
 class Launcher(Protocol):
@@ -58,12 +51,12 @@ class Launcher(Protocol):
         """Release processes and connections."""
 
 
-def chosen_launcher(options: LauncherOptions, jobs: int | None, output: Path, messages: Messages) -> Launcher:
+def chosen_launcher(options: RunOptions, output: Path, messages: Messages) -> Launcher:
     """A command's launcher; without ``jobs`` it runs as many groups at a time as cores; raises `ConfigurationError` or `MissingError`."""
-    name = options.launcher
+    name, address, jobs = options.launcher, options.address, options.jobs
     if name not in LAUNCHERS:
         raise ConfigurationError(f"--launcher must be one of {', '.join(LAUNCHERS)}, not '{name}'")
-    if options.address and name == "local":
+    if address and name == "local":
         raise ConfigurationError("--address is for --launcher ray and slurm, not for local")
     if options.slurm and name != "slurm":
         raise ConfigurationError(f"--slurm is for --launcher slurm, not for {name}")
@@ -73,11 +66,11 @@ def chosen_launcher(options: LauncherOptions, jobs: int | None, output: Path, me
         return LocalLauncher(jobs or default_jobs())
     from vehest.run.launchers.clusters import RayLauncher, SlurmLauncher, slurm_parameters
 
-    if name == "slurm" and options.address not in (None, "local"):
-        raise ConfigurationError(f"--address must be left out for --launcher slurm, or be 'local' to try it here, not '{options.address}'")
+    if name == "slurm" and address not in (None, "local"):
+        raise ConfigurationError(f"--address must be left out for --launcher slurm, or be 'local' to try it here, not '{address}'")
     parameters, package = slurm_parameters(options.slurm), "submitit" if name == "slurm" else "ray"
     if importlib.util.find_spec(package) is None:
         raise MissingError(f"--launcher {name} needs {package}, which is not installed: pip install 'vehest[{name}]'")
     if name == "slurm":
-        return SlurmLauncher(options.address or "slurm", jobs, parameters, output, messages)
-    return RayLauncher(options.address, jobs, output, messages)
+        return SlurmLauncher(address or "slurm", jobs, parameters, output, messages)
+    return RayLauncher(address, jobs, output, messages)

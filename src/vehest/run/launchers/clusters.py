@@ -111,7 +111,7 @@ def inputs_of(group: Group) -> set[Path]:
 
 def folders_of(members: Sequence[Member]) -> set[Path]:
     """Folders of the artefacts of members."""
-    return {own.folder for member in members for own in (member.model, member.calibration, member.evaluation) if own is not None}
+    return {own.folder for member in members for own in member.made}
 
 
 def pack(folders: set[Path]) -> Files:

@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 
 import pandas as pd
 
-from vehest.data.store import read_recording
 from vehest.evaluation.floors import SETS, Floor, cramer_rao_floor, drives_of, reference_floor, reference_spread
 from vehest.evaluation.regimes import AY_BANDS, LEAST_SECONDS, REGIMES, STRAIGHT_YAW_RATE, TRANSIENT
 from vehest.report.document import Column, Table
@@ -18,21 +16,9 @@ from vehest.studies.kit.runs import Name
 SYMBOLS = {"vx": "u", "yaw_rate": "ω", "ay": "a_y", "ax": "a_x", "steer": "δ"}
 
 
-@dataclass(frozen=True)
-class Row:
-    """A line of the table of floors."""
-
-    what: str  # for people
-    inputs: str  # that are read, in symbols
-    floor: Floor  # standard deviations
-    share: float  # of the mean square of v that it comes to
-
-
-def floors_of(part: PartArtefacts, test_set: str) -> list[Row]:
+def floors_table(part: PartArtefacts, test_set: str, name: str) -> Table:
     """The reference's spread and noise, then the bounds without and with the car by set of inputs, of those that were measured."""
-    drives = drives_of(
-        part.split.tests[test_set], lambda span: read_recording(part.references[span.dataset, span.recording]), part.protocol
-    )
+    drives = drives_of(part.split.tests[test_set], part.reference, part.protocol)
     spread = reference_spread(drives)
     found: list[tuple[str, str, Floor | None]] = [
         ("v = 0: the reference itself", MISSING, spread),
@@ -42,19 +28,11 @@ def floors_of(part: PartArtefacts, test_set: str) -> list[Row]:
         for inputs in SETS:
             if car or ("ay" in inputs and "steer" not in inputs):
                 found.append((what, ", ".join(SYMBOLS[name] for name in inputs), cramer_rao_floor(drives, inputs, car=car)))
-    return [
-        Row(what, inputs, floor, (floor.vy / spread.vy) ** 2 if spread.vy > 0 else float("nan"))
-        for what, inputs, floor in found
-        if floor is not None
-    ]
-
-
-def floors_table(part: PartArtefacts, test_set: str, name: str) -> Table:
-    """Table of `floors_of`."""
-    rows = [
-        {"what": row.what, "inputs": row.inputs, "vy": row.floor.vy, "sideslip": row.floor.sideslip, "share": row.share}
-        for row in floors_of(part, test_set)
-    ]
+    rows = []
+    for what, symbols, floor in found:
+        if floor is not None:
+            share = (floor.vy / spread.vy) ** 2 if spread.vy > 0 else float("nan")
+            rows.append({"what": what, "inputs": symbols, "vy": floor.vy, "sideslip": floor.sideslip, "share": share})
     return Table(
         name,
         f"What the drive of test set `{test_set}` can show, root mean square over the scored samples: the reference, the white noise in it "

@@ -10,13 +10,12 @@ from vehest.constants import FloatArray
 from vehest.data.channels import CHANNELS
 from vehest.data.recording import Recording
 from vehest.data.splits import Span
-from vehest.data.store import read_recording
 from vehest.evaluation.metrics import Scored, pieces_of, scored_range
 from vehest.report.explorer import Candidate, Explorer, Signal, reckoned_course
 from vehest.report.style import Line
 from vehest.studies.artefacts import EvaluatedModel, PartArtefacts
 from vehest.studies.kit.runs import Name
-from vehest.trust.health import HealthModel, health_rows
+from vehest.trust.health import health_rows
 from vehest.trust.record import TRUST, read_trust
 
 MOST_INPUTS = 16
@@ -40,7 +39,7 @@ def explorer_of(
     """
     start, label, gap, zoom = axis
     spans = artefacts.split.tests[test_set]
-    pieces = list(pieces_of(spans, lambda span: read_recording(artefacts.references[span.dataset, span.recording]), artefacts.protocol))
+    pieces = list(pieces_of(spans, artefacts.reference, artefacts.protocol))
     skip = artefacts.protocol.skip_seconds
     parts = [recording.cut(max(piece.start, recording.start_time) + skip, piece.stop) for recording, piece in pieces]
 
@@ -94,14 +93,13 @@ def health_over(model: EvaluatedModel, pieces: Sequence[tuple[Recording, Span]],
         return None
     if not all(name in recording for recording, _ in pieces for name in health.channels):
         return None
-    return chained([_health_of(health, recording, piece, artefacts) for recording, piece in pieces], gap)
-
-
-def _health_of(health: HealthModel, recording: Recording, piece: Span, artefacts: PartArtefacts) -> FloatArray:
-    first, end = scored_range(recording, piece, artefacts.protocol)
-    begin = recording.index_range(max(piece.start, recording.start_time) - artefacts.protocol.warm_up_seconds, piece.stop)[0]
-    rows = np.ascontiguousarray(recording.stack(health.channels)[begin:end])
-    return health_rows(health.packed(), rows, np.isfinite(rows), health.start()).status[first - begin :]
+    found = []
+    for recording, piece in pieces:
+        first, end = scored_range(recording, piece, artefacts.protocol)
+        begin = recording.index_range(max(piece.start, recording.start_time) - artefacts.protocol.warm_up_seconds, piece.stop)[0]
+        rows = np.ascontiguousarray(recording.stack(health.channels)[begin:end])
+        found.append(health_rows(health.packed(), rows, np.isfinite(rows), health.start()).status[first - begin :])
+    return chained(found, gap)
 
 
 def _signal(name: str, values: FloatArray) -> Signal:

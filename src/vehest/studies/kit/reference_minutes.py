@@ -11,12 +11,12 @@ import re
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from itertools import groupby
 from pathlib import Path
 
 import pandas as pd
 
 from vehest.data.splits import Span
-from vehest.data.store import read_recording
 from vehest.evaluation.blocks import Segments
 from vehest.evaluation.ranking import BASELINES, Name, Ranking, rank
 from vehest.report.document import Block, Column, Figure, Table, as_text
@@ -83,7 +83,7 @@ def _curve(test_set: str, parts: Sequence[PartArtefacts]) -> Curve:
     for part in parts:
         minutes = _asked_for(part, minutes_of(part))
         for model in part.models:
-            models.setdefault((model.estimator, model.variant, start_of(model), minutes), []).append(model)
+            models.setdefault((*model.name, start_of(model.training), minutes), []).append(model)
     counts = Counter((estimator, variant) for estimator, variant, _, _ in models)
     points = {
         Point(estimator, variant, as_text(own[0].title.removesuffix(start_in_words(own[0].training))), start, minutes, len(own)): own
@@ -112,16 +112,16 @@ def _asked_for(part: PartArtefacts, minutes: float) -> float:
     return asked if abs(minutes - asked) <= NEARLY * asked else round(minutes, 2)
 
 
-def start_of(model: EvaluatedModel) -> str:
+def start_of(training: Mapping[str, object]) -> str:
     """What a training started from, for people."""
-    start = model.training.get("start_from")
+    start = training.get("start_from")
     return SCRATCH if start is None else f"from {Path(str(start)).name}"
 
 
 def start_in_words(training: Mapping[str, object]) -> str:
     """Behind a title: ``, starting from MODEL``; empty where a training starts from nothing."""
-    start = training.get("start_from")
-    return "" if start is None else f", starting from {Path(str(start)).name}"
+    start = start_of(training)
+    return "" if start == SCRATCH else f", starting {start}"
 
 
 def minutes_of(part: PartArtefacts) -> float:
@@ -130,7 +130,7 @@ def minutes_of(part: PartArtefacts) -> float:
     for span in (*part.split.train, *part.split.validation):
         start, stop = span.start, span.stop
         if not (math.isfinite(start) and math.isfinite(stop)):
-            recording = read_recording(part.references[span.dataset, span.recording], ["vx"])
+            recording = part.reference(span, ["vx"])
             start, stop = max(start, recording.start_time), min(stop, recording.end_time)
         seconds += stop - start
     return seconds / 60.0
@@ -157,20 +157,15 @@ def blocks_of_curve(curve: Curve, name: str) -> list[Block]:
 
 def rows_of_curve(curve: Curve) -> list[dict[str, object]]:
     """A row a point: title, start, minutes, RMSE(β) [deg], its interval in words, trainings, and how it stands to one from scratch."""
-    return [_row(curve, point) for point in curve.points if point.estimator != BASELINES[0]]
-
-
-def _row(curve: Curve, point: Point) -> dict[str, object]:
-    low, high = curve.interval(point)
-    return {
-        "title": point.title,
-        "start": point.start,
-        "minutes": point.minutes,
-        "rmse_sideslip": curve.ranking.rmse[point.name],
-        "interval": f"{fixed(low, 3)} … {fixed(high, 3)}" if math.isfinite(low) else "–",
-        "n_trainings": point.n_trainings,
-        "against_scratch": _against_scratch(curve, point) or "–",
-    }
+    rows: list[dict[str, object]] = []
+    for point in curve.points:
+        if point.estimator != BASELINES[0]:
+            low, high = curve.interval(point)
+            row = {key: getattr(point, key) for key in ("title", "start", "minutes")}
+            row |= {"rmse_sideslip": curve.ranking.rmse[point.name]}
+            row |= {"interval": f"{fixed(low, 3)} … {fixed(high, 3)}" if math.isfinite(low) else "–", "n_trainings": point.n_trainings}
+            rows.append(row | {"against_scratch": _against_scratch(curve, point) or "–"})
+    return rows
 
 
 def _against_scratch(curve: Curve, point: Point) -> str:
@@ -179,16 +174,16 @@ def _against_scratch(curve: Curve, point: Point) -> str:
     return own.verdict if own is not None else ""
 
 
+def _lines(curve: Curve) -> list[list[Point]]:
+    """Points by estimator and start, each with more minutes than the one before; none of v = 0."""
+    groups = groupby(curve.points, key=lambda point: (point.estimator, point.variant, point.start))
+    return [list(own) for key, own in groups if key[0] != BASELINES[0]]
+
+
 def _in_words(curve: Curve) -> str:
     """What more reference brings to each estimator, and what starting from another model does; only what is more than chance."""
     sentences = []
-    for key in dict.fromkeys(
-        (point.estimator, point.variant, point.start) for point in curve.points if point.estimator not in BASELINES[:1]
-    ):
-        own = [point for point in curve.points if (point.estimator, point.variant, point.start) == key]
-        if len(own) < 2:
-            continue
-        first, last = own[0], own[-1]
+    for first, *_, last in (own for own in _lines(curve) if len(own) > 1):
         how = "" if first.start == SCRATCH else f" ({first.start})"
         sentences.append(
             f"{first.title}{how}: {fixed(curve.ranking.rmse[first.name], 2)}° after {first.minutes:g} min of reference, "
@@ -213,16 +208,13 @@ def _figure(curve: Curve) -> MatplotlibFigure:
     ranking = curve.ranking
     with new_figure(DOUBLE_COLUMN, 3.2) as figure:
         axes = figure.subplots()
-        keys = list(
-            dict.fromkeys((point.estimator, point.variant, point.start) for point in curve.points if point.estimator != BASELINES[0])
-        )
-        for shift, key in enumerate(keys):
-            own = [point for point in curve.points if (point.estimator, point.variant, point.start) == key]
-            line = line_of(key[0], key[1])
-            apart = 1.03 ** (shift - len(keys) / 2)
+        drawn = _lines(curve)
+        for shift, own in enumerate(drawn):
+            line, start = line_of(own[0].estimator, own[0].variant), own[0].start
+            apart = 1.03 ** (shift - len(drawn) / 2)
             minutes, errors = [point.minutes * apart for point in own], [ranking.rmse[point.name] for point in own]
-            dash = "solid" if key[2] == SCRATCH else "dashed"
-            label = own[0].title + ("" if key[2] == SCRATCH else f", {key[2]}")
+            dash = "solid" if start == SCRATCH else "dashed"
+            label = own[0].title + ("" if start == SCRATCH else f", {start}")
             axes.plot(minutes, errors, color=line.colour, linestyle=dash, marker=line.marker, markersize=3.5, linewidth=1.1, label=label)
             for at, point in zip(minutes, own, strict=True):
                 low, high = curve.interval(point)

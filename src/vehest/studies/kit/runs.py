@@ -61,7 +61,7 @@ def by_name(models: Iterable[EvaluatedModel]) -> dict[Name, list[EvaluatedModel]
     """Models by estimator and variant, in their order."""
     groups: dict[Name, list[EvaluatedModel]] = {}
     for model in models:
-        groups.setdefault((model.estimator, model.variant), []).append(model)
+        groups.setdefault(model.name, []).append(model)
     return groups
 
 

@@ -27,7 +27,9 @@ def standing_columns(ranking: Ranking, name: Name) -> dict[str, str | float]:
     low, high = ranking.intervals.get(name, (math.nan, math.nan))
     columns: dict[str, str | float] = {"rmse_sideslip_low": low, "rmse_sideslip_high": high}
     for baseline in BASELINES:
-        columns[f"beats_{baseline}"] = _answer(ranking, name, baseline)
+        compared = name[0] not in BASELINES and ranking.intervals and baseline not in ranking.missing_baselines
+        answers = {True: "yes", False: "no", None: "not told apart"}
+        columns[f"beats_{baseline}"] = answers[ranking.beats(name, baseline)] if compared else MISSING
     columns["against_best"] = _against_best(ranking, name)
     return columns
 
@@ -38,23 +40,13 @@ def interval_in_words(row: Mapping[Any, Any], decimals: int) -> str:
     return f"{fixed(low, decimals)} … {fixed(high, decimals)}" if math.isfinite(low) else MISSING
 
 
-def _answer(ranking: Ranking, name: Name, baseline: str) -> str:
-    if name[0] in BASELINES or not ranking.intervals or baseline in ranking.missing_baselines:
-        return MISSING
-    return {True: "yes", False: "no", None: "not told apart"}[ranking.beats(name, baseline)]
-
-
 def _against_best(ranking: Ranking, name: Name) -> str:
     if name == ranking.order[0]:
         return "lowest"
     own = ranking.against_best.get(name)
-    if own is None:
-        return MISSING
-    return (
-        "not told apart"
-        if own.verdict == "not told apart"
-        else f"+{fixed(-own.difference, 3)} [{fixed(-own.high, 3)}, {fixed(-own.low, 3)}]"
-    )
+    if own is None or own.verdict == "not told apart":
+        return MISSING if own is None else own.verdict
+    return f"+{fixed(-own.difference, 3)} [{fixed(-own.high, 3)}, {fixed(-own.low, 3)}]"
 
 
 def verdict_sentences(ranking: Ranking, titles: Mapping[Name, str], where: str) -> str:

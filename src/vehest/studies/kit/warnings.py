@@ -10,7 +10,6 @@ import numpy as np
 from vehest.alignment.standstill import STANDSTILL_SPEED
 from vehest.constants import FloatArray
 from vehest.data.splits import Span
-from vehest.data.store import read_recording
 from vehest.report.document import as_code, as_text
 from vehest.report.style import listed
 from vehest.studies.artefacts import PartArtefacts
@@ -108,11 +107,9 @@ def _kinds(artefacts: PartArtefacts) -> list[str]:
             found.append(
                 f"Test set `{test_set}` stays well below the training ranges in {listed(short)}: it is easier than what was learnt."
             )
-        kinds = {artefacts.kinds[span.dataset] for span in spans}, {artefacts.kinds[span.dataset] for span in artefacts.split.train}
+        kinds = [artefacts.kinds_of(own) for own in (spans, artefacts.split.train)]
         if kinds[0] != kinds[1]:
-            found.append(
-                f"Test set `{test_set}` is {' and '.join(sorted(kinds[0]))}, the training ranges are {' and '.join(sorted(kinds[1]))}."
-            )
+            found.append(f"Test set `{test_set}` is {kinds[0]}, the training ranges are {kinds[1]}.")
     return found
 
 
@@ -135,7 +132,7 @@ def _reference(artefacts: PartArtefacts, spans: Sequence[Span]) -> dict[str, Flo
     for span in spans:
         if (span.dataset, span.recording) not in artefacts.references:
             continue
-        recording = read_recording(artefacts.references[span.dataset, span.recording])
+        recording = artefacts.reference(span)
         own = recording.cut(max(span.start, -math.inf), span.stop)
         if "ay" not in own:
             parts.pop("ay", None)
