@@ -196,7 +196,7 @@ def plain(task: Problem) -> Any:
     )
     initial = _factor(car_filter.initial_noise.factor, car_filter.initial_noise.unit)
     mean = drives.states[:, 0]
-    covariance = (initial @ initial.mT + car_filter.initial_noise.floor * torch.eye(n)).expand(len(mean), n, n)
+    covariance = (initial @ initial.mT + FLOOR * torch.eye(n)).expand(len(mean), n, n)
     means = []
     for k in range(drives.states.shape[1]):
         if k:

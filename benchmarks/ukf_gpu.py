@@ -185,7 +185,7 @@ class Filter(torch.nn.Module):
         """Covariance at the start, (count, 5, 5)."""
         noise = self.own.initial_noise
         entries = noise.factor * noise.unit[torch.tril_indices(5, 5, device=noise.factor.device)[0]]
-        return (product(entries, 5) + noise.floor * torch.eye(5, device=entries.device)).expand(count, 5, 5)
+        return (product(entries, 5) + FLOOR * torch.eye(5, device=entries.device)).expand(count, 5, 5)
 
 
 def product(entries: Tensor, n: int) -> Tensor:

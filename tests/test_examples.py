@@ -1,6 +1,7 @@
 """The worked examples of docs/adding_an_estimator.md: found through entry points, trained, run online, saved, compared."""
 
 import re
+from importlib import import_module
 from pathlib import Path
 
 import numpy as np
@@ -99,6 +100,15 @@ def test_example_that_was_trained_is_not_trained_again_unless_a_setting_changes(
     words = ["train", "split=mine", "estimator=sliding_mode", *QUICK["sliding_mode"], "tracking=none"]
     assert [examples.told(*words, *more)["skipped"] for more in ((), (), ("estimator.injection=6.0",))] == [False, True, False]
     assert len(list((examples.folder / "outputs" / "train").iterdir())) == 2
+
+
+def test_saturating_axles_are_linearised_by_their_slope(examples):
+    example, car, inputs = import_module("saturating_ekf"), (1500.0, 2500.0, 1.2, 1.4, 9e4, 1.1e5, 0.9, 0.02), np.array([20.0, 0.1])
+    state, step = np.array([-0.8, 0.4]), 1e-5
+    value, slope = example.linearised(state, inputs, car)
+    around = [[example.model(state + side * step * axis, inputs, car) for side in (1, -1)] for axis in np.eye(2)]
+    np.testing.assert_array_equal(value, example.model(state, inputs, car))
+    np.testing.assert_allclose(slope, np.stack([(after - before) / (2 * step) for after, before in around], 1), atol=1e-6)
 
 
 def block_with(words):

@@ -1,8 +1,10 @@
 """The plant: library's equations, what was added to them, and that it holds from standstill to a spin."""
 
+import fcntl
 import math
 from dataclasses import fields
 from functools import cache
+from threading import Event, Thread
 from types import FunctionType
 
 import numpy as np
@@ -394,6 +396,22 @@ def test_no_state_becomes_infinite_between_standstill_and_70_m_per_s(vehicle):
                 assert abs(state.values[ROLL]) < (0.3 if vehicle.name.startswith("set") else 0.2)  # the published springs are soft
 
 
+def test_first_call_waits_for_another_process_that_compiles(monkeypatch):
+    function, called = compiled._Kept(compiled._advance), Event()
+    assert function.lock is not None
+    monkeypatch.setattr(function, "dispatcher", called.set)
+    first = Thread(target=function)
+    with function.lock.open("w") as file:
+        fcntl.flock(file, fcntl.LOCK_EX)
+        first.start()
+        assert not called.wait(0.3)
+    assert called.wait(10.0)
+    first.join()
+    with function.lock.open("w") as file:
+        fcntl.flock(file, fcntl.LOCK_EX)
+        function()  # later calls do not
+
+
 def test_no_kind_of_array_is_compiled_for_twice():
     plant, state = MultiBodyPlant(FERRARI), MultiBodyPlant(FERRARI).initial_state(0.0, 0.0, 0.0, 20.0)
     read_only, columns = np.broadcast_to(inputs_of(), (3, 5)), np.zeros((3, 10), order="F")[:, ::2]
@@ -401,4 +419,4 @@ def test_no_kind_of_array_is_compiled_for_twice():
         for friction in (1.0, [1, 1, 1], np.broadcast_to(1.0, 3)):
             plant.motion([state] * 3, inputs, 100.0, friction=friction)
         plant.advance(state, inputs[0], 1)
-    assert [len(function.signatures) for function in (compiled.advance, compiled.evaluate)] == [1, 1]
+    assert [len(function.dispatcher.signatures) for function in (compiled.advance, compiled.evaluate)] == [1, 1]

@@ -136,7 +136,7 @@ class Estimator(ABC):
         self.check()
 
     def check(self) -> None:  # noqa: B027 (most families have nothing to check)
-        """Check settings against each other; raises `ConfigurationError`: they do not fit."""
+        """Check settings against each other; raises `ConfigurationError` where they do not fit."""
 
     @property
     def rate_hz(self) -> float:

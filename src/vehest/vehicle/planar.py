@@ -56,7 +56,7 @@ class PlanarCar(nn.Module):
     def __init__(self, car: Mapping[str, float] = F1TENTH) -> None:
         super().__init__()
         self.mass, self.wheelbase, self.wheel_radius = (car[name] for name in KNOWN)
-        self.learnt = PositiveParameters({name: car[name] for name in LEARNT})
+        self.learnt = PositiveParameters({name: value for name, value in car.items() if name not in KNOWN})
 
     @property
     def to_front_axle(self) -> Tensor:

@@ -9,6 +9,10 @@ from __future__ import annotations
 import hashlib
 import inspect
 import math
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager, suppress
+from pathlib import Path
+from typing import Any
 
 import numba
 import numpy as np
@@ -44,6 +48,11 @@ if numba.config.DISABLE_JIT:
         """As numba's, which runs compiled only."""
         return tuple(values[:length])
 
+
+try:
+    import fcntl
+except ImportError:  # Windows
+    fcntl = None  # type: ignore[assignment]
 
 N_STATES = 29
 N_INPUTS = 5
@@ -175,27 +184,7 @@ def _relax(held, regime, forces, x, vector, part):  # type: ignore[no-untyped-de
             held[i] = forces[4 + i] / forces[8 + i]
 
 
-def _kept(function):  # type: ignore[no-untyped-def]
-    """A compiled function whose machine code is kept on disk."""
-    # numba looks code up by the name, file and date of the outermost function; the digest stands for the rest.
-    sources = (inspect.getsource(equations), inspect.getsource(regimes), repr(MultiBodyValues._fields))
-    digest = hashlib.sha256("\n".join(sources).encode()).hexdigest()
-    function.__qualname__ = f"{function.__name__}_{digest[:12]}"
-    return numba.njit(cache=True, error_model="numpy")(function)
-
-
-@_kept
-def advance(state, regime, inputs, vector, friction, step, n_steps, held_before):  # type: ignore[no-untyped-def]
-    """State (29,), regime, whether it slid, and ``held`` after classical fourth-order Runge-Kutta steps, in parts where slip needs it.
-
-    It stops at a rollover or NaN.
-
-    Args:
-        state: (29,).
-        inputs: (5,).
-        vector: parameters, and last the relaxation lengths of front and rear tyres [m].
-        held_before: lateral forces over load, where these lag, (4,).
-    """
+def _advance(state, regime, inputs, vector, friction, step, n_steps, held_before):  # type: ignore[no-untyped-def]
     p = _unpack(vector, friction)
     lags = vector[len(vector) - 2] > 0.0 or vector[len(vector) - 1] > 0.0
     held = np.empty(8)
@@ -243,12 +232,7 @@ def advance(state, regime, inputs, vector, friction, step, n_steps, held_before)
     return x, regime, slid or regime == SLIDING, held[:4].copy()
 
 
-@_kept
-def evaluate(states, regimes, inputs, vector, frictions, helds):  # type: ignore[no-untyped-def]
-    """Derivatives (T, 29) and forces (T, 12) at states (T, 29), with inputs (T, 5), frictions (T,) and ``helds`` (T, 4).
-
-    Forces: along and across in the level body's axes, then vertical, each for the library's four wheels [N].
-    """
+def _evaluate(states, regimes, inputs, vector, frictions, helds):  # type: ignore[no-untyped-def]
     lags = vector[len(vector) - 2] > 0.0 or vector[len(vector) - 1] > 0.0
     held = np.empty(8)
     n_samples = len(states)
@@ -271,3 +255,60 @@ def evaluate(states, regimes, inputs, vector, frictions, helds):  # type: ignore
             forces[k, side] -= brake
             forces[k, 2 + side] -= brake
     return derivatives, forces
+
+
+class _Kept:
+    """A function of this module whose machine code is kept on disk, where a writable place is found.
+
+    The first of several processes compiles, which takes some ten seconds; the others wait for it and load the code.
+    """
+
+    def __init__(self, function: Callable[..., Any]) -> None:
+        # numba looks code up by the name, file and date of the outermost function; the digest stands for the rest.
+        function.__qualname__ = f"{function.__name__}_{_digest()}"
+        self.dispatcher: Any = function
+        self.lock: Path | None = None
+        self._is_ready = bool(numba.config.DISABLE_JIT)
+        if self._is_ready:
+            return
+        try:
+            self.dispatcher = numba.njit(cache=True, error_model="numpy")(function)
+            self.lock = Path(self.dispatcher.stats.cache_path) / f"{Path(__file__).stem}.lock"
+        except RuntimeError:  # no place for a cache
+            self.dispatcher = _kernel(function)
+
+    def __call__(self, *arguments: Any) -> Any:
+        if self._is_ready:
+            return self.dispatcher(*arguments)
+        with _held(self.lock):
+            results = self.dispatcher(*arguments)
+        self._is_ready = True
+        return results
+
+
+@contextmanager
+def _held(lock: Path | None) -> Iterator[None]:
+    """Waits for other processes that hold the lock. Where there are no locks, as on Windows, every process compiles."""
+    with ExitStack() as stack:
+        if lock is not None and fcntl is not None:
+            with suppress(OSError):
+                fcntl.flock(stack.enter_context(lock.open("w")), fcntl.LOCK_EX)  # goes with the file, also when the process is killed
+        yield
+
+
+def _digest() -> str:
+    sources = (inspect.getsource(equations), inspect.getsource(regimes), repr(MultiBodyValues._fields))
+    return hashlib.sha256("\n".join(sources).encode()).hexdigest()[:12]
+
+
+advance = _Kept(_advance)
+"""advance(state (29,), regime, inputs (5,), vector, friction, step, n_steps, held (4,)) -> state (29,), regime, whether it slid, held (4,).
+
+``vector`` ends with the relaxation lengths of front and rear tyres [m]; ``held`` are lateral forces over load, where these lag.
+
+Classical fourth-order Runge-Kutta steps, in parts where the slip dynamics need it. Stops at a rollover or NaN."""
+
+evaluate = _Kept(_evaluate)
+"""evaluate(states (T, 29), regimes (T,), inputs (T, 5), vector, frictions (T,), held (T, 4)) -> derivatives (T, 29), forces (T, 12).
+
+Forces: along and across in the level body's axes, then vertical, each for the library's four wheels [N]."""
