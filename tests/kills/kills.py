@@ -27,7 +27,7 @@ from dataclasses import dataclass
 from glob import glob
 from pathlib import Path
 
-from processes import is_alive, start
+from processes import end_all, is_alive, start
 from vehest.data.errors import VehestError
 from vehest.run.artefacts import read_artefact
 from vehest.run.evaluate import TIMES
@@ -262,7 +262,10 @@ def main():
     out.parent.mkdir(parents=True, exist_ok=True)
     missing = Counter((STAGES[k % len(STAGES)], SIGNALS[k // len(STAGES) % len(SIGNALS)]) for k in range(given.kills))
     with tempfile.TemporaryDirectory(prefix="kills-") as scratch:
-        bad = rounds(missing, random.Random(given.seed), Path(scratch), out)
+        try:
+            bad = rounds(missing, random.Random(given.seed), Path(scratch), out)
+        finally:
+            end_all()
     print(f"{given.kills} kills, {bad} of them bad: {out}")
     sys.exit(1 if bad else 0)
 

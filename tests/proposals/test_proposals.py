@@ -101,6 +101,25 @@ def test_wheels_alone_give_a_speed_and_their_radius(tmp_path):
     assert {"vx", "vy_ref"} <= draft(examined).contents[0].channels
 
 
+def test_wheels_that_miss_samples_make_no_speed_and_no_question(tmp_path):
+    d = drive()
+    wheels = {f"n_{corner}": d[f"wheel_{corner}"] * 30.0 / np.pi for corner in CORNERS}
+    table = usual(d).drop(columns=["Time [s]", "Speed"]).assign(**wheels)
+    table.loc[1000:1100, list(wheels)] = np.nan
+    examined = inspect("my_car", [write(tmp_path / "lap.csv", table)])
+    assert examined.proposals.wheel_radius is not None
+    made = draft(examined)
+    assert (made.examined.proposals.wheel_radius, made.dataset["transforms"]) == (None, [])
+    assert sum("wheel_speed" in note and "samples are missing" in note for note in made.notes) == 4
+
+
+def test_logs_of_two_loggers_are_refused_by_the_file_that_shares_no_column(tmp_path):
+    write(tmp_path / "lap_1.csv", usual(drive(90.0)))
+    write(tmp_path / "lap_2.csv", usual(drive()).rename(columns=lambda name: name if "Time" in name else f"{name}2"))
+    with pytest.raises(DataError, match=r"lap_1\.csv' has none of the columns that are channels in '.*lap_2\.csv'"):
+        inspect("my_car", [tmp_path / "lap_1.csv", tmp_path / "lap_2.csv"])
+
+
 @pytest.mark.parametrize(("wheel", "other"), [("n_VL", "OilTemp"), ("n_VL", "pose_yaw [rad]"), ("n_VL [mph]", "pose_yaw")])
 def test_wheels_without_speed_and_acceleration_are_proposed_and_their_mean_is_not(tmp_path, wheel, other):
     d = drive()

@@ -22,6 +22,7 @@ from vehest.studies.kit.runs import by_name
 from vehest.studies.kit.standing import interval_in_words, ranking_of, standing_columns, verdict_sentences
 from vehest.studies.kit.warnings import warnings_of
 
+VERSION = "2"
 TAKES = "parts"
 SHOWS_FAILED = True
 COLUMNS = 4

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -66,6 +67,11 @@ class Proposals:
     def by_channel(self) -> dict[str, Proposal]:
         """Channel -> its proposal."""
         return {proposal.channel: proposal for proposal in self.channels}
+
+    def keeping(self, channels: Sequence[Proposal], notes: Sequence[str] = ()) -> Proposals:
+        """The same with these of its channels and further remarks; a radius stays only beside a wheel's speed."""
+        radius = self.wheel_radius if any(one.channel.startswith("wheel_speed") for one in channels) else None
+        return replace(self, channels=tuple(channels), wheel_radius=radius, notes=(*self.notes, *notes))
 
     def mirrored(self) -> Proposals:
         """The same for a car seen in a mirror, which reverses the signs of `LATERAL` channels."""

@@ -70,7 +70,7 @@ def draft(examined: Examined) -> Draft:
     """A data set by the proposals, read as an ingest reads it; raises `VehestError` where it cannot be read."""
     whole = [one for one in examined.proposals.channels if not any(_has_gaps(examined, own, one.column) for own in examined.logs)]
     gaps = [f"'{one.column}' ({one.channel}) is left out: {GAPS}" for one in examined.proposals.channels if one not in whole]
-    examined = replace(examined, proposals=replace(examined.proposals, channels=tuple(whole)))
+    examined = replace(examined, proposals=examined.proposals.keeping(whole, gaps))
     proposals, vehicle = examined.proposals, examined.vehicle
     if not proposals.channels:
         raise ConfigurationError("no column is left that would be a channel")
@@ -78,7 +78,7 @@ def draft(examined: Examined) -> Draft:
     speed = [{"name": "speed_from_wheels", "wheel_radius": proposals.wheel_radius}] if proposals.wheel_radius is not None else []
     dataset, recordings = _read_strictest(dataset | {"transforms": speed})
     longest = max(recordings, key=lambda own: own.duration)
-    late, ratio, notes = late_channels(longest), None, [*proposals.notes, *gaps]
+    late, ratio, notes = late_channels(longest), None, [*proposals.notes]
     for stem, rows in dataset.get("drop_rows", {}).items():
         why = f"beyond what a vehicle can do, or {BRIDGED:g} s and more without a sample"
         notes.append(f"left out of '{stem}' by drop_rows, {why}: data rows: {counted([str(row) for row in rows])}")

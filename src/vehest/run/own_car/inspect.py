@@ -100,8 +100,10 @@ def inspect(name: str, files: Sequence[Path], vehicle: Mapping[str, float | None
         held = {column.name: column for column in log.columns}
         lacking = [one for one in proposals.channels if one.column not in held]
         notes = [f"'{one.column}' ({one.channel}) is left out: '{log.file}' has no numbers in it" for one in lacking]
-        kept = tuple(one for one in proposals.channels if one not in lacking)
-        proposals = replace(proposals, channels=kept, notes=(*proposals.notes, *notes))
+        kept = [one for one in proposals.channels if one not in lacking]
+        if lacking and not kept:
+            raise DataError(f"'{log.file}' has none of the columns that are channels in '{longest.file}'; give files of the same columns")
+        proposals = proposals.keeping(kept, notes)
         for own in longest.columns:
             if own.name in {one.column for one in kept} and held[own.name].unit != own.unit:
                 what = f"has '{own.name}' in '{held[own.name].unit}', '{longest.file}' in '{own.unit}'"

@@ -101,6 +101,8 @@ def write(
     name = examined.name
     with use_limits(limits_from_config(compose_config("estimate")["limits"])):
         made = draft(examined)
+    gone = {one.column for one in examined.proposals.channels} - {one.column for one in made.examined.proposals.channels}
+    left = [question for question in left if question.key not in gone]
     plan = _plan_of(made, further) if "vy_ref" in made.channels and not _is_too_short(made) else Plan()
     plan.lacking.update({own: "nothing can be compared on these recordings" for own in further if not plan.sweeps})
     texts = [_dataset_text(made, left)]
