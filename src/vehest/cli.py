@@ -519,7 +519,9 @@ def run(
     Existing artefacts are skipped, and trained weights that the study has published are taken where their keys are the same. Overrides
     apply to every sweep that has their key. Sweeps are worked off in the order of the file.
     """
-    options = RunOptions(force, dry_run, quiet, jobs, False, minutes, retrain, launcher, address, slurm or ())
+    options = RunOptions(
+        force, dry_run, quiet, jobs, minutes=minutes, retrain=retrain, launcher=launcher, address=address, slurm=slurm or ()
+    )
     _run_study(pipeline, overrides or [], options, as_json)
 
 

@@ -6,12 +6,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vehest.constants import FloatArray
+from vehest.data.derived import STANDSTILL_SPEED
 from vehest.data.recording import Recording
 from vehest.data.runs import equal_runs
 
 BoolArray = NDArray[np.bool_]
 
-STANDSTILL_SPEED = 0.1  # m/s
 STANDSTILL_YAW_RATE = 0.05  # rad/s
 STANDSTILL_SHAKING = 0.3  # m/s²
 

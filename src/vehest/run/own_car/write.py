@@ -12,9 +12,9 @@ from typing import Any
 
 import yaml
 
-from vehest.alignment.standstill import STANDSTILL_SPEED
 from vehest.constants import GRAVITY
 from vehest.data.channels import CHANNELS
+from vehest.data.derived import STANDSTILL_SPEED
 from vehest.data.errors import ConfigurationError, VehestError, printable
 from vehest.data.files import written_aside
 from vehest.data.limits import limits_from_config, use_limits

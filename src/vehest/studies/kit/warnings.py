@@ -7,8 +7,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from vehest.alignment.standstill import STANDSTILL_SPEED
 from vehest.constants import FloatArray
+from vehest.data.derived import STANDSTILL_SPEED
 from vehest.data.splits import Span
 from vehest.report.document import as_code, as_text
 from vehest.report.style import listed
