@@ -111,8 +111,8 @@ def test_coarse_or_few_samples_bound_the_floor_and_smoothing_hides_noise():
 def random_model(steps, n=4, m=2, seed=1):
     generator = np.random.default_rng(seed)
     A = np.eye(n) * 0.95 + 0.1 * generator.standard_normal((steps, n, n))
-    roots = [generator.standard_normal((size, size)) for size in (n, m, n)]
-    Q, R, P = (root @ root.T + 0.1 * np.eye(len(root)) for root in roots)
+    Q, P = (root @ root.T + 0.1 * np.eye(n) for root in generator.standard_normal((2, n, n)))
+    R = 0.1 + generator.random(m)
     return LinearModel(A, np.zeros(n), Q, generator.standard_normal((steps, m, n)), np.zeros(m), R), P
 
 
@@ -120,7 +120,7 @@ def test_bound_is_that_of_tichavsky_and_others():
     """J(k+1) = D22 - D21 (J(k) + D11)⁻¹ D12 (their Eq. 21) with D11 = AᵀQ⁻¹A, D12 = -AᵀQ⁻¹, D22 = Q⁻¹ + CᵀR⁻¹C."""
     model, prior = random_model(200)
     bound = posterior_bound(model, prior)
-    inverse_Q, inverse_R = np.linalg.inv(model.process_noise), np.linalg.inv(model.observation_noise)
+    inverse_Q, inverse_R = np.linalg.inv(model.process_noise), np.diag(1.0 / model.observation_noise)
     told = [C.T @ inverse_R @ C for C in model.observation]
     information = np.linalg.inv(prior) + told[0]
     for k in range(200):

@@ -29,7 +29,7 @@ def linear_as_nonlinear(model):
         lambda x, u: (at(model.transition, u) @ x.unsqueeze(-1)).squeeze(-1) + at(model.transition_offset, u),
         lambda x, u: (at(model.observation, u) @ x.unsqueeze(-1)).squeeze(-1) + at(model.observation_offset, u),
         lambda x, u: at(model.process_noise, u),
-        lambda x, u: at(model.observation_noise, u),
+        lambda x, u: torch.diag_embed(at(model.observation_noise, u)),
     )
 
 

@@ -23,7 +23,7 @@ NOTHING = torch.zeros(3, dtype=torch.float64)
 
 def walk(steps):
     """A position that wanders by 0.1 a sample, measured to 1 by two sensors."""
-    model = LinearModel(np.eye(1), np.zeros(1), 0.01 * np.eye(1), np.ones((2, 1)), np.zeros(2), np.eye(2))
+    model = LinearModel(np.eye(1), np.zeros(1), 0.01 * np.eye(1), np.ones((2, 1)), np.zeros(2), np.ones(2))
     return LinearModel(*(np.broadcast_to(part, (steps, *part.shape)) for part in model)), Gaussian(np.zeros(1), np.eye(1))
 
 

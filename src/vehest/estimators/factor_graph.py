@@ -121,8 +121,8 @@ class FactorGraph(SideslipFilter):
         observation[:, 0, 1], observation[:, 1] = 1.0, C
         offset = np.stack([np.zeros(steps), D * steer], axis=1)
         process = np.diag(np.square([noise.model_sideslip, noise.model_yaw_rate]))
-        measured = np.diag(np.square([noise.measured_yaw_rate, noise.measured_ay]))
-        process, measured = (np.broadcast_to(covariance, (steps, 2, 2)) for covariance in (process, measured))
+        measured = np.square([noise.measured_yaw_rate, noise.measured_ay])
+        process, measured = np.broadcast_to(process, (steps, 2, 2)), np.broadcast_to(measured, (steps, 2))
         return LinearModel(A, B * steer[:, None], process, observation, offset, measured)
 
     def solve_window(

@@ -156,7 +156,7 @@ class KalmanFilter(SideslipFilter):
         driven = np.zeros((steps, n))
         driven[:, :2] = B * steer[:, None]
         expected = np.stack([D * steer, np.zeros_like(steer)], axis=1)
-        sensors = np.diag([self.values["ay"] ** 2, self.values["yaw_rate"] ** 2])
+        sensors = np.array([self.values["ay"] ** 2, self.values["yaw_rate"] ** 2])
         model = LinearModel(transition, driven, noise, observation, expected, sensors)
         found = kalman_scan(model, np.stack([ay, yaw_rate], axis=1), first, gate, refused)
         mean, covariance = found.filtered

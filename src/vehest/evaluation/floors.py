@@ -431,7 +431,7 @@ class _Blocks:
         for row, (of, _) in enumerate(self.measured):
             for column, value in of.items():
                 C[:, row, column] = value
-        R = np.diag([variance + TINY**2 for _, variance in self.measured] or [1.0])
+        R = np.array([variance + TINY**2 for _, variance in self.measured] or [1.0])
         return LinearModel(A, np.zeros(n), np.diag(self.noise), C, np.zeros(m), R), np.diag(self.prior)
 
 

@@ -14,7 +14,7 @@ class LinearModel(NamedTuple, Generic[Array]):
     """A linear model of T samples with Gaussian noise.
 
     x[k+1] = A[k] x[k] + b[k] + w[k],  w[k] ~ N(0, Q[k])
-    y[k]   = C[k] x[k] + d[k] + v[k],  v[k] ~ N(0, R[k])
+    y[k]   = C[k] x[k] + d[k] + v[k],  v[k] ~ N(0, diag(R[k]))
 
     Known inputs are part of b and d. What is constant over time needs no dimension for it.
     """
@@ -24,7 +24,7 @@ class LinearModel(NamedTuple, Generic[Array]):
     process_noise: Array  # Q, (T, n, n)
     observation: Array  # C, (T, m, n)
     observation_offset: Array  # d, (T, m)
-    observation_noise: Array  # R, (T, m, m), positive definite
+    observation_noise: Array  # R, (T, m), variances; measurements err independently of each other
 
 
 def smoothed_means(model: LinearModel[FloatArray], filtered: Filtered[FloatArray]) -> FloatArray:
