@@ -5,6 +5,7 @@ from pathlib import Path
 import pytest
 
 from vehest.data.errors import DataError
+from vehest.run.launchers.local import launch
 from vehest.sources.tabular import TabularSource
 
 
@@ -54,3 +55,14 @@ def test_a_part_of_other_settings_is_not_used(place, slow, monkeypatch):
         failing(broken, "three", DataError("unwell"))
         assert place("ingest", "mine")[0] == 3
     assert (place("ingest", "mine", "dataset.vehicle=another")[0], slow) == (0, ["one", "two", "one", "three", "two"])
+
+
+def test_the_second_process_compiles_health_first(place, slow, monkeypatch):
+    monkeypatch.setattr("vehest.run.ingest.has_to_compile", lambda kernel: True)
+    monkeypatch.setattr("vehest.run.ingest.compile_health", lambda *_: slow.append("health"))
+    monkeypatch.setattr("vehest.run.ingest.launch", lambda tasks, jobs, stop, report: launch(tasks, 1, stop, report))
+    folder = Path(place.told("ingest", "mine", "--jobs", "2")["folder"])
+    assert (slow, len(list(folder.glob("*.parquet")))) == (["one", "health", "three", "two"], 3)
+    slow.clear()
+    place("ingest", "mine", "--jobs", "1", "--force")
+    assert slow == ["one", "three", "two"]

@@ -18,6 +18,7 @@ from vehest.alignment.checks import refuse_errors
 from vehest.data.errors import ConfigurationError, DataError, printable
 from vehest.data.files import remove_leftovers, sha256_of
 from vehest.data.store import read_recording, write_recording
+from vehest.estimators.kernels.compiling import has_to_compile
 from vehest.run.artefacts import Artefact, StagePlan
 from vehest.run.config import Config, compose_config, key_of, missing_keys
 from vehest.run.config_files import choices
@@ -26,6 +27,7 @@ from vehest.run.failures import Failure
 from vehest.run.launchers.local import launch
 from vehest.run.signals import DryRunStop, StopSignals
 from vehest.sources.base import SIMULATED, Source, open_source, source_class
+from vehest.trust.health import SLOW_KERNEL, compile_health
 
 STAGE = "ingest"
 VERSION = "1"
@@ -71,8 +73,11 @@ def write_ingest(config: Config, plan: StagePlan, folder: Path, jobs: int, stop:
     parts.mkdir(parents=True, exist_ok=True)
     remove_leftovers(parts)
     missing = [recording_id for recording_id in ids if not (parts / recording_file(recording_id)).is_file()]
-    tasks = [partial(_make_part, dict(config["dataset"]), recording_id, parts) for recording_id in missing]
-    done, failures = len(ids) - len(missing), []
+    tasks: list[Callable[..., None]] = [partial(_make_part, dict(config["dataset"]), recording_id, parts) for recording_id in missing]
+    if min(jobs, len(tasks)) > 1 and has_to_compile(SLOW_KERNEL):  # while the first process compiles the plant, for which others wait
+        tasks.insert(1, compile_health)
+        missing.insert(1, "")
+    done, failures = len(ids) - len(missing) + missing.count(""), []
 
     def begun(at: int, _: object) -> None:
         report(done, len(ids), missing[at])
@@ -81,7 +86,7 @@ def write_ingest(config: Config, plan: StagePlan, folder: Path, jobs: int, stop:
         if isinstance(end.outcome, Failure):
             failures.append(end.outcome)
         else:
-            done += 1
+            done += missing[end.position] != ""
             report(done, len(ids), "")
     with suppress(OSError):
         parts.rmdir()  # unless something was made

@@ -15,6 +15,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
+import numba
 import numpy as np
 from numpy.typing import NDArray
 
@@ -263,6 +264,12 @@ def health_rows(packed: FloatArray, rows: FloatArray, measured: NDArray[np.bool_
 
 
 _NO_STATISTICS = np.empty((0, 0))
+
+
+def compile_health(*_: object) -> None:
+    """Compile the kernel, for later processes to load."""
+    rows, flat = _NO_STATISTICS, np.empty(0)
+    health_kernel.compile(tuple(map(numba.typeof, (rows, rows > 0, flat, flat, rows, rows))))
 
 
 def learn_health(train: Sequence[Recording], validation: Sequence[Recording], channels: Sequence[str], rate_hz: float) -> HealthModel:
