@@ -12,7 +12,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias
 
 from vehest.data.errors import printable
-from vehest.report.explorer import Explorer
 from vehest.report.style import MISSING, REFERENCE_COLOUR, decimals_for, fixed, on_dark, paper_style, significant
 
 if TYPE_CHECKING:
@@ -78,7 +77,7 @@ class Figure:
     name: str  # file name without ending, as in `Table`
     caption: str  # Markdown; its first sentence is the alternative text
     static: MatplotlibFigure  # matplotlib figure, for PNG, SVG and print
-    interactive: Explorer | None = None  # what the page draws in its place, to zoom and filter, where that helps
+    interactive: str = ""  # `explorer_json` of what the page draws in its place, to zoom and filter, where that helps
 
 
 Block: TypeAlias = "str | Table | Figure"
@@ -315,7 +314,7 @@ def _page(document: Document, numbers: Mapping[int, str], images: Mapping[str, b
             blocks.append({"kind": "table", **shared, **_page_table(block)})
         else:
             alternative = {"image": _data_uri(_for_both_schemes(images[block.name]), "image/svg+xml"), "alt": _spoken(block.caption)}
-            interactive = Markup(block.interactive.to_json()) if block.interactive else None
+            interactive = Markup(block.interactive) if block.interactive else None
             blocks.append({"kind": "figure", **shared, **alternative, "json": interactive})
     explored = any(block.get("json") for block in blocks)
     environment = Environment(
