@@ -30,14 +30,8 @@ from vehest.trust.contract import GuardedRun
 from vehest.trust.faults import Fault, Severity, inject
 from vehest.trust.record import Trust, is_other_vehicle
 
-VERSION = "2"
 NONE = {"name": "none"}
 DRAWN_START = (0.2, 0.4)  # shares of a range, between which a start is drawn
-
-
-def code_under_faults(code: str) -> str:
-    """Version of an evaluation under faults, from that without them."""
-    return f"{code} faults={VERSION}"
 
 
 @dataclass(frozen=True)

@@ -18,21 +18,17 @@ from typing import Any, Literal
 
 from vehest.data.errors import ConfigurationError, MissingError, VehestError
 from vehest.data.split_files import dataset_names
-from vehest.run.calibrate import code_of_calibration
 from vehest.run.comparison import resampling_fact, training_facts
 from vehest.run.config import Config
 from vehest.run.config_files import find_pipeline, pipeline_names
 from vehest.run.console import Messages
-from vehest.run.downsample import code_of_downsampling
-from vehest.run.evaluate import code_of_evaluation
-from vehest.run.evaluate_faults import all_of, code_under_faults, faults_of
-from vehest.run.ingest import PROSE, code_of_ingest, plan_ingest
+from vehest.run.evaluate_faults import all_of, faults_of
+from vehest.run.ingest import PROSE, plan_ingest
 from vehest.run.publishing import PROVENANCE, RESULTS, Published, published_in
-from vehest.run.report import code_of_report
 from vehest.run.runner import Runner
 from vehest.run.signals import StopSignals
 from vehest.run.study import Job, Jobs, Study, content_overrides, jobs_of, read_study
-from vehest.run.train import code_of_training
+from vehest.run.versions import code_of
 from vehest.sources.base import kind_of
 
 Keys = dict[str, dict[str, str]]
@@ -51,7 +47,7 @@ def keys_of_study(study: Study, jobs: Jobs, absent: Collection[str], runner: Run
     keys: Keys = {}
     for name, config in ingests.items():
         content = {key: value for key, value in config["dataset"].items() if key not in PROSE}
-        keys[f"ingest {name}"] = {CODE: code_of_ingest(config["dataset"]), CONFIGURATION: _hash(content)}
+        keys[f"ingest {name}"] = {CODE: code_of("ingest", config["dataset"]["source"]), CONFIGURATION: _hash(content)}
         if name in inputs:
             keys[f"ingest {name}"][DATA] = _hash(dict(inputs[name]))
     about: dict[str, Any] = {name: getattr(study, name) for name in ("study", "title", "about", "report")} | {"file": study.file.name}
@@ -62,7 +58,7 @@ def keys_of_study(study: Study, jobs: Jobs, absent: Collection[str], runner: Run
         keys |= {f"{part}: {name}" if part else name: entry for name, entry in _of_jobs(configs)}
         titles = [_titled(ingests[name]) for name in dataset_names(configs[0]["split"])]
         about[f"part {part}"] = [study.parts[part].title, *training_facts(configs), resampling_fact(configs), *titles]
-    return keys | {"report": {CODE: code_of_report(study.report), CONFIGURATION: _hash(about)}}
+    return keys | {"report": {CODE: code_of("report", study.report), CONFIGURATION: _hash(about)}}
 
 
 def _ingests(study: Study, jobs: Jobs, absent: Collection[str], runner: Runner) -> dict[str, Config]:
@@ -82,18 +78,17 @@ def _of_jobs(configs: Sequence[Config]) -> Iterator[tuple[str, dict[str, str]]]:
     faults = all_of(map(faults_of, configs))
     rates = sorted({float(config["estimator"]["rate_hz"]) for config in configs} | {float(first["evaluation"]["rate_hz"])})
     yield "split", {CONFIGURATION: _hash(first["split"])}
-    yield "downsample", {CODE: code_of_downsampling(), CONFIGURATION: _hash([first["downsample"], rates])}
+    yield "downsample", {CODE: code_of("downsample"), CONFIGURATION: _hash([first["downsample"], rates])}
     for name in dict.fromkeys(str(config["estimator"]["name"]) for config in configs):
         jobs = [config for config in configs if config["estimator"]["name"] == name]
         trained = [[job["estimator"], {**job["training"], "checkpoint_seconds": None}, job["seed"]] for job in jobs]
-        yield f"train {name}", {CODE: code_of_training(name), CONFIGURATION: _hash(trained)}
+        yield f"train {name}", {CODE: code_of("train", name), CONFIGURATION: _hash(trained)}
         if first["split"].get("validation"):
-            yield f"calibrate {name}", {CODE: code_of_calibration(name), CONFIGURATION: _hash(None)}
-        code = code_of_evaluation(name)
+            yield f"calibrate {name}", {CODE: code_of("calibrate", name), CONFIGURATION: _hash(None)}
         conditions: Any = {key: value for key, value in first["evaluation"].items() if key != "least_speed" or value}  # as `Protocol.plain`
         if faults:
-            code, conditions = code_under_faults(code), [conditions, *map(asdict, faults)]
-        yield f"evaluate {name}", {CODE: code, CONFIGURATION: _hash(conditions)}
+            conditions = [conditions, *map(asdict, faults)]
+        yield f"evaluate {name}", {CODE: code_of("evaluate", name, faults=bool(faults)), CONFIGURATION: _hash(conditions)}
 
 
 def _titled(config: Config) -> list[str]:
