@@ -3,15 +3,19 @@
 from __future__ import annotations
 
 import math
+import sys
 from functools import partial
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from vehest.data.channels import CHANNELS
+from vehest.data.errors import ConfigurationError
 from vehest.data.recording import Recording
-from vehest.export.method import method_source
-from vehest.export.rendering import Precision, ascii_only, braced, limit, render, truths, whole
+from vehest.estimators.base import Estimator
+from vehest.estimators.registry import estimator_class, estimator_names
+from vehest.export.rendering import Precision, ascii_only, braced, limit, render, render_block, truths, whole
 from vehest.export.tables import band_table, front_end_table, guard_table, health_table
 from vehest.export.vectors import COLUMNS, drive_for, replayed, table_text
 from vehest.trust import health_kernel, verdict, watch
@@ -28,6 +32,44 @@ def brief(value: float) -> str:
     return text if any(c in text for c in ".en") else f"{text}.0"
 
 
+def method_files(estimator: Estimator, precision: Precision) -> dict[str, str]:
+    """Header and source of a fitted estimator's method, by the family's template; name -> text.
+
+    Raises `ConfigurationError`: the family has no C, or the estimator is not causal or not fitted.
+    """
+    if not estimator.template:
+        raise ConfigurationError(f"estimator '{estimator.name}' cannot be exported to C; these can: {', '.join(exportable())}")
+    estimator.online()  # raises where it is not causal, or not fitted
+    path = f"methods/{estimator.template}.c.j2"
+    beside = Path(str(sys.modules[type(estimator).__module__].__file__)).parent
+    values = {
+        "title": ascii_only(estimator.full_title),
+        "family": estimator.name,
+        "variant": estimator.variant,
+        "rate_hz": estimator.settings.rate_hz,
+        "horizon_steps": estimator.horizon_steps,
+        "skippable": estimator.skippable,
+        "channels": channels_of(estimator),
+        **estimator.c_values(),
+        "refuses_nan": [name for name in estimator.channels if "NaN" in estimator.refuses and name not in estimator.skippable],
+        "refuses_infinite": estimator.channels if "infinite" in estimator.refuses else (),
+        "notes": estimator.notice,
+    }
+    state = render_block(path, "state", precision, beside, **values).rstrip()
+    header = render("method.h.j2", precision, **values, state=state)
+    return {"vehest_method.h": header, "vehest_method.c": render(path, precision, beside, **values)}
+
+
+def exportable() -> tuple[str, ...]:
+    """Names of families that have C."""
+    return tuple(name for name in estimator_names() if estimator_class(name).template)
+
+
+def channels_of(estimator: Estimator) -> list[tuple[str, str]]:
+    """Channels that an estimator reads, each with its meaning."""
+    return [(name, ascii_only(CHANNELS[name].meaning)) for name in estimator.channels]
+
+
 def program_files(stepper: GuardedStepper, precision: Precision, title: str) -> dict[str, str]:
     """Sources that build anywhere: the method, the contract around it, and `main`, name -> text.
 
@@ -39,10 +81,9 @@ def program_files(stepper: GuardedStepper, precision: Precision, title: str) -> 
     Raises:
         ConfigurationError: the estimator cannot be written in C.
     """
-    header, source = method_source(stepper.estimator, precision)
+    files = method_files(stepper.estimator, precision)
     context = context_of(stepper, precision, title)
     wanted = ["types.h", "estimator.h", "estimator.c", *(["health.h", "health.c"] if context["h"] is not None else [])]
-    files = {"vehest_method.h": header, "vehest_method.c": source}
     files |= {f"vehest_{name}": render(f"{name}.j2", precision, **context) for name in wanted}
     values = {
         "names": context["names"],
@@ -68,7 +109,7 @@ def context_of(stepper: GuardedStepper, precision: Precision, title: str) -> dic
     return {
         "title": ascii_only(title),
         "notes": [ascii_only(note) for note in estimator.notice],
-        "channels": [(name, ascii_only(CHANNELS[name].meaning)) for name in estimator.channels],
+        "channels": channels_of(estimator),
         "names": list(estimator.channels),
         "skippable": [name in estimator.skippable for name in estimator.channels],
         "numbers": monitor._numbers,
