@@ -21,7 +21,7 @@ from vehest.data.schema import validated
 from vehest.data.splits import Span, Split
 from vehest.estimators.base import Estimator
 from vehest.evaluation.metrics import Scored
-from vehest.evaluation.under_fault import FAULTED, Flagged, Window, errors_under_fault, flags_under_fault
+from vehest.evaluation.under_fault import FAULTED, Window, errors_under_fault, flags_under_fault
 from vehest.run.artefacts import Artefact
 from vehest.run.config import Config, compose_config
 from vehest.run.config_files import choices
@@ -158,6 +158,6 @@ def errors_under(
         flags = []
         for estimate, part in zip(guarded, scored, strict=True):
             band = estimate.held_at(part.time, "band_sideslip") if "band_sideslip" in estimate.channels else np.full(len(part.time), np.nan)
-            flags.append(Flagged(band, estimate.held_at(part.time, "health")))
+            flags.append((band, estimate.held_at(part.time, "health")))
         found[FAULTED] |= flags_under_fault(scored, flags, windows, rate_hz)
     return found
