@@ -5,6 +5,7 @@ import os
 import shutil
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
 
@@ -38,7 +39,7 @@ class Root:
 
     def found(self):
         """Path in the root."""
-        return {found.path.relative_to(self.output).as_posix(): found.reason for found in unused_artefacts(self.output)}
+        return {Path(found["path"]).relative_to(self.output).as_posix(): found["reason"] for found in unused_artefacts(self.output)}
 
 
 @pytest.fixture

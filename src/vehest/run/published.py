@@ -12,9 +12,9 @@ import hashlib
 import json
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 from vehest.data.errors import ConfigurationError, MissingError, VehestError
 from vehest.data.split_files import dataset_names
@@ -37,8 +37,6 @@ Keys = dict[str, dict[str, str]]
 CODE, CONFIGURATION, DATA = "code", "configuration", "data"
 CAUSES = (CODE, CONFIGURATION, DATA)
 MOST_NAMED = 6
-
-State = Literal["up to date", "stale", "not known"]
 
 
 def keys_of_study(study: Study, jobs: Jobs, absent: Collection[str], runner: Runner, inputs: Mapping[str, Mapping[str, str]]) -> Keys:
@@ -100,38 +98,23 @@ def _hash(content: Any) -> str:
     return hashlib.sha256(json.dumps(content, sort_keys=True, default=str).encode()).hexdigest()[:16]
 
 
-@dataclass(frozen=True)
-class Change:
-    """Something that differs from when results were published."""
-
-    what: str  # ``train ksnn``
-    cause: str  # one of `CAUSES`
-
-
-@dataclass(frozen=True)
-class Verdict:
-    """The state of a published study."""
-
-    study: str
-    state: State
-    changes: tuple[Change, ...] = ()  # why its results are stale
-    note: str = ""  # on parts that could not be compared, or why the state is not known
-
-    def in_words(self) -> str:
-        """One line."""
-        words = []
-        for cause in CAUSES:
-            named = [change.what for change in self.changes if change.cause == cause]
-            if named:
-                more = f" and {len(named) - MOST_NAMED} more" if len(named) > MOST_NAMED else ""
-                words.append(f"{cause} ({', '.join(named[:MOST_NAMED])}{more})")
-        why = "; ".join(part for part in (", ".join(words), self.note) if part)
-        return ": ".join(part for part in (self.study, self.state, why) if part)
+def in_words(verdict: Mapping[str, Any]) -> str:
+    """The state of a study in one line."""
+    words = []
+    for cause in CAUSES:
+        named = [change["what"] for change in verdict["changes"] if change["cause"] == cause]
+        if named:
+            more = f" and {len(named) - MOST_NAMED} more" if len(named) > MOST_NAMED else ""
+            words.append(f"{cause} ({', '.join(named[:MOST_NAMED])}{more})")
+    why = "; ".join(part for part in (", ".join(words), verdict["note"]) if part)
+    return ": ".join(part for part in (verdict["study"], verdict["state"], why) if part)
 
 
-def check_published(names: Sequence[str], overrides: Sequence[str] = ()) -> list[Verdict]:
+def check_published(names: Sequence[str], overrides: Sequence[str] = ()) -> list[dict[str, Any]]:
     """Compare the recorded keys of published studies with those of today's code, configuration and raw files.
 
+    Returns a ``study`` each with its ``state``, up to date, stale or not known, ``changes``, each with ``what`` (``train ksnn``) and one of
+    `CAUSES`, and a ``note`` on what was not compared, or why the state is not known.
     Raises `ConfigurationError` for an override that would change results, `MissingError` for a name of no pipeline or published study.
     """
     if content_overrides(overrides):
@@ -159,21 +142,25 @@ def _pipeline_of(study: str) -> Study | None:
     return None
 
 
-def _verdict(study: str, pipeline: Study | None, overrides: Sequence[str]) -> Verdict:
-    published = published_in(RESULTS / study)
+def _verdict(study: str, pipeline: Study | None, overrides: Sequence[str]) -> dict[str, Any]:
+    published, state, changes, note = published_in(RESULTS / study), "not known", [("pipeline", CONFIGURATION)], ""
     if published is None:
-        return Verdict(study, "not known", note=f"there is nothing in '{RESULTS / study}' that vehest published")
-    if not published.keys:
-        return Verdict(study, "not known", note="published before keys were recorded; run it again")
-    if pipeline is None:
-        return Verdict(study, "not known", note=f"there is no pipeline that publishes '{study}'")
-    try:
-        return _compared(pipeline, jobs_of(pipeline, overrides), published)
-    except ConfigurationError as error:
-        return Verdict(study, "stale", (Change("pipeline", CONFIGURATION),), f"today it cannot be run ({error})")
+        changes, note = [], f"there is nothing in '{RESULTS / study}' that vehest published"
+    elif not published.keys:
+        changes, note = [], "published before keys were recorded; run it again"
+    elif pipeline is None:
+        changes, note = [], f"there is no pipeline that publishes '{study}'"
+    else:
+        try:
+            changes, note = _changes(pipeline, jobs_of(pipeline, overrides), published)
+        except ConfigurationError as error:
+            note = f"today it cannot be run ({error})"
+        state = "stale" if changes else "up to date"
+    return {"study": study, "state": state, "changes": [{"what": what, "cause": cause} for what, cause in changes], "note": note}
 
 
-def _compared(study: Study, jobs: Jobs, published: Published) -> Verdict:
+def _changes(study: Study, jobs: Jobs, published: Published) -> tuple[list[tuple[str, str]], str]:
+    """Pairs of what differs from when results were published and its cause; a note on what was not compared."""
     runner = Runner(Path(str(next(iter(jobs.values()))[0].config["output"])), Messages(quiet=True), StopSignals())
     ingests, inputs = _ingests(study, jobs, published.absent, runner), {}
     for name, config in ingests.items():
@@ -181,13 +168,12 @@ def _compared(study: Study, jobs: Jobs, published: Published) -> Verdict:
             inputs[name] = plan_ingest(config).inputs
     missing = [name for name in ingests if name not in inputs]
     then, today = published.keys, keys_of_study(study, jobs, published.absent, runner, inputs)
-    changes = [Change(what, cause) for what in then for cause, own in today.get(what, {}).items() if then[what].get(cause) != own]
-    changes += [Change(f"{what} added", CONFIGURATION) for what in today if what not in then]
-    changes += [Change(f"{what} removed", CONFIGURATION) for what in then if what not in today]
+    changes = [(what, cause) for what in then for cause, own in today.get(what, {}).items() if then[what].get(cause) != own]
+    changes += [(f"{what} added", CONFIGURATION) for what in today if what not in then]
+    changes += [(f"{what} removed", CONFIGURATION) for what in then if what not in today]
     parts = {name: jobs[name][0].config for name in study.parts} or _by_dataset(jobs[""])
     for name in sorted(parts.keys() & set(published.absent)):  # that the study had to go on without
         with suppress(MissingError):
             runner.look_for_files(parts[name]) if study.parts else plan_ingest(parts[name])
-            changes.append(Change(f"{name}, which was not here", DATA))
-    note = f"raw files not here, not compared: {', '.join(missing)}" if missing else ""
-    return Verdict(study.study, "stale" if changes else "up to date", tuple(changes), note)
+            changes.append((f"{name}, which was not here", DATA))
+    return changes, f"raw files not here, not compared: {', '.join(missing)}" if missing else ""
