@@ -18,7 +18,7 @@ from vehest.run.artefacts import StagePlan
 from vehest.run.study import sweep_of
 from vehest.run.train import TrainJob
 from vehest.studies.artefacts import PartArtefacts
-from vehest.studies.sweep import Panel, SweepArtefacts, build, heat_map, heat_maps, interval, summary, table_of
+from vehest.studies.sweep import SweepArtefacts, build, heat_map, heat_maps, interval, summary, table_of
 
 QUICK = ("split=mine", "estimator=ksnn", "training.max_epochs=1", "training.batch_size=256", "tracking=none")
 GRID = (*QUICK, "estimator.n_local=2,3", "estimator.n_hidden=0,1", "seed=range(2)")
@@ -101,9 +101,8 @@ def test_heat_maps_need_two_numeric_keys_and_have_a_panel_a_boolean():
 
 
 def test_darker_is_larger_and_a_missing_cell_is_grey():
-    figure = heat_map(
-        [Panel("", np.array([[0.1, 0.4, np.nan]]), np.full((1, 3), np.nan), (0, 0))], ["2", "3", "4"], ["0"], "P", "Q", "RMSE"
-    )
+    panel = ("", np.array([[0.1, 0.4, np.nan]]), np.full((1, 3), np.nan), [[0, 0]])
+    figure = heat_map([panel], ["2", "3", "4"], ["0"], "P", "Q", "RMSE")
     mesh = figure.axes[0].collections[0]
     mesh.update_scalarmappable()
     first, second, missing = mesh.get_facecolor()

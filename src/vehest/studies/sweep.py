@@ -31,6 +31,8 @@ NO_VALUE = "#ececec"
 LUMINANCE = (0.2126, 0.7152, 0.0722)  # of red, green and blue
 
 Value = bool | int | float | str
+Panel = tuple[str, FloatArray, FloatArray, list[list[int]]]
+"""Of a heat map: title, mean and half interval of each cell, (R, C), NaN for none, and row and column of those with a frame."""
 
 
 @dataclass(frozen=True)
@@ -177,18 +179,7 @@ def _panel(table: pd.DataFrame, title: str, name: str, numeric: Sequence[str], c
         table.pivot(index=up, columns=across, values=shown).reindex(index=cells[1], columns=cells[0]).to_numpy(dtype=float)
         for shown in (f"{METRIC}.{name}", f"{METRIC}_half.{name}", "chosen")
     )
-    marked = np.argwhere(chosen == 1.0).tolist()
-    return Panel(title, mean, half, (marked[0][0], marked[0][1]) if marked else None)
-
-
-@dataclass(frozen=True, eq=False)
-class Panel:
-    """One panel of a heat map."""
-
-    title: str  # what it shows; may be empty
-    mean: FloatArray  # colour and first line of each cell, NaN where there is none; shape (R, C)
-    half: FloatArray  # half the interval, NaN where there is none; shape (R, C)
-    marked: tuple[int, int] | None = None  # row and column of the cell with a frame
+    return title, mean, half, np.argwhere(chosen == 1.0).tolist()
 
 
 def heat_map(
@@ -199,7 +190,7 @@ def heat_map(
     from matplotlib.cm import ScalarMappable
     from matplotlib.colors import LinearSegmentedColormap, LogNorm, Normalize
 
-    values = np.concatenate([panel.mean.ravel() for panel in panels])
+    values = np.concatenate([mean.ravel() for _, mean, *_ in panels])
     finite = values[np.isfinite(values)] if np.isfinite(values).any() else np.zeros(1)
     low, high = float(finite.min()), float(finite.max())
     scale = LogNorm(low, high) if low > 0 and high / low > LOGARITHMIC_FROM else Normalize(low, high if high > low else low + 1.0)
@@ -212,7 +203,7 @@ def heat_map(
         colours = ScalarMappable(scale, shades)
         for axes, panel in zip(grid.flat, panels, strict=False):
             _draw(axes, panel, colours, decimals_for(finite.tolist()))
-            axes.set_title(panel.title, loc="left")
+            axes.set_title(panel[0], loc="left")
             axes.set_xticks(range(len(columns)), columns)
             axes.set_yticks(range(len(rows)), rows)
         for axes in list(grid.flat)[len(panels) :]:
@@ -228,16 +219,16 @@ def heat_map(
 def _draw(axes: Any, panel: Panel, colours: Any, decimals: int) -> None:
     from matplotlib.patches import Rectangle
 
-    edges = [np.arange(number + 1) - 0.5 for number in panel.mean.T.shape]
-    axes.pcolormesh(*edges, panel.mean, cmap=colours.cmap, norm=colours.norm, edgecolors="white", linewidth=0.8)
+    _, means, halves, marked = panel
+    edges = [np.arange(number + 1) - 0.5 for number in means.T.shape]
+    axes.pcolormesh(*edges, means, cmap=colours.cmap, norm=colours.norm, edgecolors="white", linewidth=0.8)
     axes.set_facecolor(NO_VALUE)
-    for row, column in np.ndindex(panel.mean.shape):
-        mean, half = float(panel.mean[row, column]), float(panel.half[row, column])
+    for row, column in np.ndindex(means.shape):
+        mean, half = float(means[row, column]), float(halves[row, column])
         words = fixed(mean, decimals) + (f"\n±{fixed(half, decimals)}" if math.isfinite(half) else "")
         ink = "white" if math.isfinite(mean) and float(np.dot(LUMINANCE, colours.to_rgba(mean)[:3])) < 0.45 else "#111111"
         axes.text(column, row, words, ha="center", va="center", fontsize=6.5, color=ink, linespacing=1.1)
-    if panel.marked is not None:
-        row, column = panel.marked
+    for row, column in marked:
         axes.add_patch(Rectangle((column - 0.46, row - 0.46), 0.92, 0.92, fill=False, edgecolor="#d6336c", linewidth=1.8))
     axes.grid(visible=False)
     axes.tick_params(length=0)
