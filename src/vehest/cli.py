@@ -389,29 +389,13 @@ def replay(
     Estimates go onto the bus as frames, at --out into a file, and to the terminal. Frames that are lost or late are missing samples.
     Ctrl-C ends it; written files stay.
     """
+    options: dict[str, Any] = {name: value for name, value in locals().items() if name not in ("log", "overrides", "as_json")}
     from vehest.run.replay import replay_log
     from vehest.run.signals import StopSignals
 
     stop = StopSignals()
     with stop.installed(), stop.deferred():
-        outcome = replay_log(
-            log,
-            overrides or [],
-            stop.requested,
-            note,
-            model=model,
-            dbc=dbc,
-            dataset=dataset,
-            signals=signals,
-            speed=speed,
-            bus_rate=bus_rate,
-            interface=interface,
-            channel=channel,
-            identifier=identifier,
-            out=out,
-            write_dbc=write_dbc,
-            quiet=quiet,
-        )
+        outcome = replay_log(log, overrides or [], stop.requested, note, **options)
     emit(as_json, outcome)
     if stop.number is not None:
         raise typer.Exit(128 + stop.number)

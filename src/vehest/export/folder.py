@@ -76,10 +76,11 @@ def export_model(
 def readme(stepper: GuardedStepper, precision: Precision, drive: Recording | None = None, *, has_trust: bool, elsewhere: bool) -> str:
     """What people need to know of an export: how it is called, units, licences."""
     context = context_of(stepper, precision, stepper.estimator.full_title)
+    reasons = {kind: text for kind, (text, _) in health.REASONS.items() if kind and kind not in health.RETIRED}
     context |= {
         "channels": [(name, CHANNELS[name].meaning) for name in stepper.estimator.channels],
         "units": {name: CHANNELS[name].unit for name in stepper.estimator.channels},
-        "reasons": sorted(_reasons().items()),
+        "reasons": sorted((kind, text.format(channel="CHANNEL", partner="PARTNER")) for kind, text in reasons.items()),
         "trust": has_trust,
         "elsewhere": elsewhere,
         "version": __version__,
@@ -104,15 +105,6 @@ def refuse_unresolved(trust: Trust | None) -> None:
                 f"channel '{name}' follows the others to {deviation / largest:.1g} of its size where the model learnt, which float cannot "
                 f"resolve; export with --precision double"
             )
-
-
-def _reasons() -> dict[int, str]:
-    """Kind of a reason -> what it says."""
-    return {
-        kind: text.format(channel="CHANNEL", partner="PARTNER")
-        for kind, (text, _) in health.REASONS.items()
-        if kind and kind not in health.RETIRED
-    }
 
 
 def _refuse_foreign(out: Path) -> None:

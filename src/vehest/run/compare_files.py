@@ -87,7 +87,9 @@ def read_estimate_table(file: Path, vx: Recording) -> Estimate:
     for quantity, spellings in SPELLINGS.items():
         for name in names:
             if re.sub(r"[\[(].*?[\])]|[\s_]", "", name).lower() in spellings:
-                found.setdefault(quantity, {"column": name, "unit": _unit_in(name) or USUAL_UNITS[quantity]})
+                written = re.search(r"[\[(](.*?)[\])]", name)
+                unit = written and (written[1] if written[1] in ("s", "ms", "us", "ns") else plain_unit(written[1]))
+                found.setdefault(quantity, {"column": name, "unit": unit or USUAL_UNITS[quantity]})
     time, channel = found.pop("time", None), next(iter(found), None)
     if time is None or channel is None:
         wanted = "time [s]" if time is None else "vy [m/s] or sideslip [rad]"
@@ -101,13 +103,6 @@ def read_estimate_table(file: Path, vx: Recording) -> Estimate:
     if channel == "sideslip_ref":
         values = np.tan(values) * np.interp(table.time, vx.time, vx["vx"])
     return Estimate(vx.id, file.stem, table.rate_hz, table.start_time, {"vy": values, "sideslip": np.zeros_like(values)})
-
-
-def _unit_in(name: str) -> str | None:
-    written = re.search(r"[\[(](.*?)[\])]", name)
-    if written is None:
-        return None
-    return written[1] if written[1] in ("s", "ms", "us", "ns") else plain_unit(written[1])
 
 
 def compare_estimates(drive: Recording, estimates: Mapping[str, Estimate]) -> dict[str, Any]:
