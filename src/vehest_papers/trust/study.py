@@ -18,7 +18,7 @@ from vehest.data.store import read_recording
 from vehest.estimators.registry import estimator_class
 from vehest.evaluation.under_fault import FAULTED
 from vehest.report.document import PATENT_NOTE, REPORT, Block, Column, Document, Figure, Table, as_text
-from vehest.report.reliability import Reliability, reliability_figure
+from vehest.report.figures import Reliability, reliability_figure
 from vehest.report.style import lines_of, listed
 from vehest.studies.artefacts import PartArtefacts, StudyArtefacts
 from vehest.studies.drive import appendix_of

@@ -8,7 +8,7 @@ import numpy as np
 import pandas as pd
 
 from vehest.report.document import Block, Column, Figure, Table
-from vehest.report.reliability import Reliability, reliability_figure
+from vehest.report.figures import Reliability, reliability_figure
 from vehest.report.style import MISSING, Line
 from vehest.studies.artefacts import PartArtefacts
 from vehest.studies.kit.runs import Name, runs_of, values_of
