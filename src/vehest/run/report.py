@@ -42,8 +42,8 @@ from vehest.studies.artefacts import (
     of_parts,
     read_frame,
 )
-from vehest.studies.kit.reference_minutes import start_in_words
 from vehest.studies.kit.timings import timings_of_study
+from vehest.studies.reference_minutes import start_in_words
 from vehest.studies.registry import study_module
 from vehest.studies.sweep import DONE, FAILED, SweepArtefacts, build, summary
 

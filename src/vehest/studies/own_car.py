@@ -25,10 +25,10 @@ from vehest.report.document import REPORT, Block, Document, as_code, as_text
 from vehest.report.style import fixed, listed
 from vehest.studies import drive
 from vehest.studies.artefacts import EvaluatedModel, PartArtefacts, StudyArtefacts
-from vehest.studies.kit.reference_minutes import blocks_of_curve, curves_of
 from vehest.studies.kit.runs import Name, by_name, chosen_seed, runs_of, values_of
 from vehest.studies.kit.standing import BASELINE_TITLES, ranking_of
 from vehest.studies.kit.warnings import cannot_rank
+from vehest.studies.reference_minutes import blocks_of_curve, curves_of
 
 TAKES = "parts"
 SHOWS_FAILED = True
