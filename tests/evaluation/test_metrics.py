@@ -14,7 +14,7 @@ from vehest.data.recording import Recording
 from vehest.data.splits import Span
 from vehest.evaluation.blocks import segments_of
 from vehest.evaluation.lever_arm import LONGEST, lever_arm_figures
-from vehest.evaluation.metrics import UNITS, Protocol, Scored, accuracy, score, weighted_squared_errors
+from vehest.evaluation.metrics import UNITS, Protocol, Scored, accuracy, score, weighted_errors
 from vehest_papers.cnn_ukf.manoeuvres import error_distribution, group_of, kpis, kpis_by_group, manoeuvres_of
 
 
@@ -74,7 +74,7 @@ def test_weighted_metrics_have_the_values_of_a_hand_calculation_where_all_parts_
     assert "rmse_vx" in accuracy([with_vx])
     assert "mse_weighted" not in accuracy([with_vx])
     assert not {"rmse_vx", "rmse_yaw_rate", "nees", "nis"} & set(accuracy([with_vx, without]))
-    assert "there is none of yaw_rate" in refusal(lambda: weighted_squared_errors(with_vx))
+    assert "there is none of yaw_rate" in refusal(lambda: weighted_errors(with_vx, np.square))
 
 
 def test_faster_estimates_are_held_never_interpolated_from_the_future(drive):

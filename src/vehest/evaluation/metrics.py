@@ -249,7 +249,7 @@ def accuracy(parts: Sequence[Scored]) -> dict[str, float]:
 
     Definitions: RMSE = sqrt(E[e²]); FVU = var(v - v̂)/var(v) and R² = 1 - FVU (Da Lio et al. 2023, Section VIII);
     ``…_nonlinear`` counts samples with |a_y| ≥ 4 m/s² only (Bertipaglia et al. 2024) and is NaN where there are none, or no a_y.
-    ``…_weighted`` are the mean of `weighted_squared_errors`, the mean and the 99th percentile of `weighted_absolute_errors`.
+    ``…_weighted`` are the mean of squared `weighted_errors`, the mean and the 99th percentile of absolute ones.
 
     Returns:
         Metric name -> value; sideslip in deg or deg². Metrics of other states, of covariances and of innovations are there only if all
@@ -276,17 +276,8 @@ def accuracy(parts: Sequence[Scored]) -> dict[str, float]:
     }
 
 
-def weighted_squared_errors(part: Scored) -> FloatArray:
-    """Squared errors of vx, vy and yaw rate times `WEIGHTS`, summed at each sample, (K,); `DataError` where one is missing."""
-    return _weighted(part, np.square)
-
-
-def weighted_absolute_errors(part: Scored) -> FloatArray:
-    """Absolute errors of vx, vy and yaw rate times `WEIGHTS`, summed at each sample, (K,); `DataError` where one is missing."""
-    return _weighted(part, np.abs)
-
-
-def _weighted(part: Scored, size: Callable[[FloatArray], FloatArray]) -> FloatArray:
+def weighted_errors(part: Scored, size: Callable[[FloatArray], FloatArray]) -> FloatArray:
+    """Sizes of errors of vx, vy and yaw rate, such as `np.square`, times `WEIGHTS`, summed, (K,); `DataError` where one is missing."""
     errors = part.errors
     missing = [name for name in WEIGHTS if name not in errors]
     if missing:
@@ -303,8 +294,8 @@ def _state_accuracy(parts: Sequence[Scored]) -> dict[str, float]:
         if name in common and name != "vy"
     }
     if common >= set(WEIGHTS):
-        absolute = np.concatenate([weighted_absolute_errors(part) for part in parts])
-        figures["mse_weighted"] = float(np.mean(np.concatenate([weighted_squared_errors(part) for part in parts])))
+        absolute = np.concatenate([weighted_errors(part, np.abs) for part in parts])
+        figures["mse_weighted"] = float(np.mean(np.concatenate([weighted_errors(part, np.square) for part in parts])))
         figures |= {"mae_weighted": float(absolute.mean()), "ae99_weighted": float(np.quantile(absolute, 0.99))}
     return figures
 
