@@ -79,11 +79,7 @@ class Curve:
     title: str  # of the first of its parts
     test_set: str  # that was tested on
     points: Sequence[Point]  # by estimator, start and minutes
-    ranking: Ranking  # of all of them
-
-    def interval(self, point: Point) -> tuple[float, float]:
-        """95 % interval of its RMSE(β) [deg]; NaN where the test is too short for one."""
-        return self.ranking.intervals.get(point.name, (math.nan, math.nan))
+    ranking: Ranking  # of all of them, whose intervals are missing where the test is too short for them
 
 
 def curves_of(parts: Sequence[PartArtefacts]) -> list[Curve]:
@@ -138,8 +134,7 @@ def start_of(training: Mapping[str, object]) -> str:
 
 def start_in_words(training: Mapping[str, object]) -> str:
     """Behind a title: ``, starting from MODEL``; empty where a training starts from nothing."""
-    start = start_of(training)
-    return "" if start == SCRATCH else f", starting {start}"
+    return "" if training.get("start_from") is None else f", starting {start_of(training)}"
 
 
 def minutes_of(part: PartArtefacts) -> float:
@@ -178,7 +173,7 @@ def rows_of_curve(curve: Curve) -> list[dict[str, object]]:
     rows: list[dict[str, object]] = []
     for point in curve.points:
         if point.estimator != BASELINES[0]:
-            low, high = curve.interval(point)
+            low, high = curve.ranking.intervals.get(point.name, (math.nan, math.nan))
             row = {key: getattr(point, key) for key in ("title", "start", "minutes")}
             row |= {"rmse_sideslip": curve.ranking.rmse[point.name]}
             row |= {"interval": f"{fixed(low, 3)} … {fixed(high, 3)}" if math.isfinite(low) else "–", "n_trainings": point.n_trainings}
@@ -235,7 +230,7 @@ def _figure(curve: Curve) -> MatplotlibFigure:
             label = own[0].title + ("" if start == SCRATCH else f", {start}")
             axes.plot(minutes, errors, color=line.colour, linestyle=dash, marker=line.marker, markersize=3.5, linewidth=1.1, label=label)
             for at, point in zip(minutes, own, strict=True):
-                low, high = curve.interval(point)
+                low, high = curve.ranking.intervals.get(point.name, (math.nan, math.nan))
                 if math.isfinite(low):
                     axes.plot([at, at], [low, high], color=line.colour, linewidth=0.8)
         nothing = next((ranking.rmse[name] for name in ranking.order if name[0] == BASELINES[0]), math.nan)
