@@ -146,10 +146,10 @@ def write_document(
             (folder / "figures" / f"{block.name}.png").write_bytes(png_of(block.static))
             images[block.name] = svg_of(block.static)
             (folder / "figures" / f"{block.name}.svg").write_bytes(images[block.name])
-    _write_text(folder / f"{name}.md", _markdown(document, numbers))
+    (folder / f"{name}.md").write_bytes(_markdown(document, numbers).encode("utf-8", "backslashreplace"))
     if page:
         whole = replace(document, blocks=[*document.blocks, *on_page])
-        _write_text(folder / f"{name}.html", _page(whole, _numbers(whole), images))
+        (folder / f"{name}.html").write_bytes(_page(whole, _numbers(whole), images).encode("utf-8", "backslashreplace"))
 
 
 def as_text(name: str) -> str:
@@ -218,16 +218,15 @@ def png_of(figure: MatplotlibFigure) -> bytes:
 
 
 def svg_of(figure: MatplotlibFigure) -> bytes:
-    """A figure as SVG."""
+    """A figure as SVG, with places to a hundredth of a point, finer than any page: half the size."""
+
+    def in_hundredths(path: re.Match[str]) -> str:
+        return _LONG_NUMBER.sub(lambda number: f"{float(number[0]):.2f}".rstrip("0").rstrip("."), path[0])
+
     buffer = io.BytesIO()
     with paper_style():
         figure.savefig(buffer, format="svg", dpi=PNG_DPI, metadata={"Date": None, "Creator": None})
-    return _PATH.sub(_in_hundredths, buffer.getvalue().decode("utf-8")).encode("utf-8")
-
-
-def _in_hundredths(path: re.Match[str]) -> str:
-    """A path whose places are given to a hundredth of a point, finer than any page: half the size."""
-    return _LONG_NUMBER.sub(lambda number: f"{float(number[0]):.2f}".rstrip("0").rstrip("."), path[0])
+    return _PATH.sub(in_hundredths, buffer.getvalue().decode("utf-8")).encode("utf-8")
 
 
 def _for_both_schemes(svg: bytes) -> bytes:
@@ -247,10 +246,6 @@ def _for_both_schemes(svg: bytes) -> bytes:
 def _write_table(folder: Path, name: str, frame: pd.DataFrame) -> None:
     (folder / "tables").mkdir(exist_ok=True)
     frame.to_csv(folder / "tables" / f"{name}.csv", index=False, lineterminator="\n", encoding="utf-8", errors="backslashreplace")
-
-
-def _write_text(path: Path, text: str) -> None:
-    path.write_bytes(text.encode("utf-8", "backslashreplace"))
 
 
 def _markdown(document: Document, numbers: Mapping[int, str]) -> str:

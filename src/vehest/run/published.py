@@ -27,7 +27,7 @@ from vehest.run.ingest import PROSE, plan_ingest
 from vehest.run.publishing import PROVENANCE, RESULTS, Published, published_in
 from vehest.run.runner import Runner
 from vehest.run.signals import StopSignals
-from vehest.run.study import Job, Jobs, Study, content_overrides, jobs_of, read_study
+from vehest.run.study import Jobs, Study, content_overrides, jobs_of, read_study
 from vehest.run.versions import code_of
 from vehest.sources.base import kind_of
 
@@ -60,14 +60,15 @@ def keys_of_study(study: Study, jobs: Jobs, absent: Collection[str], runner: Run
 
 
 def _ingests(study: Study, jobs: Jobs, absent: Collection[str], runner: Runner) -> dict[str, Config]:
+    there = {name: config for name, config in _firsts(study, jobs).items() if name not in absent}
     if study.datasets:
-        return {name: config for name, config in _by_dataset(jobs[""]).items() if name not in absent}
-    firsts = [jobs[name][0].config for name in study.parts if name not in absent]
-    return {name: runner.dataset_config(name, config) for config in firsts for name in dataset_names(config["split"])}
+        return there
+    return {name: runner.dataset_config(name, config) for config in there.values() for name in dataset_names(config["split"])}
 
 
-def _by_dataset(jobs: Sequence[Job]) -> dict[str, Config]:
-    return {str(job.config["dataset"]["name"]): job.config for job in jobs}
+def _firsts(study: Study, jobs: Jobs) -> dict[str, Config]:
+    """Part, or data set, -> configuration of its first job."""
+    return {name: jobs[name][0].config for name in study.parts} or {str(job.config["dataset"]["name"]): job.config for job in jobs[""]}
 
 
 def _of_jobs(configs: Sequence[Config]) -> Iterator[tuple[str, dict[str, str]]]:
@@ -171,7 +172,7 @@ def _changes(study: Study, jobs: Jobs, published: Published) -> tuple[list[tuple
     changes = [(what, cause) for what in then for cause, own in today.get(what, {}).items() if then[what].get(cause) != own]
     changes += [(f"{what} added", CONFIGURATION) for what in today if what not in then]
     changes += [(f"{what} removed", CONFIGURATION) for what in then if what not in today]
-    parts = {name: jobs[name][0].config for name in study.parts} or _by_dataset(jobs[""])
+    parts = _firsts(study, jobs)
     for name in sorted(parts.keys() & set(published.absent)):  # that the study had to go on without
         with suppress(MissingError):
             runner.look_for_files(parts[name]) if study.parts else plan_ingest(parts[name])
