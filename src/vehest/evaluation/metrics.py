@@ -206,7 +206,8 @@ def score(estimate: Estimate, reference: Recording, span: Span, protocol: Protoc
         return values
 
     vy, standing = held("vy"), np.hypot(scored["vx"], scored["vy_ref"]) < protocol.least_speed
-    others = {name: (held(name), scored[reference_name]) for name, reference_name in REFERENCES.items() if _has(estimate, scored, name)}
+    measured = {name: scored[own] for name, own in REFERENCES.items() if own in scored and name in estimate.channels and name != "vy"}
+    others = {name: (held(name), own) for name, own in measured.items() if not np.isnan(own).any()}
     covariance_of = tuple(name for name in REFERENCES if name in estimate.covariance_of and (name == "vy" or name in others))
     covariance = estimate.covariance_at(scored.time, covariance_of) if covariance_of else None
     if covariance is not None:
@@ -227,12 +228,6 @@ def score(estimate: Estimate, reference: Recording, span: Span, protocol: Protoc
         nis_dof=held("nis_dof") if innovations else None,
         bands=bands,
     )
-
-
-def _has(estimate: Estimate, scored: Recording, name: str) -> bool:
-    """Whether a quantity other than vy is estimated and measured, without gaps in the reference."""
-    reference = REFERENCES[name]
-    return name != "vy" and name in estimate.channels and reference in scored and not np.isnan(scored[reference]).any()
 
 
 def _require_all(values: FloatArray, what: str, span: Span) -> None:

@@ -60,11 +60,6 @@ def pretrained_folder(name: str = PRETRAINED) -> Path:
     return Path(__file__).resolve().parents[1] / WITH_VEHEST[name]
 
 
-def pretrained_note(name: str = PRETRAINED) -> str:
-    """The caution that goes with estimates of a model that comes with vehest."""
-    return " ".join(read_description(pretrained_folder(name)).about.note.split())
-
-
 def find_model(name: str, output: Path, say: Callable[[str], None]) -> Path:
     """A model's folder, by path or by the start of its name in the output root; those of `WITH_VEHEST` come with vehest.
 
@@ -174,7 +169,7 @@ def estimate_file(words: Sequence[str], out: Path, *, strict: bool = False, car:
         **report.summary(),
         "verdict": report.verdict(),
         "findings": findings,
-        **({"note": pretrained_note(name)} if name in WITH_VEHEST else {}),
+        **({"note": " ".join(read_description(folder).about.note.split())} if name in WITH_VEHEST else {}),
     }
 
 

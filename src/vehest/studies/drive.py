@@ -22,8 +22,7 @@ from vehest.report import figures
 from vehest.report.document import PATENT_NOTE, REPORT, Block, Column, Document, Figure, ModelLink, Table, as_code, as_text
 from vehest.report.style import REFERENCE, Line, decimals_for, fixed, lines_of
 from vehest.studies.artefacts import PartArtefacts, StudyArtefacts
-from vehest.studies.kit.bands import band_blocks
-from vehest.studies.kit.drives import floors_table, regime_table
+from vehest.studies.kit.drives import band_blocks, floors_table, regime_table
 from vehest.studies.kit.explorer import chained, explorer_of
 from vehest.studies.kit.runs import Name, by_name, chosen_seed, of_model, runs_of, values_of
 from vehest.studies.kit.standing import interval_in_words, ranking_of, standing_columns, verdict_sentences
