@@ -12,9 +12,9 @@ from vehest.data.errors import ConfigurationError, printable
 from vehest.data.files import written_aside
 from vehest.data.recording import Recording
 from vehest.estimators.base import Estimator
-from vehest.export.program import TOLERANCES, context_of, program_files, vector_files
+from vehest.export.program import TOLERANCES, context_of, program_files
 from vehest.export.rendering import Precision, render
-from vehest.export.vectors import SECONDS, in_float64
+from vehest.export.vectors import COLUMNS, SECONDS, drive_for, in_float64, replayed, table_text
 from vehest.trust import health
 from vehest.trust.contract import GuardedStepper
 from vehest.trust.record import Trust
@@ -66,7 +66,10 @@ def export_model(
         refuse_unresolved(trust)
     files = program_files(stepper, kind, estimator.full_title)
     files["README.md"] = readme(stepper, kind, drive, has_trust=trust is not None, elsewhere=elsewhere)
-    files |= vector_files(GuardedStepper(in_float64(estimator), trust, bus_rate_hz, elsewhere=elsewhere), drive)
+    exact = GuardedStepper(in_float64(estimator), trust, bus_rate_hz, elsewhere=elsewhere)
+    times, samples = drive_for(exact) if drive is None else (drive.time, {name: drive[name] for name in exact._channels})
+    files["test_vectors.csv"] = table_text(("time", *samples), np.column_stack([times, *samples.values()]))
+    files["expected.csv"] = table_text(COLUMNS, replayed(exact, times, samples))
     with written_aside(out, replace_folder=True) as aside:
         aside.mkdir()
         for name, text in files.items():
