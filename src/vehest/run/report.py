@@ -45,7 +45,7 @@ from vehest.studies.artefacts import (
 from vehest.studies.kit.timings import timings_of_study
 from vehest.studies.reference_minutes import start_in_words
 from vehest.studies.registry import study_module
-from vehest.studies.sweep import DONE, FAILED, SweepArtefacts, build, summary
+from vehest.studies.sweep import DONE, FAILED, SweepArtefacts, build
 
 STAGE, SWEEP = "report", "sweep"
 OVERVIEW = "tables/overview.csv"
@@ -212,7 +212,6 @@ def draw_sweep(study: Study, comparison: Comparison, runner: Runner) -> tuple[Ar
     part = _part_artefacts(study, "", comparison)
     part = replace(part, facts=[*part.facts, *under])
     artefacts = SweepArtefacts(part, list(comparison.jobs[0].values), _job_table(comparison))
-    table = summary(artefacts.jobs, artefacts.keys, artefacts.sets)
     made = [own for member in comparison.members for own in (member.model, member.evaluation) if own is not None]
     plan = StagePlan(
         stage=SWEEP,
@@ -236,10 +235,10 @@ def draw_sweep(study: Study, comparison: Comparison, runner: Runner) -> tuple[Ar
         from vehest.report.document import write_document
 
         write_document(build(artefacts), folder, page=False)
-        for file, written in (("sweep.csv", artefacts.jobs), ("summary.csv", table)):
+        for file, written in (("sweep.csv", artefacts.jobs), ("summary.csv", artefacts.table)):
             written.to_csv(folder / file, index=False, lineterminator="\n", errors="backslashreplace")
 
-    return runner.ensure(plan, write), summary_of_sweep(artefacts, table)
+    return runner.ensure(plan, write), summary_of_sweep(artefacts)
 
 
 def _job_table(comparison: Comparison) -> pd.DataFrame:
