@@ -68,7 +68,7 @@ def test_best_is_chosen_on_validation_though_another_is_better_on_the_test_and_n
     assert ([row[0] for row in rows], rows[1][4]) == (["", "*", ""], "0.350 ± 0.635")
     swapped = jobs.rename(columns={"rmse_sideslip.validation": "rmse_sideslip.test", "rmse_sideslip.test": "rmse_sideslip.validation"})
     unvalidated = artefacts_of(swapped, KEYS)
-    unvalidated = replace(unvalidated, part=replace(unvalidated.part, split=replace(unvalidated.part.split, validation=())))
+    unvalidated = replace(unvalidated, part=replace(unvalidated.part, split=replace(unvalidated.part.split, train=(), validation=())))
     assert not unvalidated.table["chosen"].any(), "nothing is chosen without a validation range"
     jobs.loc[3, ["status", "rmse_sideslip.validation", "rmse_sideslip.test"]] = ["failed", math.nan, math.nan]
     table = artefacts_of(jobs, KEYS).table
