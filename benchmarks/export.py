@@ -40,7 +40,7 @@ def models(output: Path) -> list[tuple[str, Path]]:
     """Data set and folder of one model of each family and variant on each of `DRIVES`; one that learns nothing goes with the Ferrari."""
     from vehest.data.errors import VehestError
     from vehest.estimators.model_files import read_description
-    from vehest.export.method import exportable
+    from vehest.export.program import exportable
     from vehest.run.calibrate import trust_of
 
     found: dict[tuple[str, str, str], Path] = {}

@@ -40,24 +40,8 @@ from vehest.run.estimate import (
 )
 from vehest.run.train import new_estimator
 from vehest.trust.contract import GuardedStepper
-from vehest.trust.health import reason_in_words
+from vehest.trust.health import reason_in_words as reason_in_words
 from vehest.trust.record import Trust, write_trust
-
-__all__ = [
-    "Estimate",
-    "Estimator",
-    "Recording",
-    "estimate",
-    "load_model",
-    "online",
-    "read_recording",
-    "reason_in_words",
-    "save_model",
-    "score",
-    "train",
-    "write_estimate",
-]
-
 
 _TRUST: WeakKeyDictionary[Estimator, Trust] = WeakKeyDictionary()  # what was learnt with the estimators that were trained or loaded here
 

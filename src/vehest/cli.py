@@ -7,6 +7,7 @@ import os
 import sys
 from collections.abc import Callable, Iterable
 from dataclasses import asdict
+from datetime import timedelta
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, NoReturn
 
@@ -388,29 +389,13 @@ def replay(
     Estimates go onto the bus as frames, at --out into a file, and to the terminal. Frames that are lost or late are missing samples.
     Ctrl-C ends it; written files stay.
     """
+    options: dict[str, Any] = {name: value for name, value in locals().items() if name not in ("log", "overrides", "as_json")}
     from vehest.run.replay import replay_log
     from vehest.run.signals import StopSignals
 
     stop = StopSignals()
     with stop.installed(), stop.deferred():
-        outcome = replay_log(
-            log,
-            overrides or [],
-            stop.requested,
-            note,
-            model=model,
-            dbc=dbc,
-            dataset=dataset,
-            signals=signals,
-            speed=speed,
-            bus_rate=bus_rate,
-            interface=interface,
-            channel=channel,
-            identifier=identifier,
-            out=out,
-            write_dbc=write_dbc,
-            quiet=quiet,
-        )
+        outcome = replay_log(log, overrides or [], stop.requested, note, **options)
     emit(as_json, outcome)
     if stop.number is not None:
         raise typer.Exit(128 + stop.number)
@@ -492,8 +477,7 @@ def compare(
     """
     from vehest.run.compare_files import compare_files
 
-    found = compare_files(recording, words or [], models or [])
-    emit(as_json, asdict(found), found.in_words())
+    emit(as_json, *compare_files(recording, words or [], models or []))
 
 
 @app.command()
@@ -555,12 +539,12 @@ def report(
     Exit code 3 unless all are up to date.
     """
     if check:
-        from vehest.run.published import check_published
+        from vehest.run.published import check_published, in_words
 
         words = [word for word in (pipeline, *(overrides or [])) if word is not None]
         verdicts = check_published([word for word in words if is_file_name(word)], [word for word in words if not is_file_name(word)])
-        emit(as_json, [asdict(verdict) for verdict in verdicts], [verdict.in_words() for verdict in verdicts])
-        raise typer.Exit(3 if any(verdict.state != "up to date" for verdict in verdicts) else 0)
+        emit(as_json, verdicts, map(in_words, verdicts))
+        raise typer.Exit(3 if any(verdict["state"] != "up to date" for verdict in verdicts) else 0)
     if pipeline is None:
         raise ConfigurationError(f"no pipeline is named; there are: {', '.join(pipeline_names())}; or use --check")
     _run_study(pipeline, overrides or [], RunOptions(force, dry_run, quiet, 1), as_json, only_report=True)
@@ -623,17 +607,17 @@ def prune(
     if as_json and not (yes or dry_run):
         raise ConfigurationError("with --json nothing is asked; add --yes to remove, or --dry-run")
     found = unused_artefacts(Path(str(config["output"])))
-    total = sum(one.size for one in found)
-    shown = [TerminalTable("", ("cannot be reused", "size", "age", "since"), [one.in_words() for one in found])] if found else []
+    total = sum(one["bytes"] for one in found)
+    rows = [[one["path"], f"{one['bytes'] / 1e6:.3f} MB", str(timedelta(seconds=one["seconds"])), one["reason"]] for one in found]
+    shown = [TerminalTable("", ("cannot be reused", "size", "age", "since"), rows)] if found else []
     emit(False, None, [] if as_json else [*shown, f"{len(found)} to remove, {total / 1e6:.3f} MB" if found else "nothing to remove"])
     removed: list[str] = []
     if found and not dry_run:
         if not yes and not sys.stdin.isatty():
             raise ConfigurationError("no terminal for questions; use --yes to remove, or --dry-run")
         if yes or typer.confirm("Remove them?"):
-            remove_unused(found, lambda one: removed.append(str(one.path)))
-    listed = [{"path": str(one.path), "reason": one.reason, "bytes": one.size, "seconds": round(one.age)} for one in found]
-    emit(as_json, {"found": listed, "bytes": total, "removed": removed}, [f"{len(removed)} removed"] if removed else [])
+            remove_unused([Path(one["path"]) for one in found], lambda path: removed.append(str(path)))
+    emit(as_json, {"found": found, "bytes": total, "removed": removed}, [f"{len(removed)} removed"] if removed else [])
 
 
 @app.command()

@@ -10,7 +10,7 @@ from vehest.data.recording import Recording
 from vehest.estimators.kernels import self_calibrating as kernel
 from vehest.estimators.model_files import load_model
 from vehest.estimators.self_calibrating import SelfCalibrating
-from vehest.export.method import method_source
+from vehest.export.program import method_files
 from vehest.run.estimate import pretrained_folder
 
 RATE = 20.0
@@ -257,6 +257,6 @@ def test_smoothed_estimates_err_less_within_their_bands():
 def test_smoother_is_offline_and_refuses_online_and_c():
     model = model_of(smoothed=True)
     assert not model.causal
-    for refused in (model.online, lambda: method_source(model, "double")):
+    for refused in (model.online, lambda: method_files(model, "double")):
         with pytest.raises(ConfigurationError, match="smooths a whole drive and cannot run online; use estimator"):
             refused()

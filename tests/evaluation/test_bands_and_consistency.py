@@ -18,8 +18,17 @@ from vehest.evaluation.bands import (
     interval_score,
     proportion_interval,
 )
-from vehest.evaluation.consistency import COVERAGE, coverage, normalised_error_squared, normalised_innovation_squared
-from vehest.evaluation.metrics import UNITS, Protocol, Scored, accuracy, score
+from vehest.evaluation.metrics import (
+    COVERAGE,
+    UNITS,
+    Protocol,
+    Scored,
+    accuracy,
+    coverage,
+    normalised_error_squared,
+    normalised_innovation_squared,
+    score,
+)
 from vehest.evaluation.under_fault import detection_delay, error_while_undetected
 from vehest.trust.bands import LEVELS, Bands, Quantity, intraclass_correlation
 

@@ -114,7 +114,7 @@ def test_winners_are_named_where_they_are_clear_and_beat_the_baselines():
     assert found.winner == ("good", "good")
     assert found.order[0] == ("good", "good")
     assert found.beats(("other", "other"), "zero")
-    assert found.against_best[("other", "other")].high < 0.0
+    assert found.pairs[found.order[0], ("other", "other")].high < 0.0
     low, high = found.intervals[("good", "good")]
     assert low < found.rmse[("good", "good")] < high
     wrongly = 0

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from vehest.export.method import _common, method_source
+from vehest.export import program
 from vehest.export.rendering import render
 
 COMPILERS = [name for name in ("gcc", "clang") if shutil.which(name)]
@@ -65,9 +65,8 @@ class Library:
 
 def method_files(estimator, precision):
     """Name of a file -> the C of an estimator's method."""
-    source = method_source(estimator, precision)
-    types = render("types.h.j2", precision, **_common(estimator))
-    return {"vehest_types.h": types, "vehest_method.h": source.header, "vehest_method.c": source.source}
+    types = render("types.h.j2", precision, channels=program.channels_of(estimator))
+    return {"vehest_types.h": types, **program.method_files(estimator, precision)}
 
 
 def write(files, folder):

@@ -15,8 +15,7 @@ from conftest import planar_drive
 from every_estimator import fitted
 from single_track_drive import linear_drive
 from small_car_drive import small_car_drive
-from vehest.export.method import exportable
-from vehest.export.program import program_files
+from vehest.export.program import exportable, program_files
 from vehest.export.vectors import COLUMNS, drive_for, replayed, table_text
 from vehest.trust.bands import Bands, Quantity
 from vehest.trust.contract import GuardedStepper

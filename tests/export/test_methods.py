@@ -23,7 +23,7 @@ from vehest.estimators.network import Network
 from vehest.estimators.network_ukf import NetworkUkf
 from vehest.estimators.networks.windowed import WindowedEstimator
 from vehest.estimators.registry import estimator_class, estimator_names
-from vehest.export.method import exportable, method_source
+from vehest.export.program import exportable, method_files
 from vehest.training.sequences import PhaseSettings
 from vehest.training.through_filter import ThroughFilterSettings
 
@@ -211,11 +211,11 @@ def test_every_family_but_the_factor_graph_can_be_exported():
 
 def test_what_cannot_be_exported_is_said_in_one_line():
     offline = estimator_class("kalman").from_config({"noise": {"read_from": "recording"}})
-    assert "cannot run along with a drive" in refusal(lambda: method_source(offline, "double"), ConfigurationError)
+    assert "cannot run along with a drive" in refusal(lambda: method_files(offline, "double"), ConfigurationError)
     unscented = estimator_class("rational_ekf").from_config(
         {"filter": "unscented", "noise": {"yaw_rate": 0.01, "ay": 0.1, "steer": 0.01, "tyres": 0.01}, "curves": CURVES}
     )
-    assert "has no C; train it with filter=extended" in refusal(lambda: method_source(unscented, "double"), ConfigurationError)
+    assert "has no C; train it with filter=extended" in refusal(lambda: method_files(unscented, "double"), ConfigurationError)
 
 
 CURVES = {"c1_front": 0.1, "c2_front": 0.7e5, "c1_rear": 0.1, "c2_rear": 1.2e5}
@@ -225,14 +225,14 @@ def test_a_value_that_float_cannot_hold_is_refused():
     kalman = estimator_class("kalman").from_config({"noise": {"yaw_rate": 1e-3, "ay": 0.1, "steer": 0.01}})
     kalman.values["steer"] = 1e36
     with pytest.raises(ConfigurationError, match=r"no float number; fit it anew, or export with precision double"):
-        method_source(kalman, "float")
-    assert "1e+39" in method_source(kalman, "double").source
+        method_files(kalman, "float")
+    assert "1e+39" in method_files(kalman, "double")["vehest_method.c"]
 
 
 @pytest.mark.parametrize("precision", ["double", "float"])
 def test_sources_are_plain_c_and_their_literals_have_the_type(precision):
-    source = method_source(case_of("rational_ekf", {}).estimator, precision)
-    code = "".join(part.split("*/")[-1] for part in source.source.split("/*"))
+    source = method_files(case_of("rational_ekf", {}).estimator, precision)["vehest_method.c"]
+    code = "".join(part.split("*/")[-1] for part in source.split("/*"))
     assert code.isascii()
     assert ("TAU = 0.0500000007f;" in code) == (precision == "float")
     assert ("TAU = 0.05;" in code) == (precision == "double")

@@ -26,6 +26,7 @@ from fuzz.honest import run
 from place import DATASET, Place, write_csv
 from vehest.estimators.registry import estimator_class, estimator_names
 from vehest.run import calibrate, downsample, evaluate, evaluate_faults
+from vehest.run.versions import FAULTS, VERSIONS
 from vehest.sources.base import open_source, source_class
 from vehest.trust.faults import is_fault
 
@@ -65,11 +66,11 @@ def subjects():
         told = source_class({"source": name})
         found[f"source {name}"] = Subject({f"{told.__name__}.version": told.version}, tolerance, partial(in_folder, make))
     for stage, numbers in STAGES.items():
-        what, tolerance = f"VERSION of {stage.__name__}", FIXED
+        name, tolerance = stage.__name__.removeprefix("vehest.run."), FIXED
+        what = f"{name} in vehest.run.versions"
         if stage is not downsample:
             what, tolerance = f"{what}, unless numbers of {MODEL} moved too,", LEARNT
-        name = stage.__name__.removeprefix("vehest.run.")
-        found[f"stage {name}"] = Subject({what: stage.VERSION}, tolerance, partial(in_folder, numbers))
+        found[f"stage {name}"] = Subject({what: VERSIONS.get(name, FAULTS)}, tolerance, partial(in_folder, numbers))
     return found
 
 

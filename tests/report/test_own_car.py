@@ -22,17 +22,17 @@ def without(part, *names):
 
 
 def said(part):
-    return " ".join(verdict_of(part, "test").sentences)
+    return " ".join(verdict_of(part, "test")[0])
 
 
 def test_the_one_below_all_others_is_recommended_with_its_interval_what_it_beats_and_the_seed_chosen_on_validation(part):
     found = verdict_of(without(part, "luenberger", "gru"), "test")
-    words = " ".join(found.sentences)
+    words = " ".join(found[0])
     assert "**Use KS-NN linear + bias, P = 2.** Expected RMSE(β) " in words
     assert "It beats v = 0 and the static map." in words or "It beats the static map and v = 0." in words
     low, high = (float(text) for text in words.split("(", 2)[2].split(")")[0].split(" to "))
     assert 0.0 < low < high
-    assert (found.model.estimator, found.model.seed) == ("ksnn", 1)
+    assert (found[1].estimator, found[1].seed) == ("ksnn", 1)
 
 
 def test_two_that_are_alike_are_not_told_apart(part):
@@ -54,10 +54,10 @@ def test_the_one_that_is_named_is_the_one_whose_error_is_given_and_that_the_comm
     alike = [replace(model, evaluation_folder=gru.evaluation_folder) for model in part.models if model.estimator == "luenberger"]
     own = replace(without(part, "ksnn", "luenberger"), metrics=metrics)
     found = verdict_of(replace(own, models=[*own.models, *alike]), "test")
-    assert found.model is not None
-    assert found.model.estimator == "gru"
-    assert found.sentences[0].startswith("**Take GRU")
-    assert "Luenberger has the lowest error and is not told apart from GRU" in found.sentences[0]
+    assert found[1] is not None
+    assert found[1].estimator == "gru"
+    assert found[0][0].startswith("**Take GRU")
+    assert "Luenberger has the lowest error and is not told apart from GRU" in found[0][0]
 
 
 def test_share_that_is_scored_and_sideslip_hidden_in_the_start_of_a_range(part, tmp_path):
@@ -84,8 +84,8 @@ def test_recordings_without_sideslip_cannot_rank(part, tmp_path):
     file = tmp_path / "lap.parquet"
     write_recording(replace(still, channels={**still.channels, "vy_ref": 0.01 * still["vy_ref"]}), file)
     found = verdict_of(replace(part, references={("toy", "lap"): file}), "test")
-    assert found.sentences[0].startswith("**These recordings cannot rank estimators**, because they hardly excite sideslip (")
-    assert found.model is None
+    assert found[0][0].startswith("**These recordings cannot rank estimators**, because they hardly excite sideslip (")
+    assert found[1] is None
 
 
 def test_three_times_as_much_hard_driving_again_would_halve_the_interval(part):

@@ -91,8 +91,8 @@ def test_errors_over_filtered_rows_are_those_computed_from_the_signals_and_over_
 def test_browser_unpacks_what_was_packed(chromium, toy):
     path, _, document = toy
     opened(chromium, path)
-    (explorer,) = [block.interactive for block in document.blocks if getattr(block, "interactive", None) is not None]
-    known = unpacked(json.loads(explorer.to_json()))
+    (explorer,) = [block.interactive for block in document.blocks if getattr(block, "interactive", "")]
+    known = unpacked(json.loads(explorer))
     for name in ("vx", "vy", "vy2", "x"):
         read = chromium.execute_script(f"return [...document.querySelector('figure.live').explorer.columns['{name}']]")
         assert np.array(read, dtype=float) == pytest.approx(known[name], abs=1e-12, nan_ok=True)

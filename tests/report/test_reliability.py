@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from vehest.report.reliability import Reliability, _apart, reliability_figure
+from vehest.report.figures import Reliability, _apart, reliability_figure
 from vehest.report.style import line_of
 
 LEVELS = (0.5, 0.68, 0.9, 0.95)

@@ -15,9 +15,9 @@ from vehest.data.errors import ConfigurationError
 from vehest.data.store import read_recording
 from vehest.run.config import compose_config
 from vehest.run.config_files import choices, packaged
-from vehest.run.evaluate import code_of_evaluation
 from vehest.run.evaluate_faults import FaultSettings, all_of, faults_of
 from vehest.run.study import jobs_of, read_study
+from vehest.run.versions import code_of
 from vehest.trust.faults import KINDS, is_fault
 
 TRAINED = ("split=mine", "estimator=kinematic", "tracking=none")
@@ -134,7 +134,7 @@ def test_an_evaluation_under_a_fault_is_skipped_another_seed_is_another_and_with
     assert evaluated(trained, "fault=noise", "fault.seed=1")[0] != first[0]
     manifest = json.loads((evaluated(trained)[0] / "manifest.json").read_text())
     assert set(manifest["config"]) == {"sets", "protocol", "kinds", "split"}
-    assert manifest["code"] == code_of_evaluation("kinematic"), "and the code of faults does not count"
+    assert manifest["code"] == code_of("evaluate", "kinematic"), "and the code of faults does not count"
     assert json.loads((first[0] / "manifest.json").read_text())["code"] == f"{manifest['code']} faults=2"
     assert set(manifest["outputs"]) == {"metrics.csv", "timings.csv", "blocks.csv", "validation/0.parquet", "test/0.parquet"}
 

@@ -5,14 +5,16 @@ import os
 import shutil
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
 
 from place import run_vehest
 from vehest.data.files import ASIDE_PREFIX
-from vehest.run import calibrate, downsample, evaluate, ingest, report, train
 from vehest.run.artefacts import StagePlan, make
+from vehest.run.ingest import PARTS_PREFIX
 from vehest.run.prune import DAMAGED, LEFT_OVER, ORPHANED, OUTDATED, SUPERFLUOUS, unused_artefacts
+from vehest.run.versions import code_of
 
 
 class Root:
@@ -21,14 +23,14 @@ class Root:
     def __init__(self, output):
         self.output = output
         dataset = {"source": "tabular"}
-        self.ingested = self.add("ingest", "drives", dataset, {"lap.csv": "raw"}, ingest.code_of_ingest(dataset))
-        self.rated = self.add("downsample", "drives-20hz", {}, dict(self.ingested.outputs), downsample.code_of_downsampling())
+        self.ingested = self.add("ingest", "drives", dataset, {"lap.csv": "raw"}, code_of("ingest", "tabular"))
+        self.rated = self.add("downsample", "drives-20hz", {}, dict(self.ingested.outputs), code_of("downsample"))
         name = "luenberger"
-        self.model = self.add("train", "one", {"estimator": {"name": name}}, {"drives/lap": "gone"}, train.code_of_training(name))
+        self.model = self.add("train", "one", {"estimator": {"name": name}}, {"drives/lap": "gone"}, code_of("train", name))
         of_model = {"model": self.model.digest}
-        self.trusted = self.add("calibrate", "one-trust", {}, of_model, calibrate.code_of_calibration(name))
+        self.trusted = self.add("calibrate", "one-trust", {}, of_model, code_of("calibrate", name))
         of_both = of_model | {"calibration": self.trusted.digest}
-        self.scored = self.add("evaluate", "one-on-mine", {}, of_both, evaluate.code_of_evaluation(name))
+        self.scored = self.add("evaluate", "one-on-mine", {}, of_both, code_of("evaluate", name))
 
     def add(self, stage, label, config, inputs, code):
         """Make an artefact with one file, whose content is its label."""
@@ -37,7 +39,7 @@ class Root:
 
     def found(self):
         """Path in the root."""
-        return {found.path.relative_to(self.output).as_posix(): found.reason for found in unused_artefacts(self.output)}
+        return {Path(found["path"]).relative_to(self.output).as_posix(): found["reason"] for found in unused_artefacts(self.output)}
 
 
 @pytest.fixture
@@ -52,7 +54,7 @@ def name_of(artefact):
 def test_what_todays_code_has_made_stays_and_models_of_estimators_that_are_not_installed(root):
     assert root.found() == {}
     inputs = {artefact.folder.name: artefact.digest for artefact in (root.model, root.trusted, root.scored)}
-    root.add("report", "mine", {"module": "drive"}, inputs, report.code_of_report("drive"))
+    root.add("report", "mine", {"module": "drive"}, inputs, code_of("report", "drive"))
     root.add("evaluate", "faulted", {"faults": []}, {}, f"{root.scored.code} faults=2")
     root.add("train", "theirs", {"estimator": {"name": "somebody_elses"}}, {}, "train=1 somebody_elses=1 training=1")
     assert root.found() == {}
@@ -94,8 +96,8 @@ def test_what_a_killed_process_left_is_found_and_what_a_living_one_writes_is_not
     living = root.output / "train" / f"{ASIDE_PREFIX}{os.getpid()}-1-one"
     for folder in (dead, living):
         folder.mkdir()
-    parts = root.ingested.folder.with_name(f"{ingest.PARTS_PREFIX}{root.ingested.folder.name}")
-    unfinished = parts.with_name(f"{ingest.PARTS_PREFIX}other-0123456789ab")
+    parts = root.ingested.folder.with_name(f"{PARTS_PREFIX}{root.ingested.folder.name}")
+    unfinished = parts.with_name(f"{PARTS_PREFIX}other-0123456789ab")
     for folder in (parts, unfinished):
         folder.mkdir()
     assert root.found() == {f"train/{dead.name}": LEFT_OVER, f"ingest/{parts.name}": LEFT_OVER}

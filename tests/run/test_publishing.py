@@ -14,6 +14,7 @@ from place import PIPELINE, Place, run_vehest, undrawn
 from vehest.run import published as study_keys
 from vehest.run.artefacts import TIMINGS
 from vehest.run.publishing import PROVENANCE, published_content
+from vehest.run.versions import code_of
 
 QUICK = PIPELINE | {
     "publish": True,
@@ -118,12 +119,16 @@ def test_a_rerun_leaves_the_work_tree_clean(published, monkeypatch, capsys):
     assert (status.stdout, run_vehest(capsys, *CHECK)[:2]) == ("", (0, "small: up to date\n"))
 
 
+def other_code_of(changed):
+    return lambda stage, name="", **options: "other" if stage == changed else code_of(stage, name, **options)
+
+
 def test_results_that_other_code_gives_alike_are_recorded_as_its_own(published, place, monkeypatch):
     shutil.rmtree(place.folder)
     shutil.copytree(published, place.folder)
     shutil.rmtree(place.folder / "outputs" / "finished")
     monkeypatch.chdir(place.folder)
-    monkeypatch.setattr(study_keys, "code_of_ingest", lambda dataset: "other")
+    monkeypatch.setattr(study_keys, "code_of", other_code_of("ingest"))
     before = contents(place.folder / "results" / "small")
     assert (place(*CHECK)[:2], place(*RUN)[0]) == ((3, "small: stale: code (ingest mine)\n"), 0)
     after = contents(place.folder / "results" / "small")
@@ -167,7 +172,7 @@ def test_changed_code_and_data_are_told_apart_and_raw_files_that_are_elsewhere_a
         stream.write("\n")
     assert verdict(checked) == (3, "small: stale: data (ingest mine)")
     with monkeypatch.context() as patch:
-        patch.setattr(study_keys, "code_of_report", lambda study: "other")
+        patch.setattr(study_keys, "code_of", other_code_of("report"))
         assert verdict(checked) == (3, "small: stale: code (report), data (ingest mine)")
     shutil.rmtree(checked.folder / "raw")
     assert verdict(checked) == (0, "small: up to date: raw files not here, not compared: mine")

@@ -3,6 +3,7 @@
 import json
 import math
 import xml.etree.ElementTree as ElementTree
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -18,7 +19,7 @@ from vehest.run.artefacts import StagePlan
 from vehest.run.study import sweep_of
 from vehest.run.train import TrainJob
 from vehest.studies.artefacts import PartArtefacts
-from vehest.studies.sweep import Panel, SweepArtefacts, build, heat_map, heat_maps, interval, summary, table_of
+from vehest.studies.sweep import SweepArtefacts, build, heat_map, heat_maps, interval, table_of
 
 QUICK = ("split=mine", "estimator=ksnn", "training.max_epochs=1", "training.batch_size=256", "tracking=none")
 GRID = (*QUICK, "estimator.n_local=2,3", "estimator.n_hidden=0,1", "seed=range(2)")
@@ -59,18 +60,20 @@ KEYS = ("estimator.n_local",)
 def test_best_is_chosen_on_validation_though_another_is_better_on_the_test_and_never_with_a_failed_seed():
     scores = {(2,): ([0.4, 0.5], [0.1, 0.1]), (3,): ([0.3, 0.4], [0.8, 0.9]), (4,): ([math.nan, 0.1], [0.1, 0.1])}
     jobs = jobs_of({values: {"validation": own, "test": test} for values, (own, test) in scores.items()}, KEYS)
-    table = summary(jobs, KEYS, ["validation", "test"])
+    table = artefacts_of(jobs, KEYS).table
     assert table["chosen"].tolist() == [False, True, False]
     assert table["rmse_sideslip.test"].tolist() == pytest.approx([0.1, 0.85, 0.1])
-    header, rows = table_of(artefacts_of(jobs, KEYS), table)
+    header, rows = table_of(artefacts_of(jobs, KEYS))
     assert header == ["", "n_local", "parameters", "seeds", "validation", "test"]
     assert ([row[0] for row in rows], rows[1][4]) == (["", "*", ""], "0.350 ± 0.635")
     swapped = jobs.rename(columns={"rmse_sideslip.validation": "rmse_sideslip.test", "rmse_sideslip.test": "rmse_sideslip.validation"})
-    assert not summary(swapped, KEYS, ["test"])["chosen"].any(), "nothing is chosen without a validation range"
+    unvalidated = artefacts_of(swapped, KEYS)
+    unvalidated = replace(unvalidated, part=replace(unvalidated.part, split=replace(unvalidated.part.split, train=(), validation=())))
+    assert not unvalidated.table["chosen"].any(), "nothing is chosen without a validation range"
     jobs.loc[3, ["status", "rmse_sideslip.validation", "rmse_sideslip.test"]] = ["failed", math.nan, math.nan]
-    table = summary(jobs, KEYS, ["validation", "test"])
+    table = artefacts_of(jobs, KEYS).table
     assert (table["chosen"].tolist(), table["n_seeds"].tolist()[:2]) == ([True, False, False], [2, 1])
-    assert table_of(artefacts_of(jobs, KEYS), table)[1][1][3] == "1 (1 failed)"
+    assert table_of(artefacts_of(jobs, KEYS))[1][1][3] == "1 (1 failed)"
 
 
 def test_heat_maps_need_two_numeric_keys_and_have_a_panel_a_boolean():
@@ -80,7 +83,7 @@ def test_heat_maps_need_two_numeric_keys_and_have_a_panel_a_boolean():
     keys = (*KEYS, "estimator.n_hidden", "estimator.bias")
     grid = {(p, q, bias): score(0.1 * p + 0.01 * q + bias) for p in (3, 2) for q in (0, 1, 2) for bias in (True, False)}
     jobs = jobs_of(grid, keys)
-    made = heat_maps(artefacts_of(jobs, keys), summary(jobs, keys, ["validation", "test"]))
+    made = heat_maps(artefacts_of(jobs, keys))
     assert [figure.name for figure in made] == ["heat_map_validation", "heat_map_test"]
     axes = [axes for axes in made[0].static.axes if axes.get_xlabel() == "n_local"]
     assert [axes.get_title(loc="left") for axes in axes] == ["bias = true", "bias = false"]
@@ -89,7 +92,7 @@ def test_heat_maps_need_two_numeric_keys_and_have_a_panel_a_boolean():
     half = stats.t.ppf(0.975, 1) * 0.05
     assert texts[1, 2] == f"0.370\n±{half:.3f}"
     without = jobs_of({(p, q): score(p + q) for p in (2, 3) for q in (0, 1)}, keys[:2])
-    assert len(heat_maps(artefacts_of(without, keys[:2]), summary(without, keys[:2], ["validation", "test"]))) == 2
+    assert len(heat_maps(artefacts_of(without, keys[:2]))) == 2
     for values, names in (
         ({(2,): score(0.1), (3,): score(0.2)}, ("estimator.n_local",)),
         ({(2, "gru"): score(0.1), (3, "lstm"): score(0.2)}, ("estimator.n_local", "estimator")),
@@ -97,13 +100,12 @@ def test_heat_maps_need_two_numeric_keys_and_have_a_panel_a_boolean():
         ({(2, 1, 1): score(0.1), (3, 2, 2): score(0.2)}, ("a.n", "b.n", "c.n")),
     ):
         others = jobs_of(values, names)
-        assert heat_maps(artefacts_of(others, names), summary(others, names, ["validation", "test"])) == []
+        assert heat_maps(artefacts_of(others, names)) == []
 
 
 def test_darker_is_larger_and_a_missing_cell_is_grey():
-    figure = heat_map(
-        [Panel("", np.array([[0.1, 0.4, np.nan]]), np.full((1, 3), np.nan), (0, 0))], ["2", "3", "4"], ["0"], "P", "Q", "RMSE"
-    )
+    panel = ("", np.array([[0.1, 0.4, np.nan]]), np.full((1, 3), np.nan), [[0, 0]])
+    figure = heat_map([panel], ["2", "3", "4"], ["0"], "P", "Q", "RMSE")
     mesh = figure.axes[0].collections[0]
     mesh.update_scalarmappable()
     first, second, missing = mesh.get_facecolor()

@@ -7,13 +7,7 @@ from refusals import refusal
 from vehest.data.errors import ConfigurationError
 from vehest.estimators.ksnn import Ksnn
 from vehest.estimators.registry import estimator_class, estimator_names
-from vehest.run.calibrate import code_of_calibration
-from vehest.run.downsample import code_of_downsampling
-from vehest.run.evaluate import code_of_evaluation
-from vehest.run.evaluate_faults import code_under_faults
-from vehest.run.ingest import code_of_ingest
-from vehest.run.report import SWEEP_CODE, code_of_report
-from vehest.run.train import code_of_training
+from vehest.run.versions import code_of
 from vehest.sources.base import source_names
 from vehest.studies.registry import study_names
 from vehest.training.supervised import SupervisedSettings
@@ -22,21 +16,21 @@ PLAIN = re.compile(r"\w+=[\w.]+( \w+=[\w.]+)*")
 
 
 def trainings():
-    return {name: code_of_training(name) for name in estimator_names()}
+    return {name: code_of("train", name) for name in estimator_names()}
 
 
 def test_versions_are_names_and_numbers_without_modules_and_hashes():
-    texts = [code_of_downsampling(), SWEEP_CODE, *trainings().values()]
-    texts += [code_of_ingest({"source": name}) for name in source_names()]
-    texts += [code_of_report(name) for name in study_names()]
-    texts += [code(name) for name in estimator_names() for code in (code_of_calibration, code_of_evaluation)]
+    texts = [code_of("downsample"), code_of("sweep"), *trainings().values()]
+    texts += [code_of("ingest", name) for name in source_names()]
+    texts += [code_of("report", name) for name in study_names()]
+    texts += [code_of(stage, name) for name in estimator_names() for stage in ("calibrate", "evaluate")]
     for text in texts:
         assert PLAIN.fullmatch(text), text
         assert "vehest." not in text
         assert not re.search(r"[0-9a-f]{8}", text), text
-    assert code_of_training("ksnn") == "train=1 ksnn=1 training=1"
-    assert code_under_faults(code_of_evaluation("ksnn")) == "evaluate=1 ksnn=1 faults=2"
-    assert code_of_ingest({"source": "tabular"}) == "ingest=1 tabular=1"
+    assert code_of("train", "ksnn") == "train=1 ksnn=1 training=1"
+    assert code_of("evaluate", "ksnn", faults=True) == "evaluate=1 ksnn=1 faults=2"
+    assert code_of("ingest", "tabular") == "ingest=1 tabular=1"
 
 
 def test_a_module_that_is_renamed_retrains_nothing_and_a_raised_version_what_is_its_own(monkeypatch):
@@ -46,13 +40,13 @@ def test_a_module_that_is_renamed_retrains_nothing_and_a_raised_version_what_is_
     assert trainings() == before
     monkeypatch.setattr(Ksnn, "version", "2")
     assert {name for name, text in trainings().items() if text != before[name]} == {"ksnn"}
-    assert code_of_evaluation("ksnn") == "evaluate=1 ksnn=2"
+    assert code_of("evaluate", "ksnn") == "evaluate=1 ksnn=2"
     monkeypatch.setattr(SupervisedSettings, "version", "2")
     assert {name for name, text in trainings().items() if text != before[name]} == {"ksnn", "gru", "lstm"}
-    assert code_of_calibration("ksnn") == "calibrate=3 ksnn=2", "weights tell a calibration what changed"
+    assert code_of("calibrate", "ksnn") == "calibrate=3 ksnn=2", "weights tell a calibration what changed"
 
 
 def test_what_has_no_version_is_of_version_1():
-    assert code_of_training("zero").endswith(" training=1")
-    assert code_of_report("folds").endswith(" folds=2")
-    assert "no study module 'nobody'" in refusal(lambda: code_of_report("nobody"), ConfigurationError)
+    assert code_of("train", "zero").endswith(" training=1")
+    assert code_of("report", "folds").endswith(" folds=2")
+    assert "no study module 'nobody'" in refusal(lambda: code_of("report", "nobody"), ConfigurationError)

@@ -376,63 +376,48 @@ def _model_of(drive: Drive, inputs: set[str], levels: _Levels) -> tuple[LinearMo
     v⁺ = (φ - K (φ - 1)) v - K τ b + ξ' with the variance (1 - K) q, and z itself measures (φ - 1) v + τ b with the variance q + r.
     """
     steps, step = len(drive.vy_ref), drive.step
-    blocks = _Blocks(steps)
+    transition: dict[tuple[int, int], FloatArray | float] = {}
+    noises, priors = list[float](), list[float]()
+    measured: list[tuple[dict[int, FloatArray | float], float]] = []  # combinations of states, and the variance of each
+
+    def state(decay: float, noise: float, prior: float) -> int:
+        """Add x⁺ = decay x + w; returns its index."""
+        index = len(noises)
+        transition[index, index] = decay
+        noises.append(noise)
+        priors.append(prior)
+        return index
+
     decay, noise = _in_steps(levels.velocity, step)
-    start = levels.reference**2 if drive.known_start else levels.velocity.deviation**2
-    v = blocks.state(decay, noise, start)
+    v = state(decay, noise, levels.reference**2 if drive.known_start else levels.velocity.deviation**2)
     if levels.lateral is not None:
         white = levels.lateral.density * step + TINY**2
         gain = noise / (noise + white)
-        offset = blocks.state(*_in_steps(levels.lateral, step), levels.lateral.deviation**2)
-        blocks.transition[v, v], blocks.transition[v, offset] = decay - gain * (decay - 1.0), -gain * step
-        blocks.noise[v] = noise * (1.0 - gain)
-        blocks.measure({v: decay - 1.0, offset: step}, noise + white)
+        offset = state(*_in_steps(levels.lateral, step), levels.lateral.deviation**2)
+        transition[v, v], transition[v, offset] = decay - gain * (decay - 1.0), -gain * step
+        noises[v] = noise * (1.0 - gain)
+        measured.append(({v: decay - 1.0, offset: step}, noise + white))
     if levels.longitudinal is not None:
-        speed = blocks.state(1.0, levels.longitudinal.density * step, levels.speed**2)
-        pitch = blocks.state(*_in_steps(levels.longitudinal, step), levels.longitudinal.deviation**2)
-        blocks.transition[speed, v], blocks.transition[speed, pitch] = drive.inputs["yaw_rate"] * step, step
-        blocks.measure({speed: 1.0}, levels.speed**2)
+        speed = state(1.0, levels.longitudinal.density * step, levels.speed**2)
+        pitch = state(*_in_steps(levels.longitudinal, step), levels.longitudinal.deviation**2)
+        transition[speed, v], transition[speed, pitch] = drive.inputs["yaw_rate"] * step, step
+        measured.append(({speed: 1.0}, levels.speed**2))
     for axle, front in ((levels.rear, False), (levels.front, True)):
         if axle is not None:
-            error = blocks.state(*_in_steps(axle.error, step), axle.error.deviation**2)
-            stiffness = blocks.state(1.0, 0.0, STIFFNESS_DEVIATION**2)
+            error = state(*_in_steps(axle.error, step), axle.error.deviation**2)
+            stiffness = state(1.0, 0.0, STIFFNESS_DEVIATION**2)
             slip = _axle_columns(drive, inputs, front)[:, 1:4] @ axle.coefficients[1:4]
             white = axle.error.density / step + levels.reference**2 + (LEAST_WHITE * axle.error.deviation) ** 2
-            blocks.measure({v: 1.0, error: -1.0, stiffness: -slip}, white)
-    return blocks.model()
-
-
-class _Blocks:
-    def __init__(self, steps: int) -> None:
-        self.steps = steps
-        self.transition: dict[tuple[int, int], FloatArray | float] = {}
-        self.noise: list[float] = []
-        self.prior: list[float] = []
-        self.measured: list[tuple[dict[int, FloatArray | float], float]] = []
-
-    def state(self, decay: float, noise: float, prior: float) -> int:
-        """Add x⁺ = decay x + w; returns its index."""
-        index = len(self.noise)
-        self.transition[index, index] = decay
-        self.noise.append(noise)
-        self.prior.append(prior)
-        return index
-
-    def measure(self, of: dict[int, FloatArray | float], variance: float) -> None:
-        """Add a measurement of a combination of states."""
-        self.measured.append((of, variance))
-
-    def model(self) -> tuple[LinearModel[FloatArray], FloatArray]:
-        """The model and the prior covariance of its state."""
-        n, m = len(self.noise), max(len(self.measured), 1)
-        A, C = np.zeros((self.steps, n, n)), np.zeros((self.steps, m, n))
-        for (row, column), value in self.transition.items():
-            A[:, row, column] = value
-        for row, (of, _) in enumerate(self.measured):
-            for column, value in of.items():
-                C[:, row, column] = value
-        R = np.array([variance + TINY**2 for _, variance in self.measured] or [1.0])
-        return LinearModel(A, np.zeros(n), np.diag(self.noise), C, np.zeros(m), R), np.diag(self.prior)
+            measured.append(({v: 1.0, error: -1.0, stiffness: -slip}, white))
+    n, m = len(noises), max(len(measured), 1)
+    A, C = np.zeros((steps, n, n)), np.zeros((steps, m, n))
+    for (row, column), value in transition.items():
+        A[:, row, column] = value
+    for row, (of, _) in enumerate(measured):
+        for column, value in of.items():
+            C[:, row, column] = value
+    R = np.array([variance + TINY**2 for _, variance in measured] or [1.0])
+    return LinearModel(A, np.zeros(n), np.diag(noises), C, np.zeros(m), R), np.diag(priors)
 
 
 def _in_steps(process: Noise, step: float) -> tuple[float, float]:

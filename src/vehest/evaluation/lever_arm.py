@@ -12,7 +12,6 @@ from dataclasses import replace
 
 import numpy as np
 
-from vehest.constants import FloatArray
 from vehest.data.recording import Recording
 from vehest.data.splits import Span
 from vehest.evaluation.metrics import Protocol, Scored, accuracy, scored_range
@@ -22,32 +21,14 @@ LONGEST = 0.5  # m, ahead of the reference's point or behind it
 METRICS = ("rmse_vy", "rmse_sideslip", "fvu")
 
 
-def best_lever_arm(
-    parts: Sequence[Scored], yaw_rates: Sequence[FloatArray], speeds: Sequence[FloatArray], least_speed: float = 0.0
-) -> tuple[float, list[Scored]]:
-    """The lever arm x that leaves the least error: argmin of the mean of (v̂ - v - x·r)², that is Σ(v̂ - v)r / Σr², within `LONGEST`.
-
-    Returns x, how far ahead of the reference's point the estimates hold [m], and the estimates at the latter.
-
-    ``yaw_rates`` r [rad/s] and ``speeds`` u [m/s], by which sideslip is made of v, are at the samples of ``parts``.
-    """
-    error = np.concatenate([part.vy - part.vy_ref for part in parts])
-    turning = np.concatenate(list(yaw_rates))
-    power = float(turning @ turning)
-    x = float(np.clip(error @ turning / power, -LONGEST, LONGEST)) if power > 0.0 else 0.0
-    moved = []
-    for part, yaw_rate, speed in zip(parts, yaw_rates, speeds, strict=True):
-        vy = part.vy - x * yaw_rate
-        standing = np.hypot(speed, part.vy_ref) < least_speed
-        moved.append(replace(part, vy=vy, sideslip=np.where(standing, 0.0, np.arctan2(vy, speed))))
-    return x, moved
-
-
 def lever_arm_figures(parts: Sequence[Scored], pieces: Iterable[tuple[Recording, Span]], protocol: Protocol) -> dict[str, float]:
-    """Errors with the best lever arm, and the lever arm, of a test set whose references were all measured at unknown points.
+    """Errors of a test set whose references were all measured at unknown points, with the lever arm x that leaves the least.
+
+    It minimises the mean of (v̂ - v - x·r)² within `LONGEST`: Σ(v̂ - v)r / Σr².
 
     Returns:
-        metric -> value, with ``lever_arm`` [m]; nothing where a reference's point is known or undeclared, or a recording has no yaw rate.
+        metric -> value, with ``lever_arm``, how far ahead of the reference's point the estimates hold [m]; nothing where a reference's
+        point is known or undeclared, or a recording has no yaw rate.
     """
     yaw_rates, speeds = [], []
     for reference, span in pieces:
@@ -62,6 +43,13 @@ def lever_arm_figures(parts: Sequence[Scored], pieces: Iterable[tuple[Recording,
             return {}
     if not yaw_rates:
         return {}
-    x, moved = best_lever_arm(parts, yaw_rates, speeds, protocol.least_speed)
+    error, turns = np.concatenate([part.vy - part.vy_ref for part in parts]), np.concatenate(yaw_rates)
+    power = float(turns @ turns)
+    x = float(np.clip(error @ turns / power, -LONGEST, LONGEST)) if power > 0.0 else 0.0
+    moved = []
+    for part, yaw_rate, speed in zip(parts, yaw_rates, speeds, strict=True):
+        vy = part.vy - x * yaw_rate
+        standing = np.hypot(speed, part.vy_ref) < protocol.least_speed
+        moved.append(replace(part, vy=vy, sideslip=np.where(standing, 0.0, np.arctan2(vy, speed))))
     figures = accuracy(moved)
     return {**{name: figures[name] for name in METRICS}, "lever_arm": x}

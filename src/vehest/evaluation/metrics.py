@@ -14,11 +14,12 @@ from vehest.data.errors import DataError
 from vehest.data.estimate import Estimate
 from vehest.data.recording import Recording
 from vehest.data.splits import Span
-from vehest.evaluation.consistency import coverage, normalised_error_squared, normalised_innovation_squared
 
 NONLINEAR_AY = 4.0  # m/s², from which tyres are taken to be in their nonlinear range (Bertipaglia et al. 2024, Section V)
 
 REFERENCES = {"vx": "vx_ref", "vy": "vy_ref", "yaw_rate": "yaw_rate_ref"}  # quantity of an estimate -> channel that it is measured against
+
+COVERAGE = {1: 0.6827, 2: 0.9545}  # number of standard deviations -> fraction of Gaussian errors within them
 
 WEIGHTS = {"vx": 0.2225, "vy": 0.5064, "yaw_rate": 0.1566}
 """Weights of squared and absolute errors in SI units (Węgrzynowski et al. 2024, the authors' public code)."""
@@ -205,7 +206,8 @@ def score(estimate: Estimate, reference: Recording, span: Span, protocol: Protoc
         return values
 
     vy, standing = held("vy"), np.hypot(scored["vx"], scored["vy_ref"]) < protocol.least_speed
-    others = {name: (held(name), scored[reference_name]) for name, reference_name in REFERENCES.items() if _has(estimate, scored, name)}
+    measured = {name: scored[own] for name, own in REFERENCES.items() if own in scored and name in estimate.channels and name != "vy"}
+    others = {name: (held(name), own) for name, own in measured.items() if not np.isnan(own).any()}
     covariance_of = tuple(name for name in REFERENCES if name in estimate.covariance_of and (name == "vy" or name in others))
     covariance = estimate.covariance_at(scored.time, covariance_of) if covariance_of else None
     if covariance is not None:
@@ -228,12 +230,6 @@ def score(estimate: Estimate, reference: Recording, span: Span, protocol: Protoc
     )
 
 
-def _has(estimate: Estimate, scored: Recording, name: str) -> bool:
-    """Whether a quantity other than vy is estimated and measured, without gaps in the reference."""
-    reference = REFERENCES[name]
-    return name != "vy" and name in estimate.channels and reference in scored and not np.isnan(scored[reference]).any()
-
-
 def _require_all(values: FloatArray, what: str, span: Span) -> None:
     missing = int(np.isnan(values).sum())
     if missing:
@@ -248,7 +244,7 @@ def accuracy(parts: Sequence[Scored]) -> dict[str, float]:
 
     Definitions: RMSE = sqrt(E[e²]); FVU = var(v - v̂)/var(v) and R² = 1 - FVU (Da Lio et al. 2023, Section VIII);
     ``…_nonlinear`` counts samples with |a_y| ≥ 4 m/s² only (Bertipaglia et al. 2024) and is NaN where there are none, or no a_y.
-    ``…_weighted`` are the mean of `weighted_squared_errors`, the mean and the 99th percentile of `weighted_absolute_errors`.
+    ``…_weighted`` are the mean of squared `weighted_errors`, the mean and the 99th percentile of absolute ones.
 
     Returns:
         Metric name -> value; sideslip in deg or deg². Metrics of other states, of covariances and of innovations are there only if all
@@ -275,17 +271,8 @@ def accuracy(parts: Sequence[Scored]) -> dict[str, float]:
     }
 
 
-def weighted_squared_errors(part: Scored) -> FloatArray:
-    """Squared errors of vx, vy and yaw rate times `WEIGHTS`, summed at each sample, (K,); `DataError` where one is missing."""
-    return _weighted(part, np.square)
-
-
-def weighted_absolute_errors(part: Scored) -> FloatArray:
-    """Absolute errors of vx, vy and yaw rate times `WEIGHTS`, summed at each sample, (K,); `DataError` where one is missing."""
-    return _weighted(part, np.abs)
-
-
-def _weighted(part: Scored, size: Callable[[FloatArray], FloatArray]) -> FloatArray:
+def weighted_errors(part: Scored, size: Callable[[FloatArray], FloatArray]) -> FloatArray:
+    """Sizes of errors of vx, vy and yaw rate, such as `np.square`, times `WEIGHTS`, summed, (K,); `DataError` where one is missing."""
     errors = part.errors
     missing = [name for name in WEIGHTS if name not in errors]
     if missing:
@@ -302,8 +289,8 @@ def _state_accuracy(parts: Sequence[Scored]) -> dict[str, float]:
         if name in common and name != "vy"
     }
     if common >= set(WEIGHTS):
-        absolute = np.concatenate([weighted_absolute_errors(part) for part in parts])
-        figures["mse_weighted"] = float(np.mean(np.concatenate([weighted_squared_errors(part) for part in parts])))
+        absolute = np.concatenate([weighted_errors(part, np.abs) for part in parts])
+        figures["mse_weighted"] = float(np.mean(np.concatenate([weighted_errors(part, np.square) for part in parts])))
         figures |= {"mae_weighted": float(absolute.mean()), "ae99_weighted": float(np.quantile(absolute, 0.99))}
     return figures
 
@@ -323,6 +310,52 @@ def _consistency(parts: Sequence[Scored]) -> dict[str, float]:
         nis, dof = (np.concatenate(columns) for columns in zip(*innovations, strict=True))
         figures["nis"] = normalised_innovation_squared(nis, dof)
     return figures
+
+
+def normalised_error_squared(errors: FloatArray, covariance: FloatArray) -> FloatArray:
+    """Normalised estimation error squared of each sample over its dimension, eᵀP⁻¹e / n.
+
+    Its mean is 1 for a consistent filter, above 1 for one that is too sure of itself. Infinite where P is not positive definite.
+
+    Args:
+        errors: estimate - reference, shape (K, n).
+        covariance: shape (K, n, n).
+
+    Returns:
+        Shape (K,).
+
+    Source: Bar-Shalom, Li & Kirubarajan, Estimation with Applications to Tracking and Navigation, 2001, Section 5.4.2.
+    """
+    variances = np.diagonal(covariance, axis1=1, axis2=2)
+    proper = np.all(variances > 0, axis=1)
+    deviations = np.sqrt(np.where(proper[:, None], variances, 1.0))
+    correlation = covariance / (deviations[:, :, None] * deviations[:, None, :])
+    eigenvalues, vectors = np.linalg.eigh(np.where(proper[:, None, None], correlation, np.eye(errors.shape[1])))
+    definite = proper & np.all(eigenvalues > 0, axis=1)
+    whitened = np.einsum("kij,ki->kj", vectors, errors / deviations)
+    squared = np.sum(np.square(whitened) / np.where(definite[:, None], eigenvalues, 1.0), axis=1)
+    return np.where(definite, squared / errors.shape[1], np.inf)
+
+
+def normalised_innovation_squared(nis: FloatArray, dof: FloatArray) -> float:
+    """Mean of a filter's normalised innovation squared over the numbers that were measured; 1 for a consistent filter.
+
+    Args:
+        nis: eᵀS⁻¹e of each update, shape (K,).
+        dof: numbers measured at each, shape (K,); samples with none do not count.
+
+    Returns:
+        NaN if nothing was measured at any sample.
+
+    Source: Bar-Shalom, Li & Kirubarajan 2001, Section 5.4.2.
+    """
+    measured = dof > 0
+    return float(np.mean(nis[measured] / dof[measured])) if measured.any() else float("nan")
+
+
+def coverage(errors: FloatArray, variance: FloatArray, n_sigma: float) -> float:
+    """Fraction of errors, (K,) like ``variance``, within ``n_sigma`` standard deviations; `COVERAGE` says what is expected of Gaussians."""
+    return float(np.mean(np.square(errors) <= n_sigma**2 * variance))
 
 
 def _turned(angle: FloatArray) -> FloatArray:

@@ -43,8 +43,6 @@ class Ranking:
     order: Sequence[Name]  # by RMSE over all seeds, the lowest first
     rmse: Mapping[Name, float]  # over all seeds of each
     intervals: Mapping[Name, tuple[float, float]]  # its 95 % interval, blocks and seeds drawn anew
-    against_best: Mapping[Name, Comparison]  # the best against each other
-    against_baseline: Mapping[tuple[Name, Name], Comparison]  # (candidate, baseline) -> comparison, of each baseline that is there
     pairs: Mapping[tuple[Name, Name], Comparison]  # (first, second) -> comparison, of every pair that was compared, either way round
     n_blocks: int  # blocks that were resampled; below `LEAST_BLOCKS` there are no intervals and no comparisons
     block_seconds: float  # mean length of a block [s]
@@ -57,7 +55,7 @@ class Ranking:
 
     def beats(self, name: Name, baseline: str) -> bool | None:
         """Whether a candidate's RMSE lies below a baseline's; None where that is not told apart or was not compared."""
-        found = [own for (candidate, other), own in self.against_baseline.items() if candidate == name and other[0] == baseline]
+        found = [own for (candidate, other), own in self.pairs.items() if candidate == name and other[0] == baseline]
         if not found or found[0].verdict == "not told apart":
             return None
         return found[0].verdict == "lower"
@@ -67,13 +65,14 @@ class Ranking:
         """The one that may be called best: below every other candidate, `zero` and `static_map`, each by more than chance."""
         if self.n_blocks < LEAST_BLOCKS or not self.order or self.missing_baselines or self.order[0][0] in BASELINES:
             return None
-        beaten = all(own.verdict == "lower" for own in self.against_best.values())
+        beaten = all(self.pairs[self.order[0], other].verdict == "lower" for other in self.order[1:])
         return self.order[0] if beaten and all(self.beats(self.order[0], baseline) for baseline in BASELINES) else None
 
     @property
     def not_told_apart(self) -> list[Name]:
         """Those that the best is not told apart from."""
-        return [name for name in self.order[1:] if name in self.against_best and self.against_best[name].verdict == "not told apart"]
+        others = [(name, self.pairs.get((self.order[0], name))) for name in self.order[1:]]
+        return [name for name, own in others if own is not None and own.verdict == "not told apart"]
 
 
 def rank(segments: Mapping[Name, Sequence[Segments]], rate_hz: float, asked: Sequence[tuple[Name, Name]] = ()) -> Ranking:
@@ -98,17 +97,14 @@ def rank(segments: Mapping[Name, Sequence[Segments]], rate_hz: float, asked: Seq
     pairs = _pairs(order, asked) if enough else []
     compared = dict(zip(pairs, _corrected([(sums[one], sums[other]) for one, other in pairs], sizes), strict=True))
     intervals = root_intervals([sums[name] for name in order], sizes) if enough else []
-    best = order[0]
     return Ranking(
         order=order,
         rmse=rmse,
         intervals={name: (own.low, own.high) for name, own in zip(order, intervals, strict=True)} if enough else {},
-        against_best={other: own for (one, other), own in compared.items() if one == best},
-        against_baseline={pair: own for pair, own in compared.items() if pair[1][0] in BASELINES},
         pairs={key: own for (one, other), found in compared.items() for key, own in (((one, other), found), ((other, one), found.turned))},
         n_blocks=len(sizes),
         block_seconds=float(sizes.mean()) / rate_hz,
-        effective_blocks=effective_blocks(sums[best].mean(axis=0)),
+        effective_blocks=effective_blocks(sums[order[0]].mean(axis=0)),
     )
 
 

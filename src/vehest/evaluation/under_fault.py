@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -40,6 +39,7 @@ UNITS = {
 _CLOCK = 1e-6  # s, within which times are the same
 
 Window = tuple[float, float]  # start and end of a fault on a recording's clock [s]
+Flags = tuple[FloatArray, FloatArray]  # (K,) as the errors: half width of the 90 % band of β [rad], NaN for none; health 0, 1 or 2
 
 
 def errors_under_fault(parts: Sequence[Scored], nominal: Sequence[Scored], windows: Sequence[Window]) -> dict[str, dict[str, float]]:
@@ -61,15 +61,7 @@ def errors_under_fault(parts: Sequence[Scored], nominal: Sequence[Scored], windo
     return found
 
 
-@dataclass(frozen=True, eq=False)
-class Flagged:
-    """Band and flags of an estimate, on the grid that errors are read on."""
-
-    band: FloatArray  # half width of the 90 % band of β, (K,) [rad]; NaN where there is none
-    health: FloatArray  # 0 valid, 1 degraded, 2 invalid, (K,)
-
-
-def flags_under_fault(parts: Sequence[Scored], flagged: Sequence[Flagged], windows: Sequence[Window], rate_hz: float) -> dict[str, float]:
+def flags_under_fault(parts: Sequence[Scored], flagged: Sequence[Flags], windows: Sequence[Window], rate_hz: float) -> dict[str, float]:
     """Whether bands hold and faults are flagged while they last, over all parts together, at ``rate_hz`` [Hz].
 
     ``coverage_90`` share of samples whose error of β lies in the band, ``coverage_90_unflagged`` the same of those marked valid; of
@@ -78,15 +70,15 @@ def flags_under_fault(parts: Sequence[Scored], flagged: Sequence[Flagged], windo
     is something for.
     """
     inside, valid, delays, undetected = [], [], [], []
-    for part, own, window in zip(parts, flagged, windows, strict=True):
+    for part, (band, health), window in zip(parts, flagged, windows, strict=True):
         during = _during(part.time, window)
         error = np.remainder(part.sideslip - part.sideslip_ref + np.pi, 2.0 * np.pi) - np.pi
-        known = during & np.isfinite(own.band)
-        inside.append((np.abs(error) <= own.band)[known])
-        valid.append(own.health[known] == 0)
+        known = during & np.isfinite(band)
+        inside.append((np.abs(error) <= band)[known])
+        valid.append(health[known] == 0)
         at = np.flatnonzero(during)
-        if len(at) and (at[0] == 0 or own.health[at[0] - 1] == 0):
-            flags, onset, end = own.health > 0, int(at[0]), int(at[-1]) + 1
+        if len(at) and (at[0] == 0 or health[at[0] - 1] == 0):
+            flags, onset, end = health > 0, int(at[0]), int(at[-1]) + 1
             delays.append(detection_delay(flags, onset, end, rate_hz))
             undetected.append(error_while_undetected(np.degrees(error), flags, onset, end))
     held, calm = np.concatenate(inside), np.concatenate(valid)

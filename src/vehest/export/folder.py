@@ -12,9 +12,9 @@ from vehest.data.errors import ConfigurationError, printable
 from vehest.data.files import written_aside
 from vehest.data.recording import Recording
 from vehest.estimators.base import Estimator
-from vehest.export.program import TOLERANCES, context_of, program_files, vector_files
+from vehest.export.program import TOLERANCES, context_of, program_files
 from vehest.export.rendering import Precision, render
-from vehest.export.vectors import SECONDS, in_float64
+from vehest.export.vectors import COLUMNS, SECONDS, drive_for, in_float64, replayed, table_text
 from vehest.trust import health
 from vehest.trust.contract import GuardedStepper
 from vehest.trust.record import Trust
@@ -66,7 +66,10 @@ def export_model(
         refuse_unresolved(trust)
     files = program_files(stepper, kind, estimator.full_title)
     files["README.md"] = readme(stepper, kind, drive, has_trust=trust is not None, elsewhere=elsewhere)
-    files |= vector_files(GuardedStepper(in_float64(estimator), trust, bus_rate_hz, elsewhere=elsewhere), drive)
+    exact = GuardedStepper(in_float64(estimator), trust, bus_rate_hz, elsewhere=elsewhere)
+    times, samples = drive_for(exact) if drive is None else (drive.time, {name: drive[name] for name in exact._channels})
+    files["test_vectors.csv"] = table_text(("time", *samples), np.column_stack([times, *samples.values()]))
+    files["expected.csv"] = table_text(COLUMNS, replayed(exact, times, samples))
     with written_aside(out, replace_folder=True) as aside:
         aside.mkdir()
         for name, text in files.items():
@@ -76,10 +79,11 @@ def export_model(
 def readme(stepper: GuardedStepper, precision: Precision, drive: Recording | None = None, *, has_trust: bool, elsewhere: bool) -> str:
     """What people need to know of an export: how it is called, units, licences."""
     context = context_of(stepper, precision, stepper.estimator.full_title)
+    reasons = {kind: text for kind, (text, _) in health.REASONS.items() if kind and kind not in health.RETIRED}
     context |= {
         "channels": [(name, CHANNELS[name].meaning) for name in stepper.estimator.channels],
         "units": {name: CHANNELS[name].unit for name in stepper.estimator.channels},
-        "reasons": sorted(_reasons().items()),
+        "reasons": sorted((kind, text.format(channel="CHANNEL", partner="PARTNER")) for kind, text in reasons.items()),
         "trust": has_trust,
         "elsewhere": elsewhere,
         "version": __version__,
@@ -104,15 +108,6 @@ def refuse_unresolved(trust: Trust | None) -> None:
                 f"channel '{name}' follows the others to {deviation / largest:.1g} of its size where the model learnt, which float cannot "
                 f"resolve; export with --precision double"
             )
-
-
-def _reasons() -> dict[int, str]:
-    """Kind of a reason -> what it says."""
-    return {
-        kind: text.format(channel="CHANNEL", partner="PARTNER")
-        for kind, (text, _) in health.REASONS.items()
-        if kind and kind not in health.RETIRED
-    }
 
 
 def _refuse_foreign(out: Path) -> None:

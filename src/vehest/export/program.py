@@ -1,31 +1,81 @@
-"""All files of an export, as text: the method, the contract around it with explicit state, a program and test vectors."""
+"""Sources of an export, as text: the method, the contract around it with explicit state, and a program.
+
+Numbers are read from a `GuardedStepper` itself, so that C and Python hold the same, to the last bit.
+"""
 
 from __future__ import annotations
 
 import math
+import sys
+from fractions import Fraction
 from functools import partial
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from vehest.constants import FloatArray
 from vehest.data.channels import CHANNELS
-from vehest.data.recording import Recording
-from vehest.export.method import method_source
-from vehest.export.rendering import Precision, ascii_only, braced, limit, render, truths, whole
-from vehest.export.tables import band_table, front_end_table, guard_table, health_table
-from vehest.export.vectors import COLUMNS, drive_for, replayed, table_text
+from vehest.data.errors import ConfigurationError
+from vehest.estimators.base import Estimator
+from vehest.estimators.registry import estimator_class, estimator_names
+from vehest.export.rendering import Precision, ascii_only, braced, limit, render, render_block, truths, whole
+from vehest.trust import bands as band_rules
 from vehest.trust import health_kernel, verdict, watch
 from vehest.trust.contract import GuardedStepper
-from vehest.trust.guard import BRIDGED_SECONDS, STANDSTILL_SPEED, STANDSTILL_YAW_RATE
+from vehest.trust.front_end import CUTOFF, FrontEnd
+from vehest.trust.guard import BRIDGED_SECONDS, ENDLESS, STANDSTILL_SPEED, STANDSTILL_YAW_RATE, Guard
+from vehest.trust.health_kernel import Layout, Model
+from vehest.trust.named_arrays import views
 
 TOLERANCES = {"double": 1e-9, "float": 1e-3}
 """Precision -> by how much the outcome of the vectors may differ from that of Python [m/s, rad]."""
+NEVER = "UINT32_MAX"
+MOST_OF = 1_000_000  # largest denominator of the ratio of rates
 
 
 def brief(value: float) -> str:
     """A number as people write it, with a decimal point."""
     text = f"{value:.12g}"
     return text if any(c in text for c in ".en") else f"{text}.0"
+
+
+def method_files(estimator: Estimator, precision: Precision) -> dict[str, str]:
+    """Header and source of a fitted estimator's method, by the family's template; name -> text.
+
+    Raises `ConfigurationError`: the family has no C, or the estimator is not causal or not fitted.
+    """
+    if not estimator.template:
+        raise ConfigurationError(f"estimator '{estimator.name}' cannot be exported to C; these can: {', '.join(exportable())}")
+    estimator.online()  # raises where it is not causal, or not fitted
+    path = f"methods/{estimator.template}.c.j2"
+    beside = Path(str(sys.modules[type(estimator).__module__].__file__)).parent
+    values = {
+        "title": ascii_only(estimator.full_title),
+        "family": estimator.name,
+        "variant": estimator.variant,
+        "rate_hz": estimator.settings.rate_hz,
+        "horizon_steps": estimator.horizon_steps,
+        "skippable": estimator.skippable,
+        "channels": channels_of(estimator),
+        **estimator.c_values(),
+        "refuses_nan": [name for name in estimator.channels if "NaN" in estimator.refuses and name not in estimator.skippable],
+        "refuses_infinite": estimator.channels if "infinite" in estimator.refuses else (),
+        "notes": estimator.notice,
+    }
+    state = render_block(path, "state", precision, beside, **values).rstrip()
+    header = render("method.h.j2", precision, **values, state=state)
+    return {"vehest_method.h": header, "vehest_method.c": render(path, precision, beside, **values)}
+
+
+def exportable() -> tuple[str, ...]:
+    """Names of families that have C."""
+    return tuple(name for name in estimator_names() if estimator_class(name).template)
+
+
+def channels_of(estimator: Estimator) -> list[tuple[str, str]]:
+    """Channels that an estimator reads, each with its meaning."""
+    return [(name, ascii_only(CHANNELS[name].meaning)) for name in estimator.channels]
 
 
 def program_files(stepper: GuardedStepper, precision: Precision, title: str) -> dict[str, str]:
@@ -39,10 +89,9 @@ def program_files(stepper: GuardedStepper, precision: Precision, title: str) -> 
     Raises:
         ConfigurationError: the estimator cannot be written in C.
     """
-    header, source = method_source(stepper.estimator, precision)
+    files = method_files(stepper.estimator, precision)
     context = context_of(stepper, precision, title)
     wanted = ["types.h", "estimator.h", "estimator.c", *(["health.h", "health.c"] if context["h"] is not None else [])]
-    files = {"vehest_method.h": header, "vehest_method.c": source}
     files |= {f"vehest_{name}": render(f"{name}.j2", precision, **context) for name in wanted}
     values = {
         "names": context["names"],
@@ -68,7 +117,7 @@ def context_of(stepper: GuardedStepper, precision: Precision, title: str) -> dic
     return {
         "title": ascii_only(title),
         "notes": [ascii_only(note) for note in estimator.notice],
-        "channels": [(name, ascii_only(CHANNELS[name].meaning)) for name in estimator.channels],
+        "channels": channels_of(estimator),
         "names": list(estimator.channels),
         "skippable": [name in estimator.skippable for name in estimator.channels],
         "numbers": monitor._numbers,
@@ -102,12 +151,65 @@ def context_of(stepper: GuardedStepper, precision: Precision, title: str) -> dic
     }
 
 
-def vector_files(stepper: GuardedStepper, drive: Recording | None = None) -> dict[str, str]:
-    """Test vectors, of a drive or made up, and what Python says of them; name -> text. A stepper in its initial state is used up."""
-    given = None if drive is None else (drive.time, {name: drive[name] for name in stepper._channels})
-    times, samples = given or drive_for(stepper)
-    rows = np.column_stack([times, *samples.values()])
+def guard_table(guard: Guard) -> dict[str, Any]:
+    """Low, high, jump, lower and upper stop of each channel, longest runs, samples that are bridged and that a new level has to stand."""
+    runs = [NEVER if math.isinf(run) else f"{math.floor(run)}U" for run in guard._limits[:, 3]]
+    limits = _endless(guard._limits[:, [0, 1, 2, 4, 5]]).tolist()
+    return {"limits": limits, "runs": runs, "bridged": int(guard._settings[2]), "persists": int(guard._settings[3])}
+
+
+def _endless(values: FloatArray) -> FloatArray:
+    """The same with infinity for what stands for it."""
+    return np.where(np.abs(values) >= ENDLESS, np.copysign(np.inf, values), values)
+
+
+def front_end_table(front: FrontEnd) -> dict[str, Any]:
+    """Sections of the low-pass, and of how many samples how many rows are made."""
+    ratio = Fraction(front._ratio).limit_denominator(MOST_OF)
+    rate = front._ratio * front._guard.rate_hz
     return {
-        "test_vectors.csv": table_text(("time", *samples), rows),
-        "expected.csv": table_text(COLUMNS, replayed(stepper, times, samples)),
+        "sections": front._sections.tolist(),
+        "every": ratio.numerator,
+        "of": ratio.denominator,
+        "delay": front.delay,
+        "cutoff": CUTOFF * rate,
+    }
+
+
+def band_table(stepper: GuardedStepper) -> dict[str, Any] | None:
+    """Factors, squared floors, weights and domain of the bands; None where none are calibrated."""
+    packed = stepper._monitor._bands
+    if packed is None:
+        return None
+    head, terms = packed.numbers[: band_rules._HEAD], packed.numbers[band_rules._HEAD :].reshape(3, -1)
+    return {
+        "factor_vy": head[0],
+        "factor_sideslip": head[1],
+        "floor_vy": head[2],
+        "floor_sideslip": head[3],
+        "lowest_speed": head[4],
+        "weights_vy": terms[0],
+        "weights_sideslip": terms[1],
+        "largest": terms[2],
+        "terms": ("P", "1", "vx", "ax", "ay", "yaw rate vx", "steer vx", "vy"),
+        "first_feature": band_rules._FIRST_FEATURE,
+        "farthest": stepper._monitor._farthest,
+    }
+
+
+def health_table(packed: FloatArray | None) -> dict[str, Any] | None:
+    """Tables of `vehest.trust.health_kernel` by name; None where no health was learnt."""
+    if packed is None:
+        return None
+    layout = Layout(*packed.view(np.int64)[: len(Layout._fields)].tolist())
+    model, _ = views(Model, packed, layout)
+    return {
+        **model._asdict(),
+        **layout._asdict(),
+        **{name: float(value) for name, value in model.settings._asdict().items()},
+        "n_statistics": layout.statistics,
+        "limits": model.limits.every,
+        "inverse": model.inverse.every,
+        "stops": _endless(model.stops),
+        "wheels": bool(model.wheel.any()),
     }

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
-from vehest.data.channels import channel
+from vehest.data.channels import CHANNELS
 from vehest.data.errors import ConfigurationError
 
 if TYPE_CHECKING:
@@ -119,11 +119,6 @@ def ascii_only(text: str) -> str:
     return text.encode("ascii", "replace").decode()
 
 
-def unit_of(name: str) -> str:
-    """Unit of a channel, for a comment."""
-    return ascii_only(channel(name).unit)
-
-
 @cache
 def _environment(precision: Precision, beside: Path | None) -> Environment:
     from jinja2 import ChoiceLoader, Environment, FileSystemLoader, PackageLoader, PrefixLoader, StrictUndefined
@@ -140,7 +135,7 @@ def _environment(precision: Precision, beside: Path | None) -> Environment:
         "real": partial(literal, precision=precision),
         "table": lambda values: braced(np.asarray(values, np.float64), partial(literal, precision=precision)),
         "ascii": ascii_only,
-        "unit": unit_of,
+        "unit": lambda name: ascii_only(CHANNELS[name].unit),
     }
     environment.globals["precision"] = precision
     return environment

@@ -11,7 +11,7 @@ import numpy as np
 from vehest.constants import FloatArray
 from vehest.data.channels import CHANNELS
 from vehest.estimators.base import Estimator
-from vehest.export.tables import health_table
+from vehest.export.program import health_table
 from vehest.trust.contract import GuardedStepper
 
 SECONDS = 12.0

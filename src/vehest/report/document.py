@@ -12,7 +12,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias
 
 from vehest.data.errors import printable
-from vehest.report.explorer import Explorer
 from vehest.report.style import MISSING, REFERENCE_COLOUR, decimals_for, fixed, on_dark, paper_style, significant
 
 if TYPE_CHECKING:
@@ -78,7 +77,7 @@ class Figure:
     name: str  # file name without ending, as in `Table`
     caption: str  # Markdown; its first sentence is the alternative text
     static: MatplotlibFigure  # matplotlib figure, for PNG, SVG and print
-    interactive: Explorer | None = None  # what the page draws in its place, to zoom and filter, where that helps
+    interactive: str = ""  # `explorer_json` of what the page draws in its place, to zoom and filter, where that helps
 
 
 Block: TypeAlias = "str | Table | Figure"
@@ -147,10 +146,10 @@ def write_document(
             (folder / "figures" / f"{block.name}.png").write_bytes(png_of(block.static))
             images[block.name] = svg_of(block.static)
             (folder / "figures" / f"{block.name}.svg").write_bytes(images[block.name])
-    _write_text(folder / f"{name}.md", _markdown(document, numbers))
+    (folder / f"{name}.md").write_bytes(_markdown(document, numbers).encode("utf-8", "backslashreplace"))
     if page:
         whole = replace(document, blocks=[*document.blocks, *on_page])
-        _write_text(folder / f"{name}.html", _page(whole, _numbers(whole), images))
+        (folder / f"{name}.html").write_bytes(_page(whole, _numbers(whole), images).encode("utf-8", "backslashreplace"))
 
 
 def as_text(name: str) -> str:
@@ -219,16 +218,15 @@ def png_of(figure: MatplotlibFigure) -> bytes:
 
 
 def svg_of(figure: MatplotlibFigure) -> bytes:
-    """A figure as SVG."""
+    """A figure as SVG, with places to a hundredth of a point, finer than any page: half the size."""
+
+    def in_hundredths(path: re.Match[str]) -> str:
+        return _LONG_NUMBER.sub(lambda number: f"{float(number[0]):.2f}".rstrip("0").rstrip("."), path[0])
+
     buffer = io.BytesIO()
     with paper_style():
         figure.savefig(buffer, format="svg", dpi=PNG_DPI, metadata={"Date": None, "Creator": None})
-    return _PATH.sub(_in_hundredths, buffer.getvalue().decode("utf-8")).encode("utf-8")
-
-
-def _in_hundredths(path: re.Match[str]) -> str:
-    """A path whose places are given to a hundredth of a point, finer than any page: half the size."""
-    return _LONG_NUMBER.sub(lambda number: f"{float(number[0]):.2f}".rstrip("0").rstrip("."), path[0])
+    return _PATH.sub(in_hundredths, buffer.getvalue().decode("utf-8")).encode("utf-8")
 
 
 def _for_both_schemes(svg: bytes) -> bytes:
@@ -248,10 +246,6 @@ def _for_both_schemes(svg: bytes) -> bytes:
 def _write_table(folder: Path, name: str, frame: pd.DataFrame) -> None:
     (folder / "tables").mkdir(exist_ok=True)
     frame.to_csv(folder / "tables" / f"{name}.csv", index=False, lineterminator="\n", encoding="utf-8", errors="backslashreplace")
-
-
-def _write_text(path: Path, text: str) -> None:
-    path.write_bytes(text.encode("utf-8", "backslashreplace"))
 
 
 def _markdown(document: Document, numbers: Mapping[int, str]) -> str:
@@ -315,7 +309,7 @@ def _page(document: Document, numbers: Mapping[int, str], images: Mapping[str, b
             blocks.append({"kind": "table", **shared, **_page_table(block)})
         else:
             alternative = {"image": _data_uri(_for_both_schemes(images[block.name]), "image/svg+xml"), "alt": _spoken(block.caption)}
-            interactive = Markup(block.interactive.to_json()) if block.interactive else None
+            interactive = Markup(block.interactive) if block.interactive else None
             blocks.append({"kind": "figure", **shared, **alternative, "json": interactive})
     explored = any(block.get("json") for block in blocks)
     environment = Environment(

@@ -10,82 +10,27 @@ from __future__ import annotations
 import base64
 import json
 import zlib
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping
+from typing import Any
 
 import numpy as np
 
 from vehest.constants import FloatArray
 from vehest.data.runs import true_runs
-from vehest.report.style import Line, on_dark
 
 LEVELS = 65_534
 GAP = 65_535  # code of a value that is not there
 
 
-@dataclass(frozen=True, eq=False)
-class Signal:
-    """A channel that was measured."""
+def explorer_json(content: Mapping[str, Any], columns: Mapping[str, FloatArray | None]) -> str:
+    """What the page reads of ``columns``, (K,) each or None, and of how they are called and drawn; it cannot end a script element.
 
-    label: str  # for people
-    unit: str  # that it is drawn in
-    values: FloatArray  # shape (K,); NaN where there is none
-    drawn: bool = True  # whether it is drawn at first
-
-
-@dataclass(frozen=True, eq=False)
-class Candidate:
-    """An estimator in the traces."""
-
-    label: str  # its title
-    line: Line
-    vy: FloatArray  # estimated lateral velocity [m/s], shape (K,)
-    band_vy: FloatArray | None = None  # half width of its calibrated 90 % band of v [m/s], (K,), where it has one
-    band_sideslip: FloatArray | None = None  # the same of β [deg]
-    health: FloatArray | None = None  # 0 valid, 1 degraded, 2 invalid, (K,), where it is known
-
-
-@dataclass(frozen=True, eq=False)
-class Explorer:
-    """Everything over one uniform time axis; NaN breaks all lines between two ranges."""
-
-    start: float  # first time [s]
-    step: float  # between two samples [s]
-    time_label: str  # label of the time axis
-    zoom: tuple[float, float]  # a range that deserves a button [s]
-    vx: FloatArray  # measured forward velocity [m/s], shape (K,)
-    vy: FloatArray  # reference lateral velocity [m/s], (K,)
-    ay: FloatArray | None  # measured lateral acceleration [m/s²], (K,); None where there is none
-    inputs: Sequence[Signal]  # further channels as measured
-    candidates: Sequence[Candidate]  # in the order of the table
-    course: tuple[FloatArray, FloatArray] | None = None  # x and y of the car [m], (K,) each, where they are known
-    course_note: str = ""  # how they are known
-
-    def to_json(self) -> str:
-        """What the page reads; nothing in it can end a script element."""
-        columns: dict[str, FloatArray | None] = {"vx": self.vx, "vy": self.vy, "ay": self.ay}
-        columns |= {f"input{i}": signal.values for i, signal in enumerate(self.inputs)}
-        for i, own in enumerate(self.candidates):
-            columns |= {f"vy{i}": own.vy, f"bandv{i}": own.band_vy, f"bandb{i}": own.band_sideslip, f"health{i}": own.health}
-        if self.course is not None:
-            columns |= dict(zip(("x", "y"), self.course, strict=True))
-        described, data = packed({name: values for name, values in columns.items() if values is not None})
-        content = {
-            "start": self.start,
-            "step": self.step,
-            "length": len(self.vx),
-            "timeLabel": self.time_label,
-            "zoom": list(self.zoom),
-            "inputs": [{"label": signal.label, "unit": signal.unit, "drawn": signal.drawn} for signal in self.inputs],
-            "candidates": [
-                {"label": own.label, "colour": own.line.colour, "dark": on_dark(own.line.colour), "dash": own.line.dash}
-                for own in self.candidates
-            ],
-            "courseNote": self.course_note,
-            "columns": described,
-            "data": data,
-        }
-        return json.dumps(content, ensure_ascii=False, allow_nan=False).replace("<", "\\u003c")
+    Columns: ``vx``, reference ``vy`` [m/s], ``ay`` [m/s²], ``input0``… as measured; of each candidate ``vy0`` [m/s], half widths of its
+    90 % bands ``bandv0`` [m/s] and ``bandb0`` [deg], ``health0``; course ``x``, ``y`` [m]. NaN breaks all lines between two ranges.
+    """
+    described, data = packed({name: values for name, values in columns.items() if values is not None})
+    whole = {**content, "columns": described, "data": data}
+    return json.dumps(whole, ensure_ascii=False, allow_nan=False).replace("<", "\\u003c")
 
 
 def packed(columns: dict[str, FloatArray]) -> tuple[dict[str, list[float]], str]:

@@ -37,8 +37,11 @@ def in_words(alignment: Alignment, out: Path | None) -> Lines:
     drive = alignment.recording
     first = f"{drive.id}: {drive.kind}, {drive.duration:.6g} s at {drive.rate_hz:g} Hz; nothing is applied"
     lines: Lines = [first, _parameters(alignment)]
-    if alignment.residuals:
-        lines += ["", _residuals(alignment)]
+    rows = [
+        [own.channel, *(f"{rms:.3g}" if math.isfinite(rms) else "–" for rms in own.rms.values()), own.unit] for own in alignment.residuals
+    ]
+    if rows:
+        lines += ["", TerminalTable("", ("residual rms", "before", "after", "and without tilt", "unit"), rows)]
     lines += [*(f"note: {note}" for note in alignment.notes), f"to correct it: '{override_of(alignment)}'"]
     return lines if out is None else [*lines, f"written: {out}"]
 
@@ -113,14 +116,6 @@ def _parameters(alignment: Alignment) -> TerminalTable:
         value, sigma, low, high = (f"{factor * number:.{decimals}f}" for number in numbers)
         rows.append([parameter.name, value, sigma, f"{low} … {high}", unit])
     return TerminalTable("", ("quantity", "estimate", "standard uncertainty", "95 % interval", "unit"), rows)
-
-
-def _residuals(alignment: Alignment) -> TerminalTable:
-    rows = []
-    for own in alignment.residuals:
-        sizes = (f"{rms:.3g}" if math.isfinite(rms) else "–" for rms in own.rms.values())
-        rows.append([own.channel, *sizes, own.unit])
-    return TerminalTable("", ("residual rms", "before", "after", "and without tilt", "unit"), rows)
 
 
 def _report(alignment: Alignment) -> str:

@@ -21,16 +21,15 @@ from vehest.data.splits import Span, Split
 from vehest.data.store import read_recording
 from vehest.estimators.base import Estimator
 from vehest.estimators.model_files import load_model, read_description
-from vehest.estimators.registry import estimator_class
 from vehest.run.artefacts import Artefact, StagePlan, read_artefact
 from vehest.run.train import file_digest, recording_file
+from vehest.run.versions import code_of
 from vehest.trust.bands import Piece, band_inputs, calibrated
 from vehest.trust.guard import learn_limits
 from vehest.trust.health import learn_health
 from vehest.trust.record import TRUST, About, Trust, read_trust, write_trust
 
 STAGE = "calibrate"
-VERSION = "3"
 WARM_UP_SECONDS = 10.0  # before a range, as far as its recording goes
 SKIP_SECONDS = 1.5  # at the start of each range, as in evaluations
 
@@ -45,14 +44,9 @@ def plan_calibrate(
     inputs = {"model": model.digest}
     inputs |= {f"{span.dataset}/{span.recording}": file_digest(data[span.dataset], span) for own in spans.values() for span in own}
     config = {role: [str(span) for span in own] for role, own in spans.items()}
-    code = code_of_calibration(read_description(model.folder).estimator)
+    code = code_of(STAGE, read_description(model.folder).estimator)
     plan = StagePlan(STAGE, f"{model.label}-trust", config, inputs, code, output)
     return plan, partial(_write, model.folder, split, data)
-
-
-def code_of_calibration(estimator: str) -> str:
-    """Version of a calibration of an estimator."""
-    return f"calibrate={VERSION} {estimator}={estimator_class(estimator).version}"
 
 
 def _write(model_folder: Path, split: Split, data: Mapping[str, Artefact], folder: Path) -> None:

@@ -8,7 +8,6 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -49,25 +48,11 @@ LOWEST_RATE = 1.0  # Hz
 RATE_HZ = 20.0  # at which estimates are scored, unless the recording has less
 
 
-@dataclass(frozen=True)
-class ComparedFiles:
-    """Estimates of one recording, ranked."""
+def compare_files(recording: Path, words: Sequence[str], models: Sequence[str]) -> tuple[dict[str, Any], list[str | TerminalTable]]:
+    """Score estimates of other tools, and models, on one recording: for JSON and for a terminal.
 
-    rows: Sequence[Mapping[str, Any]]  # one an estimate, the lowest RMSE(β) first: name, metrics and ranking
-    verdict: str
-    start: float  # of the scored part [s]
-    stop: float
-    rate_hz: float
-
-    def in_words(self) -> list[str | TerminalTable]:
-        """For a terminal."""
-        cells = [(row["estimate"], *score_cells(row), f"{row['rmse_vy']:.3f}", f"{row['fvu']:.3f}") for row in self.rows]
-        scored = f"scored from {self.start:.6g} to {self.stop:.6g} s at {self.rate_hz:g} Hz"
-        return [TerminalTable("", ("estimate", *SCORE_HEADER, "RMSE(v) [m/s]", "FVU"), cells), scored, self.verdict]
-
-
-def compare_files(recording: Path, words: Sequence[str], models: Sequence[str]) -> ComparedFiles:
-    """Score estimates of other tools, and models, on one recording; raises `VehestError` where a file or model cannot be used."""
+    Raises `VehestError` where a file or model cannot be used.
+    """
     files = [Path(word) for word in words if is_file_name(word)]
     overrides = [word for word in words if not is_file_name(word)]
     config = compose_config("estimate", overrides)
@@ -82,7 +67,10 @@ def compare_files(recording: Path, words: Sequence[str], models: Sequence[str]) 
             if any(span.startswith((f"{drive.id} [", f"{drive.id} (")) for span in (*about.trained_on, *about.validated_on)):
                 complain(f"warning: '{name}' learnt on this recording: its row is no test")
             estimates[name] = estimate_recording(model, drive.without_references(), trust)
-        return compare_estimates(drive, estimates)
+        found = compare_estimates(drive, estimates)
+    cells = [(row["estimate"], *score_cells(row), f"{row['rmse_vy']:.3f}", f"{row['fvu']:.3f}") for row in found["rows"]]
+    scored = f"scored from {found['start']:.6g} to {found['stop']:.6g} s at {found['rate_hz']:g} Hz"
+    return found, [TerminalTable("", ("estimate", *SCORE_HEADER, "RMSE(v) [m/s]", "FVU"), cells), scored, found["verdict"]]
 
 
 def read_estimate_table(file: Path, vx: Recording) -> Estimate:
@@ -99,7 +87,9 @@ def read_estimate_table(file: Path, vx: Recording) -> Estimate:
     for quantity, spellings in SPELLINGS.items():
         for name in names:
             if re.sub(r"[\[(].*?[\])]|[\s_]", "", name).lower() in spellings:
-                found.setdefault(quantity, {"column": name, "unit": _unit_in(name) or USUAL_UNITS[quantity]})
+                written = re.search(r"[\[(](.*?)[\])]", name)
+                unit = written and (written[1] if written[1] in ("s", "ms", "us", "ns") else plain_unit(written[1]))
+                found.setdefault(quantity, {"column": name, "unit": unit or USUAL_UNITS[quantity]})
     time, channel = found.pop("time", None), next(iter(found), None)
     if time is None or channel is None:
         wanted = "time [s]" if time is None else "vy [m/s] or sideslip [rad]"
@@ -115,17 +105,12 @@ def read_estimate_table(file: Path, vx: Recording) -> Estimate:
     return Estimate(vx.id, file.stem, table.rate_hz, table.start_time, {"vy": values, "sideslip": np.zeros_like(values)})
 
 
-def _unit_in(name: str) -> str | None:
-    written = re.search(r"[\[(](.*?)[\])]", name)
-    if written is None:
-        return None
-    return written[1] if written[1] in ("s", "ms", "us", "ns") else plain_unit(written[1])
-
-
-def compare_estimates(drive: Recording, estimates: Mapping[str, Estimate]) -> ComparedFiles:
+def compare_estimates(drive: Recording, estimates: Mapping[str, Estimate]) -> dict[str, Any]:
     """Score estimates on the clock of ``drive`` where all of them have values, beside v = 0 and a static map.
 
     The map is fitted on one half of the scored range and scored on the other, and vice versa, so that its samples are held out.
+    Returns ``rows``, one an estimate, the lowest RMSE(β) first, the ``verdict``, and ``start`` and ``stop`` [s] and ``rate_hz`` of what is
+    scored.
     Raises `DataError` without a reference, or with too little or gaps in common, `ConfigurationError` for none or a baseline's name.
     """
     if not estimates:
@@ -148,7 +133,7 @@ def compare_estimates(drive: Recording, estimates: Mapping[str, Estimate]) -> Co
         errors = accuracy([scored[ranked]])
         figures = {key: errors[key] for key in ("rmse_sideslip", "rmse_vy", "fvu", "max_error_sideslip")}
         rows.append({"estimate": ranked[0], **figures, **standing_columns(ranking, ranked)})
-    return ComparedFiles(rows, verdict, start, stop, reference.rate_hz)
+    return {"rows": rows, "verdict": verdict, "start": start, "stop": stop, "rate_hz": reference.rate_hz}
 
 
 def _in_common(reference: Recording, estimates: Mapping[str, Estimate]) -> tuple[float, float]:

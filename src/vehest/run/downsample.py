@@ -12,21 +12,16 @@ from vehest.data.recording import PART, Recording, joined
 from vehest.data.store import read_recording, write_recording
 from vehest.data.transforms import Resample, Transform, transform_from_config
 from vehest.run.artefacts import Artefact, StagePlan
+from vehest.run.versions import code_of
 
 STAGE = "downsample"
-VERSION = "1"
 
 
 def plan_downsample(ingested: Artefact, rate_hz: float, options: Mapping[str, Any], output: Path) -> StagePlan:
     """The artefact of a downsampling; raises `ConfigurationError` for a rate, method or transform that makes no sense."""
     config = {"rate_hz": float(rate_hz), "method": options["method"], "transforms": list(options.get("transforms") or [])}
     transforms_of(config)
-    return StagePlan(STAGE, f"{ingested.label}-{rate_hz:g}hz", config, dict(ingested.outputs), code_of_downsampling(), output)
-
-
-def code_of_downsampling() -> str:
-    """Version of a downsampling."""
-    return f"downsample={VERSION}"
+    return StagePlan(STAGE, f"{ingested.label}-{rate_hz:g}hz", config, dict(ingested.outputs), code_of(STAGE), output)
 
 
 def write_downsample(ingested: Artefact, config: Mapping[str, Any], folder: Path) -> None:

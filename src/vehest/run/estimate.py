@@ -35,7 +35,7 @@ from vehest.estimators.model_files import DESCRIPTION, WEIGHTS, load_model, read
 from vehest.run.artefacts import MANIFEST, Artefact, read_artefact
 from vehest.run.calibrate import trust_of
 from vehest.run.car_record import calibrated, read_car, with_settings
-from vehest.run.config import Config, compose_config, key_of, value_of
+from vehest.run.config import compose_config, key_of, value_of
 from vehest.run.config_files import is_file_name
 from vehest.run.downsample import resampled, resampled_parts
 from vehest.run.estimate_log import LOGS, check_log_name, write_log
@@ -58,11 +58,6 @@ WITH_VEHEST = {PRETRAINED: "pretrained", SELF_CALIBRATING: "pretrained_filter"}
 def pretrained_folder(name: str = PRETRAINED) -> Path:
     """The folder of a model that comes with vehest."""
     return Path(__file__).resolve().parents[1] / WITH_VEHEST[name]
-
-
-def pretrained_note(name: str = PRETRAINED) -> str:
-    """The caution that goes with estimates of a model that comes with vehest."""
-    return " ".join(read_description(pretrained_folder(name)).about.note.split())
 
 
 def find_model(name: str, output: Path, say: Callable[[str], None]) -> Path:
@@ -174,7 +169,7 @@ def estimate_file(words: Sequence[str], out: Path, *, strict: bool = False, car:
         **report.summary(),
         "verdict": report.verdict(),
         "findings": findings,
-        **({"note": pretrained_note(name)} if name in WITH_VEHEST else {}),
+        **({"note": " ".join(read_description(folder).about.note.split())} if name in WITH_VEHEST else {}),
     }
 
 
@@ -208,11 +203,7 @@ def read_table(path: Path, overrides: Sequence[str] = (), *, references: bool = 
 
     Raises what `read_single` does, and `DataError` where a check finds an error that the data set does not accept.
     """
-    return read_by(compose_config("estimate", overrides), path, references=references)
-
-
-def read_by(config: Config, path: Path, *, references: bool = False) -> Recording:
-    """`read_table` by a configuration."""
+    config = compose_config("estimate", overrides)
     dataset = config["dataset"] if references else _without_references(config["dataset"])
     with use_limits(limits_from_config(config["limits"])):
         recording = read_single(dataset, path)

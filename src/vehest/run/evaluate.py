@@ -26,7 +26,6 @@ from vehest.data.splits import TRAINING, VALIDATION, Span, Split
 from vehest.data.store import read_recording, write_estimate
 from vehest.estimators.base import Estimator
 from vehest.estimators.model_files import load_model, read_description
-from vehest.estimators.registry import estimator_class
 from vehest.evaluation.bands import band_figures, banded, coverage_intervals, figures_by_regime
 from vehest.evaluation.blocks import figure_intervals, segments_of, write_segments
 from vehest.evaluation.floors import cramer_rao_floor, drives_of, inputs_of, reference_floor
@@ -35,15 +34,15 @@ from vehest.evaluation.metrics import UNITS, Protocol, Scored, accuracy, pieces_
 from vehest.evaluation.regimes import errors_by_regime, regimes_of
 from vehest.evaluation.under_fault import UNITS as UNITS_UNDER_FAULT
 from vehest.run.artefacts import TIMINGS, Artefact, StagePlan
-from vehest.run.evaluate_faults import FaultSettings, code_under_faults, errors_under
+from vehest.run.evaluate_faults import FaultSettings, errors_under
 from vehest.run.train import FIT_METRICS, file_digest, learnt_spans, read_fit_metrics, recording_file
+from vehest.run.versions import code_of
 from vehest.studies.artefacts import HEAD, METRIC_COLUMNS, read_frame
 from vehest.trust.bands import Bands, with_bands
 from vehest.trust.faults import is_fault
 from vehest.trust.record import Trust, read_trust
 
 STAGE = "evaluate"
-VERSION = "1"
 METRICS = "metrics.csv"
 BLOCKS = "blocks.csv"
 TIMES = ("train_seconds", "step_seconds")
@@ -107,9 +106,9 @@ class Evaluation:
             "kinds": dict(self.kinds),
             "split": self.split.name,
         }
-        code = code_of_evaluation(read_description(model.folder).estimator)
         if self.faults:
-            config["faults"], code = [asdict(fault) for fault in self.faults], code_under_faults(code)
+            config["faults"] = [asdict(fault) for fault in self.faults]
+        code = code_of(STAGE, read_description(model.folder).estimator, faults=bool(self.faults))
         plan = StagePlan(STAGE, f"{model.label}-on-{self.split.name}", config, inputs, code, self.output)
         return plan, partial(_write, self, model, calibration)
 
@@ -129,11 +128,6 @@ class Evaluation:
     def score(self, spans: Sequence[Span], estimates: Sequence[Estimate]) -> list[Scored]:
         """Estimates of a test set beside the reference."""
         return score_all(estimates.__getitem__, spans, self.reference, self.protocol)
-
-
-def code_of_evaluation(estimator: str) -> str:
-    """Version of an evaluation of an estimator."""
-    return f"evaluate={VERSION} {estimator}={estimator_class(estimator).version}"
 
 
 def test_sets(split: Split) -> dict[str, Sequence[Span]]:

@@ -21,7 +21,7 @@ from vehest.data.schema import validated
 from vehest.data.splits import Span, Split
 from vehest.estimators.base import Estimator
 from vehest.evaluation.metrics import Scored
-from vehest.evaluation.under_fault import FAULTED, Flagged, Window, errors_under_fault, flags_under_fault
+from vehest.evaluation.under_fault import FAULTED, Window, errors_under_fault, flags_under_fault
 from vehest.run.artefacts import Artefact
 from vehest.run.config import Config, compose_config
 from vehest.run.config_files import choices
@@ -30,14 +30,8 @@ from vehest.trust.contract import GuardedRun
 from vehest.trust.faults import Fault, Severity, inject
 from vehest.trust.record import Trust, is_other_vehicle
 
-VERSION = "2"
 NONE = {"name": "none"}
 DRAWN_START = (0.2, 0.4)  # shares of a range, between which a start is drawn
-
-
-def code_under_faults(code: str) -> str:
-    """Version of an evaluation under faults, from that without them."""
-    return f"{code} faults={VERSION}"
 
 
 @dataclass(frozen=True)
@@ -164,6 +158,6 @@ def errors_under(
         flags = []
         for estimate, part in zip(guarded, scored, strict=True):
             band = estimate.held_at(part.time, "band_sideslip") if "band_sideslip" in estimate.channels else np.full(len(part.time), np.nan)
-            flags.append(Flagged(band, estimate.held_at(part.time, "health")))
+            flags.append((band, estimate.held_at(part.time, "health")))
         found[FAULTED] |= flags_under_fault(scored, flags, windows, rate_hz)
     return found

@@ -23,7 +23,7 @@ from vehest.estimators.self_calibrating import SelfCalibrating
 from vehest.run.car_record import FORMAT, LIMITS, CarRecord, Number, read_car, with_settings
 from vehest.run.config import compose_config, key_of
 from vehest.run.config_files import is_file_name
-from vehest.run.estimate import SELF_CALIBRATING, finding_in_words, findings_of, open_model, prepared_recording, read_by, split_settings
+from vehest.run.estimate import SELF_CALIBRATING, finding_in_words, findings_of, open_model, prepared_recording, read_table, split_settings
 from vehest.run.printing import TerminalTable, complain
 
 IDENTIFIED_SHARE = 0.5  # of the prior's variance: a number is identified on a drive that leaves less
@@ -59,7 +59,7 @@ def identify_files(words: Sequence[str], out: Path) -> CarRecord:
         model.preparation = config["downsample"]
     drives: dict[str, dict[str, Normal]] = {}
     for file in files:
-        drive = read_by(config, file)
+        drive = read_table(file, overrides)
         if drive.id in drives:
             raise ConfigurationError(f"two recordings are called '{drive.id}'; rename one")
         for finding in findings_of(drive, model, config["dataset"].get("accept") or ()):

@@ -26,11 +26,11 @@ from vehest.run.console import Messages
 from vehest.run.failures import Failure
 from vehest.run.launchers.local import launch
 from vehest.run.signals import DryRunStop, StopSignals
-from vehest.sources.base import SIMULATED, Source, open_source, source_class
+from vehest.run.versions import code_of
+from vehest.sources.base import SIMULATED, Source, open_source
 from vehest.trust.health import SLOW_KERNEL, compile_health
 
 STAGE = "ingest"
-VERSION = "1"
 PARTS_PREFIX = ".parts-"
 LONGEST_ID = 200  # bytes
 Report = Callable[[int, int, str], None]  # recordings done, recordings in all, name of one that was begun
@@ -49,12 +49,7 @@ def plan_ingest(config: Config) -> StagePlan:
         recording_file(recording_id)
     content = {key: value for key, value in dataset.items() if key not in PROSE}
     inputs = {name: sha256_of(origin) if isinstance(origin, Path) else str(origin) for name, origin in source.inputs().items()}
-    return StagePlan(STAGE, source.name, content, inputs, code_of_ingest(dataset), Path(config["output"]))
-
-
-def code_of_ingest(dataset: Mapping[str, Any]) -> str:
-    """Version of an ingest of a data set."""
-    return f"ingest={VERSION} {dataset['source']}={source_class(dataset).version}"
+    return StagePlan(STAGE, source.name, content, inputs, code_of(STAGE, str(dataset["source"])), Path(config["output"]))
 
 
 def write_ingest(config: Config, plan: StagePlan, folder: Path, jobs: int, stop: StopSignals, report: Report) -> None:

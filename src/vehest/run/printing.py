@@ -172,20 +172,20 @@ def _summary(tables: list[TerminalTable], notes: list[str], figures: dict[str, A
     return TerminalSummary(tuple(tables), shown, "report.html", json.dumps(figures | ({"failed": dict(left_out)} if left_out else {})))
 
 
-def summary_of_sweep(artefacts: SweepArtefacts, table: pd.DataFrame) -> TerminalSummary:
+def summary_of_sweep(artefacts: SweepArtefacts) -> TerminalSummary:
     """A row a combination with settings, seeds, mean and half interval on validation and tests."""
     from vehest.studies.sweep import table_of
 
     kinds = " and ".join(kind.upper() if kind == "simulated" else kind for kind in dict.fromkeys(artefacts.part.kinds.values()))
     title = f"{artefacts.part.study}: RMSE(β) [deg], mean over seeds ± half its 95 % interval (Student's t); {kinds} data"
-    records = _records(table)
+    records = _records(artefacts.table)
     figures = {
         "chosen": next((row for row in records if row["chosen"]), None),
         "summary": records,
         "failed": [{"jobs": name, "message": reason} for name, reason in artefacts.part.failed.items()],
     }
-    note = "* lowest mean on the validation range; tests choose nothing" if table["chosen"].any() else ""
-    return TerminalSummary((TerminalTable(title, *table_of(artefacts, table)),), note, "report.md", json.dumps(figures))
+    note = "* lowest mean on the validation range; tests choose nothing" if figures["chosen"] else ""
+    return TerminalSummary((TerminalTable(title, *table_of(artefacts)),), note, "report.md", json.dumps(figures))
 
 
 def score_cells(row: Mapping[Any, Any]) -> tuple[str, ...]:

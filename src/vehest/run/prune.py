@@ -12,83 +12,65 @@ import os
 import shutil
 import stat
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable
 from contextlib import suppress
-from dataclasses import dataclass
-from datetime import timedelta
 from pathlib import Path
+from typing import Any
 
 from vehest.data.errors import VehestError
 from vehest.data.files import aside_of, is_left_over, writing_error
 from vehest.data.text_files import read_json
-from vehest.run import calibrate, downsample, evaluate, evaluate_faults, ingest, report, train
 from vehest.run.artefacts import MANIFEST, Artefact, read_artefact
+from vehest.run.ingest import PARTS_PREFIX
+from vehest.run.ingest import STAGE as INGEST
 from vehest.run.run_cache import FINISHED
+from vehest.run.train import STAGE as TRAIN
+from vehest.run.versions import VERSIONS, code_of
 
 CHECKPOINTS = "checkpoints"
-CODES: dict[str, Callable[[str], str]] = {
-    ingest.STAGE: lambda source: ingest.code_of_ingest({"source": source}),
-    downsample.STAGE: lambda _: downsample.code_of_downsampling(),
-    train.STAGE: train.code_of_training,
-    calibrate.STAGE: calibrate.code_of_calibration,
-    evaluate.STAGE: evaluate.code_of_evaluation,
-    report.STAGE: report.code_of_report,
-    report.SWEEP: lambda _: report.SWEEP_CODE,
-}
-"""Stage -> today's version of its code, by the name of the source, estimator or study."""
 OUTDATED, DAMAGED, ORPHANED = "its code has changed", "it is damaged", "its inputs are gone"
 SUPERFLUOUS, LEFT_OVER = "its model is there, or listed", "left by a process that was killed"
 
 
-@dataclass(frozen=True)
-class Unused:
-    """A folder or file in the output root that no current configuration can reuse."""
+def unused_artefacts(output: Path) -> list[dict[str, Any]]:
+    """List everything in an output root that no current configuration can reuse, stage by stage.
 
-    path: Path
-    reason: str
-    size: int  # of all its files [bytes]
-    age: float  # since it was last written to [s]
-
-    def in_words(self) -> list[str]:
-        """Path, size, age and reason, for a terminal."""
-        return [str(self.path), f"{self.size / 1e6:.3f} MB", str(timedelta(seconds=round(self.age))), self.reason]
-
-
-def unused_artefacts(output: Path) -> list[Unused]:
-    """List everything in an output root that no current configuration can reuse, stage by stage."""
+    Returns:
+        ``path``, ``reason``, ``bytes`` of all its files, and ``seconds`` since it was last written to.
+    """
     artefacts = _artefacts(output)
     whole = [artefact for artefact in artefacts.values() if artefact is not None]
     present = {digest for artefact in whole for digest in (artefact.digest, *artefact.outputs.values())}
     reasons = {folder: reason for folder, artefact in artefacts.items() if (reason := _reason(artefact, present))}
     for folder in _entries(output / CHECKPOINTS):  # without a model its training may go on
-        model = output / train.STAGE / folder.name
+        model = output / TRAIN / folder.name
         if model in reasons or any(own.folder == model and own.status == "complete" for own in whole):
             reasons[folder] = SUPERFLUOUS
-    for path in (path for place in (*CODES, CHECKPOINTS, FINISHED) for path in _entries(output / place)):
-        parts_of = path.with_name(path.name.removeprefix(ingest.PARTS_PREFIX))
+    for path in (path for place in (*VERSIONS, CHECKPOINTS, FINISHED) for path in _entries(output / place)):
+        parts_of = path.with_name(path.name.removeprefix(PARTS_PREFIX))
         if is_left_over(path) or (parts_of != path and parts_of in artefacts):
             reasons[path] = LEFT_OVER
-    return [Unused(path, reason, *_size_and_age(path)) for path, reason in reasons.items()]
+    return [{"path": str(path), "reason": reason} | _size_and_age(path) for path, reason in reasons.items()]
 
 
-def remove_unused(unused: Sequence[Unused], on_removed: Callable[[Unused], None]) -> None:
+def remove_unused(paths: Iterable[Path], on_removed: Callable[[Path], None]) -> None:
     """Remove files and folders, each renamed first so that no half is found; ``on_removed`` is called after each; raises `MissingError`."""
-    for one in unused:
-        aside = aside_of(one.path)
+    for path in paths:
+        aside = aside_of(path)
         try:
-            os.rename(one.path, aside)
+            os.rename(path, aside)
             shutil.rmtree(aside) if aside.is_dir() else aside.unlink()
         except FileNotFoundError:  # another process was quicker
             continue
         except OSError as error:
-            raise writing_error(one.path, error) from error
-        on_removed(one)
+            raise writing_error(path, error) from error
+        on_removed(path)
 
 
 def _artefacts(output: Path) -> dict[Path, Artefact | None]:
     """Artefacts whose manifest gives their own name; none where one is damaged otherwise."""
     found: dict[Path, Artefact | None] = {}
-    for folder in (folder for stage in CODES for folder in _entries(output / stage)):
+    for folder in (folder for stage in VERSIONS for folder in _entries(output / stage)):
         with suppress(VehestError, KeyError, TypeError):
             manifest = read_json(folder / MANIFEST)
             named = (manifest["stage"], f"{manifest['label']}-{manifest['key'][:12]}")
@@ -106,10 +88,9 @@ def _reason(artefact: Artefact | None, present: set[str]) -> str:
         return OUTDATED
     name = artefact.code.partition(" ")[2].partition("=")[0]  # train=1 NAME=1 training=1
     with suppress(VehestError):
-        code = CODES[artefact.stage](name)
-        if artefact.code not in (code, evaluate_faults.code_under_faults(code)):
+        if artefact.code not in (code_of(artefact.stage, name), code_of(artefact.stage, name, faults=True)):
             return OUTDATED
-    orphaned = artefact.stage not in (ingest.STAGE, train.STAGE) and not present.issuperset(artefact.inputs.values())
+    orphaned = artefact.stage not in (INGEST, TRAIN) and not present.issuperset(artefact.inputs.values())
     return ORPHANED if orphaned else ""
 
 
@@ -118,8 +99,7 @@ def _entries(place: Path) -> list[Path]:
     return [path for path in sorted(place.iterdir()) if not path.is_symlink()] if place.is_dir() and not place.is_symlink() else []
 
 
-def _size_and_age(path: Path) -> tuple[int, float]:
-    """Bytes of all files, and seconds since the last was written."""
+def _size_and_age(path: Path) -> dict[str, int]:
     about = [one.lstat() for one in (path, *path.rglob("*"))]
     size = sum(one.st_size for one in about if not stat.S_ISDIR(one.st_mode))
-    return size, max(0.0, time.time() - max(one.st_mtime for one in about))
+    return {"bytes": size, "seconds": round(max(0.0, time.time() - max(one.st_mtime for one in about)))}

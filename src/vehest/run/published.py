@@ -12,27 +12,23 @@ import hashlib
 import json
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 from vehest.data.errors import ConfigurationError, MissingError, VehestError
 from vehest.data.split_files import dataset_names
-from vehest.run.calibrate import code_of_calibration
 from vehest.run.comparison import resampling_fact, training_facts
 from vehest.run.config import Config
 from vehest.run.config_files import find_pipeline, pipeline_names
 from vehest.run.console import Messages
-from vehest.run.downsample import code_of_downsampling
-from vehest.run.evaluate import code_of_evaluation
-from vehest.run.evaluate_faults import all_of, code_under_faults, faults_of
-from vehest.run.ingest import PROSE, code_of_ingest, plan_ingest
+from vehest.run.evaluate_faults import all_of, faults_of
+from vehest.run.ingest import PROSE, plan_ingest
 from vehest.run.publishing import PROVENANCE, RESULTS, Published, published_in
-from vehest.run.report import code_of_report
 from vehest.run.runner import Runner
 from vehest.run.signals import StopSignals
-from vehest.run.study import Job, Jobs, Study, content_overrides, jobs_of, read_study
-from vehest.run.train import code_of_training
+from vehest.run.study import Jobs, Study, content_overrides, jobs_of, read_study
+from vehest.run.versions import code_of
 from vehest.sources.base import kind_of
 
 Keys = dict[str, dict[str, str]]
@@ -42,8 +38,6 @@ CODE, CONFIGURATION, DATA = "code", "configuration", "data"
 CAUSES = (CODE, CONFIGURATION, DATA)
 MOST_NAMED = 6
 
-State = Literal["up to date", "stale", "not known"]
-
 
 def keys_of_study(study: Study, jobs: Jobs, absent: Collection[str], runner: Runner, inputs: Mapping[str, Mapping[str, str]]) -> Keys:
     """Keys of everything that determines the results of a study."""
@@ -51,7 +45,7 @@ def keys_of_study(study: Study, jobs: Jobs, absent: Collection[str], runner: Run
     keys: Keys = {}
     for name, config in ingests.items():
         content = {key: value for key, value in config["dataset"].items() if key not in PROSE}
-        keys[f"ingest {name}"] = {CODE: code_of_ingest(config["dataset"]), CONFIGURATION: _hash(content)}
+        keys[f"ingest {name}"] = {CODE: code_of("ingest", config["dataset"]["source"]), CONFIGURATION: _hash(content)}
         if name in inputs:
             keys[f"ingest {name}"][DATA] = _hash(dict(inputs[name]))
     about: dict[str, Any] = {name: getattr(study, name) for name in ("study", "title", "about", "report")} | {"file": study.file.name}
@@ -62,18 +56,19 @@ def keys_of_study(study: Study, jobs: Jobs, absent: Collection[str], runner: Run
         keys |= {f"{part}: {name}" if part else name: entry for name, entry in _of_jobs(configs)}
         titles = [_titled(ingests[name]) for name in dataset_names(configs[0]["split"])]
         about[f"part {part}"] = [study.parts[part].title, *training_facts(configs), resampling_fact(configs), *titles]
-    return keys | {"report": {CODE: code_of_report(study.report), CONFIGURATION: _hash(about)}}
+    return keys | {"report": {CODE: code_of("report", study.report), CONFIGURATION: _hash(about)}}
 
 
 def _ingests(study: Study, jobs: Jobs, absent: Collection[str], runner: Runner) -> dict[str, Config]:
+    there = {name: config for name, config in _firsts(study, jobs).items() if name not in absent}
     if study.datasets:
-        return {name: config for name, config in _by_dataset(jobs[""]).items() if name not in absent}
-    firsts = [jobs[name][0].config for name in study.parts if name not in absent]
-    return {name: runner.dataset_config(name, config) for config in firsts for name in dataset_names(config["split"])}
+        return there
+    return {name: runner.dataset_config(name, config) for config in there.values() for name in dataset_names(config["split"])}
 
 
-def _by_dataset(jobs: Sequence[Job]) -> dict[str, Config]:
-    return {str(job.config["dataset"]["name"]): job.config for job in jobs}
+def _firsts(study: Study, jobs: Jobs) -> dict[str, Config]:
+    """Part, or data set, -> configuration of its first job."""
+    return {name: jobs[name][0].config for name in study.parts} or {str(job.config["dataset"]["name"]): job.config for job in jobs[""]}
 
 
 def _of_jobs(configs: Sequence[Config]) -> Iterator[tuple[str, dict[str, str]]]:
@@ -82,18 +77,17 @@ def _of_jobs(configs: Sequence[Config]) -> Iterator[tuple[str, dict[str, str]]]:
     faults = all_of(map(faults_of, configs))
     rates = sorted({float(config["estimator"]["rate_hz"]) for config in configs} | {float(first["evaluation"]["rate_hz"])})
     yield "split", {CONFIGURATION: _hash(first["split"])}
-    yield "downsample", {CODE: code_of_downsampling(), CONFIGURATION: _hash([first["downsample"], rates])}
+    yield "downsample", {CODE: code_of("downsample"), CONFIGURATION: _hash([first["downsample"], rates])}
     for name in dict.fromkeys(str(config["estimator"]["name"]) for config in configs):
         jobs = [config for config in configs if config["estimator"]["name"] == name]
         trained = [[job["estimator"], {**job["training"], "checkpoint_seconds": None}, job["seed"]] for job in jobs]
-        yield f"train {name}", {CODE: code_of_training(name), CONFIGURATION: _hash(trained)}
+        yield f"train {name}", {CODE: code_of("train", name), CONFIGURATION: _hash(trained)}
         if first["split"].get("validation"):
-            yield f"calibrate {name}", {CODE: code_of_calibration(name), CONFIGURATION: _hash(None)}
-        code = code_of_evaluation(name)
+            yield f"calibrate {name}", {CODE: code_of("calibrate", name), CONFIGURATION: _hash(None)}
         conditions: Any = {key: value for key, value in first["evaluation"].items() if key != "least_speed" or value}  # as `Protocol.plain`
         if faults:
-            code, conditions = code_under_faults(code), [conditions, *map(asdict, faults)]
-        yield f"evaluate {name}", {CODE: code, CONFIGURATION: _hash(conditions)}
+            conditions = [conditions, *map(asdict, faults)]
+        yield f"evaluate {name}", {CODE: code_of("evaluate", name, faults=bool(faults)), CONFIGURATION: _hash(conditions)}
 
 
 def _titled(config: Config) -> list[str]:
@@ -105,38 +99,23 @@ def _hash(content: Any) -> str:
     return hashlib.sha256(json.dumps(content, sort_keys=True, default=str).encode()).hexdigest()[:16]
 
 
-@dataclass(frozen=True)
-class Change:
-    """Something that differs from when results were published."""
-
-    what: str  # ``train ksnn``
-    cause: str  # one of `CAUSES`
-
-
-@dataclass(frozen=True)
-class Verdict:
-    """The state of a published study."""
-
-    study: str
-    state: State
-    changes: tuple[Change, ...] = ()  # why its results are stale
-    note: str = ""  # on parts that could not be compared, or why the state is not known
-
-    def in_words(self) -> str:
-        """One line."""
-        words = []
-        for cause in CAUSES:
-            named = [change.what for change in self.changes if change.cause == cause]
-            if named:
-                more = f" and {len(named) - MOST_NAMED} more" if len(named) > MOST_NAMED else ""
-                words.append(f"{cause} ({', '.join(named[:MOST_NAMED])}{more})")
-        why = "; ".join(part for part in (", ".join(words), self.note) if part)
-        return ": ".join(part for part in (self.study, self.state, why) if part)
+def in_words(verdict: Mapping[str, Any]) -> str:
+    """The state of a study in one line."""
+    words = []
+    for cause in CAUSES:
+        named = [change["what"] for change in verdict["changes"] if change["cause"] == cause]
+        if named:
+            more = f" and {len(named) - MOST_NAMED} more" if len(named) > MOST_NAMED else ""
+            words.append(f"{cause} ({', '.join(named[:MOST_NAMED])}{more})")
+    why = "; ".join(part for part in (", ".join(words), verdict["note"]) if part)
+    return ": ".join(part for part in (verdict["study"], verdict["state"], why) if part)
 
 
-def check_published(names: Sequence[str], overrides: Sequence[str] = ()) -> list[Verdict]:
+def check_published(names: Sequence[str], overrides: Sequence[str] = ()) -> list[dict[str, Any]]:
     """Compare the recorded keys of published studies with those of today's code, configuration and raw files.
 
+    Returns a ``study`` each with its ``state``, up to date, stale or not known, ``changes``, each with ``what`` (``train ksnn``) and one of
+    `CAUSES`, and a ``note`` on what was not compared, or why the state is not known.
     Raises `ConfigurationError` for an override that would change results, `MissingError` for a name of no pipeline or published study.
     """
     if content_overrides(overrides):
@@ -164,21 +143,25 @@ def _pipeline_of(study: str) -> Study | None:
     return None
 
 
-def _verdict(study: str, pipeline: Study | None, overrides: Sequence[str]) -> Verdict:
-    published = published_in(RESULTS / study)
+def _verdict(study: str, pipeline: Study | None, overrides: Sequence[str]) -> dict[str, Any]:
+    published, state, changes, note = published_in(RESULTS / study), "not known", [("pipeline", CONFIGURATION)], ""
     if published is None:
-        return Verdict(study, "not known", note=f"there is nothing in '{RESULTS / study}' that vehest published")
-    if not published.keys:
-        return Verdict(study, "not known", note="published before keys were recorded; run it again")
-    if pipeline is None:
-        return Verdict(study, "not known", note=f"there is no pipeline that publishes '{study}'")
-    try:
-        return _compared(pipeline, jobs_of(pipeline, overrides), published)
-    except ConfigurationError as error:
-        return Verdict(study, "stale", (Change("pipeline", CONFIGURATION),), f"today it cannot be run ({error})")
+        changes, note = [], f"there is nothing in '{RESULTS / study}' that vehest published"
+    elif not published.keys:
+        changes, note = [], "published before keys were recorded; run it again"
+    elif pipeline is None:
+        changes, note = [], f"there is no pipeline that publishes '{study}'"
+    else:
+        try:
+            changes, note = _changes(pipeline, jobs_of(pipeline, overrides), published)
+        except ConfigurationError as error:
+            note = f"today it cannot be run ({error})"
+        state = "stale" if changes else "up to date"
+    return {"study": study, "state": state, "changes": [{"what": what, "cause": cause} for what, cause in changes], "note": note}
 
 
-def _compared(study: Study, jobs: Jobs, published: Published) -> Verdict:
+def _changes(study: Study, jobs: Jobs, published: Published) -> tuple[list[tuple[str, str]], str]:
+    """Pairs of what differs from when results were published and its cause; a note on what was not compared."""
     runner = Runner(Path(str(next(iter(jobs.values()))[0].config["output"])), Messages(quiet=True), StopSignals())
     ingests, inputs = _ingests(study, jobs, published.absent, runner), {}
     for name, config in ingests.items():
@@ -186,13 +169,12 @@ def _compared(study: Study, jobs: Jobs, published: Published) -> Verdict:
             inputs[name] = plan_ingest(config).inputs
     missing = [name for name in ingests if name not in inputs]
     then, today = published.keys, keys_of_study(study, jobs, published.absent, runner, inputs)
-    changes = [Change(what, cause) for what in then for cause, own in today.get(what, {}).items() if then[what].get(cause) != own]
-    changes += [Change(f"{what} added", CONFIGURATION) for what in today if what not in then]
-    changes += [Change(f"{what} removed", CONFIGURATION) for what in then if what not in today]
-    parts = {name: jobs[name][0].config for name in study.parts} or _by_dataset(jobs[""])
+    changes = [(what, cause) for what in then for cause, own in today.get(what, {}).items() if then[what].get(cause) != own]
+    changes += [(f"{what} added", CONFIGURATION) for what in today if what not in then]
+    changes += [(f"{what} removed", CONFIGURATION) for what in then if what not in today]
+    parts = _firsts(study, jobs)
     for name in sorted(parts.keys() & set(published.absent)):  # that the study had to go on without
         with suppress(MissingError):
             runner.look_for_files(parts[name]) if study.parts else plan_ingest(parts[name])
-            changes.append(Change(f"{name}, which was not here", DATA))
-    note = f"raw files not here, not compared: {', '.join(missing)}" if missing else ""
-    return Verdict(study.study, "stale" if changes else "up to date", tuple(changes), note)
+            changes.append((f"{name}, which was not here", DATA))
+    return changes, f"raw files not here, not compared: {', '.join(missing)}" if missing else ""

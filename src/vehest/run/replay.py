@@ -18,8 +18,9 @@ from vehest.bus.view import View
 from vehest.data.errors import ConfigurationError
 from vehest.data.limits import limits_from_config, use_limits
 from vehest.estimators.base import Estimator
+from vehest.estimators.model_files import read_description
 from vehest.run.config import Config, compose_config
-from vehest.run.estimate import PRETRAINED, WITH_VEHEST, open_model, pretrained_note
+from vehest.run.estimate import PRETRAINED, WITH_VEHEST, open_model
 from vehest.sources.can.logs import read_frames
 from vehest.trust.contract import GuardedStepper
 
@@ -73,7 +74,7 @@ def replay_log(
         **figures.plain(),
         "stopped": stopped(),
         "written": [str(file) for file in written],
-        **({"note": pretrained_note(model)} if model in WITH_VEHEST else {}),
+        **({"note": " ".join(read_description(folder).about.note.split())} if model in WITH_VEHEST else {}),
     }
 
 

@@ -30,6 +30,7 @@ from vehest.run.publishing import PROVENANCE
 from vehest.run.runner import Runner
 from vehest.run.study import Study
 from vehest.run.train import new_estimator, read_fit_metrics, recording_file
+from vehest.run.versions import code_of
 from vehest.run.weights import PUBLISHED_WEIGHTS, write_weights
 from vehest.studies.artefacts import (
     METRIC_COLUMNS,
@@ -41,14 +42,12 @@ from vehest.studies.artefacts import (
     of_parts,
     read_frame,
 )
-from vehest.studies.kit.reference_minutes import start_in_words
 from vehest.studies.kit.timings import timings_of_study
+from vehest.studies.reference_minutes import start_in_words
 from vehest.studies.registry import study_module
-from vehest.studies.sweep import DONE, FAILED, SweepArtefacts, build, summary
+from vehest.studies.sweep import DONE, FAILED, SweepArtefacts, build
 
 STAGE, SWEEP = "report", "sweep"
-VERSION = "1"
-SWEEP_CODE = "sweep=2"
 OVERVIEW = "tables/overview.csv"
 SCORES = ("rmse_sideslip", "rmse_vy", "fvu")
 
@@ -94,17 +93,12 @@ def draw_report(
         if study.publish and models:
             write_weights(models, folder / PUBLISHED_WEIGHTS)
 
-    report = runner.ensure(StagePlan(STAGE, study.study, config, inputs, code_of_report(study.report), runner.output), write)
+    report = runner.ensure(StagePlan(STAGE, study.study, config, inputs, code_of(STAGE, study.report), runner.output), write)
     module = study_module(study.report)
     if not hasattr(module, "leaderboard"):
         return report, summary_of_overview(read_frame(report.folder / OVERVIEW), left_out)
     verdict: list[str] = module.verdict(artefacts) if hasattr(module, "verdict") else []
     return report, summary_of_leaderboard(study.title, module.leaderboard(artefacts.first), left_out, verdict)
-
-
-def code_of_report(study: str) -> str:
-    """Version of what a report runs, by the name of the module that draws it; raises `ConfigurationError` where the name is unknown."""
-    return f"report={VERSION} {study}={getattr(study_module(study), 'VERSION', '1')}"
 
 
 def _write(artefacts: StudyArtefacts, name: str, recordings: Mapping[str, str], folder: Path) -> None:
@@ -218,7 +212,6 @@ def draw_sweep(study: Study, comparison: Comparison, runner: Runner) -> tuple[Ar
     part = _part_artefacts(study, "", comparison)
     part = replace(part, facts=[*part.facts, *under])
     artefacts = SweepArtefacts(part, list(comparison.jobs[0].values), _job_table(comparison))
-    table = summary(artefacts.jobs, artefacts.keys, artefacts.sets)
     made = [own for member in comparison.members for own in (member.model, member.evaluation) if own is not None]
     plan = StagePlan(
         stage=SWEEP,
@@ -234,7 +227,7 @@ def draw_sweep(study: Study, comparison: Comparison, runner: Runner) -> tuple[Ar
             "facts": part.facts,
         },
         inputs={f"{own.stage}/{own.folder.name}": own.digest for own in made},
-        code=SWEEP_CODE,
+        code=code_of(SWEEP),
         output=runner.output,
     )
 
@@ -242,10 +235,10 @@ def draw_sweep(study: Study, comparison: Comparison, runner: Runner) -> tuple[Ar
         from vehest.report.document import write_document
 
         write_document(build(artefacts), folder, page=False)
-        for file, written in (("sweep.csv", artefacts.jobs), ("summary.csv", table)):
+        for file, written in (("sweep.csv", artefacts.jobs), ("summary.csv", artefacts.table)):
             written.to_csv(folder / file, index=False, lineterminator="\n", errors="backslashreplace")
 
-    return runner.ensure(plan, write), summary_of_sweep(artefacts, table)
+    return runner.ensure(plan, write), summary_of_sweep(artefacts)
 
 
 def _job_table(comparison: Comparison) -> pd.DataFrame:

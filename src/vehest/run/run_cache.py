@@ -14,7 +14,7 @@ import json
 import os
 import re
 import sys
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass
 from importlib import metadata
@@ -36,7 +36,7 @@ if TYPE_CHECKING:
     from vehest.run.runner import Runner
 
 FINISHED = "finished"  # folder of the records in an output root
-FORMAT = 3
+FORMAT = 4
 _RESOLVED = re.compile(r"\$\{\s*([A-Za-z_][\w.]*)\s*:\s*(\w*)")
 
 
@@ -58,7 +58,7 @@ class Record:
     key: str  # of its `RunCache`
     raw: dict[str, str]  # folder of raw files -> `stamp_of`
     made: dict[str, str]  # folder of an artefact in the output root -> digest; the report last
-    lines: tuple[tuple[str, str, str, str], ...]  # that the next run in full would print: status, stage, label, detail
+    notes: tuple[tuple[str, str, str, str], ...]  # that the next run in full would print too: status, stage, label, detail
     summary: TerminalSummary
     publication: Publication | None
     store: str  # MLflow's local store in the output root; empty where there is none
@@ -84,8 +84,8 @@ class RunCache:
         self.file = Path(root, FINISHED, f"{file_name(Path(self._pipeline).stem or 'sweep')}-{own}.json") if plain else None
         self.key = self._key()
 
-    def load(self) -> Record | None:
-        """The finished study, if nothing has changed since and all of it is there."""
+    def load(self) -> tuple[Record, list[Artefact]] | None:
+        """The finished study and its artefacts, if nothing has changed since and all of it is there."""
         if self.file is None or not self.file.is_file():
             return None
         output = self.file.parents[1]
@@ -93,21 +93,20 @@ class RunCache:
             record = validated(Record, read_json(self.file), f"'{self.file}'")
             if record.key != self.key or any(stamp_of(path) != stamp for path, stamp in record.raw.items()):
                 return None
-            made = {folder: read_artefact(output / folder) for folder in record.made}
+            made = [read_artefact(output / folder) for folder in record.made]
         except VehestError:
             return None
-        whole = all(artefact.status == "complete" and artefact.digest == record.made[folder] for folder, artefact in made.items())
-        return record if whole and (output / record.store).exists() else None
+        whole = all(own.status == "complete" and own.digest == digest for own, digest in zip(made, record.made.values(), strict=True))
+        return (record, made) if whole and (output / record.store).exists() else None
 
     def repeat(self, options: RunOptions) -> Ran | None:
         """The finished study, printed and published as the next run in full would; none where there is no valid record, or under force."""
-        record = None if options.force else self.load()
-        if record is None or self.file is None:
+        found = None if options.force else self.load()
+        if found is None:
             return None
-        messages = Messages(quiet=options.quiet)
-        for line in record.lines:
+        (record, (*made, report)), messages = found, Messages(quiet=options.quiet)
+        for line in (*record.notes, *(("skip", own.stage, own.label, "up to date") for own in (*made, report))):
             messages.line(*line)
-        report = read_artefact(self.file.parents[1] / list(record.made)[-1])
         published = None if options.dry_run else publish_study(record.publication, report, messages)
         return Ran(record.summary, report.folder, True, published)
 
@@ -123,7 +122,7 @@ class RunCache:
             key=self.key,
             raw=raw,
             made={own.folder.relative_to(output).as_posix(): own.digest for own in made},
-            lines=tuple(_next_time(runner.messages.printed, made)),
+            notes=tuple(line for line in runner.messages.printed if line[0] in ("note", WARNING) and line[1] != "calibrate"),
             summary=summary,
             publication=publication,
             store=tracker.store,
@@ -167,16 +166,6 @@ def stamp_of(path: str) -> str:
                 about = os.stat(file)
                 entries.append((file, about.st_size, about.st_mtime_ns, about.st_ctime_ns, about.st_ino))
     return hashlib.sha256(repr(sorted(entries)).encode("utf-8", "surrogateescape")).hexdigest()
-
-
-def _next_time(printed: Iterable[tuple[str, str, str, str]], made: Iterable[Artefact]) -> Iterator[tuple[str, str, str, str]]:
-    """The lines that the next run in full would print: artefacts are up to date, notes and warnings stay."""
-    names = {(artefact.stage, artefact.label) for artefact in made}
-    for status, stage, label, detail in printed:
-        if (stage, label) in names and status in ("done", "skip", "note"):
-            yield "skip", stage, label, "up to date"
-        elif status in ("note", WARNING) and stage != "calibrate":
-            yield status, stage, label, detail
 
 
 def _configuration(pipeline: str) -> Iterator[Path]:

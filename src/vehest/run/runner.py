@@ -11,7 +11,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 from vehest.data.errors import DataError, MissingError
 from vehest.data.recording_summary import RecordingSummary, stored_summary
@@ -29,7 +29,6 @@ from vehest.run.evaluate_faults import FaultSettings
 from vehest.run.failures import Failure
 from vehest.run.group import Group, Member, existing
 from vehest.run.ingest import parts_of, plan_ingest, write_ingest
-from vehest.run.launchers.base import Launcher
 from vehest.run.launchers.local import LocalLauncher
 from vehest.run.locks import Waiting
 from vehest.run.signals import DryRunStop, StopSignals, TimeLimit
@@ -41,6 +40,9 @@ from vehest.sources.base import kind_of, open_source
 from vehest.training.context import Progress
 from vehest.trust.health import SLOW_KERNEL
 from vehest.trust.record import read_trust
+
+if TYPE_CHECKING:
+    from vehest.run.launchers.base import Launcher
 
 Value = TypeVar("Value")
 ALL = "all groups"  # bar above those of trainings

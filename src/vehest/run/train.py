@@ -21,10 +21,10 @@ from vehest.estimators.base import Estimator, FitData, FitRecord
 from vehest.estimators.model_files import save_model
 from vehest.estimators.registry import estimator_class
 from vehest.run.artefacts import MANIFEST, TIMINGS, Artefact, StagePlan
+from vehest.run.versions import code_of
 from vehest.training.context import FitContext
 
 STAGE = "train"
-VERSION = "1"
 HISTORY = "history.csv"
 FIT_METRICS = "fit.csv"
 
@@ -77,19 +77,13 @@ def plan_train(config: Mapping[str, Any], split: Split, data: Mapping[str, Artef
     }
     inputs = {f"{span.dataset}/{span.recording}": file_digest(data[span.dataset], span) for span in (*split.train, *split.validation)}
     label = f"{estimator.name}-{estimator.variant}-seed{seed}"
-    plan = StagePlan(STAGE, label, content, inputs, code_of_training(estimator.name), Path(config["output"]))
+    plan = StagePlan(STAGE, label, content, inputs, code_of(STAGE, estimator.name), Path(config["output"]))
     return TrainJob(plan, config["estimator"], config["training"], split, seed, data)
 
 
 def _plain(span: Span) -> dict[str, str]:
     """A range as plain text, since JSON has no infinity."""
     return {"dataset": span.dataset, "recording": span.recording, "start": str(span.start), "stop": str(span.stop)}
-
-
-def code_of_training(estimator: str) -> str:
-    """Version of a training of an estimator."""
-    kind = estimator_class(estimator)
-    return f"train={VERSION} {estimator}={kind.version} training={getattr(kind.training_type, 'version', '1')}"
 
 
 def fit_jobs(jobs: Sequence[TrainJob], context: FitContext) -> list[tuple[Estimator, FitRecord]]:

@@ -22,8 +22,7 @@ from vehest.report import figures
 from vehest.report.document import PATENT_NOTE, REPORT, Block, Column, Document, Figure, ModelLink, Table, as_code, as_text
 from vehest.report.style import REFERENCE, Line, decimals_for, fixed, lines_of
 from vehest.studies.artefacts import PartArtefacts, StudyArtefacts
-from vehest.studies.kit.bands import band_blocks
-from vehest.studies.kit.drives import floors_table, regime_table
+from vehest.studies.kit.drives import band_blocks, floors_table, regime_table
 from vehest.studies.kit.explorer import chained, explorer_of
 from vehest.studies.kit.runs import Name, by_name, chosen_seed, of_model, runs_of, values_of
 from vehest.studies.kit.standing import interval_in_words, ranking_of, standing_columns, verdict_sentences
@@ -57,7 +56,15 @@ def comparison(artefacts: PartArtefacts, named: Mapping[str, Name] | None = None
     """
     board = leaderboard(artefacts)
     lines = lines_of(dict.fromkeys(model.name for model in artefacts.models))
-    blocks: list[Block] = [*_headline(artefacts)]
+    titles = {name: as_text(models[0].title) for name, models in by_name(artefacts.models).items()}
+    verdicts = [
+        verdict_sentences(ranking_of(artefacts, test_set), titles, _where(artefacts, test_set)) for test_set in artefacts.split.tests
+    ]
+    blocks: list[Block] = [artefacts.about] if artefacts.about.strip() else []
+    blocks.append("\n\n".join([data_sentence(artefacts), *verdicts, budget_sentence(artefacts)]))
+    warned = warnings_of(artefacts)
+    if warned:
+        blocks.append("**Mind:**\n\n" + "\n".join(f"- {line}" for line in warned))
     for test_set in artefacts.split.tests:
         blocks += _test_set(artefacts, board[board["test_set"] == test_set], test_set, lines, (named or {}).get(test_set))
     first = next(iter(artefacts.split.tests))
@@ -107,9 +114,6 @@ def leaderboard(artefacts: PartArtefacts) -> pd.DataFrame:
     return board
 
 
-_BOUND_SENTENCE = " Bound: the Cramér-Rao bound for what the estimator reads, as in the table of floors."
-
-
 def _spread_of(values: FloatArray) -> dict[str, float]:
     finite = values[np.isfinite(values)]
     if not len(finite):
@@ -119,20 +123,6 @@ def _spread_of(values: FloatArray) -> dict[str, float]:
 
 
 # The words
-
-
-def _headline(artefacts: PartArtefacts) -> list[Block]:
-    titles = {name: as_text(models[0].title) for name, models in by_name(artefacts.models).items()}
-    verdicts = [
-        verdict_sentences(ranking_of(artefacts, test_set), titles, _where(artefacts, test_set)) for test_set in artefacts.split.tests
-    ]
-    headline = "\n\n".join([data_sentence(artefacts), *verdicts, budget_sentence(artefacts)])
-    warned = warnings_of(artefacts)
-    blocks: list[Block] = [artefacts.about] if artefacts.about.strip() else []
-    blocks.append(headline)
-    if warned:
-        blocks.append("**Mind:**\n\n" + "\n".join(f"- {line}" for line in warned))
-    return blocks
 
 
 def _where(artefacts: PartArtefacts, test_set: str) -> str:
@@ -277,7 +267,8 @@ def _bars(artefacts: PartArtefacts, board: pd.DataFrame, test_set: str) -> Table
 def _leaderboard_table(artefacts: PartArtefacts, board: pd.DataFrame, name: str, test_set: str) -> list[Block]:
     single = board["n_seeds"] < 2
     frame = board.assign(**{column: board[column].mask(single) for column in _SPREAD})
-    decimals = decimals_for(frame["rmse_sideslip"].tolist())
+    decimals, has_bound = decimals_for(frame["rmse_sideslip"].tolist()), frame[_BOUND].notna().any()
+    bound = " Bound: the Cramér-Rao bound for what the estimator reads, as in the table of floors."
     frame["interval"] = [interval_in_words(row, decimals) for row in frame.to_dict("records")]
     standing = Table(
         name,
@@ -285,7 +276,7 @@ def _leaderboard_table(artefacts: PartArtefacts, board: pd.DataFrame, name: str,
         "another stretch of such a drive and another training; training, validation, RMSE(v) and FVU are those of the seed chosen on "
         "validation. The difference to the lowest, and whether v = 0 and the static map are beaten: paired over blocks and seeds, "
         "corrected by Holm. FVU is the fraction of the variance of v that is left unexplained."
-        f"{_BOUND_SENTENCE if frame[_BOUND].notna().any() else ''}",
+        f"{bound if has_bound else ''}",
         frame,
         {
             "title": Column("estimator"),
@@ -299,7 +290,7 @@ def _leaderboard_table(artefacts: PartArtefacts, board: pd.DataFrame, name: str,
             "rmse_sideslip_validation": Column("validation [deg]", decimals=decimals),
             "rmse_vy": Column("RMSE(v) [m/s]"),
             "fvu": Column("FVU"),
-            **({_BOUND: Column("bound [deg]", decimals=decimals)} if frame[_BOUND].notna().any() else {}),
+            **({_BOUND: Column("bound [deg]", decimals=decimals)} if has_bound else {}),
         },
         _links(artefacts, board),
     )

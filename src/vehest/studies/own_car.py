@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
@@ -25,10 +25,10 @@ from vehest.report.document import REPORT, Block, Document, as_code, as_text
 from vehest.report.style import fixed, listed
 from vehest.studies import drive
 from vehest.studies.artefacts import EvaluatedModel, PartArtefacts, StudyArtefacts
-from vehest.studies.kit.reference_minutes import blocks_of_curve, curves_of
 from vehest.studies.kit.runs import Name, by_name, chosen_seed, runs_of, values_of
 from vehest.studies.kit.standing import BASELINE_TITLES, ranking_of
 from vehest.studies.kit.warnings import cannot_rank
+from vehest.studies.reference_minutes import blocks_of_curve, curves_of
 
 TAKES = "parts"
 SHOWS_FAILED = True
@@ -37,24 +37,17 @@ PLAIN = (*BASELINES, "kinematic", "data_sheet")  # estimators that others have t
 
 VERSION = "5"
 leaderboard = drive.leaderboard
-
-
-@dataclass(frozen=True)
-class Verdict:
-    """Verdict on one test set: text and best estimator."""
-
-    sentences: tuple[str, ...]  # for people, in Markdown
-    model: EvaluatedModel | None  # to go on with; none where nothing can be recommended
+Verdict = tuple[list[str], EvaluatedModel | None]  # sentences in Markdown, and the model to go on with, if one can be recommended
 
 
 def documents(artefacts: StudyArtefacts) -> dict[str, Document]:
     """Verdict, errors as bars, traces with the estimator that is named and the next commands; folded on the page: the whole comparison."""
     part = artefacts.first
     verdicts = {name: verdict_of(part, name) for name in part.split.tests}
-    compared = drive.comparison(part, {name: own.model.name for name, own in verdicts.items() if own.model is not None})
+    compared = drive.comparison(part, {name: model.name for name, (_, model) in verdicts.items() if model is not None})
     texts = [
-        f"{'**On test set ' + as_code(name) + ':** ' if len(verdicts) > 1 else ''}{' '.join(own.sentences)}"
-        for name, own in verdicts.items()
+        f"{'**On test set ' + as_code(name) + ':** ' if len(verdicts) > 1 else ''}{' '.join(sentences)}"
+        for name, (sentences, _) in verdicts.items()
     ]
     opening = next(n for n, block in enumerate(compared.blocks) if isinstance(block, str))  # bars, and traces where there are any
     blocks: list[Block] = ["## Verdict\n\n" + "\n\n".join(texts), *compared.blocks[:opening]]
@@ -75,7 +68,7 @@ def verdict(artefacts: StudyArtefacts) -> list[str]:
     """The verdict as lines of plain text, next commands last."""
     part = artefacts.first
     verdicts = {name: verdict_of(part, name) for name in part.split.tests}
-    lines = [" ".join(own.sentences).replace("**", "").replace("`", "") for own in verdicts.values()]
+    lines = [" ".join(sentences).replace("**", "").replace("`", "") for sentences, _ in verdicts.values()]
     commands = _commands(part, verdicts, artefacts.study)
     return [*lines, *(["next:", *(f"  {command}" for command in commands)] if commands else [])]
 
@@ -91,11 +84,11 @@ def verdict_of(part: PartArtefacts, test_set: str) -> Verdict:
     titles = {name: as_text(models[0].title) for name, models in by_name(part.models).items()}
     silent = cannot_rank(part, test_set)
     if not ranking.order:
-        return Verdict((f"No estimator gave a finite error on test set `{test_set}`.",), None)
+        return [f"No estimator gave a finite error on test set `{test_set}`."], None
     if ranking.n_blocks < LEAST_BLOCKS:
         silent = [f"the test ranges hold {ranking.n_blocks} independent stretches of driving, and {LEAST_BLOCKS} is the least", *silent]
     if silent:
-        return Verdict((f"**These recordings cannot rank estimators**, because {listed(silent)}.", _wanted(part)), None)
+        return [f"**These recordings cannot rank estimators**, because {listed(silent)}.", _wanted(part)], None
     model = _to_go_on_with(part, ranking)
     name = model.name
     expected = f"RMSE(β) {_figure(ranking, name)} for {_reach(part, test_set)}"
@@ -113,7 +106,7 @@ def verdict_of(part: PartArtefacts, test_set: str) -> Verdict:
     else:
         words = f"**Take {titles[name]}**, which has the lowest error, {expected}. **No estimator can be called best.**"
     sentences = (words, _beaten(ranking, name, titles), _counted(part, test_set), _wanted(part))
-    return Verdict(tuple(sentence for sentence in sentences if sentence), model)
+    return [sentence for sentence in sentences if sentence], model
 
 
 def _figure(ranking: Ranking, name: Name) -> str:
@@ -171,7 +164,7 @@ def _counted(part: PartArtefacts, test_set: str) -> str:
 
 def _commands(part: PartArtefacts, verdicts: Mapping[str, Verdict], study: str) -> list[str]:
     """What to run next, with the model of the first test set that has a verdict."""
-    models = [(own.model, part.split.tests[name][0].dataset) for name, own in verdicts.items() if own.model is not None]
+    models = [(model, part.split.tests[name][0].dataset) for name, (_, model) in verdicts.items() if model is not None]
     if not models:
         return []
     name, dataset = models[0][0].model_folder.name, models[0][1]

@@ -1,19 +1,43 @@
-"""The study of how many minutes with a reference an estimator needs, over several cars.
+"""The study of how many minutes with a reference an estimator needs, over several cars: its error over the minutes, a learning curve.
 
-Parts with equal test ranges make a curve (`vehest.studies.kit.reference_minutes`).
+Parts of one study with equal test ranges make a curve: they differ in ``split.minutes`` and ``split.minutes_at``, and in whether trainings
+start from another model (``training.start_from``). Minutes count training and validation together, since both need the sensor.
 """
 
 from __future__ import annotations
 
+import math
+import re
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from itertools import groupby
+from pathlib import Path
+
 import pandas as pd
 
-from vehest.report.document import PATENT_NOTE, REPORT, Block, Column, Document, Table
-from vehest.studies.artefacts import StudyArtefacts
+from vehest.data.splits import Span
+from vehest.evaluation.blocks import Segments
+from vehest.evaluation.ranking import BASELINES, Name, Ranking, rank
+from vehest.report.document import PATENT_NOTE, REPORT, Block, Column, Document, Figure, Table, as_text
+from vehest.report.style import DOUBLE_COLUMN, MatplotlibFigure, fixed, line_of, listed, new_figure
+from vehest.studies.artefacts import EvaluatedModel, PartArtefacts, StudyArtefacts
 from vehest.studies.drive import data_sentence, how_it_was_made
-from vehest.studies.kit.reference_minutes import COLUMNS, blocks_of_curve, curves_of, rows_of_curve
 
 TAKES = "parts"
 METRICS = ("rmse_sideslip", "rmse_vy", "fvu", "n_parameters", "epochs")
+SCRATCH = "from scratch"
+COLUMNS = {
+    "title": Column("estimator"),
+    "start": Column("training"),
+    "minutes": Column("reference [min]", decimals=2),
+    "rmse_sideslip": Column("RMSE(β) [deg]", decimals=3),
+    "interval": Column("95 % interval [deg]"),
+    "n_trainings": Column("trainings", decimals=0),
+    "against_scratch": Column("than from scratch"),
+}
+"""Of a table of `rows_of_curve`."""
+NEARLY = 0.15  # of the minutes asked for, that ends of a few seconds may take off
 
 
 def documents(artefacts: StudyArtefacts) -> dict[str, Document]:
@@ -29,3 +53,198 @@ def documents(artefacts: StudyArtefacts) -> dict[str, Document]:
         blocks += [f"## {curve.title}, test set `{curve.test_set}`", *blocks_of_curve(curve, str(number))]
     blocks += ["## All curves", overview, *how_it_was_made(artefacts.first), PATENT_NOTE]
     return {REPORT: Document(artefacts.title, blocks)}
+
+
+@dataclass(frozen=True)
+class Point:
+    """An estimator after so much reference."""
+
+    estimator: str  # its name
+    variant: str  # its variant
+    title: str  # for people
+    start: str  # what its training starts from; `SCRATCH` for nothing
+    minutes: float  # with reference that it learnt and stopped on, as they were asked for
+    n_trainings: int  # stretches of the drive times seeds
+
+    @property
+    def name(self) -> Name:
+        """Under which it is ranked."""
+        return (self.estimator, "" if self.estimator in BASELINES[:1] else f"{self.variant}|{self.start}|{self.minutes:g}")
+
+
+@dataclass(frozen=True)
+class Curve:
+    """Learning curves on one test set."""
+
+    title: str  # of the first of its parts
+    test_set: str  # that was tested on
+    points: Sequence[Point]  # by estimator, start and minutes
+    ranking: Ranking  # of all of them, whose intervals are missing where the test is too short for them
+
+
+def curves_of(parts: Sequence[PartArtefacts]) -> list[Curve]:
+    """A curve for every test set of parts that share it; test sets with a single amount of reference make none."""
+    groups: dict[tuple[str, tuple[Span, ...]], list[PartArtefacts]] = {}
+    for part in parts:
+        for test_set, spans in part.split.tests.items():
+            groups.setdefault((test_set, tuple(spans)), []).append(part)
+    found = [_curve(test_set, own) for (test_set, _), own in groups.items()]
+    return [curve for curve in found if len({point.minutes for point in curve.points}) > 1]
+
+
+def _curve(test_set: str, parts: Sequence[PartArtefacts]) -> Curve:
+    models: dict[tuple[str, str, str, float], list[EvaluatedModel]] = {}
+    for part in parts:
+        minutes = _asked_for(part, minutes_of(part))
+        for model in part.models:
+            models.setdefault((*model.name, start_of(model.training), minutes), []).append(model)
+    counts = Counter((estimator, variant) for estimator, variant, _, _ in models)
+    points = {
+        Point(estimator, variant, as_text(own[0].title.removesuffix(start_in_words(own[0].training))), start, minutes, len(own)): own
+        for (estimator, variant, start, minutes), own in models.items()
+        if counts[estimator, variant] > 1 or estimator in BASELINES
+    }
+    segments: dict[Name, list[Segments]] = {}
+    for point, own in points.items():
+        segments.setdefault(point.name, []).extend(model.segments(test_set) for model in own)
+    finite = {name: own for name, own in segments.items() if all(math.isfinite(float(part.squared_error_sideslip.sum())) for part in own)}
+    ordered = sorted((point for point in points if point.name in finite), key=lambda p: (p.estimator, p.variant, p.start, p.minutes))
+    asked = [(tuned.name, plain.name) for plain in ordered for tuned in ordered if _same(plain, tuned)]
+    return Curve(as_text(parts[0].title), test_set, ordered, rank(finite, parts[0].protocol.rate_hz, asked=asked))
+
+
+def _same(plain: Point, tuned: Point) -> bool:
+    """Whether two points differ in what their trainings start from alone."""
+    same = (plain.estimator, plain.variant, plain.minutes) == (tuned.estimator, tuned.variant, tuned.minutes)
+    return same and plain.start == SCRATCH != tuned.start
+
+
+def _asked_for(part: PartArtefacts, minutes: float) -> float:
+    """The minutes that ``split.minutes`` asked for, which the split's name ends in, where there are about as many; else those there are."""
+    named = re.search(r"_([\d.]+)min(_at_[\d.]+)?$", part.split.name)
+    asked = float(named[1]) if named is not None else math.nan
+    return asked if abs(minutes - asked) <= NEARLY * asked else round(minutes, 2)
+
+
+def start_of(training: Mapping[str, object]) -> str:
+    """What a training started from, for people."""
+    start = training.get("start_from")
+    return SCRATCH if start is None else f"from {Path(str(start)).name}"
+
+
+def start_in_words(training: Mapping[str, object]) -> str:
+    """Behind a title: ``, starting from MODEL``; empty where a training starts from nothing."""
+    return "" if training.get("start_from") is None else f", starting {start_of(training)}"
+
+
+def minutes_of(part: PartArtefacts) -> float:
+    """Minutes of training and validation ranges together."""
+    seconds = 0.0
+    for span in (*part.split.train, *part.split.validation):
+        start, stop = span.start, span.stop
+        if not (math.isfinite(start) and math.isfinite(stop)):
+            recording = part.reference(span, ["vx"])
+            start, stop = max(start, recording.start_time), min(stop, recording.end_time)
+        seconds += stop - start
+    return seconds / 60.0
+
+
+def blocks_of_curve(curve: Curve, name: str) -> list[Block]:
+    """Sentences, figure and table of a curve; ``name`` ends the files' names."""
+    caption = (
+        f"{curve.title}, test set `{curve.test_set}`: RMSE(β) over the minutes of recording with a reference that were learnt and stopped "
+        f"on; bars are 95 % intervals over blocks of the test and trainings. Dashed: v = 0."
+    )
+    return [
+        _in_words(curve),
+        Figure(f"reference_minutes_{name}", caption, _figure(curve)),
+        Table(
+            f"reference_minutes_{name}",
+            f"{curve.title}: RMSE(β) by minutes of reference. Trainings: stretches of the drive times seeds. The last column: against the "
+            f"same estimator from scratch on as much, corrected by Holm.",
+            pd.DataFrame(rows_of_curve(curve)),
+            COLUMNS,
+        ),
+    ]
+
+
+def rows_of_curve(curve: Curve) -> list[dict[str, object]]:
+    """A row a point: title, start, minutes, RMSE(β) [deg], its interval in words, trainings, and how it stands to one from scratch."""
+    rows: list[dict[str, object]] = []
+    for point in curve.points:
+        if point.estimator != BASELINES[0]:
+            low, high = curve.ranking.intervals.get(point.name, (math.nan, math.nan))
+            row = {key: getattr(point, key) for key in ("title", "start", "minutes")}
+            row |= {"rmse_sideslip": curve.ranking.rmse[point.name]}
+            row |= {"interval": f"{fixed(low, 3)} … {fixed(high, 3)}" if math.isfinite(low) else "–", "n_trainings": point.n_trainings}
+            rows.append(row | {"against_scratch": _against_scratch(curve, point) or "–"})
+    return rows
+
+
+def _against_scratch(curve: Curve, point: Point) -> str:
+    plain = next((other for other in curve.points if _same(other, point)), None)
+    own = curve.ranking.pairs.get((point.name, plain.name)) if plain is not None else None
+    return own.verdict if own is not None else ""
+
+
+def _lines(curve: Curve) -> list[list[Point]]:
+    """Points by estimator and start, each with more minutes than the one before; none of v = 0."""
+    groups = groupby(curve.points, key=lambda point: (point.estimator, point.variant, point.start))
+    return [list(own) for key, own in groups if key[0] != BASELINES[0]]
+
+
+def _in_words(curve: Curve) -> str:
+    """What more reference brings to each estimator, and what starting from another model does; only what is more than chance."""
+    sentences = []
+    for first, *_, last in (own for own in _lines(curve) if len(own) > 1):
+        how = "" if first.start == SCRATCH else f" ({first.start})"
+        sentences.append(
+            f"{first.title}{how}: {fixed(curve.ranking.rmse[first.name], 2)}° after {first.minutes:g} min of reference, "
+            f"{fixed(curve.ranking.rmse[last.name], 2)}° after {last.minutes:g} min."
+        )
+    better = [f"{point.minutes:g}" for point in curve.points if _against_scratch(curve, point) == "lower"]
+    worse = [f"{point.minutes:g}" for point in curve.points if _against_scratch(curve, point) == "higher"]
+    if any(_against_scratch(curve, point) for point in curve.points):
+        found = [f"lower by more than chance with {listed(better)} min"] if better else []
+        found += [f"higher with {listed(worse)} min"] if worse else []
+        sentences.append(
+            f"Starting from another model, the error is {' and '.join(found)}."
+            if found
+            else "Starting from another model is not told apart from starting from scratch with any amount."
+        )
+    return f"**{curve.title}.** " + " ".join(sentences)
+
+
+def _figure(curve: Curve) -> MatplotlibFigure:
+    from matplotlib.ticker import FuncFormatter, NullFormatter
+
+    ranking = curve.ranking
+    with new_figure(DOUBLE_COLUMN, 3.2) as figure:
+        axes = figure.subplots()
+        drawn = _lines(curve)
+        for shift, own in enumerate(drawn):
+            line, start = line_of(own[0].estimator, own[0].variant), own[0].start
+            apart = 1.03 ** (shift - len(drawn) / 2)
+            minutes, errors = [point.minutes * apart for point in own], [ranking.rmse[point.name] for point in own]
+            dash = "solid" if start == SCRATCH else "dashed"
+            label = own[0].title + ("" if start == SCRATCH else f", {start}")
+            axes.plot(minutes, errors, color=line.colour, linestyle=dash, marker=line.marker, markersize=3.5, linewidth=1.1, label=label)
+            for at, point in zip(minutes, own, strict=True):
+                low, high = curve.ranking.intervals.get(point.name, (math.nan, math.nan))
+                if math.isfinite(low):
+                    axes.plot([at, at], [low, high], color=line.colour, linewidth=0.8)
+        nothing = next((ranking.rmse[name] for name in ranking.order if name[0] == BASELINES[0]), math.nan)
+        if math.isfinite(nothing):
+            axes.axhline(nothing, color="black", linewidth=0.7, linestyle=(0, (4, 3)))
+        axes.set_xscale("log")
+        axes.set_yscale("log")
+        for axis in (axes.xaxis, axes.yaxis):
+            axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+            axis.set_minor_formatter(NullFormatter())
+        axes.set_xticks(sorted({round(point.minutes, 1) for point in curve.points}))
+        low, high = axes.get_ylim()
+        axes.set_yticks([tick for tick in (0.1, 0.2, 0.3, 0.5, 0.7, 1.0, 1.5, 2.0, 3.0, 5.0, 7.0, 10.0, 15.0, 20.0) if low <= tick <= high])
+        axes.set_xlabel("recording with a reference [min]")
+        axes.set_ylabel("RMSE(β) [deg]")
+        axes.legend(loc="center left", bbox_to_anchor=(1.01, 0.5), fontsize=6.5, frameon=False)
+    return figure

@@ -1,6 +1,6 @@
 """Tables and heat maps of a sweep: every combination of settings, over its seeds.
 
-`summary` has a row a combination, `build` makes the report. The mean over seeds comes with a 95 % confidence interval from
+`SweepArtefacts.table` has a row a combination, `build` makes the report. The mean over seeds comes with a 95 % confidence interval from
 Student's t distribution. The combination is chosen on the validation range; tests choose nothing.
 """
 
@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -31,6 +32,8 @@ NO_VALUE = "#ececec"
 LUMINANCE = (0.2126, 0.7152, 0.0722)  # of red, green and blue
 
 Value = bool | int | float | str
+Panel = tuple[str, FloatArray, FloatArray, list[list[int]]]
+"""Of a heat map: title, mean and half interval of each cell, (R, C), NaN for none, and row and column of those with a frame."""
 
 
 @dataclass(frozen=True)
@@ -49,47 +52,46 @@ class SweepArtefacts:
         """What is scored: the validation range, where there is one, and each test set."""
         return [*([VALIDATION] if self.part.split.validation else []), *self.part.split.tests]
 
+    @cached_property
+    def table(self) -> pd.DataFrame:
+        """One row a combination, in the order of the jobs: its number, title, keys, parameters, seeds that are done and failed.
+
+        For each set ``rmse_sideslip.SET``, the mean over seeds, and ``rmse_sideslip_half.SET``, half its 95 % interval (NaN for one seed)
+        [deg]. ``chosen`` is the lowest mean on the validation range among those of which no seed failed; none where nothing was validated,
+        or where combinations differ in faults, the mildest of which would win.
+        """
+        rows = []
+        for number, own in self.jobs.groupby("combination", sort=False):
+            done = own[own["status"] == DONE]
+            row: dict[str, object] = {"combination": number, **{name: own.iloc[0][name] for name in ("title", *self.keys)}}
+            row |= {"n_parameters": done["n_parameters"].iloc[0] if len(done) else math.nan}
+            row |= {"n_seeds": len(done), "n_failed": len(own) - len(done)}
+            for name in self.sets:
+                row[f"{METRIC}.{name}"], row[f"{METRIC}_half.{name}"] = interval(done[f"{METRIC}.{name}"].to_numpy(dtype=float))
+            rows.append(row)
+        table = pd.DataFrame(rows)
+        table["chosen"] = False
+        if VALIDATION in self.sets and not any(is_of_fault(key) for key in self.keys):
+            mean = table[f"{METRIC}.{VALIDATION}"].where(table["n_failed"] == 0).to_numpy(dtype=float)
+            if np.isfinite(mean).any():
+                table.loc[int(np.argmin(np.where(np.isfinite(mean), mean, np.inf))), "chosen"] = True
+        return table
+
 
 def build(artefacts: SweepArtefacts) -> Document:
     """The report of a sweep: what was chosen, all combinations, what failed, heat maps, how it was made."""
-    part, table = artefacts.part, summary(artefacts.jobs, artefacts.keys, artefacts.sets)
-    blocks: list[Block] = [data_sentence(part), _chosen_sentence(artefacts, table), "## Combinations", _table(artefacts, table)]
+    part = artefacts.part
+    blocks: list[Block] = [data_sentence(part), _chosen_sentence(artefacts), "## Combinations", _table(artefacts)]
     if part.failed:
         listed = "\n".join(f"- {name}: {reason}" for name, reason in part.failed.items())
         blocks.append(f"## What failed\n\n{listed}")
-    maps = heat_maps(artefacts, table)
+    maps = heat_maps(artefacts)
     if maps:
         blocks += ["## Heat maps", *maps]
     blocks += how_it_was_made(part, (_budget(artefacts.jobs), *INTERVAL_AND_CHOICE))
     if any(model.estimator == "ksnn" for model in part.models):
         blocks.append(PATENT_NOTE)
     return Document(f"Sweep {part.study}", blocks)
-
-
-def summary(jobs: pd.DataFrame, keys: Sequence[str], sets: Sequence[str]) -> pd.DataFrame:
-    """One row a combination, in the order of the jobs.
-
-    Columns: ``combination``, ``title``, the keys, ``n_parameters``, ``n_seeds`` (of the jobs that are done), ``n_failed``; for each set
-    ``rmse_sideslip.SET``, the mean over seeds, and ``rmse_sideslip_half.SET``, half its 95 % interval (NaN for one seed) [deg]; ``chosen``.
-    Chosen is the lowest mean on the validation range among the combinations of which no seed failed; none where nothing was validated, or
-    where combinations differ in faults, the mildest of which would win.
-    """
-    rows = []
-    for number, own in jobs.groupby("combination", sort=False):
-        done = own[own["status"] == DONE]
-        row: dict[str, object] = {"combination": number, **{name: own.iloc[0][name] for name in ("title", *keys)}}
-        row |= {"n_parameters": done["n_parameters"].iloc[0] if len(done) else math.nan}
-        row |= {"n_seeds": len(done), "n_failed": len(own) - len(done)}
-        for name in sets:
-            row[f"{METRIC}.{name}"], row[f"{METRIC}_half.{name}"] = interval(done[f"{METRIC}.{name}"].to_numpy(dtype=float))
-        rows.append(row)
-    table = pd.DataFrame(rows)
-    table["chosen"] = False
-    if VALIDATION in sets and not any(is_of_fault(key) for key in keys):
-        mean = table[f"{METRIC}.{VALIDATION}"].where(table["n_failed"] == 0).to_numpy(dtype=float)
-        if np.isfinite(mean).any():
-            table.loc[int(np.argmin(np.where(np.isfinite(mean), mean, np.inf))), "chosen"] = True
-    return table
 
 
 def is_of_fault(key: str) -> bool:
@@ -114,9 +116,9 @@ def interval(values: FloatArray) -> tuple[float, float]:
     return mean, float(t.ppf(0.5 + CONFIDENCE / 2, n - 1) * np.std(values, ddof=1) / math.sqrt(n))
 
 
-def table_of(artefacts: SweepArtefacts, table: pd.DataFrame) -> tuple[list[str], list[list[str]]]:
+def table_of(artefacts: SweepArtefacts) -> tuple[list[str], list[list[str]]]:
     """A summary as a terminal shows it: headers, and rows of cells; the chosen combination has a star."""
-    names = short_names(artefacts.keys)
+    names, table = short_names(artefacts.keys), artefacts.table
     header = ["", *(names.values() or ["estimator"]), "parameters", "seeds", *artefacts.sets]
     decimals = {name: decimals_for(table[f"{METRIC}.{name}"].tolist()) for name in artefacts.sets}
     rows = []
@@ -128,8 +130,9 @@ def table_of(artefacts: SweepArtefacts, table: pd.DataFrame) -> tuple[list[str],
     return header, rows
 
 
-def heat_maps(artefacts: SweepArtefacts, table: pd.DataFrame) -> list[Figure]:
+def heat_maps(artefacts: SweepArtefacts) -> list[Figure]:
     """A heat map for each set, where two numeric keys vary and any others are booleans; else none."""
+    table = artefacts.table
     varied = [key for key in artefacts.keys if table[key].nunique() > 1]
     switches = [key for key in varied if all(isinstance(value, bool | np.bool_) for value in table[key])]
     numeric = [key for key in varied if key not in switches and all(_is_number(value) for value in table[key])]
@@ -177,18 +180,7 @@ def _panel(table: pd.DataFrame, title: str, name: str, numeric: Sequence[str], c
         table.pivot(index=up, columns=across, values=shown).reindex(index=cells[1], columns=cells[0]).to_numpy(dtype=float)
         for shown in (f"{METRIC}.{name}", f"{METRIC}_half.{name}", "chosen")
     )
-    marked = np.argwhere(chosen == 1.0).tolist()
-    return Panel(title, mean, half, (marked[0][0], marked[0][1]) if marked else None)
-
-
-@dataclass(frozen=True, eq=False)
-class Panel:
-    """One panel of a heat map."""
-
-    title: str  # what it shows; may be empty
-    mean: FloatArray  # colour and first line of each cell, NaN where there is none; shape (R, C)
-    half: FloatArray  # half the interval, NaN where there is none; shape (R, C)
-    marked: tuple[int, int] | None = None  # row and column of the cell with a frame
+    return title, mean, half, np.argwhere(chosen == 1.0).tolist()
 
 
 def heat_map(
@@ -199,7 +191,7 @@ def heat_map(
     from matplotlib.cm import ScalarMappable
     from matplotlib.colors import LinearSegmentedColormap, LogNorm, Normalize
 
-    values = np.concatenate([panel.mean.ravel() for panel in panels])
+    values = np.concatenate([mean.ravel() for _, mean, *_ in panels])
     finite = values[np.isfinite(values)] if np.isfinite(values).any() else np.zeros(1)
     low, high = float(finite.min()), float(finite.max())
     scale = LogNorm(low, high) if low > 0 and high / low > LOGARITHMIC_FROM else Normalize(low, high if high > low else low + 1.0)
@@ -212,7 +204,7 @@ def heat_map(
         colours = ScalarMappable(scale, shades)
         for axes, panel in zip(grid.flat, panels, strict=False):
             _draw(axes, panel, colours, decimals_for(finite.tolist()))
-            axes.set_title(panel.title, loc="left")
+            axes.set_title(panel[0], loc="left")
             axes.set_xticks(range(len(columns)), columns)
             axes.set_yticks(range(len(rows)), rows)
         for axes in list(grid.flat)[len(panels) :]:
@@ -228,16 +220,16 @@ def heat_map(
 def _draw(axes: Any, panel: Panel, colours: Any, decimals: int) -> None:
     from matplotlib.patches import Rectangle
 
-    edges = [np.arange(number + 1) - 0.5 for number in panel.mean.T.shape]
-    axes.pcolormesh(*edges, panel.mean, cmap=colours.cmap, norm=colours.norm, edgecolors="white", linewidth=0.8)
+    _, means, halves, marked = panel
+    edges = [np.arange(number + 1) - 0.5 for number in means.T.shape]
+    axes.pcolormesh(*edges, means, cmap=colours.cmap, norm=colours.norm, edgecolors="white", linewidth=0.8)
     axes.set_facecolor(NO_VALUE)
-    for row, column in np.ndindex(panel.mean.shape):
-        mean, half = float(panel.mean[row, column]), float(panel.half[row, column])
+    for row, column in np.ndindex(means.shape):
+        mean, half = float(means[row, column]), float(halves[row, column])
         words = fixed(mean, decimals) + (f"\n±{fixed(half, decimals)}" if math.isfinite(half) else "")
         ink = "white" if math.isfinite(mean) and float(np.dot(LUMINANCE, colours.to_rgba(mean)[:3])) < 0.45 else "#111111"
         axes.text(column, row, words, ha="center", va="center", fontsize=6.5, color=ink, linespacing=1.1)
-    if panel.marked is not None:
-        row, column = panel.marked
+    for row, column in marked:
         axes.add_patch(Rectangle((column - 0.46, row - 0.46), 0.92, 0.92, fill=False, edgecolor="#d6336c", linewidth=1.8))
     axes.grid(visible=False)
     axes.tick_params(length=0)
@@ -252,9 +244,10 @@ def _kinds(artefacts: SweepArtefacts, name: str) -> str:
     return part.kinds_of(part.split.validation if name == VALIDATION else part.split.tests[name])
 
 
-def _chosen_sentence(artefacts: SweepArtefacts, table: pd.DataFrame) -> str:
+def _chosen_sentence(artefacts: SweepArtefacts) -> str:
     if any(is_of_fault(key) for key in artefacts.keys):
         return "No combination is chosen: the combinations differ in faults, which are conditions of the evaluation and no settings."
+    table = artefacts.table
     if not table["chosen"].any():
         return "No combination is chosen: there is no finite error on a validation range, and tests choose nothing."
     row = table[table["chosen"]].iloc[0]
@@ -303,8 +296,8 @@ INTERVAL_AND_CHOICE = (
 )
 
 
-def _table(artefacts: SweepArtefacts, table: pd.DataFrame) -> Table:
-    names = short_names(artefacts.keys)
+def _table(artefacts: SweepArtefacts) -> Table:
+    names, table = short_names(artefacts.keys), artefacts.table
     columns = {"title": Column("estimator"), **{key: Column(names[key]) for key in artefacts.keys}}
     columns |= {"n_parameters": Column("params", decimals=0), "n_seeds": Column("seeds"), "n_failed": Column("failed")}
     for name in artefacts.sets:

@@ -12,7 +12,7 @@ from vehest.constants import FloatArray
 from vehest.estimators.dugoff_ukf import LEVELS, SENSORS, TYRES
 from vehest.estimators.ensemble_ukf import EnsembleUkf
 from vehest.estimators.model_files import load_model
-from vehest.evaluation.consistency import COVERAGE
+from vehest.evaluation.metrics import COVERAGE
 from vehest.report.document import Column, Table
 from vehest.report.style import MISSING, fixed, significant
 from vehest.studies.artefacts import PartArtefacts

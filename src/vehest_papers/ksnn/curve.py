@@ -13,7 +13,7 @@ import pandas as pd
 from vehest.evaluation.blocks import Segments
 from vehest.report.document import Column, Figure, Table
 from vehest.report.style import DOUBLE_COLUMN, Line, line_of, new_figure
-from vehest.studies.kit.reference_minutes import minutes_of
+from vehest.studies.reference_minutes import minutes_of
 from vehest_papers.kit.legends import legend_above
 from vehest_papers.ksnn import paper
 from vehest_papers.ksnn.candidates import category_of

@@ -19,8 +19,7 @@ from vehest.evaluation.metrics import (
     accuracy,
     pieces_of,
     scored_range,
-    weighted_absolute_errors,
-    weighted_squared_errors,
+    weighted_errors,
 )
 from vehest.studies.artefacts import EvaluatedModel, PartArtefacts
 from vehest_papers.kit import reading
@@ -134,6 +133,6 @@ def losses(part: PartArtefacts, test: str) -> Losses:
     for candidate, models in models_by_candidate(part).items():
         scored = [scored_of(part, model, test) for model in models]
         lengths = [len(piece.vy) for piece in scored[0]]
-        squared[candidate] = np.stack([np.concatenate([weighted_squared_errors(piece) for piece in own]) for own in scored])
-        absolute[candidate] = np.stack([np.concatenate([weighted_absolute_errors(piece) for piece in own]) for own in scored])
+        squared[candidate] = np.stack([np.concatenate([weighted_errors(piece, np.square) for piece in own]) for own in scored])
+        absolute[candidate] = np.stack([np.concatenate([weighted_errors(piece, np.abs) for piece in own]) for own in scored])
     return Losses(squared, absolute, sequence_labels(lengths), part.protocol.rate_hz)

@@ -7,8 +7,7 @@ from collections.abc import Mapping
 import numpy as np
 import pandas as pd
 
-from vehest.evaluation.consistency import COVERAGE
-from vehest.evaluation.metrics import Scored
+from vehest.evaluation.metrics import COVERAGE, Scored
 from vehest.report.document import Column, Table
 from vehest.studies.artefacts import EvaluatedModel, PartArtefacts
 from vehest_papers.kit.reading import with_interval

@@ -8,7 +8,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 import pandas as pd
 
-from vehest.evaluation.consistency import COVERAGE
+from vehest.evaluation.metrics import COVERAGE
 from vehest.report.document import Column, Table
 from vehest.report.style import fixed
 from vehest.studies.artefacts import PartArtefacts

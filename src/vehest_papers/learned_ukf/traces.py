@@ -12,7 +12,7 @@ from vehest.data.estimate import Estimate
 from vehest.data.recording import Recording
 from vehest.data.splits import Span
 from vehest.data.store import read_recording
-from vehest.evaluation.metrics import REFERENCES, sequences, weighted_squared_errors
+from vehest.evaluation.metrics import REFERENCES, sequences, weighted_errors
 from vehest.report.document import Figure, as_code
 from vehest.report.style import DOUBLE_COLUMN, NONLINEAR_ORANGES, REFERENCE, Line, MatplotlibFigure, fixed, new_figure
 from vehest.studies.artefacts import EvaluatedModel, PartArtefacts
@@ -37,7 +37,7 @@ def hard_sequence(
     part: PartArtefacts, models: Mapping[str, EvaluatedModel], test: str, name: str, data: str
 ) -> tuple[Figure, pd.DataFrame]:
     """Reference and estimates over the sequence on which the shown models together err most."""
-    losses = [[weighted_squared_errors(own) for own in part.scored(model, test)] for model in models.values()]
+    losses = [[weighted_errors(own, np.square) for own in part.scored(model, test)] for model in models.values()]
     position = hardest(losses)
     pieces = sequences(part.split.tests[test], lambda span: read_recording(part.references[span.dataset, span.recording]), part.protocol)
     piece = pieces[position]

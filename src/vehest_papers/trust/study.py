@@ -18,11 +18,11 @@ from vehest.data.store import read_recording
 from vehest.estimators.registry import estimator_class
 from vehest.evaluation.under_fault import FAULTED
 from vehest.report.document import PATENT_NOTE, REPORT, Block, Column, Document, Figure, Table, as_text
-from vehest.report.reliability import Reliability, reliability_figure
+from vehest.report.figures import Reliability, reliability_figure
 from vehest.report.style import lines_of, listed
 from vehest.studies.artefacts import PartArtefacts, StudyArtefacts
 from vehest.studies.drive import appendix_of
-from vehest.studies.kit.bands import COVERAGES
+from vehest.studies.kit.drives import COVERAGES
 from vehest.studies.kit.runs import by_name
 from vehest.trust.bands import LEVELS, OTHER_VEHICLE
 from vehest_papers.kit.reading import sideslip_error

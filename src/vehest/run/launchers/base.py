@@ -6,18 +6,19 @@ Imports nothing heavy: the command line takes options from here.
 from __future__ import annotations
 
 import importlib.util
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING
 
 from vehest.data.errors import ConfigurationError, MissingError
 
 if TYPE_CHECKING:
     from vehest.run.console import Messages
-    from vehest.run.group import Group
-    from vehest.run.launchers.local import Done, Reporter
-    from vehest.run.signals import StopSignals, TimeLimit
+    from vehest.run.launchers.clusters import RayLauncher, SlurmLauncher
+    from vehest.run.launchers.local import LocalLauncher
+
+    Launcher = LocalLauncher | RayLauncher | SlurmLauncher
 
 LAUNCHERS = ("local", "ray", "slurm")
 
@@ -36,19 +37,6 @@ class RunOptions:
     launcher: str = "local"  # one of `LAUNCHERS`
     address: str | None = None  # of a cluster
     slurm: Sequence[str] = ()  # resources of SLURM jobs, NAME=VALUE
-
-
-class Launcher(Protocol):
-    """Runs groups; outcomes come back to this process, which alone tracks and draws."""
-
-    def launch(self, groups: Sequence[Group], stop: StopSignals | TimeLimit, report: Reporter) -> Iterator[Done]:
-        """Run groups as `local.launch` runs tasks, with members as outcomes; on a cluster only the begin of a group is reported.
-
-        Raises `MissingError` where there is no cluster, it takes no tasks, or one of its machines cannot run them.
-        """
-
-    def close(self) -> None:
-        """Release processes and connections."""
 
 
 def chosen_launcher(options: RunOptions, output: Path, messages: Messages) -> Launcher:

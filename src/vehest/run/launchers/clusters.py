@@ -149,7 +149,7 @@ class RayLauncher:
         return min(there, self._jobs or there)
 
     def launch(self, groups: Sequence[Group], stop: StopSignals | TimeLimit, report: Reporter) -> Iterator[Done]:
-        """See `Launcher`."""
+        """See `LocalLauncher`."""
         if self._ray is None:
             self._connect()
         waiting, running, stopping = deque(range(len(groups))), dict[Any, int](), False
@@ -288,7 +288,7 @@ class SlurmLauncher:
         self._lost: Counter[str] = Counter()  # jobs, by the name of their group
 
     def launch(self, groups: Sequence[Group], stop: StopSignals | TimeLimit, report: Reporter) -> Iterator[Done]:
-        """See `Launcher`."""
+        """See `LocalLauncher`."""
         if self._executor is None:
             import submitit
 

@@ -43,7 +43,10 @@ class LocalLauncher:
     cores: int = 1
 
     def launch(self, groups: Sequence[Group], stop: StopSignals | TimeLimit, report: Reporter) -> Iterator[Done]:
-        """See `Launcher`."""
+        """Run groups as `launch` runs tasks, with members as outcomes; on a cluster only the begin of a group is reported.
+
+        Raises `MissingError` where there is no cluster, it takes no tasks, or one of its machines cannot run them.
+        """
         return launch([group.run for group in groups], self.cores, stop, report)
 
     def close(self) -> None:

@@ -80,7 +80,9 @@ def questions_of(examined: Examined) -> Iterator[Question]:
         if one.asked:
             others = tuple(other for other in one.others if other not in (one.unit, one.channel))
             hint = f"CHANNEL UNIT [SIGN [FACTOR]], or {LEAVE_OUT} to leave it out"
-            yield Question(one.column, f"column '{one.column}': {one.asked}", _declaration(one), others, one.evidence, hint)
+            factor = [f"{one.factor:.5g}"] if one.factor != 1.0 else []
+            proposed = " ".join([one.channel, one.unit, *([f"{one.sign:+d}"] if factor or one.sign != 1 else []), *factor])
+            yield Question(one.column, f"column '{one.column}': {one.asked}", proposed, others, one.evidence, hint)
     if proposals.wheel_radius is not None:
         text = "rolling radius of the tyres [m], by which the wheels make vx"
         yield Question("radius", text, f"{proposals.wheel_radius:g}", (), ("as it fits ay over the yaw rate, or the speed",))
@@ -152,13 +154,6 @@ def _declared(channels: tuple[Proposal, ...], column: str, answer: str) -> tuple
     freed = own.channel if CHANNELS[now.channel].unit == CHANNELS[own.channel].unit else now.channel
     declared = [now if one is own else replace(one, channel=freed) if one.channel == now.channel else one for one in channels]
     return tuple(one for one in declared if one is now or one.channel != now.channel)
-
-
-def _declaration(one: Proposal) -> str:
-    """A column's channel, unit, sign and factor in the form of an answer."""
-    factor = [f"{one.factor:.5g}"] if one.factor != 1.0 else []
-    sign = [f"{one.sign:+d}"] if factor or one.sign != 1 else []
-    return " ".join([one.channel, one.unit, *sign, *factor])
 
 
 def _parsed(answer: str, own: Proposal) -> Proposal:

@@ -11,8 +11,8 @@ from vehest.data.channels import CHANNELS
 from vehest.data.recording import Recording
 from vehest.data.splits import Span
 from vehest.evaluation.metrics import Scored, pieces_of, scored_range
-from vehest.report.explorer import Candidate, Explorer, Signal, reckoned_course
-from vehest.report.style import Line
+from vehest.report.explorer import explorer_json, reckoned_course
+from vehest.report.style import Line, on_dark
 from vehest.studies.artefacts import EvaluatedModel, PartArtefacts
 from vehest.studies.kit.runs import Name
 from vehest.trust.health import health_rows
@@ -29,8 +29,8 @@ def explorer_of(
     shown: Mapping[Name, tuple[EvaluatedModel, str, Line]],
     scored: Mapping[Name, Sequence[Scored]],
     axis: tuple[float, str, int, tuple[float, float]],
-) -> Explorer:
-    """What the page draws of a test set.
+) -> str:
+    """What the page draws of a test set, as `explorer_json`.
 
     Args:
         shown: (estimator, variant) -> model, title and looks, in the order of the board.
@@ -47,28 +47,26 @@ def explorer_of(
         return chained([part[name] if name in part else np.full(len(part), np.nan) for part in parts], gap)
 
     names = [name for name in CHANNELS if all(name in part for part in parts) and not CHANNELS[name].is_reference]
-    candidates = []
-    for name, (model, title, line) in shown.items():
-        bands = [part.bands for part in scored[name]]
-        band_vy, band_sideslip = (chained([own[q] for own in bands], gap) if all(q in own for own in bands) else None for q in _BANDS)
-        degrees = None if band_sideslip is None else np.degrees(band_sideslip)
-        vy = chained([part.vy for part in scored[name]], gap)
-        candidates.append(Candidate(title, line, vy, band_vy, degrees, health_over(model, pieces, artefacts, gap)))
     vx, vy_ref, step = measured("vx"), measured("vy_ref"), 1.0 / artefacts.protocol.rate_hz
+    columns: dict[str, FloatArray | None] = {"vx": vx, "vy": vy_ref, "ay": measured("ay") if "ay" in names else None}
+    inputs, candidates = [], []
+    for i, name in enumerate(names[:MOST_INPUTS]):
+        channel, values = CHANNELS[name], measured(name)
+        columns[f"input{i}"] = np.degrees(values) if channel.is_angular else values
+        unit = {"rad": "deg", "rad/s": "deg/s"}[channel.unit] if channel.is_angular else channel.unit
+        inputs.append({"label": name, "unit": unit, "drawn": name in DRAWN_INPUTS})
+    for i, (own, (model, title, line)) in enumerate(shown.items()):
+        columns[f"vy{i}"] = chained([part.vy for part in scored[own]], gap)
+        bands = [part.bands for part in scored[own]]
+        band_vy, band_sideslip = (chained([one[q] for one in bands], gap) if all(q in one for one in bands) else None for q in _BANDS)
+        columns |= {f"bandv{i}": band_vy, f"bandb{i}": None if band_sideslip is None else np.degrees(band_sideslip)}
+        columns[f"health{i}"] = health_over(model, pieces, artefacts, gap)
+        candidates.append({"label": title, "colour": line.colour, "dark": on_dark(line.colour), "dash": line.dash})
     turning = next((name for name in ("yaw_rate_ref", "yaw_rate") if all(name in part for part in parts)), None)
-    return Explorer(
-        start=start,
-        step=step,
-        time_label=label,
-        zoom=zoom,
-        vx=vx,
-        vy=vy_ref,
-        ay=measured("ay") if "ay" in names else None,
-        inputs=[_signal(name, measured(name)) for name in names[:MOST_INPUTS]],
-        candidates=candidates,
-        course=None if turning is None else reckoned_course(vx, vy_ref, measured(turning), step),
-        course_note=RECKONED,
-    )
+    if turning is not None:
+        columns["x"], columns["y"] = reckoned_course(vx, vy_ref, measured(turning), step)
+    content = {"start": start, "step": step, "length": len(vx), "timeLabel": label, "zoom": list(zoom), "inputs": inputs}
+    return explorer_json({**content, "candidates": candidates, "courseNote": RECKONED}, columns)
 
 
 _BANDS = ("vy", "sideslip")
@@ -100,9 +98,3 @@ def health_over(model: EvaluatedModel, pieces: Sequence[tuple[Recording, Span]],
         rows = np.ascontiguousarray(recording.stack(health.channels)[begin:end])
         found.append(health_rows(health.packed(), rows, np.isfinite(rows), health.start()).status[first - begin :])
     return chained(found, gap)
-
-
-def _signal(name: str, values: FloatArray) -> Signal:
-    channel = CHANNELS[name]
-    unit = {"rad": "deg", "rad/s": "deg/s"}[channel.unit] if channel.is_angular else channel.unit
-    return Signal(name, unit, np.degrees(values) if channel.is_angular else values, name in DRAWN_INPUTS)

@@ -43,7 +43,7 @@ def interval_in_words(row: Mapping[Any, Any], decimals: int) -> str:
 def _against_best(ranking: Ranking, name: Name) -> str:
     if name == ranking.order[0]:
         return "lowest"
-    own = ranking.against_best.get(name)
+    own = ranking.pairs.get((ranking.order[0], name))
     if own is None or own.verdict == "not told apart":
         return MISSING if own is None else own.verdict
     return f"+{fixed(-own.difference, 3)} [{fixed(-own.high, 3)}, {fixed(-own.low, 3)}]"

@@ -1,0 +1,28 @@
+"""Versions of what stages run, which are part of keys (docs/how_it_is_built.md#keys)."""
+
+from __future__ import annotations
+
+from vehest.estimators.registry import estimator_class
+from vehest.sources.base import source_class
+from vehest.studies.registry import study_module
+
+VERSIONS = {"ingest": "1", "downsample": "1", "train": "1", "calibrate": "3", "evaluate": "1", "report": "1", "sweep": "2"}
+"""Stage -> its version, raised when its numbers move."""
+FAULTS = "2"  # of an evaluation's faults, likewise
+
+
+def code_of(stage: str, name: str = "", *, faults: bool = False) -> str:
+    """Version of a stage, ``train=1 ksnn=1 training=1``, with that of its source, estimator or study by name, and of ``faults``.
+
+    Raises `ConfigurationError` where the name is unknown.
+    """
+    code = f"{stage}={VERSIONS[stage]}"
+    if stage == "ingest":
+        code += f" {name}={source_class({'source': name}).version}"
+    elif stage == "report":
+        code += f" {name}={getattr(study_module(name), 'VERSION', '1')}"
+    elif name:
+        code += f" {name}={estimator_class(name).version}"
+    if stage == "train":
+        code += f" training={getattr(estimator_class(name).training_type, 'version', '1')}"
+    return f"{code} faults={FAULTS}" if faults else code
