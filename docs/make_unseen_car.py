@@ -207,7 +207,8 @@ def under_change(car: Car, runner: Runner, root: str) -> list[list[str]]:
         record = record_of(model, identified_on(car, drives))
         estimates = [estimate_recording(model, drive, trust) for drive in drives]
         band, health = (np.concatenate([estimate[name] for estimate in estimates]) for name in ("band_sideslip", "health"))
-        numbers = [f"{one.value:.3g} ± {one.deviation:.2g}" for one in (getattr(record, name) for name in LIMITS)]
+        found = [getattr(record, name) for name in LIMITS]
+        numbers = [f"{one.value:.3g} ± {one.deviation:.2g}" if one.identified_on else "–" for one in found]
         rows.append([title, *numbers, fixed(float(np.degrees(np.nanmedian(band))), 2), fixed(float(np.mean(health > 0)), 2)])
     return rows
 
@@ -238,15 +239,15 @@ def git(*words: str) -> str:
     return subprocess.run(["git", *words], cwd=ROOT, check=True, capture_output=True, text=True).stdout.strip()
 
 
-def open_cars(cars: Sequence[str]) -> None:
-    """Append what is scored to openings.csv; raises SystemExit where the choices are not committed."""
+def open_cars(cars: Sequence[str], note: str) -> None:
+    """Append what is scored to openings.csv, with a note; raises SystemExit where the choices are not committed."""
     if git("status", "--porcelain", "--", CHOICES, "src/vehest/estimators", "src/vehest/run"):
         raise SystemExit(f"{CHOICES}, the estimators or identify have changes that are not committed; commit them, then open the cars")
     file, commit = TARGET / "openings.csv", git("rev-parse", "HEAD")
     rows = list(csv.DictReader(file.open(encoding="utf-8"))) if file.exists() else []
     changed = git("diff", "-U0", rows[-1]["commit"], commit, "--", CHOICES).splitlines() if rows else []
     names = sorted({line[1:].split(":")[0].strip() for line in changed if line[:1] == "+" and line[1:2] == " "})
-    rows.append({"commit": commit, "cars": "; ".join(cars), "chosen_since": " ".join(names) if rows else "everything"})
+    rows.append({"commit": commit, "cars": "; ".join(cars), "chosen_since": " ".join([*names, note]).strip() if rows else "everything"})
     with file.open("w", encoding="utf-8", newline="") as out:
         writer = csv.DictWriter(out, list(rows[-1]), lineterminator="\n")
         writer.writeheader()
@@ -332,7 +333,7 @@ def changed_table(car: Car, rows: Sequence[Sequence[str]]) -> list[str]:
     return [
         f"## {car.title} ({car.origin}) under other masses and tyres",
         "",
-        f"No reference: {about}, bands and health.",
+        f"No reference: {about}, – not identified; bands and health.",
         "",
         *table(heads, rows),
         "",
@@ -346,13 +347,14 @@ def main() -> None:
         "--output", type=Path, default=Path(os.environ.get("VEHEST_OUTPUT", "outputs")), help="output root, for ingested drives"
     )
     parser.add_argument("--development", action="store_true", help="development cars alone, printed and not published")
+    parser.add_argument("--note", default="", help="what else was chosen since the cars were last opened, and on what")
     given, root = parser.parse_args(), os.environ.get("VEHEST_DATA", "")
     if not root:
         raise SystemExit("set VEHEST_DATA to the folder of the recordings")
     cars = [car for car in CARS if car.development or not given.development]
     if not given.development:
         TARGET.mkdir(parents=True, exist_ok=True)
-        open_cars([car.title for car in cars if not car.development])
+        open_cars([car.title for car in cars if not car.development], given.note)
     runner, (_, shipped, _) = Runner(given.output, Messages(), StopSignals()), open_model("pretrained", given.output, print)
     found: dict[Car, list[Errors]] = {}
     changed: dict[Car, list[list[str]]] = {}

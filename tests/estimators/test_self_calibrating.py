@@ -230,6 +230,18 @@ def test_smoother_matches_joint_least_squares_of_a_rolling_car():
     np.testing.assert_allclose(estimate["covariance"][:, 0, 0], np.diag(covariance)[4::4], rtol=1e-6)
 
 
+def test_at_the_end_of_a_drive_smoother_and_filter_agree():
+    """Nothing is later than the last sample; a smoother that takes the drive twice is too sure there."""
+    samples, _ = drive(40.0, 0)
+    alone = {"grips": [14.0], "network_start": 1e-300, "network_odds": 1e-12, "steady_odds": 1e-12}
+    last = []
+    for smoothed in (False, True):
+        model = model_of(smoothed=smoothed, variance_share=1.0, residual_share=0.0, **alone)
+        estimate, _ = model.run(samples, model.first_state(samples[0], {}))
+        last.append((estimate["vy"][-1], estimate["covariance"][-1, 0, 0]))
+    assert last[1] == pytest.approx(last[0], rel=1e-9)
+
+
 def test_smoothed_estimates_err_less_within_their_bands():
     causal, smooth, within = [], [], []
     for seed in range(4):

@@ -32,7 +32,6 @@ SCALED = {
 """Powers of the wheelbase over the typical one that scale settings: times and speeds go with its root, tyres of small cars slip more."""
 WINDOW, NETWORK_HZ = 30, 20.0  # samples that the network sees, and their rate
 UNLIKELY = 1e-300  # weight of what does not count
-PARAMETERS = slice(kernel.LEAKAGE, kernel.ERROR)  # among the states
 UNMEASURED = 20.0  # m/s per √s: process noise of u where ax is not measured
 
 
@@ -47,7 +46,7 @@ class SelfCalibrating(Recursive):
     v = ω (b - C u²) with the priors of b and C count by how well each explains v' and u' on the drive so far, which needs no reference.
     """
 
-    name, title, version = "self_calibrating", "Self-calibrating filter", "3"
+    name, title, version = "self_calibrating", "Self-calibrating filter", "4"
     covariance_of = ("vy",)
     channels: tuple[str, ...] = ("yaw_rate", "vx", "ay", "ax")  # type: ignore[misc]  # ax may be absent
     notice = Ksnn.notice
@@ -58,7 +57,7 @@ class SelfCalibrating(Recursive):
     rate_hz: float = rate(20.0)
     wheelbase: float = setting(TYPICAL_WHEELBASE, "wheelbase", unit="m", least=0.05, most=20.0)
     cg_to_rear_axle: float = setting(None, "distance of the centre of gravity from the rear axle; null: 0.48 wheelbases", unit="m")
-    smoothed: bool = setting(False, "whether each estimate is made of the whole drive, offline; parameters are those at its end")
+    smoothed: bool = setting(False, "whether each estimate is made of the whole drive, offline")
     measured_ax: bool = setting(True, "whether ax is measured; else the longitudinal equation tells nothing")
     grips: tuple[float, ...] = setting((4.5, 6.0, 7.5, 9.0, 10.5, 12.0, 14.0, 17.0, 25.0), "grip limits a_max of the bank [m/s²]")
     grip: float = setting(14.0, "median of the prior of a_max", unit="m/s²", positive=True)
@@ -249,8 +248,8 @@ def _shipped_network() -> tuple[FloatArray, float]:
 def _smoothed(estimator: Any, samples: FloatArray, state: kernel.State) -> FloatArray:
     """v [m/s] at the reference point and its variance, (T, 2), each from all samples.
 
-    A forward pass gives parameters, weights and the likeliest filter at the drive's end; a second one starts from these parameters and is
-    smoothed (Rauch, Tung & Striebel 1965). Network and steady cornering count by their weights at the end.
+    The filter that is likeliest at the drive's end is smoothed, its parameters included (Rauch, Tung & Striebel 1965). Network and steady
+    cornering count by their weights at the end.
 
     Args:
         estimator: a `SelfCalibrating`.
@@ -261,9 +260,6 @@ def _smoothed(estimator: Any, samples: FloatArray, state: kernel.State) -> Float
     best, n, (mean, deviation), decay = int(np.argmax(last.log_weights)), estimator.numbers(), estimator.prior, estimator.decay
     bank = estimator.bank_arrays
     state = kernel.State(*(part.copy() for part in state))
-    state.means[:, PARAMETERS] = last.means[:, PARAMETERS]
-    state.covariances[:, PARAMETERS, PARAMETERS] = last.covariances[:, PARAMETERS, PARAMETERS]
-    state.log_weights[:] = last.log_weights
     rows, before = estimator.with_ax(samples).copy(), state.last.copy()
     means, covariances = np.empty((len(rows), kernel.STATES)), np.empty((len(rows), kernel.STATES, kernel.STATES))
     network, turning, scratch = np.empty(len(rows)), np.empty(len(rows)), (np.empty((1, 2)), np.empty((1, 2 * kernel.STATES)))

@@ -101,7 +101,10 @@ def _found(model: SelfCalibrating, samples: FloatArray) -> dict[str, tuple[float
     mean, variance = np.split(states, 2, axis=1)
     numbers = {name: (float(mean[-1, at]), math.sqrt(variance[-1, at])) for name, at in ROWS.items()}
     numbers |= {name: (float(mean[:, at].mean()), math.sqrt(variance[:, at].mean())) for name, at in OFFSETS.items()}
-    return numbers | {"grip": _grip(model, last.log_weights)}
+    numbers["grip"] = _grip(model, last.log_weights)
+    if last.weights[kernel.BANK] < last.weights[kernel.STEADY]:  # the filter fell back on the priors: its bank tells nothing
+        numbers |= {name: (numbers[name][0], math.inf) for name in LIMITS}
+    return numbers
 
 
 def prior_of(model: SelfCalibrating) -> dict[str, Normal]:
