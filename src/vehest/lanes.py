@@ -178,64 +178,65 @@ def _of(array: Any, fused: bool = True) -> Lanes:
     return Lanes(array.dtype, BYTES * 8 // array.dtype.bitwidth, fused)
 
 
-def _loading(fused: bool) -> Any:
-    def load(typing: Any, array: Any, at: Any) -> Any:
-        def lower(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-            return builder.load(_pointer(context, builder, array, args, _of(array)), align=array.dtype.bitwidth // 8)
+def _compiled(function: Any, type_of: Any) -> Any:
+    """Decorator of what lowers a function of the above; ``type_of`` gives its type from those of the arguments."""
 
-        return _of(array, fused)(array, types.intp), lower
+    @infer_global(function)
+    class _Typing(AbstractTemplate):  # type: ignore[misc]
+        def generic(self, args: Any, kws: Any) -> Any:
+            return type_of(*args)
 
-    return intrinsic(load)
-
-
-_load, _load_unfused = _loading(True), _loading(False)
+    return lower_builtin(function, types.VarArg(types.Any))
 
 
-@intrinsic  # type: ignore[untyped-decorator]
-def _store(typing: Any, array: Any, at: Any, vector: Any) -> Any:
-    def lower(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-        value = _vector(context, builder, args[2], vector, _of(array))
-        builder.store(value, _pointer(context, builder, array, args, _of(array)), align=array.dtype.bitwidth // 8)
-        return context.get_dummy_value()
-
-    return types.void(array, types.intp, vector), lower
+@_compiled(width, lambda array: types.intp(array))
+def _width(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+    return context.get_constant(types.intp, _of(sig.args[0]).count)
 
 
-@intrinsic  # type: ignore[untyped-decorator]
-def _store_some(typing: Any, array: Any, at: Any, vector: Any, count: Any) -> Any:
-    def lower(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-        place, lane, lanes = _pointer(context, builder, array, args, _of(array)), ir.IntType(64), vector.count
-        splat = builder.insert_element(ir.Constant(ir.VectorType(lane, lanes), ir.Undefined), args[3], ir.Constant(ir.IntType(32), 0))
-        splat = builder.shuffle_vector(splat, splat, ir.Constant(ir.VectorType(ir.IntType(32), lanes), [0] * lanes))
-        wanted = builder.icmp_signed("<", ir.Constant(splat.type, list(range(lanes))), splat)
-        kinds = [args[2].type, place.type, ir.IntType(32), wanted.type]
-        name = f"llvm.masked.store.{_name_of(vector)}.p0"
-        function = cgutils.get_or_insert_function(builder.module, ir.FunctionType(ir.VoidType(), kinds), name)
-        builder.call(function, [args[2], place, ir.Constant(ir.IntType(32), array.dtype.bitwidth // 8), wanted])
-        return context.get_dummy_value()
-
-    return types.void(array, types.intp, vector, types.intp), lower
+def _load(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+    array, vector = sig.args[0], sig.return_type
+    return builder.load(_pointer(context, builder, array, args, vector), align=array.dtype.bitwidth // 8)
 
 
-@intrinsic  # type: ignore[untyped-decorator]
-def _choose(typing: Any, condition: Any, one: Any, other: Any) -> Any:
-    kind = _pair(one, other)
-
-    def lower(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-        return builder.select(args[0], *(_vector(context, builder, v, own, kind) for v, own in zip(args[1:], (one, other), strict=True)))
-
-    return kind and kind(condition, one, other), lower
+_compiled(load, lambda array, at: _of(array)(array, types.intp))(_load)
+_compiled(load_unfused, lambda array, at: _of(array, False)(array, types.intp))(_load)
 
 
-@intrinsic  # type: ignore[untyped-decorator]
-def _total(typing: Any, vector: Any) -> Any:
-    def lower(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-        number = context.get_value_type(vector.dtype)
-        function = ir.FunctionType(number, [number, args[0].type])
-        add = builder.module.declare_intrinsic(f"llvm.vector.reduce.fadd.{_name_of(vector)}", (), function)
-        return builder.call(add, [ir.Constant(number, -0.0), args[0]], fastmath=("reassoc",))
+@_compiled(store, lambda array, at, vector: types.none(array, types.intp, vector))
+def _store(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+    array, own = sig.args[0], _of(sig.args[0])
+    value = _vector(context, builder, args[2], sig.args[2], own)
+    builder.store(value, _pointer(context, builder, array, args, own), align=array.dtype.bitwidth // 8)
+    return context.get_dummy_value()
 
-    return vector.dtype(vector), lower
+
+@_compiled(store_some, lambda array, at, vector, count: types.none(array, types.intp, vector, types.intp))
+def _store_some(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+    array, _, vector, _ = sig.args
+    place, lane, lanes = _pointer(context, builder, array, args, _of(array)), ir.IntType(64), vector.count
+    splat = builder.insert_element(ir.Constant(ir.VectorType(lane, lanes), ir.Undefined), args[3], ir.Constant(ir.IntType(32), 0))
+    splat = builder.shuffle_vector(splat, splat, ir.Constant(ir.VectorType(ir.IntType(32), lanes), [0] * lanes))
+    wanted = builder.icmp_signed("<", ir.Constant(splat.type, list(range(lanes))), splat)
+    kinds = [args[2].type, place.type, ir.IntType(32), wanted.type]
+    name = f"llvm.masked.store.{_name_of(vector)}.p0"
+    function = cgutils.get_or_insert_function(builder.module, ir.FunctionType(ir.VoidType(), kinds), name)
+    builder.call(function, [args[2], place, ir.Constant(ir.IntType(32), array.dtype.bitwidth // 8), wanted])
+    return context.get_dummy_value()
+
+
+@_compiled(choose, lambda condition, one, other: _pair(one, other) and _pair(one, other)(condition, one, other))
+def _choose(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+    kinds = sig.args[1:]
+    return builder.select(args[0], *(_vector(context, builder, v, own, _pair(*kinds)) for v, own in zip(args[1:], kinds, strict=True)))
+
+
+@_compiled(total, lambda vector: vector.dtype(vector))
+def _total(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+    number = context.get_value_type(sig.return_type)
+    function = ir.FunctionType(number, [number, args[0].type])
+    add = builder.module.declare_intrinsic(f"llvm.vector.reduce.fadd.{_name_of(sig.args[0])}", (), function)
+    return builder.call(add, [ir.Constant(number, -0.0), args[0]], fastmath=("reassoc",))
 
 
 @intrinsic  # type: ignore[untyped-decorator]
@@ -252,20 +253,6 @@ def _each(typing: Any, function: Any, vector: Any) -> Any:
     return vector(function, vector), lower
 
 
-@overload(width, inline="always")
-def _compiled_width(array):  # type: ignore[no-untyped-def]
-    count = _of(array).count
-    return lambda array: count
-
-
-overload(load, inline="always")(lambda array, at: lambda array, at: _load(array, at))
-overload(load_unfused, inline="always")(lambda array, at: lambda array, at: _load_unfused(array, at))
-overload(store, inline="always")(lambda array, at, vector: lambda array, at, vector: _store(array, at, vector))
-overload(store_some, inline="always")(
-    lambda array, at, vector, count: lambda array, at, vector, count: _store_some(array, at, vector, count)
-)
-overload(choose, inline="always")(lambda condition, one, other: lambda condition, one, other: _choose(condition, one, other))
 overload(least)(lambda one, other: None if _pair(one, other) else lambda one, other: min(one, other))
 overload(most)(lambda one, other: None if _pair(one, other) else lambda one, other: max(one, other))
-overload(total, inline="always")(lambda vector: lambda vector: _total(vector))
 overload(each, inline="always")(lambda function, vector: lambda function, vector: _each(function, vector))

@@ -142,9 +142,9 @@ def _network(theta, width, window, dt):  # type: ignore[no-untyped-def]
                 f1, f2 = theta[m, 4] * error + theta[m, 5], theta[m, 6] * error + theta[m, 7]
                 half = (theta.shape[1] - 8) // 6
                 for q in range(half):
-                    one, two = theta[m, 8 + 3 * q : 11 + 3 * q], theta[m, 8 + 3 * (half + q) : 11 + 3 * (half + q)]
-                    f1 += one[2] * math.tanh(one[0] * error + one[1])
-                    f2 += two[2] * math.tanh(two[0] * error + two[1])
+                    one, two = 8 + 3 * q, 8 + 3 * (half + q)
+                    f1 += theta[m, one + 2] * math.tanh(theta[m, one] * error + theta[m, one + 1])
+                    f2 += theta[m, two + 2] * math.tanh(theta[m, two] * error + theta[m, two + 1])
                 next_v += share * (theta[m, 0] * v + theta[m, 2] * slip - yaw_rate * f1)
                 next_u += share * (theta[m, 1] * u + theta[m, 3] * thrust - f2)
         v, u = next_v, next_u
@@ -195,7 +195,7 @@ def _judge(found, own, weights, left, lags, sample, yaw_rate, n, g_1, g_slow, mo
         left[c] = max(one[SQUARE_Y] - 2.0 * leakage * one[CROSS_Y] + leakage**2 * lags[POWER], 0.0) / time
         score = n.lateral_power * math.log(left[c] + floor) + n.longitudinal_power * math.log(one[SQUARE_X] / time + floor)
         weights[c] = odds[c] - 0.5 * score * lags[TIME] / (lags[TIME] + n.decision_time)
-    _normalise(weights, weights)
+    _normalise(weights, weights, CANDIDATES)
 
 
 @entry()
@@ -229,7 +229,7 @@ def scan(n, grips, start, prior, spread, decay, theta, state, samples, found, pa
         speed, moving = sample[1], sample[1] > n.minimum_speed
         yaw_rate, turn = (last[0] + sample[0]) / 2.0, (last[0] * last[1] + sample[0] * speed) / 2.0
         ay, ax = (last[2] + sample[2]) / 2.0, (last[3] + sample[3]) / 2.0
-        _normalise(state.log_weights, weights)
+        _normalise(state.log_weights, weights, len(grips))
         size = 0.0
         for j in range(len(grips)):
             x = means[j]
@@ -265,10 +265,16 @@ def scan(n, grips, start, prior, spread, decay, theta, state, samples, found, pa
 
 
 @part()
-def _normalise(log_weights, weights):  # type: ignore[no-untyped-def]
-    """Weights of sum 1 from their logarithms."""
-    weights[:] = np.exp(log_weights - log_weights.max())
-    weights /= weights.sum()
+def _normalise(log_weights, weights, count):  # type: ignore[no-untyped-def]
+    """Weights of sum 1 from the first logarithms; whole arrays would double the time to compile."""
+    largest, total = log_weights[0], 0.0
+    for j in range(count):
+        largest = max(largest, log_weights[j])
+    for j in range(count):
+        weights[j] = math.exp(log_weights[j] - largest)
+        total += weights[j]
+    for j in range(count):
+        weights[j] /= total
 
 
 @part()
@@ -277,7 +283,7 @@ def _mixture(means, covariances, log_weights, weights, found):  # type: ignore[n
     found[:] = 0.0
     for i in range(STATES):
         filters = len(weights) - 1 if REAR <= i <= COMPLIANCE else len(weights)
-        _normalise(log_weights[:filters], weights[:filters])
+        _normalise(log_weights, weights, filters)
         for j in range(filters):
             found[i] += weights[j] * means[j, i]
         for j in range(filters):
