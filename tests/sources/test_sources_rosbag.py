@@ -324,7 +324,8 @@ def real_configuration(root):
 @pytest.mark.slow
 def test_declared_constants_are_those_that_the_data_show(data_root):
     """Within two of the standard deviations that the script prints; what the publishers' files fix exactly, to a millionth."""
-    identified = runpy.run_path(str(ROOT / "docs" / "identify_f1tenth.py"))["identify"](data_root / "f1tenth")
+    parts = runpy.run_path(str(ROOT / "docs" / "identify.py"))["f1tenth"](data_root / "f1tenth")
+    identified = {name: value for _, part in parts for name, value in part.items()}
     declared = real_configuration(data_root)
     channels, pose = declared["channels"], declared["pose"]
     assert abs(pose["yaw"] - identified["body_yaw"]) < 2 * identified["body_yaw_sd"]
@@ -334,7 +335,7 @@ def test_declared_constants_are_those_that_the_data_show(data_root):
     assert channels["steer"]["offset"] == pytest.approx(identified["servo_neutral"], abs=1e-6)
     assert channels["steer"]["factor"] == pytest.approx(identified["servo_gain"], rel=1e-6)
     assert channels["steer"]["sign"] == -np.sign(identified["servo_agreement"])
-    for name, measured in (("ax", "acc_x"), ("ay", "acc_y"), ("yaw_rate", "gyro_z")):
+    for name, measured in (("ax", "ax by forward"), ("ay", "ay by lateral"), ("yaw_rate", "gyro by turning")):
         assert channels[name].get("sign", 1) * identified[measured] == pytest.approx(1.0, abs=0.1)  # sign and unit
     assert identified["acc_z"] == pytest.approx(9.81, abs=0.05)  # z is up, in m/s²
     for name, topic in (("imu", "/imu"), ("vesc", "/vesc/core"), ("body", "/optitrack/rigid_body_0")):
