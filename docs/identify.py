@@ -48,7 +48,7 @@ def declared(dataset: str) -> dict[str, Any]:
     return dict(yaml.safe_load(file.read_text(encoding="utf-8")))
 
 
-def factors_of(columns: Mapping[str, Array], measured: Array, chosen: Any = slice(None)) -> Figures:
+def factors_of(columns: Mapping[str, Any], measured: Any, chosen: Any = slice(None)) -> Figures:
     """Factors of least squares by the columns' names, and their standard deviations."""
     rows, values = np.stack(list(columns.values()), axis=1)[chosen], np.asarray(measured)[chosen]
     blocks = len(rows) // BLOCK
@@ -247,7 +247,7 @@ def _dart_steering(drives: Sequence[pd.DataFrame]) -> Figures:
     found = factors_of(corners, angle)
     curve = [found[name] for name in corners]
     for drive in drives:
-        wanted, gentle = np.interp(drive["steering"], knots, curve), drive["moving"] & (drive["across"] < 3.0)
+        wanted, gentle = np.interp(drive["steering"].to_numpy(), knots, curve), drive["moving"] & (drive["across"] < 3.0)
         if np.quantile(np.abs(wanted[10:] - wanted[:-10]), 0.9) >= 0.02:  # slow steering tells no delay
             rests = [np.std((drive["angle"] - np.roll(wanted, shift))[gentle][100:-100]) for shift in range(60)]
             delays.append(10.0 * int(np.argmin(rests)))
@@ -262,7 +262,7 @@ def roboracer(folder: Path) -> Parts:
         corrupt = np.flatnonzero(table["velocity_vehicle_x"] > 100.0)
         same = np.allclose(table["velocity_vehicle_x"][corrupt], table["Speed"][corrupt])
         print(f"\n{stem}: {len(table)} data rows; corrupt are {(corrupt + 1).tolist()}; velocity_vehicle_x is Speed there: {same}")
-        table = table.drop(index=corrupt)
+        table = table.drop(index=list(corrupt))
         edges = [0, *(np.flatnonzero(np.diff(table["t"]) < 0) + 1).tolist(), len(table)]
         runs = [_roboracer_run(table.iloc[start:stop]) for start, stop in pairwise(edges)]
         vx, vy, yaw_rate, theirs = (joined(runs, name) for name in ("vx", "vy", "yaw_rate", "velocity_vehicle_y"))
@@ -333,7 +333,8 @@ def f1tenth(folder: Path) -> Parts:
     runs = {name: part.rename(columns=IN_CSV).astype(float).set_index(np.arange(len(part)) / 100.0) for name, part in parts.items()}
 
     found: Figures = {}
-    times, sensed = {}, {}
+    times: dict[str, Array] = {}
+    sensed: dict[str, Array] = {}
     for topic, rate in RATES.items():
         stamps, received = ((bag.arrays[f"{topic}@{clock}"] - bag.summary["start"]) * 1e-9 for clock in ("stamped", "received"))
         later = stamps >= START
@@ -418,7 +419,11 @@ def _motor(drive: pd.DataFrame, csv: pd.DataFrame) -> Figures:
             signal.savgol_filter(one.vx, 21, 2, deriv=1, delta=0.01),
         )
         key = name if first else f"{name}: motor over vx at no current"
-        columns = {key: one.vx, f"{key}, times dvx/dt": change, f"{key}, times the front's": one.vx * (1.0 / np.cos(lock) - 1.0)}
+        columns: dict[str, Any] = {
+            key: one.vx,
+            f"{key}, times dvx/dt": change,
+            f"{key}, times the front's": one.vx * (1.0 / np.cos(lock) - 1.0),
+        }
         gentle = (np.abs(one.vx * one.yaw_rate) < GENTLE) & (np.abs(one.vy) < 0.15 * one.vx)
         chosen = ((one.vx > MOVING) & (gentle | first)).to_numpy()
         columns |= {} if first else {f"{key}, times the current": one.current}
@@ -468,7 +473,7 @@ def _residuals(given: dict[str, Any], runs: Mapping[str, pd.DataFrame]) -> Figur
         found |= {f"{name}, mean": rest[moving].mean(), f"{name}, of ay": share}
     one, wide = recordings["bag"], recordings["bag, window of 15 samples"]
     for channel in ("vx_ref", "vy_ref", "yaw_rate_ref"):
-        found[f"{channel} changes with a window of 15 samples"] = np.std((wide[channel] - one[channel])[one["vx_ref"] > MOVING])
+        found[f"{channel} changes with a window of 15 samples"] = float(np.std((wide[channel] - one[channel])[one["vx_ref"] > MOVING]))
     return found
 
 
