@@ -43,7 +43,7 @@ ACROSS, ALONG = ("lateral", "forward", "lever ahead", "one"), ("forward", "later
 
 
 def declared(dataset: str) -> dict[str, Any]:
-    """What a file in conf/dataset says."""
+    """Content of a file in conf/dataset."""
     file = Path(__file__).resolve().parents[1] / "conf" / "dataset" / f"{dataset}.yaml"
     return dict(yaml.safe_load(file.read_text(encoding="utf-8")))
 
@@ -248,7 +248,7 @@ def _dart_steering(drives: Sequence[pd.DataFrame]) -> Figures:
     curve = [found[name] for name in corners]
     for drive in drives:
         wanted, gentle = np.interp(drive["steering"].to_numpy(), knots, curve), drive["moving"] & (drive["across"] < 3.0)
-        if np.quantile(np.abs(wanted[10:] - wanted[:-10]), 0.9) >= 0.02:  # slow steering tells no delay
+        if np.quantile(np.abs(wanted[10:] - wanted[:-10]), 0.9) >= 0.02:  # slow steering has no delay to find
             rests = [np.std((drive["angle"] - np.roll(wanted, shift))[gentle][100:-100]) for shift in range(60)]
             delays.append(10.0 * int(np.argmin(rests)))
     found |= {"rest": (angle - np.interp(command, knots, curve)).std(), "rest by one factor": rest_of([command], angle)}
@@ -300,8 +300,8 @@ def _roboracer_run(table: pd.DataFrame) -> pd.DataFrame:
         if ranges and begin <= ranges[-1][1]:
             begin = ranges.pop()[0]
         ranges.append((begin, end))
-    said = ", ".join(f"{begin:.2f} to {end:.2f}" for begin, end in ranges) or "none"
-    print(f"{len(run)} rows, {stamps[0]:.2f} to {stamps[-1]:.2f} s; {lost.sum()} poses beyond 20 m/s²; pose lost at [s]: {said}")
+    shown = ", ".join(f"{begin:.2f} to {end:.2f}" for begin, end in ranges) or "none"
+    print(f"{len(run)} rows, {stamps[0]:.2f} to {stamps[-1]:.2f} s; {lost.sum()} poses beyond 20 m/s²; pose lost at [s]: {shown}")
     return run.assign(kept=kept)
 
 

@@ -220,10 +220,13 @@ def settings(*estimators: str) -> Iterable[str]:
     listed: set[tuple[str, ...]] = set()
     for name in estimators:
         rows = list(_declared(estimator_class(name).settings_type(), ""))
-        same = [row[0] for row in rows if row in listed]
+        same, own = [row[0] for row in rows if row in listed], [row for row in rows if row not in listed]
+        if not own:
+            yield f"`{name}`: as above."
+            continue
         if len(same) > 3:
             yield f"`{name}`, besides {', '.join(same)} as above:"
-            rows = [row for row in rows if row not in listed]
+            rows = own
         elif len(estimators) > 1:
             yield f"`{name}`:"
         listed.update(rows)
@@ -322,13 +325,8 @@ def _table(header: Sequence[str], rows: Iterable[Sequence[str]], right: int = 0)
     return "\n".join(f"| {' | '.join(line)} |" for line in lines)
 
 
-PARTS: dict[str, Callable[..., Iterable[str]]] = {
-    part.__name__: part
-    for part in (
-        *(commands, files, channels, units, manoeuvres, courses),
-        *(settings, figures, leaderboard),
-    )
-}
+_PARTS = (commands, files, channels, units, manoeuvres, courses, settings, figures, leaderboard)
+PARTS: dict[str, Callable[..., Iterable[str]]] = {part.__name__: part for part in _PARTS}
 
 if __name__ == "__main__":
     main()
