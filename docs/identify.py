@@ -146,18 +146,11 @@ def av21(folder: Path) -> Parts:
         angle, straight = np.degrees(np.arctan2(moving["vy"], moving["vx"])), np.abs(moving["r"]) < 0.01
         ratios.append(float((moving["wheels"] / moving["vx"]).median()))
         found = explained([table.assign(kept=table["vx"] > 5.0)], "wheels", ("vx",), np.arange(-0.2, 0.21, 0.02))
-        yield (
-            file.stem,
-            found
-            | {
-                "seconds": table.index[-1] - table.index[0],
-                "largest vx [m/s]": table["vx"].max(),
-                "wheels over vx, median": ratios[-1],
-                "correlation of vy and r": np.corrcoef(moving["vy"], moving["r"])[0, 1],
-                "|sideslip| for 99 % of the time [deg]": np.quantile(np.abs(angle), 0.99),
-                "mean sideslip where |r| < 0.01 rad/s [deg]": angle[straight].mean(),
-            },
-        )
+        found |= {"seconds": table.index[-1] - table.index[0], "wheels over vx, median": ratios[-1]}
+        found["correlation of vy and r"] = np.corrcoef(moving["vy"], moving["r"])[0, 1]
+        found["|sideslip| for 99 % of the time [deg]"] = float(np.quantile(np.abs(angle), 0.99))
+        found["mean sideslip where |r| < 0.01 rad/s [deg]"] = angle[straight].mean()
+        yield file.stem, found
     both = float(np.mean(ratios))  # of a nominal radius of 0.3 m, by which speeds at the rim become rotational speeds
     yield "Both", {"wheel radius [m]": 0.3 / both, **{f"error of file {at} [%]": 100 * (one / both - 1) for at, one in enumerate(ratios)}}
 
@@ -165,6 +158,7 @@ def av21(folder: Path) -> Parts:
 def dart(folder: Path) -> Parts:
     """Poses at 100 Hz with sensors at 10 Hz, in the rows from which ``elapsed time sensors`` has changed."""
     given, drives = declared("dart"), []
+    found: Figures
     dropped = dropped_rows_from_config(given["drop_rows"], "dart")
     place, encoder, accelerometer = ["vicon x", "vicon y"], "vel encoder", ("acc x (IMU)", "acc y (IMU)")
     for file in sorted(folder.glob("*/*.csv")):
@@ -173,18 +167,12 @@ def dart(folder: Path) -> Parts:
         rows = kept_rows(len(table), () if excluded else dropped.get(file.stem, ()), file)
         seconds, poses = float(np.ptp(table["vicon time"])), table[place].to_numpy(np.float64)
         title = ("left out " if excluded else "") + f"{file.parent.name}/{file.stem}"
-        yield (
-            title,
-            {
-                "rows": len(table),
-                "that count": int(rows.sum()),
-                "missing": round(seconds * 100.0) + 1 - len(table),
-                "jumps of the pose beyond 60 m/s²": int((np.linalg.norm(np.diff(poses, n=2, axis=0), axis=1) * 100.0**2 > 60.0).sum()),
-                "sensors [Hz]": (np.diff(table["elapsed time sensors"]) != 0).sum() / seconds,
-                "speed, 99 % [m/s]": np.quantile(np.linalg.norm(poses[10:] - poses[:-10], axis=1) * 10.0, 0.99),
-                "encoder, 99 % [m/s]": np.quantile(table[encoder], 0.99),
-            },
-        )
+        found = {"rows": len(table), "that count": int(rows.sum()), "missing": round(seconds * 100.0) + 1 - len(table)}
+        jumps = np.linalg.norm(np.diff(poses, n=2, axis=0), axis=1) * 100.0**2 > 60.0  # m/s²
+        found |= {"jumps of the pose": int(jumps.sum()), "sensors [Hz]": (np.diff(table["elapsed time sensors"]) != 0).sum() / seconds}
+        found["speed, 99 % [m/s]"] = float(np.quantile(np.linalg.norm(poses[10:] - poses[:-10], axis=1) * 10.0, 0.99))
+        found["encoder, 99 % [m/s]"] = float(np.quantile(table[encoder], 0.99))
+        yield title, found
         if not excluded:
             drive = with_accelerations(with_motion(table[rows], place, "vicon yaw", 15, 100.0), 3.0)
             new = np.flatnonzero(np.diff(drive["elapsed time sensors"], prepend=drive["elapsed time sensors"].iloc[0]) != 0)
@@ -192,7 +180,7 @@ def dart(folder: Path) -> Parts:
             drives.append(drive.assign(kept=inner & (drive["vx"] > 0.3), new=np.isin(np.arange(len(drive)), new)))
     yield "All that count", {"files": len(drives), "seconds": sum(map(len, drives)) / 100.0}
 
-    found: Figures = {}
+    found = {}
     for name in ("W (IMU)", *accelerometer, encoder, "throttle", "steering"):
         changed = [drive[name].diff().fillna(0.0) != 0.0 for drive in drives]
         together = sum((rows & drive["new"]).sum() for rows, drive in zip(changed, drives, strict=True))
