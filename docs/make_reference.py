@@ -214,23 +214,18 @@ def _sections(described: type) -> dict[str, str]:
 
 
 def settings(*estimators: str) -> Iterable[str]:
-    """Settings and fitted numbers of families, as their classes declare them; many that an earlier one has too are only named."""
+    """Settings and fitted numbers of families, as their classes declare them; those that an earlier one has too are only named."""
     from vehest.estimators.registry import estimator_class
 
     listed: set[tuple[str, ...]] = set()
     for name in estimators:
         rows = list(_declared(estimator_class(name).settings_type(), ""))
         same, own = [row[0] for row in rows if row in listed], [row for row in rows if row not in listed]
-        if not own:
-            yield f"`{name}`: as above."
-            continue
-        if len(same) > 3:
-            yield f"`{name}`, besides {', '.join(same)} as above:"
-            rows = own
-        elif len(estimators) > 1:
-            yield f"`{name}`:"
-        listed.update(rows)
-        yield _table(("`estimator.`", "default", "unit", "meaning"), rows)
+        if len(estimators) > 1:
+            yield f"`{name}`" + (f", besides {', '.join(same)} as above:" if same and own else ":" if own else ": as above.")
+        if own:
+            yield _table(("`estimator.`", "default", "unit", "meaning"), own)
+        listed.update(own)
 
 
 def _declared(settings: Any, above: str) -> Iterable[tuple[str, str, str, str]]:
