@@ -5,10 +5,10 @@ Run by ``make unseen_car``. It refuses choices that are not committed, and appen
 
 from __future__ import annotations
 
+import argparse
 import csv
 import os
 import subprocess
-import sys
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from fnmatch import fnmatchcase
@@ -327,14 +327,20 @@ def report(found: Mapping[Car, Sequence[Errors]], changed: Sequence[str]) -> str
 
 
 def main() -> None:
-    """Command line; ``--development`` prints development cars alone and publishes nothing."""
-    root, output, development = os.environ.get("VEHEST_DATA"), Path(os.environ.get("VEHEST_OUTPUT", "outputs")), "--development" in sys.argv
+    """Command line."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument(
+        "--output", type=Path, default=Path(os.environ.get("VEHEST_OUTPUT", "outputs")), help="output root, for ingested drives"
+    )
+    parser.add_argument("--development", action="store_true", help="development cars alone, printed and not published")
+    given, root = parser.parse_args(), os.environ.get("VEHEST_DATA", "")
     if not root:
         raise SystemExit("set VEHEST_DATA to the folder of the recordings")
-    cars = [car for car in CARS if car.development or not development]
-    if not development:
+    cars = [car for car in CARS if car.development or not given.development]
+    if not given.development:
+        TARGET.mkdir(parents=True, exist_ok=True)
         open_cars([car.title for car in cars if not car.development])
-    runner, (_, shipped, _) = Runner(output, Messages(), StopSignals()), open_model("pretrained", output, print)
+    runner, (_, shipped, _) = Runner(given.output, Messages(), StopSignals()), open_model("pretrained", given.output, print)
     found: dict[Car, list[Errors]] = {}
     changed: list[str] = []
     for car in cars:
@@ -345,7 +351,7 @@ def main() -> None:
         except MissingError as error:
             print(f"left out: {car.title}: {error}")
     page = report({car: [drive for drive in drives if len(drive.time)] for car, drives in found.items() if drives}, changed)
-    if development:
+    if given.development:
         print(page)
     else:
         (TARGET / "report.md").write_text(page, encoding="utf-8")
