@@ -1,4 +1,4 @@
-"""Write src/vehest/pretrained, the network for cars that nobody has trained on, and pretrained_filter, which has it inside.
+"""Write src/vehest/pretrained, the network for cars without a training of their own, and pretrained_filter, which has it inside.
 
 Run by ``make pretrained``, after the study sim_to_real, which has chosen the network's seed, with the study's output root. Bands and
 health are learnt from the simulated drives that the network was trained on and from the other simulated cars on which its training was
