@@ -77,6 +77,7 @@ lint: $(INSTALLED) ## style, types, layers of imports
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
+	$(BIN)/mypy docs/*.py
 	$(BIN)/lint-imports
 
 test-slow: $(INSTALLED) ## the studies behind the tests; needs VEHEST_DATA for the real recordings

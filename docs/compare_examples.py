@@ -46,18 +46,16 @@ SHOWN = ["title", "rmse_sideslip", "rmse_sideslip_low", "rmse_sideslip_high", "b
 
 
 def install(site: Path, place: Path) -> None:
-    """Modules and entry points as pip would install them, and the configuration where the commands are given."""
-    about = site / "vehest_examples-1.0.dist-info"
+    """Modules, templates and entry points into a new folder, as pip would install them, and the configuration into ``place``/conf."""
+    about, configuration = site / "vehest_examples-1.0.dist-info", place / "conf" / "estimator"
     about.mkdir(parents=True)
+    configuration.mkdir(parents=True, exist_ok=True)
     (about / "METADATA").write_text("Metadata-Version: 2.1\nName: vehest-examples\nVersion: 1.0\n")
     points = "\n".join(f"{name} = {name}:{kind}" for name, kind in CLASSES.items())
     (about / "entry_points.txt").write_text(f"[vehest.estimators]\n{points}\n")
-    (place / "conf" / "estimator").mkdir(parents=True)
-    (place / "pipelines").mkdir()
     for name in CLASSES:
-        shutil.copy(EXAMPLES / f"{name}.py", site)
-        shutil.copy(EXAMPLES / f"{name}.yaml", place / "conf" / "estimator")
-    (place / "pipelines" / "examples.yaml").write_text(yaml.safe_dump(PIPELINE))
+        for file in EXAMPLES.glob(f"{name}.*"):
+            shutil.copy(file, configuration if file.suffix == ".yaml" else site)
 
 
 def main() -> None:
@@ -65,6 +63,8 @@ def main() -> None:
     with tempfile.TemporaryDirectory(prefix="examples-") as scratch:
         site, place = Path(scratch) / "site", Path(scratch) / "place"
         install(site, place)
+        (place / "pipelines").mkdir()
+        (place / "pipelines" / "examples.yaml").write_text(yaml.safe_dump(PIPELINE))
         command = (sys.executable, "-c", "from vehest.cli import main; main()", "run", "examples", "tracking=none")
         subprocess.run(command, cwd=place, env={**os.environ, "PYTHONPATH": str(site), "VEHEST_OUTPUT": "outputs"}, check=True)
         (table,) = place.glob("outputs/report/examples-*/tables/leaderboard_test.csv")

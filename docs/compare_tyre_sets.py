@@ -95,7 +95,7 @@ def table(sets: dict[str, list[Recording]]) -> Iterator[str]:
     yield f"| {', '.join(f'{100 * quantile:g} %' for quantile in QUANTILES)} of | {' | '.join(sets)} |"
     yield "| :-- |" + " :-- |" * len(sets)
     for name, digits in zip(frames[0], DIGITS, strict=True):
-        cells = [frame.loc[frame["v_x [m/s]"] > SLOWEST, name].quantile(QUANTILES) for frame in frames]
+        cells = [frame[name][frame["v_x [m/s]"] > SLOWEST].quantile(QUANTILES) for frame in frames]
         yield f"| {name} | " + " | ".join(", ".join(f"{value:.{digits}f}" for value in cell) for cell in cells) + " |"
     yield "| minutes | " + " | ".join(f"{len(frame) / 6000.0:.1f}" for frame in frames) + " |"
     slow = [100.0 * (frame["v_x [m/s]"] <= SLOWEST).mean() for frame in frames]

@@ -32,7 +32,6 @@ autodoc_member_order = "bysource"
 autodoc_typehints_format = "short"
 nitpicky = True
 nitpick_ignore_regex = [("py:.*", ".*")]  # types and errors of the interface that no page describes
-suppress_warnings: list[str] = []
 highlight_language = "text"
 smartquotes_action = "q"  # the dashes of options stay
 copybutton_prompt_text = r"\$ "

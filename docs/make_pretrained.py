@@ -1,4 +1,4 @@
-"""Write src/vehest/pretrained, the network for cars that nobody has trained on, and pretrained_filter, which has it inside.
+"""Write src/vehest/pretrained, the network for cars without a training of their own, and pretrained_filter, which has it inside.
 
 Run by ``make pretrained``, after the study sim_to_real, which has chosen the network's seed, with the study's output root. Bands and
 health are learnt from the simulated drives that the network was trained on and from the other simulated cars on which its training was
@@ -8,8 +8,8 @@ stopped; bands of the filter from 30 other simulated cars and the development ca
 
 from __future__ import annotations
 
-import argparse
 import os
+import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -55,9 +55,8 @@ def note_of(row: pd.Series, estimator: Estimator) -> str:
     patent = " The KS-NN is patented by its authors (PCT/IT2023/050058)." if estimator.name == "ksnn" else ""
     left, worse = row["other_simulator_fvu"], ""
     if left > 1.0:  # of the candidate with the lowest error there
-        worse = (
-            f" All candidates of the rule are worse than v = 0 on the simulated car that it asked; this one leaves FVU {fixed(left, 1)}."
-        )
+        worse = " All candidates of the rule are worse than v = 0 on the simulated car that it asked; this one leaves FVU "
+        worse += f"{fixed(left, 1)}."
     return (
         f"pre-trained {estimator.full_title}, learnt on {row['recordings']:.0f} drives of simulated cars and not on this one. On a real "
         f"Ferrari 250 LM, which it had not seen either, it leaves {fixed(row['model_fvu'], 3)} of the variance of v unexplained, RMSE(v) "
@@ -68,8 +67,8 @@ def note_of(row: pd.Series, estimator: Estimator) -> str:
     )
 
 
-def write(row: pd.Series, model: Path, target: Path = TARGET) -> None:
-    """Copy a model with what the study says of it."""
+def write(row: pd.Series, model: Path) -> None:
+    """Copy a model with a note on its errors in the study."""
     estimator, trained = load_model(model), read_description(model).about
     about = {
         "seed": trained.seed,
@@ -80,25 +79,25 @@ def write(row: pd.Series, model: Path, target: Path = TARGET) -> None:
         "step": str(row["part"]),
         "note": note_of(row, estimator),
     }
-    target.mkdir(exist_ok=True)
-    save_model(estimator, target, about)
+    TARGET.mkdir(exist_ok=True)
+    save_model(estimator, TARGET, about)
 
 
-def write_its_trust(step: str, output: Path, target: Path = TARGET) -> None:
+def write_its_trust(step: str, output: Path) -> None:
     """Learn from a step's training and validation ranges, all of them simulated, how far the model can be trusted."""
-    words = [f"split=sim_to_real_{step}", f"estimator={read_description(target).estimator}", f"output={output}", "tracking=none"]
+    words = [f"split=sim_to_real_{step}", f"estimator={read_description(TARGET).estimator}", f"output={output}", "tracking=none"]
     config = compose_config("eval", words)
     runner = Runner(output, Messages(), StopSignals())
     whole = runner.split(config)
     split = replace(whole, tests={})
-    job = plan_calibrate(model_artefact(target), split, runner.data_for(split, float(config["estimator"]["rate_hz"]), config), output)
+    job = plan_calibrate(model_artefact(TARGET), split, runner.data_for(split, float(config["estimator"]["rate_hz"]), config), output)
     if job is None:
         raise SystemExit(f"split '{split.name}' has no validation range")
-    job[1](target)
-    write_trust(replace(read_trust(target), guard=None), target)  # samples are held to what any car's sensors do, not to simulated ones
+    job[1](TARGET)
+    write_trust(replace(read_trust(TARGET), guard=None), TARGET)  # samples are held to what any car's sensors do, not to simulated ones
 
 
-def write_filter(output: Path, target: Path = FILTER) -> None:
+def write_filter(output: Path) -> None:
     """The self-calibrating filter, with bands scaled on 30 simulated cars and calibrated on the drives of its development cars."""
     counts = [f"dataset.drives.{at}.count=5" for at in range(6)]
     made = Runner(output, Messages(), StopSignals()).ingest(
@@ -107,14 +106,14 @@ def write_filter(output: Path, target: Path = FILTER) -> None:
     estimator = estimator_class("self_calibrating").from_config({})
     drives = [resampled(read_recording(made.folder / name), estimator.rate_hz, estimator.preparation) for name in sorted(made.outputs)]
     fleet = [Stretch(drive, drive.start_time, "sim_fleet_real", drive.id) for drive in drives]
-    target.mkdir(exist_ok=True)
-    save_model(estimator, target, {"n_parameters": 0, "downsample": dict(estimator.preparation), "note": FILTER_NOTE})
+    FILTER.mkdir(exist_ok=True)
+    save_model(estimator, FILTER, {"n_parameters": 0, "downsample": dict(estimator.preparation), "note": FILTER_NOTE})
     health = read_trust(TARGET).health  # of the same channels, from more cars
     trust = learn_trust(estimator, fleet, development_drives(output))
     if trust.bands is None:
         raise SystemExit(f"no bands: {trust.about.note}")
     bands = replace(trust.bands, vehicles=())  # of many cars, so that they hold for the next one
-    write_trust(replace(trust, bands=bands, guard=None, health=health), target)
+    write_trust(replace(trust, bands=bands, guard=None, health=health), FILTER)
 
 
 def development_drives(output: Path) -> list[Stretch]:
@@ -130,15 +129,11 @@ def development_drives(output: Path) -> list[Stretch]:
 
 def main() -> None:
     """Command line."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--output", type=Path, default=Path(os.environ.get("VEHEST_OUTPUT", "outputs")), help="the study's output root")
-    parser.add_argument("--trust", action="store_true", help="only bands and health, of the model that is there")
-    given = parser.parse_args()
-    row = chosen_step()
-    if not given.trust:
-        write(row, find_model(str(row["model"]), given.output, print))
-    write_its_trust(str(row["part"]), given.output)
-    write_filter(given.output)
+    output, row = Path(os.environ.get("VEHEST_OUTPUT", "outputs")), chosen_step()
+    if "--trust" not in sys.argv:
+        write(row, find_model(str(row["model"]), output, print))
+    write_its_trust(str(row["part"]), output)
+    write_filter(output)
     print(TARGET, FILTER)
 
 

@@ -76,22 +76,17 @@ def commands() -> Iterable[str]:
     root: Any = typer.main.get_command(app)
     leaves = list(_leaves(root, ("vehest",)))
     counts = Counter(row for _, command in leaves for row in _parameters(command))
-    common = {row for row, count in counts.items() if count >= COMMON}
-    header = ("argument or option", "meaning")
-    yield _paragraphs(root.help)
-    yield f"{root.epilog} `-h` and `--help` explain every command; `--install-completion` sets up tab completion."
+    common = [row for row, count in counts.items() if count >= COMMON]
+    yield f"{_paragraphs(root.help)} `-h` and `--help` explain every command."
     yield "### Common options"
-    yield _table(header, [*_parameters(root), *(row for row in counts if row in common)])
+    yield _list([*_parameters(root), *common])
     for words, command in leaves:
-        arguments = [_argument(p) for p in command.params if p.param_type_name == "argument"]
         rows = _parameters(command)
         yield f"### `{' '.join(words)}`"
-        yield f"Usage: `{' '.join([*words[1:], *arguments, '[OPTIONS]'])}`. {_paragraphs(command.help)}"
         own = [row for row in rows if row not in common]
+        yield f"{_paragraphs(command.help)} Takes {', '.join(row[0] for row in rows if row in common)}{' and:' if own else '.'}"
         if own:
-            yield _table(header, own)
-        if len(own) < len(rows):
-            yield f"{'Also' if own else 'Takes'} {', '.join(row[0] for row in rows if row in common)}."
+            yield _list(own)
 
 
 def _leaves(group: Any, words: tuple[str, ...]) -> Iterable[tuple[tuple[str, ...], Any]]:
@@ -172,10 +167,12 @@ def manoeuvres(plant: str) -> Iterable[str]:
     from vehest.simulation.planar_drive import PLANAR_MANOEUVRES
 
     known: dict[str, Any] = {**(PLANAR_MANOEUVRES if plant == "planar" else MANOEUVRES)}
+    rows = []
     for name, made in sorted(known.items()):
         described = _sections(made)
-        rows = [(f"`{field.name}`", f"`{_as_yaml(field.default)}`", described.get(field.name, "")) for field in fields(made)]
-        yield from (f"### `{name}`", described[""], _table(("parameter", "default", "meaning"), rows))
+        rows.append((f"**`{name}`**", "", described[""]))
+        rows += [(f"`{field.name}`", f"`{_as_yaml(field.default)}`", described.get(field.name, "")) for field in fields(made)]
+    yield _table(("manoeuvre, parameters", "default", "meaning"), rows)
 
 
 def courses() -> Iterable[str]:
@@ -217,20 +214,18 @@ def _sections(described: type) -> dict[str, str]:
 
 
 def settings(*estimators: str) -> Iterable[str]:
-    """Settings and fitted numbers of families, as their classes declare them; many that an earlier one has too are only named."""
+    """Settings and fitted numbers of families, as their classes declare them; those that an earlier one has too are only named."""
     from vehest.estimators.registry import estimator_class
 
     listed: set[tuple[str, ...]] = set()
     for name in estimators:
         rows = list(_declared(estimator_class(name).settings_type(), ""))
-        same = [row[0] for row in rows if row in listed]
-        if len(same) > 3:
-            yield f"`{name}`, besides {', '.join(same)} as above:"
-            rows = [row for row in rows if row not in listed]
-        elif len(estimators) > 1:
-            yield f"`{name}`:"
-        listed.update(rows)
-        yield _table(("`estimator.`", "default", "unit", "meaning"), rows)
+        same, own = [row[0] for row in rows if row in listed], [row for row in rows if row not in listed]
+        if len(estimators) > 1:
+            yield f"`{name}`" + (f", besides {', '.join(same)} as above:" if same and own else ":" if own else ": as above.")
+        if own:
+            yield _table(("`estimator.`", "default", "unit", "meaning"), own)
+        listed.update(own)
 
 
 def _declared(settings: Any, above: str) -> Iterable[tuple[str, str, str, str]]:
@@ -311,7 +306,11 @@ def _rounded(cell: str) -> str:
 
 
 def _paragraphs(text: str | None) -> str:
-    return "\n\n".join(" ".join(part.split()) for part in (text or "").split("\n\n"))
+    return " ".join((text or "").split())
+
+
+def _list(rows: Iterable[tuple[str, str]]) -> str:
+    return "\n".join(f"- {name}: {meaning}" for name, meaning in rows)
 
 
 def _table(header: Sequence[str], rows: Iterable[Sequence[str]], right: int = 0) -> str:
@@ -321,13 +320,8 @@ def _table(header: Sequence[str], rows: Iterable[Sequence[str]], right: int = 0)
     return "\n".join(f"| {' | '.join(line)} |" for line in lines)
 
 
-PARTS: dict[str, Callable[..., Iterable[str]]] = {
-    part.__name__: part
-    for part in (
-        *(commands, files, channels, units, manoeuvres, courses),
-        *(settings, figures, leaderboard),
-    )
-}
+_PARTS = (commands, files, channels, units, manoeuvres, courses, settings, figures, leaderboard)
+PARTS: dict[str, Callable[..., Iterable[str]]] = {part.__name__: part for part in _PARTS}
 
 if __name__ == "__main__":
     main()

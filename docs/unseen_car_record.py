@@ -19,6 +19,7 @@ from make_unseen_car import CARS, HELD_BACK, PLAIN, RATE, TARGET, WARM_UP, drive
 
 from vehest.alignment.lateral import lateral_lateness
 from vehest.alignment.motion import motion_of
+from vehest.alignment.standstill import standstill
 from vehest.constants import GRAVITY, FloatArray
 from vehest.data.recording import Recording
 from vehest.estimators.base import Estimator
@@ -107,7 +108,8 @@ Profile = Callable[[float], float]  # by the time [s]
 def started(model: Estimator, record: CarRecord, names: Sequence[str], widening: float) -> Estimator:
     """The filter that starts from some numbers of a record, compliance and grip included, no surer than the filter's own priors."""
     own = {name: getattr(record, name) if name in names else replace(getattr(record, name), identified_on=()) for name in LIMITS}
-    new, changed = calibrated(model, replace(record, **own), widening), {}
+    new = calibrated(model, replace(record, **own), widening)
+    changed: dict[str, float] = {}
     for name in ("compliance", "grip"):
         if own[name].identified_on:
             deviation = min(widening * own[name].deviation / own[name].value, getattr(new, f"{name}_deviation"))
@@ -170,7 +172,7 @@ def lateness(runner: Runner, root: str) -> pd.DataFrame:
     for car in (car for car in CARS if car.development):
         for drive in drives_of(car, runner, root):
             model = filter_of(car, RATE, measured_ax="ax" in drive)
-            found, known = lateness_of(model, drive), lateral_lateness(motion_of(drive))
+            found, known = lateness_of(model, drive), lateral_lateness(motion_of(drive, ~standstill(drive)))
             row: dict[str, Any] = {"drive": f"{car.title}, {drive.id}", "by the filter": 1e3 * found}
             row |= {"by the reference": 1e3 * known[0].value, "±": 1e3 * known[0].half_width} if known else {}
             row["deviations of ay's offset"] = offset_of(model, drive)
@@ -255,34 +257,38 @@ def angle_of(drive: Recording) -> FloatArray:
     return np.arctan2(drive["vy_ref"], drive["vx_ref"])
 
 
+def drawn(rng: np.random.Generator, seed: int) -> tuple[PlanarCar, SensorLevels, Recording]:
+    """A drawn car in a drawn drive: straights, bends up to 0.75 of the grip and a sine at 10 to 33 m/s."""
+    axles = rng.uniform(2.3, 3.1), rng.uniform(0.42, 0.58), 0.0051 * math.exp(rng.uniform(-0.5, 0.5)), rng.uniform(0.6, 0.95)
+    ranges = {"mass": (900, 2300), "friction": (0.8, 1.15), "load_sensitivity": (0, 0.15), "roll_gradient": (0.005, 0.011)}
+    car = a_car(*axles, **{name: rng.uniform(*own) for name, own in (ranges | {"yaw_inertia": (0.85, 1.15)}).items()})
+    levels = SensorLevels(
+        vx=SensorLevel(noise=0.0071),
+        yaw_rate=SensorLevel(noise=2.5e-4, drift=5e-4, delay=rng.uniform(0.0, 0.06) * (seed % 2)),
+        ax=replace(ACCELEROMETER, bias=rng.normal(0.0, 0.1)),
+        ay=replace(ACCELEROMETER, bias=rng.normal(0.0, 0.3)),
+        imu=Mounting(lever_x=rng.uniform(-0.2, 0.2)),
+        tilt=Tilt(roll_share=rng.uniform(-0.5, 1.0)),
+        reference=Reference(),
+    )
+    speeds, knots = rng.uniform(10.0, 33.0, 14), np.repeat(np.cumsum(rng.uniform(2.5, 6.0, 50)), 2) + np.tile([0.0, 0.5], 50)
+    bends = np.repeat(rng.uniform(-0.75, 0.75, 51) * (rng.random(51) > 0.25) * car.friction * GRAVITY, 2)[1:-1]
+    size, rate, rate_hz = rng.uniform(0.0, 2.0), math.tau * rng.uniform(0.2, 0.8), float(rng.choice([20, 25, 50, 100]))
+
+    def lateral(time: float) -> float:
+        return (float(np.interp(time, knots, bends)) + size * math.sin(rate * time)) * (time > 0.0)
+
+    def speed(time: float) -> float:
+        return float(np.interp(time, 10.0 * np.arange(14), speeds))
+
+    return car, levels, driven(car, levels, speed, lateral, seconds=rng.uniform(60.0, 120.0), rate_hz=rate_hz, seed=seed)
+
+
 def mixed(seed: int) -> tuple[PlanarCar, SensorLevels, Recording]:
-    """A drawn car in a drawn drive: straights, bends up to 0.75 of the grip and a sine at 10 to 33 m/s; drawn anew where it slides."""
+    """A drawn car with its drive; drawn anew where it slides."""
     rng = np.random.default_rng(seed)
     while True:
-        axles = rng.uniform(2.3, 3.1), rng.uniform(0.42, 0.58), 0.0051 * math.exp(rng.uniform(-0.5, 0.5)), rng.uniform(0.6, 0.95)
-        ranges = {"mass": (900, 2300), "friction": (0.8, 1.15), "load_sensitivity": (0, 0.15), "roll_gradient": (0.005, 0.011)}
-        car = a_car(*axles, **{name: rng.uniform(*own) for name, own in (ranges | {"yaw_inertia": (0.85, 1.15)}).items()})
-        levels = SensorLevels(
-            vx=SensorLevel(noise=0.0071),
-            yaw_rate=SensorLevel(noise=2.5e-4, drift=5e-4, delay=rng.uniform(0.0, 0.06) * (seed % 2)),
-            ax=replace(ACCELEROMETER, bias=rng.normal(0.0, 0.1)),
-            ay=replace(ACCELEROMETER, bias=rng.normal(0.0, 0.3)),
-            imu=Mounting(lever_x=rng.uniform(-0.2, 0.2)),
-            tilt=Tilt(roll_share=rng.uniform(-0.5, 1.0)),
-            reference=Reference(),
-        )
-        speeds, knots = rng.uniform(10.0, 33.0, 14), np.repeat(np.cumsum(rng.uniform(2.5, 6.0, 50)), 2) + np.tile([0.0, 0.5], 50)
-        bends = np.repeat(rng.uniform(-0.75, 0.75, 51) * (rng.random(51) > 0.25) * car.friction * GRAVITY, 2)[1:-1]
-        size, rate = rng.uniform(0.0, 2.0), math.tau * rng.uniform(0.2, 0.8)
-
-        def speed(time: float, speeds: FloatArray = speeds) -> float:
-            return float(np.interp(time, 10.0 * np.arange(14), speeds))
-
-        def lateral(time: float, knots: FloatArray = knots, bends: FloatArray = bends, size: float = size, rate: float = rate) -> float:
-            return (float(np.interp(time, knots, bends)) + size * math.sin(rate * time)) * (time > 0.0)
-
-        rate_hz = float(rng.choice([20, 25, 50, 100]))
-        drive = driven(car, levels, speed, lateral, seconds=rng.uniform(60.0, 120.0), rate_hz=rate_hz, seed=seed)
+        car, levels, drive = drawn(rng, seed)
         if np.abs(angle_of(drive)).max() < math.radians(25.0):
             return car, levels, drive
 
@@ -306,31 +312,32 @@ def weave(time: float) -> float:
     return 0.15 * math.sin(0.5 * time) + 0.1 * math.sin(1.3 * time)
 
 
+SALOON, PRODUCTION = a_car(rear=0.54, compliance=0.0036), replace(SensorLevels(), reference=Reference())
+
+
 def scenes() -> dict[str, Recording]:
     """Drives with little excitation, or that the filter is not made for, with the sensors of production cars."""
-    car, levels = a_car(rear=0.54, compliance=0.0036), replace(SensorLevels(), reference=Reference())
     loose = a_car(rear=0.42, front=1.4, load_sensitivity=0.3, roll_share_front=0.1)
 
     def ramp(begin: float, seconds: float, size: float) -> Profile:
         return lambda time: size * min(max((time - begin) / seconds, 0.0), 1.0)
 
     def sweep(size: float) -> Recording:
-        return driven(car, levels, lambda t: 20.0, lambda t: size * math.sin(math.tau * (0.1 + 0.016 * t) * t) * (t > 0.0))
+        return driven(SALOON, PRODUCTION, lambda t: 20.0, lambda t: size * math.sin(math.tau * (0.1 + 0.016 * t) * t) * (t > 0.0))
 
     return {
         "sweep, β up to 0.5°": sweep(math.radians(0.5) / float(np.abs(angle_of(sweep(1.0))).max())),
-        "straight motorway": driven(car, levels, lambda t: 35.0, weave),
-        "standstill": driven(car, levels, lambda t: 0.0),
-        "spin": driven(loose, levels, lambda t: 28.0, steer=ramp(4.0, 0.5, 0.06), seconds=12.0),
-        "banked curve, 10°": driven(car, levels, lambda t: 30.0, ramp(5.0, 5.0, 4.0), bank=ramp(5.0, 5.0, -math.radians(10.0))),
-        "trailer's pull": driven(car, levels, lambda t: 25.0, weave, pull=0.5),
+        "straight motorway": driven(SALOON, PRODUCTION, lambda t: 35.0, weave),
+        "standstill": driven(SALOON, PRODUCTION, lambda t: 0.0),
+        "spin": driven(loose, PRODUCTION, lambda t: 28.0, steer=ramp(4.0, 0.5, 0.06), seconds=12.0),
+        "banked curve, 10°": driven(SALOON, PRODUCTION, lambda t: 30.0, ramp(5.0, 5.0, 4.0), bank=ramp(5.0, 5.0, -math.radians(10.0))),
+        "trailer's pull": driven(SALOON, PRODUCTION, lambda t: 25.0, weave, pull=0.5),
     }
 
 
 def pulled() -> dict[str, float]:
     """By how much the trailer's pull moves the means of the inputs."""
-    car, levels = a_car(rear=0.54, compliance=0.0036), replace(SensorLevels(), reference=Reference())
-    free, held = (driven(car, levels, lambda t: 25.0, weave, pull=pull) for pull in (0.0, 0.5))
+    free, held = (driven(SALOON, PRODUCTION, lambda t: 25.0, weave, pull=pull) for pull in (0.0, 0.5))
     return {f"pull_{name}": float(np.mean(held[name] - free[name])) for name in ("yaw_rate", "ax", "ay")}
 
 
@@ -371,13 +378,11 @@ def root(errors: FloatArray) -> float:
 
 def markdown(frame: pd.DataFrame, whole: int = 0) -> str:
     """A table of a frame with its index; the first columns may be whole numbers."""
-    rows = [
-        [
-            str(name),
-            *["–" if one != one else fixed(one, 2 * (at >= whole)) if isinstance(one, float) else str(one) for at, one in enumerate(row)],
-        ]
-        for name, row in zip(frame.index, frame.values.tolist(), strict=True)
-    ]
+
+    def cell(at: int, one: Any) -> str:
+        return "–" if one != one else fixed(one, 2 * (at >= whole)) if isinstance(one, float) else str(one)
+
+    rows = [[str(name), *map(cell, range(len(row)), row)] for name, row in zip(frame.index, frame.values.tolist(), strict=True)]
     return "\n".join(table([str(frame.index.name), *map(str, frame.columns)], rows))
 
 
@@ -385,22 +390,17 @@ def report(pairs: pd.DataFrame, rows: pd.DataFrame, cars: pd.DataFrame, shifts: 
     """The page."""
     named = pairs.assign(drives=(pairs["first"] + ", " + pairs["second"]).str.replace("telemetry_", ""))
     ratios = rows.iloc[:, 3:].div(rows["cold"], axis=0)
-    by_car = np.log(ratios).groupby(rows["car"], sort=False).mean()
-    starts = np.exp(by_car).T.assign(mean=np.exp(by_car.mean()), worst=ratios.max()).rename_axis("starts from; widening")
+    by_car = ratios.apply(np.log).groupby(rows["car"], sort=False).mean()
+    starts = by_car.apply(np.exp).T.assign(mean=np.exp(by_car.mean()), worst=ratios.max()).rename_axis("starts from; widening")
     late = pd.cut(cars["delay"], [-1.0, 0.0, 0.02, 0.04, 0.06], labels=["no delay", "to 20 ms", "20 to 40 ms", "40 to 60 ms"])
     cells: dict[str, dict[str, str]] = {}
     for number in (*LIMITS, "offset_ay", "offset_ax"):
-        z = ((cars[number] - cars[f"{number}_planted"]) / cars[f"{number}_deviation"]).groupby(late, observed=True)
-        used = cars[f"{number}_identified"] > 0
-        sure = ((cars[number] - cars[f"{number}_planted"]).abs() < 1.645 * cars[f"{number}_deviation"])[used & (cars["delay"] == 0.0)]
-        cells[number] = {
-            "identified": f"{used.sum()}",
-            "of these without delay within 90 %": f"{fixed(float(sure.mean()), 2)} of {len(sure)}",
-        }
-        for title, own in z:
-            cells[number][f"{title} ({len(own)})"] = (
-                f"{fixed(own.mean(), 2)} ± {fixed(own.std(), 2)}, {fixed(float((own.abs() < 1.645).mean()), 2)}"
-            )
+        error, used = cars[number] - cars[f"{number}_planted"], cars[f"{number}_identified"] > 0
+        sure = (error.abs() < 1.645 * cars[f"{number}_deviation"])[used & (cars["delay"] == 0.0)]
+        cells[number] = {"identified": f"{used.sum()}", "of these without delay within 90 %": f"{fixed(sure.mean(), 2)} of {len(sure)}"}
+        for title, own in (error / cars[f"{number}_deviation"]).groupby(late, observed=True):
+            within = fixed((own.abs() < 1.645).mean(), 2)
+            cells[number][f"{title} ({len(own)})"] = f"{fixed(own.mean(), 2)} ± {fixed(own.std(), 2)}, {within}"
     apart = pairs[pairs["z"].abs() > 1.645]["number"]
     excess = seen["RMSE(β)"] - seen["RMSE(β), v = 0"]
     beyond, worse = seen[excess > seen["band of β, median"]]["scene"], seen[excess > 0.0]["scene"]

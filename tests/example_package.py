@@ -1,33 +1,20 @@
 """The worked examples of docs/adding_an_estimator.md as a package of their own, installed into a folder."""
 
-import shutil
 import sys
 from pathlib import Path
 
 import pandas as pd
+from compare_examples import CLASSES, install
 
 from conftest import planar_drive
 from vehest.estimators.registry import estimator_class, estimator_names
 
-EXAMPLES = Path(__file__).resolve().parents[1] / "docs" / "examples"
-CLASSES = {"saturating_ekf": "SaturatingEkf", "sliding_mode": "SlidingMode", "window_transformer": "WindowTransformer"}
 NAMES = tuple(CLASSES)
 
 
 def install_examples(folder, monkeypatch):
-    """Put modules and entry points, as pip would install them, into a new folder on sys.path, and the configuration into ./conf."""
-    about = folder / "vehest_examples-1.0.dist-info"
-    about.mkdir(parents=True)
-    (about / "METADATA").write_text("Metadata-Version: 2.1\nName: vehest-examples\nVersion: 1.0\n")
-    (about / "entry_points.txt").write_text(
-        "\n".join(["[vehest.estimators]", *(f"{name} = {name}:{kind}" for name, kind in CLASSES.items())])
-    )
-    configurations = Path("conf") / "estimator"
-    configurations.mkdir(parents=True, exist_ok=True)
-    for name in NAMES:
-        for file in (*EXAMPLES.glob(f"{name}.py"), *EXAMPLES.glob(f"{name}.c.j2")):
-            shutil.copy(file, folder)
-        shutil.copy(EXAMPLES / f"{name}.yaml", configurations)
+    """Install them into a new folder on sys.path, with their configuration in ./conf."""
+    install(folder, Path())
     monkeypatch.syspath_prepend(str(folder))
     forget_examples()
 

@@ -8,11 +8,12 @@ import numpy as np
 import pandas as pd
 import pytest
 import yaml
+from compare_examples import EXAMPLES
 from refusals import refusal
 
 import vehest
 from conftest import planar_drive
-from example_package import EXAMPLES, NAMES, forget_examples, install_examples, write_laps
+from example_package import NAMES, forget_examples, install_examples, write_laps
 from single_track_drive import linear_drive, with_gaps
 from vehest.data.errors import ConfigurationError, DataError
 from vehest.data.recording import Recording

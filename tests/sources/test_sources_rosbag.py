@@ -321,10 +321,26 @@ def real_configuration(root):
     return yaml.safe_load(CONFIGURATION.read_text(encoding="utf-8").replace("${root}", str(root)))
 
 
+def identify(car, root):
+    """Every figure that docs/identify.py prints of a car, by name."""
+    parts = runpy.run_path(str(ROOT / "docs" / "identify.py"))[car](root / car)
+    return {name: value for _, part in parts for name, value in part.items()}
+
+
+@pytest.mark.slow
+def test_declared_constants_of_tables_are_those_that_the_data_show(data_root):
+    declared = {car: yaml.safe_load((CONFIGURATION.parent / f"{car}.yaml").read_text()) for car in ("av21", "dart", "roboracer")}
+    identified = {car: identify(car, data_root) for car in declared}
+    assert declared["av21"]["transforms"][0]["wheel_radius"] == pytest.approx(identified["av21"]["wheel radius [m]"], abs=5e-5)
+    assert declared["dart"]["pose"]["yaw_offset"] == pytest.approx(identified["dart"]["body_yaw"], abs=5e-5)
+    assert declared["dart"]["held"]["delay"] == pytest.approx(1e-3 * identified["dart"]["vel encoder late [ms]"])
+    assert 1 / declared["roboracer"]["channels"]["vx"]["factor"] == pytest.approx(identified["roboracer"]["rpm for 1 m/s"], rel=1e-3)
+
+
 @pytest.mark.slow
 def test_declared_constants_are_those_that_the_data_show(data_root):
     """Within two of the standard deviations that the script prints; what the publishers' files fix exactly, to a millionth."""
-    identified = runpy.run_path(str(ROOT / "docs" / "identify_f1tenth.py"))["identify"](data_root / "f1tenth")
+    identified = identify("f1tenth", data_root)
     declared = real_configuration(data_root)
     channels, pose = declared["channels"], declared["pose"]
     assert abs(pose["yaw"] - identified["body_yaw"]) < 2 * identified["body_yaw_sd"]
@@ -334,7 +350,7 @@ def test_declared_constants_are_those_that_the_data_show(data_root):
     assert channels["steer"]["offset"] == pytest.approx(identified["servo_neutral"], abs=1e-6)
     assert channels["steer"]["factor"] == pytest.approx(identified["servo_gain"], rel=1e-6)
     assert channels["steer"]["sign"] == -np.sign(identified["servo_agreement"])
-    for name, measured in (("ax", "acc_x"), ("ay", "acc_y"), ("yaw_rate", "gyro_z")):
+    for name, measured in (("ax", "ax by forward"), ("ay", "ay by lateral"), ("yaw_rate", "gyro by turning")):
         assert channels[name].get("sign", 1) * identified[measured] == pytest.approx(1.0, abs=0.1)  # sign and unit
     assert identified["acc_z"] == pytest.approx(9.81, abs=0.05)  # z is up, in m/s²
     for name, topic in (("imu", "/imu"), ("vesc", "/vesc/core"), ("body", "/optitrack/rigid_body_0")):
