@@ -61,7 +61,7 @@ def timed(launcher: Launcher, groups: Sequence[Group]) -> dict[str, float]:
     for done in launcher.launch(groups, StopSignals(), lambda *_: begun.append(time.perf_counter())):
         if isinstance(done.outcome, Failure):
             raise SystemExit(done.outcome.message)
-        seconds.append(done.seconds)
+        seconds.append(sum(made.provenance["seconds"] for member in done.outcome for made in member.made))
         ended = time.perf_counter()
     launcher.close()
     added = (CORES * (ended - begun[0]) - sum(seconds)) / len(groups)
