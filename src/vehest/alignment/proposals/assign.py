@@ -266,7 +266,11 @@ def _turning_proposals(turning: Turning) -> Iterator[Proposal]:
                 doubt = doubt or f"it is {turning.scale:.2g} times vx·yaw_rate without a unit or clear name: it may be a velocity"
             if column.hint(channel) <= -STRONG:
                 doubt = doubt or "the motion contradicts its name"
-            yield Proposal(column.name, channel, turning.units[channel], turning.signs[channel], (evidence,), doubt)
+            unit = turning.units[channel]
+            if column.unit not in ("", unit):
+                doubt = f"by ay over vx·yaw_rate it is in {unit}, by its header in {column.unit}"
+            others = (f"{channel} {column.unit}",) if column.unit not in ("", unit) else ()
+            yield Proposal(column.name, channel, unit, turning.signs[channel], (evidence,), doubt, others=others)
 
 
 def _unconfirmed(turning: Turning, found: dict[str, Proposal]) -> dict[str, Proposal]:

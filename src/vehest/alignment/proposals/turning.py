@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 
 from vehest.alignment.motion import Motion, rms
-from vehest.alignment.proposals.columns import COMPUTED, Candidate, correlation, largest, si_factor
+from vehest.alignment.proposals.columns import COMPUTED, UNITS, Candidate, correlation, largest, si_factor
 from vehest.alignment.proposals.names import STRONG, is_filtered, is_pair, is_reference
 from vehest.alignment.proposals.proposal import Proposal
 from vehest.constants import FloatArray
@@ -160,7 +160,20 @@ def _scored(columns: Sequence[Candidate], named: Mapping[str, Candidate], agreei
         score -= 2.0
     score += 3.0 if mismatch < CLOSE else 1.0 if mismatch < FAR else -5.0
     score -= UNNAMED * (not is_evident(named["ay"], left))
-    return Turning(named, dict(zip(named, units, strict=True)), decided, agreeing, left, score)
+    found = dict(zip(named, units, strict=True))
+    others = [*_with_another_unit(named, found, left)] if mismatch > FAR else []
+    found, left = others[0] if len(others) == 1 else (found, left)
+    return Turning(named, found, decided, agreeing, left, score)
+
+
+def _with_another_unit(named: Mapping[str, Candidate], units: Mapping[str, str], scale: float) -> Iterator[tuple[dict[str, str], float]]:
+    """Units that explain the scale of ay over vx·yaw_rate where one of the header's is another one, and the scale that is left."""
+    for channel, column in named.items():
+        for unit in UNITS[channel] if column.unit and not column.is_made else ():
+            factor = si_factor(unit, channel) / si_factor(units[channel], channel)
+            left = scale * factor if channel == "ay" else scale / factor
+            if abs(math.log(left)) < CLOSE and _is_plausible(column, channel, unit):
+                yield {**units, channel: unit}, left
 
 
 class Repeat(NamedTuple):

@@ -23,12 +23,14 @@ from vehest.data.errors import ConfigurationError, DataError, VehestError
 from vehest.data.recording import Recording
 from vehest.data.recording_summary import RecordingSummary, common_channels, summary_of
 from vehest.data.runs import true_runs
+from vehest.data.units import factor_to_si
 from vehest.run.own_car.inspect import BRIDGED, EVIDENCE_HZ, RATE_TOLERANCE, TABLES, Examined, rate_of
 from vehest.run.printing import counted
 from vehest.sources.base import open_source
 from vehest.sources.clocks import plain_rate
 from vehest.sources.surveys import Log, RawColumn
 from vehest.sources.surveys.clocks import FEWEST_STEPS, MAX_GAP
+from vehest.sources.unit_spellings import plain_unit
 
 POLICIES = {"vbo": ("strict", "interpolate"), **dict.fromkeys(TABLES, ("strict", "interpolate", "uniform"))}
 """Source -> clocks of its data sets, the strictest first; other sources make their own."""
@@ -80,7 +82,7 @@ def draft(examined: Examined) -> Draft:
     longest = max(recordings, key=lambda own: own.duration)
     late, ratio, notes = late_channels(longest), None, [*proposals.notes]
     for stem, rows in dataset.get("drop_rows", {}).items():
-        why = f"beyond what a vehicle can do, or {BRIDGED:g} s and more without a sample"
+        why = f"beyond what a vehicle can do, written twice, or {BRIDGED:g} s and more without a sample"
         notes.append(f"left out of '{stem}' by drop_rows, {why}: data rows: {counted([str(row) for row in rows])}")
     if vehicle["wheelbase"] and vehicle["steering_ratio"] is None and "handwheel" in longest:
         try:
@@ -162,7 +164,8 @@ def _dataset(examined: Examined) -> dict[str, Any]:
             dataset |= {"drop_rows": named} if (named := {stem: rows for stem, rows in dropped.items() if rows}) else {}
             if any(holes.values()) and "runs" not in log.options:
                 dataset["max_gap"] = log.options.get("max_gap", MAX_GAP)
-    dataset["channels"] = {one.channel: _entry(one, columns[one.column].place) for one in proposals.channels}
+    units = {name: own.unit if log.source == "vbo" else "" for name, own in columns.items()}
+    dataset["channels"] = {one.channel: _entry(one, columns[one.column].place, units[one.column]) for one in proposals.channels}
     if proposals.pose:
         rate = rate_of(log.seconds) if log.seconds is not None else float(examined.rate_hz or EVIDENCE_HZ)
         parts = {part: {"column": column, "unit": unit} for part, column, unit in proposals.pose}
@@ -171,16 +174,22 @@ def _dataset(examined: Examined) -> dict[str, Any]:
     return dataset
 
 
-def _entry(one: Proposal, place: Mapping[str, Any]) -> dict[str, Any]:
+def _entry(one: Proposal, place: Mapping[str, Any], header: str = "") -> dict[str, Any]:
+    """A channel's entry; with a factor where it is in another unit than by the header, which its source holds against the entry."""
+    unit, factor, si = one.unit, one.factor, CHANNELS[one.channel].unit
+    if (own := plain_unit(header)) and own != unit:
+        unit, factor = own, float(f"{factor * factor_to_si(unit, si) / factor_to_si(own, si):.7g}")
     sign = {"sign": one.sign} if one.sign != 1 else {}
-    return {**place, "unit": one.unit} | sign | ({"factor": one.factor} if one.factor != 1.0 else {})
+    return {**place, "unit": unit} | sign | ({"factor": factor} if factor != 1.0 else {})
 
 
 def _stray_rows(log: Log, channels: Sequence[Proposal]) -> list[int]:
-    """Rows, from 1, in which a channel is beyond what a vehicle can do, where they are as few as spikes."""
+    """Rows, from 1, in which a channel is beyond what a vehicle can do, where they are as few as spikes, and rows written twice."""
     columns = {column.name: column.values for column in log.columns}
     beyond = np.any([one.beyond(columns[one.column]) for one in channels], axis=0)
-    return (np.flatnonzero(beyond) + 1).tolist() if beyond.mean() <= MOST_STRAY else []
+    assert log.seconds is not None
+    twice = np.all([np.diff(np.nan_to_num(own), prepend=np.nan) == 0.0 for own in (log.seconds, *columns.values())], axis=0)
+    return (np.flatnonzero(beyond & (beyond.mean() <= MOST_STRAY) | twice) + 1).tolist()
 
 
 def _has_gaps(examined: Examined, log: Log, column: str) -> bool:
@@ -213,7 +222,7 @@ def _mdf_options(columns: Mapping[str, RawColumn], proposals: Sequence[Proposal]
         rate, gap = _rate_and_gap(columns[one.column], LONGEST_GAP)
         rates.append(rate)
         paused |= gap < _rate_and_gap(columns[one.column])[1]
-        channels[one.channel] = _entry(one, columns[one.column].place)
+        channels[one.channel] = _entry(one, columns[one.column].place, columns[one.column].unit)
         if 3.0 / rate < gap:
             channels[one.channel]["max_gap"] = math.ceil(100.0 * gap) / 100.0
     pause = {"max_gap": float(f"{max(MAX_GAP, FEWEST_STEPS / min(rates)):.3g}")} if paused else {}

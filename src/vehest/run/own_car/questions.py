@@ -8,6 +8,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
+import numpy as np
 import typer
 
 from vehest.alignment.proposals.proposal import LATERAL, Proposal
@@ -20,6 +21,7 @@ from vehest.sources.surveys import Log
 from vehest.sources.surveys.clocks import UNITS
 
 LEAVE_OUT = "-"
+MOSTLY_BEYOND = 0.1  # of a column's samples beyond what a vehicle can do: leaving it out is proposed
 
 
 @dataclass(frozen=True)
@@ -63,6 +65,7 @@ def ask(examined: Examined, answers: Sequence[str] = (), *, interactive: bool) -
             examined = _ask_at_terminal(question, examined)
         else:
             left.append(question)
+            examined = _answered(examined, question, question.proposed)
     return examined, tuple(left)
 
 
@@ -80,7 +83,10 @@ def questions_of(examined: Examined) -> Iterator[Question]:
         if one.asked:
             others = tuple(other for other in one.others if other not in (one.unit, one.channel))
             hint = f"CHANNEL UNIT [SIGN [FACTOR]], or {LEAVE_OUT} to leave it out"
-            yield Question(one.column, f"column '{one.column}': {one.asked}", _declaration(one), others, one.evidence, hint)
+            values = next(own.values for own in examined.log.columns if own.name == one.column)
+            odd = np.count_nonzero(one.beyond(values)) > MOSTLY_BEYOND * np.count_nonzero(np.isfinite(values))
+            proposed = LEAVE_OUT if odd else _declaration(one)
+            yield Question(one.column, f"column '{one.column}': {one.asked}", proposed, others, one.evidence, hint)
     if proposals.wheel_radius is not None:
         text = "rolling radius of the tyres [m], by which the wheels make vx"
         yield Question("radius", text, f"{proposals.wheel_radius:g}", (), ("as it fits ay over the yaw rate, or the speed",))
@@ -114,8 +120,8 @@ def _ask_at_terminal(question: Question, examined: Examined) -> Examined:
 
 
 def _answered(examined: Examined, question: Question, answer: str) -> Examined:
-    key, answer, proposals = question.key, answer.strip(), examined.proposals
-    if answer in ("", question.proposed):
+    key, answer, proposals = question.key, answer.strip() or question.proposed, examined.proposals
+    if answer == question.proposed != LEAVE_OUT:
         return examined
     if key == "rate":
         return replace(examined, rate_hz=_number(answer, key))

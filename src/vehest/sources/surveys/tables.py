@@ -41,6 +41,8 @@ CONTROLS, MOST_CONTROLS = re.compile(rb"[\x00-\x08\x0b\x0e-\x1f]"), 0.01
 MARKS = frozenset({"-", "--", "---", "----", "–", "—", "*", "?", "n.a.", "none", "missing", "invalid", "inv", "void", "#value!", "#div/0!"})
 """What loggers and spreadsheets write where there is no sample, in lower case."""
 BRACKETED = re.compile(r"^(?P<name>.*?)[\s_]*[\[(<{](?P<unit>[^\])>}]*)[\])>}]\s*$")
+VELOCITY = re.compile(r"(.*_)?v([_xy]|lat|lon)|.*(speed|spd|velo|geschw)", re.IGNORECASE)
+"""Names that end in ms for metres a second."""
 ABBREVIATED = {"radps": "rad/s", "degps": "deg/s", "degs": "deg/s", "rads": "rad/s", "ms2": "m/s2", "mss": "m/s2", "kmh": "km/h"}
 
 
@@ -104,6 +106,8 @@ def unit_in_name(name: str) -> str:
         return bracketed["unit"].strip()
     words = re.split(r"[_\s]+", name.strip())
     last = words[-1].lower() if len(words) > 1 else ""
+    if last == "ms" and VELOCITY.match(name):
+        return "m/s"
     return ABBREVIATED.get(last) or (last if _is_unit(last) and len(last) > 1 else "")
 
 
