@@ -615,3 +615,46 @@ def test_rows_of_several_rasters_in_the_order_of_their_times_are_read(tmp_path):
     own = read_back(made)
     np.testing.assert_allclose(own["vx"], np.interp(own.time - own.time[0], d["t"], d["vx"]), atol=0.2)
     assert own.duration == pytest.approx(120.0, abs=0.2)
+
+
+@pytest.mark.parametrize(
+    ("name", "unit", "role"),
+    [
+        ("gnss_lateral_mps", "m/s", "vy_ref"),
+        ("v_kmh", "km/h", "vx"),
+        ("adma_vy_ms", "m/s", "vy_ref"),
+        ("lat_mps", "m/s", "vy_ref"),
+        ("Lateral", "m/s²", "ay"),
+    ],
+)
+def test_the_unit_says_of_what_a_name_is(name, unit, role):
+    assert max(hints(name, unit).items(), key=lambda own: own[1])[0] == role
+
+
+def test_a_speed_that_is_negative_in_reverse_is_the_speed(tmp_path):
+    d = drive()
+    back = {name: -d[name][::-1] if name in ("vx", "vy", "r") else d[name][::-1] for name in d if name != "t"}
+    d = {"t": np.arange(2 * len(d["t"])) / 50.0} | {name: np.concatenate([d[name], back[name]]) for name in back}
+    found = proposed(tmp_path, usual(d).drop(columns="Beta").assign(v_lat=d["vy"]))
+    assert {name: found[name].column for name in ("vx", "yaw_rate", "ay", "vy_ref")} == {
+        "vx": "Speed",
+        "yaw_rate": "Gyro",
+        "ay": "LatAcc",
+        "vy_ref": "v_lat",
+    }
+    assert {found[name].sign for name in ("vx", "yaw_rate", "ay", "vy_ref")} == {1}
+
+
+def test_a_speed_in_an_unknown_unit_is_scaled_by_that_of_the_reference_wherever_it_stands(tmp_path):
+    d = drive()
+    table = pd.DataFrame({"t": d["t"], "encoder": 100.0 * d["vx"], "gyro": d["r"], "mocap_vx": d["vx"], "mocap_vy": d["vy"]})
+    found = proposed(tmp_path, table)
+    assert (found["vx"].column, found["vx_ref"].column) == ("encoder", "mocap_vx")
+    assert found["vx"].factor == pytest.approx(0.01, rel=0.01)
+
+
+def test_names_in_shift_jis_are_read(tmp_path):
+    table = usual(drive()).rename(columns={"Speed": "車速[km/h]", "Gyro": "ヨーレート[deg/s]", "LatAcc": "横加速度[g]"})
+    examined = inspect("my_car", [write(tmp_path / "lap.csv", table, encoding="shift_jis")])
+    assert examined.proposals.by_channel["vx"].column == "車速[km/h]"
+    assert read_back(draft(examined))["vx"].mean() == pytest.approx(drive()["vx"].mean(), rel=1e-3)

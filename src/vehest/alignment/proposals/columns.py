@@ -104,7 +104,7 @@ def candidates(columns: Sequence[tuple[str, str, FloatArray, str]], rate_hz: flo
             continue
         known[known] = ~_stray(values[known])
         whole = values if known.all() else np.interp(np.arange(len(values)), np.flatnonzero(known), values[known])
-        found.append(Candidate(name, unit, whole, slow_of(whole, rate_hz), hints(name), device=device))
+        found.append(Candidate(name, unit, whole, slow_of(whole, rate_hz), hints(name, unit), device=device))
     return found
 
 

@@ -96,7 +96,9 @@ def turning_by_names(columns: Sequence[Candidate]) -> Turning | None:
         pool = [one for one in _pool(columns, channel) if channel in one.hints]
         if not pool:
             return None
-        named[channel] = column = max(pool, key=lambda one: (one.hints[channel], not is_filtered(one.name), bool(one.unit)))
+        named[channel] = column = max(
+            pool, key=lambda one: (channel == "vx" and _is_forward(one.slow), one.hints[channel], not is_filtered(one.name), bool(one.unit))
+        )
         offered = column.units(channel)
         units[channel] = next((unit for unit in offered if _is_plausible(column, channel, unit)), offered[0])
     is_one = named["vx"] is named["yaw_rate"]
@@ -117,7 +119,7 @@ def _pool(columns: Sequence[Candidate], channel: str) -> list[Candidate]:
         for one in own
         if one.device != COMPUTED and (channel in one.hints or all(one.hints.get(other) != STRONG for other in FOLLOWING))
     ]
-    own = [one for one in own if channel != "vx" or _is_forward(one.slow)]
+    own = [one for one in own if channel != "vx" or "vx" in one.hints or _is_forward(one.slow)]
     return sorted(own, key=lambda one: -(one.hints.get(channel) or (-1.0 if one.hints else NAMELESS)))[:MOST_COLUMNS]
 
 
@@ -237,6 +239,8 @@ def _unit(column: Candidate, first: Repeat, channel: str, agreeing: float) -> st
 
 def _scaled_speed(column: Candidate, first: Repeat) -> Iterator[Proposal]:
     """The car's own speed in counts, and the reference's by which it is scaled."""
+    if column.is_reference and not first.column.is_reference:
+        column, first = first.column, Repeat(column, UNITS["vx"][0], first.sign)
     name = first.column.name
     speed = first.column.slow * first.sign * si_factor(first.unit, "vx")
     factor = float(column.slow @ speed) / float(column.slow @ column.slow)

@@ -177,8 +177,8 @@ def _dataset(examined: Examined) -> dict[str, Any]:
 def _entry(one: Proposal, place: Mapping[str, Any], header: str = "") -> dict[str, Any]:
     """A channel's entry; with a factor where it is in another unit than by the header, which its source holds against the entry."""
     unit, factor, si = one.unit, one.factor, CHANNELS[one.channel].unit
-    if (own := plain_unit(header)) and own != unit:
-        unit, factor = own, float(f"{factor * factor_to_si(unit, si) / factor_to_si(own, si):.7g}")
+    if factor == 1.0 and (own := plain_unit(header)) and own != unit:
+        unit, factor = own, float(f"{factor_to_si(unit, si) / factor_to_si(own, si):.7g}")
     sign = {"sign": one.sign} if one.sign != 1 else {}
     return {**place, "unit": unit} | sign | ({"factor": factor} if factor != 1.0 else {})
 

@@ -9,6 +9,7 @@ import codecs
 import csv
 import re
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import asdict, dataclass, field, replace
 from functools import partial
 from itertools import pairwise
@@ -190,8 +191,10 @@ def _decoded(head: bytes, file: Path) -> tuple[str, str]:
     try:
         return "utf8", codecs.getincrementaldecoder("utf-8-sig")().decode(head, final=len(head) < HEAD)
     except UnicodeDecodeError:
-        encoding = "cp1252" if re.search(rb"[\x80-\x9f]", head) else "latin-1"
-        return encoding, head.decode(encoding, errors="replace")
+        for encoding in ("cp1252", "shift_jis") if re.search(rb"[\x80-\x9f]", head) else ():
+            with suppress(UnicodeDecodeError):
+                return encoding, codecs.getincrementaldecoder(encoding)().decode(head, final=len(head) < HEAD)
+        return "latin-1", head.decode("latin-1")
 
 
 def _columns(file: Path, shape: Shape) -> tuple[dict[str, FloatArray], dict[str, FloatArray], set[str], list[str]]:
