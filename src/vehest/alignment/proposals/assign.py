@@ -61,13 +61,14 @@ def propose(columns: Sequence[tuple[str, str, FloatArray, str]], rate_hz: float 
 
     Args:
         columns: name, unit as vehest spells it (empty where the file has none), values on an even clock, (T,) each, and ``car`` or
-            ``reference`` where the file says which of them measured it, `COMPUTED` where nothing did, else nothing.
+            ``reference`` where the file says which of them measured it, else nothing.
         rate_hz: of that clock; None where it is unknown.
         is_vbo: whether the column ``heading`` counts clockwise and longitudes to the west, as in a VBOX's log.
     """
     rate = rate_hz or NOMINAL_RATE
     found = candidates(columns, rate)
     wheels = find_wheels(found)
+    found = [one for one in found if not any(role.startswith("wheel_speed") for role in one.hints)]
     found += speed_of_wheels(found, wheels, rate)
     stands = _stands(found)
     turning = [] if stands else find_turning(found)
@@ -91,7 +92,7 @@ def propose(columns: Sequence[tuple[str, str, FloatArray, str]], rate_hz: float 
         notes += more
     clues = () if known is None else _clues(found, wheels, known, is_vbo)
     proposals = _as_most_count(_left_and_right(replace(proposals, notes=tuple(notes)), found, known, clues))
-    proposals = possible(proposals, {column.name: column.values for column in found})
+    proposals = possible(proposals, {column.name: column.values for column in (*found, *wheels.values())})
     used = {one.column for one in proposals.channels} | {column for _, column, _ in proposals.pose}
     unused = tuple(name for name, *_ in columns if name not in used)
     return replace(proposals, unused=unused, rate_hz=NOMINAL_RATE if rate_hz is None else None)
@@ -204,7 +205,6 @@ def _assigned(columns: Sequence[Candidate], search: Search | None, wheels: Wheel
         is_made = any(one.is_made for one in columns)
         made, radius = wheel_proposals(wheels, search.known if search else None, has_speed="vx" in found, is_made=is_made)
         found |= {one.channel: one for one in made}
-        free = [one for one in free if one not in wheels.values()]
     found |= {one.channel: one for one in _named_channels(free, found, moves=search is not None)}
     return Proposals(tuple(found.values()), wheel_radius=radius, notes=notes)
 

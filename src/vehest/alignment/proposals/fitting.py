@@ -11,7 +11,7 @@ import numpy as np
 from scipy.optimize import linear_sum_assignment
 
 from vehest.alignment.motion import Motion
-from vehest.alignment.proposals.columns import COMPUTED, Candidate, correlation, si_factor, slow_of
+from vehest.alignment.proposals.columns import Candidate, correlation, si_factor, slow_of
 from vehest.alignment.proposals.names import STRONG
 from vehest.alignment.proposals.proposal import Proposal
 from vehest.alignment.proposals.turning import Search
@@ -77,7 +77,7 @@ class Angle(NamedTuple):
 
 def fitting_channels(search: Search) -> tuple[dict[str, Proposal], tuple[str, ...]]:
     """The assignment with most evidence in all, and notes of columns that are left out."""
-    columns = [one for one in search.free if "other" not in one.hints and not one.is_wheel]
+    columns = list(search.free)
     offers = [[offer(search, one) for one in columns] for offer in (_as_ax, _as_steering, _as_lateral)]
     scores = np.array([[offer.score if offer else 0.0 for offer in row] for row in offers])
     pairs = zip(*linear_sum_assignment(scores, maximize=True), strict=True) if columns else ()
@@ -124,7 +124,7 @@ def _with_rivals(chosen: Offer, rivals: Sequence[Offer]) -> Proposal:
 
 def may_be_ax(column: Candidate) -> bool:
     """Whether unit and name allow a longitudinal acceleration."""
-    return column.measures("ax") and column.hint("ax") >= 0.0 and column.device != COMPUTED
+    return column.measures("ax") and column.hint("ax") >= 0.0
 
 
 def _as_ax(search: Search, column: Candidate) -> Offer | None:

@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 
 from vehest.alignment.motion import Motion, rms
-from vehest.alignment.proposals.columns import COMPUTED, UNITS, Candidate, correlation, largest, si_factor
+from vehest.alignment.proposals.columns import UNITS, Candidate, correlation, largest, si_factor
 from vehest.alignment.proposals.names import STRONG, is_filtered, is_pair, is_reference
 from vehest.alignment.proposals.proposal import Proposal
 from vehest.constants import FloatArray
@@ -113,13 +113,8 @@ def _centred(rows: FloatArray) -> tuple[FloatArray, FloatArray]:
 
 def _pool(columns: Sequence[Candidate], channel: str) -> list[Candidate]:
     """Columns that could be a channel, those whose names suggest it first."""
-    own = [one for one in columns if one.measures(channel) and "other" not in one.hints and not one.is_wheel]
-    own = [
-        one
-        for one in own
-        if one.device != COMPUTED and (channel in one.hints or all(one.hints.get(other) != STRONG for other in FOLLOWING))
-    ]
-    own = [one for one in own if channel != "vx" or "vx" in one.hints or _is_forward(one.slow)]
+    own = [one for one in columns if channel in one.hints or all(one.hints.get(other) != STRONG for other in FOLLOWING)]
+    own = [one for one in own if one.measures(channel) and (channel != "vx" or "vx" in one.hints or _is_forward(one.slow))]
     return sorted(own, key=lambda one: -(one.hints.get(channel) or (-1.0 if one.hints else NAMELESS)))[:MOST_COLUMNS]
 
 
@@ -230,7 +225,7 @@ def reference_speed(found: dict[str, Proposal]) -> dict[str, Proposal]:
 def _unit(column: Candidate, first: Repeat, channel: str, agreeing: float) -> str:
     """The unit in which a column is another one measured again; empty where it is not."""
     least = SAME_NAMED[channel] if channel in column.hints else SAME
-    if abs(agreeing) < least or column.hint(channel) < 0.0 or column.is_wheel or not column.measures(channel):
+    if abs(agreeing) < least or column.hint(channel) < 0.0 or not column.measures(channel):
         return ""
     size = rms(first.column.slow) * si_factor(first.unit, channel)
     ranked = [(abs(math.log(rms(column.slow) * si_factor(unit, channel) / size)), unit) for unit in column.units(channel)[:LIKELY]]

@@ -15,7 +15,6 @@ from typing import Any
 import numpy as np
 
 from vehest.alignment.proposals.assign import possible, propose
-from vehest.alignment.proposals.columns import COMPUTED
 from vehest.alignment.proposals.names import hints
 from vehest.alignment.proposals.proposal import Proposals
 from vehest.constants import FloatArray
@@ -208,8 +207,9 @@ def _evidence(log: Log, differences: Collection[str]) -> tuple[list[tuple[str, s
         samples, rate = samples[:, cut : cut + whole].reshape(len(samples), -1, factor).mean(axis=2), rate / factor
         samples = _busiest(samples, round(LONGEST_EVIDENCE * rate), max(round(60.0 * rate), 1))
     found = [
-        (own.name, plain_unit(own.unit) or "", values, COMPUTED if own.name in differences else own.device)
+        (own.name, plain_unit(own.unit) or "", values, own.device)
         for own, values in zip(log.columns, samples, strict=True)
+        if own.name not in differences
     ]
     return found, rate
 
