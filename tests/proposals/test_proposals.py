@@ -658,3 +658,10 @@ def test_names_in_shift_jis_are_read(tmp_path):
     examined = inspect("my_car", [write(tmp_path / "lap.csv", table, encoding="shift_jis")])
     assert examined.proposals.by_channel["vx"].column == "車速[km/h]"
     assert read_back(draft(examined))["vx"].mean() == pytest.approx(drive()["vx"].mean(), rel=1e-3)
+
+
+def test_the_sign_of_a_steering_wheel_that_follows_nothing_is_asked(tmp_path):
+    table = usual(drive()).rename(columns={"Steer": "SteeringWheelAngle [deg]"})
+    assert not proposed(tmp_path, table)["handwheel"].asked
+    table["SteeringWheelAngle [deg]"] = 40.0 * np.random.default_rng(1).standard_normal(len(table))
+    assert proposed(tmp_path, table)["handwheel"].asked

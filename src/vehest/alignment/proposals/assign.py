@@ -52,6 +52,7 @@ USUAL = {  # 99th percentile of the motion's channels, SI
     "vy_ref": (0.02, 8.0),
     "sideslip_ref": (0.002, 0.8),
 }
+UNCONFIRMED = "no other column agrees with it"
 BY_NAME_ALONE = ("motor_current", "brake_pressure_front", "brake_pressure_rear", "roll", "pitch", "roll_rate", "pitch_rate")
 """Channels that no relation is known of."""
 
@@ -238,14 +239,13 @@ def _named_channels(columns: Sequence[Candidate], held: Collection[str], *, move
 def _by_name(column: Candidate, channel: str) -> Proposal:
     """With the header's unit, or the first in which the column is of a usual size, or at least of a possible one."""
     if column.unit:
-        return Proposal(column.name, channel, column.unit, 1, ("its name and unit",), "sign", others=UNITS[channel])
+        return Proposal(column.name, channel, column.unit, 1, ("its name and unit",), f"sign: {UNCONFIRMED}", others=UNITS[channel])
     size, (low, high) = largest(column.values), USUAL[channel]
     sizes = {unit: size * si_factor(unit, channel) for unit in UNITS[channel]}
     fitting = [unit for unit, own in sizes.items() if low <= own <= high]
     fitting += [unit for unit, own in sizes.items() if own <= CHANNELS[channel].high]
     evidence = f"its name, and {size:.3g} for its 99th percentile"
-    asked = "unit and sign: nothing to hold it against"
-    return Proposal(column.name, channel, (*fitting, *sizes)[0], 1, (evidence,), asked, others=UNITS[channel])
+    return Proposal(column.name, channel, (*fitting, *sizes)[0], 1, (evidence,), f"unit and sign: {UNCONFIRMED}", others=UNITS[channel])
 
 
 def _turning_proposals(turning: Turning) -> Iterator[Proposal]:

@@ -156,11 +156,12 @@ def _as_steering(search: Search, column: Candidate) -> Offer | None:
     sign = best.sign if best.strength else (-1 if slope < 0.0 else 1)
     text = best.in_words or f"{column.name} follows yaw_rate/vx with sign {sign:+d}"
     evidence = (text, *_name_evidence(column, "steer", "handwheel"))
+    asked = "" if best.strength >= CLEAR or (best.strength and hint == STRONG) else HARDLY
     found = angles(search.known, column)
     if "handwheel" in column.hints:
         found = [one for one in found if one.channel == "handwheel"] or found
     if not found and column.hints.get("handwheel") == STRONG and column.unit:
-        return Offer(score, column, Proposal(column.name, "handwheel", column.unit, sign, evidence))
+        return Offer(score, column, Proposal(column.name, "handwheel", column.unit, sign, evidence, asked))
     if not found:
         spread = float(np.quantile(np.abs(column.values - straight), 0.995))
         unit = next((unit for unit in column.units("steer") if spread * si_factor(unit, "steer") <= CHANNELS["steer"].high), "rad")
@@ -169,7 +170,6 @@ def _as_steering(search: Search, column: Candidate) -> Offer | None:
         return Offer(score, column, Proposal(column.name, "steer", unit, sign, evidence, asked, offset=offset))
     _, channel, unit, length, reach = min(found)
     others = sorted({(one.channel, one.unit) for one in found} - {(channel, unit)})
-    asked = "" if best.strength >= CLEAR or hint == STRONG else HARDLY
     if others:
         asked = f"could be {' or '.join(f'{other} in {of_other}' for other, of_other in others)} as well"
     text = f"up to {math.degrees(reach):.3g}°"

@@ -232,7 +232,8 @@ def _table(file: Path, shape: Shape) -> pa.Table:
             return parse_table(partial(table_stream, file), shape.layout, convert)
         except DAMAGE as error:
             problem = printable(first_line(error))
-    raise DataError(f"'{file}' cannot be read as a table ({problem}); is it truncated, or are its columns aligned by blanks?")
+    why = "is it truncated, is a line of text below its rows, or are its columns aligned by blanks?"
+    raise DataError(f"'{file}' cannot be read as a table ({problem}); {why}")
 
 
 def _numbers(column: pa.ChunkedArray, decimal: str) -> tuple[FloatArray, set[str]] | None:
