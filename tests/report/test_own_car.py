@@ -88,6 +88,14 @@ def test_recordings_without_sideslip_cannot_rank(part, tmp_path):
     assert found.model is None
 
 
+def test_a_bound_that_an_estimator_goes_below_does_not_make_a_drive_silent(part):
+    rows = part.metrics[(part.metrics["metric"] == "rmse_sideslip") & (part.metrics["test_set"] == "test")]
+    bounded = pd.concat([part.metrics, rows.assign(metric="floor_cramer_rao", value=90.0)], ignore_index=True)
+    assert "cannot rank" not in said(replace(part, metrics=bounded))
+    own = bounded.assign(value=bounded["value"].where(bounded["metric"] != "rmse_sideslip", 95.0))
+    assert "tells sideslip to no better than 90° (Cramér-Rao)" in said(replace(part, metrics=own))
+
+
 def test_three_times_as_much_hard_driving_again_would_halve_the_interval(part):
     recording = read_recording(part.references["toy", "lap"])
     minutes = 0.0
