@@ -167,14 +167,12 @@ def _by_ax(search: Search, unit: str = "") -> list[Agreement]:
 
 def _speed_by_ax(columns: Sequence[Candidate], named: Turning, rate_hz: float) -> Turning:
     """The same with the speed's unit by d(vx)/dt, where a column that may be a longitudinal acceleration decides it."""
-    best = math.inf
+    found = [(CLOSE, named)]
     for unit in named.columns["vx"].units("vx"):
         turning = replace(named, units={**named.units, "vx": unit})
-        for one in _by_ax(_of(columns, turning, rate_hz)):
-            mismatch = one.mismatch + RARE.get(unit, 0.0)
-            if one.strength >= CLEAR and mismatch < min(best, CLOSE):
-                best, found = mismatch, turning
-    return named if math.isinf(best) else found
+        agreeing = [one.mismatch for one in _by_ax(_of(columns, turning, rate_hz)) if one.strength >= CLEAR]
+        found += [(mismatch + RARE.get(unit, 0.0), turning) for mismatch in agreeing]
+    return min(found, key=lambda one: one[0])[1]
 
 
 def _rate_by_ax(search: Search) -> float | None:

@@ -135,16 +135,19 @@ def _is_plausible(column: Candidate, channel: str, unit: str) -> bool:
 
 
 def _scored(columns: Sequence[Candidate], named: Mapping[str, Candidate], agreeing: float, scale: float) -> Turning:
-    """With the units that explain best a scale of ay over vx·yaw_rate in the file's units, and the score of all evidence."""
+    """With the units that explain best a scale of ay over vx·yaw_rate in the file's units, others than by the header only where these
+    are far from it, and the score of all evidence."""
     ranked = []
-    for units in product(*(column.units(channel) for channel, column in named.items())):
+    tried = [{*column.units(channel), *(() if column.is_made else UNITS[channel])} for channel, column in named.items()]
+    for units in product(*tried):
         speed, rate, acceleration = (si_factor(unit, channel) for unit, channel in zip(units, named, strict=True))
         left = scale / (speed * rate / acceleration)
         implausible = sum(not _is_plausible(column, channel, unit) for (channel, column), unit in zip(named.items(), units, strict=True))
-        rare = 0.0 if named["vx"].unit else RARE.get(units[0], 0.0)
-        ranked.append((abs(math.log(left)) + rare + implausible, abs(math.log(left)), units, left, implausible))
+        rare = 0.0 if named["vx"].unit == units[0] else RARE.get(units[0], 0.0)
+        against = sum(column.unit not in ("", unit) for column, unit in zip(named.values(), units, strict=True))
+        ranked.append((abs(math.log(left)) + rare + implausible + against, abs(math.log(left)), units, left, implausible, against))
     ranked.sort()
-    cost, mismatch, units, left, implausible = ranked[0]
+    cost, mismatch, units, left, implausible, against = ranked[0]
     decided = mismatch < FAR and (len(ranked) == 1 or ranked[1][0] - cost > APART)
     score = 12.0 * (abs(agreeing) - LEAST_CORRELATION) / (1.0 - LEAST_CORRELATION)
     for channel, one in named.items():
@@ -155,22 +158,9 @@ def _scored(columns: Sequence[Candidate], named: Mapping[str, Candidate], agreei
     level = np.abs(named["vx"].slow)
     if float(np.std(level)) < 0.05 * float(np.mean(level)) and "vx" not in named["vx"].hints:
         score -= 2.0
-    score += 3.0 if mismatch < CLOSE else 1.0 if mismatch < FAR else -5.0
+    score += -5.0 if against or mismatch >= FAR else 3.0 if mismatch < CLOSE else 1.0
     score -= UNNAMED * (not is_evident(named["ay"], left))
-    found = dict(zip(named, units, strict=True))
-    others = [*_with_another_unit(named, found, left)] if mismatch > FAR else []
-    found, left = others[0] if len(others) == 1 else (found, left)
-    return Turning(named, found, decided, agreeing, left, score)
-
-
-def _with_another_unit(named: Mapping[str, Candidate], units: Mapping[str, str], scale: float) -> Iterator[tuple[dict[str, str], float]]:
-    """Units that explain the scale of ay over vx·yaw_rate where one of the header's is another one, and the scale that is left."""
-    for channel, column in named.items():
-        for unit in UNITS[channel] if column.unit and not column.is_made else ():
-            factor = si_factor(unit, channel) / si_factor(units[channel], channel)
-            left = scale * factor if channel == "ay" else scale / factor
-            if abs(math.log(left)) < CLOSE and _is_plausible(column, channel, unit):
-                yield {**units, channel: unit}, left
+    return Turning(named, dict(zip(named, units, strict=True)), decided, agreeing, left, score)
 
 
 class Repeat(NamedTuple):

@@ -41,6 +41,7 @@ LEAST_NUMBERS = 0.5  # share of a row's cells that are numbers or empty
 CONTROLS, MOST_CONTROLS = re.compile(rb"[\x00-\x08\x0b\x0e-\x1f]"), 0.01
 MARKS = frozenset({"-", "--", "---", "----", "–", "—", "*", "?", "n.a.", "none", "missing", "invalid", "inv", "void", "#value!", "#div/0!"})
 """What loggers and spreadsheets write where there is no sample, in lower case."""
+NUMBER = re.compile(r"\s*[+-]?(\d+\.?\d*(e[+-]?\d+)?|\.\d+(e[+-]?\d+)?|nan|inf(inity)?)\s*", re.IGNORECASE)
 BRACKETED = re.compile(r"^(?P<name>.*?)[\s_]*[\[(<{](?P<unit>[^\])>}]*)[\])>}]\s*$")
 VELOCITY = re.compile(r"(.*_)?v([_xy]|lat|lon)|.*(speed|spd|velo|geschw)", re.IGNORECASE)
 """Names that end in ms for metres a second."""
@@ -162,13 +163,7 @@ def _share(row: Sequence[str], decimal: str) -> float:
 
 def _is_number(cell: str, decimal: str) -> bool:
     text = cell.strip().strip('"')
-    if "_" in text or (decimal == "," and "." in text):
-        return False
-    try:
-        float(text.replace(decimal, "."))
-    except ValueError:
-        return False
-    return True
+    return bool(NUMBER.fullmatch(text.replace(decimal, "."))) and not (decimal == "," and "." in text)
 
 
 def _are_units(cells: Sequence[str]) -> bool:

@@ -79,7 +79,7 @@ def _floors(artefacts: PartArtefacts) -> list[str]:
         if math.isnan(bound):
             continue
         level = _level(artefacts, spans)
-        if bound > SILENT * level:
+        if min(bound, error) > SILENT * level:
             found.append(
                 f"Test set `{test_set}` is a silent drive: what the estimators read tells sideslip to no better than {bound:.2g}° "
                 f"(Cramér-Rao), and v = 0 errs by {level:.2g}°; it cannot rank estimators."
