@@ -96,9 +96,8 @@ def turning_by_names(columns: Sequence[Candidate]) -> Turning | None:
         pool = [one for one in _pool(columns, channel) if channel in one.hints]
         if not pool:
             return None
-        named[channel] = column = max(
-            pool, key=lambda one: (channel == "vx" and _is_forward(one.slow), one.hints[channel], not is_filtered(one.name), bool(one.unit))
-        )
+        ahead = [one for one in pool if channel == "vx" and _is_forward(one.slow)]
+        named[channel] = column = max(ahead or pool, key=lambda one: (one.hints[channel], not is_filtered(one.name), bool(one.unit)))
         offered = column.units(channel)
         units[channel] = next((unit for unit in offered if _is_plausible(column, channel, unit)), offered[0])
     is_one = named["vx"] is named["yaw_rate"]

@@ -160,8 +160,8 @@ def _notes(longest: Log, logs: Sequence[Log]) -> Iterator[str]:
     if len(longest.skipped) > MOST_LISTED:
         yield f"not read: {len(longest.skipped) - MOST_LISTED} more"
     for log in logs:
-        for run in log.runs if log.seconds is not None else ():
-            stamps = log.seconds[run]
+        for run in log.runs:
+            stamps = np.empty(0) if log.seconds is None else log.seconds[run]
             steps = np.diff(stamps)
             if steps.max(initial=0.0) > BRIDGED:
                 start = stamps[np.argmax(steps)]

@@ -84,8 +84,7 @@ def questions_of(examined: Examined) -> Iterator[Question]:
             others = tuple(other for other in one.others if other not in (one.unit, one.channel))
             hint = f"CHANNEL UNIT [SIGN [FACTOR]], or {LEAVE_OUT} to leave it out"
             values = next(own.values for own in examined.log.columns if own.name == one.column)
-            odd = np.count_nonzero(one.beyond(values)) > MOSTLY_BEYOND * np.count_nonzero(np.isfinite(values))
-            proposed = LEAVE_OUT if odd else _declaration(one)
+            proposed = LEAVE_OUT if float(one.beyond(values)[np.isfinite(values)].mean()) > MOSTLY_BEYOND else _declaration(one)
             yield Question(one.column, f"column '{one.column}': {one.asked}", proposed, others, one.evidence, hint)
     if proposals.wheel_radius is not None:
         text = "rolling radius of the tyres [m], by which the wheels make vx"
