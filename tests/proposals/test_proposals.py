@@ -660,6 +660,17 @@ def test_names_in_shift_jis_are_read(tmp_path):
     assert read_back(draft(examined))["vx"].mean() == pytest.approx(drive()["vx"].mean(), rel=1e-3)
 
 
+def test_a_column_that_run_would_refuse_in_the_second_file_is_left_out_unless_answered(tmp_path):
+    d = drive()
+    table = usual(d).assign(Steer=np.degrees(d["steer"])).rename(columns={"Steer": "RoadWheel [deg]"})
+    write(tmp_path / "lap_1.csv", table)
+    other = table[:5000].copy()
+    other.loc[100:200, "RoadWheel [deg]"] = 170.0
+    examined = inspect("my_car", [tmp_path / "lap_1.csv", write(tmp_path / "lap_2.csv", other)])
+    assert {question.key: question.proposed for question in questions_of(examined)}["RoadWheel [deg]"] == "-"
+    assert "steer" not in draft(ask(examined, interactive=False)[0]).channels
+
+
 def test_the_sign_of_a_steering_wheel_that_follows_nothing_is_asked(tmp_path):
     table = usual(drive()).rename(columns={"Steer": "SteeringWheelAngle [deg]"})
     assert not proposed(tmp_path, table)["handwheel"].asked

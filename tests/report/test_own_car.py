@@ -77,6 +77,7 @@ def test_share_that_is_scored_and_sideslip_hidden_in_the_start_of_a_range(part, 
 def test_nothing_is_recommended_that_does_not_beat_the_static_map(part):
     words = said(without(part, "luenberger", "gru", "ksnn"))
     assert words.startswith("**Nothing beats Static map here**")
+    assert ": none that learns was compared." in words
 
 
 def test_recordings_without_sideslip_cannot_rank(part, tmp_path):

@@ -103,7 +103,9 @@ def verdict_of(part: PartArtefacts, test_set: str) -> Verdict:
     if ranking.winner is not None:
         words = f"**Use {titles[name]}.** Expected {expected}."
     elif ranking.order[0][0] in PLAIN:
-        words = f"**Nothing beats {titles[name]} here**, which has {expected}: no estimator that learns is worth its while on these data."
+        none = "no estimator that learns is worth its while on these data"
+        why = none if any(other not in PLAIN for other, *_ in ranking.order) else "none that learns was compared"
+        words = f"**Nothing beats {titles[name]} here**, which has {expected}: {why}."
     elif level:
         others = listed(level) if len(level) <= 6 else f"{len(level)} others"
         words = (

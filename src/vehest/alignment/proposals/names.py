@@ -80,7 +80,6 @@ _EXPLAINED = {
 }
 """Role -> roles that a part of its names suggests: the yaw in a yaw rate is no heading."""
 _QUANTITIES = {**dict.fromkeys(("m/s", "km/h", "mph", "knots"), "vel"), **dict.fromkeys(("m/s²", "g"), "acc")}
-_PLACES = ("heading", "latitude", "longitude", "position_x", "position_y")
 _WITHOUT_UNIT = re.compile(r" (km?p?h|mp[hs]|ms|kts?|kn|ms2|mps2)$")
 _PLAIN = str.maketrans({"ä": "ae", "ö": "oe", "ü": "ue", "Ä": "Ae", "Ö": "Oe", "Ü": "Ue", "ß": "ss", "ψ": "psi", "β": "beta", "δ": "delta"})
 _PAIRS = (("x", "y"), ("u", "v"), ("long", "lat"), ("lng", "lat"), ("lon", "lat"), ("laengs", "quer"))
@@ -117,7 +116,7 @@ def hints(name: str, unit: str = "") -> dict[str, float]:
     if is_other or (_STEERING_RATE.search(compact) and "yaw_rate" not in strong):
         return {"other": STRONG}
     parts = {part for role in strong for part in _EXPLAINED.get(role, ()) if role != "vx" or part not in strong}
-    parts |= {"other", *(_PLACES if unit in _QUANTITIES else ())}
+    parts |= {"other", *(("heading", "latitude", "longitude", "position_x", "position_y") if unit in _QUANTITIES else ())}
     return {role: strength for role, strength in found.items() if role not in parts}
 
 

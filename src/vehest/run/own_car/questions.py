@@ -8,9 +8,9 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
-import numpy as np
 import typer
 
+from vehest.alignment.proposals.assign import MOST_BEYOND
 from vehest.alignment.proposals.proposal import LATERAL, Proposal
 from vehest.data.channels import CHANNELS, channel
 from vehest.data.errors import ConfigurationError, DataError, printable
@@ -21,7 +21,6 @@ from vehest.sources.surveys import Log
 from vehest.sources.surveys.clocks import UNITS
 
 LEAVE_OUT = "-"
-MOSTLY_BEYOND = 0.1  # of a column's samples beyond what a vehicle can do: leaving it out is proposed
 
 
 @dataclass(frozen=True)
@@ -83,8 +82,8 @@ def questions_of(examined: Examined) -> Iterator[Question]:
         if one.asked:
             others = tuple(other for other in one.others if other not in (one.unit, one.channel))
             hint = f"CHANNEL UNIT [SIGN [FACTOR]], or {LEAVE_OUT} to leave it out"
-            values = next(own.values for own in examined.log.columns if own.name == one.column)
-            proposed = LEAVE_OUT if float(one.beyond(values)[np.isfinite(values)].mean()) > MOSTLY_BEYOND else _declaration(one)
+            beyond = max(one.beyond(own.values).mean() for log in examined.logs for own in log.columns if own.name == one.column)
+            proposed = LEAVE_OUT if beyond > MOST_BEYOND else _declaration(one)
             yield Question(one.column, f"column '{one.column}': {one.asked}", proposed, others, one.evidence, hint)
     if proposals.wheel_radius is not None:
         text = "rolling radius of the tyres [m], by which the wheels make vx"
