@@ -41,7 +41,7 @@ LEAST_NUMBERS = 0.5  # share of a row's cells that are numbers or empty
 CONTROLS, MOST_CONTROLS = re.compile(rb"[\x00-\x08\x0b\x0e-\x1f]"), 0.01
 MARKS = frozenset({"-", "--", "---", "----", "–", "—", "*", "?", "n.a.", "none", "missing", "invalid", "inv", "void", "#value!", "#div/0!"})
 """What loggers and spreadsheets write where there is no sample, in lower case."""
-NUMBER = re.compile(r"\s*[+-]?(\d+\.?\d*(e[+-]?\d+)?|\.\d+(e[+-]?\d+)?|nan|inf(inity)?)\s*", re.IGNORECASE)
+NUMBER = re.compile(r"\s*[+-]?((\d+(\.\d*)?|\.\d+)(e[+-]?\d+)?|nan|inf(inity)?)\s*", re.IGNORECASE)
 BRACKETED = re.compile(r"^(?P<name>.*?)[\s_]*[\[(<{](?P<unit>[^\])>}]*)[\])>}]\s*$")
 VELOCITY = re.compile(r"(.*_)?v([_xy]|lat|lon)|.*(speed|spd|velo|geschw)", re.IGNORECASE)
 """Names that end in ms for metres a second."""
