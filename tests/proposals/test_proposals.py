@@ -19,10 +19,11 @@ from vehest.data.errors import DataError, MissingError, VehestError
 from vehest.data.transforms import Resample
 from vehest.run.own_car.dataset import draft
 from vehest.run.own_car.inspect import inspect
-from vehest.run.own_car.questions import questions_of
+from vehest.run.own_car.questions import ask, questions_of
 from vehest.run.own_car.write import write as write_files
 from vehest.sources.base import open_source
 from vehest.sources.surveys import survey
+from vehest.sources.surveys.tables import unit_in_name
 
 
 def proposals_of(tmp_path, table, **options):
@@ -560,3 +561,118 @@ def test_a_speedometer_that_reads_too_much_is_asked_where_wheels_agree(tmp_path,
     too_much = excess > 1.0
     assert ("5 % too much by the wheels" in found["vx"].asked, "vx km/h +1 0.952" in found["vx"].others) == (too_much, too_much)
     assert any("too much by ay over yaw_rate" in note for note in proposals_of(tmp_path, table).notes) == too_much
+
+
+@pytest.mark.parametrize("suffix", [".csv", ".vbo", ".mf4"])
+def test_a_unit_in_the_header_that_the_motion_contradicts_is_asked_and_the_motions_is_read(tmp_path, suffix):
+    d = drive()
+    table = usual(d).assign(Gyro=d["r"])
+    if suffix == ".csv":
+        table = table.rename(columns={"Speed": "Speed [km/h]", "Gyro": "Gyro [deg/s]", "LatAcc": "LatAcc [g]"})
+    examined = inspect("my_car", [written(tmp_path / f"lap{suffix}", table)])
+    found = examined.proposals.by_channel
+    assert (found["yaw_rate"].unit, found["vx"].unit, found["ay"].unit) == ("rad/s", "km/h", "g")
+    assert "by its header in deg/s" in found["yaw_rate"].asked
+    assert (found["vx"].asked, found["ay"].asked) == ("", "")
+    own = read_back(draft(examined))
+    np.testing.assert_allclose(own["yaw_rate"], np.interp(own.time - own.time[0], d["t"], d["r"]), atol=1e-4)
+
+
+def test_rows_that_are_written_twice_are_left_out_and_said(tmp_path):
+    table = usual(drive())
+    table = pd.concat([table[:1000], table[999:1000], table[1000:]], ignore_index=True)
+    made = drafted(tmp_path, table)
+    assert made.dataset["drop_rows"] == {"lap": [1001]}
+    assert any("written twice" in note for note in made.notes)
+    assert len(read_back(made)) == len(table) - 1
+
+
+def test_a_steering_command_in_counts_is_left_out_unless_its_scale_is_answered(tmp_path):
+    d = drive()
+    counts = np.round(1500.0 + 8000.0 * d["steer"])
+    examined = inspect("my_car", [write(tmp_path / "lap.csv", usual(d).drop(columns="Steer").assign(steer_us=counts))])
+    taken, left = ask(examined, interactive=False)
+    assert {question.key: question.proposed for question in left}["steer_us"] == "-"
+    assert "steer" not in draft(taken).channels
+    made = draft(ask(examined, ["steer_us=steer rad 1 0.000125"], interactive=False)[0])
+    assert np.corrcoef(read_back(made)["steer"], d["steer"])[0, 1] > 0.99
+    assert np.abs(read_back(made)["steer"] - d["steer"]).max() < 0.01
+
+
+@pytest.mark.parametrize(("name", "unit"), [("vy_ms", "m/s"), ("speed_ms", "m/s"), ("gps_v_ms", "m/s"), ("valve_ms", "ms")])
+def test_ms_behind_the_name_of_a_velocity_are_metres_a_second(name, unit):
+    assert unit_in_name(name) == unit
+
+
+def test_rows_of_several_rasters_in_the_order_of_their_times_are_read(tmp_path):
+    d = drive()
+    table = usual(d)
+    slow = table[["Time [s]", "Speed", "Beta"]][::2]
+    slow = slow.assign(**{"Time [s]": slow["Time [s]"] + 0.003})
+    mixed = pd.concat([table.drop(columns=["Speed", "Beta"]), slow]).sort_values("Time [s]")
+    made = drafted(tmp_path, mixed)
+    assert {"vx", "yaw_rate", "ay", "ax", "vy_ref"} <= made.channels
+    own = read_back(made)
+    np.testing.assert_allclose(own["vx"], np.interp(own.time - own.time[0], d["t"], d["vx"]), atol=0.2)
+    assert own.duration == pytest.approx(120.0, abs=0.2)
+
+
+@pytest.mark.parametrize(
+    ("name", "unit", "role"),
+    [
+        ("gnss_lateral_mps", "m/s", "vy_ref"),
+        ("v_kmh", "km/h", "vx"),
+        ("adma_vy_ms", "m/s", "vy_ref"),
+        ("lat_mps", "m/s", "vy_ref"),
+        ("Lateral", "m/s²", "ay"),
+    ],
+)
+def test_the_unit_says_of_what_a_name_is(name, unit, role):
+    assert max(hints(name, unit).items(), key=lambda own: own[1])[0] == role
+
+
+def test_a_speed_that_is_negative_in_reverse_is_the_speed(tmp_path):
+    d = drive()
+    back = {name: -d[name][::-1] if name in ("vx", "vy", "r") else d[name][::-1] for name in d if name != "t"}
+    d = {"t": np.arange(2 * len(d["t"])) / 50.0} | {name: np.concatenate([d[name], back[name]]) for name in back}
+    found = proposed(tmp_path, usual(d).drop(columns="Beta").assign(v_lat=d["vy"]))
+    assert {name: found[name].column for name in ("vx", "yaw_rate", "ay", "vy_ref")} == {
+        "vx": "Speed",
+        "yaw_rate": "Gyro",
+        "ay": "LatAcc",
+        "vy_ref": "v_lat",
+    }
+    assert {(found[name].sign, found[name].asked) for name in ("vx", "yaw_rate", "ay", "vy_ref")} == {(1, "")}
+
+
+def test_a_speed_in_an_unknown_unit_is_scaled_by_that_of_the_reference_wherever_it_stands(tmp_path):
+    d = drive()
+    table = pd.DataFrame({"t": d["t"], "encoder": 100.0 * d["vx"], "gyro": d["r"], "mocap_vx": d["vx"], "mocap_vy": d["vy"]})
+    found = proposed(tmp_path, table)
+    assert (found["vx"].column, found["vx_ref"].column) == ("encoder", "mocap_vx")
+    assert found["vx"].factor == pytest.approx(0.01, rel=0.01)
+
+
+def test_names_in_shift_jis_are_read(tmp_path):
+    table = usual(drive()).rename(columns={"Speed": "車速[km/h]", "Gyro": "ヨーレート[deg/s]", "LatAcc": "横加速度[g]"})
+    examined = inspect("my_car", [write(tmp_path / "lap.csv", table, encoding="shift_jis")])
+    assert examined.proposals.by_channel["vx"].column == "車速[km/h]"
+    assert read_back(draft(examined))["vx"].mean() == pytest.approx(drive()["vx"].mean(), rel=1e-3)
+
+
+def test_a_column_that_run_would_refuse_in_the_second_file_is_left_out_unless_answered(tmp_path):
+    d = drive()
+    table = usual(d).assign(Steer=np.degrees(d["steer"])).rename(columns={"Steer": "RoadWheel [deg]"})
+    write(tmp_path / "lap_1.csv", table)
+    other = table[:5000].copy()
+    other.loc[100:200, "RoadWheel [deg]"] = 170.0
+    examined = inspect("my_car", [tmp_path / "lap_1.csv", write(tmp_path / "lap_2.csv", other)])
+    assert {question.key: question.proposed for question in questions_of(examined)}["RoadWheel [deg]"] == "-"
+    assert "steer" not in draft(ask(examined, interactive=False)[0]).channels
+
+
+def test_the_sign_of_a_steering_wheel_that_follows_nothing_is_asked(tmp_path):
+    table = usual(drive()).rename(columns={"Steer": "SteeringWheelAngle [deg]"})
+    assert not proposed(tmp_path, table)["handwheel"].asked
+    table["SteeringWheelAngle [deg]"] = 40.0 * np.random.default_rng(1).standard_normal(len(table))
+    assert proposed(tmp_path, table)["handwheel"].asked

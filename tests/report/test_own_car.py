@@ -77,6 +77,7 @@ def test_share_that_is_scored_and_sideslip_hidden_in_the_start_of_a_range(part, 
 def test_nothing_is_recommended_that_does_not_beat_the_static_map(part):
     words = said(without(part, "luenberger", "gru", "ksnn"))
     assert words.startswith("**Nothing beats Static map here**")
+    assert ": none that learns was compared." in words
 
 
 def test_recordings_without_sideslip_cannot_rank(part, tmp_path):
@@ -86,6 +87,14 @@ def test_recordings_without_sideslip_cannot_rank(part, tmp_path):
     found = verdict_of(replace(part, references={("toy", "lap"): file}), "test")
     assert found[0][0].startswith("**These recordings cannot rank estimators**, because they hardly excite sideslip (")
     assert found[1] is None
+
+
+def test_a_bound_that_an_estimator_goes_below_does_not_make_a_drive_silent(part):
+    rows = part.metrics[(part.metrics["metric"] == "rmse_sideslip") & (part.metrics["test_set"] == "test")]
+    bounded = pd.concat([part.metrics, rows.assign(metric="floor_cramer_rao", value=90.0)], ignore_index=True)
+    assert "cannot rank" not in said(replace(part, metrics=bounded))
+    own = bounded.assign(value=bounded["value"].where(bounded["metric"] != "rmse_sideslip", 95.0))
+    assert "tells sideslip to no better than 90° (Cramér-Rao)" in said(replace(part, metrics=own))
 
 
 def test_three_times_as_much_hard_driving_again_would_halve_the_interval(part):

@@ -13,7 +13,7 @@ _SPELLINGS = {
     **dict.fromkeys(("m/s", "mps", "m/sec", "ms-1", "ms^-1"), "m/s"),
     **dict.fromkeys(("km/h", "kmh", "kph", "km/hr", "kmph", "kmh-1", "kmh^-1"), "km/h"),
     **dict.fromkeys(("mph", "mi/h", "mile/h", "miles/h"), "mph"),
-    **dict.fromkeys(("kt", "kts", "knot", "knots"), "knots"),
+    **dict.fromkeys(("kt", "kts", "knot", "knots", "knoten", "noeuds", "nœuds"), "knots"),
     **dict.fromkeys(("m/s²", "m/s^2", "m/s2", "m/s/s", "m/sec^2", "m/sec²", "m/sec2", "mps2", "ms-2", "ms^-2"), "m/s²"),
     **dict.fromkeys(("g", "gn", "g0"), "g"),
     **dict.fromkeys(("rad", "radian", "radians"), "rad"),
@@ -35,7 +35,7 @@ _SPELLINGS = {
     **dict.fromkeys(("m", "meter", "metre"), "m"),
     **dict.fromkeys(("mm", "cm", "km", "mv", "ma", "hpa", "mbar", "hz", "kg", "ms", "s"), "another unit"),
 }
-_CASES = {"kN": "kN", "Mpa": "MPa", "mPa": "another unit"}  # where upper and lower case differ in meaning
+_CASES = {"kN": "kN", "kn": "knots", "Mpa": "MPa", "mPa": "another unit"}  # where upper and lower case differ in meaning
 
 
 def plain_unit(text: str) -> str | None:

@@ -52,6 +52,7 @@ USUAL = {  # 99th percentile of the motion's channels, SI
     "vy_ref": (0.02, 8.0),
     "sideslip_ref": (0.002, 0.8),
 }
+UNCONFIRMED = "no other column agrees with it"
 BY_NAME_ALONE = ("motor_current", "brake_pressure_front", "brake_pressure_rear", "roll", "pitch", "roll_rate", "pitch_rate")
 """Channels that no relation is known of."""
 
@@ -61,13 +62,14 @@ def propose(columns: Sequence[tuple[str, str, FloatArray, str]], rate_hz: float 
 
     Args:
         columns: name, unit as vehest spells it (empty where the file has none), values on an even clock, (T,) each, and ``car`` or
-            ``reference`` where the file says which of them measured it, `COMPUTED` where nothing did, else nothing.
+            ``reference`` where the file says which of them measured it, else nothing.
         rate_hz: of that clock; None where it is unknown.
         is_vbo: whether the column ``heading`` counts clockwise and longitudes to the west, as in a VBOX's log.
     """
     rate = rate_hz or NOMINAL_RATE
     found = candidates(columns, rate)
     wheels = find_wheels(found)
+    found = [one for one in found if not any(role.startswith("wheel_speed") for role in one.hints)]
     found += speed_of_wheels(found, wheels, rate)
     stands = _stands(found)
     turning = [] if stands else find_turning(found)
@@ -91,7 +93,7 @@ def propose(columns: Sequence[tuple[str, str, FloatArray, str]], rate_hz: float 
         notes += more
     clues = () if known is None else _clues(found, wheels, known, is_vbo)
     proposals = _as_most_count(_left_and_right(replace(proposals, notes=tuple(notes)), found, known, clues))
-    proposals = possible(proposals, {column.name: column.values for column in found})
+    proposals = possible(proposals, {column.name: column.values for column in (*found, *wheels.values())})
     used = {one.column for one in proposals.channels} | {column for _, column, _ in proposals.pose}
     unused = tuple(name for name, *_ in columns if name not in used)
     return replace(proposals, unused=unused, rate_hz=NOMINAL_RATE if rate_hz is None else None)
@@ -165,14 +167,12 @@ def _by_ax(search: Search, unit: str = "") -> list[Agreement]:
 
 def _speed_by_ax(columns: Sequence[Candidate], named: Turning, rate_hz: float) -> Turning:
     """The same with the speed's unit by d(vx)/dt, where a column that may be a longitudinal acceleration decides it."""
-    best = math.inf
+    found = [(CLOSE, named)]
     for unit in named.columns["vx"].units("vx"):
         turning = replace(named, units={**named.units, "vx": unit})
-        for one in _by_ax(_of(columns, turning, rate_hz)):
-            mismatch = one.mismatch + RARE.get(unit, 0.0)
-            if one.strength >= CLEAR and mismatch < min(best, CLOSE):
-                best, found = mismatch, turning
-    return named if math.isinf(best) else found
+        agreeing = [one.mismatch for one in _by_ax(_of(columns, turning, rate_hz)) if one.strength >= CLEAR]
+        found += [(mismatch + RARE.get(unit, 0.0), turning) for mismatch in agreeing]
+    return min(found, key=lambda one: one[0])[1]
 
 
 def _rate_by_ax(search: Search) -> float | None:
@@ -204,7 +204,6 @@ def _assigned(columns: Sequence[Candidate], search: Search | None, wheels: Wheel
         is_made = any(one.is_made for one in columns)
         made, radius = wheel_proposals(wheels, search.known if search else None, has_speed="vx" in found, is_made=is_made)
         found |= {one.channel: one for one in made}
-        free = [one for one in free if one not in wheels.values()]
     found |= {one.channel: one for one in _named_channels(free, found, moves=search is not None)}
     return Proposals(tuple(found.values()), wheel_radius=radius, notes=notes)
 
@@ -238,14 +237,13 @@ def _named_channels(columns: Sequence[Candidate], held: Collection[str], *, move
 def _by_name(column: Candidate, channel: str) -> Proposal:
     """With the header's unit, or the first in which the column is of a usual size, or at least of a possible one."""
     if column.unit:
-        return Proposal(column.name, channel, column.unit, 1, ("its name and unit",), "sign", others=UNITS[channel])
+        return Proposal(column.name, channel, column.unit, 1, ("its name and unit",), f"sign: {UNCONFIRMED}", others=UNITS[channel])
     size, (low, high) = largest(column.values), USUAL[channel]
     sizes = {unit: size * si_factor(unit, channel) for unit in UNITS[channel]}
     fitting = [unit for unit, own in sizes.items() if low <= own <= high]
     fitting += [unit for unit, own in sizes.items() if own <= CHANNELS[channel].high]
     evidence = f"its name, and {size:.3g} for its 99th percentile"
-    asked = "unit and sign: nothing to hold it against"
-    return Proposal(column.name, channel, (*fitting, *sizes)[0], 1, (evidence,), asked, others=UNITS[channel])
+    return Proposal(column.name, channel, (*fitting, *sizes)[0], 1, (evidence,), f"unit and sign: {UNCONFIRMED}", others=UNITS[channel])
 
 
 def _turning_proposals(turning: Turning) -> Iterator[Proposal]:
@@ -266,7 +264,11 @@ def _turning_proposals(turning: Turning) -> Iterator[Proposal]:
                 doubt = doubt or f"it is {turning.scale:.2g} times vx·yaw_rate without a unit or clear name: it may be a velocity"
             if column.hint(channel) <= -STRONG:
                 doubt = doubt or "the motion contradicts its name"
-            yield Proposal(column.name, channel, turning.units[channel], turning.signs[channel], (evidence,), doubt)
+            unit = turning.units[channel]
+            if column.unit not in ("", unit):
+                doubt = f"by ay over vx·yaw_rate it is in {unit}, by its header in {column.unit}"
+            others = (f"{channel} {column.unit}",) if column.unit not in ("", unit) else ()
+            yield Proposal(column.name, channel, unit, turning.signs[channel], (evidence,), doubt, others=others)
 
 
 def _unconfirmed(turning: Turning, found: dict[str, Proposal]) -> dict[str, Proposal]:

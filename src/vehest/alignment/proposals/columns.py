@@ -25,8 +25,6 @@ MOST_STRAY = 0.002
 LONG = 1000  # samples
 FEWEST_LEVELS = 9  # values that a motion takes; a gear or a flag takes fewer
 
-COMPUTED = "computed"
-
 UNITS = {  # where the header is silent, the likeliest first
     "vx": ("m/s", "km/h", "mph", "knots"),
     "yaw_rate": ("rad/s", "deg/s"),
@@ -49,12 +47,7 @@ class Candidate:
     slow: FloatArray  # low-passed, at `KEPT_HZ` or less, (S,)
     hints: Mapping[str, float]  # role -> strength with which the name suggests it
     is_made: bool = False  # whether it is the mean of wheels, and no column of the log
-    device: str = ""  # ``car`` or ``reference`` where the file says which of them measured it, `COMPUTED` where nothing did
-
-    @property
-    def is_wheel(self) -> bool:
-        """Whether its name suggests the speed of a wheel."""
-        return any(role.startswith("wheel_speed") for role in self.hints)
+    device: str = ""  # ``car`` or ``reference`` where the file says which of them measured it
 
     @cached_property
     def size(self) -> float:
@@ -99,12 +92,13 @@ def candidates(columns: Sequence[tuple[str, str, FloatArray, str]], rate_hz: flo
         known = np.isfinite(values) & (np.abs(values) < 1e15)
         if 1.0 - known.mean() > MOST_MISSING or not np.ptp(values[known]) > 0.0 or len(np.unique(values[known][:200_000])) < FEWEST_LEVELS:
             continue
+        roles = hints(name, unit)
         only_grows = len(values) > LONG and np.min(np.diff(values[known])) >= 0.0
-        if only_grows and not {"latitude", "longitude", "position_x", "position_y"} & set(hints(name)):
+        if "other" in roles or (only_grows and not {"latitude", "longitude", "position_x", "position_y"} & set(roles)):
             continue
         known[known] = ~_stray(values[known])
         whole = values if known.all() else np.interp(np.arange(len(values)), np.flatnonzero(known), values[known])
-        found.append(Candidate(name, unit, whole, slow_of(whole, rate_hz), hints(name), device=device))
+        found.append(Candidate(name, unit, whole, slow_of(whole, rate_hz), roles, device=device))
     return found
 
 

@@ -11,7 +11,7 @@ import numpy as np
 from scipy.optimize import linear_sum_assignment
 
 from vehest.alignment.motion import Motion
-from vehest.alignment.proposals.columns import COMPUTED, Candidate, correlation, si_factor, slow_of
+from vehest.alignment.proposals.columns import Candidate, correlation, si_factor, slow_of
 from vehest.alignment.proposals.names import STRONG
 from vehest.alignment.proposals.proposal import Proposal
 from vehest.alignment.proposals.turning import Search
@@ -77,7 +77,7 @@ class Angle(NamedTuple):
 
 def fitting_channels(search: Search) -> tuple[dict[str, Proposal], tuple[str, ...]]:
     """The assignment with most evidence in all, and notes of columns that are left out."""
-    columns = [one for one in search.free if "other" not in one.hints and not one.is_wheel]
+    columns = list(search.free)
     offers = [[offer(search, one) for one in columns] for offer in (_as_ax, _as_steering, _as_lateral)]
     scores = np.array([[offer.score if offer else 0.0 for offer in row] for row in offers])
     pairs = zip(*linear_sum_assignment(scores, maximize=True), strict=True) if columns else ()
@@ -124,7 +124,7 @@ def _with_rivals(chosen: Offer, rivals: Sequence[Offer]) -> Proposal:
 
 def may_be_ax(column: Candidate) -> bool:
     """Whether unit and name allow a longitudinal acceleration."""
-    return column.measures("ax") and column.hint("ax") >= 0.0 and column.device != COMPUTED
+    return column.measures("ax") and column.hint("ax") >= 0.0
 
 
 def _as_ax(search: Search, column: Candidate) -> Offer | None:
@@ -156,11 +156,12 @@ def _as_steering(search: Search, column: Candidate) -> Offer | None:
     sign = best.sign if best.strength else (-1 if slope < 0.0 else 1)
     text = best.in_words or f"{column.name} follows yaw_rate/vx with sign {sign:+d}"
     evidence = (text, *_name_evidence(column, "steer", "handwheel"))
+    asked = "" if best.strength >= CLEAR or (best.strength and hint == STRONG) else HARDLY
     found = angles(search.known, column)
     if "handwheel" in column.hints:
         found = [one for one in found if one.channel == "handwheel"] or found
     if not found and column.hints.get("handwheel") == STRONG and column.unit:
-        return Offer(score, column, Proposal(column.name, "handwheel", column.unit, sign, evidence))
+        return Offer(score, column, Proposal(column.name, "handwheel", column.unit, sign, evidence, asked))
     if not found:
         spread = float(np.quantile(np.abs(column.values - straight), 0.995))
         unit = next((unit for unit in column.units("steer") if spread * si_factor(unit, "steer") <= CHANNELS["steer"].high), "rad")
@@ -169,7 +170,6 @@ def _as_steering(search: Search, column: Candidate) -> Offer | None:
         return Offer(score, column, Proposal(column.name, "steer", unit, sign, evidence, asked, offset=offset))
     _, channel, unit, length, reach = min(found)
     others = sorted({(one.channel, one.unit) for one in found} - {(channel, unit)})
-    asked = "" if best.strength >= CLEAR or hint == STRONG else HARDLY
     if others:
         asked = f"could be {' or '.join(f'{other} in {of_other}' for other, of_other in others)} as well"
     text = f"up to {math.degrees(reach):.3g}°"

@@ -29,7 +29,7 @@ _STRONG = {  # over the name without blanks
     "position_x": r"^x$|posx$|positionx$|posex$|xpos$|viconx$|^xm$",
     "position_y": r"^y$|posy$|positiony$|posey$|ypos$|vicony$|^ym$",
     "vx": r"speed|velocity|geschw|vehspd|^vx|vxc?g?$|vlong|vellong|longvel|vfzg|tacho|velocityx|linearx$|^kmh$|^mph$|"
-    r"velx|vlaengs|longitudinalvel|lngvel|velforward|fahrzeugv|vehv|groundspd|vehicles?pd|encoder",
+    r"velx|vlaengs|longitudinalvel|lngvel|velforward|forwardvel|fahrzeugv|vehv|groundspd|vehicles?pd|encoder",
     "roll_rate": r"rollra?te?|wankrate|angularvelocityx|omegax|gyr(o)?x|^[gw]x$",
     "pitch_rate": r"pitchrate|nickrate|angularvelocityy|omegay|gyr(o)?y|^[gw]y$",
     "roll": r"^roll|rollang|wankwinkel|^wank",
@@ -53,7 +53,7 @@ _REFERENCE = re.compile(
 )
 _BUS = re.compile(r"\bcan\d?\b|\besp\b|\babs\b|\besc\b|\bobd|^veh(icle)?(spd|speed|sp)|^tacho|spdlgt|^alat\d|^algt\d")
 _STEERING_RATE = re.compile(r"deltadelta|steer(ing)?(wheel)?(angle)?(rate|speed|vel)|lenk\w*geschw|swarate|anglerate|deltadot|ddelta")
-_FILTERED = re.compile(r"filt|smooth|\blp\b|avg|mittel|gemittelt")
+_FILTERED = re.compile(r"filt(er(ed)?)?|smooth|\blp\b|avg|mittel|gemittelt")
 _UNTELLING = re.compile(r"\b(body|frame|chassis)\b")
 _CORNERS = {
     "fl": r"fl|vl|lf|front ?left|vorne? ?links|left ?front",
@@ -79,6 +79,8 @@ _EXPLAINED = {
     "heading": ("yaw_rate",),
 }
 """Role -> roles that a part of its names suggests: the yaw in a yaw rate is no heading."""
+_QUANTITIES = {**dict.fromkeys(("m/s", "km/h", "mph", "knots"), "vel"), **dict.fromkeys(("m/s²", "g"), "acc")}
+_WITHOUT_UNIT = re.compile(r" (km?p?h|mp[hs]|ms|kts?|kn|ms2|mps2)$")
 _PLAIN = str.maketrans({"ä": "ae", "ö": "oe", "ü": "ue", "Ä": "Ae", "Ö": "Oe", "Ü": "Ue", "ß": "ss", "ψ": "psi", "β": "beta", "δ": "delta"})
 _PAIRS = (("x", "y"), ("u", "v"), ("long", "lat"), ("lng", "lat"), ("lon", "lat"), ("laengs", "quer"))
 
@@ -91,12 +93,12 @@ def bare(name: str) -> str:
 
 
 @cache
-def hints(name: str) -> dict[str, float]:
-    """Role -> `STRONG` or `WEAK`, for each role that a name suggests."""
+def hints(name: str, unit: str = "") -> dict[str, float]:
+    """Role -> `STRONG` or `WEAK`, for each role that a name suggests; a unit, as vehest spells it, says of what quantity it is."""
     words = re.sub(r" {2,}", " ", _UNTELLING.sub("", _FILTERED.sub("", bare(name)))).strip()
     compact = words.replace(" ", "")
-    if is_filtered(name):
-        compact = compact.removesuffix("ered")
+    alone = _WITHOUT_UNIT.sub("", words).replace(" ", "")
+    texts = "\n".join([compact, *([alone, alone + _QUANTITIES[unit]] if unit in _QUANTITIES else [])])
     corner = _corner(words)
     if corner:
         return {f"wheel_speed_{corner}": STRONG}
@@ -106,15 +108,16 @@ def hints(name: str) -> dict[str, float]:
     found = {
         role: WEAK
         for role, pattern in _WEAK.items()
-        if re.search(pattern, compact) or re.search(rf"^(?:{pattern})$", words.rpartition(" ")[2])
+        if re.search(pattern, texts, re.MULTILINE) or re.search(rf"^(?:{pattern})$", words.rpartition(" ")[2])
     }
-    found |= {role: STRONG for role, pattern in _STRONG.items() if re.search(pattern, compact) or role in words.split()}
+    found |= {role: STRONG for role, own in _STRONG.items() if re.search(own, texts, re.MULTILINE) or role in words.split()}
     strong = {role for role, strength in found.items() if strength == STRONG}
     is_other = "other" in strong and not strong & {"yaw_rate", "ay", "ax", "sideslip_ref", "vy_ref", "handwheel"}
     if is_other or (_STEERING_RATE.search(compact) and "yaw_rate" not in strong):
         return {"other": STRONG}
     parts = {part for role in strong for part in _EXPLAINED.get(role, ()) if role != "vx" or part not in strong}
-    return {role: strength for role, strength in found.items() if role not in parts | {"other"}}
+    parts |= {"other", *(("heading", "latitude", "longitude", "position_x", "position_y") if unit in _QUANTITIES else ())}
+    return {role: strength for role, strength in found.items() if role not in parts}
 
 
 def _corner(words: str) -> str:

@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 
 from vehest.alignment.motion import Motion, rms
-from vehest.alignment.proposals.columns import COMPUTED, Candidate, correlation, largest, si_factor
+from vehest.alignment.proposals.columns import UNITS, Candidate, correlation, largest, si_factor
 from vehest.alignment.proposals.names import STRONG, is_filtered, is_pair, is_reference
 from vehest.alignment.proposals.proposal import Proposal
 from vehest.constants import FloatArray
@@ -96,7 +96,8 @@ def turning_by_names(columns: Sequence[Candidate]) -> Turning | None:
         pool = [one for one in _pool(columns, channel) if channel in one.hints]
         if not pool:
             return None
-        named[channel] = column = max(pool, key=lambda one: (one.hints[channel], not is_filtered(one.name), bool(one.unit)))
+        ahead = [one for one in pool if channel == "vx" and _is_forward(one.slow)]
+        named[channel] = column = max(ahead or pool, key=lambda one: (one.hints[channel], not is_filtered(one.name), bool(one.unit)))
         offered = column.units(channel)
         units[channel] = next((unit for unit in offered if _is_plausible(column, channel, unit)), offered[0])
     is_one = named["vx"] is named["yaw_rate"]
@@ -111,13 +112,8 @@ def _centred(rows: FloatArray) -> tuple[FloatArray, FloatArray]:
 
 def _pool(columns: Sequence[Candidate], channel: str) -> list[Candidate]:
     """Columns that could be a channel, those whose names suggest it first."""
-    own = [one for one in columns if one.measures(channel) and "other" not in one.hints and not one.is_wheel]
-    own = [
-        one
-        for one in own
-        if one.device != COMPUTED and (channel in one.hints or all(one.hints.get(other) != STRONG for other in FOLLOWING))
-    ]
-    own = [one for one in own if channel != "vx" or _is_forward(one.slow)]
+    own = [one for one in columns if channel in one.hints or all(one.hints.get(other) != STRONG for other in FOLLOWING)]
+    own = [one for one in own if one.measures(channel) and (channel != "vx" or "vx" in one.hints or _is_forward(one.slow))]
     return sorted(own, key=lambda one: -(one.hints.get(channel) or (-1.0 if one.hints else NAMELESS)))[:MOST_COLUMNS]
 
 
@@ -138,16 +134,19 @@ def _is_plausible(column: Candidate, channel: str, unit: str) -> bool:
 
 
 def _scored(columns: Sequence[Candidate], named: Mapping[str, Candidate], agreeing: float, scale: float) -> Turning:
-    """With the units that explain best a scale of ay over vx·yaw_rate in the file's units, and the score of all evidence."""
+    """With the units that explain best a scale of ay over vx·yaw_rate in the file's units, others than by the header only where these
+    are far from it, and the score of all evidence."""
     ranked = []
-    for units in product(*(column.units(channel) for channel, column in named.items())):
+    tried = [{*column.units(channel), *(() if column.is_made else UNITS[channel])} for channel, column in named.items()]
+    for units in product(*tried):
         speed, rate, acceleration = (si_factor(unit, channel) for unit, channel in zip(units, named, strict=True))
         left = scale / (speed * rate / acceleration)
         implausible = sum(not _is_plausible(column, channel, unit) for (channel, column), unit in zip(named.items(), units, strict=True))
-        rare = 0.0 if named["vx"].unit else RARE.get(units[0], 0.0)
-        ranked.append((abs(math.log(left)) + rare + implausible, abs(math.log(left)), units, left, implausible))
+        rare = 0.0 if named["vx"].unit == units[0] else RARE.get(units[0], 0.0)
+        against = sum(column.unit not in ("", unit) for column, unit in zip(named.values(), units, strict=True))
+        ranked.append((abs(math.log(left)) + rare + implausible + against, abs(math.log(left)), units, left, implausible, against))
     ranked.sort()
-    cost, mismatch, units, left, implausible = ranked[0]
+    cost, mismatch, units, left, implausible, against = ranked[0]
     decided = mismatch < FAR and (len(ranked) == 1 or ranked[1][0] - cost > APART)
     score = 12.0 * (abs(agreeing) - LEAST_CORRELATION) / (1.0 - LEAST_CORRELATION)
     for channel, one in named.items():
@@ -158,7 +157,7 @@ def _scored(columns: Sequence[Candidate], named: Mapping[str, Candidate], agreei
     level = np.abs(named["vx"].slow)
     if float(np.std(level)) < 0.05 * float(np.mean(level)) and "vx" not in named["vx"].hints:
         score -= 2.0
-    score += 3.0 if mismatch < CLOSE else 1.0 if mismatch < FAR else -5.0
+    score += -5.0 if against or mismatch >= FAR else 3.0 if mismatch < CLOSE else 1.0
     score -= UNNAMED * (not is_evident(named["ay"], left))
     return Turning(named, dict(zip(named, units, strict=True)), decided, agreeing, left, score)
 
@@ -215,7 +214,7 @@ def reference_speed(found: dict[str, Proposal]) -> dict[str, Proposal]:
 def _unit(column: Candidate, first: Repeat, channel: str, agreeing: float) -> str:
     """The unit in which a column is another one measured again; empty where it is not."""
     least = SAME_NAMED[channel] if channel in column.hints else SAME
-    if abs(agreeing) < least or column.hint(channel) < 0.0 or column.is_wheel or not column.measures(channel):
+    if abs(agreeing) < least or column.hint(channel) < 0.0 or not column.measures(channel):
         return ""
     size = rms(first.column.slow) * si_factor(first.unit, channel)
     ranked = [(abs(math.log(rms(column.slow) * si_factor(unit, channel) / size)), unit) for unit in column.units(channel)[:LIKELY]]
@@ -224,6 +223,8 @@ def _unit(column: Candidate, first: Repeat, channel: str, agreeing: float) -> st
 
 def _scaled_speed(column: Candidate, first: Repeat) -> Iterator[Proposal]:
     """The car's own speed in counts, and the reference's by which it is scaled."""
+    if column.is_reference and not first.column.is_reference:
+        column, first = first.column, Repeat(column, UNITS["vx"][0], first.sign)
     name = first.column.name
     speed = first.column.slow * first.sign * si_factor(first.unit, "vx")
     factor = float(column.slow @ speed) / float(column.slow @ column.slow)

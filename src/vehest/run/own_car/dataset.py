@@ -23,18 +23,19 @@ from vehest.data.errors import ConfigurationError, DataError, VehestError
 from vehest.data.recording import Recording
 from vehest.data.recording_summary import RecordingSummary, common_channels, summary_of
 from vehest.data.runs import true_runs
-from vehest.run.own_car.inspect import BRIDGED, EVIDENCE_HZ, RATE_TOLERANCE, TABLES, Examined, rate_of
+from vehest.data.units import factor_to_si
+from vehest.run.own_car.inspect import BRIDGED, EVIDENCE_HZ, TABLES, Examined, rate_of
 from vehest.run.printing import counted
 from vehest.sources.base import open_source
-from vehest.sources.clocks import plain_rate
+from vehest.sources.clocks import INTERPOLATED_TOLERANCE, plain_rate
 from vehest.sources.surveys import Log, RawColumn
 from vehest.sources.surveys.clocks import FEWEST_STEPS, MAX_GAP
+from vehest.sources.unit_spellings import plain_unit
 
 POLICIES = {"vbo": ("strict", "interpolate"), **dict.fromkeys(TABLES, ("strict", "interpolate", "uniform"))}
 """Source -> clocks of its data sets, the strictest first; other sources make their own."""
 BAG_HZ = 100.0
 LEAST_GAP = 0.05  # s
-LONGEST_GAP = 1.0  # s that signals of a measurement may be missing
 GAPS = "samples are missing; only a table with a column of times may lack some, which are bridged, or cut out beyond one second"
 MOST_STRAY = 0.002  # of the rows
 POSE_SECONDS = 0.15  # of the filter that differentiates poses
@@ -80,7 +81,7 @@ def draft(examined: Examined) -> Draft:
     longest = max(recordings, key=lambda own: own.duration)
     late, ratio, notes = late_channels(longest), None, [*proposals.notes]
     for stem, rows in dataset.get("drop_rows", {}).items():
-        why = f"beyond what a vehicle can do, or {BRIDGED:g} s and more without a sample"
+        why = f"beyond what a vehicle can do, written twice, or {BRIDGED:g} s and more without a sample"
         notes.append(f"left out of '{stem}' by drop_rows, {why}: data rows: {counted([str(row) for row in rows])}")
     if vehicle["wheelbase"] and vehicle["steering_ratio"] is None and "handwheel" in longest:
         try:
@@ -115,7 +116,7 @@ def _read_strictest(dataset: dict[str, Any]) -> tuple[dict[str, Any], list[Recor
         with suppress(DataError):
             own = dataset | {"clock": policy}
             recordings = _recordings(own)
-            if all(math.isclose(one.rate_hz, plain_rate(one.rate_hz, RATE_TOLERANCE)) for one in recordings):
+            if all(math.isclose(one.rate_hz, plain_rate(one.rate_hz, INTERPOLATED_TOLERANCE)) for one in recordings):
                 return own, recordings
     return dataset, _recordings(dataset)
 
@@ -162,7 +163,8 @@ def _dataset(examined: Examined) -> dict[str, Any]:
             dataset |= {"drop_rows": named} if (named := {stem: rows for stem, rows in dropped.items() if rows}) else {}
             if any(holes.values()) and "runs" not in log.options:
                 dataset["max_gap"] = log.options.get("max_gap", MAX_GAP)
-    dataset["channels"] = {one.channel: _entry(one, columns[one.column].place) for one in proposals.channels}
+    units = {name: own.unit if log.source == "vbo" else "" for name, own in columns.items()}
+    dataset["channels"] = {one.channel: _entry(one, columns[one.column].place, units[one.column]) for one in proposals.channels}
     if proposals.pose:
         rate = rate_of(log.seconds) if log.seconds is not None else float(examined.rate_hz or EVIDENCE_HZ)
         parts = {part: {"column": column, "unit": unit} for part, column, unit in proposals.pose}
@@ -171,16 +173,22 @@ def _dataset(examined: Examined) -> dict[str, Any]:
     return dataset
 
 
-def _entry(one: Proposal, place: Mapping[str, Any]) -> dict[str, Any]:
+def _entry(one: Proposal, place: Mapping[str, Any], header: str = "") -> dict[str, Any]:
+    """A channel's entry; with a factor where it is in another unit than by the header, which its source holds against the entry."""
+    unit, factor, si = one.unit, one.factor, CHANNELS[one.channel].unit
+    if factor == 1.0 and (own := plain_unit(header)) and own != unit:
+        unit, factor = own, float(f"{factor_to_si(unit, si) / factor_to_si(own, si):.7g}")
     sign = {"sign": one.sign} if one.sign != 1 else {}
-    return {**place, "unit": one.unit} | sign | ({"factor": one.factor} if one.factor != 1.0 else {})
+    return {**place, "unit": unit} | sign | ({"factor": factor} if factor != 1.0 else {})
 
 
 def _stray_rows(log: Log, channels: Sequence[Proposal]) -> list[int]:
-    """Rows, from 1, in which a channel is beyond what a vehicle can do, where they are as few as spikes."""
+    """Rows, from 1, in which a channel is beyond what a vehicle can do, where they are as few as spikes, and rows written twice."""
     columns = {column.name: column.values for column in log.columns}
     beyond = np.any([one.beyond(columns[one.column]) for one in channels], axis=0)
-    return (np.flatnonzero(beyond) + 1).tolist() if beyond.mean() <= MOST_STRAY else []
+    rows = np.nan_to_num([*([] if log.seconds is None else [log.seconds]), *columns.values()])
+    twice = (np.diff(rows, prepend=np.nan) == 0.0).all(axis=0)
+    return (np.flatnonzero(beyond & (beyond.mean() <= MOST_STRAY) | twice) + 1).tolist()
 
 
 def _has_gaps(examined: Examined, log: Log, column: str) -> bool:
@@ -191,7 +199,7 @@ def _has_gaps(examined: Examined, log: Log, column: str) -> bool:
         return not len(known) or (log.clock is None and bool(_gaps(examined, log, column).max() > BRIDGED))
     if log.source != "mdf" or own.stamps is None or not len(known):
         return len(known) < len(own.values)
-    return bool((np.diff(own.stamps[known])[np.diff(known) > 1] <= LONGEST_GAP).any())
+    return bool((np.diff(own.stamps[known])[np.diff(known) > 1] <= BRIDGED).any())
 
 
 def _gaps(examined: Examined, log: Log, column: str) -> FloatArray:
@@ -210,14 +218,14 @@ def _gaps(examined: Examined, log: Log, column: str) -> FloatArray:
 def _mdf_options(columns: Mapping[str, RawColumn], proposals: Sequence[Proposal]) -> dict[str, Any]:
     channels, rates, paused = {}, [], False
     for one in proposals:
-        rate, gap = _rate_and_gap(columns[one.column], LONGEST_GAP)
+        rate, gap = _rate_and_gap(columns[one.column], BRIDGED)
         rates.append(rate)
         paused |= gap < _rate_and_gap(columns[one.column])[1]
-        channels[one.channel] = _entry(one, columns[one.column].place)
+        channels[one.channel] = _entry(one, columns[one.column].place, columns[one.column].unit)
         if 3.0 / rate < gap:
             channels[one.channel]["max_gap"] = math.ceil(100.0 * gap) / 100.0
     pause = {"max_gap": float(f"{max(MAX_GAP, FEWEST_STEPS / min(rates)):.3g}")} if paused else {}
-    return {"rate_hz": plain_rate(max(rates), RATE_TOLERANCE), **pause, "channels": channels}
+    return {"rate_hz": plain_rate(max(rates), INTERPOLATED_TOLERANCE), **pause, "channels": channels}
 
 
 def _bag_options(columns: Mapping[str, RawColumn], proposals: Sequence[Proposal]) -> dict[str, Any]:
@@ -234,7 +242,7 @@ def _bag_options(columns: Mapping[str, RawColumn], proposals: Sequence[Proposal]
             topics[short] = {"topic": place["topic"], "type": place["type"], "stamps": place["stamps"], "max_gap": max_gap}
         entry = _entry(one, {"topic": short, "field": place["field"]})
         channels[one.channel] = entry | ({"offset": float(f"{one.offset:.5g}")} if one.offset else {})
-    return {"rate_hz": plain_rate(min(max(rates), BAG_HZ), RATE_TOLERANCE), "topics": topics, "channels": channels}
+    return {"rate_hz": plain_rate(min(max(rates), BAG_HZ), INTERPOLATED_TOLERANCE), "topics": topics, "channels": channels}
 
 
 def _rate_and_gap(column: RawColumn, shorter: float = math.inf) -> tuple[float, float]:

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from vehest.alignment.proposals.assign import possible, propose
-from vehest.alignment.proposals.columns import COMPUTED
+from vehest.alignment.proposals.columns import correlation
 from vehest.alignment.proposals.names import hints
 from vehest.alignment.proposals.proposal import Proposals
 from vehest.constants import FloatArray
@@ -26,7 +26,7 @@ from vehest.run.config import compose_config
 from vehest.run.config_files import choices
 from vehest.run.printing import counted
 from vehest.sources.base import source_names
-from vehest.sources.clocks import plain_rate
+from vehest.sources.clocks import INTERPOLATED_TOLERANCE, plain_rate
 from vehest.sources.surveys import Log, survey
 from vehest.sources.surveys.clocks import between_pauses
 from vehest.sources.text_log import bridged
@@ -38,7 +38,6 @@ ENDS = 1.0  # s at either end of a longer drive that do not count
 BRIDGED = 1.0  # s without a sample that straight lines bridge
 MOST_LISTED = 5
 MOST_COMPARED, USUAL, EXACT = 4_000, 0.99, 0.999  # rows, share of them, and correlation of a column with another's difference
-RATE_TOLERANCE = 5e-3  # of rates of unknown clocks
 TABLES = ("tabular", "text_log")
 LAYOUT = {"delimiter": ",", "decimal": ".", "encoding": "utf8", "skip_rows": 0, "rows_below_names": 0, "runs": None}
 """Options of a table's layout with their defaults."""
@@ -161,8 +160,8 @@ def _notes(longest: Log, logs: Sequence[Log]) -> Iterator[str]:
     if len(longest.skipped) > MOST_LISTED:
         yield f"not read: {len(longest.skipped) - MOST_LISTED} more"
     for log in logs:
-        stamps_of_runs = [] if log.seconds is None else [log.seconds[run] for run in log.runs]
-        for stamps in stamps_of_runs:
+        for run in log.runs:
+            stamps = np.empty(0) if log.seconds is None else log.seconds[run]
             steps = np.diff(stamps)
             if steps.max(initial=0.0) > BRIDGED:
                 start = stamps[np.argmax(steps)]
@@ -177,10 +176,6 @@ def _place(files: Sequence[Path], source: str) -> dict[str, Any]:
         listed = ", ".join(map(str, (folder, *further)))
         raise ConfigurationError(f"the files lie in several folders ({listed}); put them into one, or make a data set of each folder")
     names = sorted({file.name for file in files})
-    stems = [Path(name).stem for name in names]
-    doubled = [stem for stem in stems if stems.count(stem) > 1]
-    if doubled:
-        raise ConfigurationError(f"two files are called '{doubled[0]}'; a recording's name must be unique")
     path = os.path.relpath(folder) if folder.is_relative_to(Path.cwd()) else str(folder)
     if source == "rosbag":
         return {"path": path, "files": [file.name for file in files]}
@@ -207,11 +202,8 @@ def _evidence(log: Log, differences: Collection[str]) -> tuple[list[tuple[str, s
         whole = (n_rows - 2 * cut) // factor * factor
         samples, rate = samples[:, cut : cut + whole].reshape(len(samples), -1, factor).mean(axis=2), rate / factor
         samples = _busiest(samples, round(LONGEST_EVIDENCE * rate), max(round(60.0 * rate), 1))
-    found = [
-        (own.name, plain_unit(own.unit) or "", values, COMPUTED if own.name in differences else own.device)
-        for own, values in zip(log.columns, samples, strict=True)
-    ]
-    return found, rate
+    columns = [(own, values) for own, values in zip(log.columns, samples, strict=True) if own.name not in differences]
+    return [(own.name, plain_unit(own.unit) or "", values, own.device) for own, values in columns], rate
 
 
 def _differences(log: Log) -> dict[str, str]:
@@ -224,11 +216,8 @@ def _differences(log: Log) -> dict[str, str]:
     for k, (first, last) in product(velocities, ((0, -1), (1, None))):
         steps = np.diff(rows[k])
         usual = np.abs(steps) <= np.quantile(np.abs(steps), USUAL)
-        steps, others = steps[usual] - steps[usual].mean(), rows[:, first:last][:, usual]
-        others -= others.mean(axis=1, keepdims=True)
-        with np.errstate(all="ignore"):
-            agreeing = np.abs(others @ steps) / np.sqrt((others * others).sum(axis=1) * (steps @ steps))
-        found |= {own[j].name: own[k].name for j in np.flatnonzero(agreeing > EXACT) if j != k}
+        agreeing = [abs(correlation(row[first:last][usual], steps[usual])) for row in rows]
+        found |= {own[j].name: own[k].name for j, one in enumerate(agreeing) if one > EXACT and j != k}
     return found
 
 
@@ -239,7 +228,7 @@ def _on_one_clock(log: Log) -> tuple[FloatArray, float | None]:
         runs, _ = between_pauses(sampled, 1.0 / max(rate_of(stamps) for _, stamps in timed))
         longest = sampled[max(runs, key=lambda run: sampled[run.stop - 1] - sampled[run.start])]
         begin, end = (float(np.median(np.clip([stamps[edge] for _, stamps in timed], longest[0], longest[-1]))) for edge in (0, -1))
-        rate = plain_rate(min(max(rate_of(stamps) for _, stamps in timed), EVIDENCE_HZ), RATE_TOLERANCE)
+        rate = plain_rate(min(max(rate_of(stamps) for _, stamps in timed), EVIDENCE_HZ), INTERPOLATED_TOLERANCE)
         check_limit("samples", (end - begin) * rate, f"'{log.file}' lasts {(end - begin) * rate:.0f} samples at {rate:g} Hz")
         grid = np.arange(begin, end, 1.0 / rate)
         return np.stack([np.interp(grid, stamps, values) for values, stamps in timed]), rate
@@ -249,7 +238,7 @@ def _on_one_clock(log: Log) -> tuple[FloatArray, float | None]:
     stamps = log.seconds[run]
     rows = [bridged(column.values[run], stamps, BRIDGED) for column in log.columns]
     step = float(np.median(np.diff(stamps))) or float(stamps[-1] - stamps[0]) / max(len(stamps) - 1, 1)
-    rate = plain_rate(1.0 / step, RATE_TOLERANCE)
+    rate = plain_rate(1.0 / step, INTERPOLATED_TOLERANCE)
     is_even = np.abs(stamps - stamps[0] - np.arange(len(stamps)) / rate).max() <= 1.0 / rate
     if is_even or (stamps[-1] - stamps[0]) * rate > 4 * len(stamps):
         return np.stack(rows), rate

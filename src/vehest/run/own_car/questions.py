@@ -10,6 +10,7 @@ from typing import Any
 
 import typer
 
+from vehest.alignment.proposals.assign import MOST_BEYOND
 from vehest.alignment.proposals.proposal import LATERAL, Proposal
 from vehest.data.channels import CHANNELS, channel
 from vehest.data.errors import ConfigurationError, DataError, printable
@@ -63,6 +64,7 @@ def ask(examined: Examined, answers: Sequence[str] = (), *, interactive: bool) -
             examined = _ask_at_terminal(question, examined)
         else:
             left.append(question)
+            examined = _answered(examined, question, question.proposed)
     return examined, tuple(left)
 
 
@@ -80,8 +82,8 @@ def questions_of(examined: Examined) -> Iterator[Question]:
         if one.asked:
             others = tuple(other for other in one.others if other not in (one.unit, one.channel))
             hint = f"CHANNEL UNIT [SIGN [FACTOR]], or {LEAVE_OUT} to leave it out"
-            factor = [f"{one.factor:.5g}"] if one.factor != 1.0 else []
-            proposed = " ".join([one.channel, one.unit, *([f"{one.sign:+d}"] if factor or one.sign != 1 else []), *factor])
+            beyond = max(one.beyond(own.values).mean() for log in examined.logs for own in log.columns if own.name == one.column)
+            proposed = LEAVE_OUT if beyond > MOST_BEYOND else _declaration(one)
             yield Question(one.column, f"column '{one.column}': {one.asked}", proposed, others, one.evidence, hint)
     if proposals.wheel_radius is not None:
         text = "rolling radius of the tyres [m], by which the wheels make vx"
@@ -116,8 +118,8 @@ def _ask_at_terminal(question: Question, examined: Examined) -> Examined:
 
 
 def _answered(examined: Examined, question: Question, answer: str) -> Examined:
-    key, answer, proposals = question.key, answer.strip(), examined.proposals
-    if answer in ("", question.proposed):
+    key, answer, proposals = question.key, answer.strip() or question.proposed, examined.proposals
+    if answer == question.proposed != LEAVE_OUT:
         return examined
     if key == "rate":
         return replace(examined, rate_hz=_number(answer, key))

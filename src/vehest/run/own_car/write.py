@@ -80,12 +80,9 @@ def registered(word: str) -> str:
     """The name of an estimator that is given by its name or as ``package.module:Class``; raises `ConfigurationError` where it is none."""
     name = next((point.name for point in entry_points(group=ENTRY_POINTS) if point.value == word), word)
     if name not in estimator_names():
-        declared = f'NAME = "{word if ":" in word else "package.module:Class"}"'
-        raise ConfigurationError(
-            f"no installed package declares the estimator '{word}'; its pyproject.toml needs, under "
-            f'[project.entry-points."{ENTRY_POINTS}"], '
-            f"{declared}; then install it with pip"
-        )
+        declared = f'[project.entry-points."{ENTRY_POINTS}"], NAME = "{word if ":" in word else "package.module:Class"}"'
+        what = f"no installed package declares the estimator '{word}'"
+        raise ConfigurationError(f"{what}; its pyproject.toml needs, under {declared}; then install it with pip")
     if name not in choices("estimator"):
         raise ConfigurationError(f"there is no conf/estimator/{name}.yaml; write one with the line 'name: {name}', and a line a setting")
     return name

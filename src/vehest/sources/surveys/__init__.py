@@ -20,6 +20,7 @@ from vehest.sources.rosbag.topics import read_bag
 from vehest.sources.surveys.clocks import between_pauses
 from vehest.sources.surveys.log import Log, RawColumn, Stamps
 from vehest.sources.surveys.tables import survey_table
+from vehest.sources.tables import read_head
 from vehest.sources.vbo import SLIP_AT_A_POINT, read_log, require_slip_offsets
 
 __all__ = ["Log", "RawColumn", "Stamps", "survey"]
@@ -68,7 +69,7 @@ def _survey(path: Path) -> Log:
         return _survey_bag(path)
     if path.stat().st_size == 0:
         raise MissingError(f"file '{path}' is empty")
-    if ending in MDF and _begins_as_mdf(path):
+    if ending in MDF and (ending != ".dat" or read_head(path, 8) in (b"MDF     ", b"UnFinMF ")):
         return _survey_mdf(path)
     if ending == ".vbo":
         return _survey_vbo(path)
@@ -123,10 +124,3 @@ def _survey_vbo(file: Path) -> Log:
     runs, options = between_pauses(seconds, float(np.median(np.diff(seconds))))
     runs.sort(key=lambda rows: rows.start - rows.stop)
     return Log(file, "vbo", columns, options, clock, seconds, tuple(runs), skipped)
-
-
-def _begins_as_mdf(path: Path) -> bool:
-    if path.suffix.lower() != ".dat":
-        return True
-    with open(path, "rb") as stream:
-        return stream.read(8) in (b"MDF     ", b"UnFinMF ")

@@ -36,14 +36,14 @@ MOST_RESTARTS = 0.01  # of the rows
 def find_clock(
     columns: Mapping[str, FloatArray], units: Mapping[str, str]
 ) -> tuple[Stamps | None, FloatArray | None, tuple[slice, ...], dict[str, Any]]:
-    """The column, (N,), that grows evenly, by name or unit before another; None where none looks like a clock.
+    """The column, (N,), that grows evenly, by name or unit before another, or one that is named so and grows; None where none does.
 
     With it the times of the rows [s], (N,), rows of each run, the longest first, and the source's options by which runs begin.
     """
     best, likely, step = None, -1, 0.0
     for name, values in columns.items():
-        own = _step(values)
         unit, named = SPELLINGS.get(units.get(name, "").strip().lower(), ""), bool(NAMED.match(plain_name(name)))
+        own = _step(values, is_even=not named)
         counts_rows = own == 1.0 and float(values[0]) in (0.0, 1.0) and not (unit or named)
         stamps = None if own is None or counts_rows else _stamps(name, own, unit, named)
         if own is not None and stamps is not None and 2 * bool(unit) + named > likely:
@@ -78,8 +78,8 @@ def plain_name(name: str) -> str:
     return re.sub(r"[\W_]+", " ", apart).strip().lower()
 
 
-def _step(values: FloatArray) -> float | None:
-    """Median step of a column that grows evenly but for restarts; None of another."""
+def _step(values: FloatArray, *, is_even: bool) -> float | None:
+    """Median step of a column that grows, and ``is_even`` grows evenly, but for restarts; None of another."""
     if len(values) < 10 or not np.isfinite(values).all():
         return None
     steps = np.diff(values)
@@ -87,7 +87,7 @@ def _step(values: FloatArray) -> float | None:
     if (steps < 0).mean() > MOST_RESTARTS or len(grown) < 0.3 * len(steps):  # stamps of too coarse a resolution repeat
         return None
     step = float(np.median(steps)) or float(grown.sum() / len(steps))
-    return step if step > 0 and np.mean(np.abs(steps - step) <= 0.5 * step) >= REGULAR else None
+    return step if step > 0 and (not is_even or np.mean(np.abs(steps - step) <= 0.5 * step) >= REGULAR) else None
 
 
 def _stamps(name: str, step: float, unit: str, named: bool) -> Stamps | None:

@@ -9,6 +9,7 @@ import codecs
 import csv
 import re
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import asdict, dataclass, field, replace
 from functools import partial
 from itertools import pairwise
@@ -40,7 +41,10 @@ LEAST_NUMBERS = 0.5  # share of a row's cells that are numbers or empty
 CONTROLS, MOST_CONTROLS = re.compile(rb"[\x00-\x08\x0b\x0e-\x1f]"), 0.01
 MARKS = frozenset({"-", "--", "---", "----", "–", "—", "*", "?", "n.a.", "none", "missing", "invalid", "inv", "void", "#value!", "#div/0!"})
 """What loggers and spreadsheets write where there is no sample, in lower case."""
+NUMBER = re.compile(r"\s*[+-]?((\d+(\.\d*)?|\.\d+)(e[+-]?\d+)?|nan|inf(inity)?)\s*", re.IGNORECASE)
 BRACKETED = re.compile(r"^(?P<name>.*?)[\s_]*[\[(<{](?P<unit>[^\])>}]*)[\])>}]\s*$")
+VELOCITY = re.compile(r"(.*_)?v([_xy]|lat|lon)|.*(speed|spd|velo|geschw)", re.IGNORECASE)
+"""Names that end in ms for metres a second."""
 ABBREVIATED = {"radps": "rad/s", "degps": "deg/s", "degs": "deg/s", "rads": "rad/s", "ms2": "m/s2", "mss": "m/s2", "kmh": "km/h"}
 
 
@@ -104,6 +108,8 @@ def unit_in_name(name: str) -> str:
         return bracketed["unit"].strip()
     words = re.split(r"[_\s]+", name.strip())
     last = words[-1].lower() if len(words) > 1 else ""
+    if last == "ms" and VELOCITY.match(name):
+        return "m/s"
     return ABBREVIATED.get(last) or (last if _is_unit(last) and len(last) > 1 else "")
 
 
@@ -157,13 +163,7 @@ def _share(row: Sequence[str], decimal: str) -> float:
 
 def _is_number(cell: str, decimal: str) -> bool:
     text = cell.strip().strip('"')
-    if "_" in text or (decimal == "," and "." in text):
-        return False
-    try:
-        float(text.replace(decimal, "."))
-    except ValueError:
-        return False
-    return True
+    return bool(NUMBER.fullmatch(text.replace(decimal, "."))) and not (decimal == "," and "." in text)
 
 
 def _are_units(cells: Sequence[str]) -> bool:
@@ -186,8 +186,10 @@ def _decoded(head: bytes, file: Path) -> tuple[str, str]:
     try:
         return "utf8", codecs.getincrementaldecoder("utf-8-sig")().decode(head, final=len(head) < HEAD)
     except UnicodeDecodeError:
-        encoding = "cp1252" if re.search(rb"[\x80-\x9f]", head) else "latin-1"
-        return encoding, head.decode(encoding, errors="replace")
+        for encoding in ("cp1252", "shift_jis") if re.search(rb"[\x80-\x9f]", head) else ():
+            with suppress(UnicodeDecodeError):
+                return encoding, codecs.getincrementaldecoder(encoding)().decode(head, final=len(head) < HEAD)
+        return "latin-1", head.decode("latin-1")
 
 
 def _columns(file: Path, shape: Shape) -> tuple[dict[str, FloatArray], dict[str, FloatArray], set[str], list[str]]:
@@ -225,7 +227,8 @@ def _table(file: Path, shape: Shape) -> pa.Table:
             return parse_table(partial(table_stream, file), shape.layout, convert)
         except DAMAGE as error:
             problem = printable(first_line(error))
-    raise DataError(f"'{file}' cannot be read as a table ({problem}); is it truncated, or are its columns aligned by blanks?")
+    why = "is it truncated, is a line of text below its rows, or are its columns aligned by blanks?"
+    raise DataError(f"'{file}' cannot be read as a table ({problem}); {why}")
 
 
 def _numbers(column: pa.ChunkedArray, decimal: str) -> tuple[FloatArray, set[str]] | None:
