@@ -8,6 +8,7 @@ compilation vectors are arrays.
 from __future__ import annotations
 
 import operator
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -178,7 +179,7 @@ def _of(array: Any, fused: bool = True) -> Lanes:
     return Lanes(array.dtype, BYTES * 8 // array.dtype.bitwidth, fused)
 
 
-def _compiled(function: Any, type_of: Any) -> Any:
+def _compiled(function: Any, type_of: Any) -> Callable[[Callable[..., Any]], Any]:
     """Decorator of what lowers a function of the above; ``type_of`` gives its type from those of the arguments."""
 
     @infer_global(function)
@@ -186,7 +187,7 @@ def _compiled(function: Any, type_of: Any) -> Any:
         def generic(self, args: Any, kws: Any) -> Any:
             return type_of(*args)
 
-    return lower_builtin(function, types.VarArg(types.Any))
+    return lower_builtin(function, types.VarArg(types.Any))  # type: ignore[no-any-return]
 
 
 @_compiled(width, lambda array: types.intp(array))
@@ -225,7 +226,7 @@ def _store_some(context: Any, builder: Any, sig: Any, args: Any) -> Any:
     return context.get_dummy_value()
 
 
-@_compiled(choose, lambda condition, one, other: _pair(one, other) and _pair(one, other)(condition, one, other))
+@_compiled(choose, lambda condition, one, other: (kind := _pair(one, other)) and kind(condition, one, other))
 def _choose(context: Any, builder: Any, sig: Any, args: Any) -> Any:
     kinds = sig.args[1:]
     return builder.select(args[0], *(_vector(context, builder, v, own, _pair(*kinds)) for v, own in zip(args[1:], kinds, strict=True)))

@@ -83,7 +83,9 @@ def questions_of(examined: Examined) -> Iterator[Question]:
             others = tuple(other for other in one.others if other not in (one.unit, one.channel))
             hint = f"CHANNEL UNIT [SIGN [FACTOR]], or {LEAVE_OUT} to leave it out"
             beyond = max(one.beyond(own.values).mean() for log in examined.logs for own in log.columns if own.name == one.column)
-            proposed = LEAVE_OUT if beyond > MOST_BEYOND else _declaration(one)
+            factor = [f"{one.factor:.5g}"] if one.factor != 1.0 else []
+            declared = [one.channel, one.unit, *([f"{one.sign:+d}"] if factor or one.sign != 1 else []), *factor]
+            proposed = LEAVE_OUT if beyond > MOST_BEYOND else " ".join(declared)
             yield Question(one.column, f"column '{one.column}': {one.asked}", proposed, others, one.evidence, hint)
     if proposals.wheel_radius is not None:
         text = "rolling radius of the tyres [m], by which the wheels make vx"
