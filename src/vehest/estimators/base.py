@@ -75,7 +75,7 @@ class Trial(NamedTuple):
 class Stepper(ABC):
     """An estimator that runs along with the drive, one sample after another."""
 
-    horizon_steps: ClassVar[int] = 0  # sampling intervals after the sample for which the returned estimate holds
+    horizon_steps: int = 0  # sampling intervals after the sample for which the returned estimate holds
 
     @abstractmethod
     def step(self, sample: Mapping[str, float]) -> dict[str, float]:
@@ -106,6 +106,7 @@ class Estimator(ABC):
     refuses: ClassVar[tuple[str, ...]] = ()  # measurements of a sample that are errors: ``NaN`` where it is not skippable, ``infinite``
     may_be_nan: ClassVar[tuple[str, ...]] = ()  # weights that may stay NaN, because each recording tells them
     covariance_of: ClassVar[tuple[str, ...]] = ()  # quantities that the covariances of `run` are of
+    horizon_steps: ClassVar[int] = 0  # sampling intervals after a sample for which the estimate made with it holds
     ignores_initial_state: ClassVar[bool] = False  # whether an initial state is left aside; else it is used, or refused as an error
     slow_kernel: ClassVar[str] = ""  # ``module:function`` that takes tens of seconds to compile; empty: none
     # error of `online` where its settings make it not causal, with those that make it causal
@@ -131,7 +132,7 @@ class Estimator(ABC):
             setattr(cls, name, property(attrgetter(f"settings.{name}")))
 
     def __init__(self, settings: Any) -> None:
-        self.settings = settings
+        self.settings, self._seed = settings, 0
         self.preparation: Mapping[str, Any] = {"method": "polyphase", "transforms": []}
         self.check()
 
@@ -156,12 +157,7 @@ class Estimator(ABC):
     @property
     def learns(self) -> bool:
         """Whether the fit takes anything from recordings; if not, it needs none."""
-        return True
-
-    @property
-    def horizon_steps(self) -> int:
-        """How many sampling intervals after a sample the estimate made with it holds."""
-        return 0
+        return self.n_parameters > 0
 
     @property
     def warm_up_steps(self) -> int:
@@ -205,9 +201,9 @@ class Estimator(ABC):
     def n_parameters(self) -> int:
         """How many numbers the fit determines."""
 
-    @abstractmethod
     def seed(self, seed: int) -> None:
         """Say which random numbers the next fit starts from and uses."""
+        self._seed = seed
 
     @classmethod
     @abstractmethod

@@ -19,9 +19,10 @@ class Network(Estimator):
     A family has either its own `run`, or is a `WindowedEstimator`; and either `fit_member` or its own `fit_members`.
     """
 
+    learns = True  # always
+
     def __init__(self, settings: Any) -> None:
         super().__init__(settings)
-        self._seed = 0
         self._loaded: dict[str, np.ndarray[Any, Any]] = {}
 
     @cached_property
@@ -56,10 +57,6 @@ class Network(Estimator):
     def n_parameters(self) -> int:
         """Numbers that training determines; ranges taken from the data do not count."""
         return sum(parameter.numel() for parameter in self.network.parameters() if parameter.requires_grad)
-
-    def seed(self, seed: int) -> None:
-        """Seed of initial weights, batches and dropout."""
-        self._seed = seed
 
     def fewest_weights(self) -> int:
         """Its parameters, found without room for them."""

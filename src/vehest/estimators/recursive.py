@@ -43,7 +43,7 @@ class Recursive(Estimator):
         super().__init_subclass__(**options)
         for name, declared in cls.settings_type.declarations().items():
             if declared.is_fitted:
-                setattr(cls, name, _FittedNumber(name))
+                setattr(cls, name, _fitted_number(name))
 
     def __init__(self, settings: Any) -> None:
         super().__init__(settings)
@@ -114,14 +114,6 @@ class Recursive(Estimator):
         """How many numbers are not given."""
         return len(self.unknown)
 
-    @property
-    def learns(self) -> bool:
-        """Whether there is any number to determine."""
-        return bool(self.unknown)
-
-    def seed(self, seed: int) -> None:
-        """Nothing here is random."""
-
     @classmethod
     def fit_members(cls, members: Sequence[Estimator], data: FitData, training: Any, context: FitContext) -> list[FitRecord]:
         """Fit one; the others, which could not differ, get the same.
@@ -165,17 +157,9 @@ class Recursive(Estimator):
         self.values = {name: float(weights[name][0]) for name in self.values}
 
 
-class _FittedNumber:
+def _fitted_number(name: str) -> property:
     """Attribute of an estimator that is one of its ``values``."""
-
-    def __init__(self, name: str) -> None:
-        self.name = name
-
-    def __get__(self, owner: Recursive | None, kind: type | None = None) -> Any:
-        return self if owner is None else owner.values[self.name]
-
-    def __set__(self, owner: Recursive, value: float) -> None:
-        owner.values[self.name] = float(value)
+    return property(lambda own: own.values[name], lambda own, value: own.values.update({name: float(value)}))
 
 
 @cache

@@ -253,7 +253,7 @@ class GuardedStepper(Stepper):
         self, estimator: Estimator, trust: Trust | None = None, bus_rate_hz: float | None = None, *, elsewhere: bool = False
     ) -> None:
         self.estimator, self._channels = estimator, tuple(estimator.channels)
-        self._stepper, self._fresh = estimator.online(), True
+        self._stepper, self._fresh, self.horizon_steps = estimator.online(), True, estimator.horizon_steps
         rate = estimator.settings.rate_hz
         limits = limits_for(estimator, trust)
         self._front = FrontEnd(estimator.channels, estimator.skippable, limits, bus_rate_hz, rate) if bus_rate_hz is not None else None
@@ -269,11 +269,6 @@ class GuardedStepper(Stepper):
         self._others: dict[str, float] = {}
         self.last: dict[str, float] = {"vy": math.nan, "sideslip": math.nan}
         self.marks = 0
-
-    @property
-    def horizon_steps(self) -> int:  # type: ignore[override]
-        """How many sampling intervals after the sample the estimate holds."""
-        return self.estimator.horizon_steps
 
     @property
     def delay(self) -> float:

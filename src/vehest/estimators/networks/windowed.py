@@ -39,6 +39,7 @@ class WindowedEstimator(Network):
 
     channels = ("yaw_rate", "vx", "ay", "ax")
     training_type = SupervisedSettings
+    horizon_steps = 1  # a window predicts the velocity one sample after it
     rate_hz: float = rate(20.0)
     window: int = setting(30, "samples that it sees", least=1)
 
@@ -50,11 +51,6 @@ class WindowedEstimator(Network):
         if isinstance(network, StandardisedNetwork):
             network.standardise(train, self.channels)
         return network
-
-    @property
-    def horizon_steps(self) -> int:
-        """One: a window predicts the velocity one sample after it."""
-        return WindowStepper.horizon_steps
 
     @property
     def warm_up_steps(self) -> int:
