@@ -103,8 +103,7 @@ class Estimate:
     def covariance_at(self, times: FloatArray, names: Sequence[str]) -> FloatArray:
         """Covariance (K, n, n) of n quantities at other times (K,) [s]: the latest that is not in the future, NaN outside the estimate.
 
-        Raises:
-            DataError: the estimate has no covariance of one of them.
+        Raises `DataError`: the estimate has no covariance of one of them.
         """
         if self.covariance is None or set(names) - set(self.covariance_of):
             have = ", ".join(self.covariance_of) or "nothing"

@@ -83,8 +83,7 @@ class Stepper(ABC):
 
         A method that has a covariance also returns ``vy_variance`` [m²/s²].
 
-        Raises:
-            DataError: a channel is missing.
+        Raises `DataError`: a channel is missing.
         """
 
 

@@ -392,8 +392,7 @@ class DugoffUkf(SigmaPointEstimator):
     def noise_covariances(self, levels: Mapping[str, float]) -> tuple[Tensor, Tensor]:
         """Covariance of a step, (2, 2), and those of measurements where the car is linear and where it is not, (2, 4, 4).
 
-        Raises:
-            ConfigurationError: a level is neither given nor found.
+        Raises `ConfigurationError`: a level is neither given nor found.
         """
         if any(math.isnan(level) for level in levels.values()):
             raise ConfigurationError(f"estimator '{self.name}' has no noise levels yet; fit or load it first, or give estimator.noise")

@@ -78,8 +78,7 @@ class Network(Estimator):
     def load_weights(self, weights: Mapping[str, np.ndarray[Any, Any]]) -> None:
         """Take parameters and ranges back, in the precision they were trained in.
 
-        Raises:
-            DataError: a name or shape does not fit the settings.
+        Raises `DataError`: a name or shape does not fit the settings.
         """
         expected = self.weight_shapes()
         require_shapes(self, weights, expected)

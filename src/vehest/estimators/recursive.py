@@ -71,8 +71,7 @@ class Recursive(Estimator):
     def closed_form(self, recordings: Sequence[Recording]) -> dict[str, float] | None:
         """Numbers of the smallest mean squared error of vy, where the family has them in closed form.
 
-        Raises:
-            DataError: the recordings do not determine them.
+        Raises `DataError`: the recordings do not determine them.
         """
         return None
 
@@ -118,8 +117,7 @@ class Recursive(Estimator):
     def fit_members(cls, members: Sequence[Estimator], data: FitData, training: Any, context: FitContext) -> list[FitRecord]:
         """Fit one; the others, which could not differ, get the same.
 
-        Raises:
-            DataError: a channel or the reference is missing or has gaps.
+        Raises `DataError`: a channel or the reference is missing or has gaps.
         """
         started = time.monotonic()
         own = [member for member in members if isinstance(member, Recursive)]

@@ -75,7 +75,7 @@ def drive_freely(
     per_command = whole_steps(COMMAND_RATE_HZ, plant.step, "driver's")
     per_sample = whole_steps(rate_hz, plant.step, "sampling")
     stride = int(np.gcd(per_command, per_sample))
-    driver = manoeuvre.driver(plant.car, surface, seed)
+    driver = manoeuvre.controller(plant.car, surface, seed)
     first_sample = round(SETTLING_TIME / plant.step)
     state, kept, acting = plant.initial_state(), [], []
     for now in range(0, first_sample + round(driver.duration * rate_hz) * per_sample, stride):

@@ -52,8 +52,7 @@ class PoseOptions:
         Raises:
             DataError: too few poses.
 
-        Source:
-            Savitzky & Golay, Smoothing and differentiation of data by simplified least squares procedures, Anal. Chem. 36 (8), 1964.
+        Source: Savitzky & Golay, Smoothing and differentiation of data by simplified least squares procedures, Anal. Chem. 36 (8), 1964.
         """
         if len(yaw) < self.window:
             raise DataError(f"{where}: {len(yaw)} poses are fewer than the {self.window} of the filter's window")

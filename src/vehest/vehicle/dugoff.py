@@ -39,8 +39,7 @@ Tyres = Literal["plain", "smooth"]
 class LoadedCar:
     """A car as a single track whose axles carry what a steady longitudinal acceleration leaves them; a BMW 545i by default.
 
-    Raises:
-        ValueError: a number that is not positive.
+    Raises `ValueError`: a number that is not positive.
 
     Source: Bertipaglia et al. 2024, Eq. 2.
     """

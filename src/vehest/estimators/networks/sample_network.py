@@ -188,8 +188,7 @@ def learnt_samples(
 
     Samples slower than ``minimum_speed`` [m/s] are left out.
 
-    Raises:
-        DataError: a channel is missing or has gaps, or all samples are too slow.
+    Raises `DataError`: a channel is missing or has gaps, or all samples are too slow.
     """
     hint = "; set estimator.inputs=imu for cars without measured tyre forces"
     hints = {name: hint for name in channels if name.startswith("f")}

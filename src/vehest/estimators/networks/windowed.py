@@ -61,9 +61,8 @@ class WindowedEstimator(Network):
     def fit_members(cls, members: Sequence[Any], data: FitData, training: Any, context: FitContext) -> list[FitRecord]:
         """Train members together (`train_members`).
 
-        Raises:
-            DataError: recordings are too short or have gaps, the loss is no longer finite, or a model to start from is damaged.
-            ConfigurationError: the network cannot be trained so, or a model to start from is of another family or has other settings.
+        Raises `DataError`: recordings are too short or have gaps, the loss is no longer finite, or a model to start from is damaged. Raises
+        `ConfigurationError`: the network cannot be trained so, or a model to start from is of another family or has other settings.
         """
         import torch
 

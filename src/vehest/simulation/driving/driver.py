@@ -19,6 +19,7 @@ from vehest.constants import GRAVITY, FloatArray
 from vehest.data.errors import ConfigurationError
 from vehest.simulation.driving.car import Car
 from vehest.simulation.road.course import Course
+from vehest.simulation.road.lines import Line
 
 DRIVER_RATE_HZ = 100.0  # rate of a driver's decisions [Hz]
 
@@ -50,8 +51,7 @@ class DrivingStyle:
 
     Both variations are sums of sines of the distance driven, whose wavelengths do not divide a lap.
 
-    Raises:
-        ConfigurationError: the grip used is not between 0 and 1 all along.
+    Raises `ConfigurationError`: the grip used is not between 0 and 1 all along.
     """
 
     grip_fraction: float  # mean share of the grip that the speed profile uses, 0 … 1
@@ -68,14 +68,9 @@ class DrivingStyle:
 
 
 @dataclass(frozen=True, eq=False)
-class Plan:
-    """Planned line and speed over the distance along the way; all arrays have shape (N,)."""
+class Plan(Line):
+    """Planned line and speed over the distance along the way, uniform from 0; all arrays have shape (N,)."""
 
-    distance: FloatArray  # [m], uniform from 0
-    x: FloatArray  # the line [m]
-    y: FloatArray  # the line [m]
-    heading: FloatArray  # of the line, not wrapped [rad]
-    curvature: FloatArray  # of the line, positive to the left [1/m]
     speed: FloatArray  # [m/s]
     friction: FloatArray  # scale of the tyres' friction
     bank: FloatArray  # positive with the left side higher [rad]

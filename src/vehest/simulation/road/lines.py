@@ -30,13 +30,13 @@ class Gate:
 
 @dataclass(frozen=True, eq=False)
 class Line:
-    """A line, sampled every ``SPACING`` of its length; arrays of shape (N,): place [m], heading [rad], curvature [1/m]."""
+    """A line, sampled at even distances along itself, here every ``SPACING``; arrays of shape (N,)."""
 
-    distance: FloatArray
-    x: FloatArray
-    y: FloatArray
-    heading: FloatArray
-    curvature: FloatArray
+    distance: FloatArray  # [m]
+    x: FloatArray  # [m]
+    y: FloatArray  # [m]
+    heading: FloatArray  # not wrapped [rad]
+    curvature: FloatArray  # positive to the left [1/m]
 
 
 @lru_cache(maxsize=64)

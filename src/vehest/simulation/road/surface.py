@@ -24,8 +24,7 @@ class Surface:
     Either one scale all along or, with ``patches``, patches of which each has a scale drawn between ``patches`` and ``friction``,
     uniformly, and a length drawn from ``patch_length``, uniformly. Friction changes over two metres between them.
 
-    Raises:
-        ConfigurationError: a scale is outside 0.05 … 1.5 or a length makes no sense.
+    Raises `ConfigurationError`: a scale is outside 0.05 … 1.5 or a length makes no sense.
     """
 
     name: str = "dry"  # in recordings

@@ -85,8 +85,7 @@ class _UriPath(type(Path())):  # type: ignore[misc]
 def _opened(bag: Path) -> Reader:
     """A bag, unless a SQLite file of it ends within a page: SQLite would fill that up with zeros.
 
-    Source:
-        SQLite, Database File Format, section 1.3, https://www.sqlite.org/fileformat2.html.
+    Source: SQLite, Database File Format, section 1.3, https://www.sqlite.org/fileformat2.html.
     """
     for file in [bag] if bag.is_file() else bag.iterdir():
         if file.is_file():
