@@ -134,13 +134,10 @@ def draw_style(seed: int, grip_range: tuple[float, float], ripple: float, line_o
 def plan_laps(
     course: Course, car: Car, driver: Driver, style: DrivingStyle, n_laps: int, *, friction: FloatArray, highest_speed: FloatArray | float
 ) -> Plan:
-    """Line and speed profile over whole laps.
+    """Line and speed profile over one whole lap or more, within the car's limits.
 
-    Args:
-        car: whose limits are kept.
-        n_laps: at least one.
-        friction: of one lap, on the course's samples, shape (N,).
-        highest_speed: [m/s], one value or one for each of the n_laps·(N - 1) + 1 samples.
+    ``friction`` is that of one lap, on the course's samples, (N,); ``highest_speed`` [m/s] one value or one for each of the n_laps·(N - 1)
+    + 1 samples.
     """
     distance = _repeat(course.arc_length, n_laps, course.length)
     heading = _repeat(course.heading, n_laps, course.turning)
@@ -174,16 +171,12 @@ def speed_profile(
     bank: FloatArray | float = 0.0,
     grade: FloatArray | float = 0.0,
 ) -> FloatArray:
-    """Highest speeds [m/s] within friction circle, engine power and top speed; (N,).
+    """Highest speeds [m/s] within friction circle, engine power, the car's top speed and the driver's ``highest_speed`` [m/s]; (N,).
 
     Args:
-        curvature: (N,) [1/m].
+        curvature: (N,) [1/m], at samples ``spacing`` [m] apart.
         used: (N,), grip that is used at most [m/s²]; braking gets ``driver.braking_share`` of it, driving ``car.driving_share``.
-        spacing: distance between samples [m].
-        car: whose power and top speed are used.
-        highest_speed: limit of the driver [m/s].
-        bank: of the road, positive with its left side higher [rad]; gravity helps or hinders.
-        grade: of the road, positive downhill [rad].
+        bank, grade: of the road, positive with its left side higher, and downhill [rad]; gravity helps or hinders.
     """
     lateral = np.maximum(used - np.sign(curvature) * GRAVITY * np.sin(bank), 0.1 * used)
     cornering = np.sqrt(lateral / np.maximum(np.abs(curvature), 1e-9))

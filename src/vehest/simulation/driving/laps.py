@@ -207,14 +207,10 @@ FASTEST_SEVERITY = 0.95  # share of the grip that a fast lap may take
 
 
 class LapDriver(LineDriver):
-    """Follows a plan of laps from just before the second one to an end; the first sample is taken on the start line.
+    """Follows a plan of laps of length ``lap`` [m] from just before the second one; the first sample is taken on the start line.
 
-    Args:
-        plan: of one lap more than is recorded.
-        lap: length of a lap [m].
-        end: distance at which the drive is over, or the stop begins [m].
-        stop_time: time from the end to the stand [s]; by default the drive is over at the end.
-        end_time: at which the drive is over wherever the car is [s].
+    At the distance ``end`` [m] the drive is over or, with a ``stop_time`` [s], the car begins to stop, to stand after it; it is over at
+    ``end_time`` [s] wherever the car is. The plan has one lap more than is recorded.
     """
 
     def __init__(

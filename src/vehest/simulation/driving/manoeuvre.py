@@ -72,13 +72,7 @@ FASTEST_SHARE = 0.9  # share of the top speed that a manoeuvre on an open area i
 
 
 class LineDriver(Follower):
-    """Follows a line until its end.
-
-    Args:
-        end: distance at which the drive is over [m]; by default the plan's end.
-        end_time: at which it is over at the latest [s].
-        following: see Follower.
-    """
+    """Follows a line to the distance ``end`` [m], by default the plan's end, or until ``end_time`` [s]; ``following``: see `Follower`."""
 
     def __init__(
         self,

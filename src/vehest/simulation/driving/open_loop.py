@@ -147,13 +147,7 @@ N_SINES = 24  # of which random steering is made, evenly spread over the band
 
 
 class OpenLoop:
-    """Steers by the clock on an open area and holds the speed.
-
-    Args:
-        speed: [m/s].
-        steer_at: road-wheel angle [rad] at a time [s].
-        end_time: at which the drive is over [s].
-    """
+    """Steers by the clock, road-wheel angle [rad] at a time [s], on an open area and holds the speed [m/s], until ``end_time`` [s]."""
 
     def __init__(
         self, car: Car, area: OpenArea, speed: float, steer_at: Callable[[float], float], end_time: float, drawn: dict[str, Any]

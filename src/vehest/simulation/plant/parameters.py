@@ -95,13 +95,10 @@ def vehicle_from_configuration(configuration: Mapping[str, Any]) -> Vehicle:
 
 
 def loaded(vehicle: Vehicle, mass: float, forward: float, up: float) -> Vehicle:
-    """The vehicle with a payload, a point mass that its springs carry; the same one without.
+    """The vehicle with a payload [kg], a point mass that its springs carry ``forward`` and ``up`` of the centre of gravity [m].
 
-    Unsprung masses are shared anew between the axles, so that body and car keep one centre of gravity in plan.
-
-    Args:
-        mass: of the payload [kg]; raises `ConfigurationError` where it is negative, or an axle would carry nothing.
-        forward, up: its place from the centre of gravity [m].
+    Unsprung masses are shared anew between the axles, so that body and car keep one centre of gravity in plan. Without a mass it is the
+    same vehicle. Raises `ConfigurationError`: it is negative, or an axle would carry nothing.
     """
     if mass == 0.0:
         return vehicle

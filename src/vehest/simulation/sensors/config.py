@@ -17,12 +17,10 @@ def switched_off(levels: SensorLevels, *names: str) -> SensorLevels:
 
     >>> levels = switched_off(SensorLevels(), "ay.noise", "tilt.bank", "reference", "*.drift")
 
-    Args:
-        names: an error of a sensor (``ay.noise``, ``imu.lever_x``, ``reference.heading.drift``), all errors of one (``ay``, ``tilt``,
-            ``reference``), or one kind of error of every sensor but the reference (``*.noise``), or all of them (``*``).
+    A name is an error of a sensor (``ay.noise``, ``imu.lever_x``, ``reference.heading.drift``), all errors of one (``ay``, ``tilt``,
+    ``reference``), or one kind of error of every sensor but the reference (``*.noise``), or all of them (``*``).
 
-    Raises:
-        ConfigurationError: there is no such sensor or error.
+    Raises `ConfigurationError`: there is no such sensor or error.
     """
     every = [entry.name for entry in fields(levels) if isinstance(getattr(levels, entry.name), SensorLevel)]
     for name in names:
