@@ -215,8 +215,7 @@ class Estimator(ABC):
             training: of ``training_type``.
             context: checkpoints, progress, the wish to stop.
 
-        Raises:
-            DataError: a channel is missing or the recordings are too short.
+        Raises `DataError`: a channel is missing or the recordings are too short.
         """
 
     def fewest_weights(self) -> int:
@@ -230,16 +229,13 @@ class Estimator(ABC):
     def estimate(
         self, recordings: Sequence[Recording], initial_state: Mapping[str, float] | Sequence[Mapping[str, float]] | None = None
     ) -> list[Estimate]:
-        """Estimate the lateral velocity of recordings that carry no reference channels.
+        """Estimate the lateral velocity of recordings, at the estimator's rate, that carry no reference channels.
 
-        Args:
-            recordings: at the estimator's rate.
-            initial_state: state at the first sample to start from, where a protocol hands it over openly, for all recordings or one a
-                recording: ``vy``, ``vx`` [m/s] and ``yaw_rate`` [rad/s], of which a method takes those that it has.
+        Where a protocol hands it over openly, ``initial_state`` is the state at the first sample to start from, for all recordings or one a
+        recording: ``vy``, ``vx`` [m/s] and ``yaw_rate`` [rad/s], of which a method takes those that it has.
 
-        Raises:
-            DataError: a channel is missing, the rate is another, or there are not as many states as recordings.
-            ConfigurationError: a state is given and the method cannot start from one.
+        Raises `DataError`: a channel is missing, the rate is another, or there are not as many states as recordings. Raises
+        `ConfigurationError`: a state is given and the method cannot start from one.
         """
         if initial_state is None or self.ignores_initial_state:
             states: list[Mapping[str, float] | None] = [None] * len(recordings)

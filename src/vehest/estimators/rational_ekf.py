@@ -348,18 +348,15 @@ class RationalFilter(SideslipFilter):
         levels: Mapping[str, float] | None = None,
         crossfall: float = 0.0,
     ) -> FilteredStates:
-        """Filter samples of ``channels``, (T, 4), from a state at the first one before its measurement.
+        """Filter samples of ``channels``, (T, 4), from a state at the first one before its measurement, by default `first_gaussian` of it.
 
         Args:
-            samples: (T, 4).
-            first: none: `first_gaussian` of the first sample.
-            levels: of noise; none: `values`.
             gate: levels are found without.
             refused: see `Gate`.
+            levels: of noise; none: `values`.
             crossfall: deviation by which the last state drifts where ``first`` has one more, the pull of a crossfall [m/s² √s⁻¹].
 
-        Raises:
-            ConfigurationError: curves or levels are neither given nor fitted.
+        Raises `ConfigurationError`: curves or levels are neither given nor fitted.
         """
         levels = self.values if levels is None else levels
         self.require_fitted(levels)

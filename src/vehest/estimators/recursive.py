@@ -78,10 +78,7 @@ class Recursive(Estimator):
     def find_numbers(self, data: FitData, training: Any, context: FitContext) -> tuple[Mapping[str, float], FitRecord]:
         """Best values of what is not given: in closed form, else by Nelder-Mead on the mean squared error of vy in training.
 
-        Args:
-            data: recordings with ``vy_ref``, without gaps but in channels that are skippable.
-            training: of ``training_type``.
-            context: progress and the wish to stop.
+        The recordings have ``vy_ref``, without gaps but in channels that are skippable.
         """
         values = self.closed_form(data.train)
         if values is not None:

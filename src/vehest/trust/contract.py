@@ -53,14 +53,11 @@ def limits_for(estimator: Estimator, trust: Trust | None) -> GuardLimits:
 class GuardedRun:
     """An estimator under the contract on a recording, or on its parts one after another, to the same bits.
 
-    Args:
-        estimator: fitted.
-        trust: learnt with the estimator; without it limits are those of any car, and there is neither band nor health of channels.
-        initial_state: of a protocol, at the first sample.
-        elsewhere: whether the car or its tyres are others than those that were calibrated on.
+    Without ``trust``, learnt with the fitted estimator, limits are those of any car, and there is neither band nor health of channels. The
+    state of a protocol, ``initial_state``, is that at the first sample; ``elsewhere``: the car or its tyres are others than those that were
+    calibrated on.
 
-    Attributes:
-        takes_parts: whether the estimator can go on where it stopped; else the recording must come whole.
+    Attributes:     takes_parts: whether the estimator can go on where it stopped; else the recording must come whole.
     """
 
     def __init__(
@@ -233,20 +230,13 @@ def motion_of(channels: Sequence[str], cleaned: Cleaned) -> FloatArray:
 
 
 class GuardedStepper(Stepper):
-    """Any estimator online, under the contract.
+    """Any fitted, causal estimator online, under the contract; ``trust`` and ``elsewhere`` are as of `GuardedRun`.
 
-    Args:
-        estimator: fitted, causal.
-        trust: learnt with the estimator; without it limits are those of any car, and there is neither band nor health of channels.
-        bus_rate_hz: rate at which samples come, if it is above the estimator's: they then go through a causal anti-aliasing filter first.
-        elsewhere: whether the car or its tyres are others than those that were calibrated on.
+    Samples at ``bus_rate_hz``, if that is above the estimator's rate, go through a causal anti-aliasing filter first.
 
-    Raises:
-        ConfigurationError: the estimator is not causal, or the bus is slower than it.
+    Raises `ConfigurationError`: the estimator is not causal, or the bus is slower than it.
 
-    Attributes:
-        last: what the last step returned.
-        marks: of `vehest.trust.watch` for it.
+    Attributes:     last: what the last step returned.     marks: of `vehest.trust.watch` for it.
     """
 
     def __init__(
@@ -282,9 +272,8 @@ class GuardedStepper(Stepper):
             sample: channel -> value [SI]; a channel that is missing, None or no number counts as not measured; None: all.
             time: of the sample [s], if known: repeated samples are skipped, missing ones bridged; what is no number counts as unknown.
 
-        Returns:
-            ``vy`` [m/s] and ``sideslip`` [rad], NaN only before the first estimate; ``health`` (0 valid, 1 degraded, 2 invalid) and
-            ``health_reason`` of the sample; with calibrated bands their half widths at 90 %, ``band_vy`` and ``band_sideslip``.
+        Returns:     ``vy`` [m/s] and ``sideslip`` [rad], NaN only before the first estimate; ``health`` (0 valid, 1 degraded, 2 invalid)
+        and     ``health_reason`` of the sample; with calibrated bands their half widths at 90 %, ``band_vy`` and ``band_sideslip``.
         """
         if isinstance(time, Real):
             skipped = self._clock.skipped(time)
