@@ -96,8 +96,7 @@ class Source(ABC):
         options: the options of this data set.
         version: raised when the recordings that it makes change.
 
-    Raises:
-        ConfigurationError: an unknown or missing option, or a value of the wrong type.
+    Raises `ConfigurationError`: an unknown or missing option, or a value of the wrong type.
     """
 
     options_type: ClassVar[type]

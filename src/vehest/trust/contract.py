@@ -57,7 +57,8 @@ class GuardedRun:
     state of a protocol, ``initial_state``, is that at the first sample; ``elsewhere``: the car or its tyres are others than those that were
     calibrated on.
 
-    Attributes:     takes_parts: whether the estimator can go on where it stopped; else the recording must come whole.
+    Attributes:
+        takes_parts: whether the estimator can go on where it stopped; else the recording must come whole.
     """
 
     def __init__(
@@ -88,8 +89,7 @@ class GuardedRun:
         Returns:
             ``vy``, ``sideslip``, ``health``, ``health_reason`` and, with calibrated bands, ``band_vy`` and ``band_sideslip``.
 
-        Raises:
-            DataError: a channel is missing.
+        Raises `DataError`: a channel is missing.
         """
         estimator = self.estimator
         missing = [name for name in estimator.channels if name not in samples]
@@ -236,7 +236,9 @@ class GuardedStepper(Stepper):
 
     Raises `ConfigurationError`: the estimator is not causal, or the bus is slower than it.
 
-    Attributes:     last: what the last step returned.     marks: of `vehest.trust.watch` for it.
+    Attributes:
+        last: what the last step returned.
+        marks: of `vehest.trust.watch` for it.
     """
 
     def __init__(
@@ -272,8 +274,9 @@ class GuardedStepper(Stepper):
             sample: channel -> value [SI]; a channel that is missing, None or no number counts as not measured; None: all.
             time: of the sample [s], if known: repeated samples are skipped, missing ones bridged; what is no number counts as unknown.
 
-        Returns:     ``vy`` [m/s] and ``sideslip`` [rad], NaN only before the first estimate; ``health`` (0 valid, 1 degraded, 2 invalid)
-        and     ``health_reason`` of the sample; with calibrated bands their half widths at 90 %, ``band_vy`` and ``band_sideslip``.
+        Returns:
+            ``vy`` [m/s] and ``sideslip`` [rad], NaN only before the first estimate; ``health`` (0 valid, 1 degraded, 2 invalid) and
+            ``health_reason`` of the sample; with calibrated bands their half widths at 90 %, ``band_vy`` and ``band_sideslip``.
         """
         if isinstance(time, Real):
             skipped = self._clock.skipped(time)
