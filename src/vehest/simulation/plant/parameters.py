@@ -14,10 +14,9 @@ from dataclasses import dataclass, field, fields, is_dataclass, replace
 from functools import cache
 from importlib import metadata
 from types import MappingProxyType
-from typing import Annotated, Any
+from typing import Any
 
 import numpy as np
-from pydantic import Field
 from vehiclemodels.utils.longitudinal_parameters import LongitudinalParameters
 from vehiclemodels.utils.steering_parameters import SteeringParameters
 from vehiclemodels.utils.tireParameters import TireParameters
@@ -56,8 +55,6 @@ MultiBodyValues = namedtuple(  # type: ignore[misc]
 POSITIVE = ("m", "m_s", "m_uf", "m_ur", "a", "b", "I_z", "I_Phi_s", "I_y_s", "I_y_w", "T_f", "T_r", "R_w", "K_zt", "K_sf", "K_sr", "w")
 """Parameters without which a car does not exist."""
 
-Length = Annotated[float, Field(ge=0.0)]
-
 
 @dataclass(frozen=True)
 class Vehicle:
@@ -71,7 +68,7 @@ class Vehicle:
     parameter_set: int  # number of the published set it starts from
     overrides: Mapping[str, Any] = field(default_factory=dict)
     driver: Mapping[str, float] = field(default_factory=dict)  # values of this car for its driver (car.py); the plant does not read them
-    relaxation: tuple[Length, Length] = (0.0, 0.0)  # way over which tyres' lateral forces follow their slip, front and rear [m]; 0: at once
+    relaxation: tuple[float, float] = (0.0, 0.0)  # way over which tyres' lateral forces follow their slip, front and rear [m]; 0: at once
 
     def __post_init__(self) -> None:
         parameters = library_parameters(self)
@@ -79,6 +76,9 @@ class Vehicle:
             if not getattr(parameters, name) > 0.0:
                 raise ConfigurationError(f"vehicle '{self.name}': {name} must be positive, not {getattr(parameters, name)}")
         rear_tyre(self)
+        for place, length in zip(("front", "rear"), self.relaxation, strict=True):
+            if not 0.0 <= length < math.inf:
+                raise ConfigurationError(f"vehicle '{self.name}': relaxation {place} must be zero or positive, not {length} m")
 
 
 def vehicle_from_configuration(configuration: Mapping[str, Any]) -> Vehicle:
