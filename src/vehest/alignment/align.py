@@ -123,17 +123,11 @@ def in_words(name: str, value: float) -> str:
 def align(recording: Recording, settings: AlignmentSettings) -> Alignment:
     """Estimate the quantities that are asked for; the recording stays as it is.
 
-    The steering ratio is estimated last, on the drive as the other transforms would correct it.
+    The steering ratio is estimated last, on the drive as the other transforms would correct it. It needs ``handwheel`` or ``steer``,
+    ``vx``, ``yaw_rate`` and ``ay``; all others ``ax``, ``ay``, ``yaw_rate`` and ``vy_ref`` (and ``vx_ref`` or ``vx``).
 
-    Args:
-        recording: with ``ax``, ``ay``, ``yaw_rate`` and ``vy_ref`` (and ``vx_ref`` or ``vx``) for all but the steering ratio, with
-            ``handwheel`` or ``steer``, ``vx``, ``yaw_rate`` and ``ay`` for that.
-        settings: quantities, and how to estimate them.
-
-    Raises:
-        DataError: a channel is missing or has gaps, the recording is too short, sensor and reference have nothing in common, or the
-            drive cannot tell the parameters apart.
-        ConfigurationError: the cut-off is too high for the recording's rate.
+    Raises `DataError`: a channel is missing or has gaps, the recording is too short, sensor and reference have nothing in common, or the
+    drive cannot tell the parameters apart. Raises `ConfigurationError`: the cut-off is too high for the recording's rate.
     """
     parameters: list[Parameter] = []
     transforms: list[dict[str, Any]] = []

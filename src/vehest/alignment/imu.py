@@ -428,9 +428,8 @@ def scatter_of(fit: Fit, blocks: int) -> FloatArray:
     Residuals remember for seconds; blocks that are longer than that are nearly independent, whatever the residuals' spectrum. Parameters
     with a prior vary as the prior does.
 
-    Source:
-        Cluster jackknife: MacKinnon, Nielsen & Webb, Cluster-robust inference: A guide to empirical practice, Journal of Econometrics
-        232 (2), 2023, section 3; blocks of a time series as clusters: Ibragimov & Müller, J. Business & Economic Statistics 28 (4), 2010.
+    Source: Cluster jackknife: MacKinnon, Nielsen & Webb, Cluster-robust inference: A guide to empirical practice, Journal of Econometrics
+    232 (2), 2023, section 3; blocks of a time series as clusters: Ibragimov & Müller, J. Business & Economic Statistics 28 (4), 2010.
     """
     information = fit.information
     edges = np.linspace(0, fit.error.shape[1], blocks + 1).astype(int)

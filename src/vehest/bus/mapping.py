@@ -33,10 +33,8 @@ def from_dataset(dataset: Mapping[str, Any], needed: Sequence[str], optional: Se
 
     ``optional`` are those of them that may be missing; ``dbc`` takes the place of the data set's.
 
-    Raises:
-        ConfigurationError: the data set is of another source, or declares no such channel.
-        MissingError: there is no DBC.
-        DataError: it cannot be used, lacks a signal, or contradicts a declared unit.
+    Raises `ConfigurationError`: the data set is of another source, or declares no such channel. Raises `MissingError`: there is no DBC.
+    Raises `DataError`: it cannot be used, lacks a signal, or contradicts a declared unit.
     """
     where, declared = f"data set '{dataset.get('name')}'", dataset.get("channels") or {}
     if dataset.get("source") != "can":
@@ -60,10 +58,8 @@ def from_dataset(dataset: Mapping[str, Any], needed: Sequence[str], optional: Se
 def from_names(dbc: Path, needed: Sequence[str], optional: Sequence[str] = (), words: Sequence[str] = ()) -> BusSignals:
     """Signals that ``words`` name, such as ``ay=-IMU.AccLat:g``, and those that are called like channels, in the units of the DBC.
 
-    Raises:
-        ConfigurationError: a word that cannot be understood, a unit that is not known, or a channel without a signal.
-        MissingError: there is no DBC.
-        DataError: it cannot be used, or lacks a signal.
+    Raises `ConfigurationError`: a word that cannot be understood, a unit that is not known, or a channel without a signal. Raises
+    `MissingError`: there is no DBC. Raises `DataError`: it cannot be used, or lacks a signal.
     """
     entries = dict(map(_entry, words))
     if unknown := sorted(set(entries) - set(needed)):

@@ -99,13 +99,8 @@ class Bus:
 class Replay:
     """A log's frames, sent onto a bus by the car, and a control unit that estimates from what it hears there.
 
-    Args:
-        signals: of the bus that the model reads.
-        frames: writes estimates as frames.
-        stopped: whether to end early; what was written is kept.
-
-    Raises:
-        ConfigurationError: the DBC has the identifiers of the estimates.
+    The model reads ``signals``; ``frames`` writes its estimates as frames; ``stopped`` tells whether to end early, with what was written
+    kept. Raises `ConfigurationError`: the DBC has the identifiers of the estimates.
     """
 
     def __init__(

@@ -81,8 +81,7 @@ class SpeedFromWheels:
     ``hold_seconds``; after them the median counts, since something must. Wheels that the recording does not have do not count; one
     alone counts as it is. Without ``steer`` the front wheels point straight ahead.
 
-    Source:
-        Di Biase, Lenzo & Timpone 2020, Eqs. 61 to 64, after Selmanaj et al. 2017; the check of plausibility is vehest's own.
+    Source: Di Biase, Lenzo & Timpone 2020, Eqs. 61 to 64, after Selmanaj et al. 2017; the check of plausibility is vehest's own.
     """
 
     wheel_radius: PositiveFloat  # rolling radius R [m]
@@ -149,8 +148,7 @@ class AccelerationFromSpeed:
     An accelerometer shows du/dt - v·r; the second term is left out, since v is unknown. It is small where sideslip is: 0.2 m/s² for
     v = 0.5 m/s and r = 0.4 rad/s.
 
-    Source:
-        Rigid-body kinematics, e.g. Da Lio et al. 2023, Eq. 4b.
+    Source: Rigid-body kinematics, e.g. Da Lio et al. 2023, Eq. 4b.
     """
 
     channel: Literal["vx", "vx_ref"] = "vx"  # the speed; ``vx`` or ``vx_ref``
@@ -217,9 +215,8 @@ class ScaleToWheelbase:
     that are geometrically similar on similar tyres then drive the same manoeuvre. Channels that are no lengths, times or angles
     (forces, torques, currents, pressures) are left out.
 
-    Source:
-        Froude scaling: dynamic similarity under gravity, the unit of time being √(wheelbase/g); e.g. Brennan & Alleyne, Using a scale
-        testbed, IEEE Control Systems Magazine 21 (3), 2001, for vehicles.
+    Source: Froude scaling: dynamic similarity under gravity, the unit of time being √(wheelbase/g); e.g. Brennan & Alleyne, Using a scale
+    testbed, IEEE Control Systems Magazine 21 (3), 2001, for vehicles.
     """
 
     wheelbase: PositiveFloat  # of the car [m]

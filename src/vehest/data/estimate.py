@@ -44,31 +44,18 @@ half widths of the calibrated 90 % band, ``health`` is 0 (valid), 1 (degraded) o
 class Estimate:
     """Estimated states of one recording; sample k holds for ``start_time + k / rate_hz``.
 
-    NaN means that the method has no estimate yet (a window that is not full).
-
-    Args:
-        recording_id: the recording it was made from.
-        estimator: name of the estimator.
-        rate_hz: rate of the estimate [Hz].
-        start_time: time of the first sample [s].
-        channels: quantity -> values, shape (T,); ``vy`` and ``sideslip`` always, others where the method has them.
-        mode: ``causal`` if no sample used measurements later than its own time.
-        covariance: of the errors of some of the quantities, shape (T, n, n), where the method has one.
-        covariance_of: the quantity behind each row of the covariance, n names.
-
-    Raises:
-        DataError: a quantity is unknown or of another length, the covariance is not of shape (T, n, n), or its rows have no n
-            different names.
+    NaN means that the method has no estimate yet (a window that is not full). Raises `DataError`: a quantity is unknown or of another
+    length, the covariance is not of shape (T, n, n), or its rows have no n different names.
     """
 
-    recording_id: str
-    estimator: str
-    rate_hz: float
-    start_time: float
-    channels: Mapping[str, FloatArray]
-    mode: Mode = "causal"
-    covariance: FloatArray | None = None
-    covariance_of: tuple[str, ...] = ()
+    recording_id: str  # the recording it was made from
+    estimator: str  # name of the estimator
+    rate_hz: float  # rate of the estimate [Hz]
+    start_time: float  # time of the first sample [s]
+    channels: Mapping[str, FloatArray]  # quantity -> values, (T,); ``vy`` and ``sideslip`` always, others where the method has them
+    mode: Mode = "causal"  # ``causal`` if no sample used measurements later than its own time
+    covariance: FloatArray | None = None  # of the errors of some of the quantities, (T, n, n), where the method has one
+    covariance_of: tuple[str, ...] = ()  # the quantity behind each row of the covariance, n names
 
     def __post_init__(self) -> None:
         where, lengths = f"estimate of '{self.recording_id}'", {len(values) for values in self.channels.values()}
@@ -103,8 +90,7 @@ class Estimate:
     def covariance_at(self, times: FloatArray, names: Sequence[str]) -> FloatArray:
         """Covariance (K, n, n) of n quantities at other times (K,) [s]: the latest that is not in the future, NaN outside the estimate.
 
-        Raises:
-            DataError: the estimate has no covariance of one of them.
+        Raises `DataError`: the estimate has no covariance of one of them.
         """
         if self.covariance is None or set(names) - set(self.covariance_of):
             have = ", ".join(self.covariance_of) or "nothing"

@@ -23,32 +23,19 @@ LOWEST_RATE, HIGHEST_RATE = 1e-6, 1e5  # between which a sampling rate lies [Hz]
 
 @dataclass(frozen=True, eq=False)
 class Recording:
-    """One uninterrupted drive; immutable.
+    """One uninterrupted drive; immutable. Sample k was taken at ``start_time + k / rate_hz``.
 
-    Sample k was taken at ``start_time + k / rate_hz``.
-
-    Args:
-        id: name, unique within its data set.
-        vehicle: name of the vehicle that was driven.
-        rate_hz: sampling rate [Hz].
-        start_time: time of the first sample [s].
-        channels: canonical name -> samples, float64 of shape (T,), SI units.
-        kind: ``real`` or ``simulated``.
-        gappy: channels in which NaN means "not measured"; everywhere else NaN is an error.
-        provenance: where the samples come from (JSON values only); not part of the data.
-
-    Raises:
-        DataError: no samples, unknown channel, unequal lengths, values that are not finite, or a rate, start or kind that makes no sense.
+    Raises `DataError`: no samples, unknown channel, unequal lengths, values that are not finite, or a senseless rate, start or kind.
     """
 
-    id: str
-    vehicle: str
-    rate_hz: float
-    start_time: float
-    channels: Mapping[str, FloatArray]
-    kind: Kind = "real"
-    gappy: frozenset[str] = frozenset()
-    provenance: Mapping[str, Any] = field(default_factory=dict)
+    id: str  # name, unique within its data set
+    vehicle: str  # name of the vehicle that was driven
+    rate_hz: float  # sampling rate [Hz]
+    start_time: float  # time of the first sample [s]
+    channels: Mapping[str, FloatArray]  # canonical name -> samples, float64 of shape (T,), SI units
+    kind: Kind = "real"  # ``real`` or ``simulated``
+    gappy: frozenset[str] = frozenset()  # channels in which NaN means "not measured"; everywhere else NaN is an error
+    provenance: Mapping[str, Any] = field(default_factory=dict)  # where samples come from (JSON values only); not part of the data
 
     def __post_init__(self) -> None:
         if not LOWEST_RATE <= self.rate_hz <= HIGHEST_RATE:

@@ -31,13 +31,10 @@ def validated(kind: type[Schema], content: Any, where: str, *, error: type[Vehes
 
     Args:
         kind: dataclass, which may hold others; its ``__post_init__`` may raise a `VehestError` or ``ValueError``.
-        content: plain values.
         where: first words of a message, ``"'model.yaml'"``; may be empty.
-        error: what to raise.
         group: that the keys belong to, ``training`` for ``training.patience``; may be empty.
 
-    Raises:
-        DataError: a key is missing, unknown or of the wrong type, or a value makes no sense (or ``error``).
+    Raises `DataError` (or ``error``): a key is missing, unknown or of the wrong type, or a value makes no sense.
     """
     above = [group] if group else []
     try:

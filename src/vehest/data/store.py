@@ -79,9 +79,7 @@ def write_recording(recording: Recording, path: Path) -> None:
 def read_recording(path: Path, channels: Iterable[str] | None = None) -> Recording:
     """Read a recording back, all of it or the named channels.
 
-    Raises:
-        MissingError: there is no such file.
-        DataError: the file is damaged, not a recording, or lacks a channel.
+    Raises `MissingError`: there is no such file. Raises `DataError`: the file is damaged, not a recording, or lacks a channel.
     """
     columns, described = _read(path, RecordingDescription, None if channels is None else list(channels))
     gappy, about = described.gappy & columns.keys(), _attributes(described, _OF_RECORDING)
@@ -131,9 +129,7 @@ def estimate_columns(parts: Iterable[Estimate]) -> Iterator[dict[str, FloatArray
 def read_estimate(path: Path) -> Estimate:
     """Read an estimate back.
 
-    Raises:
-        MissingError: there is no such file.
-        DataError: the file is damaged or not an estimate.
+    Raises `MissingError`: there is no such file. Raises `DataError`: the file is damaged or not an estimate.
     """
     columns, described = _read(path, EstimateDescription)
     covariance, n_states = None, described.n_states

@@ -47,8 +47,7 @@ class Resample:
     nothing is shifted and frequencies above the new Nyquist frequency are removed before they can alias. ``decimate`` keeps every n-th
     sample as it is (integer ratios only), as a slower sensor or a naive logger would.
 
-    Source:
-        Crochiere & Rabiner, Multirate Digital Signal Processing, 1983; `scipy.signal.resample_poly`.
+    Source: Crochiere & Rabiner, Multirate Digital Signal Processing, 1983; `scipy.signal.resample_poly`.
     """
 
     rate_hz: float  # the new rate [Hz]
@@ -162,8 +161,7 @@ class LowPass:
 class RemoveOutliers:
     """Replace isolated spikes by the median of their neighbourhood (Hampel filter); offline.
 
-    Source:
-        Hampel, The influence curve and its role in robust estimation, JASA 69 (346), 1974.
+    Source: Hampel, The influence curve and its role in robust estimation, JASA 69 (346), 1974.
     """
 
     half_window: PositiveInt = 5  # samples on either side that count as neighbours
@@ -200,8 +198,7 @@ class MountingCorrection:
     The sensor sits ``lever_x``, ``lever_y`` from the centre of gravity and is turned by ``yaw`` about the vertical axis:
     a_cg = R(yaw) a_sensor - dω/dt × l - ω × (ω × l). With a lever arm it is offline: dω/dt is taken by central differences.
 
-    Source:
-        Rigid-body kinematics, e.g. Guiggiani, The Science of Vehicle Dynamics, 2018, section 3.2.
+    Source: Rigid-body kinematics, e.g. Guiggiani, The Science of Vehicle Dynamics, 2018, section 3.2.
     """
 
     lever_x: float = 0.0  # forward offset of the sensor from the centre of gravity [m]
@@ -224,8 +221,7 @@ class MountingCorrection:
 class ReferenceLever:
     """Move reference velocities from where their sensor sits to the centre of gravity: v_cg = v_sensor - ω × l.
 
-    Source:
-        Rigid-body kinematics, as `MountingCorrection`; Bertipaglia et al. 2024, Section III-C moves an optical sensor on the bumper so.
+    Source: Rigid-body kinematics, as `MountingCorrection`; Bertipaglia et al. 2024, Section III-C moves an optical sensor on the bumper so.
     """
 
     lever_x: float = 0.0  # forward offset of the sensor from the centre of gravity [m]
@@ -252,8 +248,7 @@ class DelayCorrection:
     frequency. Where it would need samples that the recording does not have, the recording is cut: at either end by the reach of the
     interpolation, 16 samples, and by the delay at one of them.
 
-    Source:
-        Laakso, Välimäki, Karjalainen & Laine, Splitting the unit delay, IEEE Signal Processing Magazine 13 (1), 1996.
+    Source: Laakso, Välimäki, Karjalainen & Laine, Splitting the unit delay, IEEE Signal Processing Magazine 13 (1), 1996.
     """
 
     delay: float  # by how much the channels are late, negative if they are early [s]

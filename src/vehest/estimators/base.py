@@ -75,7 +75,7 @@ class Trial(NamedTuple):
 class Stepper(ABC):
     """An estimator that runs along with the drive, one sample after another."""
 
-    horizon_steps: ClassVar[int] = 0  # sampling intervals after the sample for which the returned estimate holds
+    horizon_steps: int = 0  # sampling intervals after the sample for which the returned estimate holds
 
     @abstractmethod
     def step(self, sample: Mapping[str, float]) -> dict[str, float]:
@@ -83,8 +83,7 @@ class Stepper(ABC):
 
         A method that has a covariance also returns ``vy_variance`` [m²/s²].
 
-        Raises:
-            DataError: a channel is missing.
+        Raises `DataError`: a channel is missing.
         """
 
 
@@ -106,6 +105,7 @@ class Estimator(ABC):
     refuses: ClassVar[tuple[str, ...]] = ()  # measurements of a sample that are errors: ``NaN`` where it is not skippable, ``infinite``
     may_be_nan: ClassVar[tuple[str, ...]] = ()  # weights that may stay NaN, because each recording tells them
     covariance_of: ClassVar[tuple[str, ...]] = ()  # quantities that the covariances of `run` are of
+    horizon_steps: ClassVar[int] = 0  # sampling intervals after a sample for which the estimate made with it holds
     ignores_initial_state: ClassVar[bool] = False  # whether an initial state is left aside; else it is used, or refused as an error
     slow_kernel: ClassVar[str] = ""  # ``module:function`` that takes tens of seconds to compile; empty: none
     # error of `online` where its settings make it not causal, with those that make it causal
@@ -131,7 +131,7 @@ class Estimator(ABC):
             setattr(cls, name, property(attrgetter(f"settings.{name}")))
 
     def __init__(self, settings: Any) -> None:
-        self.settings = settings
+        self.settings, self._seed = settings, 0
         self.preparation: Mapping[str, Any] = {"method": "polyphase", "transforms": []}
         self.check()
 
@@ -156,12 +156,7 @@ class Estimator(ABC):
     @property
     def learns(self) -> bool:
         """Whether the fit takes anything from recordings; if not, it needs none."""
-        return True
-
-    @property
-    def horizon_steps(self) -> int:
-        """How many sampling intervals after a sample the estimate made with it holds."""
-        return 0
+        return self.n_parameters > 0
 
     @property
     def warm_up_steps(self) -> int:
@@ -205,9 +200,9 @@ class Estimator(ABC):
     def n_parameters(self) -> int:
         """How many numbers the fit determines."""
 
-    @abstractmethod
     def seed(self, seed: int) -> None:
         """Say which random numbers the next fit starts from and uses."""
+        self._seed = seed
 
     @classmethod
     @abstractmethod
@@ -220,8 +215,7 @@ class Estimator(ABC):
             training: of ``training_type``.
             context: checkpoints, progress, the wish to stop.
 
-        Raises:
-            DataError: a channel is missing or the recordings are too short.
+        Raises `DataError`: a channel is missing or the recordings are too short.
         """
 
     def fewest_weights(self) -> int:
@@ -235,16 +229,13 @@ class Estimator(ABC):
     def estimate(
         self, recordings: Sequence[Recording], initial_state: Mapping[str, float] | Sequence[Mapping[str, float]] | None = None
     ) -> list[Estimate]:
-        """Estimate the lateral velocity of recordings that carry no reference channels.
+        """Estimate the lateral velocity of recordings, at the estimator's rate, that carry no reference channels.
 
-        Args:
-            recordings: at the estimator's rate.
-            initial_state: state at the first sample to start from, where a protocol hands it over openly, for all recordings or one a
-                recording: ``vy``, ``vx`` [m/s] and ``yaw_rate`` [rad/s], of which a method takes those that it has.
+        Where a protocol hands it over openly, ``initial_state`` is the state at the first sample to start from, for all recordings or one a
+        recording: ``vy``, ``vx`` [m/s] and ``yaw_rate`` [rad/s], of which a method takes those that it has.
 
-        Raises:
-            DataError: a channel is missing, the rate is another, or there are not as many states as recordings.
-            ConfigurationError: a state is given and the method cannot start from one.
+        Raises `DataError`: a channel is missing, the rate is another, or there are not as many states as recordings. Raises
+        `ConfigurationError`: a state is given and the method cannot start from one.
         """
         if initial_state is None or self.ignores_initial_state:
             states: list[Mapping[str, float] | None] = [None] * len(recordings)

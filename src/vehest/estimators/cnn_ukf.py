@@ -251,8 +251,7 @@ class EndToEnd:
 
         Cuts whose covariance or gradient is not finite are left out and counted.
 
-        Raises:
-            DataError: that is more than half of the batch.
+        Raises `DataError`: that is more than half of the batch.
         """
         estimator = self.estimator
         count, steps = batch.sideslip.shape

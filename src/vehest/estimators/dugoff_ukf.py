@@ -166,7 +166,6 @@ class DugoffUkf(SigmaPointEstimator):
         self.axle_tyres = np.array([getattr(settings.tyres, name) for name in TYRES], np.float64)
         given = np.array([getattr(settings.noise, name) for name in self.level_names], np.float64)
         self.levels = dict(zip(self.level_names, given.tolist(), strict=True))
-        self._seed = 0
 
     def check(self) -> None:
         """Raises `ConfigurationError`: thresholds of the non-linear range in the wrong order."""
@@ -192,11 +191,6 @@ class DugoffUkf(SigmaPointEstimator):
         return f"{self.title}, {'with' if self.inputs == 'full' else 'without'} tyre forces{self.gate_title}"
 
     @property
-    def learns(self) -> bool:
-        """Whether tyres or levels are not given."""
-        return self.n_parameters > 0
-
-    @property
     def n_parameters(self) -> int:
         """Tyre parameters and levels of noise that are not given."""
         return self.n_identified
@@ -217,10 +211,6 @@ class DugoffUkf(SigmaPointEstimator):
         """Raises `ConfigurationError`: tyres or levels are neither given nor found."""
         self.track()
         self.noise_covariances(self.levels)
-
-    def seed(self, seed: int) -> None:
-        """Seed of the genetic searches and of Optuna's trials."""
-        self._seed = seed
 
     def track(self) -> DugoffTrack:
         """The model; raises `ConfigurationError`: the tyres are neither given nor identified."""
@@ -402,8 +392,7 @@ class DugoffUkf(SigmaPointEstimator):
     def noise_covariances(self, levels: Mapping[str, float]) -> tuple[Tensor, Tensor]:
         """Covariance of a step, (2, 2), and those of measurements where the car is linear and where it is not, (2, 4, 4).
 
-        Raises:
-            ConfigurationError: a level is neither given nor found.
+        Raises `ConfigurationError`: a level is neither given nor found.
         """
         if any(math.isnan(level) for level in levels.values()):
             raise ConfigurationError(f"estimator '{self.name}' has no noise levels yet; fit or load it first, or give estimator.noise")

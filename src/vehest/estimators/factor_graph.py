@@ -128,13 +128,10 @@ class FactorGraph(SideslipFilter):
     def solve_window(
         self, model: LinearModel[FloatArray], samples: FloatArray, start: Gaussian[FloatArray], refused: NDArray[np.int64]
     ) -> FloatArray:
-        """States of a window's samples given all of them, (N, 2); measurements of the newest that the gate refuses become NaN.
+        """States of a window's samples given all of them, (N, 2), of their model and ``start``, the first state before its measurement.
 
-        Args:
-            model: of these samples.
-            samples: of ``channels``, (N, 4), of which the newest is changed in place.
-            start: the first state before its measurement.
-            refused: see `Gate`, changed in place.
+        Samples are of ``channels``, (N, 4). Measurements of the newest that the gate refuses become NaN in them; ``refused`` is changed in
+        place, too (see `Gate`).
         """
         filtered = kalman_scan(model, samples[:, MEASURED], start)
         gate = self.gate_in_use()

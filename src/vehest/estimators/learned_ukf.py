@@ -308,8 +308,7 @@ class LearnedUkf(Network, SigmaPointEstimator):
     def drive(self, recording: Recording, dtype: torch.dtype) -> Drive:
         """A recording as its filter takes it: true states (T, 5), inputs (T, 2), measurements (T, 4); friction is that of training.
 
-        Raises:
-            DataError: a reference, an input or the motor's speed is missing or has gaps.
+        Raises `DataError`: a reference, an input or the motor's speed is missing or has gaps.
         """
         require_learnable([recording], (*REFERENCES, "motor_speed", *INPUTS), self.name)
         measurements, inputs = self._samples(recording)

@@ -18,19 +18,15 @@ from vehest.training.search import DirectSearchSettings
 def implicit_euler_observer(
     measurements: FloatArray, gain: float, threshold: float, step: float, v: float, u: float, vy: FloatArray, vx: FloatArray
 ) -> None:
-    """Run the observer over a recording, writing the estimates made for the time of each sample.
+    """Run the observer over a recording, writing the estimates ``vy`` and ``vx`` [m/s] made for the time of each sample, (T,).
 
     (I - τA)x⁺ = x + τb with A = [[0, -α²ω], [ω, -2α|ω|]], b = [a_y + (α² - 1)ωu_m, a_x + 2α|ω|u_m]
 
     Args:
         measurements: yaw_rate, vx, ay, ax, shape (T, 4).
-        gain: α.
+        gain, step: α, and the sampling time τ [s].
         threshold: |yaw rate| below which the state is reset [rad/s].
-        step: sampling time τ [s].
-        v: lateral velocity to start from [m/s].
-        u: forward velocity to start from [m/s]; the measured one if NaN.
-        vy: output, shape (T,) [m/s].
-        vx: output, shape (T,) [m/s].
+        v, u: lateral and forward velocity to start from [m/s]; the measured one where u is NaN.
 
     Source: Da Lio et al. 2023, Appendix A, with the gains in the order of Appendix B; Farrelly & Wellstead 1996.
     """

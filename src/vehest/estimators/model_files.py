@@ -59,8 +59,7 @@ class Description:
 def save_model(estimator: Estimator, folder: Path, about: Mapping[str, Any] | None = None) -> None:
     """Write a fitted estimator into an existing folder; ``about`` are plain values of `About`, and others for people.
 
-    Raises:
-        OSError: it cannot be written.
+    Raises `OSError`: it cannot be written.
     """
     description = {
         "format": FORMAT,
@@ -81,10 +80,8 @@ def save_model(estimator: Estimator, folder: Path, about: Mapping[str, Any] | No
 def load_model(folder: Path) -> Estimator:
     """Read a fitted estimator back.
 
-    Raises:
-        MissingError: there is no model.
-        DataError: a file is damaged or of another format, the estimator is unknown, a weight is not finite, or the weights do not fit the
-            settings.
+    Raises `MissingError`: there is no model. Raises `DataError`: a file is damaged or of another format, the estimator is unknown, a weight
+    is not finite, or the weights do not fit the settings.
     """
     description, path = read_description(folder), folder / DESCRIPTION
     try:
@@ -110,9 +107,7 @@ def load_model(folder: Path) -> Estimator:
 def read_description(folder: Path) -> Description:
     """What a model folder says about itself.
 
-    Raises:
-        MissingError: there is no model.
-        DataError: the description is damaged, or of another format.
+    Raises `MissingError`: there is no model. Raises `DataError`: the description is damaged, or of another format.
     """
     path = folder / DESCRIPTION
     try:
@@ -129,8 +124,7 @@ def read_description(folder: Path) -> Description:
 def _built(kind: type[Estimator], settings: Mapping[str, Any], n_weights: int, path: Path) -> Estimator:
     """An estimator of these settings, once they are known to ask for no more parameters than there are weights.
 
-    Raises:
-        DataError: they ask for more, or make no sense.
+    Raises `DataError`: they ask for more, or make no sense.
     """
     for name, number in _whole_numbers(settings, "settings"):
         if number > max(USUAL_SIZE, n_weights):
@@ -160,9 +154,7 @@ def _whole_numbers(content: Any, name: str) -> Iterator[tuple[str, int]]:
 def _read_weights(folder: Path, may_be_nan: tuple[str, ...]) -> dict[str, np.ndarray[Any, Any]]:
     """Weights by name; what a tensor takes in memory is in the file.
 
-    Raises:
-        MissingError: there are none.
-        DataError: the file is damaged, or holds other numbers than finite float32 and float64.
+    Raises `MissingError`: there are none. Raises `DataError`: the file is damaged, or holds other numbers than finite float32 and float64.
     """
     path = folder / WEIGHTS
     try:

@@ -19,9 +19,10 @@ class Network(Estimator):
     A family has either its own `run`, or is a `WindowedEstimator`; and either `fit_member` or its own `fit_members`.
     """
 
+    learns = True  # always
+
     def __init__(self, settings: Any) -> None:
         super().__init__(settings)
-        self._seed = 0
         self._loaded: dict[str, np.ndarray[Any, Any]] = {}
 
     @cached_property
@@ -57,10 +58,6 @@ class Network(Estimator):
         """Numbers that training determines; ranges taken from the data do not count."""
         return sum(parameter.numel() for parameter in self.network.parameters() if parameter.requires_grad)
 
-    def seed(self, seed: int) -> None:
-        """Seed of initial weights, batches and dropout."""
-        self._seed = seed
-
     def fewest_weights(self) -> int:
         """Its parameters, found without room for them."""
         import torch
@@ -81,8 +78,7 @@ class Network(Estimator):
     def load_weights(self, weights: Mapping[str, np.ndarray[Any, Any]]) -> None:
         """Take parameters and ranges back, in the precision they were trained in.
 
-        Raises:
-            DataError: a name or shape does not fit the settings.
+        Raises `DataError`: a name or shape does not fit the settings.
         """
         expected = self.weight_shapes()
         require_shapes(self, weights, expected)

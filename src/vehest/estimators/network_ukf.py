@@ -48,11 +48,6 @@ class NetworkUkf(SampleNetworkEstimator, DugoffUkf):
         return self.inputs + self.gate_suffix + NAMED[self.normalisation]
 
     @property
-    def learns(self) -> bool:
-        """Always."""
-        return True
-
-    @property
     def n_parameters(self) -> int:
         """Weights and biases of the network, and what the filter's fit finds."""
         return super().n_parameters + self.n_identified

@@ -133,7 +133,6 @@ class RationalFilter(SideslipFilter):
         self.curve_covariance = (settings.curves.deviation or GIVEN_DEVIATION) ** 2 * np.eye(len(CURVES))
         levels = vars(settings.noise) | {name: 0.0 for name in LEVELS if name not in self.level_names}
         self.values = {name: math.nan if level is None else level for name, level in levels.items()}
-        self._seed = 0
 
     def check(self) -> None:
         """Raises `ConfigurationError`: a gate of the unscented filter, or levels or curves that are given in part."""
@@ -188,11 +187,6 @@ class RationalFilter(SideslipFilter):
         return bool(self.adapted) and self.adapt_above > 0.0
 
     @property
-    def learns(self) -> bool:
-        """Whether curves or levels are not given."""
-        return not self._curves_given or bool(self._unknown)
-
-    @property
     def n_parameters(self) -> int:
         """Parameters of curves and levels of noise that are not given."""
         return len(self.curve_names) * (not self._curves_given) + len(self._unknown)
@@ -209,10 +203,6 @@ class RationalFilter(SideslipFilter):
     def _searched(self) -> tuple[str, ...]:
         """Levels that are tuned: the sensors' as ratios to the first, whose size follows from the innovations."""
         return tuple(name for name in self._unknown if name != LEVELS[0])
-
-    def seed(self, seed: int) -> None:
-        """Seed of Optuna's trials; nothing else is random."""
-        self._seed = seed
 
     def track(self) -> TyreTrack:
         """The model in torch, at the curves that the filter starts with."""
@@ -358,18 +348,15 @@ class RationalFilter(SideslipFilter):
         levels: Mapping[str, float] | None = None,
         crossfall: float = 0.0,
     ) -> FilteredStates:
-        """Filter samples of ``channels``, (T, 4), from a state at the first one before its measurement.
+        """Filter samples of ``channels``, (T, 4), from a state at the first one before its measurement, by default `first_gaussian` of it.
 
         Args:
-            samples: (T, 4).
-            first: none: `first_gaussian` of the first sample.
-            levels: of noise; none: `values`.
             gate: levels are found without.
             refused: see `Gate`.
+            levels: of noise; none: `values`.
             crossfall: deviation by which the last state drifts where ``first`` has one more, the pull of a crossfall [m/s² √s⁻¹].
 
-        Raises:
-            ConfigurationError: curves or levels are neither given nor fitted.
+        Raises `ConfigurationError`: curves or levels are neither given nor fitted.
         """
         levels = self.values if levels is None else levels
         self.require_fitted(levels)

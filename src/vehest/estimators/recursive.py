@@ -43,7 +43,7 @@ class Recursive(Estimator):
         super().__init_subclass__(**options)
         for name, declared in cls.settings_type.declarations().items():
             if declared.is_fitted:
-                setattr(cls, name, _FittedNumber(name))
+                setattr(cls, name, _fitted_number(name))
 
     def __init__(self, settings: Any) -> None:
         super().__init__(settings)
@@ -71,18 +71,14 @@ class Recursive(Estimator):
     def closed_form(self, recordings: Sequence[Recording]) -> dict[str, float] | None:
         """Numbers of the smallest mean squared error of vy, where the family has them in closed form.
 
-        Raises:
-            DataError: the recordings do not determine them.
+        Raises `DataError`: the recordings do not determine them.
         """
         return None
 
     def find_numbers(self, data: FitData, training: Any, context: FitContext) -> tuple[Mapping[str, float], FitRecord]:
         """Best values of what is not given: in closed form, else by Nelder-Mead on the mean squared error of vy in training.
 
-        Args:
-            data: recordings with ``vy_ref``, without gaps but in channels that are skippable.
-            training: of ``training_type``.
-            context: progress and the wish to stop.
+        The recordings have ``vy_ref``, without gaps but in channels that are skippable.
         """
         values = self.closed_form(data.train)
         if values is not None:
@@ -114,20 +110,11 @@ class Recursive(Estimator):
         """How many numbers are not given."""
         return len(self.unknown)
 
-    @property
-    def learns(self) -> bool:
-        """Whether there is any number to determine."""
-        return bool(self.unknown)
-
-    def seed(self, seed: int) -> None:
-        """Nothing here is random."""
-
     @classmethod
     def fit_members(cls, members: Sequence[Estimator], data: FitData, training: Any, context: FitContext) -> list[FitRecord]:
         """Fit one; the others, which could not differ, get the same.
 
-        Raises:
-            DataError: a channel or the reference is missing or has gaps.
+        Raises `DataError`: a channel or the reference is missing or has gaps.
         """
         started = time.monotonic()
         own = [member for member in members if isinstance(member, Recursive)]
@@ -165,17 +152,9 @@ class Recursive(Estimator):
         self.values = {name: float(weights[name][0]) for name in self.values}
 
 
-class _FittedNumber:
+def _fitted_number(name: str) -> property:
     """Attribute of an estimator that is one of its ``values``."""
-
-    def __init__(self, name: str) -> None:
-        self.name = name
-
-    def __get__(self, owner: Recursive | None, kind: type | None = None) -> Any:
-        return self if owner is None else owner.values[self.name]
-
-    def __set__(self, owner: Recursive, value: float) -> None:
-        owner.values[self.name] = float(value)
+    return property(lambda own: own.values[name], lambda own, value: own.values.update({name: float(value)}))
 
 
 @cache

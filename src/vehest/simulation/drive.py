@@ -74,17 +74,13 @@ def simulate_drive(
 ) -> Recording:
     """A recording of one drive; the same arguments give the same samples, bit by bit.
 
-    A car that spins or leaves the road brakes to its stand, and the recording ends AFTER_STAND later; its provenance has ``flags``.
+    A car that spins or leaves the road brakes to its stand, and the recording ends AFTER_STAND later; its provenance has ``flags``. The
+    seed, zero or positive, is that of the driver, of what the manoeuvre draws, of patches on the surface and of the sensors' errors; a
+    whole number of plant steps must fit between samples at ``rate_hz``; the loss of grip over the drive, ``stint``, is unknown to the
+    driver.
 
-    Args:
-        seed: of the driver, of what the manoeuvre draws, of patches on the surface and of the sensors' errors; zero or positive.
-        rate_hz: sampling rate; a whole number of plant steps must fit between samples [Hz].
-        stability_control: whether the car has it switched on.
-        stint: loss of grip over the drive, unknown to the driver; by default none.
-
-    Raises:
-        ConfigurationError: a value that makes no sense, or a car that cannot do the manoeuvre.
-        SimulationError: the car rolled over, or a state is not finite.
+    Raises `ConfigurationError`: a value that makes no sense, or a car that cannot do the manoeuvre. Raises `SimulationError`: the car
+    rolled over, or a state is not finite.
     """
     plant = MultiBodyPlant(vehicle)
     with naming(id, seed):

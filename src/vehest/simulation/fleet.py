@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from copy import deepcopy
 from dataclasses import dataclass, fields, replace
@@ -53,37 +54,36 @@ def varied(vehicle: Vehicle, variations: Sequence[Variation], seed: int) -> Vehi
     """The vehicle with its parameters scaled as the seed draws them; the same one if nothing varies; raises `ConfigurationError`."""
     if not variations:
         return vehicle
-    generator = np.random.default_rng(np.random.SeedSequence(entropy=seed, spawn_key=(_STREAM, 0)))
     overrides = deepcopy(dict(vehicle.overrides))
     published, rear = library_parameters(vehicle), rear_tyre(vehicle)
-    scaled: dict[str, float] = {}
-    for variation in variations:
-        factor = variation.drawn(generator)
-        for name in variation.parameters:
-            *group, last = name.split(".")
-            holder: Any = published
-            for part in group:
-                holder = rear if part == REAR_TYRE else getattr(holder, part, None)
-            value = getattr(holder, last, None)
-            if not isinstance(value, int | float):
-                raise ConfigurationError(f"vary: '{name}' is no parameter of vehicle '{vehicle.name}' that can be scaled")
-            scaled[name] = scaled.get(name, float(value)) * factor
-            target = overrides
-            for part in group:
-                target = target.setdefault(part, {})
-            target[last] = scaled[name]
+    for name, factors in _drawn(variations, seed).items():
+        *group, last = name.split(".")
+        holder: Any = published
+        target = overrides
+        for part in group:
+            holder = rear if part == REAR_TYRE else getattr(holder, part, None)
+            target = target.setdefault(part, {})
+        value = getattr(holder, last, None)
+        if not isinstance(value, int | float):
+            raise ConfigurationError(f"vary: '{name}' is no parameter of vehicle '{vehicle.name}' that can be scaled")
+        target[last] = math.prod(factors, start=float(value))
     return replace(vehicle, overrides=overrides)
 
 
 def varied_planar(car: PlanarCar, variations: Sequence[Variation], seed: int) -> PlanarCar:
     """The same for a car of the planar plant; raises `ConfigurationError` where a name is no parameter of the plant."""
+    return scaled_car(car, {name: math.prod(factors) for name, factors in _drawn(variations, seed).items()})
+
+
+def _drawn(variations: Sequence[Variation], seed: int) -> dict[str, list[float]]:
+    """Scales of each parameter."""
     generator = np.random.default_rng(np.random.SeedSequence(entropy=seed, spawn_key=(_STREAM, 0)))
-    factors: dict[str, float] = {}
+    found: dict[str, list[float]] = {}
     for variation in variations:
         factor = variation.drawn(generator)
         for name in variation.parameters:
-            factors[name] = factors.get(name, 1.0) * factor
-    return scaled_car(car, factors)
+            found.setdefault(name, []).append(factor)
+    return found
 
 
 @dataclass(frozen=True)

@@ -36,17 +36,11 @@ def simulate_planar_drive(
     sensors: SensorLevels = PRESETS["small_car"],
     surface: Surface = SURFACES["dry"],
 ) -> Recording:
-    """A recording of one drive; the same arguments give the same samples, bit by bit.
+    """A recording of one drive, with arguments as of `simulate_drive`.
 
     ``vx`` is the motor's speed at the rim, as such a car knows its speed: it errs where the wheels slip. Spins are driven on from.
 
-    Args:
-        seed: of the driver, of patches on the surface and of the sensors' errors; zero or positive.
-        rate_hz: sampling rate; a whole number of plant steps must fit between samples [Hz].
-
-    Raises:
-        ConfigurationError: a value that makes no sense.
-        SimulationError: a state is not finite.
+    Raises `ConfigurationError`: a value that makes no sense. Raises `SimulationError`: a state is not finite.
     """
     plant = PlanarPlant(car)
     with naming(id, seed):
@@ -75,7 +69,7 @@ def drive_freely(
     per_command = whole_steps(COMMAND_RATE_HZ, plant.step, "driver's")
     per_sample = whole_steps(rate_hz, plant.step, "sampling")
     stride = int(np.gcd(per_command, per_sample))
-    driver = manoeuvre.driver(plant.car, surface, seed)
+    driver = manoeuvre.controller(plant.car, surface, seed)
     first_sample = round(SETTLING_TIME / plant.step)
     state, kept, acting = plant.initial_state(), [], []
     for now in range(0, first_sample + round(driver.duration * rate_hz) * per_sample, stride):

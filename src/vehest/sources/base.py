@@ -96,8 +96,7 @@ class Source(ABC):
         options: the options of this data set.
         version: raised when the recordings that it makes change.
 
-    Raises:
-        ConfigurationError: an unknown or missing option, or a value of the wrong type.
+    Raises `ConfigurationError`: an unknown or missing option, or a value of the wrong type.
     """
 
     options_type: ClassVar[type]
@@ -136,8 +135,7 @@ class Source(ABC):
     def inputs(self) -> dict[str, str | Path]:
         """Inputs of the recordings: name -> file, or a version where there is no file.
 
-        Raises:
-            MissingError: a file or folder is not there.
+        Raises `MissingError`: a file or folder is not there.
         """
 
     @abstractmethod
@@ -147,19 +145,15 @@ class Source(ABC):
     def read(self, recording_id: str) -> Recording:
         """One recording, with the channels that the data set derives and its reference at the centre of gravity.
 
-        Raises:
-            MissingError: there is none of that name, or a file is missing.
-            DataError: its files cannot be used.
+        Raises `MissingError`: there is none of that name, or a file is missing. Raises `DataError`: its files cannot be used.
         """
         return self._prepared(self.read_raw(recording_id))
 
     def read_file(self, file: Path) -> Recording:
         """A recording of a file, or of a bag's folder, wherever it is, as `read` makes it.
 
-        Raises:
-            ConfigurationError: this source reads no single files.
-            MissingError: the file is not there.
-            DataError: it cannot be used.
+        Raises `ConfigurationError`: this source reads no single files. Raises `MissingError`: the file is not there. Raises `DataError`: it
+        cannot be used.
         """
         return self._prepared(self.read_raw_file(file))
 
@@ -209,10 +203,8 @@ def open_source(dataset: Mapping[str, Any]) -> Source:
 def read_single(dataset: Mapping[str, Any], file: Path) -> Recording:
     """A recording of a file wherever it is, read as a data set describes.
 
-    Raises:
-        ConfigurationError: the file is of another format than the data set's, or its source reads no single files.
-        MissingError: it is not there.
-        DataError: it cannot be used as it is.
+    Raises `ConfigurationError`: the file is of another format than the data set's, or its source reads no single files. Raises
+    `MissingError`: it is not there. Raises `DataError`: it cannot be used as it is.
     """
     return source_of_file(dataset, file).read_file(file)
 

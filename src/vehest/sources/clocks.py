@@ -46,15 +46,10 @@ def require_clock(stamps: FloatArray, where: str, fix: str = SORT, *, may_repeat
 
 
 def clock_fault(stamps: FloatArray, fix: str = SORT, *, may_repeat: bool = False) -> str:
-    """How time stamps break the rule for every recording: increasing finite times, at most 1e5 Hz, at most 1e8 median steps in all.
+    """How time stamps (T,) [s] break the rule for every recording, and what to do about it, in words; empty where the rule holds.
 
-    Args:
-        stamps: time stamps [s], shape (T,).
-        fix: how to repair their order.
-        may_repeat: whether they may repeat, as those with software delay do.
-
-    Returns:
-        The fault and what to do about it, in words; empty where the rule holds.
+    It is: increasing finite times, at most 1e5 Hz, at most 1e8 median steps in all. ``fix`` is how to repair their order; they
+    ``may_repeat`` where they have software delay.
     """
     if fault := _order_fault(stamps, fix, may_repeat):
         return fault
@@ -147,18 +142,13 @@ class Clock:
 
 
 def uniform_clock(stamps: FloatArray, where: str, policy: ClockPolicy = "strict", fix: str = BRIDGE) -> Clock:
-    """The uniform clock behind a file's time stamps.
+    """The uniform clock behind a file's time stamps (T,) [s]; ``where`` is the file, for messages.
 
-    Args:
-        stamps: time stamps [s], shape (T,).
-        where: file, for messages.
-        policy: ``strict`` refuses gaps, jitter above 1 % of an interval and drift, ``interpolate`` bridges them, ``uniform`` takes the rows
-            as evenly sampled and their stamps as late, and refuses missing rows.
-        fix: what to do where ``strict`` finds no even clock.
+    By ``policy``, ``strict`` refuses gaps, jitter above 1 % of an interval and drift, ``interpolate`` bridges them, ``uniform`` takes the
+    rows as evenly sampled and their stamps as late, and refuses missing rows. ``fix`` is what to do where ``strict`` finds no even clock.
 
-    Raises:
-        DataError: stamps break the rule of `require_clock`, are not as even as ``policy`` wants them, or an even clock over them would
-            hold more samples than the limits allow.
+    Raises `DataError`: stamps break the rule of `require_clock`, are not as even as ``policy`` wants them, or an even clock over them would
+    hold more samples than the limits allow.
     """
     require_clock(stamps, where, may_repeat=policy == "uniform")
     start, elapsed, steps = float(stamps[0]), float(stamps[-1] - stamps[0]), np.diff(stamps)
@@ -207,23 +197,15 @@ def even_clock(blocks: Iterable[FloatArray]) -> Clock | None:
 def uniform_times(
     stamps: FloatArray, rate_hz: float, where: str, tolerated: float = 0.0, fix: str = "cut the range out or set clock: stamps"
 ) -> tuple[FloatArray, float, float]:
-    """Times of a sensor that samples evenly, from time stamps with software delay.
+    """Times of a sensor that samples evenly (T,) [s], from time stamps with software delay, (T,) [s], which may repeat.
 
-    A straight line through stamps over their number, by least squares; stamps beyond three standard deviations, as a stalled
-    computer makes them, do not count. A constant latency stays in.
+    A straight line through stamps over their number, by least squares; stamps beyond three standard deviations, as a stalled computer makes
+    them, do not count. A constant latency stays in. With them the rate found [Hz], and the root mean square of stamps minus times [s].
 
-    Args:
-        stamps: time stamps [s], shape (T,); they may repeat.
-        rate_hz: the sensor's nominal rate [Hz].
-        where: file and topic, for messages.
-        tolerated: wandering of the stamps about the line that does not matter [s].
-        fix: what to do where samples are missing, for messages.
+    The sensor's nominal rate is ``rate_hz``; wandering of the stamps about the line by ``tolerated`` [s] does not matter; ``where`` is file
+    and topic, ``fix`` what to do where samples are missing, for messages.
 
-    Returns:
-        times [s], shape (T,), the rate found [Hz], and the root mean square of stamps minus times [s].
-
-    Raises:
-        DataError: too few samples, stamps that go backwards or are no numbers, another rate, or samples that are missing.
+    Raises `DataError`: too few samples, stamps that go backwards or are no numbers, another rate, or samples that are missing.
     """
     if len(stamps) < FEWEST:
         raise DataError(f"{where}: {len(stamps)} samples are too few to find a uniform clock; {FEWEST} are needed")

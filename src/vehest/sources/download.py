@@ -80,9 +80,8 @@ class Download:
     def fetch(self, progress: Progress | None = None) -> Iterator[Outcome]:
         """Download missing files one after another; a file takes its name once it is complete, checked and recorded.
 
-        Raises:
-            DataError: a file that is there or that came has other bytes than recorded.
-            MissingError: the server cannot be reached or does not have it, or the disk is full; what has arrived is kept.
+        Raises `DataError`: a file that is there or that came has other bytes than recorded. Raises `MissingError`: the server cannot be
+        reached or does not have it, or the disk is full; what has arrived is kept.
         """
         under_way = self.folder / UNDER_WAY
         try:

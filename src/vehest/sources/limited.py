@@ -47,17 +47,12 @@ class Reading(NamedTuple):
 def read_limited(reader: str, file: Path, **request: Any) -> Reading:
     """Call ``reader(file, **request)`` in a process that may not exceed its memory and time or write a file.
 
-    Processor time is 15 s and 1 s for each MB of the file, memory is ``limits.memory`` and ten times the file's size. Where the system
-    has no such limits (Windows), eight times that time is all that ends it.
+    Processor time is 15 s and 1 s for each MB of the file or folder, memory is ``limits.memory`` and ten times its size. Where the system
+    has no such limits (Windows), eight times that time is all that ends it. ``reader`` is ``module:function``, which returns arrays and a
+    summary; ``request`` what JSON holds.
 
-    Args:
-        reader: ``module:function``, which returns arrays and a summary.
-        file: a file, or a folder of files.
-        request: further arguments, as JSON holds them.
-
-    Raises:
-        VehestError: as the reader raises it.
-        DataError: the process ended otherwise: the file is damaged, or asks for more than the limits.
+    Raises `VehestError`: as the reader raises it. Raises `DataError`: the process ended otherwise, as the file is damaged, or asks for
+    more.
     """
     size = sum(part.stat().st_size for part in (file.rglob("*") if file.is_dir() else [file]) if part.is_file())
     seconds, memory = SECONDS + SECONDS_PER_BYTE * size, current_limits().memory + MEMORY_PER_BYTE * size

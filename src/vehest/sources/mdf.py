@@ -48,13 +48,10 @@ class MdfSource(SignalSource):
 
 
 def read_measurement(file: Path, wanted: Wanted | None) -> tuple[dict[str, Signal], list[str], dict[str, Any]]:
-    """Signals of a measurement; raises `MissingError` without file or asammdf, `DataError` where it or a wanted signal is unusable.
+    """Signals of a measurement by their keys, what was not read and why, and ``version``, ``start`` and, by key, ``signals`` of the file.
 
-    Args:
-        wanted: where each signal stands; None for every signal of numbers whose group has times.
-
-    Returns:
-        Signals by their keys, what was not read and why, and ``version``, ``start`` and, by key, ``signals`` of the file.
+    ``wanted`` is where each signal stands; None for every signal of numbers whose group has times. Raises `MissingError` without file or
+    asammdf, `DataError` where it or a wanted signal is unusable.
     """
     require_package("asammdf", "mdf", f"reading '{file}'")
     reading = read_limited("vehest.sources.readers.mdf:read", regular_file(file), wanted=wanted)

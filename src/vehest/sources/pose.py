@@ -43,17 +43,14 @@ class PoseOptions:
         """Reference channels: poses are differentiated by a Savitzky-Golay filter and the velocity is turned into the car's axes.
 
         Args:
-            positions: of the rigid body's origin, x and y with z up [m], evenly sampled, shape (T, 2).
+            positions: of the rigid body's origin, x and y with z up [m], evenly sampled by ``interval`` [s], shape (T, 2).
             yaw: of the rigid body, unwrapped [rad], shape (T,).
-            interval: between two samples [s].
             turned: from the rigid body's x axis to the car's forward axis, counter-clockwise [rad].
             at: times of the samples, and others [s] to which straight lines bring the velocities.
 
-        Raises:
-            DataError: too few poses.
+        Raises `DataError`: too few poses.
 
-        Source:
-            Savitzky & Golay, Smoothing and differentiation of data by simplified least squares procedures, Anal. Chem. 36 (8), 1964.
+        Source: Savitzky & Golay, Smoothing and differentiation of data by simplified least squares procedures, Anal. Chem. 36 (8), 1964.
         """
         if len(yaw) < self.window:
             raise DataError(f"{where}: {len(yaw)} poses are fewer than the {self.window} of the filter's window")
@@ -73,15 +70,10 @@ class PoseOptions:
 
 
 def ground_plane(positions: FloatArray, orientations: FloatArray, up: UpAxis, where: str) -> tuple[FloatArray, FloatArray]:
-    """Positions in the ground plane and unwrapped yaw, from poses in space; raises `DataError` where a quaternion is not of unit length.
+    """Positions in the ground plane, (T, 2) [m], and unwrapped yaw, (T,) [rad], z up, of positions x, y, z in the world, (T, 3) [m].
 
-    Args:
-        positions: x, y, z in the world [m], shape (T, 3).
-        orientations: quaternions x, y, z, w from the rigid body's axes to the world's, shape (T, 4).
-        up: the world's and the rigid body's upward axis; ``y`` is usual in motion capture, ``z`` in ROS.
-
-    Returns:
-        positions, shape (T, 2), and yaw [rad], shape (T,), both with z up.
+    Orientations are quaternions x, y, z, w from the rigid body's axes to the world's, (T, 4); ``up`` is the upward axis of both, ``y`` is
+    usual in motion capture, ``z`` in ROS. Raises `DataError`: a quaternion is not of unit length.
     """
     with np.errstate(over="ignore"):
         length = np.linalg.norm(orientations, axis=1)

@@ -36,10 +36,8 @@ class ResumingDownloader:
     def __call__(self, url: str, output_file: str, pooch: Any = None, check_only: bool = False) -> None:
         """Download ``url`` into ``output_file``.
 
-        Raises:
-            MissingError: the server refuses, or sends a web page.
-            requests.RequestException: it is out of reach; what has arrived is kept.
-            OSError: the disk is full or not writable.
+        Raises `MissingError`: the server refuses, or sends a web page. Raises `requests.RequestException`: it is out of reach; what has
+        arrived is kept. Raises `OSError`: the disk is full or not writable.
         """
         from requests import exceptions
 

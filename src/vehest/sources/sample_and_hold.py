@@ -38,14 +38,10 @@ class SampleAndHold:
     def interpolated(
         self, columns: Mapping[str, Column], values: Mapping[str, FloatArray], clock: Clock, where: str
     ) -> tuple[dict[str, FloatArray], slice, float]:
-        """Held channels on a recording's clock, along straight lines, which look ahead by up to one interval; raises `DataError`.
+        """Held channels on every tick of a recording's clock, along straight lines, which look ahead by up to one interval.
 
-        Args:
-            columns: of the held channels.
-            values: of a table's columns, shape (T,).
-
-        Returns:
-            Channels on every tick, NaN outside their samples; the ticks between two samples of every channel; rate of the samples [Hz].
+        NaN outside their samples. With them the ticks between two samples of every channel, and the rate of the samples [Hz]. ``columns``
+        are those of the held channels, ``values`` a table's, (T,). Raises `DataError`: there are no such samples.
         """
         markers = {column.column for column in columns.values()} if self.updated is None else {str(self.updated)}
         rows = np.flatnonzero(np.any([np.diff(values[name]) != 0 for name in markers], axis=0)) + 1  # the first row's sample may be older

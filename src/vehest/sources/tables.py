@@ -88,17 +88,9 @@ def require_columns(file: Path, names: Sequence[str], wanted: Iterable[str]) -> 
 
 
 def read_columns(file: Path, wanted: Sequence[str], layout: TextLayout = TextLayout(), text: bytes | None = None) -> dict[str, FloatArray]:
-    """Columns of numbers, shape (T,) each, NaN where a sample is missing.
+    """Columns of numbers, shape (T,) each, NaN where a sample is missing; ``text`` is that of the table where it is not the file's own.
 
-    Args:
-        file: a table.
-        wanted: names of columns.
-        layout: of a table of text.
-        text: of the table where it is not the file's own.
-
-    Raises:
-        MissingError: there is no such file.
-        DataError: it cannot be read, lacks a column, or holds text where numbers belong.
+    Raises `MissingError`: there is no such file. Raises `DataError`: it cannot be read, lacks a column, or holds text where numbers belong.
     """
     require_columns(file, column_names(file, layout), wanted)
     if is_parquet(file):

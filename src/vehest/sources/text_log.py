@@ -57,12 +57,9 @@ class TextLogSource(TabularSource):
 
 
 def bridged(samples: FloatArray, times: FloatArray, longest: float) -> FloatArray:
-    """Samples with straight lines across gaps, (T,).
+    """Samples, (T,), NaN where there is none, with straight lines across gaps of at most ``longest`` [s] between two samples.
 
-    Args:
-        samples: NaN where there is none, (T,).
-        times: of the samples [s], (T,); where they go backwards or leave a longer gap a run begins, which no line reaches across.
-        longest: time between two samples that a line may bridge [s].
+    Where times, (T,) [s], go backwards or leave a longer gap a run begins, which no line reaches across.
     """
     known = np.flatnonzero(np.isfinite(samples))
     if not 0 < len(known) < len(samples):

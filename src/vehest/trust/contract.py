@@ -53,11 +53,9 @@ def limits_for(estimator: Estimator, trust: Trust | None) -> GuardLimits:
 class GuardedRun:
     """An estimator under the contract on a recording, or on its parts one after another, to the same bits.
 
-    Args:
-        estimator: fitted.
-        trust: learnt with the estimator; without it limits are those of any car, and there is neither band nor health of channels.
-        initial_state: of a protocol, at the first sample.
-        elsewhere: whether the car or its tyres are others than those that were calibrated on.
+    Without ``trust``, learnt with the fitted estimator, limits are those of any car, and there is neither band nor health of channels. The
+    state of a protocol, ``initial_state``, is that at the first sample; ``elsewhere``: the car or its tyres are others than those that were
+    calibrated on.
 
     Attributes:
         takes_parts: whether the estimator can go on where it stopped; else the recording must come whole.
@@ -91,8 +89,7 @@ class GuardedRun:
         Returns:
             ``vy``, ``sideslip``, ``health``, ``health_reason`` and, with calibrated bands, ``band_vy`` and ``band_sideslip``.
 
-        Raises:
-            DataError: a channel is missing.
+        Raises `DataError`: a channel is missing.
         """
         estimator = self.estimator
         missing = [name for name in estimator.channels if name not in samples]
@@ -233,16 +230,11 @@ def motion_of(channels: Sequence[str], cleaned: Cleaned) -> FloatArray:
 
 
 class GuardedStepper(Stepper):
-    """Any estimator online, under the contract.
+    """Any fitted, causal estimator online, under the contract; ``trust`` and ``elsewhere`` are as of `GuardedRun`.
 
-    Args:
-        estimator: fitted, causal.
-        trust: learnt with the estimator; without it limits are those of any car, and there is neither band nor health of channels.
-        bus_rate_hz: rate at which samples come, if it is above the estimator's: they then go through a causal anti-aliasing filter first.
-        elsewhere: whether the car or its tyres are others than those that were calibrated on.
+    Samples at ``bus_rate_hz``, if that is above the estimator's rate, go through a causal anti-aliasing filter first.
 
-    Raises:
-        ConfigurationError: the estimator is not causal, or the bus is slower than it.
+    Raises `ConfigurationError`: the estimator is not causal, or the bus is slower than it.
 
     Attributes:
         last: what the last step returned.
@@ -253,7 +245,7 @@ class GuardedStepper(Stepper):
         self, estimator: Estimator, trust: Trust | None = None, bus_rate_hz: float | None = None, *, elsewhere: bool = False
     ) -> None:
         self.estimator, self._channels = estimator, tuple(estimator.channels)
-        self._stepper, self._fresh = estimator.online(), True
+        self._stepper, self._fresh, self.horizon_steps = estimator.online(), True, estimator.horizon_steps
         rate = estimator.settings.rate_hz
         limits = limits_for(estimator, trust)
         self._front = FrontEnd(estimator.channels, estimator.skippable, limits, bus_rate_hz, rate) if bus_rate_hz is not None else None
@@ -269,11 +261,6 @@ class GuardedStepper(Stepper):
         self._others: dict[str, float] = {}
         self.last: dict[str, float] = {"vy": math.nan, "sideslip": math.nan}
         self.marks = 0
-
-    @property
-    def horizon_steps(self) -> int:  # type: ignore[override]
-        """How many sampling intervals after the sample the estimate holds."""
-        return self.estimator.horizon_steps
 
     @property
     def delay(self) -> float:

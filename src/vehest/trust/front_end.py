@@ -52,8 +52,7 @@ class FrontEnd:
 
     ``limits`` of the guard are those learnt at the estimator's rate; ``channels`` are in the order of the columns.
 
-    Raises:
-        ConfigurationError: the bus is slower than the estimator, or faster than any.
+    Raises `ConfigurationError`: the bus is slower than the estimator, or faster than any.
     """
 
     def __init__(self, channels: Sequence[str], skippable: Sequence[str], limits: GuardLimits, bus_rate_hz: float, rate_hz: float) -> None:

@@ -277,8 +277,7 @@ def learn_health(train: Sequence[Recording], validation: Sequence[Recording], ch
 
     Single samples that stand apart from both neighbours are glitches of the recording and left out (`without_glitches`).
 
-    Raises:
-        DataError: a recording has another rate or lacks a channel, or there are too few samples.
+    Raises `DataError`: a recording has another rate or lacks a channel, or there are too few samples.
     """
     names = tuple(channels)
     for recording in (*train, *validation):

@@ -182,15 +182,10 @@ class State(NamedTuple):
 
 @compiling.entry(nogil=True, _nrt=False)
 def health_kernel(rows, measured, tables, memory, out, statistics):  # type: ignore[no-untyped-def]
-    """Judge row after row.
+    """Judge rows (T, C), as received, one after another; ``measured`` tells which of their values count as measured.
 
-    Args:
-        rows: (T, C), as received.
-        measured: which values of them count as measured, (T, C).
-        tables: of `HealthModel.packed`.
-        memory: of `HealthModel.start`, changed in place.
-        out: output, (3, T): status, code of the reason, largest statistic over its limit.
-        statistics: output, (T, K), or (0, K) where they are not wanted.
+    ``tables`` are of `HealthModel.packed`, ``memory`` is of `HealthModel.start` and changed in place. Output are ``out``, (3, T): status,
+    code of the reason, largest statistic over its limit; and ``statistics``, (T, K), or (0, K) where they are not wanted.
     """
     model = open_views(Model, tables, open_views(Layout, tables, ()))
     state = open_views(State, memory, model.layout)

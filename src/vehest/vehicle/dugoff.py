@@ -39,8 +39,7 @@ Tyres = Literal["plain", "smooth"]
 class LoadedCar:
     """A car as a single track whose axles carry what a steady longitudinal acceleration leaves them; a BMW 545i by default.
 
-    Raises:
-        ValueError: a number that is not positive.
+    Raises `ValueError`: a number that is not positive.
 
     Source: Bertipaglia et al. 2024, Eq. 2.
     """
@@ -76,16 +75,10 @@ class DugoffAxle(NamedTuple):
     reduction: Any  # e_r, share of the friction that is lost per m/s of sliding [s/m]
 
     def force(self, tangent: Tensor, load: Tensor, vx: Tensor, tyres: Tyres) -> Tensor:
-        """Lateral force of the axle in the wheels' axes, positive to the left; everything broadcasts.
+        """Lateral force of the axle in the wheels' axes, positive to the left, (...) [N]; everything broadcasts.
 
-        Args:
-            tangent: of the slip angle, positive where it makes a force to the left (...).
-            load: vertical force (...) [N].
-            vx: forward speed (...) [m/s].
-            tyres: ``plain`` (Eq. 9) or ``smooth`` (Eq. 10).
-
-        Returns:
-            (...) [N], differentiable everywhere, at a slip of zero too.
+        It is differentiable everywhere, at a slip of zero too. The tangent is of the slip angle, positive where it makes a force to the
+        left; ``load`` the vertical force [N], ``vx`` the forward speed [m/s]; ``tyres`` are ``plain`` (Eq. 9) or ``smooth`` (Eq. 10).
         """
         slide = tangent.abs()
         half = self.friction * (1.0 - self.reduction * vx * slide).clamp(min=LEAST_SHARE) * load / (2.0 * self.cornering_stiffness)

@@ -81,10 +81,8 @@ class PlanarCar(nn.Module):
     def motion(self, state: Tensor, inputs: Tensor, forces: TyreForces) -> Motion:
         """Rates under given tyre forces.
 
-        Args:
-            state: vx, vy [m/s], yaw rate [rad/s], rim speed [m/s] and whatever follows, (..., 4 or more).
-            inputs: steering angle [rad], motor current [A], (..., 2).
-            forces: of both axles.
+        The state is vx, vy [m/s], yaw rate [rad/s], rim speed [m/s] and whatever follows, (..., 4 or more); inputs are steering angle [rad]
+        and motor current [A], (..., 2).
         """
         p = self.learnt
         vx, vy, yaw_rate, rim_speed = state[..., :4].unbind(-1)

@@ -67,13 +67,10 @@ class TyreTrack:
         return torch.stack([states[..., 1], inputs[..., 0] * (states[..., 2] + states[..., 1])], -1)
 
     def process_noise(self, states: Tensor, inputs: Tensor, steer: float, tyres: float) -> Tensor:
-        """Q = Δt B Λ Bᵀ (Eqs. 41 to 45), (..., n, n); the steering angle changes the next state by the first column of B (Eqs. 52, 60).
+        """Q = Δt B Λ Bᵀ (Eqs. 41 to 45), (..., n, n), of states (..., n) and inputs (..., 2).
 
-        Args:
-            states: (..., n).
-            inputs: (..., 2).
-            steer: standard deviation of the steering angle for a second's step [rad √s].
-            tyres: of the logarithms of the adapted parameters [1/√s].
+        The steering angle changes the next state by the first column of B (Eqs. 52, 60). Standard deviations: ``steer`` of it for a
+        second's step [rad √s], ``tyres`` of the logarithms of the adapted parameters [1/√s].
         """
         front, _ = self.axles(states, inputs)
         slope = torch.zeros_like(states)

@@ -49,11 +49,7 @@ class PositiveParameters(nn.Module):
 def magic_formula(slip: Tensor, stiffness: Tensor, shape: Tensor, curvature: Tensor | float = 0.0) -> Tensor:
     """Pacejka's curve for a peak of 1: sin(C atan(B s - E (B s - atan(B s)))).
 
-    Args:
-        slip: s, an angle [rad] or a ratio.
-        stiffness: B [1/rad] or [1].
-        shape: C.
-        curvature: E; 0 leaves it out.
+    The slip s is an angle [rad] or a ratio, the stiffness B [1/rad] or [1]; a curvature E of 0 is left out.
 
     Source: Pacejka & Bakker 1992.
     """

@@ -34,13 +34,8 @@ LEAST_ENTROPY = -9.0  # [nat] of the process noise
 class CarFilter(nn.Module):
     """States vx, vy, yaw rate, rim speed and friction; measured are ax, ay, yaw rate and rim speed.
 
-    Args:
-        dynamics: how the car moves.
-        noise: covariances constant, or dependent on the state.
-        step: [s].
-        least: smallest possible vx [m/s] and friction.
-        correlated: whether noise has entries off the diagonals of its covariances.
-        repair: whether lost definiteness is repaired.
+    Covariances of noise are constant or depend on the state, and are ``correlated`` or diagonal. The step is in s, ``least`` the smallest
+    possible vx [m/s] and friction; ``repair``: lost definiteness is repaired.
 
     Source: Węgrzynowski et al. 2024, Section III-B; start values as in its authors' code.
     """
@@ -169,12 +164,9 @@ class CarFilter(nn.Module):
         self.initial_noise.begin(initial, PACE)
 
     def estimated(self, drives: Drive, start: Tensor, steps: int | None) -> tuple[Tensor, Tensor]:
-        """States of training sequences and their covariances, (B, T, 5, 5), differentiable.
+        """States of training sequences, which start from ``start``, (B, 5), and their covariances, (B, T, 5, 5), differentiable.
 
-        Args:
-            drives: sequences.
-            start: states that estimates start from, (B, 5).
-            steps: samples that gradients reach back; none: all.
+        Gradients reach back ``steps`` samples; none: all.
         """
         total = drives.states.shape[1]
         initial = Gaussian(start, self.initial_covariance())

@@ -44,16 +44,12 @@ def fit_dugoff(
 
     Args:
         recordings: as `axle_motion` takes them, with ``ax``; forces across the body are turned into the front wheels' axes.
-        car: mass, inertia, places of the axles, height of the centre of gravity.
-        tyres: ``plain`` or ``smooth``.
         minimum_speed: slower samples are left out [m/s].
         measured_forces: take forces from the channels ``fy_*``, instead of from accelerations.
         seed: of the first restart; the others follow it.
-        restarts: searches, of which the best counts.
-        generations: of each, at most.
+        restarts: searches, of which the best counts, of so many ``generations`` each at most.
 
-    Raises:
-        DataError: a channel is missing, ``ax`` has gaps, or hardly any samples are left.
+    Raises `DataError`: a channel is missing, ``ax`` has gaps, or hardly any samples are left.
 
     Source: Bertipaglia et al. 2024, Section III-B; differential evolution: Storn & Price, Journal of Global Optimization 11, 1997.
     """

@@ -117,16 +117,10 @@ class SideslipFilter(GatedFilter, Recursive):
 
 
 def read_levels(recordings: Sequence[Recording], names: Sequence[str], cutoff: float, least: float = 0.0) -> dict[str, float]:
-    """Standard deviations of measured channels above a frequency, by name.
+    """Standard deviations of measured channels of all recordings above a frequency, by name.
 
-    Args:
-        recordings: of which all samples count together.
-        names: of channels.
-        cutoff: see `high_passed_level`.
-        least: what a level has to exceed to be noise.
-
-    Raises:
-        DataError: a channel has too many gaps, or no noise.
+    The ``cutoff`` is that of `high_passed_level`; a level has to exceed ``least`` to be noise. Raises `DataError`: a channel has too many
+    gaps, or no noise.
     """
     among = f"recording{'s' if len(recordings) > 1 else ''} {', '.join(repr(recording.id) for recording in recordings)}"
     levels = {}

@@ -60,8 +60,7 @@ class TrackFilter:
             initial: state before the first measurement, mean (2,) or (B, 2); none: `start` of every sequence.
             gate: which measurements are refused; none: all are taken.
 
-        Raises:
-            ValueError: shapes do not fit each other.
+        Raises `ValueError`: shapes do not fit each other.
         """
         slow = (inputs[..., 0] < self.track.minimum_speed)[..., None]
         if bool(slow.any()):
@@ -98,13 +97,9 @@ class TrackFilter:
 
 
 def in_nonlinear_range(ay: FloatArray, enter: float, leave: float, before: bool = False) -> NDArray[np.bool_]:
-    """Whether the car behaves non-linearly, with a hysteresis: from |ay| ≥ ``enter`` on until |ay| ≤ ``leave``.
+    """Whether the car behaves non-linearly, with a hysteresis: from |ay| ≥ ``enter`` on until |ay| ≤ ``leave``, less than that.
 
-    Args:
-        ay: lateral acceleration, (T,) [m/s²]; what is NaN changes nothing.
-        enter: [m/s²].
-        leave: [m/s²], less than ``enter``.
-        before: what it was before the first sample.
+    Of ay, (T,) [m/s²], what is NaN changes nothing; ``before`` is what it was before the first sample.
 
     Source: Bertipaglia et al. 2024, Section IV-C, which gives no thresholds.
     """

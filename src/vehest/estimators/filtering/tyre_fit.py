@@ -103,8 +103,7 @@ def axle_motion(
         minimum_speed: slower samples are left out [m/s].
         measured_forces: take forces from the channels ``fy_fl`` to ``fy_rr``, which simulated cars have, instead of from accelerations.
 
-    Raises:
-        DataError: a channel is missing, or hardly any samples are left.
+    Raises `DataError`: a channel is missing, or hardly any samples are left.
     """
     parts: list[AxleMotion] = []
     first_block = 0
@@ -156,20 +155,13 @@ def _motion_of(
 
 
 def fit_motion(motion: AxleMotion, kind: Kind = "rational") -> TyreFit:
-    """Least squares of both axle curves.
+    """Least squares of both axle curves; raises `DataError` where forces run against slips.
 
     Drives that stay where tyres are nearly linear say nothing of c₁: it is known beforehand as well as `PEAK_SLIP` says of road tyres, a
     block of 10 s counting as one sample against it.
 
     The covariance is that of least squares whose residuals hang together within blocks of 10 s and may differ in size (a sandwich of
     blocks): residuals of neighbouring samples are hardly independent, and to count them so would make intervals far too narrow.
-
-    Args:
-        motion: of both axles.
-        kind: ``linear`` or ``rational``.
-
-    Raises:
-        DataError: forces run against slips.
 
     Source: Di Biase, Lenzo & Timpone 2020, section III.B, Figure 3 and Table 1; blocks as in Liang & Zeger, Biometrika 73 (1), 1986.
     """

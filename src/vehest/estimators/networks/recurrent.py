@@ -45,12 +45,7 @@ class HiddenStateEstimator(Network):
 class RecurrentNetwork(CompiledNetwork, StandardisedNetwork):
     """One recurrent layer, one bias a gate, and a linear read-out of the last hidden state.
 
-    Args:
-        settings: sizes.
-
-    Shapes:
-        prepared windows: (..., N, C), standardised.
-        returns: (...) lateral velocity [m/s] one step after the window.
+    From standardised windows, (..., N, C), to the lateral velocity [m/s] one step after each, (...).
     """
 
     n_gates: ClassVar[int]  # of the cell

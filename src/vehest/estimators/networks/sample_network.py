@@ -89,14 +89,9 @@ class SampleNetworkEstimator(Network):
 class SampleNetwork(nn.Module):
     """M networks of two hidden layers with rectifiers and dropout, each sample by itself: 1x1 convolutions over time.
 
-    Inputs are mapped to [0, 1] by their ranges in training, or to a mean of 0 and a deviation of 1; a constant one becomes 0. Targets are
-    divided by their root mean square in training. Both are kept with the weights and are not parameters.
-
-    Args:
-        n_inputs: measured channels C.
-        hidden: widths of the hidden layers.
-        n_outputs: numbers O that a network says of a sample.
-        members: M.
+    Inputs, C measured channels, are mapped to [0, 1] by their ranges in training, or to a mean of 0 and a deviation of 1; a constant one
+    becomes 0. Targets are divided by their root mean square in training. Both are kept with the weights and are not parameters. A network
+    says O numbers of a sample.
 
     Source: Bertipaglia et al. 2024, Section III-A.
     """
@@ -188,8 +183,7 @@ def learnt_samples(
 
     Samples slower than ``minimum_speed`` [m/s] are left out.
 
-    Raises:
-        DataError: a channel is missing or has gaps, or all samples are too slow.
+    Raises `DataError`: a channel is missing or has gaps, or all samples are too slow.
     """
     hint = "; set estimator.inputs=imu for cars without measured tyre forces"
     hints = {name: hint for name in channels if name.startswith("f")}

@@ -96,15 +96,10 @@ class VelocityNetwork(StandardisedNetwork):
                     parameter.copy_((2.0 * draw - 1.0) / math.sqrt(n))
 
     def forward(self, measured: Tensor, state: State, mask: Tensor | None = None) -> tuple[Tensor, State]:
-        """Estimates at the times of the samples.
+        """Velocities at the times of the samples, (B, T, O) [m/s, rad/s], and the state after the last, of measurements (B, T, C) [SI].
 
-        Args:
-            measured: (B, T, C), SI.
-            state: before the first sample, of `start` or of an earlier call.
-            mask: (B, T, H), what the hidden state is multiplied by on its way out; none outside training.
-
-        Returns:
-            Velocities (B, T, O) [m/s, rad/s] and the state after the last sample.
+        The state is that before the first sample, of `start` or of an earlier call; ``mask``, (B, T, H), is what the hidden state is
+        multiplied by on its way out, none outside training.
         """
         outputs, state = self.advance(self.prepared(measured), state, mask)
         return outputs * self.output_scale + self.output_mean, state

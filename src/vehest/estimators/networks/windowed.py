@@ -39,6 +39,7 @@ class WindowedEstimator(Network):
 
     channels = ("yaw_rate", "vx", "ay", "ax")
     training_type = SupervisedSettings
+    horizon_steps = 1  # a window predicts the velocity one sample after it
     rate_hz: float = rate(20.0)
     window: int = setting(30, "samples that it sees", least=1)
 
@@ -52,11 +53,6 @@ class WindowedEstimator(Network):
         return network
 
     @property
-    def horizon_steps(self) -> int:
-        """One: a window predicts the velocity one sample after it."""
-        return WindowStepper.horizon_steps
-
-    @property
     def warm_up_steps(self) -> int:
         """Until the window is full."""
         return self.window - 1
@@ -65,9 +61,8 @@ class WindowedEstimator(Network):
     def fit_members(cls, members: Sequence[Any], data: FitData, training: Any, context: FitContext) -> list[FitRecord]:
         """Train members together (`train_members`).
 
-        Raises:
-            DataError: recordings are too short or have gaps, the loss is no longer finite, or a model to start from is damaged.
-            ConfigurationError: the network cannot be trained so, or a model to start from is of another family or has other settings.
+        Raises `DataError`: recordings are too short or have gaps, the loss is no longer finite, or a model to start from is damaged. Raises
+        `ConfigurationError`: the network cannot be trained so, or a model to start from is of another family or has other settings.
         """
         import torch
 

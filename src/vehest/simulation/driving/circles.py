@@ -4,31 +4,29 @@ from __future__ import annotations
 
 import math
 from dataclasses import asdict, dataclass
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Literal
 
 from vehest.simulation.driving.car import Car
 from vehest.simulation.driving.driver import Command, Driver, Observation, Plan
 from vehest.simulation.driving.manoeuvre import (
     FASTEST_SHARE,
     SETTLING_TIME,
-    SIDE_CHOICES,
     SIDES,
     Controller,
+    Draws,
     LineDriver,
     Manoeuvre,
     OpenArea,
     Range,
+    Side,
     as_range,
-    draw,
     draw_driver,
-    draw_side,
-    generator_of,
     plan_along,
-    require,
-    require_one_of,
 )
 from vehest.simulation.road.lines import circle
 from vehest.simulation.road.surface import Surface
+
+CIRCLE_LIMITS = {"radius": (15.0, 500.0), "severity": (0.1, 1.3)}
 
 
 @dataclass(frozen=True)
@@ -41,13 +39,10 @@ class SteadyCircle(Manoeuvre):
     ay_rate: float = 0.25  # by which the lateral acceleration grows [m/s³]; the standard's slow increase
     start_ay: float = 2.0  # at which the circle is entered [m/s²]
     hold_time: float = 2.0  # at the final speed [s]
-    side: str = "either"  # ``left``, ``right`` or ``either``
+    side: Side = "either"  # ``left``, ``right`` or ``either``
     half_width: float = 4.0  # distance from the circle beyond which the car has left it [m]
 
-    def __post_init__(self) -> None:
-        require(self, radius=(15.0, 500.0), severity=(0.1, 1.3), ay_rate=(0.02, 3.0), start_ay=(0.2, 8.0), hold_time=(0.0, 120.0))
-        require(self, half_width=(0.5, 50.0))
-        require_one_of(self, "side", SIDE_CHOICES)
+    limits: ClassVar = CIRCLE_LIMITS | {"ay_rate": (0.02, 3.0), "start_ay": (0.2, 8.0), "hold_time": (0.0, 120.0)}
 
     @property
     def longest(self) -> float:
@@ -56,8 +51,8 @@ class SteadyCircle(Manoeuvre):
 
     def controller(self, car: Car, surface: Surface, seed: int) -> Controller:
         """A driver with the radius, the side and the habits of this seed."""
-        generator = generator_of(seed)
-        radius, severity, side = draw(self.radius, generator), draw(self.severity, generator), draw_side(self.side, generator)
+        draw = Draws(seed)
+        radius, severity, side = draw(self.radius), draw(self.severity), draw.side(self.side)
         driver = draw_driver(seed)
         final_ay = min(severity * car.grip * OpenArea(surface, seed).lowest, (FASTEST_SHARE * car.top_speed) ** 2 / radius)
         first_ay = min(self.start_ay, 0.5 * final_ay)
@@ -87,16 +82,12 @@ class BrakingInTurn(Manoeuvre):
     severity: Range = (0.4, 0.7)  # share of the grip that the turn takes; the standard's 5 m/s² are about half of a dry road's
     deceleration: Range = (2.0, 5.0)  # [m/s²]
     turn_time: Range = (3.0, 5.0)  # on the circle before the brakes [s]
-    steering: str = "held"  # ``held`` or, for a driver who keeps to the circle, ``path``
+    steering: Literal["held", "path"] = "held"  # ``held`` or, for a driver who keeps to the circle, ``path``
     until_speed: float = 0.0  # at which the recording ends [m/s]; 0 is the stand
-    side: str = "either"  # ``left``, ``right`` or ``either``
+    side: Side = "either"  # ``left``, ``right`` or ``either``
     half_width: float = 4.0  # distance from the circle beyond which the car has left it [m]; counts for ``path`` only once it brakes
 
-    def __post_init__(self) -> None:
-        require(self, radius=(15.0, 500.0), severity=(0.1, 1.3), deceleration=(0.5, 10.0), turn_time=(1.0, 60.0), until_speed=(0.0, 60.0))
-        require(self, half_width=(0.5, 50.0))
-        require_one_of(self, "side", SIDE_CHOICES)
-        require_one_of(self, "steering", ("held", "path"))
+    limits: ClassVar = CIRCLE_LIMITS | {"deceleration": (0.5, 10.0), "turn_time": (1.0, 60.0), "until_speed": (0.0, 60.0)}
 
     @property
     def longest(self) -> float:
@@ -105,9 +96,9 @@ class BrakingInTurn(Manoeuvre):
 
     def controller(self, car: Car, surface: Surface, seed: int) -> Controller:
         """A driver with the radius, the speed, the brakes and the habits of this seed."""
-        generator = generator_of(seed)
-        radius, severity, side = draw(self.radius, generator), draw(self.severity, generator), draw_side(self.side, generator)
-        deceleration, turn_time = draw(self.deceleration, generator), draw(self.turn_time, generator)
+        draw = Draws(seed)
+        radius, severity, side = draw(self.radius), draw(self.severity), draw.side(self.side)
+        deceleration, turn_time = draw(self.deceleration), draw(self.turn_time)
         driver = draw_driver(seed)
         speed = min(math.sqrt(severity * car.grip * OpenArea(surface, seed).mean * radius), FASTEST_SHARE * car.top_speed)
         run_in, transition = (SETTLING_TIME + 1.0) * speed, 1.5 * speed

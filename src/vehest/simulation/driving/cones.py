@@ -4,32 +4,29 @@ from __future__ import annotations
 
 import math
 from dataclasses import asdict, dataclass, replace
-from typing import ClassVar
+from typing import ClassVar, Literal
 
 import numpy as np
 
-from vehest.data.errors import ConfigurationError
 from vehest.simulation.driving.car import Car
 from vehest.simulation.driving.manoeuvre import (
     FASTEST_SHARE,
     SETTLING_TIME,
-    SIDE_CHOICES,
     SIDES,
     Controller,
+    Draws,
     LineDriver,
     Manoeuvre,
     OpenArea,
     Range,
-    draw,
+    Side,
     draw_driver,
-    draw_side,
-    generator_of,
     plan_along,
-    require,
-    require_one_of,
 )
 from vehest.simulation.road.lines import Gate, Line, line_through
 from vehest.simulation.road.surface import Surface
+
+CONE_LIMITS = {"severity": (0.05, 1.3), "speed": (3.0, 70.0)}
 
 
 @dataclass(frozen=True)
@@ -40,15 +37,13 @@ class DoubleLaneChange(Manoeuvre):
     """
 
     name: ClassVar[str] = "double_lane_change"
-    layout: str = "iso_3888_1"  # ``iso_3888_1`` (double lane change) or ``iso_3888_2`` (obstacle avoidance)
+    layout: Literal["iso_3888_1", "iso_3888_2"] = "iso_3888_1"  # ``iso_3888_1`` (double lane change) or ``iso_3888_2`` (obstacle avoidance)
     severity: Range = (0.5, 0.9)  # share of the grip that the sharpest bend of the line takes; decides the speed
     speed: Range | None = None  # [m/s], instead of the severity
-    side: str = "either"  # of the neighbouring lane: ``left``, ``right`` or ``either``
+    side: Side = "either"  # of the neighbouring lane: ``left``, ``right`` or ``either``
     half_width: float = 1.5  # distance from the line beyond which the car has left the road [m]
 
-    def __post_init__(self) -> None:
-        _require_cone_values(self)
-        require_one_of(self, "layout", ("iso_3888_1", "iso_3888_2"))
+    limits: ClassVar = CONE_LIMITS
 
     @property
     def longest(self) -> float:
@@ -81,14 +76,10 @@ class Slalom(Manoeuvre):
     cones: int = 8  # how many
     severity: Range = (0.5, 0.9)  # share of the grip that the sharpest bend of the line takes; decides the speed
     speed: Range | None = None  # [m/s], instead of the severity
-    side: str = "either"  # on which the first cone is passed: ``left``, ``right`` or ``either``
+    side: Side = "either"  # on which the first cone is passed: ``left``, ``right`` or ``either``
     half_width: float = 2.0  # distance from the line beyond which the car has left the road [m]
 
-    def __post_init__(self) -> None:
-        _require_cone_values(self)
-        require(self, spacing=(8.0, 100.0), cones=(1, 30))
-        if not isinstance(self.cones, int):
-            raise ConfigurationError(f"manoeuvre 'slalom': cones must be a whole number, not {self.cones}")
+    limits: ClassVar = CONE_LIMITS | {"spacing": (8.0, 100.0), "cones": (1.0, 30.0)}
 
     @property
     def longest(self) -> float:
@@ -106,17 +97,10 @@ class Slalom(Manoeuvre):
         return _between_cones(self, self.gates(car.width), car, surface, seed)
 
 
-def _require_cone_values(manoeuvre: DoubleLaneChange | Slalom) -> None:
-    require(manoeuvre, severity=(0.05, 1.3), half_width=(0.5, 50.0))
-    require_one_of(manoeuvre, "side", SIDE_CHOICES)
-    if manoeuvre.speed is not None:
-        require(manoeuvre, speed=(3.0, 70.0))
-
-
 def _between_cones(manoeuvre: DoubleLaneChange | Slalom, gates: tuple[Gate, ...], car: Car, surface: Surface, seed: int) -> Controller:
-    generator = generator_of(seed)
-    severity, side = draw(manoeuvre.severity, generator), draw_side(manoeuvre.side, generator)
-    own_speed = draw(manoeuvre.speed, generator) if manoeuvre.speed is not None else None
+    draw = Draws(seed)
+    severity, side = draw(manoeuvre.severity), draw.side(manoeuvre.side)
+    own_speed = draw(manoeuvre.speed) if manoeuvre.speed is not None else None
     usual = draw_driver(seed)  # who looks less far ahead and steers faster between cones
     driver = replace(usual, preview_time=0.57 * usual.preview_time, steering_lag=0.5 * usual.steering_lag)
     shape = line_through(gates, car.width, 40.0, 60.0)
@@ -134,13 +118,8 @@ def _between_cones(manoeuvre: DoubleLaneChange | Slalom, gates: tuple[Gate, ...]
 
 def _beginning_at(line: Line, earlier: float) -> Line:
     """The line with a straight of this length [m] before it."""
-    n_more = math.ceil(earlier / line.distance[1])
-    before = np.arange(n_more) * line.distance[1]
-    nothing = np.zeros(n_more)
-    return Line(
-        distance=np.concatenate([before, before[-1] + line.distance[1] + line.distance]),
-        x=np.concatenate([line.x[0] - before[::-1] - line.distance[1], line.x]),
-        y=np.concatenate([nothing, line.y]),
-        heading=np.concatenate([nothing, line.heading]),
-        curvature=np.concatenate([nothing, line.curvature]),
-    )
+    step = line.distance[1]
+    before = np.arange(math.ceil(earlier / step)) * step
+    distance = np.concatenate([before, before[-1] + step + line.distance])
+    x = np.concatenate([line.x[0] - before[::-1] - step, line.x])
+    return Line(distance, x, *(np.pad(values, (len(before), 0)) for values in (line.y, line.heading, line.curvature)))

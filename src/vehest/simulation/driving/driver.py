@@ -19,6 +19,7 @@ from vehest.constants import GRAVITY, FloatArray
 from vehest.data.errors import ConfigurationError
 from vehest.simulation.driving.car import Car
 from vehest.simulation.road.course import Course
+from vehest.simulation.road.lines import Line
 
 DRIVER_RATE_HZ = 100.0  # rate of a driver's decisions [Hz]
 
@@ -50,8 +51,7 @@ class DrivingStyle:
 
     Both variations are sums of sines of the distance driven, whose wavelengths do not divide a lap.
 
-    Raises:
-        ConfigurationError: the grip used is not between 0 and 1 all along.
+    Raises `ConfigurationError`: the grip used is not between 0 and 1 all along.
     """
 
     grip_fraction: float  # mean share of the grip that the speed profile uses, 0 … 1
@@ -68,14 +68,9 @@ class DrivingStyle:
 
 
 @dataclass(frozen=True, eq=False)
-class Plan:
-    """Planned line and speed over the distance along the way; all arrays have shape (N,)."""
+class Plan(Line):
+    """Planned line and speed over the distance along the way, uniform from 0; all arrays have shape (N,)."""
 
-    distance: FloatArray  # [m], uniform from 0
-    x: FloatArray  # the line [m]
-    y: FloatArray  # the line [m]
-    heading: FloatArray  # of the line, not wrapped [rad]
-    curvature: FloatArray  # of the line, positive to the left [1/m]
     speed: FloatArray  # [m/s]
     friction: FloatArray  # scale of the tyres' friction
     bank: FloatArray  # positive with the left side higher [rad]
@@ -139,13 +134,10 @@ def draw_style(seed: int, grip_range: tuple[float, float], ripple: float, line_o
 def plan_laps(
     course: Course, car: Car, driver: Driver, style: DrivingStyle, n_laps: int, *, friction: FloatArray, highest_speed: FloatArray | float
 ) -> Plan:
-    """Line and speed profile over whole laps.
+    """Line and speed profile over one whole lap or more, within the car's limits.
 
-    Args:
-        car: whose limits are kept.
-        n_laps: at least one.
-        friction: of one lap, on the course's samples, shape (N,).
-        highest_speed: [m/s], one value or one for each of the n_laps·(N - 1) + 1 samples.
+    ``friction`` is that of one lap, on the course's samples, (N,); ``highest_speed`` [m/s] one value or one for each of the n_laps·(N - 1)
+    + 1 samples.
     """
     distance = _repeat(course.arc_length, n_laps, course.length)
     heading = _repeat(course.heading, n_laps, course.turning)
@@ -179,16 +171,12 @@ def speed_profile(
     bank: FloatArray | float = 0.0,
     grade: FloatArray | float = 0.0,
 ) -> FloatArray:
-    """Highest speeds [m/s] within friction circle, engine power and top speed; (N,).
+    """Highest speeds [m/s] within friction circle, engine power, the car's top speed and the driver's ``highest_speed`` [m/s]; (N,).
 
     Args:
-        curvature: (N,) [1/m].
+        curvature: (N,) [1/m], at samples ``spacing`` [m] apart.
         used: (N,), grip that is used at most [m/s²]; braking gets ``driver.braking_share`` of it, driving ``car.driving_share``.
-        spacing: distance between samples [m].
-        car: whose power and top speed are used.
-        highest_speed: limit of the driver [m/s].
-        bank: of the road, positive with its left side higher [rad]; gravity helps or hinders.
-        grade: of the road, positive downhill [rad].
+        bank, grade: of the road, positive with its left side higher, and downhill [rad]; gravity helps or hinders.
     """
     lateral = np.maximum(used - np.sign(curvature) * GRAVITY * np.sin(bank), 0.1 * used)
     cornering = np.sqrt(lateral / np.maximum(np.abs(curvature), 1e-9))

@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 import math
-from dataclasses import asdict, dataclass
-from typing import Any, ClassVar
-
-import numpy as np
+from dataclasses import dataclass
+from typing import ClassVar
 
 from vehest.data.errors import ConfigurationError
 from vehest.simulation.driving.driver import Observation
-from vehest.simulation.driving.manoeuvre import OpenArea, Range, as_range, draw, generator_of, require
+from vehest.simulation.driving.manoeuvre import Draws, Manoeuvre, OpenArea, Range, as_range
 from vehest.simulation.plant.planar import Inputs
 from vehest.simulation.plant.planar_car import PlanarCar
 from vehest.simulation.road.surface import Surface
@@ -23,7 +21,7 @@ COUNTERSTEER = 1.5  # road-wheel angle over sideslip angle in a slide that is ca
 
 
 @dataclass(frozen=True)
-class Freestyle:
+class Freestyle(Manoeuvre):
     """A remotely controlled car on an open area, thrown from turn to turn; all habits are assumed.
 
     The driver holds the steering at a stop, half way or straight for a while, then goes on to the next; gives gas in bursts as long as the
@@ -39,9 +37,13 @@ class Freestyle:
     kicks: float = 0.03  # share of the decisions that are a burst with the largest current
     straights: float = 0.15  # share of the steering decisions that are straight ahead
 
+    limits: ClassVar = {
+        **{"duration": (1.0, 3600.0), "speed": (0.5, 20.0), "current": (0.0, 1000.0), "sideslip": (0.05, math.pi)},
+        **dict.fromkeys(("brakes", "kicks", "straights"), (0.0, 1.0)),
+    }
+
     def __post_init__(self) -> None:
-        require(self, duration=(1.0, 3600.0), speed=(0.5, 20.0), current=(0.0, 1000.0), sideslip=(0.05, math.pi))
-        require(self, brakes=(0.0, 1.0), kicks=(0.0, 1.0), straights=(0.0, 1.0))
+        super().__post_init__()
         if self.brakes + self.kicks > 1.0:
             raise ConfigurationError(f"manoeuvre 'freestyle': brakes and kicks are shares of one, not {self.brakes} and {self.kicks}")
 
@@ -50,32 +52,28 @@ class Freestyle:
         """The longest that a recording may be drawn to be [s]."""
         return as_range(self.duration)[1]
 
-    def description(self) -> dict[str, Any]:
-        """Name and parameters."""
-        return {"name": self.name, **asdict(self)}
-
-    def driver(self, car: PlanarCar, surface: Surface, seed: int) -> FreestyleDriver:
+    def controller(self, car: PlanarCar, surface: Surface, seed: int) -> FreestyleDriver:  # type: ignore[override]
         """The driver of this seed."""
-        return FreestyleDriver(self, car, OpenArea(surface, seed), generator_of(seed))
+        return FreestyleDriver(self, car, OpenArea(surface, seed), Draws(seed))
 
 
 class FreestyleDriver:
     """Drives one car for the time of one recording."""
 
-    def __init__(self, style: Freestyle, car: PlanarCar, area: OpenArea, generator: np.random.Generator) -> None:
-        self._style, self._car, self._area, self._generator = style, car, area, generator
-        self.duration = draw(style.duration, generator)
+    def __init__(self, style: Freestyle, car: PlanarCar, area: OpenArea, draw: Draws) -> None:
+        self._style, self._car, self._area, self._draw, self._generator = style, car, area, draw, draw.generator
+        self.duration = draw(style.duration)
         self.drawn = {"duration": self.duration}
         self._progress = self._speed_until = self._steer_until = self._gas_until = 0.0
         self._wanted = self._steer = self._gas = 0.0
-        self._side, self._held_sideslip, self._saves = 1.0, draw(style.sideslip, generator), False
+        self._side, self._held_sideslip, self._saves = 1.0, draw(style.sideslip), False
 
     def inputs(self, time: float, seen: Observation) -> Inputs:
         """The driver's inputs at a time [s]; called COMMAND_RATE_HZ times a second."""
         self._progress += seen.speed / COMMAND_RATE_HZ
         sideslip = math.atan2(seen.vy, seen.vx) if seen.speed > SLOW else 0.0
         if not self._saves and abs(sideslip) > self._held_sideslip:
-            self._saves, self._held_sideslip = True, draw(self._style.sideslip, self._generator)
+            self._saves, self._held_sideslip = True, self._draw(self._style.sideslip)
         elif self._saves and abs(sideslip) < CALM:
             self._saves = False
         steer, gas = self._next_steer(time), self._next_gas(time, seen)

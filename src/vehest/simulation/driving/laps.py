@@ -11,16 +11,16 @@ import numpy as np
 from vehest.constants import FloatArray
 from vehest.data.errors import ConfigurationError
 from vehest.simulation.driving.car import Car
-from vehest.simulation.driving.driver import Command, Driver, Follower, Hands, Observation, Plan, draw_style, plan_laps
+from vehest.simulation.driving.driver import Command, Driver, Hands, Observation, Plan, draw_style, plan_laps
 from vehest.simulation.driving.manoeuvre import (
     SETTLING_TIME,
     Controller,
+    Draws,
+    LineDriver,
     Manoeuvre,
     Range,
     as_range,
-    draw,
     draw_driver,
-    generator_of,
     require,
 )
 from vehest.simulation.road.course import Course, course_by_name
@@ -48,18 +48,17 @@ class Laps(Manoeuvre):
     traffic: float = 0.0  # stretches per lap, on average, behind a slower car
     traffic_speed: tuple[float, float] = (8.0, 30.0)  # of those, drawn for each [m/s]
 
+    limits: ClassVar = {
+        **{"severity": (0.05, 1.0), "ripple": (0.0, 0.5), "corrections": (0.0, 5.0)},
+        **{"traffic": (0.0, 20.0), "traffic_speed": (3.0, 100.0), "duration": (0.01, 36_000.0)},
+        **{"laps": (1.0, 1000.0), "top_speed": (3.0, 100.0)},
+    }
+
     def __post_init__(self) -> None:
-        require(self, severity=(0.05, 1.0), ripple=(0.0, 0.5), line_offset=(0.0, 3.0), half_width=(0.5, 50.0))
-        require(self, corrections=(0.0, 5.0), traffic=(0.0, 20.0), traffic_speed=(3.0, 100.0))
+        super().__post_init__()
         course_by_name(self.course)
         if (self.duration is None) == (self.laps is None):
             raise ConfigurationError("manoeuvre 'laps' needs either a duration [s] or a number of laps")
-        if self.duration is not None:
-            require(self, duration=(0.01, 36_000.0))
-        if self.laps is not None and not (isinstance(self.laps, int) and 1 <= self.laps <= 1000):
-            raise ConfigurationError(f"manoeuvre 'laps': laps must be a whole number from 1, not {self.laps}")
-        if self.top_speed is not None:
-            require(self, top_speed=(3.0, 100.0))
 
     @property
     def longest(self) -> float:
@@ -83,10 +82,8 @@ class Laps(Manoeuvre):
         style = draw_style(seed, (min(low, room), min(high, room)), self.ripple, self.line_offset)
         friction = course.friction * surface.along(course.arc_length, seed, course.length)
         highest = self.top_speed if self.top_speed is not None else math.inf
-        hands = None
-        if self.corrections != 0.0:
-            generator = generator_of(seed)
-            hands = Hands(draw(self.corrections, generator), generator)
+        draw = Draws(seed)
+        hands = Hands(draw(self.corrections), draw.generator) if self.corrections != 0.0 else None
 
         def plan(n_laps: int) -> Plan:
             speeds = self._held_up(course, n_laps, highest, seed) if self.traffic else highest
@@ -98,7 +95,7 @@ class Laps(Manoeuvre):
         end_time = self.duration if self.duration is not None else math.inf
         if hands is not None:
             drawn["corrections"] = hands.size
-        return LapDriver(plan(laps + 2), car, driver, course.length, end, drawn, end_time=end_time, hands=hands)
+        return LapDriver(plan(laps + 2), car, driver, drawn, course.length, end, end_time=end_time, hands=hands)
 
     def _held_up(self, course: Course, n_laps: int, highest: float, seed: int) -> FloatArray:
         """Highest speeds along the way [m/s]: those of slower cars ahead, on stretches that are drawn lap by lap."""
@@ -128,9 +125,10 @@ class SpeedLaps(Manoeuvre):
     flat: bool = False  # leaves out the course's bank and grade
     half_width: float = 5.0  # of the road, beyond which the car has left it [m]
 
+    limits: ClassVar = {"severity": (0.05, 0.95), "stop_time": (1.0, 60.0), "change_rate": (0.05, 3.0)}
+
     def __post_init__(self) -> None:
-        require(self, severity=(0.05, 0.95), stop_time=(1.0, 60.0), change_rate=(0.05, 3.0), line_offset=(0.0, 3.0))
-        require(self, half_width=(0.5, 50.0))
+        super().__post_init__()
         course_by_name(self.course)
         if not self.speeds or not all(2.0 <= speed <= 60.0 for speed in self.speeds):
             raise ConfigurationError(f"manoeuvre 'speed_laps': speeds must lie between 2 and 60 m/s, not {list(self.speeds)}")
@@ -144,7 +142,7 @@ class SpeedLaps(Manoeuvre):
     def controller(self, car: Car, surface: Surface, seed: int) -> Controller:
         """A driver with the line and the habits of this seed."""
         course, driver = _course(self.course, self.flat), draw_driver(seed)
-        severity = draw(self.severity, generator_of(seed))
+        severity = Draws(seed)(self.severity)
         style = draw_style(seed, (severity, severity), 0.0, self.line_offset)
         friction = course.friction * surface.along(course.arc_length, seed, course.length)
         n_laps = len(self.speeds) + 2
@@ -154,7 +152,7 @@ class SpeedLaps(Manoeuvre):
         plan = plan_laps(course, car, driver, style, n_laps, friction=friction, highest_speed=_eased(wanted, course, self.change_rate))
         end = (1 + len(self.speeds)) * course.length
         drawn = {"severity": severity, "style": asdict(style), "driver": asdict(driver)}
-        return LapDriver(plan, car, driver, course.length, end, drawn, stop_time=self.stop_time)
+        return LapDriver(plan, car, driver, drawn, course.length, end, stop_time=self.stop_time)
 
 
 @dataclass(frozen=True)
@@ -169,8 +167,11 @@ class FastLap(Manoeuvre):
     flat: bool = False  # leaves out the course's bank and grade
     half_width: float = 5.0  # of the road, beyond which the car has left it [m]
 
+    limits: ClassVar = {"mean_speed": (2.0, 60.0)}
+
     def __post_init__(self) -> None:
-        require(self, mean_speed=(2.0, 60.0), top_speed=(self.mean_speed, 100.0), line_offset=(0.0, 3.0), half_width=(0.5, 50.0))
+        super().__post_init__()
+        require(self, top_speed=(self.mean_speed, 100.0))
         course_by_name(self.course)
 
     @property
@@ -199,54 +200,39 @@ class FastLap(Manoeuvre):
         for _ in range(12):
             middle = 0.5 * (low + high)
             low, high = (middle, high) if mean(middle) < self.mean_speed else (low, middle)
-        return LapDriver(plan(high), car, driver, course.length, 2.0 * course.length, {"severity": high, "driver": asdict(driver)})
+        return LapDriver(plan(high), car, driver, {"severity": high, "driver": asdict(driver)}, course.length, 2.0 * course.length)
 
 
 FASTEST_SEVERITY = 0.95  # share of the grip that a fast lap may take
 
 
-class LapDriver(Follower):
-    """Follows a plan of laps from just before the second one to an end; the first sample is taken on the start line.
+class LapDriver(LineDriver):
+    """Follows a plan of laps of length ``lap`` [m] from just before the second one; the first sample is taken on the start line.
 
-    Args:
-        plan: of one lap more than is recorded.
-        lap: length of a lap [m].
-        end: distance at which the drive is over, or the stop begins [m].
-        stop_time: time from the end to the stand [s]; by default the drive is over at the end.
-        end_time: at which the drive is over wherever the car is [s].
-        hands: corrections beside the line; by default none.
+    At the distance ``end`` [m] the drive is over or, with a ``stop_time`` [s], the car begins to stop, to stand after it; it is over at
+    ``end_time`` [s] wherever the car is. The plan has one lap more than is recorded.
     """
 
     def __init__(
-        self,
-        plan: Plan,
-        car: Car,
-        driver: Driver,
-        lap: float,
-        end: float,
-        drawn: dict[str, Any],
-        stop_time: float | None = None,
-        end_time: float = math.inf,
-        hands: Hands | None = None,
-    ) -> None:
+        self, plan: Plan, car: Car, driver: Driver, drawn: dict[str, Any], lap: float, end: float, *,
+        stop_time: float | None = None, end_time: float = math.inf, hands: Hands | None = None,
+    ) -> None:  # fmt: skip
         times = np.concatenate([[0.0], np.cumsum(plan.distance[1] / (0.5 * (plan.speed[1:] + plan.speed[:-1])))])
-        on_line = np.interp(lap, plan.distance, times)
-        super().__init__(plan, car, driver, progress=float(np.interp(on_line - SETTLING_TIME, times, plan.distance)), hands=hands)
-        self.drawn, self._end, self._stop_time, self._end_time = drawn, end, stop_time, end_time
+        begin = float(np.interp(np.interp(lap, plan.distance, times) - SETTLING_TIME, times, plan.distance))
+        super().__init__(plan, car, driver, drawn, end=end, end_time=end_time - 1e-9, progress=begin, hands=hands)
+        self._stop_time = stop_time
         self._stop: tuple[float, float] | None = None  # when it began, and at which speed
 
     def command(self, time: float, seen: Observation) -> Command:
         """As planned, and braking evenly once the end is reached."""
         decision = super().command(time, seen)
-        if decision.progress < self._end:
-            return decision._replace(finished=time >= self._end_time - 1e-9)
-        if self._stop_time is None:
-            return decision._replace(finished=True)
+        if self._stop_time is None or decision.progress < self._end:
+            return decision
         if self._stop is None:
             self._stop = (time, seen.speed)
         begin, speed = self._stop
         rate = speed / self._stop_time
-        return decision._replace(acceleration=-rate + 3.0 * min(speed - rate * (time - begin) - seen.speed, 0.0))
+        return decision._replace(finished=False, acceleration=-rate + 3.0 * min(speed - rate * (time - begin) - seen.speed, 0.0))
 
 
 def _course(name: str, flat: bool) -> Course:

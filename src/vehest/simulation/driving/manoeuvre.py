@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Callable
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass, replace
-from typing import Any, ClassVar, Protocol
+from typing import Any, ClassVar, Literal, Protocol
 
 import numpy as np
 
@@ -17,7 +17,9 @@ from vehest.simulation.road.lines import Line
 from vehest.simulation.road.surface import Surface
 
 Range = float | tuple[float, float]
+Side = Literal["left", "right", "either"]
 
+COMMON_LIMITS = {"half_width": (0.5, 50.0), "line_offset": (0.0, 3.0)}
 SETTLING_TIME = 2.0  # driven before the first sample [s]
 OPEN_AREA_LAP = 2000.0  # distance after which an open area's patches of friction come again [m]
 
@@ -44,9 +46,13 @@ class Controller(Protocol):
 
 @dataclass(frozen=True)
 class Manoeuvre(ABC):
-    """Base of all manoeuvres."""
+    """Base of all manoeuvres; raises `ConfigurationError`: a parameter is outside its limits."""
 
     name: ClassVar[str]
+    limits: ClassVar[Mapping[str, tuple[float, float]]] = {}  # parameter -> lowest and highest value, beside `COMMON_LIMITS`
+
+    def __post_init__(self) -> None:
+        require(self, **COMMON_LIMITS, **self.limits)
 
     @property
     @abstractmethod
@@ -66,13 +72,7 @@ FASTEST_SHARE = 0.9  # share of the top speed that a manoeuvre on an open area i
 
 
 class LineDriver(Follower):
-    """Follows a line until its end.
-
-    Args:
-        end: distance at which the drive is over [m]; by default the plan's end.
-        end_time: at which it is over at the latest [s].
-        speed_at: see Follower.
-    """
+    """Follows a line to the distance ``end`` [m], by default the plan's end, or until ``end_time`` [s]; ``following``: see `Follower`."""
 
     def __init__(
         self,
@@ -83,9 +83,9 @@ class LineDriver(Follower):
         *,
         end: float | None = None,
         end_time: float = math.inf,
-        speed_at: Callable[[float], tuple[float, float]] | None = None,
+        **following: Any,
     ) -> None:
-        super().__init__(plan, car, driver, speed_at=speed_at)
+        super().__init__(plan, car, driver, **following)
         self.drawn, self._end, self._end_time = drawn, plan.length - 1.0 if end is None else end, end_time
 
     def command(self, time: float, seen: Observation) -> Command:
@@ -106,22 +106,14 @@ class OpenArea:
         return float(self._friction[int(distance) % len(self._friction)])
 
 
-SIDES = {1.0: "left", -1.0: "right"}  # names of the values of draw_side
-SIDE_CHOICES = ("left", "right", "either")  # values of a manoeuvre's ``side``
-
-
-def require_one_of(manoeuvre: Any, key: str, choices: tuple[Any, ...]) -> None:
-    """Refuse a parameter that is none of its choices, by a `ConfigurationError`."""
-    value = getattr(manoeuvre, key)
-    if value not in choices:
-        raise ConfigurationError(f"manoeuvre '{manoeuvre.name}': {key} '{value}' is not one of: {', '.join(map(str, choices))}")
+SIDES = {1.0: "left", -1.0: "right"}  # names of the values of Draws.side
 
 
 def require(manoeuvre: Any, **limits: tuple[float, float]) -> None:
-    """Refuse parameters outside their limits, both ends of a range included, by a `ConfigurationError`."""
+    """Refuse parameters outside their limits, both ends of a range included, by a `ConfigurationError`; None is within."""
     for key, (lowest, highest) in limits.items():
-        value = getattr(manoeuvre, key)
-        low, high = as_range(value)
+        value = getattr(manoeuvre, key, None)
+        low, high = as_range(lowest if value is None else value)
         if not (lowest <= low <= high <= highest):
             raise ConfigurationError(f"manoeuvre '{manoeuvre.name}': {key} must lie between {lowest:g} and {highest:g}, not {value}")
 
@@ -132,20 +124,20 @@ def as_range(value: Range) -> tuple[float, float]:
     return float(low), float(high)
 
 
-def generator_of(seed: int) -> np.random.Generator:
-    """Generator of a manoeuvre's draws; their order is fixed."""
-    return np.random.default_rng(np.random.SeedSequence(entropy=seed, spawn_key=(_STREAM, 0)))
+class Draws:
+    """What the seed of a drive draws for its manoeuvre; their order is fixed."""
 
+    def __init__(self, seed: int) -> None:
+        self.generator = np.random.default_rng(np.random.SeedSequence(entropy=seed, spawn_key=(_STREAM, 0)))
 
-def draw(value: Range, generator: np.random.Generator) -> float:
-    """A value of the range, uniformly; also a plain number takes one draw, so that later ones stay as they are."""
-    return float(generator.uniform(*as_range(value)))
+    def __call__(self, value: Range) -> float:
+        """A value of the range, uniformly; also a plain number takes one draw, so that later ones stay as they are."""
+        return float(self.generator.uniform(*as_range(value)))
 
-
-def draw_side(side: str, generator: np.random.Generator) -> float:
-    """1 for the left, -1 for the right."""
-    drawn = 1.0 if generator.uniform() < 0.5 else -1.0
-    return {"left": 1.0, "right": -1.0}.get(side, drawn)
+    def side(self, side: Side) -> float:
+        """1 for the left, -1 for the right."""
+        drawn = 1.0 if self.generator.uniform() < 0.5 else -1.0
+        return {"left": 1.0, "right": -1.0}.get(side, drawn)
 
 
 def draw_driver(seed: int) -> Driver:
@@ -161,4 +153,4 @@ def plan_along(line: Line, speed: float, surface: Surface, seed: int) -> Plan:
     """A plan for a level open area: along a line at a constant speed [m/s]."""
     level = np.zeros_like(line.distance)
     friction = surface.along(line.distance, seed, OPEN_AREA_LAP)
-    return Plan(line.distance, line.x, line.y, line.heading, line.curvature, level + speed, friction, level, level)
+    return Plan(**vars(line), speed=level + speed, friction=friction, bank=level, grade=level)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Literal
 
 import numpy as np
 
@@ -15,18 +15,14 @@ from vehest.simulation.driving.driver import DRIVER_RATE_HZ, Command, Observatio
 from vehest.simulation.driving.manoeuvre import (
     FASTEST_SHARE,
     SETTLING_TIME,
-    SIDE_CHOICES,
     SIDES,
     Controller,
+    Draws,
     Manoeuvre,
     OpenArea,
     Range,
+    Side,
     as_range,
-    draw,
-    draw_side,
-    generator_of,
-    require,
-    require_one_of,
 )
 from vehest.simulation.road.surface import Surface
 
@@ -40,11 +36,9 @@ class StepSteer(Manoeuvre):
     severity: Range = (0.4, 1.0)  # share of the grip that the steady turn takes; beyond 1 the steering angle grows with its square
     steer_time: Range = (0.15, 0.6)  # in which the angle is reached, unless the steering is slower [s]
     turn_time: Range = (5.0, 8.0)  # after the step [s]
-    side: str = "either"  # ``left``, ``right`` or ``either``
+    side: Side = "either"  # ``left``, ``right`` or ``either``
 
-    def __post_init__(self) -> None:
-        require(self, speed=(3.0, 70.0), severity=(0.05, 2.0), steer_time=(0.02, 10.0), turn_time=(0.5, 600.0))
-        require_one_of(self, "side", SIDE_CHOICES)
+    limits: ClassVar = {"speed": (3.0, 70.0), "severity": (0.05, 2.0), "steer_time": (0.02, 10.0), "turn_time": (0.5, 600.0)}
 
     @property
     def longest(self) -> float:
@@ -53,10 +47,10 @@ class StepSteer(Manoeuvre):
 
     def controller(self, car: Car, surface: Surface, seed: int) -> Controller:
         """A driver with the speed, the angle and the side of this seed."""
-        generator = generator_of(seed)
-        speed = min(draw(self.speed, generator), FASTEST_SHARE * car.top_speed)
-        severity, steer_time, turn_time = (draw(values, generator) for values in (self.severity, self.steer_time, self.turn_time))
-        side, begin = draw_side(self.side, generator), float(generator.uniform(1.0, 2.0))
+        draw = Draws(seed)
+        speed = min(draw(self.speed), FASTEST_SHARE * car.top_speed)
+        severity, steer_time, turn_time = (draw(values) for values in (self.severity, self.steer_time, self.turn_time))
+        side, begin = draw.side(self.side), draw((1.0, 2.0))
         area = OpenArea(surface, seed)
         angle = side * _steer_at(car, severity, speed, area.mean)
 
@@ -76,13 +70,10 @@ class Spiral(Manoeuvre):
     severity: Range = (0.7, 1.0)  # share of the grip that the tightest turn takes; beyond 1 the steering angle grows with its square
     ramp_time: Range = (6.0, 12.0)  # in which the angle is reached [s]
     hold_time: Range = (1.0, 2.0)  # at the angle [s]
-    turns: int = 2  # 1, or 2 for a second turn to the other side
-    side: str = "either"  # of the first turn: ``left``, ``right`` or ``either``
+    turns: Literal[1, 2] = 2  # 1, or 2 for a second turn to the other side
+    side: Side = "either"  # of the first turn: ``left``, ``right`` or ``either``
 
-    def __post_init__(self) -> None:
-        require(self, speed=(3.0, 70.0), severity=(0.05, 2.0), ramp_time=(0.5, 300.0), hold_time=(0.0, 300.0))
-        require_one_of(self, "side", SIDE_CHOICES)
-        require_one_of(self, "turns", (1, 2))
+    limits: ClassVar = {"speed": (3.0, 70.0), "severity": (0.05, 2.0), "ramp_time": (0.5, 300.0), "hold_time": (0.0, 300.0)}
 
     @property
     def longest(self) -> float:
@@ -91,10 +82,10 @@ class Spiral(Manoeuvre):
 
     def controller(self, car: Car, surface: Surface, seed: int) -> Controller:
         """A driver with the speed, the angle and the side of this seed."""
-        generator = generator_of(seed)
-        speed = min(draw(self.speed, generator), FASTEST_SHARE * car.top_speed)
-        severity, ramp, hold = (draw(values, generator) for values in (self.severity, self.ramp_time, self.hold_time))
-        side, begin = draw_side(self.side, generator), float(generator.uniform(1.0, 2.0))
+        draw = Draws(seed)
+        speed = min(draw(self.speed), FASTEST_SHARE * car.top_speed)
+        severity, ramp, hold = (draw(values) for values in (self.severity, self.ramp_time, self.hold_time))
+        side, begin = draw.side(self.side), draw((1.0, 2.0))
         area = OpenArea(surface, seed)
         angle = side * _steer_at(car, severity, speed, area.mean)
         back = min(0.4 * ramp, 3.0)
@@ -120,8 +111,10 @@ class RandomSteer(Manoeuvre):
     band: tuple[float, float] = (0.1, 1.2)  # lowest and highest frequency [Hz]
     duration: float = 30.0  # of the recording [s]
 
+    limits: ClassVar = {"speed": (3.0, 70.0), "severity": (0.05, 2.0), "duration": (1.0, 3600.0)}
+
     def __post_init__(self) -> None:
-        require(self, speed=(3.0, 70.0), severity=(0.05, 2.0), duration=(1.0, 3600.0))
+        super().__post_init__()
         if not 0.01 <= self.band[0] < self.band[1] <= 5.0:
             raise ConfigurationError(f"manoeuvre 'random_steer': the band must lie between 0.01 and 5 Hz, not {self.band}")
 
@@ -132,14 +125,14 @@ class RandomSteer(Manoeuvre):
 
     def controller(self, car: Car, surface: Surface, seed: int) -> Controller:
         """A driver with the speed and the noise of this seed."""
-        generator = generator_of(seed)
-        speed = min(draw(self.speed, generator), FASTEST_SHARE * car.top_speed)
-        severity = draw(self.severity, generator)
+        draw = Draws(seed)
+        speed = min(draw(self.speed), FASTEST_SHARE * car.top_speed)
+        severity = draw(self.severity)
         area = OpenArea(surface, seed)
         deviation = _steer_at(car, severity, speed, area.mean) / 3.0
         edges = np.linspace(*self.band, N_SINES + 1)
-        rates = (2.0 * math.pi * generator.uniform(edges[:-1], edges[1:])).tolist()
-        phases = generator.uniform(0.0, 2.0 * math.pi, N_SINES).tolist()
+        rates = (2.0 * math.pi * draw.generator.uniform(edges[:-1], edges[1:])).tolist()
+        phases = draw.generator.uniform(0.0, 2.0 * math.pi, N_SINES).tolist()
         amplitude = deviation * math.sqrt(2.0 / N_SINES)
 
         def steer_at(time: float) -> float:
@@ -154,13 +147,7 @@ N_SINES = 24  # of which random steering is made, evenly spread over the band
 
 
 class OpenLoop:
-    """Steers by the clock on an open area and holds the speed.
-
-    Args:
-        speed: [m/s].
-        steer_at: road-wheel angle [rad] at a time [s].
-        end_time: at which the drive is over [s].
-    """
+    """Steers by the clock, road-wheel angle [rad] at a time [s], on an open area and holds the speed [m/s], until ``end_time`` [s]."""
 
     def __init__(
         self, car: Car, area: OpenArea, speed: float, steer_at: Callable[[float], float], end_time: float, drawn: dict[str, Any]

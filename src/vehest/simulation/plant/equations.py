@@ -221,16 +221,10 @@ def _axle_rates(x, axle, suspension, across, left, right, radius, compliance, de
 
 @_kernel
 def multi_body(x, steering_velocity, acceleration, contact, p, derivatives):  # type: ignore[no-untyped-def]
-    """Fill the derivatives (29,) of the state; returns the twelve tyre forces in the wheels' axes: four along, four across, four loads.
+    """Fill the derivatives (29,) of the state x (29,); returns twelve tyre forces in the wheels' axes: four along, four across, four loads.
 
-    A negative wheel speed becomes zero in x itself.
-
-    Args:
-        x: state (29,); axes and places are those of regimes.py.
-        steering_velocity, acceleration: wanted [rad/s, m/s²].
-        contact: see forces_of_contact.
-        p: parameters (MultiBodyValues).
-        derivatives: (29,), is overwritten.
+    A negative wheel speed becomes zero in x itself. Axes and places are those of regimes.py; steering velocity [rad/s] and acceleration
+    [m/s²] are the wanted ones, ``contact`` is as forces_of_contact takes it, p are MultiBodyValues.
     """
     u = steering_limit(x[STEER], steering_velocity, p.steering), acceleration_limit(x[VX], acceleration, p.longitudinal)
     front, rear = _axles(p)

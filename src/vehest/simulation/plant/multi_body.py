@@ -57,6 +57,8 @@ The rest goes into the drag of the steered front wheels, its yaw moment, and the
 HEAVE_FRONT, HEAVE_REAR = 16, 21
 MIRRORED = (1, 0, 3, 2)  # the library's left front, right front, left rear and right rear wheel in the order of motion.WHEELS
 
+PLACES = {"x": X, "y": Y, "yaw": YAW, "vx": VX, "vy": VY, "yaw_rate": YAW_RATE, "steer": STEER}
+
 
 def _state(place: int, meaning: str) -> Any:
     return property(lambda state: float(state.values[place]), doc=meaning)
@@ -186,15 +188,9 @@ class MultiBodyPlant:
 
         return Motion(
             rate_hz=rate_hz,
-            x=values[:, X],
-            y=values[:, Y],
-            yaw=values[:, YAW],
-            vx=vx,
-            vy=vy,
-            yaw_rate=yaw_rate,
+            **{name: values[:, place] for name, place in PLACES.items()},
             ax=derivatives[:, VX] - vy * yaw_rate,
             ay=derivatives[:, VY] + vx * yaw_rate,
-            steer=values[:, STEER],
             roll=-values[:, ROLL],
             pitch=self._at_rest[PITCH] - values[:, PITCH],
             roll_rate=-values[:, ROLL_RATE],

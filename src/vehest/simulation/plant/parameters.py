@@ -24,6 +24,7 @@ from vehiclemodels.vehicle_parameters import VehicleParameters, setup_vehicle_pa
 
 from vehest.constants import FloatArray
 from vehest.data.errors import ConfigurationError
+from vehest.data.schema import validated
 
 LIBRARY = "commonroad-vehicle-models"
 LIBRARY_VERSION = metadata.version(LIBRARY)  # of the package whose parameter files are read
@@ -70,48 +71,34 @@ class Vehicle:
     relaxation: tuple[float, float] = (0.0, 0.0)  # way over which tyres' lateral forces follow their slip, front and rear [m]; 0: at once
 
     def __post_init__(self) -> None:
-        for name, mapping in (("overrides", self.overrides), ("driver", self.driver)):
-            if not isinstance(mapping, Mapping):
-                raise ConfigurationError(f"vehicle '{self.name}': {name} must be a mapping, not {mapping!r}")
         parameters = library_parameters(self)
         for name in POSITIVE:
             if not getattr(parameters, name) > 0.0:
                 raise ConfigurationError(f"vehicle '{self.name}': {name} must be positive, not {getattr(parameters, name)}")
         rear_tyre(self)
-        for name, value in self.driver.items():
-            _require_number(f"vehicle '{self.name}': driver's value '{name}'", value)
         for place, length in zip(("front", "rear"), self.relaxation, strict=True):
-            _require_number(f"vehicle '{self.name}': relaxation {place}", length)
-            if length < 0.0:
+            if not 0.0 <= length < math.inf:
                 raise ConfigurationError(f"vehicle '{self.name}': relaxation {place} must be zero or positive, not {length} m")
 
 
 def vehicle_from_configuration(configuration: Mapping[str, Any]) -> Vehicle:
     """A vehicle from the keys ``name``, ``parameter_set`` and (optional) ``overrides``, ``driver`` and ``relaxation`` (front, rear).
 
-    Raises `ConfigurationError` where a key is missing or unknown, and as `Vehicle` does.
+    Raises `ConfigurationError` where a key is missing or unknown, or a value of the wrong type, and as `Vehicle` does.
     """
-    known = {"name", "parameter_set", "overrides", "driver", "relaxation"}
-    unknown = sorted(set(configuration) - known)
-    missing = sorted({"name", "parameter_set"} - set(configuration))
-    if unknown or missing:
-        raise ConfigurationError(f"vehicle configuration: unknown keys {unknown}, missing keys {missing}; it has {sorted(known)}")
-    overrides, driver = configuration.get("overrides") or {}, configuration.get("driver") or {}
-    lengths = configuration.get("relaxation") or {}
+    given, where = {key: value for key, value in configuration.items() if value is not None}, f"vehicle '{configuration.get('name')}'"
+    lengths = given.pop("relaxation", {})
     if not isinstance(lengths, Mapping) or set(lengths) - {"front", "rear"}:
-        raise ConfigurationError(f"vehicle '{configuration['name']}': relaxation is {{front: 0.3, rear: 0.3}} [m], not {lengths!r}")
-    relaxation = (lengths.get("front", 0.0), lengths.get("rear", 0.0))
-    return Vehicle(str(configuration["name"]), configuration["parameter_set"], _plain(overrides), _plain(driver), relaxation)
+        raise ConfigurationError(f"{where}: relaxation is {{front: 0.3, rear: 0.3}} [m], not {lengths!r}")
+    given["relaxation"] = [lengths.get("front", 0.0), lengths.get("rear", 0.0)]
+    return validated(Vehicle, given, where, error=ConfigurationError)
 
 
 def loaded(vehicle: Vehicle, mass: float, forward: float, up: float) -> Vehicle:
-    """The vehicle with a payload, a point mass that its springs carry; the same one without.
+    """The vehicle with a payload [kg], a point mass that its springs carry ``forward`` and ``up`` of the centre of gravity [m].
 
-    Unsprung masses are shared anew between the axles, so that body and car keep one centre of gravity in plan.
-
-    Args:
-        mass: of the payload [kg]; raises `ConfigurationError` where it is negative, or an axle would carry nothing.
-        forward, up: its place from the centre of gravity [m].
+    Unsprung masses are shared anew between the axles, so that body and car keep one centre of gravity in plan. Without a mass it is the
+    same vehicle. Raises `ConfigurationError`: it is negative, or an axle would carry nothing.
     """
     if mass == 0.0:
         return vehicle
@@ -141,8 +128,7 @@ def loaded(vehicle: Vehicle, mass: float, forward: float, up: float) -> Vehicle:
 
 def library_parameters(vehicle: Vehicle) -> VehicleParameters:
     """The library's own parameter object with the overrides in place (but the rear tyre's); a fresh one at every call."""
-    number = vehicle.parameter_set
-    if isinstance(number, bool) or not isinstance(number, int) or number not in PUBLISHED_SETS:
+    if vehicle.parameter_set not in PUBLISHED_SETS:
         known = ", ".join(f"{number} ({car})" for number, car in PUBLISHED_SETS.items())
         raise ConfigurationError(
             f"vehicle '{vehicle.name}': there is no multi-body parameter set {vehicle.parameter_set}; there are {known}"
@@ -182,10 +168,6 @@ def parameter_vector(parameters: Any) -> FloatArray:
     for value in parameters:
         values.extend(parameter_vector(value) if isinstance(value, tuple) else [value])
     return np.array(values)
-
-
-def _plain(value: Any) -> Any:
-    return {name: _plain(inner) for name, inner in value.items()} if isinstance(value, Mapping) else value
 
 
 def _override(parameters: Any, overrides: Mapping[str, Any], vehicle_name: str, prefix: str) -> None:

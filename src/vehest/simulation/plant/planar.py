@@ -37,6 +37,7 @@ X, Y, YAW, VX, VY, YAW_RATE = range(6)
 FIRST_WHEEL, FIRST_SLIP_X, FIRST_SLIP_Y = 6, 10, 14
 LOAD_AX, LOAD_AY, STEER, CURRENT = 18, 19, 20, 21
 N_STATES = 22
+PLACES = {"x": X, "y": Y, "yaw": YAW, "vx": VX, "vy": VY, "yaw_rate": YAW_RATE, "steer": STEER}
 
 PlanarValues = namedtuple("PlanarValues", PARAMETERS)  # type: ignore[misc]
 PlanarValues.__doc__ = "A PlanarCar's parameters as compiled code reads them."
@@ -172,15 +173,9 @@ class PlanarPlant:
         wheel_speed = values[:, FIRST_WHEEL : FIRST_WHEEL + len(WHEELS)]
         return Motion(
             rate_hz=rate_hz,
-            x=values[:, X],
-            y=values[:, Y],
-            yaw=values[:, YAW],
-            vx=values[:, VX],
-            vy=values[:, VY],
-            yaw_rate=values[:, YAW_RATE],
+            **{name: values[:, place] for name, place in PLACES.items()},
             ax=rates[:, VX] - values[:, VY] * values[:, YAW_RATE],
             ay=rates[:, VY] + values[:, VX] * values[:, YAW_RATE],
-            steer=values[:, STEER],
             roll=car.roll_gradient * values[:, LOAD_AY],
             pitch=-car.pitch_gradient * values[:, LOAD_AX],
             roll_rate=car.roll_gradient * rates[:, LOAD_AY],

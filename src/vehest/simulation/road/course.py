@@ -49,9 +49,8 @@ def build_course(name: str, layout: Layout) -> Course:
     The corners are kept as they are and must turn by a full circle in total; the course is closed by the smallest
     change, in the sum of squares, of the lengths of its straights.
 
-    Raises:
-        ConfigurationError: the corners do not add up to a circle, a corner is too short for its clothoids, or a
-            straight would have to become negative.
+    Raises `ConfigurationError`: the corners do not add up to a circle, a corner is too short for its clothoids, or a straight would have to
+    become negative.
     """
     for segment in layout.segments:
         if isinstance(segment, Corner | Compound) and segment.arc < 0:

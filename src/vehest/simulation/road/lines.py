@@ -30,27 +30,22 @@ class Gate:
 
 @dataclass(frozen=True, eq=False)
 class Line:
-    """A line, sampled every ``SPACING`` of its length; arrays of shape (N,): place [m], heading [rad], curvature [1/m]."""
+    """A line, sampled at even distances along itself, here every ``SPACING``; arrays of shape (N,)."""
 
-    distance: FloatArray
-    x: FloatArray
-    y: FloatArray
-    heading: FloatArray
-    curvature: FloatArray
+    distance: FloatArray  # [m]
+    x: FloatArray  # [m]
+    y: FloatArray  # [m]
+    heading: FloatArray  # not wrapped [rad]
+    curvature: FloatArray  # positive to the left [1/m]
 
 
 @lru_cache(maxsize=64)
 def line_through(gates: tuple[Gate, ...], width: float, run_in: float, run_out: float) -> Line:
-    """The smoothest line along the x axis that takes a car between the cones.
+    """The smoothest line along the x axis that takes a car of a width [m] through gates, in the order of the axis.
 
     It makes the sum of the squares of the curvature, and of its change, as small as the gates allow; in and out it runs straight along the
-    axis. The length of the car, whose ends swing out a little where the line turns, is covered by the clearance.
-
-    Args:
-        gates: in the order of the x axis.
-        width: of the car [m].
-        run_in: straight before the first gate [m].
-        run_out: after the last gate, of which the last two thirds run along the axis [m].
+    axis, over ``run_in`` before the first gate and the last two thirds of ``run_out`` after the last [m]. The length of the car, whose ends
+    swing out a little where the line turns, is covered by the clearance.
     """
     begin, end = gates[0].begin - run_in, gates[-1].end + run_out
     straight_until, straight_from = gates[0].begin - min(run_in, 40.0), gates[-1].end + run_out / 3.0

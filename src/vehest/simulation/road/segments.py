@@ -60,8 +60,7 @@ class Compound:
 
     Each part turns by its own angle, half of the clothoids on either side included.
 
-    Raises:
-        ValueError: the parts do not agree.
+    Raises `ValueError`: the parts do not agree.
     """
 
     parts: tuple[Corner, ...]  # corners to the same side, with the same transition

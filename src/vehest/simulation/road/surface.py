@@ -24,8 +24,7 @@ class Surface:
     Either one scale all along or, with ``patches``, patches of which each has a scale drawn between ``patches`` and ``friction``,
     uniformly, and a length drawn from ``patch_length``, uniformly. Friction changes over two metres between them.
 
-    Raises:
-        ConfigurationError: a scale is outside 0.05 … 1.5 or a length makes no sense.
+    Raises `ConfigurationError`: a scale is outside 0.05 … 1.5 or a length makes no sense.
     """
 
     name: str = "dry"  # in recordings
@@ -44,12 +43,10 @@ class Surface:
             raise ConfigurationError(f"surface '{self.name}': patches are at least 5 m long, not {self.patch_length}")
 
     def along(self, distance: FloatArray, drive_seed: int, length: float | None = None) -> FloatArray:
-        """Scale at each distance along the way, shape (N,).
+        """Scale at each distance along the way, (N,) [m], zero or positive, uniform.
 
-        Args:
-            distance: (N,) [m], zero or positive, uniform.
-            drive_seed: draws the patches if the surface has no seed of its own.
-            length: of a lap, after which the same patches come again [m]; by default they never do.
+        The drive's seed draws the patches if the surface has none of its own; after a lap's ``length`` [m] the same come again, by default
+        never.
         """
         if self.patches is None:
             return np.full(distance.shape, self.friction)

@@ -17,21 +17,16 @@ def switched_off(levels: SensorLevels, *names: str) -> SensorLevels:
 
     >>> levels = switched_off(SensorLevels(), "ay.noise", "tilt.bank", "reference", "*.drift")
 
-    Args:
-        names: an error of a sensor (``ay.noise``, ``imu.lever_x``, ``reference.heading.drift``), all errors of one (``ay``, ``tilt``,
-            ``reference``), or one kind of error of every sensor but the reference (``*.noise``), or all of them (``*``).
+    A name is an error of a sensor (``ay.noise``, ``imu.lever_x``, ``reference.heading.drift``), all errors of one (``ay``, ``tilt``,
+    ``reference``), or one kind of error of every sensor but the reference (``*.noise``), or all of them (``*``).
 
-    Raises:
-        ConfigurationError: there is no such sensor or error.
+    Raises `ConfigurationError`: there is no such sensor or error.
     """
+    every = [entry.name for entry in fields(levels) if isinstance(getattr(levels, entry.name), SensorLevel)]
     for name in names:
-        path = str(name).split(".")
-        if path[0] == "*":
-            every = [entry.name for entry in fields(levels) if isinstance(getattr(levels, entry.name), SensorLevel)]
-            for sensor in every:
-                levels = _off_at(levels, [sensor, *path[1:]], name)
-        else:
-            levels = _off_at(levels, path, name)
+        first, *rest = str(name).split(".")
+        for sensor in every if first == "*" else [first]:
+            levels = _off_at(levels, [sensor, *rest], name)
     return levels
 
 
@@ -43,8 +38,7 @@ def sensor_levels_from_config(value: Any) -> SensorLevels:
     A sensor, ``imu``, ``tilt`` and ``reference`` take a mapping of what changes, or ``off``; ``reference`` also takes a kind, or a
     mapping with one.
 
-    Raises:
-        ConfigurationError: an unknown name, with those there are, or a value that makes no sense.
+    Raises `ConfigurationError`: an unknown name, with those there are, or a value that makes no sense.
     """
     given = {"preset": value} if isinstance(value, str) else value or {}
     changes = {str(key): change for key, change in given.items()}

@@ -15,14 +15,7 @@ STREAM = 1  # first spawn key of all sensor errors; 0 is the driver's
 
 
 def shown(true: FloatArray, level: SensorLevel, rate_hz: float, seed: int, name: str) -> FloatArray:
-    """Signal of a sensor (T,) for a true signal.
-
-    Args:
-        true: (T,), uniformly sampled.
-        level: of its errors.
-        rate_hz: sampling rate [Hz].
-        name: of the sensor; with the kind of error it chooses the random stream.
-    """
+    """Signal of a sensor for a true one, (T,), uniformly sampled; the sensor's name and the kind of error choose the random stream."""
     value = delayed(true, level.delay * rate_hz)
     if level.gain:
         value = value * (1.0 + level.gain)

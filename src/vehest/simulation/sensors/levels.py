@@ -4,13 +4,27 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, fields, is_dataclass, replace
-from typing import Any
+from typing import Any, ClassVar
 
 from vehest.data.errors import ConfigurationError
 
 
 @dataclass(frozen=True)
-class SensorLevel:
+class Errors:
+    """Sizes of errors, which are finite and, but for the ``signed`` ones, not negative; raises `ConfigurationError` otherwise."""
+
+    signed: ClassVar[tuple[str, ...]] = ()
+
+    def __post_init__(self) -> None:
+        for name, value in vars(self).items():
+            if isinstance(value, float) and not math.isfinite(value):
+                raise ConfigurationError(f"{name} must be finite, not {value}")
+            if isinstance(value, int | float) and name not in self.signed and value < 0.0:
+                raise ConfigurationError(f"{name} must be zero or positive, not {value}")
+
+
+@dataclass(frozen=True)
+class SensorLevel(Errors):
     """Errors of one sensor; ``unit`` is its channel's unit.
 
     shown = quantise((1 + gain) (1 + scale) true(t - delay) + bias + offset + drift(t) + noise(t))
@@ -20,10 +34,10 @@ class SensorLevel:
     Noise is a density, so that a level means the same at every sampling rate: a sensor that is low-passed at half the sampling rate has
     samples of standard deviation noise·√(rate/2), which at 100 Hz is 7.07 times the density.
 
-    Raises:
-        ConfigurationError: a value is not finite or, but for gain and bias, negative, or the correlation time is zero.
+    Raises `ConfigurationError`: as `Errors` does, or the correlation time is zero.
     """
 
+    signed: ClassVar[tuple[str, ...]] = ("gain", "bias")
     noise: float = 0.0  # density of the white noise [unit/√Hz]
     offset: float = 0.0  # standard deviation of a constant that is drawn for each drive [unit]
     drift: float = 0.0  # standard deviation of a first-order Gauss-Markov process that is stationary from the first sample on [unit]
@@ -35,24 +49,16 @@ class SensorLevel:
     bias: float = 0.0  # constant of every drive [unit]
 
     def __post_init__(self) -> None:
-        _require_finite(self, *(entry.name for entry in fields(self) if entry.name not in ("gain", "bias")))
+        super().__post_init__()
         if self.drift_time == 0.0:
             raise ConfigurationError("drift_time must be positive, not 0")
 
 
-def _require_finite(levels: Any, *not_negative: str) -> None:
-    for entry in fields(levels):
-        value = getattr(levels, entry.name)
-        if isinstance(value, float) and not math.isfinite(value):
-            raise ConfigurationError(f"{entry.name} must be finite, not {value}")
-        if entry.name in not_negative and value < 0.0:
-            raise ConfigurationError(f"{entry.name} must be zero or positive, not {value}")
-
-
 @dataclass(frozen=True)
-class Mounting:
-    """Where the inertial unit sits and how it is turned against the body; raises `ConfigurationError` for a value that makes no sense."""
+class Mounting(Errors):
+    """Where the inertial unit sits and how it is turned against the body."""
 
+    signed: ClassVar[tuple[str, ...]] = ("lever_x", "lever_y", "lever_z", "roll", "pitch", "yaw")
     lever_x: float = 0.0  # its place forward of the centre of gravity [m]
     lever_y: float = 0.0  # its place left of the centre of gravity [m]
     lever_z: float = 0.0  # its place above the centre of gravity [m]
@@ -61,14 +67,12 @@ class Mounting:
     yaw: float = 0.0  # of its axes against the body's, right-handed [rad]
     misalignment: float = 0.0  # standard deviation of what is drawn for a drive and added to each of the three angles [rad]
 
-    def __post_init__(self) -> None:
-        _require_finite(self, "misalignment")
-
 
 @dataclass(frozen=True)
-class Tilt:
-    """Which angles tilt the inertial unit, so that gravity leaks into the accelerometers; others are zero; raises `ConfigurationError`."""
+class Tilt(Errors):
+    """Which angles tilt the inertial unit, so that gravity leaks into the accelerometers; others are zero."""
 
+    signed: ClassVar[tuple[str, ...]] = ("roll_share",)
     roll: bool = True  # of the body against the road; also makes the gyros measure about the body's axes instead of the road's
     pitch: bool = True  # likewise
     bank: bool = True  # of the road
@@ -76,33 +80,27 @@ class Tilt:
     # of the body's roll that leaks; an installation that corrects for roll leaves less than 1, one that corrects too much a negative share
     roll_share: float = 1.0
 
-    def __post_init__(self) -> None:
-        _require_finite(self)
-
 
 @dataclass(frozen=True)
-class Vibration:
-    """How turning wheels shake the inertial unit: white noise whose deviation grows with their mean speed; raises `ConfigurationError`."""
+class Vibration(Errors):
+    """How turning wheels shake the inertial unit: white noise whose deviation grows with their mean speed."""
 
     yaw_rate: float = 0.0  # standard deviation of a sample per speed of the wheels [1]
     ax: float = 0.0  # the same [m/s² per rad/s]
     ay: float = 0.0  # the same [m/s² per rad/s]
 
-    def __post_init__(self) -> None:
-        _require_finite(self, "yaw_rate", "ax", "ay")
-
 
 @dataclass(frozen=True)
-class Reference:
+class Reference(Errors):
     """The sensor that gives vx_ref, vy_ref, yaw_rate_ref and, as atan2(vy_ref, vx_ref), sideslip_ref.
 
     It measures the velocity where it sits, in axes turned by the error ``heading``, and moves it to the centre of gravity with its
     own yaw rate and a lever that is known but for ``lever_error``. Roll and pitch rate are left out of that, as is usual.
 
-    Raises:
-        ConfigurationError: a lever is not finite, lever_error is negative, or heading has errors without a meaning.
+    Raises `ConfigurationError`: as `Errors` does, or heading has errors without a meaning.
     """
 
+    signed: ClassVar[tuple[str, ...]] = ("lever_x", "lever_y", "lever_z")
     kind: str = "ideal"  # what it stands for, ``optical``, ``gnss``, ``motion_capture`` or ``ideal``
     vx: SensorLevel = SensorLevel()  # errors of the velocity along its x axis [m/s]
     vy: SensorLevel = SensorLevel()  # along its y axis [m/s]
@@ -115,7 +113,7 @@ class Reference:
     lever_error: float = 0.0  # standard deviation of what is drawn for a drive for lever_x and lever_y each [m]
 
     def __post_init__(self) -> None:
-        _require_finite(self, "lever_error")
+        super().__post_init__()
         if self.heading.delay or self.heading.scale or self.heading.quantisation:
             raise ConfigurationError("heading has noise, offset and drift only")
 

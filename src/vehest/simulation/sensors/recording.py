@@ -15,6 +15,8 @@ from vehest.simulation.plant.motion import WHEELS, Motion
 from vehest.simulation.sensors.errors import shown, stream
 from vehest.simulation.sensors.levels import Reference, SensorLevels, Tilt, Vibration
 
+OF_MOTOR = ("motor_speed", "motor_current")
+
 
 def measure(motion: Motion, levels: SensorLevels, seed: int) -> dict[str, FloatArray]:
     """Channels (canonical name -> (T,), SI units) that the sensors show of a motion; the same arguments give the same samples.
@@ -24,21 +26,17 @@ def measure(motion: Motion, levels: SensorLevels, seed: int) -> dict[str, FloatA
     """
     speed = _speed_of_wheels(motion) if levels.speed_of_wheels else motion.vx
     true = {"vx": speed, "steer": motion.steer, **_inertial(motion, levels, seed)}
-    sensor_of = {name: name for name in true}
-    for sensor, values in (("wheel_speed", motion.wheel_speed), ("fx", motion.tyre_fx), ("fy", motion.tyre_fy), ("fz", motion.tyre_fz)):
-        for place, wheel in enumerate(WHEELS):
-            true[f"{sensor}_{wheel}"] = values[:, place]
-            sensor_of[f"{sensor}_{wheel}"] = sensor
-    for name, of_motor in (("motor_speed", motion.motor_speed), ("motor_current", motion.motor_current)):
-        if of_motor is not None:
-            true[name], sensor_of[name] = of_motor, name
-    channels = {name: shown(values, getattr(levels, sensor_of[name]), motion.rate_hz, seed, name) for name, values in true.items()}
+    wheels = {"wheel_speed": motion.wheel_speed, "fx": motion.tyre_fx, "fy": motion.tyre_fy, "fz": motion.tyre_fz}
+    felt = [(name, name, values) for name, values in true.items()]
+    felt += [(f"{sensor}_{wheel}", sensor, own) for sensor, values in wheels.items() for wheel, own in zip(WHEELS, values.T, strict=True)]
+    felt += [(name, name, values) for name in OF_MOTOR if (values := getattr(motion, name)) is not None]
+    channels = {name: shown(values, getattr(levels, sensor), motion.rate_hz, seed, name) for name, sensor, values in felt}
     return channels | _reference(motion, levels.reference, seed)
 
 
 def described(levels: SensorLevels, motion: Motion) -> dict[str, Any]:
     """Sensors that measured a motion, for provenance; without those of a motor, and a vibration, that are not there."""
-    absent = {name for name in ("motor_speed", "motor_current") if getattr(motion, name) is None}
+    absent = {name for name in OF_MOTOR if getattr(motion, name) is None}
     if levels.vibration == Vibration():
         absent.add("vibration")
     if not levels.speed_of_wheels:

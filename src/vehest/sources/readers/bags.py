@@ -36,13 +36,9 @@ Topic = Sequence[Any]  # name, message type, paths of fields
 def read_topics(bag: Path, topics: Sequence[Topic], layouts: Mapping[str, str]) -> tuple[Arrays, dict[str, Any]]:
     """All messages of topics, in the order in which the bag received them; raises `ConfigurationError` or `DataError`.
 
-    Args:
-        bag: a bag's folder, or one of its files.
-        topics: name, message type and paths of numeric fields of each.
-        layouts: definitions of message types that ROS 2 Humble does not ship, by type.
-
-    Returns:
-        ``TOPIC@received`` [ns of unix time], ``TOPIC@stamped`` [ns] where messages have headers, ``TOPIC.FIELD`` and the start of the bag.
+    Of each topic are given name, message type and paths of numeric fields; ``layouts`` are definitions of types that ROS 2 Humble does not
+    ship. Arrays are ``TOPIC@received`` [ns of unix time], ``TOPIC@stamped`` [ns] where messages have headers, and ``TOPIC.FIELD``; the
+    summary has the start of the bag.
     """
     types = _types(layouts)
     with _opened(bag) as reader:
@@ -85,8 +81,7 @@ class _UriPath(type(Path())):  # type: ignore[misc]
 def _opened(bag: Path) -> Reader:
     """A bag, unless a SQLite file of it ends within a page: SQLite would fill that up with zeros.
 
-    Source:
-        SQLite, Database File Format, section 1.3, https://www.sqlite.org/fileformat2.html.
+    Source: SQLite, Database File Format, section 1.3, https://www.sqlite.org/fileformat2.html.
     """
     for file in [bag] if bag.is_file() else bag.iterdir():
         if file.is_file():

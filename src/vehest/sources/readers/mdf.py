@@ -43,13 +43,9 @@ BUS_FRAMES = ("CAN_DataFrame", "LIN_Frame", "ETH_Frame", "FLX_Frame")
 def read(file: Path, wanted: Mapping[str, tuple[str, int | str | None]] | None) -> tuple[Arrays, dict[str, Any]]:
     """Signals with the times of their groups; raises `DataError` for a formula, too much, or a wanted signal that cannot be read.
 
-    Args:
-        wanted: key -> name of a signal, and number or name of its group where the name occurs in several; None for every signal
-            of numbers whose group has times.
-
-    Returns:
-        Arrays ``KEY`` (physical values, NaN where marked invalid) and ``stamps GROUP`` [s], shape (T,) each; and a summary with
-        ``version``, ``start``, ``signals`` (key -> name, group, its title and the unit) and ``skipped`` (reasons).
+    ``wanted``: key -> name of a signal, and number or name of its group where the name occurs in several; None for every signal of numbers
+    whose group has times. Arrays are ``KEY`` (physical values, NaN where marked invalid) and ``stamps GROUP`` [s], shape (T,) each; the
+    summary has ``version``, ``start``, ``signals`` (key -> name, group, its title and the unit) and ``skipped`` (reasons).
     """
     forbid_evaluation()
     with open(file, "rb") as stream:
@@ -83,14 +79,9 @@ def read(file: Path, wanted: Mapping[str, tuple[str, int | str | None]] | None) 
 def with_signals(
     file: Path, seconds: list[float], signals: list[tuple[str, list[float], str, str, dict[str, str]]]
 ) -> tuple[Arrays, dict[str, Any]]:
-    """A measurement of version 4 with a group of signals more; raises `DataError` where it is of another version.
+    """``content``: bytes of a measurement of version 4 with a group of signals more; raises `DataError` where it is of another version.
 
-    Args:
-        seconds: times of the new group [s].
-        signals: name, values, unit, comment and, where values are codes, the text of each.
-
-    Returns:
-        ``content``: bytes of the new file.
+    ``seconds`` are times of the new group [s], ``signals`` name, values, unit, comment and, where values are codes, the text of each.
     """
     forbid_evaluation()
     with open(file, "rb") as stream:

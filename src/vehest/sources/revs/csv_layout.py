@@ -26,15 +26,10 @@ LONGEST_HEAD = 0.5  # of the rows: a column that begins later is not slow but br
 def read_csv(
     file: Path, columns: Sequence[str], gappy: Collection[str], preamble_lines: int
 ) -> tuple[dict[str, FloatArray], dict[str, str], dict[str, Any]]:
-    """Columns from the first row on in which all of them hold a value; raises `DataError` where a column or cell cannot be read.
+    """Columns, the one of time first, from the first row on in which all but the ``gappy`` ones hold a value, (T,) each.
 
-    Args:
-        columns: names of columns, the one of time first.
-        gappy: columns that wait for nothing.
-        preamble_lines: lines about the drive, above the names.
-
-    Returns:
-        Columns, shape (T,) in the units of the file; those units; and the provenance: lines about the drive, rows dropped at the head.
+    In the units of the file, with these units and the provenance: lines about the drive, of which there are ``preamble_lines`` above the
+    names, and rows dropped at the head. Raises `DataError`: a column or cell cannot be read.
     """
     time, head = columns[0], read_head(file).split(b"\n")[: preamble_lines + 2]
     lines = [_decoded(line).strip() for line in (*head, *[b""] * (preamble_lines + 2))]
