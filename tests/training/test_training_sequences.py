@@ -40,9 +40,9 @@ def _phase(network, name="fit", trainable=None, loss=None, validation=None, **se
 
 
 def _two_phases(network):
-    """The read-out first, then all together from a wrapper that shares its parameters."""
-    first = _phase(network, "read-out", lambda name: name.startswith("2."), max_epochs=7, validate_every=2)
-    return [first, _phase(nn.ModuleDict({"inner": network})["inner"], "all", patience=6, schedule="cosine")]
+    """The read-out first, then all together, in steps so large that patience ends it after its fourth epoch, the second being the best."""
+    first = _phase(network, "read-out", lambda name: name.startswith("2."), max_epochs=7, validate_every=2, learning_rate=0.6)
+    return [first, _phase(nn.ModuleDict({"inner": network})["inner"], "all", patience=2, schedule="cosine", learning_rate=0.3)]
 
 
 def _flat(network):
@@ -76,6 +76,8 @@ def test_killed_training_goes_on_from_its_last_checkpoint_to_the_same_bits(tmp_p
     with pytest.raises(KeyboardInterrupt):
         train_phases(_two_phases(killed), 3, FitContext([tmp_path], on_progress=die_after(11)), checkpoint_seconds=0.0)
     assert resume_epoch(tmp_path) == 10, "in the second phase"
+    kept = load_checkpoint(tmp_path).tensors
+    assert not torch.equal(kept["now.0.0.weight"], kept["best.0.0.weight"]), "it goes on from the first and ends with the second"
     resumed = _network()
     train_phases(_two_phases(resumed), 3, FitContext([tmp_path]))
     assert torch.equal(_flat(whole), _flat(resumed))
