@@ -1,7 +1,5 @@
 """Processes that tests start: each ends with its test, and with the process that runs the tests."""
 
-from __future__ import annotations
-
 import ctypes
 import json
 import os

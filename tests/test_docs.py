@@ -1,7 +1,5 @@
 """The documentation says what the code does: generated pages, links, commands, examples, constants."""
 
-from __future__ import annotations
-
 import re
 import shlex
 from dataclasses import dataclass, fields

@@ -1,7 +1,5 @@
 """A drive in closed form with content at many frequencies, any channel of which may be late or low-passed to the last digit."""
 
-from __future__ import annotations
-
 from functools import cache
 
 import numpy as np

@@ -1,7 +1,5 @@
 """What keeps files from asking for too much: limits, text, schemas, names."""
 
-from __future__ import annotations
-
 import os
 import time
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """What an export takes: bytes of state, code and tables, and the worst case of its stack, as compilers that are there say it."""
 
-from __future__ import annotations
-
 import re
 import shutil
 import subprocess

@@ -1,7 +1,5 @@
 """A method in C says what Python's stepper says, sample by sample: gaps, restarts and float included."""
 
-from __future__ import annotations
-
 import copy
 from dataclasses import dataclass, replace
 from functools import cache

@@ -11,8 +11,6 @@ estimator's first sample on. What is asked of a case:
 - `within_speed`: the lateral velocity never exceeded what the last believed speed allows.
 """
 
-from __future__ import annotations
-
 import argparse
 import math
 import os

@@ -1,7 +1,5 @@
 """Filters to compare compiled ones with: unscented and extended as their equations stand, in torch, and a gate around any filter."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """The compiled scan is the readable unscented filter, in values and gradients; that one is filterpy's to 1e-8 (test_filters_nonlinear)."""
 
-from __future__ import annotations
-
 import dataclasses
 from functools import partial
 from typing import NamedTuple

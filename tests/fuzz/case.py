@@ -1,7 +1,5 @@
 """What a generator is given and what it returns, and the register of all generators."""
 
-from __future__ import annotations
-
 import importlib
 import os
 import pkgutil

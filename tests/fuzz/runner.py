@@ -1,7 +1,5 @@
 """The process that imports once, and the workers that build inputs and fork a child for each."""
 
-from __future__ import annotations
-
 import contextlib
 import gc
 import io

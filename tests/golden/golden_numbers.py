@@ -1,7 +1,5 @@
 """Numbers of every estimator family, source and stage on small recordings, and what is recorded of them; `make golden` records anew."""
 
-from __future__ import annotations
-
 import contextlib
 import csv
 import hashlib

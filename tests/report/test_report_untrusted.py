@@ -1,7 +1,5 @@
 """Names and titles from files in a report: they are shown as text, whatever they hold."""
 
-from __future__ import annotations
-
 import re
 
 import pandas as pd

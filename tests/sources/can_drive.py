@@ -1,7 +1,5 @@
 """A recording as the log of a CAN bus, written by cantools and python-can: jittering stamps, lost frames, units and signs of a supplier."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any

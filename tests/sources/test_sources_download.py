@@ -1,7 +1,5 @@
 """Downloads from a server on loopback that breaks off, changes its file, stalls or sends other bytes."""
 
-from __future__ import annotations
-
 import fcntl
 import hashlib
 import os

@@ -1,7 +1,5 @@
 """ROS 2 bags written by the test, of a drive in closed form: what comes back, and one clear line for what cannot be used."""
 
-from __future__ import annotations
-
 import contextlib
 import importlib
 import runpy
