@@ -295,12 +295,9 @@ def test_pages_know_every_name():
         assert f"`{name}`" in cli, f"docs/cli.md does not explain {name}"
 
 
-def test_page_of_the_python_interface_has_every_public_name():
+def test_page_of_the_python_interface_has_every_public_name_and_that_of_commands_the_exit_codes_of_the_errors():
     documented = set(re.findall(r"^\.\. auto(?:function|class):: (\w+)$", page("docs/api.md"), re.MULTILINE))
     assert documented == set(vehest.__all__) - {"__version__"}
-
-
-def test_exit_codes_are_those_of_the_errors():
     table = dict(re.findall(r"^\| (\d+) \| ([^|]+) \|", page("docs/cli.md"), re.MULTILINE))
     stated = {"configuration": ConfigurationError, "unusable data": DataError, "missing": MissingError, "some jobs": JobsFailedError}
     for words, error in stated.items():

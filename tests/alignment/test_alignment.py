@@ -240,7 +240,7 @@ def test_unmeasured_tilt_adds_to_the_uncertainty():
     assert tilted["offset_yaw_rate"].tilt < 1e-4  # its reference is a gyroscope
 
 
-def test_effects_that_a_drive_does_not_tell_are_refused(motion):
+def test_effects_and_delays_that_a_drive_does_not_tell_are_refused(motion):
     circle = weaving(0, turning=False, varying=False, noise=0.02)
     with pytest.raises(DataError, match=r"cannot tell lever_y and offset_ay apart \(condition number"):
         align(circle, AlignmentSettings(("lever_arm", "offsets")))
@@ -252,9 +252,6 @@ def test_effects_that_a_drive_does_not_tell_are_refused(motion):
     straight = replace(still, vx=np.full(len(motion), 25.0), vy=np.zeros(len(motion)))
     with pytest.raises(DataError, match=r"lever_x cannot be estimated: .* % of its effect in this drive is noise"):
         align(recorded(straight, {}), AlignmentSettings(("lever_arm",)))
-
-
-def test_unrelated_sensors_and_delays_beyond_the_search_are_refused(motion):
     ours, other = weaving(0), weaving(1)
     mixed = replace(ours, channels={**ours.channels, "yaw_rate_ref": other["yaw_rate_ref"]})
     with pytest.raises(DataError, match=r"correlate by .* at most"):
@@ -557,7 +554,7 @@ def ferrari(data_root):
     return real_drive(data_root)
 
 
-def test_ferrari_shows_no_misalignment_that_its_intervals_do_not_contain(found_on_ferrari):
+def test_ferrari_shows_no_misalignment_and_the_yaw_rate_offset_of_the_turns_of_its_laps(found_on_ferrari, ferrari):
     """Its publishers give accelerations at the centre of gravity: lever arm, rotation and offsets should be near zero."""
     found = found_on_ferrari
     for name in ("lever_x", "lever_y", "yaw"):
@@ -565,10 +562,7 @@ def test_ferrari_shows_no_misalignment_that_its_intervals_do_not_contain(found_o
     assert all(math.isfinite(parameter.high - parameter.low) for parameter in found.parameters)
     assert found["lever_x"].uncertainty < 0.5
     assert abs(found["delay"].value) < 0.05
-
-
-def test_yaw_rate_offset_on_the_ferrari_agrees_with_the_turns_of_its_laps(ferrari, found_on_ferrari):
-    """Between two passes of one place the car has turned by whole circles: what is left over of the integrated yaw rate is its offset."""
+    # Between two passes of one place the car has turned by whole circles: what is left over of the integrated yaw rate is its offset.
     path = np.cumsum(ferrari["vx"]) / ferrari.rate_hz
     curvature = np.interp(np.arange(0.0, path[-1], 10.0), path, ferrari["yaw_rate"] / ferrari["vx"])
     curvature -= curvature.mean()

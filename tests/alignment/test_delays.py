@@ -66,14 +66,11 @@ def test_without_references_of_their_own_accelerations_and_angles_still_tell_who
     assert not reported(without(broadband_drive(late={"ay": 0.06}), "vy_ref", "sideslip_ref"))
 
 
-def test_a_lever_arm_is_no_delay():
+def test_a_lever_arm_is_no_delay_and_one_in_channels_of_the_wrong_sign_and_unit_is_found():
     drive = without(broadband_drive(lever=1.5), "yaw_rate_ref")
     assert not reported(drive)
     found = between(drive, "yaw_rate", "ay").delay
     assert found.low < 0.0 < found.high
-
-
-def test_a_delay_is_found_in_channels_of_the_wrong_sign_and_unit():
     late = broadband_drive(late={"ay": 0.06})
     spoilt = replace(late, channels={**late.channels, "ay": -late["ay"], "vy_ref": 3.6 * late["vy_ref"]})
     found = checks_of_recording(spoilt)
@@ -128,13 +125,10 @@ def ferrari(data_root):
     return real_drive(data_root)
 
 
-def test_the_ferraris_channels_are_not_reported(ferrari):
+def test_the_ferraris_accelerometers_are_a_sample_or_two_late_which_is_not_reported(ferrari):
     for start, stop in ((150.0, 450.0), (450.0, 550.0), (550.0, 700.0)):
         assert not reported(ferrari.cut(start, stop))
-
-
-def test_the_ferraris_accelerometers_are_a_sample_or_two_late(ferrari):
-    """`vehest data align` finds 0.2 to 22.6 ms by another method: the intervals meet."""
+    # `vehest data align` finds 0.2 to 22.6 ms by another method: the intervals meet.
     drive = ferrari.cut(150.0, 450.0)
     for delay in (between(drive, "ax", "vx_ref").delay, between(drive, "vy_ref", "ay").turned.delay):
         assert max(delay.low, 0.0002) < min(delay.high, 0.0226)

@@ -139,13 +139,10 @@ def test_limits_come_from_a_configuration_and_end_with_their_block():
             limits_from_config(wrong)
 
 
-def test_the_configuration_names_every_limit_and_an_hour_at_1_khz_stays_below():
+def test_the_configuration_names_every_limit_and_a_file_may_not_unpack_to_more():
     assert limits_from_config(compose_config("ingest", ["dataset=tabular"])["limits"]) == Limits()
     assert Limits().samples > 3600 * 1000
     assert Limits().memory > 8 * 3600 * 1000 * 55
-
-
-def test_a_file_may_not_unpack_to_more_than_the_limit_and_ten_times_its_size():
     with use_limits(Limits(memory=1000)):
         check_unpacked("f", 200, 3000)
         with pytest.raises(DataError, match=r"'f' unpacks to 3001 bytes, 1001 beyond ten times its size, .*limits\.memory=NUMBER"):

@@ -178,15 +178,12 @@ def test_luenberger_sensitivity_is_the_transform_of_the_observers_impulse_respon
         np.testing.assert_allclose(response, _transform(measured, rate_hz), rtol=0, atol=1e-8)  # 3000 rounded differences add up
 
 
-def test_observer_passes_nothing_where_it_is_reset():
-    closed = luenberger_sensitivity(_luenberger(threshold=0.1), 0.05)
-    assert np.abs(np.stack(closed.response(FREQUENCY))).max() == 0.0
-    assert closed.white_noise_gains() == (0.0, 0.0)
-
-
-def test_variance_is_the_integral_of_the_squared_magnitude():
+def test_variance_is_the_integral_of_the_squared_magnitude_and_an_observer_that_is_reset_passes_nothing():
     model = LocalModels.of(ksnn_with_weights(2, 0, False)).linearised()
     for closed in (ksnn_sensitivity(model, 0.3), ksnn_sensitivity(model, 0.3).truncated(30), luenberger_sensitivity(_luenberger(), 0.3)):
         band = closed.band_gains(closed.rate_hz / 2, n_lines=20_001)
         for gain, over_band in zip(closed.white_noise_gains(), band, strict=True):
             assert over_band / math.sqrt(closed.rate_hz / 2) == pytest.approx(gain, rel=1e-6)
+    closed = luenberger_sensitivity(_luenberger(threshold=0.1), 0.05)
+    assert np.abs(np.stack(closed.response(FREQUENCY))).max() == 0.0
+    assert closed.white_noise_gains() == (0.0, 0.0)

@@ -136,7 +136,7 @@ def report(part, everything):
     return documents(StudyArtefacts("cnn_ukf", "t", "a", "c", {name: f"Part {name}" for name in names}, parts, []))["report"]
 
 
-def test_report_has_every_table_and_figure_of_the_paper_and_says_what_its_data_are(report):
+def test_report_has_every_table_and_figure_of_the_paper_and_each_claim_a_verdict_with_an_interval(report):
     text = "\n".join(block if isinstance(block, str) else block.caption for block in report.blocks)
     shown = {block.name for block in report.blocks if isinstance(block, Figure)}
     assert {f"figure_{number}" for number in range(4, 15)} == shown
@@ -159,9 +159,6 @@ def test_report_has_every_table_and_figure_of_the_paper_and_says_what_its_data_a
     } <= of_tables
     assert "SIMULATED data" in text
     assert not re.search(r"\bnan\b", text)
-
-
-def test_every_claim_has_a_verdict_and_an_interval_or_says_why_not(report):
     frame = next(block.frame for block in report.blocks if isinstance(block, Table) and block.name == "claims")
     assert len(frame) > 25
     tested = frame[(frame["verdict"] != "not testable on this data") & (frame["data"] == "simulated")]

@@ -36,7 +36,7 @@ def _trained(n_hidden=0, bias=False, n_local=2, **planted):
     return Trained(estimator, "KS-NN", "made-up drives, simulated", 2)
 
 
-def test_leak_is_told_as_the_time_constant_of_its_pole():
+def test_leak_is_told_as_the_time_constant_of_its_pole_and_a_state_as_the_forward_speed_if_it_is():
     """γ₁ = exp(-τ/T) with τ = 0.05 s and T = 0.5 s."""
     leak = float(np.exp(-0.05 / 0.5))
     text = gains_in_words(_trained(gamma=[[leak, 1.0], [0.99, 1.0]]))
@@ -44,10 +44,7 @@ def test_leak_is_told_as_the_time_constant_of_its_pole():
     assert "At |ω| = 0.60 rad/s it is 0.990, nearer to one, as the paper argues" in text
     assert "not nearer to one" in gains_in_words(_trained(gamma=[[0.99, 1.0], [0.9, 1.0]]))
     assert "nothing makes v̂ forget" in gains_in_words(_trained(gamma=[[1.0, 1.0], [0.9, 1.0]]))
-
-
-def test_state_that_is_the_forward_speed_is_told_from_one_that_is_not():
-    """û settles at w₁₂/(1 - γ₂ + w₁₂) of u_m."""
+    # û settles at w₁₂/(1 - γ₂ + w₁₂) of u_m.
     own = {"linear_weight": [[0.3, 0.2], [0.3, 0.2]]}
     assert "settles at 100 % of u_m, so û is the forward speed." in gains_in_words(_trained(gamma=[[0.9, 1.0], [0.9, 1.0]], **own))
     assert "settles at 80 % of u_m, so û is not" in gains_in_words(_trained(gamma=[[0.9, 0.95], [0.9, 1.0]], **own))
@@ -186,7 +183,7 @@ def _panel(test, trained_on, *, lstm=0.2):
     )
 
 
-def test_levels_are_those_of_the_planted_errors():
+def test_levels_are_those_of_the_planted_errors_and_exceed_the_signal_from_the_planted_frequency_on():
     """The LSTM's error is exactly twice the KS-NN's here: 6.02 dB above it everywhere."""
     table = residuals([_panel("Corvette C-2", "Ferrari F-1")])[2]
     assert isinstance(table, Table)
@@ -196,10 +193,7 @@ def test_levels_are_those_of_the_planted_errors():
     ksnn = table.frame[table.frame["estimator"] == "KS-NN, seed 1"].iloc[0]
     assert ksnn["below_v_1"] == pytest.approx(20.0, abs=4 * 10 / math.log(10) * math.sqrt(2 / (6 * 22)))
     assert math.isnan(ksnn["exceeds_v_from"])
-
-
-def test_frequency_from_which_an_error_exceeds_the_signal_is_the_planted_one():
-    """White error, signal whose amplitude falls as 1/f and is 0.5 times the error's level at 2 Hz and above: they cross at 1 Hz."""
+    # White error, signal whose amplitude falls as 1/f and is 0.5 times the error's level at 2 Hz and above: they cross at 1 Hz.
     generator = np.random.default_rng(0)
     white = generator.standard_normal(2**16)
     spectrum = np.fft.rfft(generator.standard_normal(2**16))

@@ -92,16 +92,13 @@ def test_which_way_is_left_is_asked_unless_wheels_of_both_sides_or_a_course_tell
     assert ("course over latitude and longitude" in found.left_right, found.by_channel["yaw_rate"].sign) == (True, -1)
 
 
-def test_wheels_alone_give_a_speed_and_their_radius(tmp_path):
+def test_wheels_alone_give_a_speed_and_their_radius_unless_they_miss_samples(tmp_path):
     d = drive()
     wheels = {f"n_{corner}": d[f"wheel_{corner}"] * 30.0 / np.pi for corner in CORNERS}
     examined = inspect("my_car", [write(tmp_path / "lap.csv", usual(d).drop(columns="Speed").assign(**wheels))])
     assert examined.proposals.by_channel["wheel_speed_fl"].unit == "rpm"
     assert examined.proposals.wheel_radius == pytest.approx(RADIUS, rel=0.02)
     assert {"vx", "vy_ref"} <= draft(examined).contents[0].channels
-
-
-def test_wheels_that_miss_samples_make_no_speed_and_no_question(tmp_path):
     d = drive()
     wheels = {f"n_{corner}": d[f"wheel_{corner}"] * 30.0 / np.pi for corner in CORNERS}
     table = usual(d).drop(columns=["Time [s]", "Speed"]).assign(**wheels)
@@ -111,13 +108,6 @@ def test_wheels_that_miss_samples_make_no_speed_and_no_question(tmp_path):
     made = draft(examined)
     assert (made.examined.proposals.wheel_radius, made.dataset["transforms"]) == (None, [])
     assert sum("wheel_speed" in note and "samples are missing" in note for note in made.notes) == 4
-
-
-def test_logs_of_two_loggers_are_refused_by_the_file_that_shares_no_column(tmp_path):
-    write(tmp_path / "lap_1.csv", usual(drive(90.0)))
-    write(tmp_path / "lap_2.csv", usual(drive()).rename(columns=lambda name: name if "Time" in name else f"{name}2"))
-    with pytest.raises(DataError, match=r"lap_1\.csv' has none of the columns that are channels in '.*lap_2\.csv'"):
-        inspect("my_car", [tmp_path / "lap_1.csv", tmp_path / "lap_2.csv"])
 
 
 @pytest.mark.parametrize(("wheel", "other"), [("n_VL", "OilTemp"), ("n_VL", "pose_yaw [rad]"), ("n_VL [mph]", "pose_yaw")])
@@ -452,24 +442,26 @@ def test_files_that_are_laid_out_otherwise_are_refused(tmp_path, change, options
         in_two_files(tmp_path, change, **options)
 
 
-def test_a_file_with_another_unit_below_its_names_is_refused(tmp_path):
+def test_files_with_another_unit_below_their_names_or_of_two_loggers_are_refused(tmp_path):
     names, _, numbers = usual(drive()).round(5).to_csv(index=False).partition("\n")
     for name, unit in (("lap_1", "km/h"), ("lap_2", "m/s")):
         (tmp_path / f"{name}.csv").write_text(f"{names}\ns,{unit},deg/s,g,g,deg,deg\n{numbers}")
     with pytest.raises(DataError, match=r"lap_2.csv' has 'Speed' in 'm/s', .*lap_1.csv' in 'km/h'; write both alike"):
         inspect("my_car", [tmp_path / "lap_1.csv", tmp_path / "lap_2.csv"])
+    write(tmp_path / "lap_1.csv", usual(drive(90.0)))
+    write(tmp_path / "lap_2.csv", usual(drive()).rename(columns=lambda name: name if "Time" in name else f"{name}2"))
+    with pytest.raises(DataError, match=r"lap_1\.csv' has none of the columns that are channels in '.*lap_2\.csv'"):
+        inspect("my_car", [tmp_path / "lap_1.csv", tmp_path / "lap_2.csv"])
 
 
-def test_a_column_that_is_empty_in_another_file_is_left_out(tmp_path):
+def test_a_column_that_is_empty_or_impossible_in_another_file_is_left_out(tmp_path):
     found = in_two_files(tmp_path, lambda table: table.assign(Steer=np.nan)).proposals
     assert ("handwheel" in found.by_channel, "ax" in found.by_channel) == (False, True)
     assert any(re.search(r"'Steer' \(handwheel\) is left out: '.*lap_2.csv' has no numbers in it", note) for note in found.notes)
-
-
-def test_a_yaw_rate_that_is_named_as_made_of_yaw_is_the_references(tmp_path):
-    found = proposed(tmp_path, usual(drive()).assign(yaw_rate_from_yaw=np.degrees(drive()["r"]) + 0.01))
-    assert (found["yaw_rate"].column, found["yaw_rate_ref"].column) == ("Gyro", "yaw_rate_from_yaw")
-    assert not found["yaw_rate"].asked
+    roll = 0.05 * np.sin(np.arange(6000) / 50.0)
+    first = write(tmp_path / "lap_1.csv", usual(drive(seed=1)).assign(**{"roll (rad)": roll}))
+    second = write(tmp_path / "lap_2.csv", usual(drive(100.0, seed=2)).assign(**{"roll (rad)": 40.0 * roll[:5000]}))
+    assert ["roll" in inspect("my_car", files).proposals.by_channel for files in ([first], [first, second])] == [True, False]
 
 
 def test_an_acceleration_that_is_the_difference_of_the_references_speed_is_not_the_cars(tmp_path):
@@ -484,12 +476,15 @@ def test_an_acceleration_that_is_the_difference_of_the_references_speed_is_not_t
     assert "'acc_vehicle_x' is left out: the difference of 'mocap_speed' from row to row, and no measurement" in examined.proposals.notes
 
 
-def test_a_torque_is_no_acceleration_and_a_speed_in_an_unknown_unit_is_told_of(tmp_path):
+def test_a_torque_is_no_acceleration_a_yaw_rate_made_of_yaw_the_references_and_an_unknown_unit_told_of(tmp_path):
     d = drive()
     table = pd.DataFrame({"t": d["t"], "speed": d["vx"] / 0.3048, "gyro_z": np.degrees(d["r"]), "acc_y": d["ay"], "Tq": 130.0 * d["ax"]})
     found = inspect("my_car", [write(tmp_path / "lap.csv", table)]).proposals
     assert (found.by_channel["vx"].unit, "ax" in found.by_channel) == ("km/h", False)
     assert any("'speed' reads" in note and "% too little" in note for note in found.notes)
+    found = proposed(tmp_path, usual(drive()).assign(yaw_rate_from_yaw=np.degrees(drive()["r"]) + 0.01))
+    assert (found["yaw_rate"].column, found["yaw_rate_ref"].column) == ("Gyro", "yaw_rate_from_yaw")
+    assert not found["yaw_rate"].asked
 
 
 def test_a_sign_that_the_motion_does_not_decide_is_asked_and_taken_as_most_of_the_others_count(tmp_path):
@@ -517,15 +512,12 @@ def test_rows_without_a_sample_for_longer_than_lines_bridge_are_left_out_and_end
         assert any("1-500" in note for note in made.notes)
 
 
-def test_course_and_heading_without_another_reference_are_told_of(tmp_path):
+def test_course_and_heading_without_another_reference_and_samples_that_rows_repeat_are_told_of(tmp_path):
     d = drive()
     yaw = np.cumsum(d["r"]) / 50.0
     table = usual(d).drop(columns="Beta").assign(Heading=-np.degrees(yaw) % 360.0, Course=-np.degrees(yaw + d["sideslip"]) % 360.0)
     notes = inspect("my_car", [write(tmp_path / "lap.csv", table)]).proposals.notes
     assert "'Heading' less 'Course' may be the sideslip angle that is missing as a reference; save it as a column" in notes
-
-
-def test_samples_that_rows_repeat_are_told_of(tmp_path):
     table = usual(drive())
     assert not drafted(tmp_path, table).remarks
     remarks = drafted(tmp_path, table.assign(Gyro=np.repeat(table["Gyro"].to_numpy()[::10], 10))).remarks
@@ -542,13 +534,6 @@ def test_a_few_rows_that_no_vehicle_drives_are_left_out_and_said(tmp_path):
     recording = read_back(made)
     assert (recording.rate_hz, len(recording["vx"])) == (50.0, 6000)
     np.testing.assert_allclose(recording["vx"], d["vx"], atol=0.2)
-
-
-def test_what_is_impossible_in_the_second_file_alone_is_left_out_too(tmp_path):
-    roll = 0.05 * np.sin(np.arange(6000) / 50.0)
-    first = write(tmp_path / "lap_1.csv", usual(drive(seed=1)).assign(**{"roll (rad)": roll}))
-    second = write(tmp_path / "lap_2.csv", usual(drive(100.0, seed=2)).assign(**{"roll (rad)": 40.0 * roll[:5000]}))
-    assert ["roll" in inspect("my_car", files).proposals.by_channel for files in ([first], [first, second])] == [True, False]
 
 
 @pytest.mark.parametrize("excess", [1.0, 1.05])

@@ -14,18 +14,15 @@ from vehest.run.config_files import GROUPS, choices
 from vehest.run.study import jobs_of, read_study
 
 
-def test_estimator_chooses_its_training_and_the_user_may_choose_another(elsewhere):
-    assert compose_config("train", ["estimator=luenberger"])["training"]["name"] == "nelder_mead"
-    assert compose_config("train", ["estimator=gru"])["training"]["name"] == "supervised"
-    assert compose_config("train", ["estimator=luenberger", "training=supervised"])["training"]["name"] == "supervised"
-
-
-def test_every_estimator_composes_with_any_split(elsewhere):
+def test_every_estimator_composes_with_any_split_and_chooses_its_training_unless_the_user_does(elsewhere):
     estimators, splits = choices("estimator"), choices("split")
     for at, estimator in enumerate(estimators):
         split = splits[at * len(splits) // len(estimators)]
         config = compose_config("eval", [f"estimator={estimator}", f"split={split}"])
         assert (config["estimator"]["name"], config["split"]["name"]) == (estimator, split)
+    assert compose_config("train", ["estimator=luenberger"])["training"]["name"] == "nelder_mead"
+    assert compose_config("train", ["estimator=gru"])["training"]["name"] == "supervised"
+    assert compose_config("train", ["estimator=luenberger", "training=supervised"])["training"]["name"] == "supervised"
 
 
 def test_local_configuration_is_searched_first_and_adds_to_the_packaged_one(elsewhere):

@@ -268,15 +268,12 @@ def test_tables_that_are_damaged_are_one_line(tmp_path):
     assert read_rows(path)[0] == {"metric": "epochs", "value": "7"}
 
 
-def test_a_checkpoint_that_says_nonsense_counts_as_none(tmp_path):
+def test_a_checkpoint_or_a_published_study_that_is_damaged_counts_as_none(tmp_path):
     for values in ({"epoch": "three"}, {}, {"epoch": 3, "finished": "no"}):
         save_checkpoint(tmp_path, Checkpoint({"a": torch.zeros(2)}, values))
         assert (load_checkpoint(tmp_path), resume_epoch(tmp_path)) == (None, 0)
     save_checkpoint(tmp_path, Checkpoint({"a": torch.zeros(2)}, {"epoch": 3, "finished": False, "losses": [1.0]}))
     assert resume_epoch(tmp_path) == 3
-
-
-def test_a_published_study_that_is_damaged_shows_nothing(tmp_path):
     for text in ("[]", "{", '{"kinds": [1]}', "[" * 100_000):
         (tmp_path / PROVENANCE).write_text(text)
         assert published_in(tmp_path) is None

@@ -165,16 +165,13 @@ def _loop_with_all_its_weights(averaging):
     return network, losses
 
 
-def test_averaged_weights_are_those_of_a_loop_that_keeps_every_step():
+def test_averaged_weights_are_those_of_a_loop_that_keeps_every_step_and_never_reach_the_optimiser():
     settings = SupervisedSettings(dtype="float64", max_epochs=4, learning_rate=1e-2, averaging=0.9)
     (member,), (record,) = _fit("ksnn", {"n_hidden": 1, "bias": True}, [3], settings)
     network, losses = _loop_with_all_its_weights(0.9)
     assert np.allclose(record.history["validation_loss"], losses, rtol=1e-9)
     for own, other in zip(member.network.parameters(), network.parameters(), strict=True):
         assert torch.allclose(own, other, rtol=0, atol=1e-10)
-
-
-def test_averaging_never_reaches_the_optimiser():
     (_,), (plain,) = _fit("ksnn", {}, [0], SupervisedSettings(max_epochs=5))
     (_,), (averaged,) = _fit("ksnn", {}, [0], SupervisedSettings(max_epochs=5, averaging=0.99))
     assert averaged.history["train_loss"] == plain.history["train_loss"]

@@ -117,13 +117,17 @@ def test_forces_oppose_sliding_and_scale_with_friction_and_load(car):
         assert float(other) == pytest.approx(float(one))
 
 
-def test_curvature_is_learnt_only_where_it_is_asked_for():
+def test_curvature_is_learnt_only_where_it_is_asked_for_and_positive_parameters_stay_positive():
     plain, curved = PacejkaTyres(TYRES), PacejkaTyres(TYRES, with_curvature=True)
     assert sum(p.numel() for p in curved.parameters()) - sum(p.numel() for p in plain.parameters()) == 3
     chassis = PlanarCar()
     slips = chassis.slips(torch.tensor([3.0, 0.5, 1.0, 3.5]), torch.tensor([0.1, 0.0]))
     for one, other in zip(plain(slips, chassis.loads()), curved(slips, chassis.loads()), strict=True):
         assert one.item() == pytest.approx(other.item(), rel=1e-5)
+    own = PositiveParameters({"inertia": 0.46})
+    with torch.no_grad():
+        own.get_parameter("log_inertia").sub_(20.0)
+    assert 0.0 < own["inertia"].item() < 1e-8
 
 
 def test_gradients_reach_every_parameter_and_batches_work(car):
@@ -137,10 +141,3 @@ def test_gradients_reach_every_parameter_and_batches_work(car):
         assert parameter.grad is not None
         assert torch.isfinite(parameter.grad).all()
     assert all(chassis.learnt.get_parameter(f"log_{name}").grad.abs() > 0 for name in LEARNT)
-
-
-def test_positive_parameters_stay_positive():
-    own = PositiveParameters({"inertia": 0.46})
-    with torch.no_grad():
-        own.get_parameter("log_inertia").sub_(20.0)
-    assert 0.0 < own["inertia"].item() < 1e-8
