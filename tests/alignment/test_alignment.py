@@ -544,19 +544,10 @@ def test_command_refuses_in_one_line_and_writes_nothing(called, arguments, code,
     assert files() == before
 
 
-@pytest.fixture(scope="module")
-def found_on_ferrari(ferrari):
-    return align(ferrari, AlignmentSettings(IMU))
-
-
-@pytest.fixture(scope="module")
-def ferrari(data_root):
-    return real_drive(data_root)
-
-
-def test_ferrari_shows_no_misalignment_and_the_yaw_rate_offset_of_the_turns_of_its_laps(found_on_ferrari, ferrari):
+def test_ferrari_shows_no_misalignment_and_the_yaw_rate_offset_of_the_turns_of_its_laps(data_root):
     """Its publishers give accelerations at the centre of gravity: lever arm, rotation and offsets should be near zero."""
-    found = found_on_ferrari
+    ferrari = real_drive(data_root)
+    found = align(ferrari, AlignmentSettings(IMU))
     for name in ("lever_x", "lever_y", "yaw"):
         assert found[name].low <= 0.0 <= found[name].high, name
     assert all(math.isfinite(parameter.high - parameter.low) for parameter in found.parameters)
@@ -572,5 +563,4 @@ def test_ferrari_shows_no_misalignment_and_the_yaw_rate_offset_of_the_turns_of_i
     turned = ferrari["yaw_rate"][first:last].sum() / ferrari.rate_hz
     offset = (turned - 2.0 * np.pi * round(turned / (2.0 * np.pi))) / ((last - first) / ferrari.rate_hz)
     assert abs(offset) < 2e-4
-    found = found_on_ferrari["offset_yaw_rate"]
-    assert found.low <= offset <= found.high
+    assert found["offset_yaw_rate"].low <= offset <= found["offset_yaw_rate"].high

@@ -1,6 +1,6 @@
 """The learned filter as an estimator: candidates, starts, dropouts, members, and what it refuses."""
 
-from functools import cache
+from functools import cache, partial
 
 import numpy as np
 import pytest
@@ -40,9 +40,9 @@ def data():
     return FitData([small_car_drive(4.0, 0), small_car_drive(4.0, 1)], [small_car_drive(4.0, 2)])
 
 
-def estimator(seed=0, **config):
-    made = LearnedUkf.from_config({"width": 16} | config)
-    made.seed(seed)
+def estimator(family=LearnedUkf, **config):
+    made = family.from_config({"width": 16} | config)
+    made.seed(0)
     return made
 
 
@@ -188,10 +188,7 @@ def test_weights_and_drives_that_do_not_fit_are_one_clear_error():
     assert "channel 'steer' has gaps" in refusal(lambda: estimator().fit(FitData([gappy], [gappy]), quick()))
 
 
-def variant_of(seed=0, **config):
-    made = LearnedUkfVariant.from_config({"width": 16} | config)
-    made.seed(seed)
-    return made
+variant_of = partial(estimator, LearnedUkfVariant)
 
 
 def test_variant_without_its_options_is_the_learned_filter_to_the_bit():
