@@ -10,7 +10,6 @@ import time
 from contextlib import suppress
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
 
 HANGS = 900.0  # s after which a test fails; until then it waits for what happens
 MOMENT = 0.02  # s between two looks
@@ -60,7 +59,7 @@ class Striking:
 
     def __init__(self, function, call=0, number=0):
         self.function, self.call, self.number = function, call, number
-        self.calls: list[tuple[Any, ...]] = []
+        self.calls = []
 
     def __call__(self, *arguments, **options):
         result = self.function(*arguments, **options)

@@ -14,7 +14,7 @@ class Wave:
 
     def __init__(self, amplitudes, omegas, phases, level=0.0):
         self.amplitudes, self.omegas, self.phases, self.level = amplitudes, omegas, phases, level
-        self._known: dict[tuple[float, float, int, int], np.ndarray] = {}  # by uniform clock and order
+        self._known = {}  # by uniform clock and order
 
     @classmethod
     def random(cls, generator, size, low, high, number=120, level=0.0, corner=0.5):

@@ -112,7 +112,6 @@ def assert_recovered(found, truth, names):
 @pytest.mark.parametrize("reference_rate", [False, True])
 def test_cross_correlation_finds_a_delay_alone(motion, reference_rate):
     found = align(recorded(motion, {"delay": 0.040}, reference_rate=reference_rate), AlignmentSettings(("delay",)))
-    assert found.correlation is not None
     assert found.correlation.peak == pytest.approx(0.040, abs=0.010)
 
 

@@ -84,9 +84,7 @@ def test_the_delay_is_that_of_the_peak_of_the_cross_correlation():
     follower = np.roll(source, 7) + 0.3 * source.std() * generator.standard_normal(12000)
     peak = int(np.argmax(np.correlate(follower, source[100:-100], "valid"))) - 100
     spectra = cross_spectra({"source": source, "follower": follower}, 100.0)
-    assert spectra is not None
     lag = lag_of(spectra, "source", "follower", low_pass=False)
-    assert lag is not None
     assert peak == 7
     assert lag.delay.value == pytest.approx(0.07, abs=2e-3)
 
@@ -100,9 +98,7 @@ def test_intervals_hold_the_truth_as_often_as_they_promise():
         signals = {"source": wave(clock), "follower": wave(clock - 0.03)}
         noisy = {name: samples + 0.3 * samples.std() * generator.standard_normal(len(clock)) for name, samples in signals.items()}
         spectra = cross_spectra(noisy, 25.0)
-        assert spectra is not None
         lag = lag_of(spectra, "source", "follower", low_pass=False)
-        assert lag is not None
         inside += lag.delay.low < 0.03 < lag.delay.high
     assert inside >= 52
 

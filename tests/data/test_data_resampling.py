@@ -16,7 +16,6 @@ from vehest.data.transforms import Resample, windowed_sinc
 
 RATIOS = [(100.0, 20.0), (125.0, 20.0), (125.0, 100.0), (1000.0, 20.0), (20.0, 100.0), (50.0, 30.0), (1000.0 / 3.0, 20.0), (400.0, 100.0)]
 PROPERTY = settings(max_examples=60, deadline=None, derandomize=True, database=None)
-SMALL = st.floats(-1e3, 1e3)
 every_ratio = pytest.mark.parametrize(("rate", "new_rate"), RATIOS)
 
 

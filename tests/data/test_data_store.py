@@ -131,7 +131,6 @@ def test_an_estimate_comes_back_with_its_covariance(length, n_states, data):
     if estimate.covariance is None:
         assert read.covariance is None
     else:
-        assert read.covariance is not None
         assert read.covariance.shape == estimate.covariance.shape
         assert bits(read.covariance.ravel()) == bits(estimate.covariance.ravel())
 

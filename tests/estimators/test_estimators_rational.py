@@ -12,7 +12,7 @@ from rational_drive import CURVES, NOISE, changed, rational_drive
 from vehest.data.errors import ConfigurationError
 from vehest.estimators.base import FitData
 from vehest.estimators.model_files import load_model, save_model
-from vehest.estimators.rational_ekf import BOXES, KINDS, LEVELS, RationalFilter
+from vehest.estimators.rational_ekf import BOXES, KINDS, LEVELS
 from vehest.estimators.registry import estimator_class
 from vehest.filters.gaussian import Gaussian
 from vehest.training.context import FitContext
@@ -27,9 +27,7 @@ QUICK = NoiseTuningSettings(grid=1, max_evaluations=25)
 def rational(tyres="rational_adaptive", **config):
     """A filter with everything given."""
     curves = {name: value for name, value in CURVES.items() if tyres != "linear" or name.startswith("c2")}
-    estimator = estimator_class("rational_ekf").from_config({"tyres": tyres, "noise": LEVEL, "curves": curves, **config})
-    assert isinstance(estimator, RationalFilter)
-    return estimator
+    return estimator_class("rational_ekf").from_config({"tyres": tyres, "noise": LEVEL, "curves": curves, **config})
 
 
 @pytest.fixture(scope="module")

@@ -182,8 +182,8 @@ class _Readers:
     def __init__(self, command):
         self._command = command
         self.command_kb = 0  # most memory of the command
-        self.peaks_kb: dict[str, int] = {}  # of each reading process
-        self._waits: dict[str, float] = {}
+        self.peaks_kb = {}  # of each reading process
+        self._waits = {}
 
     @property
     def waited(self):

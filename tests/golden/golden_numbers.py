@@ -12,7 +12,6 @@ from dataclasses import dataclass
 from functools import cache, partial
 from importlib import metadata
 from pathlib import Path
-from typing import Any
 
 import llvmlite.binding
 import numpy as np
@@ -34,7 +33,7 @@ LIBRARIES = ("numpy", "scipy", "numba", "torch")
 VEHICLE = Path(__file__).parents[2] / "conf" / "vehicle" / "bmw_320i_low.yaml"
 MODEL = "static_map"
 TRAINED = (f"estimator={MODEL}", "estimator.rate_hz=20", "split=mine", "tracking=none")
-Arrays = dict[str, np.ndarray[Any, Any]]
+Arrays = dict[str, np.ndarray]
 
 
 @dataclass(frozen=True)

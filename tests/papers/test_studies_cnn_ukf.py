@@ -295,7 +295,6 @@ def test_tyres_and_body_are_changed_in_a_copy_and_wrong_ones_cost_more(part, run
 
 def test_the_model_is_observable_straight_ahead_as_well():
     estimator = estimator_class("dugoff_ukf").from_config({"tyres": TYRES, "noise": LEVELS, "curve": "smooth"})
-    assert isinstance(estimator, DugoffUkf)
     found = observability.local(estimator)
     straight = found[(found["steer"] == 0.0) & (found["measured"] == "ay, yaw rate, both forces")]
     assert set(straight["rank"]) == {2}

@@ -51,7 +51,6 @@ def test_two_commands_lead_to_a_verdict_and_those_it_names_to_an_estimate_and_to
     assert json.loads(out)["estimated"] > 4000
     assert np.isfinite(pd.read_csv(log / "out.csv")["sideslip"].iloc[60:]).all()
     export = re.search(r"vehest export (\S+) -o (\S+)", said)
-    assert export is not None
     words = ("export", export[1], "-o", export[2], "--vectors", "lap.csv", "dataset=my_car")
     assert run_vehest(capsys, *words)[0] == 0
     code, _, err = run_vehest(capsys, *words, "--onnx")

@@ -2,7 +2,6 @@
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -47,7 +46,7 @@ ORIGIN = 1.7e9  # s, of the writers that take no other time; an .asc counts from
 class Written:
     dbc: Path
     log: Path
-    lost: dict[str, np.ndarray[Any, Any]]  # message -> numbers of the samples whose frames were lost
+    lost: dict[str, np.ndarray]  # message -> numbers of the samples whose frames were lost
     origin: float  # time of the recording at which the log's clock stands at 0 [s]
 
 

@@ -12,7 +12,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 import yaml
-from numpy.typing import NDArray
 from refusals import refusal
 
 from vehest.data.errors import ConfigurationError, DataError
@@ -56,8 +55,8 @@ class Topic:
     """Messages of one topic: their times [s after START_NS] and fields."""
 
     type: str
-    times: NDArray[np.float64]
-    fields: dict[str, NDArray[np.float64]]
+    times: np.ndarray
+    fields: dict[str, np.ndarray]
 
 
 def drive(seconds=SECONDS):

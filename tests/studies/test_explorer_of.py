@@ -40,7 +40,6 @@ def test_health_on_the_page_flags_a_frozen_channel_from_its_onset_on(tmp_path):
     drive = frozen_drive()
     part, model = comparison_on(drive, tmp_path, RATE)
     found = health_over(model, list(pieces_of(SPANS, lambda span: drive, part.protocol)), part, 5)
-    assert found is not None
     lengths = [round((span.stop - span.start - 1.5) * RATE) for span in SPANS]
     assert len(found) == sum(lengths) + 5
     first, second = found[: lengths[0]], found[lengths[0] + 5 :]

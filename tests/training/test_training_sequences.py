@@ -235,7 +235,6 @@ def test_stop_leaves_the_best_so_far_and_says_so(tmp_path):
     assert records[-1].interrupted
     assert records[-1].epochs == 4
     checkpoint = load_checkpoint(tmp_path)
-    assert checkpoint is not None
     assert torch.equal(_flat(network)[:8], checkpoint.tensors["best.0.0.weight"].reshape(-1))
     assert math.isclose(records[-1].best_loss, float((network(X) - Y).square().mean().detach()), rel_tol=1e-6)
 

@@ -138,6 +138,5 @@ def test_gradients_reach_every_parameter_and_batches_work(car):
     assert outcome.shape == (2, 3, 4)
     outcome.square().sum().backward()
     for parameter in (*chassis.parameters(), *tyres.parameters()):
-        assert parameter.grad is not None
         assert torch.isfinite(parameter.grad).all()
     assert all(chassis.learnt.get_parameter(f"log_{name}").grad.abs() > 0 for name in LEARNT)
