@@ -8,6 +8,7 @@ import subprocess
 import sys
 import time
 from contextlib import suppress
+from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -20,13 +21,10 @@ _started = []
 
 def start(command, **options):
     """Start a process that leads a session of its own; see `end_all`."""
-    process = subprocess.Popen(list(map(str, command)), start_new_session=True, preexec_fn=_end_with_parent, **options)
+    dies = partial(_libc.prctl, PR_SET_PDEATHSIG, signal.SIGKILL)  # with its parent
+    process = subprocess.Popen(list(map(str, command)), start_new_session=True, preexec_fn=dies, **options)
     _started.append(process)
     return process
-
-
-def _end_with_parent():
-    _libc.prctl(PR_SET_PDEATHSIG, signal.SIGKILL)
 
 
 def end_all():

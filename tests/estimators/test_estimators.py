@@ -219,14 +219,10 @@ OF_SHIPPED = ["estimator.n_local=2", "estimator.n_hidden=2", "estimator.bias=fal
 STANDING = ["training.max_epochs=1", "training.learning_rate=1e-12"]
 
 
-@pytest.fixture(scope="module")
-def drives():
-    return [planar_drive(30.0, 20.0, seed=seed) for seed in (1, 2)]
-
-
-def test_a_training_that_does_not_move_ends_where_it_started_and_other_settings_are_refused(drives):
+def test_a_training_that_does_not_move_ends_where_it_started_and_other_settings_are_refused():
     from vehest.run.estimate import pretrained_folder
 
+    drives = [planar_drive(30.0, 20.0, seed=seed) for seed in (1, 2)]
     started = vehest.train("ksnn", drives[:1], drives[1:], [*OF_SHIPPED, *STANDING, f"training.start_from={pretrained_folder()}"])
     assert flat_weights(started) == pytest.approx(flat_weights(vehest.load_model()), abs=1e-6)
     scratch = vehest.train("ksnn", drives[:1], drives[1:], [*OF_SHIPPED, *STANDING])

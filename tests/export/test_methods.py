@@ -82,7 +82,8 @@ def case_of(name, config):
 def _case(name, config):
     given = next(own for family, own in VARIANTS if family == name and repr(own) == config)
     estimator = of_dugoff(name, given) if name in ON_DUGOFF else fitted(name, "float32", **given)
-    rows = dugoff_rows(estimator) if name in ON_DUGOFF else drive_for(estimator).stack(estimator.channels)
+    on_dugoff = name in ON_DUGOFF and np.stack([dugoff_channels()[own] for own in estimator.channels], axis=1)
+    rows = on_dugoff if name in ON_DUGOFF else drive_for(estimator).stack(estimator.channels)
     return Case(estimator, widened(estimator), disturbed(estimator, rows))
 
 
@@ -119,10 +120,6 @@ def dugoff_channels():
         for corner in ("fl", "fr", "rl", "rr"):
             channels[f"f{axis}_{corner}"] = loads[corner[0] == "r"] + 70.0 * generator.standard_normal(n)
     return channels
-
-
-def dugoff_rows(estimator):
-    return np.stack([dugoff_channels()[name] for name in estimator.channels], axis=1)
 
 
 def widened(estimator):

@@ -222,10 +222,6 @@ def _made(pattern):
     return file
 
 
-def _calibrated(folder):
-    return dict(_leaves("", yaml.safe_load(_made("calibrate/*/trust.yaml").read_text(encoding="utf-8"))))
-
-
 def _metrics(chosen):
     with _made("evaluate/*/metrics.csv").open(newline="", encoding="utf-8") as stream:
         rows = [row for row in csv.DictReader(stream) if chosen(row["condition"])]
@@ -258,7 +254,7 @@ def _leaves(path, content):
 
 STAGES = {
     downsample: _downsampled,
-    calibrate: _calibrated,
+    calibrate: lambda _: dict(_leaves("", yaml.safe_load(_made("calibrate/*/trust.yaml").read_text(encoding="utf-8")))),
     evaluate: lambda _: _metrics(lambda condition: not is_fault(condition)),
     evaluate_faults: lambda _: _metrics(is_fault),
 }

@@ -18,10 +18,6 @@ from vehest_papers.ksnn.noise_sensitivity import ksnn_sensitivity, luenberger_se
 STRUCTURES = [(1, 0, True), (2, 0, False), (4, 0, True), (2, 2, False), (3, 3, True)]
 
 
-def _noisy_drive(**options):
-    return planar_drive(noise=0.2, **options)
-
-
 def _constant_turn(yaw_rate, n_samples, seed=0):
     """Measurements (1, T, 4) at constant yaw rate; everything else wanders."""
     generator = np.random.default_rng(seed)
@@ -67,7 +63,7 @@ def test_gain_in_force_is_the_slope_of_the_chord_from_zero():
 @pytest.mark.parametrize("structure", STRUCTURES)
 def test_sub_models_add_up_to_the_network_along_a_drive(structure):
     estimator = ksnn_with_weights(*structure)
-    drive = _noisy_drive(seed=1)
+    drive = planar_drive(noise=0.2, seed=1)
     parts, expected = decomposed_estimate(estimator, drive), estimator.estimate([drive.without_references()])[0]["vy"]
     assert np.isnan(parts.total[:30]).all()
     np.testing.assert_allclose(parts.total[30:], expected[30:], rtol=0, atol=1e-9)
@@ -125,17 +121,13 @@ def _turn(yaw_rate, n_samples):
     return np.tile([yaw_rate, 25.0, 25.0 * yaw_rate, 0.0], (n_samples, 1))
 
 
-def _run(estimator, windows):
-    with torch.no_grad():
-        return estimator.network(torch.as_tensor(windows)).numpy()
-
-
 def _measured_impulse_response(estimator, yaw_rate, channel, n_window, size=1.0):
     """Lags 0 to N of the network itself: the impulse stands at each place of the window in turn."""
     windows = np.repeat(_turn(yaw_rate, n_window)[None], n_window + 1, axis=0)
     for lag in range(1, n_window + 1):
         windows[lag, n_window - lag, channel] += size
-    lateral = _run(estimator, windows)
+    with torch.no_grad():
+        lateral = estimator.network(torch.as_tensor(windows)).numpy()
     return (lateral - lateral[0]) / size
 
 

@@ -107,11 +107,8 @@ def everything(tmp_path_factory):
 @pytest.fixture(scope="module")
 def part(everything):
     """What Table II needs."""
-    return replace(everything, models=[own for own in everything.models if not is_further(own)])
-
-
-def is_further(own):
-    return own.estimator == "velocity_gru" or own.model_folder.name.startswith(POINT)
+    of_table = [own for own in everything.models if own.estimator != "velocity_gru" and not own.model_folder.name.startswith(POINT)]
+    return replace(everything, models=of_table)
 
 
 @pytest.fixture(scope="module")
@@ -345,8 +342,4 @@ def test_recordings_are_prepared_as_the_pipeline_prepares_them(part):
     assert tuple(transform_from_config(entry) for entry in yaml.safe_load(told.partition("=")[2])) == OFFLINE
     prepared = Prepared(part)
     noisy = part.references["car", "test_lap_1"]
-    assert np.std(np.diff(prepared.recording("car", "test_lap_1")["ay"], 2)) < 0.1 * np.std(np.diff(loaded_ay(noisy), 2))
-
-
-def loaded_ay(path):
-    return pd.read_parquet(path)["ay"].to_numpy()
+    assert np.std(np.diff(prepared.recording("car", "test_lap_1")["ay"], 2)) < 0.1 * np.std(np.diff(pd.read_parquet(noisy)["ay"], 2))

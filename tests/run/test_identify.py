@@ -36,12 +36,8 @@ def model():
     return with_settings(load_model(pretrained_folder("self_calibrating")), {"wheelbase": 2.7, "cg_to_rear_axle": 1.25})
 
 
-@pytest.fixture(scope="module")
-def record(model):
-    return record_of(model, {name: posterior_of(model, recording(name, lap(seed)[0])) for name, seed in (("one", 0), ("two", 1))})
-
-
-def test_numbers_of_a_known_car_are_found_and_an_estimate_that_starts_from_them_is_closer(record, model):
+def test_numbers_of_a_known_car_are_found_and_an_estimate_that_starts_from_them_is_closer(model):
+    record = record_of(model, {name: posterior_of(model, recording(name, lap(seed)[0])) for name, seed in (("one", 0), ("two", 1))})
     for name, truth in PLANTED.items():
         number = getattr(record, name)
         assert number.identified_on == (() if name == "rear_axle" else ("one", "two"))  # nearly one speed: C u and b/u are alike

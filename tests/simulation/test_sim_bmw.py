@@ -101,13 +101,11 @@ def five_seconds(name, channels):
     return Recording(name, "bmw_545i", 100.0, 0.0, made).select(channels)
 
 
-def catalogue(dataset):
-    return {name: partial(five_seconds, name) for name in source(dataset).ids()}
-
-
 @cache
 def split(name):
-    return split_from_config(configuration("split", name), catalogue)
+    return split_from_config(
+        configuration("split", name), lambda dataset: {own: partial(five_seconds, own) for own in source(dataset).ids()}
+    )
 
 
 def test_splits_take_the_drives_by_their_names_and_the_limited_one_learns_below_7():

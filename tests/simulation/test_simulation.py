@@ -63,11 +63,6 @@ def circuit():
     return trip(1, course="palm_beach_like", duration=80.0)  # 2 km of 3.3 km, until the banked corner's end
 
 
-@pytest.fixture(scope="module")
-def recording():
-    return drive(seed=1)
-
-
 @pytest.mark.parametrize(
     ("name", "shortest", "longest"),
     [
@@ -285,7 +280,8 @@ def test_wet_road_lowers_what_is_reached_and_patches_are_in_the_motion():
     assert np.ptp(patchy.motion.friction) > 0.3
 
 
-def test_recording_says_where_it_comes_from(recording):
+def test_recording_says_where_it_comes_from():
+    recording = drive(seed=1)
     assert recording.kind == "simulated"
     assert recording.vehicle == "bmw_320i_low"
     assert (len(recording), recording.rate_hz) == (1200, 100.0)

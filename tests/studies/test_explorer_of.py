@@ -29,15 +29,11 @@ def comparison_on(drive, folder, rate_hz):
     return part, model
 
 
-def frozen_drive():
+def test_health_on_the_page_flags_a_frozen_channel_from_its_onset_on(tmp_path):
     drive = measured_drive(3)
     yaw_rate = np.array(drive["yaw_rate"])
     yaw_rate[drive.time >= FROZEN] = yaw_rate[drive.time >= FROZEN][0]
-    return replace(drive, channels={**drive.channels, "yaw_rate": yaw_rate})
-
-
-def test_health_on_the_page_flags_a_frozen_channel_from_its_onset_on(tmp_path):
-    drive = frozen_drive()
+    drive = replace(drive, channels={**drive.channels, "yaw_rate": yaw_rate})
     part, model = comparison_on(drive, tmp_path, RATE)
     found = health_over(model, list(pieces_of(SPANS, lambda span: drive, part.protocol)), part, 5)
     lengths = [round((span.stop - span.start - 1.5) * RATE) for span in SPANS]
