@@ -162,13 +162,10 @@ def test_quantised_resting_and_stepped_channels_are_not_saturated():
     assert complaints(Recording("step", "car", RATE, 0.0, {"steer": steer})) == []
 
 
-def test_a_steering_offset_shows_straight_ahead():
+def test_a_steering_offset_shows_straight_ahead_and_a_wheel_that_drops_out_is_named():
     whole = clean_drive()
     assert complaints(changed(whole, steer=lambda samples: samples + np.deg2rad(1.0))) == []
     assert complaints(changed(whole, steer=lambda samples: samples - np.deg2rad(5.0))) == [("warning", "offset", "steer")]
-
-
-def test_a_wheel_that_drops_out_is_named_and_one_that_locks_is_not():
     drive = clean_drive()
     wheels = {f"wheel_speed_{wheel}": drive["vx"] / 0.3 for wheel in ("fl", "fr", "rl", "rr")}
     whole = replace(drive, channels={**drive.channels, **wheels})

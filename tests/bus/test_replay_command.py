@@ -47,15 +47,12 @@ def test_figures_come_as_json_estimates_as_a_table_their_dbc_alone_and_progress_
     assert "\x1b" not in err
 
 
-def test_a_data_set_serves_replays_and_estimates_alike(bus):
+def test_a_data_set_serves_replays_and_estimates_alike_and_what_is_wrong_is_one_line(bus):
     code, _, err = bus("replay", "raw/bus/drive.asc", "--dataset", "bus", "--speed", "max", "--quiet", "-o", "online.csv")
     assert (code, err) == (0, "")
     bus.done("estimate", "raw/bus/drive.asc", "dataset=bus", "-o", "offline.csv")
     online, offline = pd.read_csv("online.csv"), pd.read_csv("offline.csv")
     assert {"time", "vy", "sideslip", "health", "health_reason"} <= set(online) & set(offline)
-
-
-def test_what_is_wrong_is_one_line_and_nothing_is_left_behind(bus):
     assert bus.refused("replay", "raw/bus/nothing.asc", "--dataset", "bus")[0] == 4
     assert bus.refused("replay", "raw/bus/drive.asc")[0] == 2
     assert bus.refused("replay", "raw/bus/car.dbc", "--dataset", "bus")[0] == 3

@@ -176,11 +176,15 @@ def test_slow_signals_with_empty_cells_and_marks_of_missing_samples_are_bridged(
     assert np.isfinite([recording["sideslip_ref"], recording["ay"]]).all()
 
 
-def test_a_log_without_reference_cannot_rank_anything(tmp_path):
+def test_a_log_without_reference_ranks_nothing_and_one_the_other_way_round_keeps_signs_together(tmp_path):
     examined = inspect("my_car", [write(tmp_path / "lap.csv", usual(drive()).drop(columns="Beta"))])
     outcome, _ = write_files(examined, dry_run=True)
     assert (outcome["estimators"], [Path(file).parts[0] for file in outcome["written"]]) == ([], ["conf"])
     assert outcome["next"][-1].startswith("vehest estimate ")
+    table = -usual(drive())
+    table["Time [s]"] *= -1.0
+    signs = {name: one.sign for name, one in proposed(tmp_path, table).items()}
+    assert (signs["vx"], signs["ax"], len({signs[name] for name in LATERAL})) == (-1, -1, 1)
 
 
 def test_a_reference_is_made_of_positions_and_yaw_where_there_is_no_other(tmp_path):
@@ -240,11 +244,6 @@ def test_a_row_of_units_a_preamble_and_quotes_are_seen_through(tmp_path):
     np.testing.assert_allclose(read_back(draft(inspect("my_car", [file])))["vx"], d["vx"], atol=1e-4)
 
 
-def test_mirroring_turns_lateral_channels_alone():
-    told = Proposals((Proposal("v", "vx", "m/s"), Proposal("r", "yaw_rate", "rad/s"), Proposal("a", "ax", "m/s²", -1)))
-    assert [one.sign for one in told.mirrored().channels] == [1, -1, -1]
-
-
 ROLES = {
     "Querbeschleunigung": "ay", "Gierrate": "yaw_rate", "Lenkradwinkel": "handwheel", "Schwimmwinkel": "sideslip_ref", "v_Fzg": "vx",
     "WheelSpeedFL": "wheel_speed_fl", "n_HR": "wheel_speed_rr", "FLwhlspd": "wheel_speed_fl", "angular_velocity.z": "yaw_rate",
@@ -253,8 +252,10 @@ ROLES = {
 }  # fmt: skip
 
 
-def test_names_speak_for_one_role():
+def test_names_speak_for_one_role_and_mirroring_turns_lateral_channels_alone():
     assert {name: list(hints(name)) for name in ROLES} == {name: [role] for name, role in ROLES.items()}
+    told = Proposals((Proposal("v", "vx", "m/s"), Proposal("r", "yaw_rate", "rad/s"), Proposal("a", "ax", "m/s²", -1)))
+    assert [one.sign for one in told.mirrored().channels] == [1, -1, -1]
 
 
 @pytest.mark.parametrize("log", LOGS)
@@ -263,13 +264,6 @@ def test_dressed_logs_of_real_cars_are_seen_through(tmp_path, data_root, log):
         pytest.importorskip(module, reason="the log is written by it")
     answers = yaml.safe_load(ANSWERS.read_text(encoding="utf-8"))[log]
     assert [row for row in rows_of(log, answers, outcome_of(write_log(log, data_root, tmp_path))) if row["correct"] != "yes"] == []
-
-
-def test_a_log_that_counts_everything_the_other_way_keeps_its_signs_together(tmp_path):
-    table = -usual(drive())
-    table["Time [s]"] *= -1.0
-    signs = {name: one.sign for name, one in proposed(tmp_path, table).items()}
-    assert (signs["vx"], signs["ax"], len({signs[name] for name in LATERAL})) == (-1, -1, 1)
 
 
 def test_steering_is_no_lateral_acceleration_however_well_it_agrees_and_names_that_motion_contradicts_are_asked(tmp_path):
@@ -312,16 +306,13 @@ def test_times_of_a_clock_are_read(tmp_path, first, how):
     np.testing.assert_allclose(recording["vx"], d["vx"], atol=1e-4)
 
 
-def test_whole_nanoseconds_since_1970_are_read_and_a_column_that_counts_runs_makes_recordings_of_them(tmp_path):
+def test_whole_nanoseconds_and_dates_are_a_clock_and_a_column_that_counts_runs_makes_recordings(tmp_path):
     table = usual(drive()).rename(columns={"Time [s]": "stamp"})
     table["stamp"] = 1_700_000_000_000_000_000 + (table["stamp"] * 1e9).round().astype("int64")
     clock = survey(write(tmp_path / "lap.csv", table)).clock
     assert (clock.column, clock.unit) == ("stamp", "ns")
     log = survey(write(tmp_path / "laps.csv", pd.concat([usual(drive(40.0, seed=seed)).assign(run=seed) for seed in (3, 4)])))
     assert (log.options["runs"], sorted((one.start, one.stop) for one in log.runs)) == ("run", [(0, 2000), (2000, 4000)])
-
-
-def test_dates_of_a_parquet_table_are_its_clock(tmp_path):
     d = drive(60.0)
     dates = pd.Timestamp("2024-05-03T10:59:30") + pd.to_timedelta(d["t"], unit="s").round("ms")
     usual(d).assign(**{"Time [s]": dates}).to_parquet(tmp_path / "lap.parquet")

@@ -57,11 +57,22 @@ def model(tmp_path):
     return folder
 
 
-def test_the_description_of_a_model_is_read_with_its_types(model):
+def test_a_model_is_read_with_its_types_and_numbers_that_are_not_finite_are_counted_by_tensor(model, tmp_path):
     described = read_description(model)
     assert isinstance(described, Description)
     assert (described.estimator, described.about.seed, described.about.datasets) == ("ksnn", 3, ("d",))
     assert (preparation_of(model), load_model(model).name) == ({"method": "decimate", "transforms": []}, "ksnn")
+    weights = load_file(model / "model.safetensors")
+    name = max(weights, key=lambda own: weights[own].size)
+    weights[name].flat[:2] = [np.nan, np.inf]
+    save_file(weights, model / "model.safetensors")
+    said = f"model.safetensors': 2 of the {weights[name].size} numbers of tensor '{name}' are not finite"
+    assert said in refusal(lambda: load_model(model))
+    estimator = estimator_class("kalman").from_config({})
+    save_model(estimator, tmp_path)
+    load_model(tmp_path)
+    save_file({name: np.array([np.inf]) for name in estimator.weights()}, tmp_path / "model.safetensors")
+    assert "1 of the 1 numbers of tensor" in refusal(lambda: load_model(tmp_path))
 
 
 @pytest.mark.parametrize(
@@ -90,20 +101,6 @@ def test_a_description_that_does_not_fit_is_one_line_that_names_file_and_key(mod
     message = refusal(lambda: load_model(model), VehestError)
     assert says in message
     assert "model.yaml" in message or "transform" in says or "fit its settings" in says
-
-
-def test_numbers_that_are_not_finite_are_counted_by_tensor_and_levels_that_each_recording_tells_may_be_open(model, tmp_path):
-    weights = load_file(model / "model.safetensors")
-    name = max(weights, key=lambda own: weights[own].size)
-    weights[name].flat[:2] = [np.nan, np.inf]
-    save_file(weights, model / "model.safetensors")
-    said = f"model.safetensors': 2 of the {weights[name].size} numbers of tensor '{name}' are not finite"
-    assert said in refusal(lambda: load_model(model))
-    estimator = estimator_class("kalman").from_config({})
-    save_model(estimator, tmp_path)
-    load_model(tmp_path)
-    save_file({name: np.array([np.inf]) for name in estimator.weights()}, tmp_path / "model.safetensors")
-    assert "1 of the 1 numbers of tensor" in refusal(lambda: load_model(tmp_path))
 
 
 def with_header(header, length=None):

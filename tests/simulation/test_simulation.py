@@ -226,13 +226,20 @@ def test_speed_profile_stays_within_friction_circle_and_power_on_bank_and_slippe
     assert slippery**2 * 0.02 == pytest.approx(4.0, rel=3e-3)
 
 
-def test_vehicles_own_driver_values_count():
+def test_vehicles_own_driver_values_count_and_a_rollover_says_which_drive_and_when():
     own = replace(LOWERED, driver={"grip": 7.0, "top_speed": 30.0, "power_per_mass": 20.0})
     car = car_of(MultiBodyPlant(own))
     assert (car.grip, car.top_speed, car.power_per_mass) == (7.0, 30.0, 20.0)
     for wrong, complaint in (({"grip": -1.0}, "grip"), ({"top_speed": 0.0}, "top_speed"), ({"gripp": 8.0}, "gripp")):
         with pytest.raises(ConfigurationError, match=complaint):
             car_of(MultiBodyPlant(replace(LOWERED, driver=wrong)))
+    tall = Vehicle("tall", 2, {**LOWERED.overrides, "h_s": 1.4}, driver={"grip": 9.0})
+    manoeuvre = manoeuvre_from_config({"name": "j_turn", "speed": 30.0, "severity": 1.5})
+    with pytest.raises(
+        SimulationError, match=r"drive 'high' with seed 0: manoeuvre 'j_turn', \d+\.\d\d s after the first sample: "
+    ) as raised:
+        simulate_drive(id="high", vehicle=tall, manoeuvre=manoeuvre, seed=0)
+    assert raised.value.exit_code == 3
 
 
 def test_circuit_lap_keeps_the_bank_and_grade_of_its_place(circuit):
@@ -298,16 +305,6 @@ def test_recording_says_where_it_comes_from():
     assert (flags["spun"], flags["left_road"], flags["completed"]) == (False, False, True)
     assert 0.0 < flags["largest_lateral_error"] < 1.5
     assert 0.0 < flags["largest_sideslip"] < 0.2
-
-
-def test_rollover_says_which_drive_and_when():
-    tall = Vehicle("tall", 2, {**LOWERED.overrides, "h_s": 1.4}, driver={"grip": 9.0})
-    manoeuvre = manoeuvre_from_config({"name": "j_turn", "speed": 30.0, "severity": 1.5})
-    with pytest.raises(
-        SimulationError, match=r"drive 'high' with seed 0: manoeuvre 'j_turn', \d+\.\d\d s after the first sample: "
-    ) as raised:
-        simulate_drive(id="high", vehicle=tall, manoeuvre=manoeuvre, seed=0)
-    assert raised.value.exit_code == 3
 
 
 @pytest.mark.parametrize("options", [{"rate_hz": 30.0}, {"rate_hz": 0.0}, {"duration": 0.0}])
