@@ -38,10 +38,7 @@ class Wave:
 def broadband_drive(seconds=120.0, rate_hz=100.0, seed=0, late=None, lever=0.0, slow_yaw_rate=0.0, noise=1.0):
     """d(vy)/dt = ay - vx·yaw_rate and d(vx)/dt = ax + vy·yaw_rate hold at each instant, but for noise and what is asked for.
 
-    Args:
-        late: channel -> delay [s].
-        lever: how far ahead of the reference the inertial unit sits [m].
-        slow_yaw_rate: time constant of its low-pass [s].
+    Channels are ``late`` by so many seconds; ``lever`` is how far ahead the inertial unit sits [m], ``slow_yaw_rate`` a time constant [s].
     """
     return _made(seconds, rate_hz, seed, tuple(sorted((late or {}).items())), lever, slow_yaw_rate, noise)
 

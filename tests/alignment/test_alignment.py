@@ -74,12 +74,7 @@ def recorded(motion, planted, *, leaning=False, reference_rate=False):
     """A recording of a motion by a sensor that is misplaced, turned, late and off.
 
     Written with rotation matrices and cross products, on the true motion, before noise; the plane as complex numbers is the code's way.
-
-    Args:
-        motion: true motion of the centre of gravity.
-        planted: parameters that are not zero.
-        leaning: whether roll and pitch let gravity into the accelerometers.
-        reference_rate: whether the reference measures the yaw rate.
+    If ``leaning``, roll and pitch let gravity into the accelerometers.
     """
     p = dict.fromkeys(PLANTED, 0.0) | planted
     time = np.arange(len(motion)) / 100.0

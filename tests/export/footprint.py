@@ -51,12 +51,7 @@ class Footprint:
 
 
 def footprint(files: Mapping[str, str], target: Target) -> Footprint | None:
-    """What an export takes on a target; None where there is no compiler for it, or it cannot say.
-
-    Args:
-        files: name -> text, as those of `vehest.export.program`; main.c does not count.
-        target: to compile for.
-    """
+    """What files, name -> text, take on a target, main.c aside; None where there is no compiler for it, or it cannot say."""
     if target.compiler is None:
         return None
     with tempfile.TemporaryDirectory() as temporary:
@@ -101,18 +96,8 @@ def _sections(said: str) -> tuple[int, int, int]:
 
 
 def worst_stack(graphs: Iterable[str], entries: Iterable[str]) -> tuple[int, tuple[str, ...]]:
-    """Bytes of the deepest chain of calls from one of the entries, and functions that are called but not there.
-
-    Args:
-        graphs: of each source, as ``gcc -fcallgraph-info=su`` writes them.
-        entries: functions that are called from outside.
-
-    Raises:
-        RecursionError: a function calls itself, directly or not.
-    """
-    own: dict[str, int] = {}
-    calls: dict[str, set[str]] = {}
-    known: set[str] = set()
+    """Bytes of the deepest chain of calls from an entry, as ``gcc -fcallgraph-info=su`` writes them; functions that are called but absent."""
+    own, calls, known = {}, {}, set()
     for graph in graphs:
         for title, label in _NODE.findall(graph):
             known.add(title)
