@@ -96,7 +96,7 @@ def _sections(said: str) -> tuple[int, int, int]:
 
 
 def worst_stack(graphs: Iterable[str], entries: Iterable[str]) -> tuple[int, tuple[str, ...]]:
-    """Bytes of the deepest chain of calls from an entry, as ``gcc -fcallgraph-info=su`` writes them; functions that are called but absent."""
+    """Bytes of the deepest chain of calls from entries in ``gcc -fcallgraph-info=su``; functions that are called and absent."""
     own, calls, known = {}, {}, set()
     for graph in graphs:
         for title, label in _NODE.findall(graph):
