@@ -2,7 +2,8 @@
 
 import re
 import shlex
-from dataclasses import dataclass, fields
+from collections import namedtuple
+from dataclasses import fields
 from pathlib import Path
 
 import make_reference
@@ -151,13 +152,7 @@ def test_python_examples_run(workplace, drive, monkeypatch, request):
     assert (workplace / "out.parquet").is_file()
 
 
-@dataclass(frozen=True)
-class Given:
-    """A command line, taken apart."""
-
-    command: tuple[str, ...]
-    arguments: list[str]
-    overrides: list[str]
+Given = namedtuple("Given", "command arguments overrides")  # a command line, taken apart
 
 
 def command_lines(file):

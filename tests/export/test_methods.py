@@ -1,7 +1,8 @@
 """A method in C says what Python's stepper says, sample by sample: gaps, restarts and float included."""
 
 import copy
-from dataclasses import dataclass, replace
+from collections import namedtuple
+from dataclasses import replace
 from functools import cache
 
 import numpy as np
@@ -16,7 +17,7 @@ from example_package import forget_examples, install_examples
 from real_drives import real_drive
 from vehest.data.errors import ConfigurationError, DataError
 from vehest.data.transforms import Resample
-from vehest.estimators.base import Estimator, FitData
+from vehest.estimators.base import FitData
 from vehest.estimators.network import Network
 from vehest.estimators.network_ukf import NetworkUkf
 from vehest.estimators.networks.windowed import WindowedEstimator
@@ -62,15 +63,7 @@ pytestmark = [pytest.mark.export, pytest.mark.skipif(not COMPILERS, reason="ther
 each_variant = pytest.mark.parametrize(
     "variant", VARIANTS, ids=lambda own: "-".join([own[0], *(f"{key}={value}" for key, value in own[1].items() if key not in TRACK)])
 )
-
-
-@dataclass(frozen=True, eq=False)
-class Case:
-    """An estimator as it was trained, the same in float64, and rows of its channels."""
-
-    estimator: Estimator
-    in_float64: Estimator
-    rows: np.ndarray
+Case = namedtuple("Case", "estimator in_float64 rows")  # an estimator as it was trained, the same in float64, rows of its channels
 
 
 def case_of(name, config):

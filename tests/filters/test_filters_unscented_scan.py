@@ -1,14 +1,13 @@
 """The compiled scan is the readable unscented filter, in values and gradients; that one is filterpy's to 1e-8 (test_filters_nonlinear)."""
 
 import dataclasses
+from collections import namedtuple
 from functools import partial
-from typing import NamedTuple
 
 import pytest
 import torch
 from readable_filters import NonlinearModel, unscented_filter
 from test_filters_nonlinear import RULES, STEP, constant, measured_pendulum, pendulum_with_radar
-from torch import Tensor
 
 from point_models import noise_by
 from vehest.filters.gaussian import Gaussian
@@ -17,16 +16,7 @@ from vehest.filters.unscented_scan import TorchModel, UnscentedStepper, moved, u
 
 FREE = [-1e9, -1e9, -1e9]
 ANY = {"measurements": torch.zeros(2, 5, 2), "inputs": torch.zeros(2, 5, 1)}
-
-
-class Learnt(NamedTuple):
-    """What gradients are wanted for."""
-
-    process: Tensor
-    observation: Tensor
-    mean: Tensor
-    covariance: Tensor
-    gravity: Tensor
+Learnt = namedtuple("Learnt", "process observation mean covariance gravity")  # what gradients are wanted for
 
 
 def learnt(first):

@@ -21,9 +21,8 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections import Counter
+from collections import Counter, namedtuple
 from contextlib import suppress
-from dataclasses import dataclass
 from glob import glob
 from pathlib import Path
 
@@ -58,17 +57,8 @@ COUNTS = 3  # a moment is one of the first so many of its kind
 RUN_SECONDS, LOOK_SECONDS = 1800.0, 0.002  # after the first a run hangs
 HEADER = ("number", "round", "jobs", "signal", "stage", "moment", "exit_code", "resumed_runs", "metrics_equal", "tracking_complete")
 HEADER += ("leftovers", "outcome")
-
-
-@dataclass(frozen=True)
-class Kill:
-    """When a run was killed, by what, how it ended, and what was wrong at once."""
-
-    stage: str
-    number: signal.Signals
-    moment: str
-    exit_code: int
-    at_once: tuple[str, ...]
+Kill = namedtuple("Kill", "stage number moment exit_code at_once")
+"""When a run was killed, by what, how it ended, and what was wrong at once."""
 
 
 def started(output, jobs):

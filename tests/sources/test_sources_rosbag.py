@@ -6,7 +6,7 @@ import runpy
 import shutil
 import sqlite3
 import sys
-from dataclasses import dataclass
+from collections import namedtuple
 from pathlib import Path
 
 import numpy as np
@@ -48,15 +48,7 @@ CHANNELS = {
     "motor_current": {"topic": "motor", "field": "motor.currents.1", "unit": "A"},
     "steer": {"topic": "servo", "field": "data", "offset": 0.5, "sign": -1, "factor": 60.0, "unit": "deg"},
 }
-
-
-@dataclass
-class Topic:
-    """Messages of one topic: their times [s after START_NS] and fields."""
-
-    type: str
-    times: np.ndarray
-    fields: dict[str, np.ndarray]
+Topic = namedtuple("Topic", "type times fields")  # messages of one topic: their times [s after START_NS] and fields
 
 
 def drive(seconds=SECONDS):
