@@ -140,8 +140,6 @@ def test_learned_filters_share_their_training_with_gates_and_unscented_ones_have
 
 FILTERS = ("kalman", "factor_graph", "rational_ekf", "dugoff_ukf", "cnn_ukf", "learned_ukf", "learned_ukf_variant")
 OTHERS = [name for name in estimator_names() if name not in (*FILTERS, "ensemble_ukf")]  # whose stepper is that of cnn_ukf
-
-
 known = cache(fitted)
 
 

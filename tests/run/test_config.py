@@ -69,8 +69,6 @@ def test_shipped_pipeline_of_the_ferrari_has_35_jobs(elsewhere):
 
 
 SHIPPED = {file.stem for file in (Path(__file__).parents[2] / "pipelines").glob("*.yaml")}
-
-
 COMPOSED = set()
 
 

@@ -290,8 +290,6 @@ def test_nothing_is_published_through_a_link(elsewhere, link):
 
 
 PIPELINE = {"study": "mine", "report": "drive", "split": "quickstart", "sweeps": [["estimator=luenberger"]]}
-
-
 BOMB = "\n".join(["a0: &a0 [x, x, x, x, x, x, x, x, x]", *(f"a{n}: &a{n} [{', '.join([f'*a{n - 1}'] * 9)}]" for n in range(1, 12))])
 
 
