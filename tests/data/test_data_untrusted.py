@@ -97,13 +97,10 @@ def test_yaml_that_is_none_is_one_line(text, message):
         parse_yaml(text, "'f'")
 
 
-def test_honest_yaml_with_anchors_is_read():
+def test_honest_yaml_with_anchors_is_read_and_json_that_is_none_is_one_line():
+    for text in ("[" * 100000, b"\xff\xfe"):
+        assert "cannot be read as JSON" in refusal(lambda text=text: parse_json(text, "'f'"))
     assert parse_yaml("a: &a {x: 1}\nb: *a\nc: {<<: *a, y: 2}", "") == {"a": {"x": 1}, "b": {"x": 1}, "c": {"x": 1, "y": 2}}
-
-
-@pytest.mark.parametrize("text", ["[" * 100000, b"\xff\xfe"])
-def test_json_that_is_none_is_one_line(text):
-    assert "cannot be read as JSON" in refusal(lambda: parse_json(text, "'f'"))
 
 
 def test_only_regular_files_of_utf8_and_bounded_length_are_read(tmp_path):

@@ -219,6 +219,10 @@ def test_what_makes_no_sense_is_said():
     estimator = estimator_of("cnn_ukf")
     with pytest.raises(DataError, match="'unit' is missing, unknown or of another shape"):
         estimator.load_weights({name: values for name, values in estimator.weights().items() if name != "network.unit"})
+    wrong = {"error": "drives", "most_process_yaw_rate": 0.0}
+    for settings, name, value in ((EndToEndSettings, "loss_unit", "grad"), *((IdentificationSettings, *own) for own in wrong.items())):
+        with pytest.raises(ConfigurationError, match=name):
+            settings_from_config(settings, {name: value}, "training")
 
 
 @pytest.mark.parametrize(
@@ -273,16 +277,3 @@ def test_one_recording_decides_less_where_recordings_count():
         for drives, own in ((DATA.train, pseudo), (DATA.train[:1], pseudo[:1]), (DATA.train[1:], pseudo[1:]))
     )
     assert np.sqrt(both) == pytest.approx(0.5 * (np.sqrt(first) + np.sqrt(second)))
-
-
-@pytest.mark.parametrize(
-    ("settings", "wrong"),
-    [
-        (EndToEndSettings, {"loss_unit": "grad"}),
-        (IdentificationSettings, {"error": "drives"}),
-        (IdentificationSettings, {"most_process_yaw_rate": 0.0}),
-    ],
-)
-def test_settings_of_a_training_that_make_no_sense_are_refused(settings, wrong):
-    with pytest.raises(ConfigurationError, match=next(iter(wrong))):
-        settings_from_config(settings, wrong, "training")

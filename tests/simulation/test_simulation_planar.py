@@ -229,6 +229,14 @@ def car_with(**changes):
     return planar_car_from_configuration({**CONFIGURATION, "parameters": {**CONFIGURATION["parameters"], **changes}})
 
 
+def data_set(**changes):
+    drive = {"id": "a", "manoeuvre": {"name": "freestyle", "duration": 1.0}}
+    return open_source({"name": "mine", "source": "simulated", "vehicle": CONFIGURATION, "drives": [drive], **changes})
+
+
+OF_OTHERS = [{"parameters": ["tire.p_dy1"], "factor": [0.9, 1.1]}]
+
+
 @pytest.mark.parametrize(
     ("make", "complaint"),
     [
@@ -237,35 +245,20 @@ def car_with(**changes):
         (lambda: manoeuvre_from_config({"name": "slalom"}, PLANAR_MANOEUVRES), "there is no manoeuvre 'slalom'; there are freestyle"),
         (lambda: manoeuvre_from_config({"name": "freestyle", "brakes": 2.0}, PLANAR_MANOEUVRES), "brakes must lie between 0 and 1"),
         (lambda: manoeuvre_from_config({"name": "freestyle", "brakes": 0.6, "kicks": 0.6}, PLANAR_MANOEUVRES), "shares of one"),
+        (lambda: data_set(stability_control=True), "has no stability control"),
+        (lambda: data_set(drives=[{"id": "a", "manoeuvre": {"name": "slalom"}}]), "there are freestyle"),
+        (lambda: data_set(vary=OF_OTHERS), r"'tire\.p_dy1' is no parameter of vehicle 'f1tenth_tyre_a'"),
+        (lambda: data_set(vehicle={"name": "a", "parameter_set": 2}), "there is no manoeuvre 'freestyle'"),
     ],
 )
-def test_cars_and_manoeuvres_that_make_no_sense_are_refused(make, complaint):
+def test_cars_manoeuvres_and_data_sets_that_make_no_sense_are_refused(make, complaint):
     with pytest.raises(ConfigurationError, match=complaint):
         make()
 
 
-def data_set(**changes):
-    drive = {"id": "a", "manoeuvre": {"name": "freestyle", "duration": 1.0}}
-    return {"name": "mine", "source": "simulated", "vehicle": CONFIGURATION, "drives": [drive], **changes}
-
-
-@pytest.mark.parametrize(
-    ("changes", "complaint"),
-    [
-        ({"stability_control": True}, "has no stability control"),
-        ({"drives": [{"id": "a", "manoeuvre": {"name": "slalom"}}]}, "there are freestyle"),
-        ({"vary": [{"parameters": ["tire.p_dy1"], "factor": [0.9, 1.1]}]}, r"'tire\.p_dy1' is no parameter of vehicle 'f1tenth_tyre_a'"),
-        ({"vehicle": {"name": "a", "parameter_set": 2}}, "there is no manoeuvre 'freestyle'"),
-    ],
-)
-def test_data_set_that_the_plant_cannot_make_is_refused(changes, complaint):
-    with pytest.raises(ConfigurationError, match=complaint):
-        open_source(data_set(**changes))
-
-
 def test_cars_of_a_data_set_vary_from_drive_to_drive():
     drives = [{"id": "a", "count": 2, "manoeuvre": {"name": "freestyle", "duration": 1.0}}]
-    source = open_source(data_set(drives=drives, vary=[{"parameters": ["friction", "mass"], "factor": [0.5, 0.9]}]))
+    source = data_set(drives=drives, vary=[{"parameters": ["friction", "mass"], "factor": [0.5, 0.9]}])
     assert source.inputs() == {}  # the planar plant is vehest's own
     first, second = (source.read(name).provenance["parameters"] for name in source.ids())
     for drawn in (first, second):

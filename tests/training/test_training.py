@@ -103,7 +103,13 @@ def test_a_member_goes_on_alone_and_a_damaged_checkpoint_starts_anew(tmp_path):
     assert np.array_equal(flat_weights(whole), flat_weights(resumed))
 
 
-def test_diverging_training_is_one_clear_error():
+def test_diverging_training_and_settings_that_make_no_sense_are_one_clear_error():
+    for config, said in (
+        ({"learning_rate": -1.0}, "learning_rate must be positive"),
+        ({"averaging": 1.0}, "averaging must lie between 0 and 1"),
+    ):
+        with pytest.raises(ConfigurationError, match=said):
+            settings_from_config(SupervisedSettings, config, "training")
     with pytest.raises(DataError, match=r"lower training\.learning_rate"):
         _fit("ksnn", {"n_hidden": 0, "bias": True}, [0], SupervisedSettings(max_epochs=200, learning_rate=1e3))
 
@@ -121,15 +127,6 @@ def test_direct_search_finds_the_minimum_of_a_fine_grid_within_its_box():
     )
     assert np.allclose(record.best, [2, 1], atol=1e-3)
     assert (record.best <= [2, 1]).all()
-
-
-@pytest.mark.parametrize(
-    ("config", "message"),
-    [({"learning_rate": -1.0}, "learning_rate must be positive"), ({"averaging": 1.0}, "averaging must lie between 0 and 1")],
-)
-def test_training_settings_that_make_no_sense_are_refused(config, message):
-    with pytest.raises(ConfigurationError, match=message):
-        settings_from_config(SupervisedSettings, config, "training")
 
 
 def _loop_with_all_its_weights(averaging):

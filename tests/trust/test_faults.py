@@ -152,14 +152,9 @@ def test_a_lost_wheel_drops_out_spins_or_locks(samples):
     assert locked[2] == pytest.approx(0.5 * before[2]), "within 0.2 s"
 
 
-@pytest.mark.parametrize(
-    ("onset", "duration", "found"), [(0.0, math.inf, (0, 600)), (10.0, 8.0, (200, 360)), (29.9, 5.0, (598, 600)), (40.0, 5.0, (600, 600))]
-)
-def test_a_fault_lasts_from_its_onset_on(onset, duration, found):
-    assert window(Fault("bias", "ay", "mild", onset, duration), 600, RATE) == found
-
-
-def test_every_kind_is_for_some_channel_and_none_for_a_reference():
+def test_a_fault_lasts_from_its_onset_on_and_every_kind_is_for_some_channel_and_none_for_a_reference():
+    for onset, duration, found in ((0.0, math.inf, (0, 600)), (10.0, 8.0, (200, 360)), (29.9, 5.0, (598, 600)), (40.0, 5.0, (600, 600))):
+        assert window(Fault("bias", "ay", "mild", onset, duration), 600, RATE) == found
     for kind in KINDS:
         assert any(applies(kind, channel) for channel in CHANNELS), kind
         assert not any(applies(kind, channel) for channel, own in CHANNELS.items() if own.is_reference)
