@@ -73,7 +73,7 @@ def test_a_recording_comes_back_bit_for_bit_with_all_it_says_about_itself(record
         assert [path.name for path in Path(folder).iterdir()] == [file.name]
 
 
-def test_other_tools_read_the_same_numbers_and_the_time_of_an_estimate(tmp_path):
+def test_other_tools_read_the_same_numbers_and_writing_twice_gives_the_same_bytes(tmp_path):
     samples = np.random.default_rng(0).standard_normal(1000)
     write_recording(simple(samples), tmp_path / "r.parquet")
     table = pd.read_parquet(tmp_path / "r.parquet")
@@ -81,9 +81,6 @@ def test_other_tools_read_the_same_numbers_and_the_time_of_an_estimate(tmp_path)
     assert bits(table["ay"].to_numpy()) == bits(samples)
     write_estimate(Estimate("r", "gru", 20.0, 450.0, {"vy": np.arange(3.0), "sideslip": np.zeros(3)}), tmp_path / "e.parquet")
     assert pd.read_parquet(tmp_path / "e.parquet")["time"].tolist() == pytest.approx([450.0, 450.05, 450.1], abs=1e-12)
-
-
-def test_writing_twice_gives_the_same_bytes(tmp_path):
     for name in ("a", "b"):
         write_recording(simple(np.arange(500) / 7.0), tmp_path / name)
     assert (tmp_path / "a").read_bytes() == (tmp_path / "b").read_bytes()

@@ -163,14 +163,14 @@ def test_patches_are_drawn_by_the_seed_or_the_surfaces_own_and_come_again_every_
     np.testing.assert_array_equal(own.along(places, 1), own.along(places, 2))
 
 
-@pytest.mark.parametrize(
-    ("configuration", "complaint"),
-    [("icy", "icy"), ({"friction": 0.0}, "0.05"), ({"mu": 0.5}, "mu"), ({"patches": 0.9, "friction": 0.5}, "patches"),
-     ({"patches": 0.5, "patch_length": [1.0, 2.0]}, "5 m")],
-)  # fmt: skip
-def test_surface_that_makes_no_sense_is_refused(configuration, complaint):
-    with pytest.raises(ConfigurationError, match=complaint):
-        surface_from_config(configuration)
+def test_surfaces_and_drives_that_make_no_sense_are_refused():
+    patches = {"patches": {"patches": 0.9, "friction": 0.5}, "5 m": {"patches": 0.5, "patch_length": [1.0, 2.0]}}
+    for complaint, configuration in {"icy": "icy", "0.05": {"friction": 0.0}, "mu": {"mu": 0.5}, **patches}.items():
+        with pytest.raises(ConfigurationError, match=complaint):
+            surface_from_config(configuration)
+    for options in ({"rate_hz": 30.0}, {"rate_hz": 0.0}, {"duration": 0.0}):
+        with pytest.raises(ConfigurationError):
+            drive(**{"seed": 0, "duration": 1.0, **options})
 
 
 def test_smoothest_line_agrees_with_a_general_solver():
@@ -305,9 +305,3 @@ def test_recording_says_where_it_comes_from():
     assert (flags["spun"], flags["left_road"], flags["completed"]) == (False, False, True)
     assert 0.0 < flags["largest_lateral_error"] < 1.5
     assert 0.0 < flags["largest_sideslip"] < 0.2
-
-
-@pytest.mark.parametrize("options", [{"rate_hz": 30.0}, {"rate_hz": 0.0}, {"duration": 0.0}])
-def test_drive_that_makes_no_sense_is_refused(options):
-    with pytest.raises(ConfigurationError):
-        drive(**{"seed": 0, "duration": 1.0, **options})
