@@ -189,15 +189,10 @@ def test_keeps_priors_where_nothing_tells_them_and_rolls_or_stands_without_slip(
     assert estimate["vy"][-1] == pytest.approx((1.0 + 0.3) * 0.3, abs=0.01)
 
 
-def test_refuses_weights_of_another_network_and_as_a_smoother_online_and_c():
+def test_refuses_weights_of_another_network():
     model = model_of()
     with pytest.raises(DataError, match="weights of 'self_calibrating' do not fit its settings"):
         model.load_weights({"network": np.zeros((3, 20)), "yaw_rate_max": np.ones(1)})
-    model = model_of(smoothed=True)
-    assert not model.causal
-    for refused in (model.online, lambda: method_source(model, "double")):
-        with pytest.raises(ConfigurationError, match="smooths a whole drive and cannot run online; use estimator"):
-            refused()
 
 
 def test_compiled_code_is_found_again_in_the_next_process():
@@ -242,3 +237,11 @@ def test_smoothed_estimates_err_less_within_their_bands():
         within.append(np.mean(np.abs(estimate["vy"] - vy) < 1.645 * np.sqrt(estimate["covariance"][:, 0, 0])))
     assert np.median(smooth) < 0.8 * np.median(causal)
     assert np.mean(within) > 0.85
+
+
+def test_smoother_is_offline_and_refuses_online_and_c():
+    model = model_of(smoothed=True)
+    assert not model.causal
+    for refused in (model.online, lambda: method_source(model, "double")):
+        with pytest.raises(ConfigurationError, match="smooths a whole drive and cannot run online; use estimator"):
+            refused()

@@ -105,12 +105,17 @@ def test_coarse_or_few_samples_bound_the_floor_and_smoothing_hides_noise():
     assert cramer_rao_floor([drive], SETS[1]) is None
 
 
+def random_model(steps, n=4, m=2, seed=1):
+    generator = np.random.default_rng(seed)
+    A = np.eye(n) * 0.95 + 0.1 * generator.standard_normal((steps, n, n))
+    roots = [generator.standard_normal((size, size)) for size in (n, m, n)]
+    Q, R, P = (root @ root.T + 0.1 * np.eye(len(root)) for root in roots)
+    return LinearModel(A, np.zeros(n), Q, generator.standard_normal((steps, m, n)), np.zeros(m), R), P
+
+
 def test_bound_is_that_of_tichavsky_and_others():
     """J(k+1) = D22 - D21 (J(k) + D11)⁻¹ D12 (their Eq. 21) with D11 = AᵀQ⁻¹A, D12 = -AᵀQ⁻¹, D22 = Q⁻¹ + CᵀR⁻¹C."""
-    generator = np.random.default_rng(1)
-    A = np.eye(4) * 0.95 + 0.1 * generator.standard_normal((200, 4, 4))
-    Q, R, prior = (root @ root.T + 0.1 * np.eye(len(root)) for root in [generator.standard_normal((size, size)) for size in (4, 2, 4)])
-    model = LinearModel(A, np.zeros(4), Q, generator.standard_normal((200, 2, 4)), np.zeros(2), R)
+    model, prior = random_model(200)
     bound = posterior_bound(model, prior)
     inverse_Q, inverse_R = np.linalg.inv(model.process_noise), np.linalg.inv(model.observation_noise)
     told = [C.T @ inverse_R @ C for C in model.observation]

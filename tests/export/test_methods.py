@@ -193,22 +193,28 @@ def test_an_estimator_of_another_package_is_exported_by_the_template_beside_it(t
     forget_examples()
 
 
-def test_every_family_but_the_factor_graph_can_be_exported_and_what_cannot_be_is_said_in_one_line():
+def test_every_family_but_the_factor_graph_can_be_exported():
     assert set(exportable()) == set(estimator_names()) - {"factor_graph", "learned_ukf_variant"}
+
+
+def test_what_cannot_be_exported_is_said_in_one_line():
     offline = estimator_class("kalman").from_config({"noise": {"read_from": "recording"}})
     assert "cannot run along with a drive" in refusal(lambda: method_source(offline, "double"), ConfigurationError)
     unscented = estimator_class("rational_ekf").from_config(
         {"filter": "unscented", "noise": {"yaw_rate": 0.01, "ay": 0.1, "steer": 0.01, "tyres": 0.01}, "curves": CURVES}
     )
     assert "has no C; train it with filter=extended" in refusal(lambda: method_source(unscented, "double"), ConfigurationError)
+
+
+CURVES = {"c1_front": 0.1, "c2_front": 0.7e5, "c1_rear": 0.1, "c2_rear": 1.2e5}
+
+
+def test_a_value_that_float_cannot_hold_is_refused():
     kalman = estimator_class("kalman").from_config({"noise": {"yaw_rate": 1e-3, "ay": 0.1, "steer": 0.01}})
     kalman.values["steer"] = 1e36
     with pytest.raises(ConfigurationError, match=r"no float number; fit it anew, or export with precision double"):
         method_source(kalman, "float")
     assert "1e+39" in method_source(kalman, "double").source
-
-
-CURVES = {"c1_front": 0.1, "c2_front": 0.7e5, "c1_rear": 0.1, "c2_rear": 1.2e5}
 
 
 @pytest.mark.parametrize("precision", ["double", "float"])

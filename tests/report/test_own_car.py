@@ -54,6 +54,7 @@ def test_the_one_that_is_named_is_the_one_whose_error_is_given_and_that_the_comm
     alike = [replace(model, evaluation_folder=gru.evaluation_folder) for model in part.models if model.estimator == "luenberger"]
     own = replace(without(part, "ksnn", "luenberger"), metrics=metrics)
     found = verdict_of(replace(own, models=[*own.models, *alike]), "test")
+    assert found.model is not None
     assert found.model.estimator == "gru"
     assert found.sentences[0].startswith("**Take GRU")
     assert "Luenberger has the lowest error and is not told apart from GRU" in found.sentences[0]
