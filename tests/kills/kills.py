@@ -154,11 +154,6 @@ def content(output):
     return found
 
 
-def differences(found, wanted):
-    """What one has and the other has not, or has otherwise."""
-    return [name for name in sorted({*found, *wanted}) if found.get(name) != wanted.get(name)]
-
-
 def tracked(output):
     """Finished run -> its artefact and what was logged of it, times aside; runs that are neither finished nor killed by that name."""
     found = {}
@@ -194,7 +189,10 @@ def one_round(position, wanted, output, reference, draw):
     last = started(output, jobs)
     code, left = last.wait(RUN_SECONDS), strays(last.pid)
     failed = [f"the last run left with {code}, see '{output.with_suffix('.log')}'"] if code != 0 else []
-    metrics, tracking = ([] if failed else differences(of(output), of(reference)) for of in (content, tracked))
+    metrics, tracking = [], []
+    for of, differing in () if failed else ((content, metrics), (tracked, tracking)):
+        found, known = of(output), of(reference)
+        differing += [name for name in sorted({*found, *known}) if found.get(name) != known.get(name)]
     left += [] if failed else leftovers(output)
     equal, complete = ("no" if failed or found else "yes" for found in (metrics, tracking))
     rows = []

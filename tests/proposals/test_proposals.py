@@ -403,11 +403,18 @@ def in_two_files(tmp_path, change, **options):
     return inspect("my_car", files)
 
 
-def test_a_second_file_in_another_unit_is_told_of_and_a_mark_in_it_alone_is_read(tmp_path):
+def test_a_second_file_in_another_unit_is_told_of_and_what_is_empty_or_impossible_in_it_left_out(tmp_path):
     remarks = draft(in_two_files(tmp_path, lambda table: table.assign(Speed=table["Speed"] / 3.6))).remarks
     assert any("in 'lap_2', ay is 3.6" in one for one in remarks)
     marked = in_two_files(tmp_path, lambda table: table.assign(LatAcc=table["LatAcc"].where(~table.index.isin((10, 11, 12)))), na_rep="-")
     assert len(draft(marked).contents) == 2
+    found = in_two_files(tmp_path, lambda table: table.assign(Steer=np.nan)).proposals
+    assert ("handwheel" in found.by_channel, "ax" in found.by_channel) == (False, True)
+    assert any(re.search(r"'Steer' \(handwheel\) is left out: '.*lap_2.csv' has no numbers in it", note) for note in found.notes)
+    roll = 0.05 * np.sin(np.arange(6000) / 50.0)
+    first = write(tmp_path / "lap_1.csv", usual(drive(seed=1)).assign(**{"roll (rad)": roll}))
+    second = write(tmp_path / "lap_2.csv", usual(drive(100.0, seed=2)).assign(**{"roll (rad)": 40.0 * roll[:5000]}))
+    assert ["roll" in inspect("my_car", files).proposals.by_channel for files in ([first], [first, second])] == [True, False]
 
 
 def in_ms(table):
@@ -427,16 +434,6 @@ def test_files_that_are_laid_out_otherwise_or_of_two_loggers_are_refused(tmp_pat
     write(tmp_path / "lap_2.csv", usual(drive()).rename(columns=lambda name: name if "Time" in name else f"{name}2"))
     with pytest.raises(DataError, match=r"lap_1\.csv' has none of the columns that are channels in '.*lap_2\.csv'"):
         inspect("my_car", [tmp_path / "lap_1.csv", tmp_path / "lap_2.csv"])
-
-
-def test_a_column_that_is_empty_or_impossible_in_another_file_is_left_out(tmp_path):
-    found = in_two_files(tmp_path, lambda table: table.assign(Steer=np.nan)).proposals
-    assert ("handwheel" in found.by_channel, "ax" in found.by_channel) == (False, True)
-    assert any(re.search(r"'Steer' \(handwheel\) is left out: '.*lap_2.csv' has no numbers in it", note) for note in found.notes)
-    roll = 0.05 * np.sin(np.arange(6000) / 50.0)
-    first = write(tmp_path / "lap_1.csv", usual(drive(seed=1)).assign(**{"roll (rad)": roll}))
-    second = write(tmp_path / "lap_2.csv", usual(drive(100.0, seed=2)).assign(**{"roll (rad)": 40.0 * roll[:5000]}))
-    assert ["roll" in inspect("my_car", files).proposals.by_channel for files in ([first], [first, second])] == [True, False]
 
 
 def test_an_acceleration_that_is_the_difference_of_the_references_speed_is_not_the_cars(tmp_path):

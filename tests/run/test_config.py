@@ -53,13 +53,10 @@ def test_wrong_overrides_are_one_line_that_helps(elsewhere, overrides, message):
     assert "did you mean pipelines/quickstart.yaml?" in refusal(lambda: read_study("quikstart"), MissingError)
 
 
-def test_sweeps_expand_to_every_combination():
+def test_sweeps_expand_to_every_combination_that_of_the_ferrari_to_35_jobs(elsewhere):
     jobs = expand(["estimator=ksnn", "estimator.n_local=2,3", "estimator.bias=true,false", "seed=range(3)"])
     assert (len(jobs), jobs[0]) == (12, ["estimator=ksnn", "estimator.n_local=2", "estimator.bias=True", "seed=0"])
     assert len({tuple(job) for job in jobs}) == 12
-
-
-def test_shipped_pipeline_of_the_ferrari_has_35_jobs(elsewhere):
     configs = [job.config for job in jobs_of(read_study("ferrari_drive"), [])[""]]
     names = [config["estimator"]["name"] for config in configs]
     baselines = {"zero": 1, "kinematic": 1, "data_sheet": 1, "static_map": 1}

@@ -72,13 +72,6 @@ def test_wrong_usage_is_one_line_with_the_next_step(place, arguments, words):
     assert _shows_only_text(place.refused(*arguments, code=2, says=words)[1])
 
 
-def test_help_and_version_answer_as_before(place):
-    assert "Usage" in place("train", "--help")[1]
-    assert place("--version")[:2] == (0, "vehest 0.1.0\n")
-    code, out, err = place("data")
-    assert (code, err, "channels" in out) == (2, "", True)
-
-
 def test_hostile_names_reach_the_terminal_as_text(place):
     dataset = {**DATASET, "title": HOSTILE, "licence": HOSTILE, "citation": HOSTILE, "vehicle": HOSTILE}
     (place.folder / "conf" / "dataset" / "mine.yaml").write_text(yaml.safe_dump(dataset, allow_unicode=True))
@@ -94,7 +87,7 @@ def test_hostile_names_reach_the_terminal_as_text(place):
     assert code == 3, "no column 'Yaw'"
 
 
-def test_json_yaml_and_tables_show_only_text_and_keep_every_value(place, capsys):
+def test_json_yaml_and_tables_show_only_text_and_help_and_version_answer_as_before(place, capsys):
     hostile = HOSTILE + "\x7f\u2028\U000e0041β"
     override = f"output='{hostile}'"
     for arguments, read in ((("--json",), json.loads), ((), yaml.safe_load)):
@@ -108,6 +101,10 @@ def test_json_yaml_and_tables_show_only_text_and_keep_every_value(place, capsys)
     assert "[bold]name[/]" in out
     assert printable(HOSTILE) in out
     assert ":car:" in out
+    assert "Usage" in place("train", "--help")[1]
+    assert place("--version")[:2] == (0, "vehest 0.1.0\n")
+    code, out, err = place("data")
+    assert (code, err, "channels" in out) == (2, "", True)
 
 
 @pytest.mark.parametrize("terminal", [False, True])

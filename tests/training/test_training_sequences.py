@@ -121,7 +121,7 @@ def test_frozen_parameters_stay_and_learn_again_afterwards():
         assert value.requires_grad
 
 
-def test_best_validation_is_kept_and_the_start_is_a_candidate():
+def test_best_validation_is_kept_also_of_every_third_epoch_and_progress_counts_over_all_phases():
     network, seen = _network(), []
     losses = iter([5.0, 4.0, 2.0, 3.0, math.nan, 2.5])
 
@@ -136,9 +136,6 @@ def test_best_validation_is_kept_and_the_start_is_a_candidate():
     (record,) = train_phases([_phase(network, validation=lambda: 1.0, patience=3)], 0, FitContext())
     assert (record.best_epoch, record.epochs) == (0, 3), "no better than the start, and out of patience"
     assert torch.equal(_flat(network), start)
-
-
-def test_validation_comes_every_third_epoch_and_progress_counts_over_all_phases():
     (record,) = train_phases([_phase(_network(), validate_every=3, max_epochs=8)], 0, FitContext())
     assert [math.isfinite(loss) for loss in record.validation_loss] == [False, False, True, False, False, True, False, True]
     told = []
