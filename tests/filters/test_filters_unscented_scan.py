@@ -134,7 +134,7 @@ def test_lost_definiteness_is_repaired_and_counted_as_by_the_filter():
     ways = [[False] * 3, [True, False, False], [True, False, False], [True, False, False], [False, True, False], [True, False, False]]
     assert scanned.repaired.tolist() == ways
     for a, b in zip(slopes, own, strict=True):
-        assert torch.allclose(a, b, rtol=1e-9, atol=1e-12)
+        assert torch.allclose(a, b, rtol=1e-9, atol=1e-10)  # the fourth is conditioned like the margin of a repair, 1e6
 
 
 def test_without_repair_a_sequence_is_lost_and_leaves_the_others_alone():
