@@ -306,11 +306,15 @@ def test_a_misspelt_declaration_is_refused(bags):
         assert said in refused(bags, ConfigurationError, **changes)
 
 
+def real_configuration(root):
+    return yaml.safe_load(CONFIGURATION.read_text(encoding="utf-8").replace("${root}", str(root)))
+
+
 @pytest.mark.slow
 def test_declared_constants_are_those_that_the_data_show(data_root):
     """Within two of the standard deviations that the script prints; what the publishers' files fix exactly, to a millionth."""
     identified = runpy.run_path(str(ROOT / "docs" / "identify_f1tenth.py"))["identify"](data_root / "f1tenth")
-    declared = yaml.safe_load(CONFIGURATION.read_text(encoding="utf-8").replace("${root}", str(data_root)))
+    declared = real_configuration(data_root)
     channels, pose = declared["channels"], declared["pose"]
     assert abs(pose["yaw"] - identified["body_yaw"]) < 2 * identified["body_yaw_sd"]
     rpm = 1 / channels["vx"]["factor"]
