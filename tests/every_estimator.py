@@ -42,8 +42,6 @@ SAMPLED = {
     EnsembleSettings: lambda dtype: EnsembleSettings(ONCE, 256, dtype, identification=GIVEN),
     EndToEndSettings: lambda dtype: EndToEndSettings(ONCE, 256, ONCE, steps=50, batch_size=16, identification=GIVEN, dtype=dtype),
 }
-
-
 _FITTED = {}
 
 

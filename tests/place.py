@@ -83,8 +83,6 @@ def undrawn(patch):
 
 STEERED = {"vx": "m/s", "yaw_rate": "rad/s", "ay": "m/s²", "steer": "rad"}
 STEERED |= {"vx_ref": "m/s", "vy_ref": "m/s", "yaw_rate_ref": "rad/s"}
-
-
 SPLIT = {"name": "mine", "dataset": "mine", "train": [{"recording": "one"}], "validation": [{"recording": "two"}]}
 SPLIT |= {"tests": {"test": [{"recording": "three"}]}}
 

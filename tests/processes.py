@@ -1,7 +1,5 @@
 """Processes that tests start: each ends with its test, and with the process that runs the tests."""
 
-from __future__ import annotations
-
 import ctypes
 import json
 import os
@@ -10,9 +8,9 @@ import subprocess
 import sys
 import time
 from contextlib import suppress
+from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
 
 HANGS = 900.0  # s after which a test fails; until then it waits for what happens
 MOMENT = 0.02  # s between two looks
@@ -23,13 +21,10 @@ _started = []
 
 def start(command, **options):
     """Start a process that leads a session of its own; see `end_all`."""
-    process = subprocess.Popen(list(map(str, command)), start_new_session=True, preexec_fn=_end_with_parent, **options)
+    dies = partial(_libc.prctl, PR_SET_PDEATHSIG, signal.SIGKILL)  # with its parent
+    process = subprocess.Popen(list(map(str, command)), start_new_session=True, preexec_fn=dies, **options)
     _started.append(process)
     return process
-
-
-def _end_with_parent():
-    _libc.prctl(PR_SET_PDEATHSIG, signal.SIGKILL)
 
 
 def end_all():
@@ -62,7 +57,7 @@ class Striking:
 
     def __init__(self, function, call=0, number=0):
         self.function, self.call, self.number = function, call, number
-        self.calls: list[tuple[Any, ...]] = []
+        self.calls = []
 
     def __call__(self, *arguments, **options):
         result = self.function(*arguments, **options)

@@ -3,8 +3,6 @@
 Names of columns and parameters are those that public programs read from the real files; values are made here.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 from itertools import zip_longest

@@ -45,12 +45,6 @@ def examples(place, tmp_path_factory, monkeypatch):
     forget_examples()
 
 
-def drive_for(name, seconds=8.0):
-    kind = estimator_class(name)
-    drive = linear_drive(seconds, seed=7)[0] if "steer" in kind.channels else planar_drive(seconds, 100.0, seed=7, noise=0.02)
-    return drive.without_references()
-
-
 def test_each_example_is_a_module_and_a_configuration_of_few_lines_on_the_page():
     lines = {file.name: len(file.read_text(encoding="utf-8").splitlines()) for file in EXAMPLES.iterdir() if file.is_file()}
     assert set(lines) == {f"{name}.{end}" for name in NAMES for end in ("py", "yaml")} | {"sliding_mode.c.j2"}
@@ -84,7 +78,8 @@ def test_example_is_trained_evaluated_read_back_and_runs_online_as_in_batch(name
     (trust,) = (examples.folder / "outputs" / "calibrate").glob("*/trust.yaml")
     assert {"bands", "guard", "health"} <= {key for key, value in yaml.safe_load(trust.read_text()).items() if value}
     model, again = vehest.load_model(folder), vehest.load_model(folder)
-    drive = drive_for(name)
+    drive = linear_drive(8.0, seed=7)[0] if "steer" in model.channels else planar_drive(8.0, 100.0, seed=7, noise=0.02)
+    drive = drive.without_references()
     assert np.array_equal(vehest.estimate(model, drive)["vy"], vehest.estimate(again, drive)["vy"], equal_nan=True)
     at_rate = drive if model.settings.rate_hz == drive.rate_hz else planar_drive(8.0, model.settings.rate_hz, seed=7)
     (batch,) = model.estimate([at_rate.without_references()])

@@ -1,7 +1,5 @@
 """A drive in closed form with content at many frequencies, any channel of which may be late or low-passed to the last digit."""
 
-from __future__ import annotations
-
 from functools import cache
 
 import numpy as np
@@ -16,7 +14,7 @@ class Wave:
 
     def __init__(self, amplitudes, omegas, phases, level=0.0):
         self.amplitudes, self.omegas, self.phases, self.level = amplitudes, omegas, phases, level
-        self._known: dict[tuple[float, float, int, int], np.ndarray] = {}  # by uniform clock and order
+        self._known = {}  # by uniform clock and order
 
     @classmethod
     def random(cls, generator, size, low, high, number=120, level=0.0, corner=0.5):
@@ -40,10 +38,7 @@ class Wave:
 def broadband_drive(seconds=120.0, rate_hz=100.0, seed=0, late=None, lever=0.0, slow_yaw_rate=0.0, noise=1.0):
     """d(vy)/dt = ay - vx·yaw_rate and d(vx)/dt = ax + vy·yaw_rate hold at each instant, but for noise and what is asked for.
 
-    Args:
-        late: channel -> delay [s].
-        lever: how far ahead of the reference the inertial unit sits [m].
-        slow_yaw_rate: time constant of its low-pass [s].
+    Channels are ``late`` by so many seconds; ``lever`` is how far ahead the inertial unit sits [m], ``slow_yaw_rate`` a time constant [s].
     """
     return _made(seconds, rate_hz, seed, tuple(sorted((late or {}).items())), lever, slow_yaw_rate, noise)
 

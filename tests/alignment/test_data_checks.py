@@ -162,20 +162,13 @@ def test_quantised_resting_and_stepped_channels_are_not_saturated():
     assert complaints(Recording("step", "car", RATE, 0.0, {"steer": steer})) == []
 
 
-def with_wheels(recording):
-    """The same drive with four wheels that roll."""
-    wheels = {f"wheel_speed_{wheel}": recording["vx"] / 0.3 for wheel in ("fl", "fr", "rl", "rr")}
-    return replace(recording, channels={**recording.channels, **wheels})
-
-
-def test_a_steering_offset_shows_straight_ahead():
+def test_a_steering_offset_shows_straight_ahead_and_a_wheel_that_drops_out_is_named():
     whole = clean_drive()
     assert complaints(changed(whole, steer=lambda samples: samples + np.deg2rad(1.0))) == []
     assert complaints(changed(whole, steer=lambda samples: samples - np.deg2rad(5.0))) == [("warning", "offset", "steer")]
-
-
-def test_a_wheel_that_drops_out_is_named_and_one_that_locks_is_not():
-    whole = with_wheels(clean_drive())
+    drive = clean_drive()
+    wheels = {f"wheel_speed_{wheel}": drive["vx"] / 0.3 for wheel in ("fl", "fr", "rl", "rr")}
+    whole = replace(drive, channels={**drive.channels, **wheels})
     assert not complaints(whole)
     dropped = changed(whole, wheel_speed_rl=stuck(0.0, 2000, 2060))
     assert complaints(dropped) == [("warning", "dropout", "wheel_speed_rl")]

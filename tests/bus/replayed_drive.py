@@ -1,7 +1,5 @@
 """A drive as the frames of a bus, estimated online from them, against the same model offline on the drive itself."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -31,7 +31,7 @@ def bus(place):
     return place
 
 
-def test_figures_come_as_json_and_estimates_as_a_table(bus):
+def test_figures_come_as_json_estimates_as_a_table_their_dbc_alone_and_progress_in_plain_lines(bus):
     words = ("--dbc", "raw/bus/car.dbc", "--signals", TOLD, "--speed", "max", "--json", "--quiet", "-o", "out.csv")
     code, out, err = bus("replay", "raw/bus/drive.asc", *words)
     assert (code, err) == (0, "")
@@ -39,29 +39,20 @@ def test_figures_come_as_json_and_estimates_as_a_table(bus):
     assert figures["samples_hz"] == 100.0
     assert figures["estimates"] == len(pd.read_csv("out.csv")) == 200
     assert figures["written"] == ["out.csv"]
-
-
-def test_a_data_set_serves_replays_and_estimates_alike(bus):
-    code, _, err = bus("replay", "raw/bus/drive.asc", "--dataset", "bus", "--speed", "max", "--quiet", "-o", "online.csv")
-    assert (code, err) == (0, "")
-    bus.done("estimate", "raw/bus/drive.asc", "dataset=bus", "-o", "offline.csv")
-    online, offline = pd.read_csv("online.csv"), pd.read_csv("offline.csv")
-    assert {"time", "vy", "sideslip", "health", "health_reason"} <= set(online) & set(offline)
-
-
-def test_the_dbc_of_estimates_is_written_alone(bus):
     words = ("--dbc", "raw/bus/car.dbc", "--signals", TOLD, "--speed", "max", "--quiet", "--write-dbc", "own.dbc", "--id", "0x100")
     assert bus("replay", "raw/bus/drive.asc", *words)[0] == 0
     assert "BO_ 256 VehestEstimate: 8" in Path("own.dbc").read_text()
-
-
-def test_progress_goes_to_standard_error_in_plain_lines(bus):
     _, err = bus.done("replay", "raw/bus/drive.asc", "--dbc", "raw/bus/car.dbc", "--signals", TOLD, "--speed", "max")
     assert err.startswith("time ")
     assert "\x1b" not in err
 
 
-def test_what_is_wrong_is_one_line_and_nothing_is_left_behind(bus):
+def test_a_data_set_serves_replays_and_estimates_alike_and_what_is_wrong_is_one_line(bus):
+    code, _, err = bus("replay", "raw/bus/drive.asc", "--dataset", "bus", "--speed", "max", "--quiet", "-o", "online.csv")
+    assert (code, err) == (0, "")
+    bus.done("estimate", "raw/bus/drive.asc", "dataset=bus", "-o", "offline.csv")
+    online, offline = pd.read_csv("online.csv"), pd.read_csv("offline.csv")
+    assert {"time", "vy", "sideslip", "health", "health_reason"} <= set(online) & set(offline)
     assert bus.refused("replay", "raw/bus/nothing.asc", "--dataset", "bus")[0] == 4
     assert bus.refused("replay", "raw/bus/drive.asc")[0] == 2
     assert bus.refused("replay", "raw/bus/car.dbc", "--dataset", "bus")[0] == 3

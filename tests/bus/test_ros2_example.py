@@ -99,15 +99,12 @@ def test_a_drive_goes_through_the_node_and_its_estimates_through_a_bag(tmp_path,
     assert held == pytest.approx(19.95 + 1 / 20 - stepper.delay, abs=1e-6)
 
 
-def test_a_speed_that_is_too_old_counts_as_not_measured(node, types):
+def test_a_speed_that_is_too_old_counts_as_not_measured_and_what_there_is_not_is_nan(node, types):
     samples = node.Samples()
     assert math.isnan(samples.imu(imu(types, 0.0, 0.1, 0.0, 1.0))[1]["vx"])
     samples.speed(speed(types, 0.0, 20.0))
     assert samples.imu(imu(types, 0.05, 0.1, 0.0, 1.0))[1]["vx"] == 20.0
     assert math.isnan(samples.imu(imu(types, 0.2, 0.1, 0.0, 1.0))[1]["vx"])
-
-
-def test_what_there_is_not_is_nan_in_the_message(node):
     fields = node.fields_of({"vy": 0.5, "sideslip": 0.02, "health": 2.0, "health_reason": 300000.0})
     assert fields["reason"] == "there is no estimate"
     assert math.isnan(fields["yaw_rate"])

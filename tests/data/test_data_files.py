@@ -17,13 +17,16 @@ class InterruptedHereError(Exception):
     """Something that goes wrong half-way."""
 
 
-def test_nothing_stands_at_the_place_before_the_end(tmp_path):
+def test_nothing_stands_at_the_place_before_the_end_and_the_digest_is_that_of_the_bytes(tmp_path):
     path = tmp_path / "deep" / "er" / "file"
     with written_aside(path) as aside:
         aside.write_text("new")
         assert not path.exists()
         assert aside.parent == path.parent  # the same file system: renaming is one step
     assert path.read_text() == "new"
+    (tmp_path / "file").write_bytes(b"abc")
+    assert sha256_of(tmp_path / "file") == hashlib.sha256(b"abc").hexdigest()
+    assert "cannot read" in refusal(lambda: sha256_of(tmp_path / "none"))
 
 
 def write_half(path, make):
@@ -82,9 +85,3 @@ def test_a_killed_writer_leaves_only_what_is_swept(tmp_path):
     assert len(list(tmp_path.iterdir())) == 2
     assert remove_leftovers(tmp_path) == 1
     assert [path.name for path in tmp_path.iterdir()] == ["file"]
-
-
-def test_the_digest_is_that_of_the_bytes_of_a_file_that_can_be_read(tmp_path):
-    (tmp_path / "file").write_bytes(b"abc")
-    assert sha256_of(tmp_path / "file") == hashlib.sha256(b"abc").hexdigest()
-    assert "cannot read" in refusal(lambda: sha256_of(tmp_path / "none"))

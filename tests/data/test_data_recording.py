@@ -50,20 +50,27 @@ def test_a_cut_at_two_sample_times_holds_the_first_and_not_the_second(length, ra
     assert piece.start_time == pytest.approx(recording.time[first], abs=1e-12, rel=1e-15)
 
 
-def test_ranges_without_samples_and_missing_channels_are_refused_with_what_there_is():
+def test_ranges_without_samples_missing_channels_and_estimates_of_unknown_quantities_are_refused():
     with pytest.raises(DataError, match=r"'lap' spans 10 s to 11 s; it has no samples between 10.501 s and 10.502 s"):
         counting(100, 100.0, 10.0).cut(10.501, 10.502)
     with pytest.raises(DataError, match=r"'lap' has no channel 'vx' \(it has ay\)"):
         _ = counting(3)["vx"]
+    for channels, said in (({"vz": np.zeros(3)}, "unknown quantity 'vz'"), ({"vy": np.zeros(3), "vx": np.zeros(2)}, "one common length")):
+        with pytest.raises(DataError, match=said):
+            Estimate("r", "ekf", 20.0, 0.0, channels)
+    assert "not None and (vy)" in refusal(lambda: Estimate("r", "ekf", 20.0, 0.0, {"vy": np.zeros(3)}, covariance_of=("vy",)))
 
 
-def test_samples_are_copied_and_cannot_be_written_to():
+def test_samples_are_copied_and_cannot_be_written_to_and_estimators_see_no_references():
     samples = np.zeros(3)
     recording = Recording("r", "car", 10.0, 0.0, {"ay": samples})
     samples[0] = 1.0
     assert recording["ay"][0] == 0.0
     with pytest.raises(ValueError, match="read-only"):
         recording["ay"][0] = 1.0
+    recording = Recording("r", "car", 10.0, 0.0, {name: np.zeros(2) for name in ("vx", "vy_ref", "ay", "sideslip_ref")})
+    assert list(recording.without_references().channels) == ["vx", "ay"]
+    assert "reference channels only" in refusal(lambda: recording.select(["vy_ref"]).without_references())
 
 
 @pytest.mark.parametrize(
@@ -84,12 +91,6 @@ def test_samples_are_copied_and_cannot_be_written_to():
 def test_what_cannot_be_a_recording_is_refused(changes, what):
     arguments = {"id": "r", "vehicle": "car", "rate_hz": 10.0, "start_time": 0.0, "channels": {"ay": np.zeros(3)}}
     assert what in refusal(lambda: Recording(**(arguments | changes)))
-
-
-def test_estimators_see_no_references():
-    recording = Recording("r", "car", 10.0, 0.0, {name: np.zeros(2) for name in ("vx", "vy_ref", "ay", "sideslip_ref")})
-    assert list(recording.without_references().channels) == ["vx", "ay"]
-    assert "reference channels only" in refusal(lambda: recording.select(["vy_ref"]).without_references())
 
 
 @PROPERTY
@@ -121,13 +122,6 @@ def test_a_covariance_is_held_like_its_quantities_and_read_by_name():
     assert (held[1] == [[17.0, 15.0], [11.0, 9.0]]).all()
     assert (held[2] == held[1]).all()
     assert "a covariance of vx, vy, friction, not of yaw_rate" in refusal(lambda: estimate.covariance_at(np.zeros(1), ["yaw_rate"]))
-
-
-def test_an_estimate_of_unknown_or_unequal_quantities_is_refused():
-    for channels, said in (({"vz": np.zeros(3)}, "unknown quantity 'vz'"), ({"vy": np.zeros(3), "vx": np.zeros(2)}, "one common length")):
-        with pytest.raises(DataError, match=said):
-            Estimate("r", "ekf", 20.0, 0.0, channels)
-    assert "not None and (vy)" in refusal(lambda: Estimate("r", "ekf", 20.0, 0.0, {"vy": np.zeros(3)}, covariance_of=("vy",)))
 
 
 def test_units_of_something_else_and_unknown_channels_are_refused():

@@ -42,15 +42,12 @@ def steady_drive(car, seconds=30.0):
 CAR = SingleTrackParameters(1000.0, 1600.0, 1.2, 1.3, 8.0e4, 1.1e5)
 
 
-def test_static_map_finds_the_two_numbers_of_a_linear_single_track():
+def test_static_map_finds_the_two_numbers_of_a_linear_single_track_and_the_data_sheet_is_exact_on_one():
     estimator, record = fitted("static_map", steady_drive(CAR))
     assert estimator.values["b"] == pytest.approx(CAR.cg_to_rear_axle, rel=1e-9)
     wheelbase = CAR.cg_to_front_axle + CAR.cg_to_rear_axle
     assert estimator.values["k"] == pytest.approx(CAR.mass * CAR.cg_to_front_axle / (wheelbase * CAR.cornering_stiffness_rear), rel=1e-9)
     assert record.metrics["best_train_loss"] == pytest.approx(0.0, abs=1e-18)
-
-
-def test_data_sheet_is_exact_on_a_car_with_the_stiffness_it_assumes():
     drive = steady_drive(CAR)
     wheelbase = CAR.cg_to_front_axle + CAR.cg_to_rear_axle
     coefficient = CAR.cornering_stiffness_rear / (CAR.mass * 9.81 * CAR.cg_to_front_axle / wheelbase)
@@ -84,14 +81,11 @@ def test_kinematic_integration_is_the_solution_of_its_equation_whose_time_consta
     assert record.metrics["best_validation_loss"] < 1e-8
 
 
-def test_zero_is_zero_and_what_is_not_fitted_does_not_run(drive):
+def test_zero_is_zero_and_a_map_that_is_not_fitted_or_not_determined_is_refused(drive):
     (estimate,) = new("zero").estimate([drive.without_references()])
     assert not estimate["vy"].any()
     assert not estimate["sideslip"].any()
     assert "has not been fitted" in refusal(lambda: new("static_map").online(), ConfigurationError)
-
-
-def test_what_does_not_determine_a_static_map_is_refused(drive):
     straight = Recording("straight", "car", 20.0, 0.0, {**drive.channels, "yaw_rate": np.zeros(len(drive))}, "simulated")
     one_speed = Recording("one speed", "car", 20.0, 0.0, {**drive.channels, "vx": np.full(len(drive), 20.0)}, "simulated")
     for recording in (straight, one_speed):

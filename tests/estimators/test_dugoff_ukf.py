@@ -33,12 +33,6 @@ def changed(drive, channels, gappy=()):
     return replace(drive, channels={**drive.channels, **channels}, gappy=frozenset(gappy))
 
 
-def error_of(estimator, drive):
-    """Root mean square of the sideslip's error after a second [rad]."""
-    estimate = estimator.estimate([drive.without_references()])[0]
-    return float(np.sqrt(np.mean((estimate["sideslip"] - drive["sideslip_ref"])[100:] ** 2)))
-
-
 def test_the_fit_finds_tyres_and_noise_with_measured_forces_and_without():
     drives = [dugoff_drive(30.0, seed, straight=5.0) for seed in (1, 2)]
     estimator = DugoffUkf.from_config({})
@@ -60,22 +54,27 @@ def test_the_fit_finds_tyres_and_noise_with_measured_forces_and_without():
 @pytest.mark.parametrize("inputs", ["full", "imu"])
 def test_the_filter_follows_the_car_and_knows_how_well(inputs):
     drive = dugoff_drive(20.0, 5)
-    estimator = given(inputs)
-    assert error_of(estimator, drive) < np.radians(0.2)
-    estimate = estimator.estimate([drive.without_references()])[0]
+    estimate = given(inputs).estimate([drive.without_references()])[0]
+    assert np.sqrt(np.mean((estimate["sideslip"] - drive["sideslip_ref"])[100:] ** 2)) < np.radians(0.2), "after a second"
     assert estimate.covariance_of == ("vy", "yaw_rate")
     error = (estimate["vy"] - drive["vy_ref"])[100:] / np.sqrt(estimate.covariance[100:, 0, 0])
     assert 0.2 < np.sqrt(np.mean(error**2)) < 2.0
     assert set(estimate["nis_dof"]) == ({4.0} if inputs == "full" else {2.0})
 
 
-def test_drives_of_different_length_are_estimated_as_alone():
+def test_drives_of_different_length_are_estimated_as_alone_and_forces_trusted_with_a_hysteresis():
     drives = [dugoff_drive(seconds, seed).without_references() for seconds, seed in ((3.0, 1), (5.0, 2), (3.0, 3))]
     estimator = given()
     for together, drive in zip(estimator.estimate(drives), drives, strict=True):
         np.testing.assert_array_equal(together["vy"], estimator.estimate([drive])[0]["vy"])
     assert list(groups_of([3, 5, 3], 10)) == [[1, 0], [2]]
     assert list(groups_of([30, 5], 10)) == [[0], [1]]
+    ay = np.array([0.0, 3.9, -4.1, 3.5, np.nan, -3.1, 2.9, 3.9, 4.0])
+    expected = [False, False, True, True, True, True, False, False, True]
+    assert in_nonlinear_range(ay, 4.0, 3.0).tolist() == expected
+    whole = in_nonlinear_range(ay, 4.0, 3.0)
+    assert all(in_nonlinear_range(ay[k : k + 1], 4.0, 3.0, bool(whole[k - 1]))[0] == whole[k] for k in range(1, len(ay)))
+    assert in_nonlinear_range(ay[3:4], 4.0, 3.0, before=True)[0]
 
 
 @pytest.mark.parametrize("inputs", ["full", "imu"])
@@ -107,15 +106,6 @@ def test_errors_alike_count_as_fewer_measurements_and_states_handed_over_are_bel
     (process, once), (same, tenfold) = (own.noise_covariances(own.levels) for own in (white, alike))
     np.testing.assert_array_equal(process, same)
     np.testing.assert_allclose(tenfold, 10.0 * once)
-
-
-def test_forces_are_trusted_with_a_hysteresis():
-    ay = np.array([0.0, 3.9, -4.1, 3.5, np.nan, -3.1, 2.9, 3.9, 4.0])
-    expected = [False, False, True, True, True, True, False, False, True]
-    assert in_nonlinear_range(ay, 4.0, 3.0).tolist() == expected
-    whole = in_nonlinear_range(ay, 4.0, 3.0)
-    assert all(in_nonlinear_range(ay[k : k + 1], 4.0, 3.0, bool(whole[k - 1]))[0] == whole[k] for k in range(1, len(ay)))
-    assert in_nonlinear_range(ay[3:4], 4.0, 3.0, before=True)[0]
 
 
 def test_process_noise_is_tuned_by_the_house_search_below_its_limit():

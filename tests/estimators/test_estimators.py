@@ -96,13 +96,16 @@ def test_truncated_weights_are_one_clear_error(tmp_path, size):
     assert "truncated or damaged" in refusal(lambda: load_model(tmp_path))
 
 
-def test_estimator_refuses_wrong_rate_missing_channel_and_gaps(drive):
+def test_estimator_refuses_wrong_rate_missing_channel_and_gaps_and_the_registry_unknown_names(drive):
     estimator = known("ksnn", "float64")
     assert "works at 20 Hz; resample it first" in refusal(lambda: estimator.estimate([Resample(10).__call__(drive)]))
     assert "no channel 'ax'" in refusal(lambda: estimator.estimate([drive.select(["vx", "yaw_rate", "ay"])]))
     gaps = {**drive.channels, "ay": np.where(np.arange(len(drive)) == 7, np.nan, drive["ay"])}
     gappy = type(drive)(drive.id, drive.vehicle, drive.rate_hz, 0.0, gaps, "simulated", frozenset({"ay"}))
     assert "has gaps" in refusal(lambda: estimator.estimate([gappy]))
+    with pytest.raises(ConfigurationError, match=f"is not one of: {', '.join(sorted(estimator_names()))}"):
+        estimator_class("kalman_filter_from_the_future")
+    assert "'windowed' is not one of" in refusal(lambda: estimator_class("windowed"), ConfigurationError)
 
 
 def test_a_model_of_another_version_is_refused_and_one_without_loads(tmp_path, monkeypatch):
@@ -144,12 +147,6 @@ def test_recordings_start_from_their_own_states_or_all_from_one_and_forget_them(
     assert "2 initial states for 1 recordings" in refusal(lambda: estimator.estimate([drive], states))
     monkeypatch.setattr(type(estimator), "ignores_initial_state", True)
     assert np.array_equal(estimator.estimate([drive], states[0])[0]["vy"], estimator.estimate([drive])[0]["vy"])
-
-
-def test_registry_refuses_names_that_it_does_not_know():
-    with pytest.raises(ConfigurationError, match=f"is not one of: {', '.join(sorted(estimator_names()))}"):
-        estimator_class("kalman_filter_from_the_future")
-    assert "'windowed' is not one of" in refusal(lambda: estimator_class("windowed"), ConfigurationError)
 
 
 @pytest.mark.parametrize(
@@ -222,14 +219,10 @@ OF_SHIPPED = ["estimator.n_local=2", "estimator.n_hidden=2", "estimator.bias=fal
 STANDING = ["training.max_epochs=1", "training.learning_rate=1e-12"]
 
 
-@pytest.fixture(scope="module")
-def drives():
-    return [planar_drive(30.0, 20.0, seed=seed) for seed in (1, 2)]
-
-
-def test_a_training_that_does_not_move_ends_where_it_started_and_other_settings_are_refused(drives):
+def test_a_training_that_does_not_move_ends_where_it_started_and_other_settings_are_refused():
     from vehest.run.estimate import pretrained_folder
 
+    drives = [planar_drive(30.0, 20.0, seed=seed) for seed in (1, 2)]
     started = vehest.train("ksnn", drives[:1], drives[1:], [*OF_SHIPPED, *STANDING, f"training.start_from={pretrained_folder()}"])
     assert flat_weights(started) == pytest.approx(flat_weights(vehest.load_model()), abs=1e-6)
     scratch = vehest.train("ksnn", drives[:1], drives[1:], [*OF_SHIPPED, *STANDING])

@@ -11,24 +11,20 @@ from scipy.sparse.linalg import spsolve
 from single_track_drive import linear_drive, with_gaps
 from vehest.data.errors import ConfigurationError
 from vehest.estimators.base import FitData
-from vehest.estimators.factor_graph import MEASURED, FactorGraph
+from vehest.estimators.factor_graph import MEASURED
 from vehest.estimators.registry import estimator_class
 from vehest.filters.gating import Gate
 from vehest.filters.gaussian import Gaussian
 from vehest.filters.kalman_scan import kalman_scan
 from vehest.training.context import NoTraining
 
-GAPS = {"ay": slice(40, 60), "yaw_rate": slice(50, 70)}
-
 
 def factor_graph(**config):
-    estimator = estimator_class("factor_graph").from_config(config)
-    assert isinstance(estimator, FactorGraph)
-    return estimator
+    return estimator_class("factor_graph").from_config(config)
 
 
 def drive_with_gaps(seconds=2.0):
-    return with_gaps(linear_drive(seconds, seed=1)[0].without_references(), GAPS)
+    return with_gaps(linear_drive(seconds, seed=1)[0].without_references(), {"ay": slice(40, 60), "yaw_rate": slice(50, 70)})
 
 
 def least_squares(estimator, drive, first, last, start, deviation):

@@ -114,8 +114,11 @@ def test_after_a_jump_of_the_truth_it_comes_back_to_what_it_would_say_without_a_
 
 
 @EVERY
-def test_a_gate_that_refuses_nothing_changes_no_bit(name):
+def test_a_gate_that_refuses_nothing_changes_no_bit_but_the_variants_name_and_a_gate_of_nothing_is_refused(name):
     assert np.array_equal(vy(estimator(name), drive(name)), vy(estimator(name, 1e9), drive(name)))
+    assert estimator(name, 5.0).variant.replace("_gate5", "") == estimator(name).variant != estimator(name, 5.0).variant
+    assert "gated at 5 sigma" in estimator(name, 5.0).full_title
+    assert "estimator.gate must be positive" in refusal(lambda: estimator(name, 0.0), ConfigurationError)
 
 
 @EVERY
@@ -129,13 +132,6 @@ def test_online_with_a_gate_is_batch_with_a_gate(name):
         assert taken[round(SPIKE * recording.rate_hz)] < taken.max()
 
 
-@EVERY
-def test_a_variant_with_a_gate_is_called_another_and_a_gate_of_nothing_refused(name):
-    assert estimator(name, 5.0).variant.replace("_gate5", "") == estimator(name).variant != estimator(name, 5.0).variant
-    assert "gated at 5 sigma" in estimator(name, 5.0).full_title
-    assert "estimator.gate must be positive" in refusal(lambda: estimator(name, 0.0), ConfigurationError)
-
-
 def test_learned_filters_share_their_training_with_gates_and_unscented_ones_have_none():
     with pytest.raises(ConfigurationError, match=r"estimator\.gate is there for estimator\.filter=extended only"):
         estimator_class("rational_ekf").from_config({**CONFIGS["rational_ekf"], "filter": "unscented", "gate": 5.0})
@@ -144,8 +140,6 @@ def test_learned_filters_share_their_training_with_gates_and_unscented_ones_have
 
 FILTERS = ("kalman", "factor_graph", "rational_ekf", "dugoff_ukf", "cnn_ukf", "learned_ukf", "learned_ukf_variant")
 OTHERS = [name for name in estimator_names() if name not in (*FILTERS, "ensemble_ukf")]  # whose stepper is that of cnn_ukf
-
-
 known = cache(fitted)
 
 

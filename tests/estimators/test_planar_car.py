@@ -30,9 +30,6 @@ def scaled(car):
     return car
 
 
-KINDS = pytest.mark.parametrize("kind", CARS)
-
-
 def a_car(kind="NNTF", dtype=torch.float64):
     car = CARS[kind]()
     car.reset(torch.Generator().manual_seed(0))
@@ -70,7 +67,7 @@ def through_the_filter(car, compiled, dtype):
     return outcome.steps.filtered.mean.detach(), gradients
 
 
-@KINDS
+@pytest.mark.parametrize("kind", CARS)
 def test_compiled_filter_has_the_values_and_all_gradients_of_the_readable_one(kind):
     car = a_car(kind)
     (known, gradients), (mean, own) = (through_the_filter(car, compiled, torch.float64) for compiled in (False, True))

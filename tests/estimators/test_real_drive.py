@@ -53,13 +53,10 @@ def _over_the_whole_drive(name, recording, **config):
     return accuracy([score(estimate, Resample(20.0)(recording), whole, Protocol(20.0))])
 
 
-def test_kalman_filter_over_the_whole_ferrari_drive_is_the_published_one(ferrari):
+def test_kalman_filter_and_factor_graph_over_the_whole_ferrari_drive_are_the_published_ones(ferrari):
     """Published: 0.87° (Leanza et al. 2021; Table VI of Da Lio et al. 2023)."""
     assert _over_the_whole_drive("kalman", ferrari, noise={"read_from": "recording"})["rmse_sideslip"] == pytest.approx(0.87, abs=0.05)
-
-
-def test_factor_graph_over_the_whole_ferrari_drive_is_the_published_one(ferrari):
-    """Published: 0.57° in batch. A window sees no later samples, so it does worse, but better than the Kalman filter."""
+    # Published: 0.57° in batch. A window sees no later samples, so it does worse, but better than the Kalman filter.
     batch = _over_the_whole_drive("factor_graph", ferrari)["rmse_sideslip"]
     window = _over_the_whole_drive("factor_graph", ferrari, window=0.05)["rmse_sideslip"]
     assert batch == pytest.approx(0.57, abs=0.02)

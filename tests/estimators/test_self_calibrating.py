@@ -120,13 +120,18 @@ def test_filter_with_the_networks_axle_matches_plain_matrices():
     np.testing.assert_allclose(states / largest, expected / largest, rtol=0.0, atol=1e-6)
 
 
-def test_network_inside_is_the_one_that_comes_with_vehest():
+def test_network_inside_is_the_one_that_comes_with_vehest_and_ax_may_be_missing():
     samples, _ = drive(10.0)
     recording = Recording("a", "a", RATE, 0.0, dict(zip(("yaw_rate", "vx", "ay", "ax"), samples.T, strict=True)))
     expected = load_model(pretrained_folder()).estimate([recording])[0]["vy"]
     model = model_of(network_odds=1e12, lateral_power=0.0, longitudinal_power=0.0, minimum_speed=1.0)
     vy = model.estimate([recording])[0]["vy"]
     np.testing.assert_allclose(vy[30:], expected[30:], atol=2e-5)  # its weights and arithmetic are single there
+    samples, vy = drive(60.0)
+    model = model_of(measured_ax=False)
+    assert model.channels == ("yaw_rate", "vx", "ay")
+    found, _, _ = model.trace(samples[:, :3], model.first_state(samples[0, :3], {}))
+    assert np.std(found[400:, 0] - vy[400:]) < 0.5 * np.std(vy[400:])
 
 
 def test_finds_the_rear_axle_and_tells_how_well():
@@ -182,14 +187,6 @@ def test_keeps_priors_where_nothing_tells_them_and_rolls_or_stands_without_slip(
     state.covariances[:, kernel.REAR, kernel.REAR] = 1e-6
     estimate, _ = model.run(samples, state)
     assert estimate["vy"][-1] == pytest.approx((1.0 + 0.3) * 0.3, abs=0.01)
-
-
-def test_goes_without_ax():
-    samples, vy = drive(60.0)
-    model = model_of(measured_ax=False)
-    assert model.channels == ("yaw_rate", "vx", "ay")
-    found, _, _ = model.trace(samples[:, :3], model.first_state(samples[0, :3], {}))
-    assert np.std(found[400:, 0] - vy[400:]) < 0.5 * np.std(vy[400:])
 
 
 def test_refuses_weights_of_another_network():

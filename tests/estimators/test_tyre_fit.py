@@ -55,11 +55,15 @@ def test_fit_finds_the_curves_of_a_car_that_has_such_curves(kind):
     assert (fit.interval / CURVES[kind] < 0.1).all()
 
 
-def test_without_noise_the_forces_are_those_of_the_car():
+def test_without_noise_the_forces_are_those_of_the_car_and_refusals_say_what_to_do():
     clean = drive(noise=0.0)
     motion = axle_motion([clean], TRUCK)
     for curve, slip, force in zip(CURVES["rational"], motion.slip, motion.force, strict=True):
         assert np.sqrt(np.mean((axle_force("rational", curve, slip) - force) ** 2)) < 0.005 * np.abs(force).max()
+    own = drive()
+    assert "100 are needed" in refusal(lambda: axle_motion([own.cut(0.0, 1.0)], TRUCK))
+    with pytest.raises(DataError, match="check the signs of steer, ay and vy_ref"):
+        fit_motion(axle_motion([replace(own, channels={**own.channels, "ay": -own["ay"], "yaw_rate": -own["yaw_rate"]})], TRUCK))
 
 
 def test_intervals_hold_the_truth_about_as_often_as_they_say():
@@ -92,10 +96,3 @@ def test_measured_forces_and_several_drives_count_and_slow_samples_do_not():
     motion = axle_motion([replace(own, channels={**own.channels, "vx": slow, "ay": unknown}, gappy=frozenset({"ay"}))], TRUCK)
     assert motion.slip.shape == motion.force.shape == (2, len(motion.block))
     assert len(motion.block) == len(own) - 500 - 100 - 24 - 12  # the smoothing reaches 12 samples to either side
-
-
-def test_refusals_say_what_to_do():
-    own = drive()
-    assert "100 are needed" in refusal(lambda: axle_motion([own.cut(0.0, 1.0)], TRUCK))
-    with pytest.raises(DataError, match="check the signs of steer, ay and vy_ref"):
-        fit_motion(axle_motion([replace(own, channels={**own.channels, "ay": -own["ay"], "yaw_rate": -own["yaw_rate"]})], TRUCK))

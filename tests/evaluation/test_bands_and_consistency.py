@@ -97,10 +97,14 @@ def test_intervals_of_coverage_hold_the_truth_where_blocks_are_alike_inside():
     assert held / 2000 >= 0.95 - 0.015
 
 
-def test_interval_of_full_coverage_is_that_of_one_sample_a_block():
+def test_interval_of_full_coverage_is_that_of_one_sample_a_block_and_edges_count():
     low, high = proportion_interval(np.full(10, 50.0), np.full(10, 50.0))
     assert low == pytest.approx(0.025 ** (1.0 / 10.0))  # Clopper & Pearson for 10 of 10
     assert high == 1.0
+    nis, dof = np.array([0.0, 3.0, 1.0]), np.array([0.0, 4.0, 2.0])
+    assert normalised_innovation_squared(nis, dof) == pytest.approx((0.75 + 0.5) / 2)
+    assert math.isnan(normalised_innovation_squared(nis[:1], dof[:1]))
+    assert coverage(np.array([0.1, -2.0, 2.0, 3.0]), np.ones(4), 2.0) == 0.75
 
 
 def test_true_bands_cover_what_they_say():
@@ -184,10 +188,3 @@ def test_normalised_errors_are_those_of_a_hand_calculation_and_infinite_without_
     squared = normalised_error_squared(np.full((4, 2), 0.5), improper)
     assert np.isinf(squared[:3]).all()
     assert squared[3] == pytest.approx(0.25)
-
-
-def test_edges_count_and_updates_without_measurements_do_not():
-    nis, dof = np.array([0.0, 3.0, 1.0]), np.array([0.0, 4.0, 2.0])
-    assert normalised_innovation_squared(nis, dof) == pytest.approx((0.75 + 0.5) / 2)
-    assert math.isnan(normalised_innovation_squared(nis[:1], dof[:1]))
-    assert coverage(np.array([0.1, -2.0, 2.0, 3.0]), np.ones(4), 2.0) == 0.75

@@ -146,12 +146,14 @@ def figures(recording, vy):
     return lever_arm_figures([scored(recording, vy)], [(recording, span)], PROTOCOL)
 
 
-@pytest.mark.parametrize("x", [-0.4, 0.0, 0.27])
-def test_a_planted_lever_arm_is_found_and_leaves_no_error(x):
+def test_a_planted_lever_arm_is_found_and_leaves_no_error_and_nothing_is_given_where_the_point_is_known_or_undeclared():
     recording = drive()
-    found = figures(recording, recording["vy_ref"] + x * recording["yaw_rate"])
-    assert found["lever_arm"] == pytest.approx(x, abs=1e-12)
-    assert [found[name] for name in ("rmse_vy", "rmse_sideslip", "fvu")] == pytest.approx([0.0, 0.0, 0.0], abs=1e-9)
+    for x in (-0.4, 0.0, 0.27):
+        found = figures(recording, recording["vy_ref"] + x * recording["yaw_rate"])
+        assert found["lever_arm"] == pytest.approx(x, abs=1e-12)
+        assert [found[name] for name in ("rmse_vy", "rmse_sideslip", "fvu")] == pytest.approx([0.0, 0.0, 0.0], abs=1e-9)
+    for recording in (drive(None), drive({"x": 0.0, "y": 0.0})):
+        assert figures(recording, recording["vy_ref"]) == {}
 
 
 def test_no_other_lever_arm_leaves_less_of_a_noisy_estimate():
@@ -177,12 +179,6 @@ def test_lever_arms_end_at_half_a_metre_and_need_a_turn():
     straight = replace(recording, channels={**recording.channels, "yaw_rate": np.zeros(N)})
     found = figures(straight, recording["vy_ref"] + 0.1)
     assert (found["lever_arm"], found["rmse_vy"]) == (0.0, pytest.approx(0.1))
-
-
-@pytest.mark.parametrize("point", [None, {"x": 0.0, "y": 0.0}])
-def test_where_the_point_is_known_or_undeclared_nothing_is_given(point):
-    recording = drive(point)
-    assert figures(recording, recording["vy_ref"]) == {}
 
 
 def driven_by(errors_deg, ay):

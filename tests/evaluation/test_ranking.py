@@ -68,11 +68,7 @@ def test_block_length_is_that_of_another_library(memory):
     assert politis_white_length([values]) == _length(covariances, window, 900)
 
 
-def test_equal_values_are_blocks_of_their_own():
-    assert politis_white_length([np.ones(50)]) == 1.0
-
-
-def test_many_ranges_are_blocks_and_few_are_cut():
+def test_many_ranges_are_blocks_few_are_cut_and_equal_values_are_blocks_of_their_own():
     generator = np.random.default_rng(1)
     many = segments_of([scored(coloured(generator, 100)) for _ in range(9)], RATE)
     assert list(block_labels(many, many.squared_error_vy[None])) == [label for label in range(9) for _ in range(5)]
@@ -80,6 +76,7 @@ def test_many_ranges_are_blocks_and_few_are_cut():
     labels = block_labels(few, few.squared_error_vy[None])
     assert 2 < labels.max() + 1 < 400
     assert not set(labels[few.piece == 0]) & set(labels[few.piece == 1])
+    assert politis_white_length([np.ones(50)]) == 1.0
 
 
 @pytest.mark.parametrize("memory", [0.0, 0.98])

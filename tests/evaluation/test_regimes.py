@@ -45,14 +45,11 @@ def test_regimes_are_where_the_drive_was_made_to_have_them_one_of_each_kind():
     assert masks["steady"][(time < 9.7) | ((time > 11.5) & (time < 19.7)) | (time > 21.8)].all()
 
 
-def test_regimes_of_a_range_are_those_of_the_whole_drive_there():
+def test_regimes_of_a_range_are_those_of_the_whole_drive_and_slopes_are_known_across_a_gap():
     whole = regimes_of(stepped_drive(), Span("d", "steps"), ALL)
     cut = regimes_of(stepped_drive(), Span("d", "steps", 5.0, 20.5), Protocol(RATE, 0.0, 1.5))
     for name, mask in cut.items():
         assert np.array_equal(mask, whole[name][130:410]), name
-
-
-def test_slope_of_a_ramp_is_its_own_even_across_a_gap():
     ramp = 3.0 * np.arange(200) / RATE
     assert np.allclose(slope(ramp, RATE), 3.0)
     ramp[50:60] = np.nan

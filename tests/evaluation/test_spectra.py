@@ -37,12 +37,6 @@ def test_sinusoids_stand_in_their_bin_and_recordings_count_by_segments():
     np.testing.assert_allclose(together.density, (7 * apart[0].density + apart[1].density) / 8, rtol=1e-12)
 
 
-def test_series_that_cannot_be_read_are_refused():
-    assert "series 1 lasts 25.0 s" in refusal(lambda: periodogram([np.zeros(600), np.zeros(500)], RATE))
-    assert "series 0 has gaps" in refusal(lambda: periodogram([np.full(600, np.nan)], RATE))
-    assert "at least one" in refusal(lambda: periodogram([], RATE))
-
-
 def test_planted_biases_and_noise_are_the_process_noise_of_the_documented_rate(drive):
     hz, time = 1.0, drive.time
     waving = replace(drive, channels={**drive.channels, "vy_ref": np.sin(2 * np.pi * hz * time)})
@@ -62,9 +56,12 @@ def test_planted_biases_and_noise_are_the_process_noise_of_the_documented_rate(d
     assert own.level(1.0) == pytest.approx(0.4**2 / 10.0, rel=4 / np.sqrt(6 * own.n_segments))
 
 
-def test_level_is_the_mean_of_a_third_of_an_octave_and_differences_are_in_decibels():
+def test_level_is_the_mean_of_a_third_of_an_octave_and_what_cannot_be_read_is_refused():
     own = periodogram([np.random.default_rng(4).standard_normal(2048)], RATE)
     inside = [density for hz, density in zip(own.frequency, own.density, strict=True) if 0.8909 <= hz <= 1.1225]
     assert own.level(1.0) == pytest.approx(np.mean(inside))
     assert decibels(10.0 * own.level(1.0), own.level(1.0)) == pytest.approx(10.0)
     assert "has no line at 15 Hz" in refusal(lambda: own.level(15.0))
+    assert "series 1 lasts 25.0 s" in refusal(lambda: periodogram([np.zeros(600), np.zeros(500)], RATE))
+    assert "series 0 has gaps" in refusal(lambda: periodogram([np.full(600, np.nan)], RATE))
+    assert "at least one" in refusal(lambda: periodogram([], RATE))

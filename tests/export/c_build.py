@@ -1,7 +1,5 @@
 """Exported methods as shared libraries: what a C compiler makes of them, called on whole drives."""
 
-from __future__ import annotations
-
 import ctypes
 import shutil
 import subprocess

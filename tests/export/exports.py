@@ -1,7 +1,5 @@
 """Exports of every family: fitted for a moment, with limits, health and bands, written, built and run."""
 
-from __future__ import annotations
-
 import shutil
 import subprocess
 from dataclasses import dataclass, replace

@@ -1,7 +1,5 @@
 """What an export takes: bytes of state, code and tables, and the worst case of its stack, as compilers that are there say it."""
 
-from __future__ import annotations
-
 import re
 import shutil
 import subprocess
@@ -53,12 +51,7 @@ class Footprint:
 
 
 def footprint(files: Mapping[str, str], target: Target) -> Footprint | None:
-    """What an export takes on a target; None where there is no compiler for it, or it cannot say.
-
-    Args:
-        files: name -> text, as those of `vehest.export.program`; main.c does not count.
-        target: to compile for.
-    """
+    """What files, name -> text, take on a target, main.c aside; None where there is no compiler for it, or it cannot say."""
     if target.compiler is None:
         return None
     with tempfile.TemporaryDirectory() as temporary:
@@ -103,18 +96,8 @@ def _sections(said: str) -> tuple[int, int, int]:
 
 
 def worst_stack(graphs: Iterable[str], entries: Iterable[str]) -> tuple[int, tuple[str, ...]]:
-    """Bytes of the deepest chain of calls from one of the entries, and functions that are called but not there.
-
-    Args:
-        graphs: of each source, as ``gcc -fcallgraph-info=su`` writes them.
-        entries: functions that are called from outside.
-
-    Raises:
-        RecursionError: a function calls itself, directly or not.
-    """
-    own: dict[str, int] = {}
-    calls: dict[str, set[str]] = {}
-    known: set[str] = set()
+    """Bytes of the deepest chain of calls from entries in ``gcc -fcallgraph-info=su``; functions that are called and absent."""
+    own, calls, known = {}, {}, set()
     for graph in graphs:
         for title, label in _NODE.findall(graph):
             known.add(title)

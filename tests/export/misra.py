@@ -52,15 +52,10 @@ def documented(text):
     return {rule: int(count) for rule, count in _ROW.findall(text)}
 
 
-def main():
-    """Print the counts, a row a rule."""
+if __name__ == "__main__":
     with tempfile.TemporaryDirectory() as home:
         rules, others = found(Path(home))
     for rule, count in sorted(rules.items(), key=lambda own: [int(part) for part in own[0].split(".")]):
         print(f"| {rule} | {count} |")
     for line in others:
         print(line, file=sys.stderr)
-
-
-if __name__ == "__main__":
-    main()

@@ -27,9 +27,6 @@ def test_a_digit_beyond_the_ninth_is_no_change_and_any_other_is():
     assert differences("x = 0.3;\n", "x = 0.3;\n\n")
 
 
-DOCUMENT = Path(__file__).parents[2] / "docs" / "export.md"
-
-
 def test_each_broken_rule_is_explained_with_its_count(tmp_path):
     tool("cppcheck")
     if version() != VERSION:
@@ -37,5 +34,5 @@ def test_each_broken_rule_is_explained_with_its_count(tmp_path):
     rules, others = found(tmp_path)
     if "-" in rules or not rules:
         pytest.skip("cppcheck has no MISRA addon")
-    assert dict(rules) == documented(DOCUMENT.read_text(encoding="utf-8"))
+    assert dict(rules) == documented((Path(__file__).parents[2] / "docs" / "export.md").read_text(encoding="utf-8"))
     assert not [line for line in others if "whitened" not in line]  # a triangle that is written before it is read, row by row

@@ -1,9 +1,8 @@
 """A method in C says what Python's stepper says, sample by sample: gaps, restarts and float included."""
 
-from __future__ import annotations
-
 import copy
-from dataclasses import dataclass, replace
+from collections import namedtuple
+from dataclasses import replace
 from functools import cache
 
 import numpy as np
@@ -18,7 +17,7 @@ from example_package import forget_examples, install_examples
 from real_drives import real_drive
 from vehest.data.errors import ConfigurationError, DataError
 from vehest.data.transforms import Resample
-from vehest.estimators.base import Estimator, FitData
+from vehest.estimators.base import FitData
 from vehest.estimators.network import Network
 from vehest.estimators.network_ukf import NetworkUkf
 from vehest.estimators.networks.windowed import WindowedEstimator
@@ -64,15 +63,7 @@ pytestmark = [pytest.mark.export, pytest.mark.skipif(not COMPILERS, reason="ther
 each_variant = pytest.mark.parametrize(
     "variant", VARIANTS, ids=lambda own: "-".join([own[0], *(f"{key}={value}" for key, value in own[1].items() if key not in TRACK)])
 )
-
-
-@dataclass(frozen=True, eq=False)
-class Case:
-    """An estimator as it was trained, the same in float64, and rows of its channels."""
-
-    estimator: Estimator
-    in_float64: Estimator
-    rows: np.ndarray
+Case = namedtuple("Case", "estimator in_float64 rows")  # an estimator as it was trained, the same in float64, rows of its channels
 
 
 def case_of(name, config):
@@ -84,7 +75,8 @@ def case_of(name, config):
 def _case(name, config):
     given = next(own for family, own in VARIANTS if family == name and repr(own) == config)
     estimator = of_dugoff(name, given) if name in ON_DUGOFF else fitted(name, "float32", **given)
-    rows = dugoff_rows(estimator) if name in ON_DUGOFF else drive_for(estimator).stack(estimator.channels)
+    on_dugoff = name in ON_DUGOFF and np.stack([dugoff_channels()[own] for own in estimator.channels], axis=1)
+    rows = on_dugoff if name in ON_DUGOFF else drive_for(estimator).stack(estimator.channels)
     return Case(estimator, widened(estimator), disturbed(estimator, rows))
 
 
@@ -121,10 +113,6 @@ def dugoff_channels():
         for corner in ("fl", "fr", "rl", "rr"):
             channels[f"f{axis}_{corner}"] = loads[corner[0] == "r"] + 70.0 * generator.standard_normal(n)
     return channels
-
-
-def dugoff_rows(estimator):
-    return np.stack([dugoff_channels()[name] for name in estimator.channels], axis=1)
 
 
 def widened(estimator):

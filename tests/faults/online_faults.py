@@ -11,19 +11,17 @@ estimator's first sample on. What is asked of a case:
 - `within_speed`: the lateral velocity never exceeded what the last believed speed allows.
 """
 
-from __future__ import annotations
-
 import argparse
 import math
 import os
 import time
 import warnings
+from collections import namedtuple
 from concurrent.futures import ProcessPoolExecutor
 from functools import cache
 from itertools import product
 from multiprocessing import get_context
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 import pandas as pd
@@ -81,17 +79,8 @@ FERRARI = {
 }
 SMALL_CAR = {"learned_ukf": ("estimator.dynamics=pacejka", "training.one_step.max_epochs=60", "training.noise.max_epochs=3")}
 SLOW = ("learned_ukf", "kalman", "dugoff_ukf", "factor_graph", "cnn_ukf", "ensemble_ukf")
-
-
-class Ground(NamedTuple):
-    """Where families are tried: ranges of a data set to learn from and to be tried on, in seconds after the first sample."""
-
-    data: str
-    kind: str
-    train: tuple[str, float, float]
-    validation: tuple[str, float, float]
-    trial: tuple[str, float]
-    families: dict[str, tuple[str, ...]]
+Ground = namedtuple("Ground", "data kind train validation trial families")
+"""Where families are tried: ranges of a data set to learn from and to be tried on, in seconds after the first sample."""
 
 
 def grounds():

@@ -1,10 +1,8 @@
 """Filters to compare compiled ones with: unscented and extended as their equations stand, in torch, and a gate around any filter."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
@@ -137,7 +135,7 @@ def _updated(model, state, factor, y, u, rule):
 
     posterior, covariance, lost = conditioned(rule)
     if rule.centre_covariance < 0.0 and (lost or factorised(posterior.covariance)[2]):
-        (posterior, covariance, _), lost = conditioned(replace(rule, centre_covariance=0.0)), True
+        (posterior, covariance, _), lost = conditioned(rule._replace(centre_covariance=0.0)), True
     return posterior, innovation, covariance, measured, lost
 
 

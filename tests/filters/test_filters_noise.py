@@ -43,19 +43,16 @@ def test_learnt_noises_stay_definite_and_give_gradients_wherever_they_go():
         assert all(parameter.grad is not None and parameter.grad.abs().sum() > 0 for parameter in noise.parameters())
 
 
-def test_factors_of_zero_leave_the_floor_and_numbers_of_parameters_are_those_of_factors():
+def test_state_dependent_noise_is_the_formula_written_out_and_factors_of_zero_leave_the_floor():
+    noise = drawn(StateDependentNoise([0.2, 0.3], 5), 0.5, 3)
+    a, b, c = (noise.weight @ STATE[2]).tolist()
+    lower = torch.tensor([[a, 0.0], [b, c]])
+    assert torch.allclose(noise(STATE, INPUTS)[2], torch.diag(torch.tensor([0.2, 0.3])) + 0.01 * lower @ lower.mT, atol=1e-6)
     noise = ConstantNoise([1.0, 1.0])
     torch.nn.init.zeros_(noise.factor)
     assert torch.equal(noise(STATE, INPUTS)[0], FLOOR * torch.eye(2))
     assert sum(parameter.numel() for parameter in ConstantNoise(START).parameters()) == 15
     assert sum(parameter.numel() for parameter in StateDependentNoise(START, 5).parameters()) == 15 + 15 * 6
-
-
-def test_state_dependent_noise_is_the_formula_written_out():
-    noise = drawn(StateDependentNoise([0.2, 0.3], 5), 0.5, 3)
-    a, b, c = (noise.weight @ STATE[2]).tolist()
-    lower = torch.tensor([[a, 0.0], [b, c]])
-    assert torch.allclose(noise(STATE, INPUTS)[2], torch.diag(torch.tensor([0.2, 0.3])) + 0.01 * lower @ lower.mT, atol=1e-6)
 
 
 def test_entropy_is_that_of_a_library_and_is_raised_to_its_floor():
@@ -85,30 +82,21 @@ def test_compiled_it_is_the_same_with_and_without_a_floor(dtype, tolerance):
     assert float((with_entropy(known, floor) - known).abs().max()) > 0.01, "the floor is met"
 
 
-def test_level_of_white_noise_is_its_share_above_the_cutoff():
+def test_level_of_white_noise_is_its_share_above_the_cutoff_without_slow_signals_offsets_gaps_and_ends():
     """A fraction 1 - c of white noise's power lies above c times the Nyquist frequency; 2 % leaves room for the filter's slopes."""
     noise = 0.3 * np.random.default_rng(0).standard_normal(100_000)
     for cutoff in (0.1, 0.2):
         assert high_passed_level([noise], cutoff) == pytest.approx(0.3 * np.sqrt(1 - cutoff), rel=0.02)
-
-
-def test_slow_signals_and_offsets_are_no_noise():
-    """60 dB down below 0.75 times the cut-off."""
+    # 60 dB down below 0.75 times the cut-off.
     time = np.arange(20_000) / 100.0
     noise = 0.01 * np.random.default_rng(1).standard_normal(len(time))
     slow = 5.0 + 3.0 * np.sin(2 * np.pi * 0.5 * time) + np.sin(2 * np.pi * 7.0 * time)
     assert high_passed_level([slow], 0.2) < 1e-3
     assert high_passed_level([slow + noise], 0.2) == pytest.approx(high_passed_level([noise], 0.2), rel=0.02)
-
-
-def test_gaps_and_ends_do_not_count():
     noise = np.random.default_rng(2).standard_normal(2_000)
     offset = noise + 1e3
     offset[700] = np.nan
     without = high_passed_level([noise[:700], noise[701:]], 0.2)
     assert high_passed_level([offset], 0.2) == pytest.approx(without, rel=1e-6)
-
-
-def test_what_is_too_short_is_refused():
     with pytest.raises(ValueError, match="samples without a gap"):
         high_passed_level([np.zeros(50)], 0.2)

@@ -126,13 +126,3 @@ def test_unscented_filter_is_that_of_an_independent_library(rule, points):
         assert ours.filtered.mean[k].numpy() == pytest.approx(theirs.x, abs=1e-8)
         assert ours.filtered.covariance[k].numpy() == pytest.approx(theirs.P, abs=1e-8)
         assert float(log_likelihood(ours)[k]) == pytest.approx(theirs.log_likelihood, abs=1e-6)
-
-
-def sharp():
-    """A model whose curvature makes a negative centre weight lose the covariance's definiteness."""
-    return NonlinearModel(
-        lambda x, u: torch.cat([x[..., :1] + 0.5 * x.square().sum(-1, keepdim=True), 0.9 * x[..., 1:]], -1).clamp(-5.0, 5.0),
-        lambda x, u: x[..., :2],
-        constant(1e-6 * torch.eye(5, dtype=torch.float64)),
-        constant(1e-2 * torch.eye(2, dtype=torch.float64)),
-    )

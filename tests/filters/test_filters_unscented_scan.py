@@ -1,16 +1,13 @@
 """The compiled scan is the readable unscented filter, in values and gradients; that one is filterpy's to 1e-8 (test_filters_nonlinear)."""
 
-from __future__ import annotations
-
 import dataclasses
+from collections import namedtuple
 from functools import partial
-from typing import NamedTuple
 
 import pytest
 import torch
-from readable_filters import unscented_filter
-from test_filters_nonlinear import RULES, STEP, constant, measured_pendulum, pendulum_with_radar, sharp
-from torch import Tensor
+from readable_filters import NonlinearModel, unscented_filter
+from test_filters_nonlinear import RULES, STEP, constant, measured_pendulum, pendulum_with_radar
 
 from point_models import noise_by
 from vehest.filters.gaussian import Gaussian
@@ -19,16 +16,7 @@ from vehest.filters.unscented_scan import TorchModel, UnscentedStepper, moved, u
 
 FREE = [-1e9, -1e9, -1e9]
 ANY = {"measurements": torch.zeros(2, 5, 2), "inputs": torch.zeros(2, 5, 1)}
-
-
-class Learnt(NamedTuple):
-    """What gradients are wanted for."""
-
-    process: Tensor
-    observation: Tensor
-    mean: Tensor
-    covariance: Tensor
-    gravity: Tensor
+Learnt = namedtuple("Learnt", "process observation mean covariance gravity")  # what gradients are wanted for
 
 
 def learnt(first):
@@ -104,61 +92,60 @@ def test_missing_measurements_and_bounds_of_states_are_as_by_the_filter():
     for a, b in zip(gradients, own, strict=True):
         assert torch.isfinite(b).all()
         assert torch.allclose(a, b, rtol=0, atol=1e-10 * float(a.abs().max()))
-    lower = [-1e9, -1e9, 0.25]
+    lower = [-1e9, 0.05, 0.25]
     (filtered, gradients), (scanned, own) = both_ways(RULES["scaled"], *measured_pendulum(30, 4), lower=lower)
     assert (scanned.steps.filtered.mean[..., 2] == 0.25).any(), "the bound is met"
+    assert (scanned.steps.predicted.mean[..., 1] == 0.05).any(), "and that of the rate when it falls"
     assert (scanned.steps.filtered.mean[..., 2] >= 0.25).all()
     assert_equal(filtered, scanned)
     for a, b in zip(gradients, own, strict=True):
         assert torch.allclose(a, b, rtol=0, atol=1e-10 * float(a.abs().max()))
 
 
-def spread(*sizes):
-    """Sequences of `sharp` that are more or less spread to begin with."""
-    covariances = torch.tensor(sizes, dtype=torch.float64)[:, None, None] * torch.eye(5, dtype=torch.float64)
-    return Gaussian(torch.zeros(len(sizes), 5, dtype=torch.float64), covariances)
+VARIANCES = torch.tensor([[20.0, 20, 20], [1, 20, 20], [2.9, 20, 20], [-2, 20, 20], [20, 0.5, 20], [20, 20, 20]], dtype=torch.float64)
+"""Of squares at three samples, by which the negative weight of the mean point costs nothing, the definiteness of the innovation, that of
+the state after it, the innovation's even without that weight, and that of the innovation at the second sample. The last sequence begins
+with a covariance that is not positive definite."""
 
 
-def sharply_scanned(initial, repair=True):
-    sequences = len(initial.mean)
-    measurements = 0.1 * torch.randn(2, 20, 2, generator=torch.Generator().manual_seed(2), dtype=torch.float64)[:sequences]
-    model, nothing = sharp(), torch.zeros(5, dtype=torch.float64)
-    noises = [noise(nothing, nothing) for noise in (model.process_noise, model.observation_noise)]
-    points = TorchModel(model.transition, model.observation)
-    inputs = torch.zeros(sequences, 20, 1, dtype=torch.float64)
-    return unscented_scan(points, measurements, inputs, initial, *noises, symmetric_rule(5, -2.0), repair=repair)
+def squares(way, repair=True):
+    """Sequences with these variances by the readable filter or the scan, and gradients of means in the first mean and covariance."""
+    eye, lone = torch.eye(3, dtype=torch.float64), torch.tensor([1.0, -0.1, 1.0], dtype=torch.float64).diag()
+    mean = torch.tensor([[0.5, 0.0, 0.1]] * 3 + [[0.0, 0.0, 0.0]] + [[0.5, 0.0, 0.1]] * 2, dtype=torch.float64)
+    first = Gaussian(mean.requires_grad_(), torch.cat([eye.expand(5, 3, 3), lone[None]]).requires_grad_())
+    y, u, rule = torch.full((6, 3, 2), 0.1, dtype=torch.float64), VARIANCES[..., None], symmetric_rule(3, -1.0)
+    model = NonlinearModel(
+        lambda x, _: 0.9 * x,
+        lambda x, _: torch.stack([x.square().sum(-1), x[..., 0]], -1),
+        constant(1e-4 * eye),
+        lambda _, variance: torch.diag_embed(torch.cat([variance, 0.0 * variance + 2.0], -1)),
+    )
+    if way == "filter":
+        filtered = unscented_filter(model, y, u, first, rule)
+    else:
+        noises = 1e-4 * eye, model.observation_noise(None, u)
+        filtered = unscented_scan(TorchModel(model.transition, model.observation), y, u, first, *noises, rule, repair=repair)
+    return filtered, torch.autograd.grad(filtered.steps.filtered.mean[: 6 if repair else 1].square().sum(), first)
 
 
 def test_lost_definiteness_is_repaired_and_counted_as_by_the_filter():
-    initial = spread(1.0, 1e-3)
-    measurements = 0.1 * torch.randn(2, 20, 2, generator=torch.Generator().manual_seed(2), dtype=torch.float64)
-    inputs = torch.zeros(2, 20, 1, dtype=torch.float64)
-    filtered = unscented_filter(sharp(), measurements, inputs, initial, symmetric_rule(5, -2.0))
-    scanned = sharply_scanned(initial)
-    assert scanned.repaired[0].any()
-    assert torch.equal(filtered.repaired, scanned.repaired)
-    assert torch.allclose(filtered.steps.filtered.mean, scanned.steps.filtered.mean, rtol=0, atol=1e-6)
-    slopes = []
-    for way in (lambda first: unscented_filter(sharp(), measurements, inputs, first, symmetric_rule(5, -2.0)), sharply_scanned):
-        start = initial.mean.clone().requires_grad_()
-        way(Gaussian(start, initial.covariance)).steps.filtered.mean.square().sum().backward()
-        slopes.append(start.grad)
-    assert torch.allclose(*slopes, rtol=0, atol=1e-6 * float(slopes[0].abs().max()))
+    (filtered, slopes), (scanned, own) = squares("filter"), squares("scan")
+    assert_equal(filtered, scanned)
+    ways = [[False] * 3, [True, False, False], [True, False, False], [True, False, False], [False, True, False], [True, False, False]]
+    assert scanned.repaired.tolist() == ways
+    for a, b in zip(slopes, own, strict=True):
+        assert torch.allclose(a, b, rtol=1e-9, atol=1e-10)  # the fourth is conditioned like the margin of a repair, 1e6
 
 
 def test_without_repair_a_sequence_is_lost_and_leaves_the_others_alone():
-    initial = spread(1.0, 1e-3)
-    start = initial.mean.clone().requires_grad_()
-    left = sharply_scanned(Gaussian(start, initial.covariance), repair=False)
-    mean = left.steps.filtered.mean
-    first = int(left.repaired[0].int().argmax())
-    assert torch.isnan(mean[0, first:]).all()
-    assert torch.isfinite(mean[0, :first]).all()
-    tame = sharply_scanned(Gaussian(initial.mean, initial.covariance))
-    assert torch.equal(mean[1], tame.steps.filtered.mean[1])
-    assert torch.equal(left.steps.innovation_covariance[1], tame.steps.innovation_covariance[1])
-    mean[1].square().sum().backward()
-    assert torch.isfinite(start.grad[1]).all()
+    (left, slopes), (tame, _) = squares("scan", repair=False), squares("scan")
+    for sequence, first in enumerate((3, 0, 1, 0, 1, 0)):
+        mean = left.steps.filtered.mean[sequence]
+        assert torch.isfinite(mean[:first]).all(), sequence
+        assert torch.isnan(mean[first:]).all(), sequence
+    assert torch.equal(left.steps.filtered.mean[0], tame.steps.filtered.mean[0])
+    assert torch.equal(left.steps.innovation_covariance[0], tame.steps.innovation_covariance[0])
+    assert torch.isfinite(slopes[0][0]).all()
 
 
 def test_sequences_shared_out_are_what_they_are_together():

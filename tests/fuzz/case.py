@@ -1,13 +1,11 @@
 """What a generator is given and what it returns, and the register of all generators."""
 
-from __future__ import annotations
-
 import importlib
 import os
 import pkgutil
 import random
 import shutil
-from collections.abc import Callable
+from collections import namedtuple
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -73,20 +71,8 @@ class Case:
         return -1 if self.honest else self.visit % number
 
 
-Build = Callable[[Case], Command]
-
-
-@dataclass(frozen=True)
-class Generator:
-    """A way to make inputs: a function of a family's module that writes the files of a case and returns the command."""
-
-    family: str
-    name: str
-    build: Build
-    needs: tuple[str, ...]  # names of templates
-    weight: int  # how often it is taken in a round
-
-
+Generator = namedtuple("Generator", "family name build needs weight")
+"""A way to make inputs: a function that writes the files of a case and returns the command, templates, and its turns in a round."""
 GENERATORS = []
 TEMPLATES = {}
 

@@ -1,7 +1,5 @@
 """The process that imports once, and the workers that build inputs and fork a child for each."""
 
-from __future__ import annotations
-
 import contextlib
 import gc
 import io
@@ -16,8 +14,7 @@ import signal
 import sys
 import time
 import traceback
-from collections import Counter
-from dataclasses import dataclass
+from collections import Counter, namedtuple
 from pathlib import Path
 
 import pandas as pd
@@ -29,24 +26,8 @@ from vehest.data.errors import printable
 
 MOST_WALL_SECONDS = 180.0
 POLL_SECONDS = 0.02
-
-
-@dataclass(frozen=True)
-class Row:
-    """One input and what became of it: a line of the CSV file."""
-
-    index: int
-    family: str
-    generator: str
-    honest: bool
-    command: str
-    exit_code: int
-    seconds: float
-    cpu_seconds: float
-    peak_mb: float
-    error: str
-    verdict: str
-    detail: str
+Row = namedtuple("Row", "index family generator honest command exit_code seconds cpu_seconds peak_mb error verdict detail")
+"""One input and what became of it: a line of the CSV file."""
 
 
 class Fuzzer:
@@ -184,8 +165,8 @@ class _Readers:
     def __init__(self, command):
         self._command = command
         self.command_kb = 0  # most memory of the command
-        self.peaks_kb: dict[str, int] = {}  # of each reading process
-        self._waits: dict[str, float] = {}
+        self.peaks_kb = {}  # of each reading process
+        self._waits = {}
 
     @property
     def waited(self):

@@ -49,10 +49,6 @@ def test_each_misdeed_gets_its_verdict(tmp_path):
     assert {"refused"} == set(VERDICTS) - {verdict for verdict, _ in MISDEEDS.values()}
 
 
-def case_in(folder, *, honest):
-    return Case(folder, folder / "templates", random.Random(0), honest, 0)
-
-
 def outcome(exit_code, stderr, changed=()):
     return Outcome(exit_code, 0.1, 0.1, 1.0, "", stderr, (), changed, "")
 
@@ -74,7 +70,8 @@ def outcome(exit_code, stderr, changed=()):
     ],
 )
 def test_an_outcome_is_judged_by_exit_code_lines_and_files(tmp_path, honest, ended, verdict):
-    assert judge(case_in(tmp_path, honest=honest), Command(("ingest",), targets=("out.csv",)), ended)[0] == verdict
+    case = Case(tmp_path, tmp_path / "templates", random.Random(0), honest, 0)
+    assert judge(case, Command(("ingest",), targets=("out.csv",)), ended)[0] == verdict
 
 
 def test_what_is_written_is_seen_in_the_folders(tmp_path):

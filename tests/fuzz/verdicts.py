@@ -1,7 +1,5 @@
 """What became of an input: one word, the gravest that applies."""
 
-from __future__ import annotations
-
 import os
 import re
 import stat

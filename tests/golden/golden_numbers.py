@@ -1,7 +1,5 @@
 """Numbers of every estimator family, source and stage on small recordings, and what is recorded of them; `make golden` records anew."""
 
-from __future__ import annotations
-
 import contextlib
 import csv
 import hashlib
@@ -14,7 +12,6 @@ from dataclasses import dataclass
 from functools import cache, partial
 from importlib import metadata
 from pathlib import Path
-from typing import Any
 
 import llvmlite.binding
 import numpy as np
@@ -37,7 +34,7 @@ LIBRARIES = ("numpy", "scipy", "numba", "torch")
 VEHICLE = Path(__file__).parents[2] / "conf" / "vehicle" / "bmw_320i_low.yaml"
 MODEL = "static_map"
 TRAINED = (f"estimator={MODEL}", "estimator.rate_hz=20", "split=mine", "tracking=none")
-Arrays = dict[str, np.ndarray[Any, Any]]
+Arrays = dict[str, np.ndarray]
 
 
 @dataclass(frozen=True)
@@ -226,10 +223,6 @@ def _made(pattern):
     return file
 
 
-def _calibrated(folder):
-    return dict(_leaves("", yaml.safe_load(_made("calibrate/*/trust.yaml").read_text(encoding="utf-8"))))
-
-
 def _metrics(chosen):
     with _made("evaluate/*/metrics.csv").open(newline="", encoding="utf-8") as stream:
         rows = [row for row in csv.DictReader(stream) if chosen(row["condition"])]
@@ -262,7 +255,7 @@ def _leaves(path, content):
 
 STAGES = {
     downsample: _downsampled,
-    calibrate: _calibrated,
+    calibrate: lambda _: dict(_leaves("", yaml.safe_load(_made("calibrate/*/trust.yaml").read_text(encoding="utf-8")))),
     evaluate: lambda _: _metrics(lambda condition: not is_fault(condition)),
     evaluate_faults: lambda _: _metrics(is_fault),
 }

@@ -35,14 +35,9 @@ def read(name, root):
     return found
 
 
-def main():
-    """Record the readings on this machine."""
+if __name__ == "__main__":
     root = os.environ.get("VEHEST_DATA")
     if not root:
         sys.exit("readings: VEHEST_DATA is not set, nothing recorded")
     lines = ",\n".join(f"{json.dumps(name)}: {json.dumps(read(name, root), separators=(',', ':'))}" for name in READINGS)
     FILE.write_text(f'{{"machine": {json.dumps(this_machine())},\n"readings": {{\n{lines}\n}}}}\n', encoding="utf-8")
-
-
-if __name__ == "__main__":
-    main()

@@ -21,9 +21,8 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections import Counter
+from collections import Counter, namedtuple
 from contextlib import suppress
-from dataclasses import dataclass
 from glob import glob
 from pathlib import Path
 
@@ -58,17 +57,8 @@ COUNTS = 3  # a moment is one of the first so many of its kind
 RUN_SECONDS, LOOK_SECONDS = 1800.0, 0.002  # after the first a run hangs
 HEADER = ("number", "round", "jobs", "signal", "stage", "moment", "exit_code", "resumed_runs", "metrics_equal", "tracking_complete")
 HEADER += ("leftovers", "outcome")
-
-
-@dataclass(frozen=True)
-class Kill:
-    """When a run was killed, by what, how it ended, and what was wrong at once."""
-
-    stage: str
-    number: signal.Signals
-    moment: str
-    exit_code: int
-    at_once: tuple[str, ...]
+Kill = namedtuple("Kill", "stage number moment exit_code at_once")
+"""When a run was killed, by what, how it ended, and what was wrong at once."""
 
 
 def started(output, jobs):
@@ -164,11 +154,6 @@ def content(output):
     return found
 
 
-def differences(found, wanted):
-    """What one has and the other has not, or has otherwise."""
-    return [name for name in sorted({*found, *wanted}) if found.get(name) != wanted.get(name)]
-
-
 def tracked(output):
     """Finished run -> its artefact and what was logged of it, times aside; runs that are neither finished nor killed by that name."""
     found = {}
@@ -204,7 +189,10 @@ def one_round(position, wanted, output, reference, draw):
     last = started(output, jobs)
     code, left = last.wait(RUN_SECONDS), strays(last.pid)
     failed = [f"the last run left with {code}, see '{output.with_suffix('.log')}'"] if code != 0 else []
-    metrics, tracking = ([] if failed else differences(of(output), of(reference)) for of in (content, tracked))
+    metrics, tracking = [], []
+    for of, differing in () if failed else ((content, metrics), (tracked, tracking)):
+        found, known = of(output), of(reference)
+        differing += [name for name in sorted({*found, *known}) if found.get(name) != known.get(name)]
     left += [] if failed else leftovers(output)
     equal, complete = ("no" if failed or found else "yes" for found in (metrics, tracking))
     rows = []

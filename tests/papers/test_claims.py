@@ -38,15 +38,12 @@ def test_orders_and_limits_are_judged_by_their_intervals(ranking):
     assert verdicts == ["reproduced", "not reproduced", "undecided"]
 
 
-def test_what_cannot_be_compared_is_not_testable(ranking):
+def test_what_cannot_be_compared_is_not_testable_and_the_table_counts_its_verdicts(ranking):
     missing = order_claim(ranking, NAMES["good"], ("absent", "a"), {**TITLES, ("absent", "a"): "the absent"}, "–", "real")
     assert (missing.verdict, missing.why) == ("not testable on this data", "no finite error of the absent")
     short = rank({NAMES[name]: [segments_of([scored(0.1 * np.ones(40))], RATE)] for name in ("good", "zero")}, RATE)
     assert claimed(short, "good", "zero").verdict == "not testable on this data"
     assert bound_claim(short, NAMES["good"], "the good", math.inf, "–", "real").verdict == "not testable on this data"
-
-
-def test_the_table_counts_its_verdicts(ranking):
     table = claims_table([claimed(ranking, "good", "other"), claimed(ranking, "other", "like")], "A note.")
     assert "1 reproduced, 1 undecided" in table.caption
     assert table.caption.endswith("A note.")

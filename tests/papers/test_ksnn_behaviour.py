@@ -23,14 +23,12 @@ OFFSET = 0.2
 SECONDS = 240.0
 
 
-def without_ay(recording, offset):
-    return replace(recording, channels={**recording.channels, "ay": recording["ay"] - offset})
-
-
 def scheme(folder, *, bias=False):
     """A linear KS-NN and v = 0 on a car measured as it is, and on another whose a_y shows too little."""
     drives = {name: planar_drive(SECONDS, seed=seed, name=name) for seed, name in enumerate(("c1", "c2"))}
-    drives |= {name: without_ay(planar_drive(SECONDS, seed=seed, name=name), OFFSET) for seed, name in ((5, "f1"), (6, "f2"))}
+    for seed, name in ((5, "f1"), (6, "f2")):
+        drive = planar_drive(SECONDS, seed=seed, name=name)
+        drives[name] = replace(drive, channels={**drive.channels, "ay": drive["ay"] - OFFSET})
     network, zero = ksnn_with_weights(n_local=2, bias=bias), estimator_class("zero").from_config({"rate_hz": 20.0})
     spans = {name: (Span("cars", name),) for name in drives}
     split = Split("scheme", spans["c1"], spans["f1"], {"c2": spans["c2"], "f2": spans["f2"]})

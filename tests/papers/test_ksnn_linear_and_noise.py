@@ -18,10 +18,6 @@ from vehest_papers.ksnn.noise_sensitivity import ksnn_sensitivity, luenberger_se
 STRUCTURES = [(1, 0, True), (2, 0, False), (4, 0, True), (2, 2, False), (3, 3, True)]
 
 
-def _noisy_drive(**options):
-    return planar_drive(noise=0.2, **options)
-
-
 def _constant_turn(yaw_rate, n_samples, seed=0):
     """Measurements (1, T, 4) at constant yaw rate; everything else wanders."""
     generator = np.random.default_rng(seed)
@@ -67,7 +63,7 @@ def test_gain_in_force_is_the_slope_of_the_chord_from_zero():
 @pytest.mark.parametrize("structure", STRUCTURES)
 def test_sub_models_add_up_to_the_network_along_a_drive(structure):
     estimator = ksnn_with_weights(*structure)
-    drive = _noisy_drive(seed=1)
+    drive = planar_drive(noise=0.2, seed=1)
     parts, expected = decomposed_estimate(estimator, drive), estimator.estimate([drive.without_references()])[0]["vy"]
     assert np.isnan(parts.total[:30]).all()
     np.testing.assert_allclose(parts.total[30:], expected[30:], rtol=0, atol=1e-9)
@@ -125,17 +121,13 @@ def _turn(yaw_rate, n_samples):
     return np.tile([yaw_rate, 25.0, 25.0 * yaw_rate, 0.0], (n_samples, 1))
 
 
-def _run(estimator, windows):
-    with torch.no_grad():
-        return estimator.network(torch.as_tensor(windows)).numpy()
-
-
 def _measured_impulse_response(estimator, yaw_rate, channel, n_window, size=1.0):
     """Lags 0 to N of the network itself: the impulse stands at each place of the window in turn."""
     windows = np.repeat(_turn(yaw_rate, n_window)[None], n_window + 1, axis=0)
     for lag in range(1, n_window + 1):
         windows[lag, n_window - lag, channel] += size
-    lateral = _run(estimator, windows)
+    with torch.no_grad():
+        lateral = estimator.network(torch.as_tensor(windows)).numpy()
     return (lateral - lateral[0]) / size
 
 
@@ -178,15 +170,12 @@ def test_luenberger_sensitivity_is_the_transform_of_the_observers_impulse_respon
         np.testing.assert_allclose(response, _transform(measured, rate_hz), rtol=0, atol=1e-8)  # 3000 rounded differences add up
 
 
-def test_observer_passes_nothing_where_it_is_reset():
-    closed = luenberger_sensitivity(_luenberger(threshold=0.1), 0.05)
-    assert np.abs(np.stack(closed.response(FREQUENCY))).max() == 0.0
-    assert closed.white_noise_gains() == (0.0, 0.0)
-
-
-def test_variance_is_the_integral_of_the_squared_magnitude():
+def test_variance_is_the_integral_of_the_squared_magnitude_and_an_observer_that_is_reset_passes_nothing():
     model = LocalModels.of(ksnn_with_weights(2, 0, False)).linearised()
     for closed in (ksnn_sensitivity(model, 0.3), ksnn_sensitivity(model, 0.3).truncated(30), luenberger_sensitivity(_luenberger(), 0.3)):
         band = closed.band_gains(closed.rate_hz / 2, n_lines=20_001)
         for gain, over_band in zip(closed.white_noise_gains(), band, strict=True):
             assert over_band / math.sqrt(closed.rate_hz / 2) == pytest.approx(gain, rel=1e-6)
+    closed = luenberger_sensitivity(_luenberger(threshold=0.1), 0.05)
+    assert np.abs(np.stack(closed.response(FREQUENCY))).max() == 0.0
+    assert closed.white_noise_gains() == (0.0, 0.0)

@@ -66,13 +66,10 @@ def test_the_report_tells_what_can_rank_and_why_the_rest_cannot(tmp_path):
     assert set(tables) == {"overview", "recordings", "findings", "licences"}
 
 
-LENGTH = 2000
-
-
 def noise():
     generator = np.random.default_rng(0)
     names = ("vx", "yaw_rate", "ax", "ay", "steer", "vy_ref", "sideslip_ref")
-    return Recording("r", "car", 100.0, 0.0, {name: generator.standard_normal(LENGTH) for name in names})
+    return Recording("r", "car", 100.0, 0.0, {name: generator.standard_normal(2000) for name in names})
 
 
 def fault(name, channel, size):

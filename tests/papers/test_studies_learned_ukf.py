@@ -129,7 +129,7 @@ def test_candidates_have_the_papers_names(settings, candidate):
     assert candidate_of(EvaluatedModel("learned_ukf", estimator.variant, estimator.full_title, 0, Path(), Path())) == candidate
 
 
-def test_candidates_keep_the_papers_names_one_model_a_seed(part):
+def test_candidates_keep_the_papers_names_and_studies_without_parts_or_test_sets_are_refused(part):
     twice = replace(part, models=[part.models[0], part.models[0]])
     assert "NNT was trained twice with one seed" in refusal(lambda: models_by_candidate(twice))
     (name,) = models_by_candidate(only(part, "NNTF_UH", {"one_step": {**PHASE, "max_epochs": 0}}))
@@ -137,6 +137,9 @@ def test_candidates_keep_the_papers_names_one_model_a_seed(part):
     assert candidate_of(EvaluatedModel("learned_ukf_variant", "pc_curved", "", 0, Path(), Path())) == "PC with E"
     metrics = part.metrics[~((part.metrics["metric"] == "mae_weighted") & (part.metrics["seed"] == 1))]
     assert "seed1 has no mae_weighted.tyre_a; evaluate it again" in refusal(lambda: runs_of(replace(part, metrics=metrics)))
+    assert "needs one of the parts: real, simulated" in refusal(lambda: documents(StudyArtefacts("s", "t", "a", "c", {}, {}, [])))
+    other = replace(part, split=Split("s", SPLIT.train, SPLIT.validation, {"wet": SPLIT.tests["tyre_a"]}))
+    assert "must be called tyre_a and tyre_d" in refusal(lambda: documents(StudyArtefacts("s", "t", "a", "c", {}, {"real": other}, [])))
 
 
 def test_report_shows_every_table_and_figure_of_the_paper_and_says_what_its_data_are(part, tmp_path, monkeypatch):
@@ -186,12 +189,6 @@ def only(part, candidate, training=None):
 
 def of_length(part, steps):
     return only(part, "NNTF_U", {"steps": steps, "batch_size": 2})
-
-
-def test_study_without_its_parts_or_test_sets_is_refused(part):
-    assert "needs one of the parts: real, simulated" in refusal(lambda: documents(StudyArtefacts("s", "t", "a", "c", {}, {}, [])))
-    other = replace(part, split=Split("s", SPLIT.train, SPLIT.validation, {"wet": SPLIT.tests["tyre_a"]}))
-    assert "must be called tyre_a and tyre_d" in refusal(lambda: documents(StudyArtefacts("s", "t", "a", "c", {}, {"real": other}, [])))
 
 
 @pytest.mark.parametrize("candidate", ["NNT", "NNTF_U", "NNTF_UH", "NNTF_UH*"])
@@ -328,15 +325,6 @@ def test_instability_and_several_states_need_all_of_them():
     assert claims.states_claim("c", "w", {"vx": (higher, 1.0, False)}, "real").verdict == "reproduced"
 
 
-def test_friction_settles_after_the_last_sample_outside_and_slip_is_that_of_a_hand_calculation():
-    outside = np.array([[True, True, False, True, False, False], [False] * 6, [False] * 5 + [True]])
-    np.testing.assert_allclose(friction.settled(outside, 10.0), [0.4, 0.0, 0.6])
-    states = {"vx_ref": [1.0, 1.0, 0.1], "vy_ref": [1.0, 0.0, 1.0], "yaw_rate_ref": [0.0, 10.0, 0.0]}
-    own = Recording("r", "car", 100.0, 0.0, {name: np.array(values) for name, values in states.items()}, "real")
-    np.testing.assert_allclose(rear_slip([own], 0.1), [45.0, -45.0])
-    assert hardest([[np.array([1.0]), np.array([5.0])], [np.array([9.0]), np.array([2.0])]]) == 0
-
-
 def test_baselines_take_their_other_velocities_from_what_is_measured(part, tmp_path):
     own = model(part, "GRU")
     for test in ("tyre_a",):
@@ -449,9 +437,15 @@ def test_local_minima_are_counted_on_validation(losses, verdict):
     assert thin.why.endswith("20 % of their samples")
 
 
-def test_published_figures_agree_with_the_text_of_the_paper():
+def test_published_figures_agree_with_the_text_and_friction_and_slip_with_a_hand_calculation():
     first, second = paper.TABLE_I, paper.TABLE_II
     for name, gain in (("mse", 17), ("mae", 6), ("ae99", 33)):
         assert round(100 * (1 - getattr(first["NNTF_UH"], name) / getattr(first["GRU"], name))) == gain
     order = sorted(second, key=lambda name: -second[name].mse)
     assert order == ["PC", "LSTM", "GRU", "NN_U", "NN", "PCR", "NNTF", "NNTF_U", "NNTF_UH", "NNTF_UH*"]
+    outside = np.array([[True, True, False, True, False, False], [False] * 6, [False] * 5 + [True]])
+    np.testing.assert_allclose(friction.settled(outside, 10.0), [0.4, 0.0, 0.6])
+    states = {"vx_ref": [1.0, 1.0, 0.1], "vy_ref": [1.0, 0.0, 1.0], "yaw_rate_ref": [0.0, 10.0, 0.0]}
+    own = Recording("r", "car", 100.0, 0.0, {name: np.array(values) for name, values in states.items()}, "real")
+    np.testing.assert_allclose(rear_slip([own], 0.1), [45.0, -45.0])
+    assert hardest([[np.array([1.0]), np.array([5.0])], [np.array([9.0]), np.array([2.0])]]) == 0

@@ -125,13 +125,19 @@ def test_tallies_merge_count_slow_samples_in_the_duration_alone_and_have_the_pap
     assert tally.counts["sideslip"].sum() == len(drive)
 
 
-def test_medians_find_the_steering_that_was_added_to_the_curvature():
+def test_medians_find_the_steering_that_was_added_and_the_spectrum_of_white_noise_is_flat():
     points = HandlingPoints(2.4)
     points.add(_drive(seconds=600.0, steered=np.radians(1.03)))
     ay, angle = points.medians()
     turning = np.abs(ay) > 1.0
     assert turning.sum() >= 4
     np.testing.assert_allclose(angle[turning], 1.03 * np.sign(ay[turning]), atol=0.06)  # half a bin of 0.1°, and its edge
+    noise = np.random.default_rng(0).standard_normal(60_000)
+    drive = replace(_drive(seconds=600.0, rate_hz=100.0), channels=dict.fromkeys(CHANNELS, 0.3 * noise))
+    own = spectra({"simulated": drive})["ay [m/s²/√Hz]"][0]
+    np.testing.assert_allclose(np.median(own.density), 0.3 * np.sqrt(2 / 100.0), rtol=0.03)  # 100 bands of 59 windows each
+    np.testing.assert_allclose(own.density, 0.3 * np.sqrt(2 / 100.0), rtol=0.4)  # one band of 59 windows
+    assert own.frequency[-1] > 40.0
 
 
 def test_ramp_of_the_plant_starts_with_the_slope_of_the_linear_single_track():
@@ -148,15 +154,6 @@ def test_ramp_of_the_plant_starts_with_the_slope_of_the_linear_single_track():
     assert own.angle[-1] > 3 * own.gradient * own.ay[-1], "understeer rises towards the limit"
     wet = characteristic(vehicle, 0.7, "wet")
     assert wet.ay.max() == pytest.approx(0.7 * own.ay.max(), rel=0.05)
-
-
-def test_spectrum_of_white_noise_is_flat_at_its_density():
-    noise = np.random.default_rng(0).standard_normal(60_000)
-    drive = replace(_drive(seconds=600.0, rate_hz=100.0), channels=dict.fromkeys(CHANNELS, 0.3 * noise))
-    own = spectra({"simulated": drive})["ay [m/s²/√Hz]"][0]
-    np.testing.assert_allclose(np.median(own.density), 0.3 * np.sqrt(2 / 100.0), rtol=0.03)  # 100 bands of 59 windows each
-    np.testing.assert_allclose(own.density, 0.3 * np.sqrt(2 / 100.0), rtol=0.4)  # one band of 59 windows
-    assert own.frequency[-1] > 40.0
 
 
 def test_pages_sets_and_stretches_are_those_of_the_names_and_the_busiest_drive():

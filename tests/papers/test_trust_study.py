@@ -60,15 +60,12 @@ def test_few_manoeuvres_that_say_all_hold_less_often_than_many_that_say_nothing(
     assert few < many - 0.05
 
 
-def test_draws_are_the_same_again_whichever_manoeuvre_was_tested_and_need_enough():
+def test_draws_are_the_same_again_and_several_tests_together_have_a_narrower_interval():
     calibration, test = scores(8, 0.4, 1), scores(8, 0.4, 2)
     louder = Scores(3.0 * test.values, test.manoeuvres)
     assert share_if_shuffled(calibration, test, 50) == share_if_shuffled(calibration, test, 50)
     assert share_if_shuffled(calibration, louder, 200) == pytest.approx(share_if_shuffled(louder, calibration, 200), abs=0.12)
     assert np.isnan(share_if_shuffled(scores(8, 0.4, 1), scores(2, 0.4, 2)))
-
-
-def test_several_tests_together_have_a_narrower_interval_than_one():
     tests = [scores(10, 0.3, seed) for seed in range(5)]
     share = together(tests)[0]
     assert share == pytest.approx(np.mean([np.mean(own.values <= 1.0) for own in tests]))

@@ -15,7 +15,6 @@ RUNS = "f1tenth/iros_hoons_1_with_friction.csv"
 G = 9.80665
 RATIO, RADIUS, TRACK = 16.0, 0.32, 1.35
 UNIX = 1_393_000_000.0
-Columns = dict[str, np.ndarray]
 
 
 @cache
@@ -52,117 +51,75 @@ def nuisances(t, seed):
     return {"temperature": temperature, "gear": gear, "voltage": 13.8 + 0.02 * random.standard_normal(n), "level": np.full(n, 42.0)}
 
 
+def table(d, columns, **more):
+    """Columns, ``NAME=QUANTITY`` between commas: what ``d`` and ``more`` hold, or the same in units of loggers; - turns it round."""
+    known = d | {"ms": 1000.0 * d["t"], "km/h": 3.6 * d["vx"], "deg/s": np.degrees(d["r"]), "ay_g": d["ay"] / G, "ax_g": d["ax"] / G}
+    known |= {"road_deg": np.degrees(d["delta"]), "wheel_deg": np.degrees(RATIO * d["delta"]), **more}
+    known |= {"beta_deg": np.degrees(d["beta"])} if "beta" in d else {}
+    named = [column.rsplit("=", 1) for column in columns.split(", ")]
+    return {name: -known[own[1:]] if own[0] == "-" else known[own] for name, own in named}
+
+
 def write(file, columns, digits=4, **options):
     """A table of text."""
-    table = pd.DataFrame({name: np.round(samples, digits) for name, samples in columns.items()})
-    table.to_csv(file, index=False, **options)
+    pd.DataFrame({name: np.round(samples, digits) for name, samples in columns.items()}).to_csv(file, index=False, **options)
 
 
 def units(data, folder):
     """km/h, deg/s and g, hardly any of it in the header."""
-    d, more = ferrari(data), nuisances(ferrari(data)["t"], 1)
-    columns = {
-        "Time [s]": d["t"],
-        "Speed [km/h]": 3.6 * d["vx"],
-        "OilTemp": more["temperature"],
-        "Gyro": np.degrees(d["r"]),
-        "LatAcc": d["ay"] / G,
-        "LongAcc": d["ax"] / G,
-        "SWA [deg]": np.degrees(RATIO * d["delta"]),
-        "Gear": more["gear"],
-        "VLat": d["vy"],
-    }
-    write(folder / "units.csv", columns)
+    d = ferrari(data)
+    columns = (
+        "Time [s]=t, Speed [km/h]=km/h, OilTemp=temperature, Gyro=deg/s, LatAcc=ay_g, LongAcc=ax_g, SWA [deg]=wheel_deg, Gear=gear, VLat=vy"
+    )
+    write(folder / "units.csv", table(d, columns, **nuisances(d["t"], 1)))
 
 
 def german(data, folder):
     """Decimal commas, semicolons, Latin-1, German names, milliseconds, lateral acceleration to the right."""
     d = ferrari(data)
-    columns = {
-        "Zeit [ms]": 1000.0 * d["t"],
-        "v_Fzg [km/h]": 3.6 * d["vx"],
-        "Drehzahl [1/min]": 900.0 + 90.0 * d["vx"],
-        "Gierrate [°/s]": np.degrees(d["r"]),
-        "Querbeschl. [m/s²]": -d["ay"],
-        "Längsbeschl. [m/s²]": d["ax"],
-        "Lenkradwinkel [°]": np.degrees(RATIO * d["delta"]),
-        "Schwimmwinkel [°]": np.degrees(d["beta"]),
-    }
-    write(folder / "german.csv", columns, sep=";", decimal=",", encoding="latin-1")
+    columns = (
+        "Zeit [ms]=ms, v_Fzg [km/h]=km/h, Drehzahl [1/min]=engine, Gierrate [°/s]=deg/s, Querbeschl. [m/s²]=-ay, Längsbeschl. [m/s²]=ax, "
+    )
+    columns += "Lenkradwinkel [°]=wheel_deg, Schwimmwinkel [°]=beta_deg"
+    drawn = table(d, columns, engine=900.0 + 90.0 * d["vx"])
+    write(folder / "german.csv", drawn, sep=";", decimal=",", encoding="latin-1")
 
 
 def numbered(data, folder):
     """Columns without names or units, tabulators between them, 50 Hz."""
     d = ferrari(data, 2)
-    more = nuisances(d["t"], 3)
-    columns = [d["t"], d["ax"], 3.6 * d["vx"], more["level"], np.degrees(d["r"]), d["ay"], d["delta"], d["vy"], more["temperature"]]
-    write(folder / "numbered.txt", {f"Ch{number}": samples for number, samples in enumerate(columns, start=1)}, 5, sep="\t")
+    columns = "Ch1=t, Ch2=ax, Ch3=km/h, Ch4=level, Ch5=deg/s, Ch6=ay, Ch7=delta, Ch8=vy, Ch9=temperature"
+    write(folder / "numbered.txt", table(d, columns, **nuisances(d["t"], 3)), 5, sep="\t")
 
 
 def unix(data, folder):
     """Unix time in milliseconds, a gyro that points down, a model car."""
     d = f1tenth(data, 2)
-    columns = {
-        "stamp": np.rint(1000.0 * (UNIX + d["t"])),
-        "wheel_v": d["v"],
-        "gz": -d["r"],
-        "acc_x": d["ax"],
-        "acc_y": d["ay"],
-        "servo": d["delta"],
-        "mocap_u": d["vx"],
-        "mocap_v": d["vy"],
-        "mocap_r": d["r_ref"],
-    }
-    write(folder / "unix.csv", columns, 5)
+    columns = "stamp=stamp, wheel_v=v, gz=-r, acc_x=ax, acc_y=ay, servo=delta, mocap_u=vx, mocap_v=vy, mocap_r=r_ref"
+    write(folder / "unix.csv", table(d, columns, stamp=np.rint(1000.0 * (UNIX + d["t"]))), 5)
 
 
 def flipped(data, folder):
     """g, deg/s, degrees, two channels that count to the right, and two speeds whose names tell nothing."""
-    d = f1tenth(data, 5)
-    columns = {
-        "t_s": d["t"],
-        "V": d["v"],
-        "u": d["vx"],
-        "v": -d["vy"],
-        "imu0": d["ax"] / G,
-        "imu1": -d["ay"] / G,
-        "imu2": np.degrees(d["r"]),
-        "cmd": np.degrees(d["delta"]),
-    }
-    write(folder / "flipped.csv", columns, 5)
+    columns = "t_s=t, V=v, u=vx, v=-vy, imu0=ax_g, imu1=-ay_g, imu2=deg/s, cmd=road_deg"
+    write(folder / "flipped.csv", table(f1tenth(data, 5), columns), 5)
 
 
 def wheels(data, folder):
     """Wheels in rpm for a speed, a gyro that counts to the right."""
-    d = ferrari(data)
+    d, rpm = ferrari(data), 60.0 / (2.0 * np.pi * RADIUS)
     side = 0.5 * TRACK * d["r"]
-    rpm = 60.0 / (2.0 * np.pi * RADIUS)
-    columns = {
-        "Time (s)": d["t"],
-        "n_VL": rpm * (d["vx"] - side) / np.cos(d["delta"]),
-        "n_VR": rpm * (d["vx"] + side) / np.cos(d["delta"]),
-        "n_HL": rpm * (d["vx"] - side),
-        "n_HR": rpm * (d["vx"] + side),
-        "Gyro": -np.degrees(d["r"]),
-        "LatAcc": d["ay"],
-        "LongAcc": d["ax"],
-        "Beta": np.degrees(d["beta"]),
-    }
-    write(folder / "wheels.csv", columns)
+    rear = {"HL": rpm * (d["vx"] - side), "HR": rpm * (d["vx"] + side)}
+    front = {"VL": rear["HL"] / np.cos(d["delta"]), "VR": rear["HR"] / np.cos(d["delta"])}
+    columns = "Time (s)=t, n_VL=VL, n_VR=VR, n_HL=HL, n_HR=HR, Gyro=-deg/s, LatAcc=ay, LongAcc=ax, Beta=beta_deg"
+    write(folder / "wheels.csv", table(d, columns, **rear, **front))
 
 
 def sideslip(data, folder):
     """A sideslip angle alone for a reference, no longitudinal acceleration, unix time, 50 Hz, a gyro that is 100 ms late."""
     d = ferrari(data, 2)
-    columns = {
-        "Timestamp": UNIX + d["t"],
-        "Speed": 3.6 * d["vx"],
-        "GyroZ": np.degrees(later(d["t"], d["r"], 0.1)),
-        "AccY": -d["ay"],
-        "SteerWheel": np.degrees(RATIO * d["delta"]),
-        "SlipAngle": np.degrees(d["beta"]),
-    }
-    write(folder / "sideslip.csv", columns)
+    columns = "Timestamp=unix, Speed=km/h, GyroZ=late, AccY=-ay, SteerWheel=wheel_deg, SlipAngle=beta_deg"
+    write(folder / "sideslip.csv", table(d, columns, unix=UNIX + d["t"], late=np.degrees(later(d["t"], d["r"], 0.1))))
 
 
 def mdf(data, folder):
@@ -237,43 +194,28 @@ def vbo(data, folder):
     heading = np.degrees(-np.cumsum(d["r"]) / 100.0) % 360.0
     stamps = np.rint((36_000.0 + d["t"]) * 1000.0).astype(int)
     clock = [f"{k // 3_600_000:02d}{k // 60_000 % 60:02d}{k // 1000 % 60:02d}.{k % 1000:03d}" for k in stamps]
-    names = "sats time lat long velocity heading height Longacc Latacc YawRate SWA Slip_COG"
-    numbers = [3.6 * d["vx"], heading, np.full(len(heading), 12.0), d["ax"] / G, -d["ay"] / G, -np.degrees(d["r"])]
-    numbers += [-np.degrees(RATIO * d["delta"]), -np.degrees(d["beta"])]
-    rows = [f"009 {clock[k]} +01600.0 +04800.0 " + " ".join(f"{samples[k]:+.5f}" for samples in numbers) for k in range(len(clock))]
+    columns = (
+        "velocity=km/h, heading=heading, height=height, Longacc=ax_g, Latacc=-ay_g, YawRate=-deg/s, SWA=-wheel_deg, Slip_COG=-beta_deg"
+    )
+    numbers = table(d, columns, heading=heading, height=np.full(len(heading), 12.0))
+    names = " ".join(["sats time lat long", *numbers])
+    rows = [f"009 {clock[k]} +01600.0 +04800.0 " + " ".join(f"{own[k]:+.5f}" for own in numbers.values()) for k in range(len(clock))]
     head = ["File created on 22/02/2014 @ 10:00", "", "[channel units]", "deg/s", "deg", "deg", "", "[comments]", "", "[column names]"]
     (folder / "lap.vbo").write_bytes("\r\n".join([*head, names, "", "[data]", *rows, ""]).encode("latin-1"))
 
 
 def two_runs(data, folder):
     """Two files of 200 Hz, a lateral acceleration that is 80 ms late."""
+    columns = "ts=t, a_long=ax, a_lat=late, yawrate=r, steering=delta, v_wheel=v, Iq=Iq, ref_vx=vx, ref_vy=vy"
     for number, run in ((1, 2), (2, 5)):
         d = f1tenth(data, run, 200.0)
-        columns = {
-            "ts": d["t"],
-            "a_long": d["ax"],
-            "a_lat": later(d["t"], d["ay"], 0.08),
-            "yawrate": d["r"],
-            "steering": d["delta"],
-            "v_wheel": d["v"],
-            "Iq": d["Iq"],
-            "ref_vx": d["vx"],
-            "ref_vy": d["vy"],
-        }
-        write(folder / f"run_{number}.csv", columns, 5)
+        write(folder / f"run_{number}.csv", table(d, columns, late=later(d["t"], d["ay"], 0.08)), 5)
 
 
 def no_reference(data, folder):
     """Neither reference nor time, German shorthand, 50 Hz."""
     d = ferrari(data, 2)
-    columns = {
-        "Nr": np.arange(1.0, len(d["t"]) + 1.0),
-        "Tacho": 3.6 * d["vx"],
-        "Quer": d["ay"],
-        "Laengs": -d["ax"],
-        "Gier": d["r"],
-        "Lenk": np.degrees(RATIO * d["delta"]),
-    }
+    columns = table(d, "Nr=row, Tacho=km/h, Quer=ay, Laengs=-ax, Gier=r, Lenk=wheel_deg", row=np.arange(1.0, len(d["t"]) + 1.0))
     write(folder / "no_reference.csv", columns, 5)
 
 

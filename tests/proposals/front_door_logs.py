@@ -4,7 +4,7 @@ Each goes from ``vehest new NAME FILES --yes`` to ``vehest run NAME --minutes 5`
 """
 
 import numpy as np
-from dressed_logs import RATIO, G, ferrari, later, write
+from dressed_logs import RATIO, G, ferrari, later, table, write
 
 RADIUS = 0.33  # m
 MPS = 3.6  # km/h
@@ -12,15 +12,8 @@ MPS = 3.6  # km/h
 
 def usual(d):
     """The columns that most logs have."""
-    return {
-        "Time [s]": d["t"],
-        "VehSpd [km/h]": MPS * d["vx"],
-        "YawRate [deg/s]": np.degrees(d["r"]),
-        "AccY [m/s2]": d["ay"],
-        "AccX [m/s2]": d["ax"],
-        "SteerWheel [deg]": np.degrees(RATIO * d["delta"]),
-        "ADMA_VelLat [m/s]": d["vy"],
-    }
+    columns = "Time [s]=t, VehSpd [km/h]=km/h, YawRate [deg/s]=deg/s, AccY [m/s2]=ay, AccX [m/s2]=ax, SteerWheel [deg]=wheel_deg, "
+    return table(d, columns + "ADMA_VelLat [m/s]=vy")
 
 
 def part(d, start, seconds):
@@ -57,15 +50,7 @@ def two_speeds(data, folder):
 def misnamed_lateral(data, folder):
     """A lateral velocity called like an acceleration, before the acceleration itself, neither with a unit."""
     d = ferrari(data)
-    columns = {
-        "t": d["t"],
-        "speed": d["vx"],
-        "gyro_z": d["r"],
-        "lat_a": d["vy"],
-        "imu_1": d["ay"],
-        "imu_0": d["ax"],
-        "wheel_angle": RATIO * d["delta"],
-    }
+    columns = table(d, "t=t, speed=vx, gyro_z=r, lat_a=vy, imu_1=ay, imu_0=ax, wheel_angle=wheel", wheel=RATIO * d["delta"])
     write(folder / "misnamed.csv", columns, 5)
 
 

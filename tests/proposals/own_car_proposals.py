@@ -26,8 +26,6 @@ WHOLE = ("left_right", "rate", "radius")
 TOLERANCE = 30.0  # ms, of a delay that was planted
 LONGEST_UNPLANTED = 60.0  # ms that a channel may be late by itself
 
-Row = dict[str, str]
-
 
 def outcome_of(files):
     """What `vehest new --json --dry-run` says of files."""

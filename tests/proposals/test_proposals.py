@@ -93,18 +93,13 @@ def test_which_way_is_left_is_asked_unless_wheels_of_both_sides_or_a_course_tell
     assert ("course over latitude and longitude" in found.left_right, found.by_channel["yaw_rate"].sign) == (True, -1)
 
 
-def test_wheels_alone_give_a_speed_and_their_radius(tmp_path):
+def test_wheels_alone_give_a_speed_and_their_radius_unless_they_miss_samples(tmp_path):
     d = drive()
     wheels = {f"n_{corner}": d[f"wheel_{corner}"] * 30.0 / np.pi for corner in CORNERS}
     examined = inspect("my_car", [write(tmp_path / "lap.csv", usual(d).drop(columns="Speed").assign(**wheels))])
     assert examined.proposals.by_channel["wheel_speed_fl"].unit == "rpm"
     assert examined.proposals.wheel_radius == pytest.approx(RADIUS, rel=0.02)
     assert {"vx", "vy_ref"} <= draft(examined).contents[0].channels
-
-
-def test_wheels_that_miss_samples_make_no_speed_and_no_question(tmp_path):
-    d = drive()
-    wheels = {f"n_{corner}": d[f"wheel_{corner}"] * 30.0 / np.pi for corner in CORNERS}
     table = usual(d).drop(columns=["Time [s]", "Speed"]).assign(**wheels)
     table.loc[1000:1100, list(wheels)] = np.nan
     examined = inspect("my_car", [write(tmp_path / "lap.csv", table)])
@@ -112,13 +107,6 @@ def test_wheels_that_miss_samples_make_no_speed_and_no_question(tmp_path):
     made = draft(examined)
     assert (made.examined.proposals.wheel_radius, made.dataset["transforms"]) == (None, [])
     assert sum("wheel_speed" in note and "samples are missing" in note for note in made.notes) == 4
-
-
-def test_logs_of_two_loggers_are_refused_by_the_file_that_shares_no_column(tmp_path):
-    write(tmp_path / "lap_1.csv", usual(drive(90.0)))
-    write(tmp_path / "lap_2.csv", usual(drive()).rename(columns=lambda name: name if "Time" in name else f"{name}2"))
-    with pytest.raises(DataError, match=r"lap_1\.csv' has none of the columns that are channels in '.*lap_2\.csv'"):
-        inspect("my_car", [tmp_path / "lap_1.csv", tmp_path / "lap_2.csv"])
 
 
 @pytest.mark.parametrize(("wheel", "other"), [("n_VL", "OilTemp"), ("n_VL", "pose_yaw [rad]"), ("n_VL [mph]", "pose_yaw")])
@@ -189,11 +177,15 @@ def test_slow_signals_with_empty_cells_and_marks_of_missing_samples_are_bridged(
     assert np.isfinite([recording["sideslip_ref"], recording["ay"]]).all()
 
 
-def test_a_log_without_reference_cannot_rank_anything(tmp_path):
+def test_a_log_without_reference_ranks_nothing_and_one_the_other_way_round_keeps_signs_together(tmp_path):
     examined = inspect("my_car", [write(tmp_path / "lap.csv", usual(drive()).drop(columns="Beta"))])
     outcome, _ = write_files(examined, dry_run=True)
     assert (outcome["estimators"], [Path(file).parts[0] for file in outcome["written"]]) == ([], ["conf"])
     assert outcome["next"][-1].startswith("vehest estimate ")
+    table = -usual(drive())
+    table["Time [s]"] *= -1.0
+    signs = {name: one.sign for name, one in proposed(tmp_path, table).items()}
+    assert (signs["vx"], signs["ax"], len({signs[name] for name in LATERAL})) == (-1, -1, 1)
 
 
 def test_a_reference_is_made_of_positions_and_yaw_where_there_is_no_other(tmp_path):
@@ -253,11 +245,6 @@ def test_a_row_of_units_a_preamble_and_quotes_are_seen_through(tmp_path):
     np.testing.assert_allclose(read_back(draft(inspect("my_car", [file])))["vx"], d["vx"], atol=1e-4)
 
 
-def test_mirroring_turns_lateral_channels_alone():
-    told = Proposals((Proposal("v", "vx", "m/s"), Proposal("r", "yaw_rate", "rad/s"), Proposal("a", "ax", "m/s²", -1)))
-    assert [one.sign for one in told.mirrored().channels] == [1, -1, -1]
-
-
 ROLES = {
     "Querbeschleunigung": "ay", "Gierrate": "yaw_rate", "Lenkradwinkel": "handwheel", "Schwimmwinkel": "sideslip_ref", "v_Fzg": "vx",
     "WheelSpeedFL": "wheel_speed_fl", "n_HR": "wheel_speed_rr", "FLwhlspd": "wheel_speed_fl", "angular_velocity.z": "yaw_rate",
@@ -266,8 +253,10 @@ ROLES = {
 }  # fmt: skip
 
 
-def test_names_speak_for_one_role():
+def test_names_speak_for_one_role_and_mirroring_turns_lateral_channels_alone():
     assert {name: list(hints(name)) for name in ROLES} == {name: [role] for name, role in ROLES.items()}
+    told = Proposals((Proposal("v", "vx", "m/s"), Proposal("r", "yaw_rate", "rad/s"), Proposal("a", "ax", "m/s²", -1)))
+    assert [one.sign for one in told.mirrored().channels] == [1, -1, -1]
 
 
 @pytest.mark.parametrize("log", LOGS)
@@ -276,13 +265,6 @@ def test_dressed_logs_of_real_cars_are_seen_through(tmp_path, data_root, log):
         pytest.importorskip(module, reason="the log is written by it")
     answers = yaml.safe_load(ANSWERS.read_text(encoding="utf-8"))[log]
     assert [row for row in rows_of(log, answers, outcome_of(write_log(log, data_root, tmp_path))) if row["correct"] != "yes"] == []
-
-
-def test_a_log_that_counts_everything_the_other_way_keeps_its_signs_together(tmp_path):
-    table = -usual(drive())
-    table["Time [s]"] *= -1.0
-    signs = {name: one.sign for name, one in proposed(tmp_path, table).items()}
-    assert (signs["vx"], signs["ax"], len({signs[name] for name in LATERAL})) == (-1, -1, 1)
 
 
 def test_steering_is_no_lateral_acceleration_however_well_it_agrees_and_names_that_motion_contradicts_are_asked(tmp_path):
@@ -325,16 +307,13 @@ def test_times_of_a_clock_are_read(tmp_path, first, how):
     np.testing.assert_allclose(recording["vx"], d["vx"], atol=1e-4)
 
 
-def test_whole_nanoseconds_since_1970_are_read_and_a_column_that_counts_runs_makes_recordings_of_them(tmp_path):
+def test_whole_nanoseconds_and_dates_are_a_clock_and_a_column_that_counts_runs_makes_recordings(tmp_path):
     table = usual(drive()).rename(columns={"Time [s]": "stamp"})
     table["stamp"] = 1_700_000_000_000_000_000 + (table["stamp"] * 1e9).round().astype("int64")
     clock = survey(write(tmp_path / "lap.csv", table)).clock
     assert (clock.column, clock.unit) == ("stamp", "ns")
     log = survey(write(tmp_path / "laps.csv", pd.concat([usual(drive(40.0, seed=seed)).assign(run=seed) for seed in (3, 4)])))
     assert (log.options["runs"], sorted((one.start, one.stop) for one in log.runs)) == ("run", [(0, 2000), (2000, 4000)])
-
-
-def test_dates_of_a_parquet_table_are_its_clock(tmp_path):
     d = drive(60.0)
     dates = pd.Timestamp("2024-05-03T10:59:30") + pd.to_timedelta(d["t"], unit="s").round("ms")
     usual(d).assign(**{"Time [s]": dates}).to_parquet(tmp_path / "lap.parquet")
@@ -343,15 +322,6 @@ def test_dates_of_a_parquet_table_are_its_clock(tmp_path):
     recording = read_back(draft(examined))
     assert recording.rate_hz == pytest.approx(50.0)
     np.testing.assert_allclose(recording["vx"], d["vx"], atol=1e-6)
-
-
-def test_a_pause_ends_a_recording_and_no_line_crosses_it(tmp_path):
-    table = usual(drive()).rename(columns={"Speed": "Tempo"})
-    table.loc[np.arange(len(table)) % 5 != 0, "Beta"] = np.nan
-    made = drafted(tmp_path, table[(table["Time [s]"] < 50.0) | (table["Time [s]"] >= 53.0)])
-    assert np.isfinite(open_source(made.dataset).read("lap_run_0")["sideslip_ref"]).all()
-    assert (made.dataset["max_gap"], [round(own) for own in made.durations.values()]) == (1.0, [50, 67])
-    assert any("makes 2 recordings" in note for note in made.notes)
 
 
 def written(file, table):
@@ -370,10 +340,14 @@ def written(file, table):
     return file
 
 
-@pytest.mark.parametrize("suffix", [".vbo", ".mf4"])
-def test_pauses_of_a_vbox_and_of_a_measurement_end_recordings_too(tmp_path, suffix):
+@pytest.mark.parametrize("suffix", [".vbo", ".mf4", ".csv"])
+def test_a_pause_ends_a_recording_and_no_line_crosses_it(tmp_path, suffix):
     table = usual(drive())
+    if suffix == ".csv":
+        table = table.rename(columns={"Speed": "Tempo"})
+        table.loc[np.arange(len(table)) % 5 != 0, "Beta"] = np.nan
     made = draft(inspect("my_car", [written(tmp_path / f"lap{suffix}", table[(table["Time [s]"] < 50.0) | (table["Time [s]"] >= 53.0)])]))
+    assert suffix != ".csv" or np.isfinite(open_source(made.dataset).read("lap_run_0")["sideslip_ref"]).all()
     assert {"vx", "yaw_rate", "ay"} <= made.channels
     assert (made.dataset["max_gap"], [round(own) for own in made.durations.values()]) == (1.0, [50, 67])
     assert any("makes 2 recordings" in note for note in made.notes)
@@ -430,47 +404,37 @@ def in_two_files(tmp_path, change, **options):
     return inspect("my_car", files)
 
 
-def test_a_second_file_in_another_unit_is_told_of_and_a_mark_in_it_alone_is_read(tmp_path):
+def test_a_second_file_in_another_unit_is_told_of_and_what_is_empty_or_impossible_in_it_left_out(tmp_path):
     remarks = draft(in_two_files(tmp_path, lambda table: table.assign(Speed=table["Speed"] / 3.6))).remarks
     assert any("in 'lap_2', ay is 3.6" in one for one in remarks)
     marked = in_two_files(tmp_path, lambda table: table.assign(LatAcc=table["LatAcc"].where(~table.index.isin((10, 11, 12)))), na_rep="-")
     assert len(draft(marked).contents) == 2
+    found = in_two_files(tmp_path, lambda table: table.assign(Steer=np.nan)).proposals
+    assert ("handwheel" in found.by_channel, "ax" in found.by_channel) == (False, True)
+    assert any(re.search(r"'Steer' \(handwheel\) is left out: '.*lap_2.csv' has no numbers in it", note) for note in found.notes)
+    roll = 0.05 * np.sin(np.arange(6000) / 50.0)
+    first = write(tmp_path / "lap_1.csv", usual(drive(seed=1)).assign(**{"roll (rad)": roll}))
+    second = write(tmp_path / "lap_2.csv", usual(drive(100.0, seed=2)).assign(**{"roll (rad)": 40.0 * roll[:5000]}))
+    assert ["roll" in inspect("my_car", files).proposals.by_channel for files in ([first], [first, second])] == [True, False]
 
 
-@pytest.mark.parametrize(
-    ("change", "options", "said"),
-    [
-        (lambda table: table, {"sep": ";"}, "has delimiter ';'"),
-        (
-            lambda table: table.assign(**{"Time [s]": 1000.0 * table["Time [s]"]}).rename(columns={"Time [s]": "Time [ms]"}),
-            {},
-            r"has times 'Time \[ms\] in ms'",
-        ),
-    ],
-)
-def test_files_that_are_laid_out_otherwise_are_refused(tmp_path, change, options, said):
-    with pytest.raises(DataError, match=said):
-        in_two_files(tmp_path, change, **options)
+def in_ms(table):
+    return table.assign(**{"Time [s]": 1000.0 * table["Time [s]"]}).rename(columns={"Time [s]": "Time [ms]"})
 
 
-def test_a_file_with_another_unit_below_its_names_is_refused(tmp_path):
+def test_files_that_are_laid_out_otherwise_or_of_two_loggers_are_refused(tmp_path):
+    for change, options, said in ((lambda table: table, {"sep": ";"}, "has delimiter ';'"), (in_ms, {}, r"has times 'Time \[ms\] in ms'")):
+        with pytest.raises(DataError, match=said):
+            in_two_files(tmp_path, change, **options)
     names, _, numbers = usual(drive()).round(5).to_csv(index=False).partition("\n")
     for name, unit in (("lap_1", "km/h"), ("lap_2", "m/s")):
         (tmp_path / f"{name}.csv").write_text(f"{names}\ns,{unit},deg/s,g,g,deg,deg\n{numbers}")
     with pytest.raises(DataError, match=r"lap_2.csv' has 'Speed' in 'm/s', .*lap_1.csv' in 'km/h'; write both alike"):
         inspect("my_car", [tmp_path / "lap_1.csv", tmp_path / "lap_2.csv"])
-
-
-def test_a_column_that_is_empty_in_another_file_is_left_out(tmp_path):
-    found = in_two_files(tmp_path, lambda table: table.assign(Steer=np.nan)).proposals
-    assert ("handwheel" in found.by_channel, "ax" in found.by_channel) == (False, True)
-    assert any(re.search(r"'Steer' \(handwheel\) is left out: '.*lap_2.csv' has no numbers in it", note) for note in found.notes)
-
-
-def test_a_yaw_rate_that_is_named_as_made_of_yaw_is_the_references(tmp_path):
-    found = proposed(tmp_path, usual(drive()).assign(yaw_rate_from_yaw=np.degrees(drive()["r"]) + 0.01))
-    assert (found["yaw_rate"].column, found["yaw_rate_ref"].column) == ("Gyro", "yaw_rate_from_yaw")
-    assert not found["yaw_rate"].asked
+    write(tmp_path / "lap_1.csv", usual(drive(90.0)))
+    write(tmp_path / "lap_2.csv", usual(drive()).rename(columns=lambda name: name if "Time" in name else f"{name}2"))
+    with pytest.raises(DataError, match=r"lap_1\.csv' has none of the columns that are channels in '.*lap_2\.csv'"):
+        inspect("my_car", [tmp_path / "lap_1.csv", tmp_path / "lap_2.csv"])
 
 
 def test_an_acceleration_that_is_the_difference_of_the_references_speed_is_not_the_cars(tmp_path):
@@ -485,12 +449,15 @@ def test_an_acceleration_that_is_the_difference_of_the_references_speed_is_not_t
     assert "'acc_vehicle_x' is left out: the difference of 'mocap_speed' from row to row, and no measurement" in examined.proposals.notes
 
 
-def test_a_torque_is_no_acceleration_and_a_speed_in_an_unknown_unit_is_told_of(tmp_path):
+def test_a_torque_is_no_acceleration_a_yaw_rate_made_of_yaw_the_references_and_an_unknown_unit_told_of(tmp_path):
     d = drive()
     table = pd.DataFrame({"t": d["t"], "speed": d["vx"] / 0.3048, "gyro_z": np.degrees(d["r"]), "acc_y": d["ay"], "Tq": 130.0 * d["ax"]})
     found = inspect("my_car", [write(tmp_path / "lap.csv", table)]).proposals
     assert (found.by_channel["vx"].unit, "ax" in found.by_channel) == ("km/h", False)
     assert any("'speed' reads" in note and "% too little" in note for note in found.notes)
+    found = proposed(tmp_path, usual(drive()).assign(yaw_rate_from_yaw=np.degrees(drive()["r"]) + 0.01))
+    assert (found["yaw_rate"].column, found["yaw_rate_ref"].column) == ("Gyro", "yaw_rate_from_yaw")
+    assert not found["yaw_rate"].asked
 
 
 def test_a_sign_that_the_motion_does_not_decide_is_asked_and_taken_as_most_of_the_others_count(tmp_path):
@@ -518,15 +485,12 @@ def test_rows_without_a_sample_for_longer_than_lines_bridge_are_left_out_and_end
         assert any("1-500" in note for note in made.notes)
 
 
-def test_course_and_heading_without_another_reference_are_told_of(tmp_path):
+def test_course_and_heading_without_another_reference_and_samples_that_rows_repeat_are_told_of(tmp_path):
     d = drive()
     yaw = np.cumsum(d["r"]) / 50.0
     table = usual(d).drop(columns="Beta").assign(Heading=-np.degrees(yaw) % 360.0, Course=-np.degrees(yaw + d["sideslip"]) % 360.0)
     notes = inspect("my_car", [write(tmp_path / "lap.csv", table)]).proposals.notes
     assert "'Heading' less 'Course' may be the sideslip angle that is missing as a reference; save it as a column" in notes
-
-
-def test_samples_that_rows_repeat_are_told_of(tmp_path):
     table = usual(drive())
     assert not drafted(tmp_path, table).remarks
     remarks = drafted(tmp_path, table.assign(Gyro=np.repeat(table["Gyro"].to_numpy()[::10], 10))).remarks
@@ -543,13 +507,6 @@ def test_a_few_rows_that_no_vehicle_drives_are_left_out_and_said(tmp_path):
     recording = read_back(made)
     assert (recording.rate_hz, len(recording["vx"])) == (50.0, 6000)
     np.testing.assert_allclose(recording["vx"], d["vx"], atol=0.2)
-
-
-def test_what_is_impossible_in_the_second_file_alone_is_left_out_too(tmp_path):
-    roll = 0.05 * np.sin(np.arange(6000) / 50.0)
-    first = write(tmp_path / "lap_1.csv", usual(drive(seed=1)).assign(**{"roll (rad)": roll}))
-    second = write(tmp_path / "lap_2.csv", usual(drive(100.0, seed=2)).assign(**{"roll (rad)": 40.0 * roll[:5000]}))
-    assert ["roll" in inspect("my_car", files).proposals.by_channel for files in ([first], [first, second])] == [True, False]
 
 
 @pytest.mark.parametrize("excess", [1.0, 1.05])

@@ -10,16 +10,12 @@ from vehest.report.document import Column, Document, Table, bars_of, write_docum
 from vehest.report.explorer import explorer_json, packed, reckoned_course
 
 
-def there_and_back(**columns):
-    described, data = packed(columns)
-    return unpacked({"length": len(next(iter(columns.values()))), "columns": described, "data": data})
-
-
 def test_packed_values_come_back_within_half_a_step_of_their_range_and_gaps_stay_gaps():
     rng = np.random.default_rng(1)
     values = 30.0 * rng.standard_normal(5_000)
     values[100:120] = np.nan
-    back = there_and_back(values=values, constant=np.full(5_000, -2.5), nothing=np.full(5_000, np.nan))
+    described, data = packed({"values": values, "constant": np.full(5_000, -2.5), "nothing": np.full(5_000, np.nan)})
+    back = unpacked({"length": 5_000, "columns": described, "data": data})
     assert np.nanmax(np.abs(back["values"] - values)) <= 0.5 * np.ptp(values[np.isfinite(values)]) / 65_534 * (1 + 1e-9)
     assert np.array_equal(np.isnan(back["values"]), np.isnan(values))
     assert (back["constant"] == -2.5).all()

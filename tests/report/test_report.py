@@ -1,5 +1,3 @@
-from __future__ import annotations
-
 import base64
 import math
 import os
@@ -228,15 +226,12 @@ def table_of(artefacts, name):
     return next((block for block in comparison(artefacts).blocks if isinstance(block, Table) and block.name == name), None)
 
 
-def test_bound_stands_beside_the_errors_where_there_is_one(artefacts):
+def test_bound_stands_beside_the_errors_and_floors_are_tabled_from_the_spread_down(artefacts):
     def bounds(of):
         headers, rows, _ = formatted(table_of(of, "leaderboard_test"))
         return [row[headers.index("bound [deg]")] for row in rows] if "bound [deg]" in headers else []
 
     assert (bounds(artefacts), bounds(with_rows(artefacts, {"floor_cramer_rao": 0.125}))) == ([], ["0.125"] * 5)
-
-
-def test_floors_of_the_drive_are_tabled_from_the_spread_down(artefacts):
     frame = table_of(artefacts, "floors_test").frame
     assert frame["what"].tolist()[:2] == ["v = 0: the reference itself", "noise of the reference, at least"]
     scored = drive().cut(61.5, 85.0)
@@ -453,7 +448,6 @@ def test_page_loads_nothing_from_anywhere(written):
     assert page.policy.startswith("default-src 'none'")
     assert "http" not in page.policy
     style = re.search(r"<style>(.*?)</style>", text, re.DOTALL)
-    assert style is not None
     assert not any(words in style[1] for words in ("url(", "@import"))
     assert "prefers-color-scheme: dark" in style[1]
 
@@ -490,27 +484,22 @@ def test_document_refuses_names_that_cannot_name_its_files(names):
         Document("Names", [Table(name, "", pd.DataFrame()) for name in names])
 
 
-def test_table_columns_line_up_and_show_missing_values_as_dashes():
+def test_table_columns_line_up_with_the_digits_asked_for_and_dashes_for_missing_values():
     frame = pd.DataFrame({"error": [0.31234, 0.78, math.nan], "count": [12, 345678, 9], "name": ["a", None, "c"]})
     _, rows, numeric = formatted(Table("t", "", frame, {name: Column(name) for name in frame}))
     assert numeric == [True, True, False]
     assert rows == [["0.312", "12", "a"], ["0.780", "345\N{NARROW NO-BREAK SPACE}678", MISSING], [MISSING, "9", "c"]]
-
-
-def test_numbers_are_written_with_the_digits_asked_for():
     assert [significant(value) for value in (0.43512, 12.3456, 0.0, math.nan, -0.0261)] == ["0.435", "12.3", "0", MISSING, "−0.0261"]
     assert (decimals_for([0.31, 0.44, 12.0]), decimals_for([math.nan])) == (3, 0)
 
 
-def test_each_family_has_one_hue_and_each_estimator_a_line_of_its_own():
+def test_each_family_has_one_hue_each_estimator_a_line_and_colours_stand_out_on_dark_and_light_pages():
     assert line_of("ksnn", "linear_no_bias_p2").colour != line_of("ksnn", "linear_bias_p2").colour
     assert line_of("ksnn", "linear_bias_p2").colour == line_of("ksnn", "linear_bias_p3").colour
     names = [("ksnn", f"nonlinear_bias_p{p}_q{q}") for p in range(2, 5) for q in range(1, 5)] + [("luenberger", ""), ("new", "x")]
     lines = lines_of(names)
     assert len(set(lines.values())) == len(names)
 
-
-def test_colours_stand_out_on_dark_and_light_pages():
     def luminance(colour):
         parts = [int(colour[start : start + 2], 16) / 255 for start in (1, 3, 5)]
         linear = [part / 12.92 if part <= 0.04045 else ((part + 0.055) / 1.055) ** 2.4 for part in parts]

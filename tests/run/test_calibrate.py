@@ -65,7 +65,7 @@ def test_a_model_by_its_path_has_its_calibration_whatever_the_output_root(evalua
         assert ("this model has no calibration" in json.loads(said)["verdict"]) != found
 
 
-def test_estimates_hold_the_bands_of_the_calibration(evaluated):
+def test_estimates_hold_the_bands_of_the_calibration_twice_as_wide_where_the_test_is_said_to_be_elsewhere(evaluated):
     place, model, evaluation = evaluated
     estimate = read_estimate(evaluation / "test" / "0.parquet")
     assert np.array_equal(np.isfinite(estimate["band_vy"]), np.isfinite(estimate["vy"]))
@@ -73,6 +73,10 @@ def test_estimates_hold_the_bands_of_the_calibration(evaluated):
     which = LEVELS.index(0.9)
     assert estimate["band_vy"].min() >= floors.vy.factors[which] * floors.vy.floor
     assert estimate["band_sideslip"].max() <= math.pi
+    place, _, evaluation = evaluated
+    out = place("eval", *TRAIN, "evaluation.elsewhere='other, test'", "--json")[1]
+    here, there = (read_estimate(folder / "test" / "0.parquet") for folder in (evaluation, Path(json.loads(out)["folder"])))
+    np.testing.assert_allclose(there["band_vy"], 2.0 * here["band_vy"])
 
 
 def test_metrics_say_coverage_width_and_scores_with_intervals_and_by_acceleration(evaluated):
@@ -98,7 +102,7 @@ def test_a_run_calibrates_each_model_once_and_shows_it(place):
     assert {line.split()[0] for line in err.splitlines() if line.split()[1] == STAGE} == {"skipped"}
 
 
-def test_a_calibration_that_is_gone_is_made_again_and_nothing_is_trained(evaluated):
+def test_a_calibration_that_is_gone_is_made_again_and_trust_in_the_models_own_folder_comes_first(evaluated, tmp_path):
     place, model, evaluation = evaluated
     found = calibration_of(model, place.folder / "outputs")
     (found.folder / "trust.yaml").unlink()
@@ -106,6 +110,10 @@ def test_a_calibration_that_is_gone_is_made_again_and_nothing_is_trained(evaluat
     outcome = place.told("eval", *TRAIN)
     assert outcome | {"skipped": True} == outcome, "the same calibration leaves the evaluation up to date"
     assert (Path(outcome["folder"]), (model / "manifest.json").stat().st_mtime_ns) == (evaluation, before)
+    place, model, _ = evaluated
+    write_trust(Trust(About("luenberger", note="mine")), model)
+    assert trust_of(model, place.folder / "outputs").about.note == "mine"
+    assert trust_of(tmp_path / "nothing", tmp_path) is None
 
 
 def test_evaluation_of_a_named_model_on_another_split_takes_its_calibration_along(evaluated):
@@ -113,13 +121,6 @@ def test_evaluation_of_a_named_model_on_another_split_takes_its_calibration_alon
     without_validation(place)
     folder = Path(place.told("eval", "--model", str(model), "split=blind", "tracking=none")["folder"])
     assert read_artefact(folder).inputs["calibration"] == calibration_of(model, place.folder / "outputs").digest
-
-
-def test_bands_are_twice_as_wide_on_a_test_set_that_is_said_to_be_elsewhere(evaluated):
-    place, _, evaluation = evaluated
-    out = place("eval", *TRAIN, "evaluation.elsewhere='other, test'", "--json")[1]
-    here, there = (read_estimate(folder / "test" / "0.parquet") for folder in (evaluation, Path(json.loads(out)["folder"])))
-    np.testing.assert_allclose(there["band_vy"], 2.0 * here["band_vy"])
 
 
 def test_without_a_validation_range_there_are_no_bands_and_a_note_says_so(place):
@@ -141,10 +142,3 @@ def test_a_model_that_learns_nothing_is_not_judged_by_a_calibration_that_may_hav
     assert calibration_of(Path(model), place.folder / "outputs") is not None
     outcome = place.told("eval", "--model", model, "split=blind", "tracking=none")
     assert "calibration" not in read_artefact(Path(outcome["folder"])).inputs
-
-
-def test_trust_in_the_model_s_own_folder_comes_first_and_without_any_there_is_none(evaluated, tmp_path):
-    place, model, _ = evaluated
-    write_trust(Trust(About("luenberger", note="mine")), model)
-    assert trust_of(model, place.folder / "outputs").about.note == "mine"
-    assert trust_of(tmp_path / "nothing", tmp_path) is None

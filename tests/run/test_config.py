@@ -14,18 +14,15 @@ from vehest.run.config_files import GROUPS, choices
 from vehest.run.study import jobs_of, read_study
 
 
-def test_estimator_chooses_its_training_and_the_user_may_choose_another(elsewhere):
-    assert compose_config("train", ["estimator=luenberger"])["training"]["name"] == "nelder_mead"
-    assert compose_config("train", ["estimator=gru"])["training"]["name"] == "supervised"
-    assert compose_config("train", ["estimator=luenberger", "training=supervised"])["training"]["name"] == "supervised"
-
-
-def test_every_estimator_composes_with_any_split(elsewhere):
+def test_every_estimator_composes_with_any_split_and_chooses_its_training_unless_the_user_does(elsewhere):
     estimators, splits = choices("estimator"), choices("split")
     for at, estimator in enumerate(estimators):
         split = splits[at * len(splits) // len(estimators)]
         config = compose_config("eval", [f"estimator={estimator}", f"split={split}"])
         assert (config["estimator"]["name"], config["split"]["name"]) == (estimator, split)
+    assert compose_config("train", ["estimator=luenberger"])["training"]["name"] == "nelder_mead"
+    assert compose_config("train", ["estimator=gru"])["training"]["name"] == "supervised"
+    assert compose_config("train", ["estimator=luenberger", "training=supervised"])["training"]["name"] == "supervised"
 
 
 def test_local_configuration_is_searched_first_and_adds_to_the_packaged_one(elsewhere):
@@ -56,13 +53,10 @@ def test_wrong_overrides_are_one_line_that_helps(elsewhere, overrides, message):
     assert "did you mean pipelines/quickstart.yaml?" in refusal(lambda: read_study("quikstart"), MissingError)
 
 
-def test_sweeps_expand_to_every_combination():
+def test_sweeps_expand_to_every_combination_that_of_the_ferrari_to_35_jobs(elsewhere):
     jobs = expand(["estimator=ksnn", "estimator.n_local=2,3", "estimator.bias=true,false", "seed=range(3)"])
     assert (len(jobs), jobs[0]) == (12, ["estimator=ksnn", "estimator.n_local=2", "estimator.bias=True", "seed=0"])
     assert len({tuple(job) for job in jobs}) == 12
-
-
-def test_shipped_pipeline_of_the_ferrari_has_35_jobs(elsewhere):
     configs = [job.config for job in jobs_of(read_study("ferrari_drive"), [])[""]]
     names = [config["estimator"]["name"] for config in configs]
     baselines = {"zero": 1, "kinematic": 1, "data_sheet": 1, "static_map": 1}
@@ -72,8 +66,6 @@ def test_shipped_pipeline_of_the_ferrari_has_35_jobs(elsewhere):
 
 
 SHIPPED = {file.stem for file in (Path(__file__).parents[2] / "pipelines").glob("*.yaml")}
-
-
 COMPOSED = set()
 
 

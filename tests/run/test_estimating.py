@@ -15,8 +15,6 @@ from vehest.constants import GRAVITY
 from vehest.data.recording import Recording
 from vehest.trust.record import TRUST, read_trust
 
-QUICK = ("training.grid=1", "training.max_evaluations=5")
-
 
 def drive_of(seed, seconds=30.0):
     """A drive at the 100 Hz that the observer works at."""
@@ -26,7 +24,7 @@ def drive_of(seed, seconds=30.0):
 @pytest.fixture(scope="module")
 def model():
     """An observer with what was learnt of how far it can be trusted."""
-    return vehest.train("luenberger", [drive_of(1)], [drive_of(2)], QUICK)
+    return vehest.train("luenberger", [drive_of(1)], [drive_of(2)], ("training.grid=1", "training.max_evaluations=5"))
 
 
 @pytest.fixture

@@ -5,7 +5,6 @@ from pathlib import Path
 
 import numpy as np
 import pandas as pd
-import pytest
 
 PAGE = Path(__file__).parents[2] / "docs" / "from_a_log.md"
 DRIVE = "revs/20140222_01_01_03_250lm"
@@ -31,20 +30,13 @@ def log_of(data_root):
     )
 
 
-@pytest.fixture
-def logged(place, data_root):
-    """A place with the log, and the files that the page tells to write."""
+def test_a_log_of_twenty_seconds_gets_a_leaderboard_and_no_winner(place, data_root):
+    logged, page = place, PAGE.read_text(encoding="utf-8")
     folder = place.folder / "raw" / "my_log"
     folder.mkdir()
     log_of(data_root).to_csv(folder / "lap.csv", index=False)
-    page = PAGE.read_text(encoding="utf-8")
     for name, content in re.findall(r"```yaml\n# ((?:conf|pipelines)/\S+)\n(.*?)```", page, re.DOTALL):
         (place.folder / name).write_text(content, encoding="utf-8")
-    return place
-
-
-def test_a_log_of_twenty_seconds_gets_a_leaderboard_and_no_winner(logged):
-    page = PAGE.read_text(encoding="utf-8")
     code, out, err = logged("data", "check", "my_log")
     assert (code, err) == (0, "")
     (said,) = re.findall(r"\$ vehest data check my_log\n(warning .*)\n", page)

@@ -36,21 +36,14 @@ def model():
     return with_settings(load_model(pretrained_folder("self_calibrating")), {"wheelbase": 2.7, "cg_to_rear_axle": 1.25})
 
 
-@pytest.fixture(scope="module")
-def record(model):
-    return record_of(model, {name: posterior_of(model, recording(name, lap(seed)[0])) for name, seed in (("one", 0), ("two", 1))})
-
-
-def test_numbers_of_a_known_car_are_found_within_their_deviations(record):
+def test_numbers_of_a_known_car_are_found_and_an_estimate_that_starts_from_them_is_closer(model):
+    record = record_of(model, {name: posterior_of(model, recording(name, lap(seed)[0])) for name, seed in (("one", 0), ("two", 1))})
     for name, truth in PLANTED.items():
         number = getattr(record, name)
         assert number.identified_on == (() if name == "rear_axle" else ("one", "two"))  # nearly one speed: C u and b/u are alike
         assert abs(number.value - truth) < 2.0 * number.deviation
     for offsets in record.offsets.values():
         assert abs(offsets["ay"].value - 0.2) < offsets["ay"].deviation
-
-
-def test_an_estimate_that_starts_from_the_record_is_closer_from_the_first_seconds_on(model, record):
     channels, vy = lap(2, 20.0)
     errors = [np.mean((one.estimate([recording("lap", channels)])[0]["vy"] - vy) ** 2) for one in (model, calibrated(model, record))]
     assert errors[1] < 0.7 * errors[0]

@@ -34,10 +34,6 @@ def failing(monkeypatch, name, error):
     monkeypatch.setattr(TabularSource, "read", fails)
 
 
-def ingested(place):
-    return Path(place.told("ingest", "mine")["folder"])
-
-
 def test_what_was_finished_before_a_failure_is_not_made_again(place, slow, monkeypatch):
     with monkeypatch.context() as broken:
         failing(broken, "three", DataError("'three.csv' is unwell"))
@@ -45,7 +41,7 @@ def test_what_was_finished_before_a_failure_is_not_made_again(place, slow, monke
         assert (code, err.strip()) == (3, "error: 'three.csv' is unwell")
         assert [folder.name for folder in (place.folder / "outputs" / "ingest").glob("mine-*")] == []
     assert slow == ["one", "two"]
-    folder = ingested(place)
+    folder = Path(place.told("ingest", "mine")["folder"])
     assert (slow, sorted(file.stem for file in folder.glob("*.parquet"))) == (["one", "two", "three"], ["one", "three", "two"])
     assert [item.name for item in (place.folder / "outputs" / "ingest").iterdir()] == [folder.name], "nothing is left beside it"
 

@@ -32,7 +32,6 @@ def held_elsewhere(output, stage, name):
     """A process of its own that holds a lock until it is ended."""
     own = [sys.executable, "-c", HOLDER, str(output), stage, name]
     process = start(own, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
-    assert process.stdout is not None
     try:
         assert process.stdout.readline() == "True\n"
         yield process
@@ -108,7 +107,6 @@ def test_a_run_waits_for_what_another_makes_says_so_and_goes_on(place):
     [folder] = (place.folder / "outputs" / "ingest").iterdir()
     with held_elsewhere(place.folder / "outputs", "ingest", folder.name) as holder:
         waiting = start([*COMMAND, "ingest", "mine", "--force"], stderr=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
-        assert waiting.stderr is not None
         line = waiting.stderr.readline()
         assert line.split()[:3] == ["waiting", "ingest", folder.name]
         assert f"process {holder.pid} on " in line
@@ -126,7 +124,6 @@ def test_a_run_that_waits_stops_at_once_and_leaves_nothing(place, stage, number,
     [folder] = (place.folder / "outputs" / stage).iterdir()
     with held_elsewhere(place.folder / "outputs", stage, folder.name):
         waiting = start([*COMMAND, *command, "--force"], stderr=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
-        assert waiting.stderr is not None
         while "waiting" not in (line := waiting.stderr.readline()):
             assert line, "it ended without waiting"
         waiting.send_signal(number)

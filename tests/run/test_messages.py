@@ -72,13 +72,6 @@ def test_wrong_usage_is_one_line_with_the_next_step(place, arguments, words):
     assert _shows_only_text(place.refused(*arguments, code=2, says=words)[1])
 
 
-def test_help_and_version_answer_as_before(place):
-    assert "Usage" in place("train", "--help")[1]
-    assert place("--version")[:2] == (0, "vehest 0.1.0\n")
-    code, out, err = place("data")
-    assert (code, err, "channels" in out) == (2, "", True)
-
-
 def test_hostile_names_reach_the_terminal_as_text(place):
     dataset = {**DATASET, "title": HOSTILE, "licence": HOSTILE, "citation": HOSTILE, "vehicle": HOSTILE}
     (place.folder / "conf" / "dataset" / "mine.yaml").write_text(yaml.safe_dump(dataset, allow_unicode=True))
@@ -94,7 +87,7 @@ def test_hostile_names_reach_the_terminal_as_text(place):
     assert code == 3, "no column 'Yaw'"
 
 
-def test_json_and_yaml_show_only_text_and_keep_every_value(place):
+def test_json_yaml_and_tables_show_only_text_and_help_and_version_answer_as_before(place, capsys):
     hostile = HOSTILE + "\x7f\u2028\U000e0041β"
     override = f"output='{hostile}'"
     for arguments, read in ((("--json",), json.loads), ((), yaml.safe_load)):
@@ -102,6 +95,16 @@ def test_json_and_yaml_show_only_text_and_keep_every_value(place):
         assert _shows_only_text(out)
         assert read(out)["output"] == hostile
     assert "β" in as_yaml({"name": "β"})
+    emit(False, None, [TerminalTable("", ["[bold]name[/]", HOSTILE], [["[/]", ":car:"], ["x\\", HOSTILE]])])
+    out = capsys.readouterr().out
+    assert _shows_only_text(out)
+    assert "[bold]name[/]" in out
+    assert printable(HOSTILE) in out
+    assert ":car:" in out
+    assert "Usage" in place("train", "--help")[1]
+    assert place("--version")[:2] == (0, "vehest 0.1.0\n")
+    code, out, err = place("data")
+    assert (code, err, "channels" in out) == (2, "", True)
 
 
 @pytest.mark.parametrize("terminal", [False, True])
@@ -122,15 +125,6 @@ def test_lines_and_bars_of_progress_read_no_markup_and_no_escapes(terminal):
     assert not {"\x07", "\x9b", "\u202e"} & set(text)
     assert "\x1b]" not in text
     assert terminal == (f"{shown} " in text.split("warning", 1)[1].split(shown, 1)[1])
-
-
-def test_tables_read_no_markup_and_hold_no_escapes(place, capsys):
-    emit(False, None, [TerminalTable("", ["[bold]name[/]", HOSTILE], [["[/]", ":car:"], ["x\\", HOSTILE]])])
-    out = capsys.readouterr().out
-    assert _shows_only_text(out)
-    assert "[bold]name[/]" in out
-    assert printable(HOSTILE) in out
-    assert ":car:" in out
 
 
 def test_files_whose_names_are_not_utf_8_are_read_and_written(place):
@@ -171,13 +165,10 @@ def test_a_data_set_whose_recordings_names_are_not_utf_8_makes_a_whole_study(pla
     assert r"one\udcff" in (report.parent / "tables" / "ranges.csv").read_text(encoding="utf-8")
 
 
-def test_ranges_count_what_they_expand_to():
+def test_ranges_count_what_they_expand_to_and_the_limit_of_jobs_is_raised_by_an_override(place):
     for text in ("range(7)", "range(2,9,3)", "range(9,2,-3)", "range(0,1,0.1)", "range(5,1,-0.25)", "1,2,3", "choice(a,b)", "glob(k*)"):
         key = "estimator" if "glob" in text else "seed"
         assert count([f"{key}={text}", "training.patience=1,2"]) == len(expand([f"{key}={text}", "training.patience=1,2"])) > 0
-
-
-def test_the_limit_of_jobs_is_raised_by_an_override_and_holds_for_studies(place):
     assert place("sweep", "split=mine", "seed=range(6)", "limits.jobs=6", "--dry-run")[0] == 0
     assert limits_of(["limits.jobs=12345", "seed=3"]).jobs == 12345
     place.refused("run", "small", "limits.jobs=3", "--dry-run", code=2, says="small.yaml' stand for at least 4 jobs")

@@ -86,7 +86,6 @@ def bands_on(name, data_root):
 def test_the_documentation_tells_what_the_pretrained_bands_are_worth_on_real_cars(data_root):
     text = " ".join((ROOT / "docs" / "trust.md").read_text(encoding="utf-8").split())
     told = re.search(r"they hold (\d+) % where 90 % are asked, half width ([\d.]+)° in the median, and (\d+) % of the drive is valid", text)
-    assert told is not None
     inside, median, valid = bands_on("ferrari_250lm", data_root)
     assert [told[1], told[2], told[3]] == [f"{100 * inside:.0f}", f"{median:.1f}", f"{100 * valid:.0f}"]
     assert "hardly a sample is valid" in text

@@ -116,12 +116,8 @@ def test_links_and_what_vehest_has_not_made_stay(root, tmp_path):
     assert root.found() == {}
 
 
-@pytest.fixture
-def outdated(root, elsewhere):
-    return root.add("train", "one", {"estimator": {"name": "luenberger"}}, {}, "0" * 16).folder
-
-
-def test_a_dry_run_or_no_answer_removes_nothing_and_yes_removes_what_was_listed_and_nothing_else(outdated, root, capsys):
+def test_a_dry_run_or_no_answer_removes_nothing_and_yes_removes_what_was_listed_and_nothing_else(elsewhere, root, capsys):
+    outdated = root.add("train", "one", {"estimator": {"name": "luenberger"}}, {}, "0" * 16).folder
     code, out, err = run_vehest(capsys, "prune", "--dry-run")
     assert (code, OUTDATED in out, "1 to remove" in out) == (0, True, True), err
     for options in ((), ("--json",)):

@@ -64,15 +64,12 @@ def verdict(place, *words):
     return code, out.strip()
 
 
-def test_numbers_are_published_with_six_digits_and_everything_else_as_it_is(tmp_path):
+def test_numbers_are_published_with_six_digits_and_everything_else_as_it_is(tmp_path, published):
     file = tmp_path / "table.csv"
     cells = ["0.7459900813211685", "-1.2345678e-07", "1234567.0", "7", "0.10", "", '"0.0123456789, 2"', "nan", "1e-05"]
     file.write_text("a,b,c,d,e,f,g,h,i\n" + ",".join(cells) + "\n", encoding="utf-8")
     expected = ["0.74599", "-1.23457e-07", *cells[2:]]
     assert published_content(file).decode() == "a,b,c,d,e,f,g,h,i\n" + ",".join(expected) + "\n"
-
-
-def test_published_metrics_are_those_of_the_report_to_six_digits(published):
     (report,) = (published / "outputs" / "report").iterdir()
     own, there = (pd.read_csv(folder / "metrics.csv")["value"] for folder in (report, published / "results" / "small"))
     np.testing.assert_allclose(there, own, rtol=5e-6)

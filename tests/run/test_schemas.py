@@ -57,11 +57,22 @@ def model(tmp_path):
     return folder
 
 
-def test_the_description_of_a_model_is_read_with_its_types(model):
+def test_a_model_is_read_with_its_types_and_numbers_that_are_not_finite_are_counted_by_tensor(model, tmp_path):
     described = read_description(model)
     assert isinstance(described, Description)
     assert (described.estimator, described.about.seed, described.about.datasets) == ("ksnn", 3, ("d",))
     assert (preparation_of(model), load_model(model).name) == ({"method": "decimate", "transforms": []}, "ksnn")
+    weights = load_file(model / "model.safetensors")
+    name = max(weights, key=lambda own: weights[own].size)
+    weights[name].flat[:2] = [np.nan, np.inf]
+    save_file(weights, model / "model.safetensors")
+    said = f"model.safetensors': 2 of the {weights[name].size} numbers of tensor '{name}' are not finite"
+    assert said in refusal(lambda: load_model(model))
+    estimator = estimator_class("kalman").from_config({})
+    save_model(estimator, tmp_path)
+    load_model(tmp_path)
+    save_file({name: np.array([np.inf]) for name in estimator.weights()}, tmp_path / "model.safetensors")
+    assert "1 of the 1 numbers of tensor" in refusal(lambda: load_model(tmp_path))
 
 
 @pytest.mark.parametrize(
@@ -90,20 +101,6 @@ def test_a_description_that_does_not_fit_is_one_line_that_names_file_and_key(mod
     message = refusal(lambda: load_model(model), VehestError)
     assert says in message
     assert "model.yaml" in message or "transform" in says or "fit its settings" in says
-
-
-def test_numbers_that_are_not_finite_are_counted_by_tensor_and_levels_that_each_recording_tells_may_be_open(model, tmp_path):
-    weights = load_file(model / "model.safetensors")
-    name = max(weights, key=lambda own: weights[own].size)
-    weights[name].flat[:2] = [np.nan, np.inf]
-    save_file(weights, model / "model.safetensors")
-    said = f"model.safetensors': 2 of the {weights[name].size} numbers of tensor '{name}' are not finite"
-    assert said in refusal(lambda: load_model(model))
-    estimator = estimator_class("kalman").from_config({})
-    save_model(estimator, tmp_path)
-    load_model(tmp_path)
-    save_file({name: np.array([np.inf]) for name in estimator.weights()}, tmp_path / "model.safetensors")
-    assert "1 of the 1 numbers of tensor" in refusal(lambda: load_model(tmp_path))
 
 
 def with_header(header, length=None):
@@ -268,15 +265,12 @@ def test_tables_that_are_damaged_are_one_line(tmp_path):
     assert read_rows(path)[0] == {"metric": "epochs", "value": "7"}
 
 
-def test_a_checkpoint_that_says_nonsense_counts_as_none(tmp_path):
+def test_a_checkpoint_or_a_published_study_that_is_damaged_counts_as_none(tmp_path):
     for values in ({"epoch": "three"}, {}, {"epoch": 3, "finished": "no"}):
         save_checkpoint(tmp_path, Checkpoint({"a": torch.zeros(2)}, values))
         assert (load_checkpoint(tmp_path), resume_epoch(tmp_path)) == (None, 0)
     save_checkpoint(tmp_path, Checkpoint({"a": torch.zeros(2)}, {"epoch": 3, "finished": False, "losses": [1.0]}))
     assert resume_epoch(tmp_path) == 3
-
-
-def test_a_published_study_that_is_damaged_shows_nothing(tmp_path):
     for text in ("[]", "{", '{"kinds": [1]}', "[" * 100_000):
         (tmp_path / PROVENANCE).write_text(text)
         assert published_in(tmp_path) is None
@@ -296,8 +290,6 @@ def test_nothing_is_published_through_a_link(elsewhere, link):
 
 
 PIPELINE = {"study": "mine", "report": "drive", "split": "quickstart", "sweeps": [["estimator=luenberger"]]}
-
-
 BOMB = "\n".join(["a0: &a0 [x, x, x, x, x, x, x, x, x]", *(f"a{n}: &a{n} [{', '.join([f'*a{n - 1}'] * 9)}]" for n in range(1, 12))])
 
 

@@ -38,14 +38,11 @@ def test_a_seed_gives_the_same_samples_however_many_processes_make_them(place, m
     assert not any(np.array_equal(values, other[name]) for name, values in alone.items())
 
 
-def test_seed_is_short_for_the_data_sets_seed_and_the_ordinary_ingest_makes_the_same(place):
+def test_the_ordinary_ingest_makes_the_same_which_says_that_it_is_simulated_and_looking_at_it_simulates_nothing(place, monkeypatch):
     simulated(place, [{"id": "lap", "manoeuvre": LAP}])
     folder = place.told("simulate", "sim", "seed=1")["folder"]
     again = place.told("simulate", "sim", "dataset.seed=1")
     assert (again["folder"], again["skipped"], place.told("ingest", "sim", "dataset.seed=1")["folder"]) == (folder, True, folder)
-
-
-def test_everything_it_makes_says_that_it_is_simulated_and_looking_at_it_simulates_nothing(place, monkeypatch):
     simulated(place, [{"id": "lap", "manoeuvre": LAP}])
     (file,) = Path(place.told("simulate", "sim")["folder"]).glob("*.parquet")
     recording = read_recording(file)

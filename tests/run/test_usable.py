@@ -86,14 +86,6 @@ def models(place):
     return {folder.name.split("-")[0] for folder in (place.folder / "outputs" / "train").glob("[!.]*")}
 
 
-def test_description_in_the_store_tells_channels_gaps_and_rate_as_the_samples_do(tmp_path):
-    vx = np.where(np.arange(40) == 3, np.nan, 1.0)
-    recording = Recording("gap", "car", 40.0, 0.0, {"vx": vx, "ay": np.ones(40)}, gappy=frozenset({"vx"}))
-    write_recording(recording, tmp_path / "gap.parquet")
-    told = RecordingSummary("gap", 40.0, frozenset({"vx", "ay"}), frozenset({"vx"}))
-    assert stored_summary(tmp_path / "gap.parquet") == summary_of(recording) == told
-
-
 IDENTIFIED = [f"training.identification.{setting}" for setting in ("method=data", "restarts=1", "generations=1")]
 QUICK = {"cnn_ukf": IDENTIFIED, "ensemble_ukf": IDENTIFIED}
 
@@ -207,13 +199,18 @@ def test_lacking_references_gaps_and_channels_of_one_recording_alone_are_told_to
         assert derivation_of(channel, held, gappy, 50.0) is None
 
 
-def test_every_transform_that_makes_a_channel_is_known():
+def test_every_transform_that_makes_a_channel_is_known_and_the_store_tells_gaps_and_rate(tmp_path):
     assert set(MAKES) <= set(TRANSFORMS)
     recording = log(set(UNITS))
     for name, channel in MAKES.items():
         options = {"speed_from_wheels": {"wheel_radius": RADIUS}, "steering_ratio": {"ratio": RATIO}}.get(name, {})
         lacking = recording.select([own for own in recording.channels if own != channel])
         assert channel in transform_from_config({"name": name, **options})(lacking)
+    vx = np.where(np.arange(40) == 3, np.nan, 1.0)
+    recording = Recording("gap", "car", 40.0, 0.0, {"vx": vx, "ay": np.ones(40)}, gappy=frozenset({"vx"}))
+    write_recording(recording, tmp_path / "gap.parquet")
+    told = RecordingSummary("gap", 40.0, frozenset({"vx", "ay"}), frozenset({"vx"}))
+    assert stored_summary(tmp_path / "gap.parquet") == summary_of(recording) == told
 
 
 def test_table_names_all_estimators_and_json_says_the_same(place):

@@ -12,8 +12,6 @@ from vehest.sources.base import source_names
 from vehest.studies.registry import study_names
 from vehest.training.supervised import SupervisedSettings
 
-PLAIN = re.compile(r"\w+=[\w.]+( \w+=[\w.]+)*")
-
 
 def trainings():
     return {name: code_of("train", name) for name in estimator_names()}
@@ -25,7 +23,7 @@ def test_versions_are_names_and_numbers_without_modules_and_hashes():
     texts += [code_of("report", name) for name in study_names()]
     texts += [code_of(stage, name) for name in estimator_names() for stage in ("calibrate", "evaluate")]
     for text in texts:
-        assert PLAIN.fullmatch(text), text
+        assert re.fullmatch(r"\w+=[\w.]+( \w+=[\w.]+)*", text), text
         assert "vehest." not in text
         assert not re.search(r"[0-9a-f]{8}", text), text
     assert code_of("train", "ksnn") == "train=1 ksnn=1 training=1"

@@ -5,26 +5,20 @@ import re
 
 import numpy as np
 import pandas as pd
-import pytest
 import yaml
 
 from conftest import planar_drive
 from place import run_vehest, undrawn
 
 
-@pytest.fixture
-def log(elsewhere, monkeypatch):
-    """Four minutes of a simulated car in a logger's dress, in an empty folder."""
+def test_two_commands_lead_to_a_verdict_and_those_it_names_to_an_estimate_and_to_c(elsewhere, monkeypatch, capsys):
+    """Of four minutes of a simulated car in a logger's dress, in an empty folder."""
     undrawn(monkeypatch)
-    drive = planar_drive(240.0, 50.0, seed=5, noise=0.02)
+    log, drive = elsewhere, planar_drive(240.0, 50.0, seed=5, noise=0.02)
     beta = np.degrees(np.arctan2(drive["vy_ref"], drive["vx"]))
     columns = {"Time": drive.time, "Speed": 3.6 * drive["vx"], "GyroZ": np.degrees(drive["yaw_rate"])}
     columns |= {"AccX": drive["ax"] / 9.80665, "AccY": drive["ay"] / 9.80665, "Beta": beta}
     pd.DataFrame(columns).to_csv(elsewhere / "lap.csv", index=False)
-    return elsewhere
-
-
-def test_two_commands_lead_to_a_verdict_and_those_it_names_to_an_estimate_and_to_c(log, capsys):
     assert run_vehest(capsys, "new", "my_car", "lap.csv", "--yes")[0] == 0
     file = log / "pipelines" / "my_car.yaml"
     pipeline = yaml.safe_load(file.read_text(encoding="utf-8"))
@@ -51,7 +45,6 @@ def test_two_commands_lead_to_a_verdict_and_those_it_names_to_an_estimate_and_to
     assert json.loads(out)["estimated"] > 4000
     assert np.isfinite(pd.read_csv(log / "out.csv")["sideslip"].iloc[60:]).all()
     export = re.search(r"vehest export (\S+) -o (\S+)", said)
-    assert export is not None
     words = ("export", export[1], "-o", export[2], "--vectors", "lap.csv", "dataset=my_car")
     assert run_vehest(capsys, *words)[0] == 0
     code, _, err = run_vehest(capsys, *words, "--onnx")

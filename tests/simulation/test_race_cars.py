@@ -31,19 +31,13 @@ def _lagging(lengths=LENGTHS):
     return MultiBodyPlant(replace(plant_of("ferrari_250_lm").vehicle, relaxation=lengths))
 
 
-def _swerve(plant, seconds=1.5):
-    """States after every millisecond of a swerve at 25 m/s."""
-    states = [plant.initial_state(0.0, 0.0, 0.0, 25.0)]
-    for k in range(round(1000 * seconds)):
-        steering = 0.25 * math.cos(2.0 * math.pi * 1.5 * k / 1000.0)
-        states.append(plant.advance(states[-1], np.array([steering, 0.0, 0.0, 0.0, 0.0]), 1))
-    return states
-
-
 def test_lateral_forces_follow_the_slip_over_the_relaxation_length():
     """Against scipy's integration of dq/dt = u/length (asked - q), the force over load, with what a plant without lag asks for there."""
     plant, plain = _lagging(), _lagging((0.0, 0.0))
-    states = _swerve(plant)
+    states = [plant.initial_state(0.0, 0.0, 0.0, 25.0)]
+    for k in range(1500):  # of a swerve
+        steering = 0.25 * math.cos(2.0 * math.pi * 1.5 * k / 1000.0)
+        states.append(plant.advance(states[-1], np.array([steering, 0.0, 0.0, 0.0, 0.0]), 1))
     inputs = np.zeros((len(states), 5))
     _, forces = plain.evaluate(states, inputs)
     steer = np.array([state.steer for state in states])

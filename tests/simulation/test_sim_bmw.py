@@ -45,7 +45,7 @@ def mix(role, dataset="sim_bmw"):
     return Counter(drive.manoeuvre["name"] for name, drive in source(dataset).drives.items() if role_of(name) == role)
 
 
-def test_manoeuvres_and_their_mix_are_the_papers():
+def test_manoeuvres_their_mix_and_the_cars_mass_inertia_and_axle_distances_are_the_papers():
     roles = Counter(role_of(name) for name in source().drives)
     assert sum(roles.values()) == 216
     assert set(roles) == {"train", "validation", "test"}
@@ -56,6 +56,8 @@ def test_manoeuvres_and_their_mix_are_the_papers():
         drives = mix(role)
         for name, count in TEST_MANOEUVRES.items():
             assert abs(drives[name] - count / 23 * drives.total()) < 1.0, (role, name)
+    p = plant().parameters
+    assert (p.m, p.I_z, p.a, p.b) == (1970.0, 3498.0, 1.47, 1.41)
 
 
 def test_drives_of_all_roles_share_ranges_and_stability_control_and_no_seed():
@@ -101,13 +103,11 @@ def five_seconds(name, channels):
     return Recording(name, "bmw_545i", 100.0, 0.0, made).select(channels)
 
 
-def catalogue(dataset):
-    return {name: partial(five_seconds, name) for name in source(dataset).ids()}
-
-
 @cache
 def split(name):
-    return split_from_config(configuration("split", name), catalogue)
+    return split_from_config(
+        configuration("split", name), lambda dataset: {own: partial(five_seconds, own) for own in source(dataset).ids()}
+    )
 
 
 def test_splits_take_the_drives_by_their_names_and_the_limited_one_learns_below_7():
@@ -122,8 +122,3 @@ def test_splits_take_the_drives_by_their_names_and_the_limited_one_learns_below_
     assert {span.stop for span in limited.train + limited.validation} == {2.5}  # beyond 7 m/s² after that
     assert limited.tests == full.tests
     assert len(limited.train) == 161
-
-
-def test_the_cars_mass_inertia_and_axle_distances_are_the_papers():
-    p = plant().parameters
-    assert (p.m, p.I_z, p.a, p.b) == (1970.0, 3498.0, 1.47, 1.41)

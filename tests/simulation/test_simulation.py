@@ -63,11 +63,6 @@ def circuit():
     return trip(1, course="palm_beach_like", duration=80.0)  # 2 km of 3.3 km, until the banked corner's end
 
 
-@pytest.fixture(scope="module")
-def recording():
-    return drive(seed=1)
-
-
 @pytest.mark.parametrize(
     ("name", "shortest", "longest"),
     [
@@ -168,14 +163,14 @@ def test_patches_are_drawn_by_the_seed_or_the_surfaces_own_and_come_again_every_
     np.testing.assert_array_equal(own.along(places, 1), own.along(places, 2))
 
 
-@pytest.mark.parametrize(
-    ("configuration", "complaint"),
-    [("icy", "icy"), ({"friction": 0.0}, "0.05"), ({"mu": 0.5}, "mu"), ({"patches": 0.9, "friction": 0.5}, "patches"),
-     ({"patches": 0.5, "patch_length": [1.0, 2.0]}, "5 m")],
-)  # fmt: skip
-def test_surface_that_makes_no_sense_is_refused(configuration, complaint):
-    with pytest.raises(ConfigurationError, match=complaint):
-        surface_from_config(configuration)
+def test_surfaces_and_drives_that_make_no_sense_are_refused():
+    patches = {"patches": {"patches": 0.9, "friction": 0.5}, "5 m": {"patches": 0.5, "patch_length": [1.0, 2.0]}}
+    for complaint, configuration in {"icy": "icy", "0.05": {"friction": 0.0}, "mu": {"mu": 0.5}, **patches}.items():
+        with pytest.raises(ConfigurationError, match=complaint):
+            surface_from_config(configuration)
+    for options in ({"rate_hz": 30.0}, {"rate_hz": 0.0}, {"duration": 0.0}):
+        with pytest.raises(ConfigurationError):
+            drive(**{"seed": 0, "duration": 1.0, **options})
 
 
 def test_smoothest_line_agrees_with_a_general_solver():
@@ -231,13 +226,20 @@ def test_speed_profile_stays_within_friction_circle_and_power_on_bank_and_slippe
     assert slippery**2 * 0.02 == pytest.approx(4.0, rel=3e-3)
 
 
-def test_vehicles_own_driver_values_count():
+def test_vehicles_own_driver_values_count_and_a_rollover_says_which_drive_and_when():
     own = replace(LOWERED, driver={"grip": 7.0, "top_speed": 30.0, "power_per_mass": 20.0})
     car = car_of(MultiBodyPlant(own))
     assert (car.grip, car.top_speed, car.power_per_mass) == (7.0, 30.0, 20.0)
     for wrong, complaint in (({"grip": -1.0}, "grip"), ({"top_speed": 0.0}, "top_speed"), ({"gripp": 8.0}, "gripp")):
         with pytest.raises(ConfigurationError, match=complaint):
             car_of(MultiBodyPlant(replace(LOWERED, driver=wrong)))
+    tall = Vehicle("tall", 2, {**LOWERED.overrides, "h_s": 1.4}, driver={"grip": 9.0})
+    manoeuvre = manoeuvre_from_config({"name": "j_turn", "speed": 30.0, "severity": 1.5})
+    with pytest.raises(
+        SimulationError, match=r"drive 'high' with seed 0: manoeuvre 'j_turn', \d+\.\d\d s after the first sample: "
+    ) as raised:
+        simulate_drive(id="high", vehicle=tall, manoeuvre=manoeuvre, seed=0)
+    assert raised.value.exit_code == 3
 
 
 def test_circuit_lap_keeps_the_bank_and_grade_of_its_place(circuit):
@@ -285,7 +287,8 @@ def test_wet_road_lowers_what_is_reached_and_patches_are_in_the_motion():
     assert np.ptp(patchy.motion.friction) > 0.3
 
 
-def test_recording_says_where_it_comes_from(recording):
+def test_recording_says_where_it_comes_from():
+    recording = drive(seed=1)
     assert recording.kind == "simulated"
     assert recording.vehicle == "bmw_320i_low"
     assert (len(recording), recording.rate_hz) == (1200, 100.0)
@@ -302,19 +305,3 @@ def test_recording_says_where_it_comes_from(recording):
     assert (flags["spun"], flags["left_road"], flags["completed"]) == (False, False, True)
     assert 0.0 < flags["largest_lateral_error"] < 1.5
     assert 0.0 < flags["largest_sideslip"] < 0.2
-
-
-def test_rollover_says_which_drive_and_when():
-    tall = Vehicle("tall", 2, {**LOWERED.overrides, "h_s": 1.4}, driver={"grip": 9.0})
-    manoeuvre = manoeuvre_from_config({"name": "j_turn", "speed": 30.0, "severity": 1.5})
-    with pytest.raises(
-        SimulationError, match=r"drive 'high' with seed 0: manoeuvre 'j_turn', \d+\.\d\d s after the first sample: "
-    ) as raised:
-        simulate_drive(id="high", vehicle=tall, manoeuvre=manoeuvre, seed=0)
-    assert raised.value.exit_code == 3
-
-
-@pytest.mark.parametrize("options", [{"rate_hz": 30.0}, {"rate_hz": 0.0}, {"duration": 0.0}])
-def test_drive_that_makes_no_sense_is_refused(options):
-    with pytest.raises(ConfigurationError):
-        drive(**{"seed": 0, "duration": 1.0, **options})

@@ -110,7 +110,7 @@ def test_a_drive_is_consistent_in_forces_kinematics_and_friction():
     assert (motion.tyre_fz > 0.0).all()  # and no wheel lifts
 
 
-def test_wheel_loads_carry_the_weight_and_balance_the_moments_of_inertia():
+def test_wheel_loads_carry_the_weight_and_a_fixed_step_agrees_with_solve_ivp():
     plant = PlanarPlant(CAR)
     state = plant.initial_state(2.0)
     state[LOAD_AX], state[LOAD_AY] = 2.0, -3.0
@@ -119,6 +119,13 @@ def test_wheel_loads_carry_the_weight_and_balance_the_moments_of_inertia():
     assert 0.5 * CAR.track * (load[1] + load[3] - load[0] - load[2]) == pytest.approx(CAR.mass * CAR.cg_height * -3.0)
     axles = CAR.cg_to_front_axle * load[:2].sum() - CAR.cg_to_rear_axle * load[2:].sum()
     assert -axles == pytest.approx(CAR.mass * CAR.cg_height * 2.0)
+    plant, inputs = PlanarPlant(CAR), Inputs(steer=0.45, current=45.0)
+    start = plant.initial_state(2.0)
+    reference = solve_ivp(lambda _, state: plant.derivative(state, inputs)[0], (0.0, 0.5), start, rtol=1e-9, atol=1e-10, max_step=0.005)
+    np.testing.assert_allclose(plant.advance(start, inputs, 500), reference.y[:, -1], rtol=1e-3, atol=2e-4)
+    plant = PlanarPlant(CAR, step=0.1)
+    with pytest.raises(SimulationError, match=r"smaller step than 0\.1 s"):
+        plant.advance(plant.initial_state(3.0), Inputs(0.4, 60.0), 10_000)
 
 
 @pytest.mark.parametrize("yaw_rate", [0.0, 6.0, -12.0])
@@ -136,12 +143,15 @@ def test_a_car_that_coasts_loses_energy_until_it_stands(yaw_rate):
     assert energies[-1] < 1e-4 * energies[0]
 
 
-def test_a_car_at_rest_stays_at_rest_and_motor_friction_holds_it():
+def test_a_car_at_rest_stays_at_rest_and_a_slippery_floor_lowers_what_is_reached():
     state = held(CAR, 2.0, steer=0.4)
     assert state[STEER] == pytest.approx(0.4)
     np.testing.assert_array_equal(state[:STEER], 0.0)
     assert held(CAR, 2.0, current=0.5 * CAR.coulomb_torque / CAR.torque_constant)[VX] < 0.06
     assert held(CAR, 2.0, current=30.0)[VX] > 2.0
+    floors = {name: drive_freely(PlanarPlant(CAR), Freestyle(duration=15.0), 1, surface=SURFACES[name]).motion for name in ("dry", "wet")}
+    reached = {name: np.quantile(np.hypot(motion.ax, motion.ay), 0.95) for name, motion in floors.items()}
+    assert reached["wet"] / reached["dry"] == pytest.approx(0.7, rel=0.05)
 
 
 def test_nothing_becomes_infinite_under_wild_inputs_from_standstill_through_spins_and_backwards():
@@ -160,16 +170,6 @@ def test_nothing_becomes_infinite_under_wild_inputs_from_standstill_through_spin
     assert 3.0 < turned < 40.0
 
 
-def test_fixed_step_agrees_with_solve_ivp_and_states_that_are_not_finite_are_errors():
-    plant, inputs = PlanarPlant(CAR), Inputs(steer=0.45, current=45.0)
-    start = plant.initial_state(2.0)
-    reference = solve_ivp(lambda _, state: plant.derivative(state, inputs)[0], (0.0, 0.5), start, rtol=1e-9, atol=1e-10, max_step=0.005)
-    np.testing.assert_allclose(plant.advance(start, inputs, 500), reference.y[:, -1], rtol=1e-3, atol=2e-4)
-    plant = PlanarPlant(CAR, step=0.1)
-    with pytest.raises(SimulationError, match=r"smaller step than 0\.1 s"):
-        plant.advance(plant.initial_state(3.0), Inputs(0.4, 60.0), 10_000)
-
-
 def test_vx_is_the_motors_speed_at_the_rim_and_errs_where_wheels_slip():
     recording = simulate_planar_drive(id="a", car=CAR, manoeuvre=Freestyle(duration=15.0), seed=1, sensors=PRESETS["ideal"])
     motion = freestyle(rate_hz=100.0)
@@ -180,12 +180,6 @@ def test_vx_is_the_motors_speed_at_the_rim_and_errs_where_wheels_slip():
     assert np.abs(recording["vx"] - recording["vx_ref"]).max() > 0.5
     assert recording.kind == "simulated"
     assert recording.provenance["parameters"]["friction"] == CAR.friction
-
-
-def test_slippery_floor_lowers_what_is_reached_by_its_scale():
-    floors = {name: drive_freely(PlanarPlant(CAR), Freestyle(duration=15.0), 1, surface=SURFACES[name]).motion for name in ("dry", "wet")}
-    reached = {name: np.quantile(np.hypot(motion.ax, motion.ay), 0.95) for name, motion in floors.items()}
-    assert reached["wet"] / reached["dry"] == pytest.approx(0.7, rel=0.05)
 
 
 @cache
@@ -229,6 +223,14 @@ def car_with(**changes):
     return planar_car_from_configuration({**CONFIGURATION, "parameters": {**CONFIGURATION["parameters"], **changes}})
 
 
+def data_set(**changes):
+    drive = {"id": "a", "manoeuvre": {"name": "freestyle", "duration": 1.0}}
+    return open_source({"name": "mine", "source": "simulated", "vehicle": CONFIGURATION, "drives": [drive], **changes})
+
+
+OF_OTHERS = [{"parameters": ["tire.p_dy1"], "factor": [0.9, 1.1]}]
+
+
 @pytest.mark.parametrize(
     ("make", "complaint"),
     [
@@ -237,35 +239,20 @@ def car_with(**changes):
         (lambda: manoeuvre_from_config({"name": "slalom"}, PLANAR_MANOEUVRES), "there is no manoeuvre 'slalom'; there are freestyle"),
         (lambda: manoeuvre_from_config({"name": "freestyle", "brakes": 2.0}, PLANAR_MANOEUVRES), "brakes must lie between 0 and 1"),
         (lambda: manoeuvre_from_config({"name": "freestyle", "brakes": 0.6, "kicks": 0.6}, PLANAR_MANOEUVRES), "shares of one"),
+        (lambda: data_set(stability_control=True), "has no stability control"),
+        (lambda: data_set(drives=[{"id": "a", "manoeuvre": {"name": "slalom"}}]), "there are freestyle"),
+        (lambda: data_set(vary=OF_OTHERS), r"'tire\.p_dy1' is no parameter of vehicle 'f1tenth_tyre_a'"),
+        (lambda: data_set(vehicle={"name": "a", "parameter_set": 2}), "there is no manoeuvre 'freestyle'"),
     ],
 )
-def test_cars_and_manoeuvres_that_make_no_sense_are_refused(make, complaint):
+def test_cars_manoeuvres_and_data_sets_that_make_no_sense_are_refused(make, complaint):
     with pytest.raises(ConfigurationError, match=complaint):
         make()
 
 
-def data_set(**changes):
-    drive = {"id": "a", "manoeuvre": {"name": "freestyle", "duration": 1.0}}
-    return {"name": "mine", "source": "simulated", "vehicle": CONFIGURATION, "drives": [drive], **changes}
-
-
-@pytest.mark.parametrize(
-    ("changes", "complaint"),
-    [
-        ({"stability_control": True}, "has no stability control"),
-        ({"drives": [{"id": "a", "manoeuvre": {"name": "slalom"}}]}, "there are freestyle"),
-        ({"vary": [{"parameters": ["tire.p_dy1"], "factor": [0.9, 1.1]}]}, r"'tire\.p_dy1' is no parameter of vehicle 'f1tenth_tyre_a'"),
-        ({"vehicle": {"name": "a", "parameter_set": 2}}, "there is no manoeuvre 'freestyle'"),
-    ],
-)
-def test_data_set_that_the_plant_cannot_make_is_refused(changes, complaint):
-    with pytest.raises(ConfigurationError, match=complaint):
-        open_source(data_set(**changes))
-
-
 def test_cars_of_a_data_set_vary_from_drive_to_drive():
     drives = [{"id": "a", "count": 2, "manoeuvre": {"name": "freestyle", "duration": 1.0}}]
-    source = open_source(data_set(drives=drives, vary=[{"parameters": ["friction", "mass"], "factor": [0.5, 0.9]}]))
+    source = data_set(drives=drives, vary=[{"parameters": ["friction", "mass"], "factor": [0.5, 0.9]}])
     assert source.inputs() == {}  # the planar plant is vehest's own
     first, second = (source.read(name).provenance["parameters"] for name in source.ids())
     for drawn in (first, second):

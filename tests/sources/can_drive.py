@@ -1,10 +1,6 @@
 """A recording as the log of a CAN bus, written by cantools and python-can: jittering stamps, lost frames, units and signs of a supplier."""
 
-from __future__ import annotations
-
-from dataclasses import dataclass
-from pathlib import Path
-from typing import Any
+from collections import namedtuple
 
 import numpy as np
 
@@ -43,14 +39,8 @@ SIGNALS = {
     "steer": {"column": "SteerAng", "unit": "deg"},
 }
 ORIGIN = 1.7e9  # s, of the writers that take no other time; an .asc counts from its first frame
-
-
-@dataclass(frozen=True)
-class Written:
-    dbc: Path
-    log: Path
-    lost: dict[str, np.ndarray[Any, Any]]  # message -> numbers of the samples whose frames were lost
-    origin: float  # time of the recording at which the log's clock stands at 0 [s]
+Written = namedtuple("Written", "dbc log lost origin")
+"""Files; message -> numbers of the samples whose frames were lost; time of the recording at which the log's clock stands at 0 [s]."""
 
 
 def write_log(recording, folder, suffix=".asc", *, jitter=0.0, lost=0.0, seed=0, repeats=1):

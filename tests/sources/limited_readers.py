@@ -1,15 +1,11 @@
 """Functions that a limited process calls as readers: one that answers, and one for each way of ending otherwise."""
 
 import os
-from typing import Any
 
 import numpy as np
 
 from vehest.data.errors import MissingError
 from vehest.data.limits import current_limits
-from vehest.sources.limited import Arrays
-
-Answer = tuple[Arrays, dict[str, Any]]
 
 
 def answers(file, factor):

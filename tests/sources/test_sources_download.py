@@ -1,7 +1,5 @@
 """Downloads from a server on loopback that breaks off, changes its file, stalls or sends other bytes."""
 
-from __future__ import annotations
-
 import fcntl
 import hashlib
 import os
@@ -39,18 +37,18 @@ class Server(ThreadingHTTPServer):
 
     def __init__(self):
         super().__init__(("127.0.0.1", 0), Handler)
-        self.contents: dict[str, bytes] = {"a.csv": BYTES}
-        self.etag: str | None = '"one"'
-        self.modified: str | None = None
+        self.contents = {"a.csv": BYTES}
+        self.etag = '"one"'
+        self.modified = None
         self.ranges = True  # whether it knows them
         self.careless = False  # whether it ignores If-Range
-        self.changed: tuple[bytes, str] | None = None  # the file and its ETag after the first answer
-        self.breaks: list[int] = []  # after how many bytes the next answers break off
-        self.statuses: list[int] = []  # of the next answers
-        self.headers: dict[str, str] = {"Content-Type": "text/csv"}
+        self.changed = None  # the file and its ETag after the first answer
+        self.breaks = []  # after how many bytes the next answers break off
+        self.statuses = []  # of the next answers
+        self.headers = {"Content-Type": "text/csv"}
         self.length = True  # whether it tells the length
-        self.asked: list[tuple[str, str | None, str | None]] = []  # path, Range, If-Range
-        self.sent: list[int] = []
+        self.asked = []  # path, Range, If-Range
+        self.sent = []
 
     @property
     def url(self):

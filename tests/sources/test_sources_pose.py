@@ -73,21 +73,16 @@ def test_late_stamps_of_even_rows_do_no_harm(tmp_path):
             read(table.drop(index=range(500, 500 + lost)), tmp_path, clock="uniform")
 
 
-def held_table(delay_rows, every=10, n=1000):
-    """A yaw rate that its sensor samples in every tenth row and that arrives later, with the sensor's own clock beside it."""
-    time = np.arange(n) / RATE
-    truth = np.sin(2 * np.pi * 0.5 * time)
-    taken = (np.arange(n) - delay_rows) // every * every
-    values, stamps = np.where(taken >= 0, truth[np.maximum(taken, 0)], 0.0), np.where(taken >= 0, 300.0 + taken / RATE, 0.0)
-    return pd.DataFrame({"t": time, "vx": 3.0 + time, "r": values, "sensor": stamps}), truth
-
-
 HELD_CHANNELS = {"vx": {"column": "vx", "unit": "m/s"}, "yaw_rate": {"column": "r", "unit": "rad/s"}}
 
 
 @pytest.mark.parametrize("updated", ["sensor", None])
 def test_held_samples_are_taken_once_and_where_they_were_measured(tmp_path, updated):
-    table, truth = held_table(delay_rows=4)
+    """A yaw rate that its sensor samples in every tenth row and that arrives four later, with the sensor's own clock beside it."""
+    time, taken = np.arange(1000) / RATE, (np.arange(1000) - 4) // 10 * 10
+    truth = np.sin(2 * np.pi * 0.5 * time)
+    values, stamps = np.where(taken >= 0, truth[np.maximum(taken, 0)], 0.0), np.where(taken >= 0, 300.0 + taken / RATE, 0.0)
+    table = pd.DataFrame({"t": time, "vx": 3.0 + time, "r": values, "sensor": stamps})
     held = {"channels": ["yaw_rate"], "updated": updated, "delay": 0.04}
     recording = read(table, tmp_path, channels=HELD_CHANNELS, held=held)
     at = np.rint(recording.time * RATE).astype(int)

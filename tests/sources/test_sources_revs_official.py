@@ -9,7 +9,6 @@ from refusals import refusal
 from revs_files import COLUMNS, PREAMBLE, Drive, smooth_drive, write_csv, write_vehicle_parameters
 from vehest.run.config import compose_config
 from vehest.sources.base import open_source
-from vehest.sources.revs import RevsSource
 
 NAME = "20140222_01_01_03_250lm"
 SECONDS, BLANK = 4.0, 37
@@ -19,9 +18,7 @@ ONE_ROUNDING = {"rtol": 4e-16, "atol": 1e-300}  # degrees and back: two multipli
 def source(root, *overrides, dataset="revs_targa_2014", **changes):
     """The source of a data set in conf/, of one recording below ``root``."""
     config = compose_config("ingest", [f"dataset={dataset}", f"root={root}", *overrides])["dataset"]
-    found = open_source({**config, "recordings": [NAME], **changes})
-    assert isinstance(found, RevsSource)
-    return found
+    return open_source({**config, "recordings": [NAME], **changes})
 
 
 def read(root, *overrides, **changes):

@@ -1,20 +1,17 @@
 """ROS 2 bags written by the test, of a drive in closed form: what comes back, and one clear line for what cannot be used."""
 
-from __future__ import annotations
-
 import contextlib
 import importlib
 import runpy
 import shutil
 import sqlite3
 import sys
-from dataclasses import dataclass
+from collections import namedtuple
 from pathlib import Path
 
 import numpy as np
 import pytest
 import yaml
-from numpy.typing import NDArray
 from refusals import refusal
 
 from vehest.data.errors import ConfigurationError, DataError
@@ -51,15 +48,7 @@ CHANNELS = {
     "motor_current": {"topic": "motor", "field": "motor.currents.1", "unit": "A"},
     "steer": {"topic": "servo", "field": "data", "offset": 0.5, "sign": -1, "factor": 60.0, "unit": "deg"},
 }
-
-
-@dataclass
-class Topic:
-    """Messages of one topic: their times [s after START_NS] and fields."""
-
-    type: str
-    times: NDArray[np.float64]
-    fields: dict[str, NDArray[np.float64]]
+Topic = namedtuple("Topic", "type times fields")  # messages of one topic: their times [s after START_NS] and fields
 
 
 def drive(seconds=SECONDS):

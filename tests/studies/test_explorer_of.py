@@ -29,18 +29,13 @@ def comparison_on(drive, folder, rate_hz):
     return part, model
 
 
-def frozen_drive():
+def test_health_on_the_page_flags_a_frozen_channel_from_its_onset_on(tmp_path):
     drive = measured_drive(3)
     yaw_rate = np.array(drive["yaw_rate"])
     yaw_rate[drive.time >= FROZEN] = yaw_rate[drive.time >= FROZEN][0]
-    return replace(drive, channels={**drive.channels, "yaw_rate": yaw_rate})
-
-
-def test_health_on_the_page_flags_a_frozen_channel_from_its_onset_on(tmp_path):
-    drive = frozen_drive()
+    drive = replace(drive, channels={**drive.channels, "yaw_rate": yaw_rate})
     part, model = comparison_on(drive, tmp_path, RATE)
     found = health_over(model, list(pieces_of(SPANS, lambda span: drive, part.protocol)), part, 5)
-    assert found is not None
     lengths = [round((span.stop - span.start - 1.5) * RATE) for span in SPANS]
     assert len(found) == sum(lengths) + 5
     first, second = found[: lengths[0]], found[lengths[0] + 5 :]
@@ -51,14 +46,11 @@ def test_health_on_the_page_flags_a_frozen_channel_from_its_onset_on(tmp_path):
     assert np.isnan(found[lengths[0] : lengths[0] + 5]).all()
 
 
-def test_no_health_is_shown_of_a_model_that_reads_another_rate_or_was_not_calibrated(tmp_path):
+def test_no_health_is_shown_of_a_model_at_another_rate_and_ranges_are_chained_with_a_gap(tmp_path):
     drive = measured_drive(3)
     part, model = comparison_on(drive, tmp_path, RATE)
     pieces = list(pieces_of(SPANS, lambda span: drive, part.protocol))
     other = replace(part, protocol=replace(part.protocol, rate_hz=2 * RATE))
     assert health_over(model, pieces, other, 5) is None
     assert health_over(replace(model, calibration_folder=None), pieces, part, 5) is None
-
-
-def test_ranges_are_chained_with_a_gap_between_two_and_none_at_the_ends():
     assert chained([np.ones(2), np.zeros(1)], 2).tolist() == pytest.approx([1.0, 1.0, np.nan, np.nan, 0.0], nan_ok=True)

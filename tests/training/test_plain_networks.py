@@ -200,35 +200,22 @@ def test_frozen_parameters_and_buffers_stay_each_member_s_own():
     assert together[0].n_parameters == 6 + 1
 
 
-class Normalised(nn.Module):
-    def __init__(self):
-        super().__init__()
-        self.norm, self.output = nn.BatchNorm1d(4), nn.Linear(4, 1)
-
-
-class Masked(nn.Module):
-    def __init__(self):
-        super().__init__()
-        self.output = nn.Linear(4, 1)
-        self.register_buffer("mask", torch.ones(4, dtype=torch.bool))
-
-
-class Sequence(nn.Module):
-    def __init__(self):
-        super().__init__()
-        self.output = nn.Linear(4, 1)
-
-    def forward(self, windows):
-        return self.output(windows).squeeze(-1)
+def masked():
+    network = nn.Linear(4, 1)
+    network.register_buffer("mask", torch.ones(4, dtype=torch.bool))
+    return network
 
 
 @pytest.mark.parametrize(
     ("network", "message"),
     [
-        (Normalised, r"layer 'norm' \(BatchNorm1d\) keeps running statistics"),
-        (Masked, "buffer 'mask' is torch.bool, no floating point; register it with persistent=False"),
+        (lambda: nn.Sequential(nn.BatchNorm1d(4), nn.Linear(4, 1)), r"layer '0' \(BatchNorm1d\) keeps running statistics"),
+        (masked, "buffer 'mask' is torch.bool, no floating point; register it with persistent=False"),
         (nn.Identity, "Identity has no parameters to train"),
-        (Sequence, r"Sequence maps windows of shape \(64, 8, 4\) to \(64, 8\); it must return one lateral velocity a window, \(64,\)"),
+        (
+            lambda: nn.Sequential(nn.Linear(4, 1), nn.Flatten()),
+            r"Sequential maps windows of shape \(64, 8, 4\) to \(64, 8\); it must return one lateral velocity a window, \(64,\)",
+        ),
     ],
 )
 @pytest.mark.parametrize("seeds", [[0], [0, 1]])

@@ -103,7 +103,13 @@ def test_a_member_goes_on_alone_and_a_damaged_checkpoint_starts_anew(tmp_path):
     assert np.array_equal(flat_weights(whole), flat_weights(resumed))
 
 
-def test_diverging_training_is_one_clear_error():
+def test_diverging_training_and_settings_that_make_no_sense_are_one_clear_error():
+    for config, said in (
+        ({"learning_rate": -1.0}, "learning_rate must be positive"),
+        ({"averaging": 1.0}, "averaging must lie between 0 and 1"),
+    ):
+        with pytest.raises(ConfigurationError, match=said):
+            settings_from_config(SupervisedSettings, config, "training")
     with pytest.raises(DataError, match=r"lower training\.learning_rate"):
         _fit("ksnn", {"n_hidden": 0, "bias": True}, [0], SupervisedSettings(max_epochs=200, learning_rate=1e3))
 
@@ -121,15 +127,6 @@ def test_direct_search_finds_the_minimum_of_a_fine_grid_within_its_box():
     )
     assert np.allclose(record.best, [2, 1], atol=1e-3)
     assert (record.best <= [2, 1]).all()
-
-
-@pytest.mark.parametrize(
-    ("config", "message"),
-    [({"learning_rate": -1.0}, "learning_rate must be positive"), ({"averaging": 1.0}, "averaging must lie between 0 and 1")],
-)
-def test_training_settings_that_make_no_sense_are_refused(config, message):
-    with pytest.raises(ConfigurationError, match=message):
-        settings_from_config(SupervisedSettings, config, "training")
 
 
 def _loop_with_all_its_weights(averaging):
@@ -165,16 +162,13 @@ def _loop_with_all_its_weights(averaging):
     return network, losses
 
 
-def test_averaged_weights_are_those_of_a_loop_that_keeps_every_step():
+def test_averaged_weights_are_those_of_a_loop_that_keeps_every_step_and_never_reach_the_optimiser():
     settings = SupervisedSettings(dtype="float64", max_epochs=4, learning_rate=1e-2, averaging=0.9)
     (member,), (record,) = _fit("ksnn", {"n_hidden": 1, "bias": True}, [3], settings)
     network, losses = _loop_with_all_its_weights(0.9)
     assert np.allclose(record.history["validation_loss"], losses, rtol=1e-9)
     for own, other in zip(member.network.parameters(), network.parameters(), strict=True):
         assert torch.allclose(own, other, rtol=0, atol=1e-10)
-
-
-def test_averaging_never_reaches_the_optimiser():
     (_,), (plain,) = _fit("ksnn", {}, [0], SupervisedSettings(max_epochs=5))
     (_,), (averaged,) = _fit("ksnn", {}, [0], SupervisedSettings(max_epochs=5, averaging=0.99))
     assert averaged.history["train_loss"] == plain.history["train_loss"]

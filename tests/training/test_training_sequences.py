@@ -40,9 +40,9 @@ def _phase(network, name="fit", trainable=None, loss=None, validation=None, **se
 
 
 def _two_phases(network):
-    """The read-out first, then all together from a wrapper that shares its parameters."""
-    first = _phase(network, "read-out", lambda name: name.startswith("2."), max_epochs=7, validate_every=2)
-    return [first, _phase(nn.ModuleDict({"inner": network})["inner"], "all", patience=6, schedule="cosine")]
+    """The read-out first, then all together, in steps so large that patience ends it after its fourth epoch, the second being the best."""
+    first = _phase(network, "read-out", lambda name: name.startswith("2."), max_epochs=7, validate_every=2, learning_rate=0.6)
+    return [first, _phase(nn.ModuleDict({"inner": network})["inner"], "all", patience=2, schedule="cosine", learning_rate=0.3)]
 
 
 def _flat(network):
@@ -76,6 +76,8 @@ def test_killed_training_goes_on_from_its_last_checkpoint_to_the_same_bits(tmp_p
     with pytest.raises(KeyboardInterrupt):
         train_phases(_two_phases(killed), 3, FitContext([tmp_path], on_progress=die_after(11)), checkpoint_seconds=0.0)
     assert resume_epoch(tmp_path) == 10, "in the second phase"
+    kept = load_checkpoint(tmp_path).tensors
+    assert not torch.equal(kept["now.0.0.weight"], kept["best.0.0.weight"]), "it goes on from the first and ends with the second"
     resumed = _network()
     train_phases(_two_phases(resumed), 3, FitContext([tmp_path]))
     assert torch.equal(_flat(whole), _flat(resumed))
@@ -119,7 +121,7 @@ def test_frozen_parameters_stay_and_learn_again_afterwards():
         assert value.requires_grad
 
 
-def test_best_validation_is_kept_and_the_start_is_a_candidate():
+def test_best_validation_is_kept_also_of_every_third_epoch_and_progress_counts_over_all_phases():
     network, seen = _network(), []
     losses = iter([5.0, 4.0, 2.0, 3.0, math.nan, 2.5])
 
@@ -134,9 +136,6 @@ def test_best_validation_is_kept_and_the_start_is_a_candidate():
     (record,) = train_phases([_phase(network, validation=lambda: 1.0, patience=3)], 0, FitContext())
     assert (record.best_epoch, record.epochs) == (0, 3), "no better than the start, and out of patience"
     assert torch.equal(_flat(network), start)
-
-
-def test_validation_comes_every_third_epoch_and_progress_counts_over_all_phases():
     (record,) = train_phases([_phase(_network(), validate_every=3, max_epochs=8)], 0, FitContext())
     assert [math.isfinite(loss) for loss in record.validation_loss] == [False, False, True, False, False, True, False, True]
     told = []
@@ -233,7 +232,6 @@ def test_stop_leaves_the_best_so_far_and_says_so(tmp_path):
     assert records[-1].interrupted
     assert records[-1].epochs == 4
     checkpoint = load_checkpoint(tmp_path)
-    assert checkpoint is not None
     assert torch.equal(_flat(network)[:8], checkpoint.tensors["best.0.0.weight"].reshape(-1))
     assert math.isclose(records[-1].best_loss, float((network(X) - Y).square().mean().detach()), rel_tol=1e-6)
 

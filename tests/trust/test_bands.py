@@ -50,16 +50,13 @@ def bands_of(seed=0, **changes):
     return calibrated([piece_of(rng, 6000, **changes)], [piece_of(rng, 4000, **changes)], CHANNELS, **ORIGIN)
 
 
-def test_scale_follows_a_planted_growth_with_acceleration():
+def test_scale_follows_a_planted_growth_with_acceleration_and_that_of_a_filter_its_variance_and_a_floor():
     rng = np.random.default_rng(1)
     terms = np.stack([np.ones(200_000), 3.0 * rng.standard_normal(200_000), rng.standard_normal(200_000)], axis=1)
     errors = np.sqrt(0.04 + 0.01 * terms[:, 1] ** 2) * rng.standard_normal(200_000)
     weights, floor = fitted_scale(terms, errors)
     assert weights == pytest.approx([0.04, 0.01, 0.0], abs=1e-3)
     assert floor == pytest.approx(0.1 * np.sqrt(np.mean(errors**2)))
-
-
-def test_scale_of_a_filter_is_its_variance_and_a_floor():
     rng = np.random.default_rng(2)
     deviation = rng.uniform(0.01, 0.3, 100_000)
     errors = 3.0 * np.sqrt(deviation**2 + 0.2**2) * rng.standard_normal(100_000)

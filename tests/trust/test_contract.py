@@ -159,12 +159,18 @@ def test_an_estimator_that_raises_starts_anew_but_programming_errors_are_not_swa
         GuardedStepper(Saying(says)).step(SAMPLE)
 
 
-def test_none_missing_channels_and_words_count_as_not_measured():
+def test_none_missing_channels_and_words_count_as_not_measured_and_repeated_samples_are_passed_over():
     estimator = Saying(lambda step: 1.0)
     stepper = GuardedStepper(estimator)
     for sample in (SAMPLE, None, {}, {"vx": None, "yaw_rate": "?"}, SAMPLE):
         assert stepper.step(sample)["vy"] == 1.0
     assert estimator.begun == 1
+    estimator = Saying(float)
+    stepper = GuardedStepper(estimator)
+    times = [0.0, 0.05, 0.05, 0.1, 0.3, 0.35]
+    assert [stepper.step(moving(k), time)["vy"] for k, time in enumerate(times)] == [0.0, 1.0, 1.0, 2.0, 6.0, 7.0]
+    assert stepper.step(moving(6), 10.0)["vy"] == 0.0  # starts anew after a gap of 10 s
+    assert estimator.begun == 2
 
 
 def test_v_fades_over_a_long_gap_and_a_new_start_follows():
@@ -181,22 +187,18 @@ def test_v_fades_over_a_long_gap_and_a_new_start_follows():
     assert estimator.begun == 2
 
 
-def test_repeated_samples_are_passed_over_and_missing_ones_counted():
-    estimator = Saying(float)
-    stepper = GuardedStepper(estimator)
-    times = [0.0, 0.05, 0.05, 0.1, 0.3, 0.35]
-    assert [stepper.step(moving(k), time)["vy"] for k, time in enumerate(times)] == [0.0, 1.0, 1.0, 2.0, 6.0, 7.0]
-    assert stepper.step(moving(6), 10.0)["vy"] == 0.0  # starts anew after a gap of 10 s
-    assert estimator.begun == 2
-
-
-def test_a_clock_at_another_rate_is_said_once():
+def test_a_clock_at_another_rate_and_the_delay_of_the_filter_are_said_and_a_slower_bus_refused():
     stepper = GuardedStepper(Saying(lambda step: 0.0))
     with warnings.catch_warnings(record=True) as said:
         warnings.simplefilter("always")
         for k in range(60):
             stepper.step(moving(k), 0.1 * k)
     assert [str(warning.message) for warning in said] == ["samples come at 10 Hz instead of 20 Hz; set bus_rate_hz=10"]
+    assert GuardedStepper(ready("ksnn"), bus_rate_hz=100.0).delay == pytest.approx(0.0509, abs=1e-3)
+    assert GuardedStepper(ready("ksnn")).delay == 0.0
+    for rate in (10.0, 0.0):
+        with pytest.raises(ConfigurationError, match=f"samples at {rate:g} Hz are too slow for an estimator that works at 20 Hz"):
+            GuardedStepper(ready("ksnn"), bus_rate_hz=rate)
 
 
 def test_a_spinning_car_may_slide_as_fast_as_it_drove_and_is_marked():
@@ -249,11 +251,3 @@ def test_front_end_keeps_uneven_rates_and_starts_anew_after_a_gap():
         assert row is None or math.isnan(row[0, 0]) or row[0, 0] == pytest.approx(1.0)
     after = [front(np.array([[3.0 + 1e-6 * k]])) for k in range(40)]
     assert [row[0, 0] for row in after if row is not None] == pytest.approx([3.0] * 4, abs=1e-3)
-
-
-def test_delay_of_the_filter_is_said_and_a_slower_bus_refused():
-    assert GuardedStepper(ready("ksnn"), bus_rate_hz=100.0).delay == pytest.approx(0.0509, abs=1e-3)
-    assert GuardedStepper(ready("ksnn")).delay == 0.0
-    for rate in (10.0, 0.0):
-        with pytest.raises(ConfigurationError, match=f"samples at {rate:g} Hz are too slow for an estimator that works at 20 Hz"):
-            GuardedStepper(ready("ksnn"), bus_rate_hz=rate)

@@ -116,11 +116,16 @@ def test_frozen_and_lost_samples_are_as_many_as_the_severity_says(samples):
         assert np.abs(after[struck]).min() >= 10 * CHANNELS["ay"].high
 
 
-def test_noise_has_the_standard_deviation_that_it_says(samples):
+def test_noise_has_the_standard_deviation_that_it_says_short_faults_strike_and_gaps_stay(samples):
     long = {"ay": np.zeros(40_000)}
     noise = inject(long, RATE, Fault("noise", "ay", "medium"))["ay"]
     assert noise.std() == pytest.approx(1.0, abs=4.0 / math.sqrt(2 * len(noise))), "within four standard errors"
     assert abs(noise[1:] @ noise[:-1]) / len(noise) < 4.0 / math.sqrt(len(noise)), "white"
+    made = inject(samples, RATE, Fault("inf", "ay", "mild", ONSET, 1.0 / RATE))["ay"]
+    assert np.flatnonzero(~np.isfinite(made)).tolist() == [FIRST]
+    samples["ay"] = np.where(np.arange(600) % 7 == 0, np.nan, samples["ay"])
+    after = faulted(samples, "saturation", "ay", "severe")[1]
+    np.testing.assert_array_equal(np.isnan(after), np.isnan(samples["ay"][FIRST:END]))
 
 
 @pytest.mark.parametrize(
@@ -138,14 +143,6 @@ def test_a_wrong_unit_is_its_factor(samples, channel, severity, factor):
     assert after == pytest.approx(factor * before)
 
 
-def test_short_faults_strike_and_gaps_stay(samples):
-    made = inject(samples, RATE, Fault("inf", "ay", "mild", ONSET, 1.0 / RATE))["ay"]
-    assert np.flatnonzero(~np.isfinite(made)).tolist() == [FIRST]
-    samples["ay"] = np.where(np.arange(600) % 7 == 0, np.nan, samples["ay"])
-    after = faulted(samples, "saturation", "ay", "severe")[1]
-    np.testing.assert_array_equal(np.isnan(after), np.isnan(samples["ay"][FIRST:END]))
-
-
 def test_a_lost_wheel_drops_out_spins_or_locks(samples):
     before = samples["wheel_speed_fl"][FIRST:END]
     gone, spinning, locked = (faulted(samples, "lost_wheel", "wheel_speed_fl", severity)[1] for severity in SEVERITIES)
@@ -155,14 +152,9 @@ def test_a_lost_wheel_drops_out_spins_or_locks(samples):
     assert locked[2] == pytest.approx(0.5 * before[2]), "within 0.2 s"
 
 
-@pytest.mark.parametrize(
-    ("onset", "duration", "found"), [(0.0, math.inf, (0, 600)), (10.0, 8.0, (200, 360)), (29.9, 5.0, (598, 600)), (40.0, 5.0, (600, 600))]
-)
-def test_a_fault_lasts_from_its_onset_on(onset, duration, found):
-    assert window(Fault("bias", "ay", "mild", onset, duration), 600, RATE) == found
-
-
-def test_every_kind_is_for_some_channel_and_none_for_a_reference():
+def test_a_fault_lasts_from_its_onset_on_and_every_kind_is_for_some_channel_and_none_for_a_reference():
+    for onset, duration, found in ((0.0, math.inf, (0, 600)), (10.0, 8.0, (200, 360)), (29.9, 5.0, (598, 600)), (40.0, 5.0, (600, 600))):
+        assert window(Fault("bias", "ay", "mild", onset, duration), 600, RATE) == found
     for kind in KINDS:
         assert any(applies(kind, channel) for channel in CHANNELS), kind
         assert not any(applies(kind, channel) for channel, own in CHANNELS.items() if own.is_reference)
@@ -170,11 +162,13 @@ def test_every_kind_is_for_some_channel_and_none_for_a_reference():
     assert [channel for channel in tried if applies("sign", channel)] == ["ay", "yaw_rate"]
 
 
-def test_a_condition_is_compact():
+def test_a_condition_is_compact_and_a_channel_that_is_not_there_named(samples):
     assert Fault("frozen", "yaw_rate", "severe", 3.0, 5.0).condition == "frozen:yaw_rate:severe"
     assert Fault("bias", "ay", size=-0.25, seed=2).condition == "bias:ay:-0.25:2"
     assert is_fault(Fault("nan", "vx").condition)
     assert not is_fault("nominal")
+    with pytest.raises(ConfigurationError, match=r"fault 'bias:handwheel:mild': there is no channel 'handwheel'; there are: vx, yaw_rate"):
+        inject(samples, RATE, Fault("bias", "handwheel", "mild"))
 
 
 @pytest.mark.parametrize(
@@ -193,11 +187,6 @@ def test_a_condition_is_compact():
 )
 def test_what_makes_no_sense_is_one_line(arguments, message):
     assert message in refusal(lambda: Fault(*arguments), ConfigurationError)
-
-
-def test_a_channel_that_is_not_there_is_named(samples):
-    with pytest.raises(ConfigurationError, match=r"fault 'bias:handwheel:mild': there is no channel 'handwheel'; there are: vx, yaw_rate"):
-        inject(samples, RATE, Fault("bias", "handwheel", "mild"))
 
 
 def cells(start):

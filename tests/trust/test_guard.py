@@ -55,12 +55,18 @@ def test_a_channel_is_missing_for_as_long_as_another_can_be_skipped(drive):
     assert (guard(("ay", "yaw_rate"))(rows).flow == WAIT).sum() == 90
 
 
-def test_a_spike_is_left_aside_and_a_new_level_believed_once_it_stands(drive):
+def test_a_spike_is_left_aside_a_new_level_believed_and_a_frozen_channel_not_measured(drive):
     rows = rows_of(drive)
     rows[100, 2] += 12.0
     rows[200:, 2] += 12.0
     measured = guard(limits=learn_limits([drive], CHANNELS, RATE))(rows).measured[:, 2]
     assert np.flatnonzero(~measured).tolist() == [100, 200]
+    limits = learn_limits([drive], CHANNELS, RATE)
+    rows = rows_of(drive)
+    rows[300:400, 0] = rows[299, 0]
+    measured = guard(limits=limits)(rows).measured[:, 0]
+    first = 300 + round(limits.channels["yaw_rate"].run * RATE)
+    assert np.flatnonzero(~measured).tolist() == list(range(first, 400))
 
 
 @pytest.mark.parametrize(("samples", "restarts"), [(10, 0), (11, 1), (60, 1)])
@@ -70,15 +76,6 @@ def test_gaps_up_to_half_a_second_are_bridged_and_longer_ones_start_anew(drive, 
     flow = guard()(rows).flow
     assert (flow[1:] == RESTART).sum() == restarts
     assert (flow == WAIT).sum() == max(samples - 10, 0)
-
-
-def test_a_frozen_channel_counts_as_not_measured_after_its_longest_run(drive):
-    limits = learn_limits([drive], CHANNELS, RATE)
-    rows = rows_of(drive)
-    rows[300:400, 0] = rows[299, 0]
-    measured = guard(limits=limits)(rows).measured[:, 0]
-    first = 300 + round(limits.channels["yaw_rate"].run * RATE)
-    assert np.flatnonzero(~measured).tolist() == list(range(first, 400))
 
 
 @pytest.mark.parametrize(("held", "believed"), [("at its lock", True), ("on the way there", False)])

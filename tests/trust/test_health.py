@@ -202,11 +202,17 @@ def test_senseless_values_leave_nothing_behind():
     np.testing.assert_allclose(found.ratio[later], healthy.ratio[later], rtol=0.2, atol=0.05)
 
 
-def test_a_channel_that_never_moved_in_training_can_be_learnt_and_watched():
+def test_a_channel_that_never_moved_in_training_is_watched_and_a_glitch_of_the_recording_no_limit():
     drives = [replace(drive, channels={**drive.channels, "steer": np.zeros(len(drive))}) for drive in map(measured_drive, range(4))]
     model = learn_health(drives[:2], drives[2:3], CHANNELS, RATE)
     assert not judged(model, drives[3]).status.any()
     assert (judged(model, drives[3], steer=after(drives[3]["steer"], 0.01)).status[ONSET:] > VALID).any()
+    drive = measured_drive(0)
+    steer = np.array(drive["steer"])
+    steer[1234] += 0.2
+    glitched = replace(drive, channels={**drive.channels, "steer": steer})
+    model = learn_health([glitched, measured_drive(1)], [measured_drive(2)], CHANNELS, RATE)
+    np.testing.assert_allclose(model.limits, model_of().limits, rtol=0.25)
 
 
 def test_a_car_without_a_measured_speed_is_judged_by_its_motor():
@@ -234,15 +240,6 @@ def test_a_locked_wheel_is_told_from_a_lost_one(braking):
     found = judged(model, drive, **faulty)
     words = reason_in_words(found.reason[ONSET + round(0.5 * RATE)])
     assert words == ("locked wheel: wheel_speed_fl" if braking else "lost wheel: wheel_speed_fl")
-
-
-def test_a_glitch_of_the_recording_is_no_limit():
-    drive = measured_drive(0)
-    steer = np.array(drive["steer"])
-    steer[1234] += 0.2
-    glitched = replace(drive, channels={**drive.channels, "steer": steer})
-    model = learn_health([glitched, measured_drive(1)], [measured_drive(2)], CHANNELS, RATE)
-    np.testing.assert_allclose(model.limits, model_of().limits, rtol=0.25)
 
 
 def test_models_come_back_from_files_and_say_what_lies_outside_training_or_of_another_rate():

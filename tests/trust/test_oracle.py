@@ -73,12 +73,8 @@ def test_a_correlated_channel_shortens_the_delay_as_the_information_says():
     assert abs(found.mean() - (12.0 / power + 0.583 * 2.0 / math.sqrt(power))) < 3.0 * found.std() / math.sqrt(len(found))
 
 
-@pytest.fixture(scope="module")
-def oracle():
-    return learn_oracle([measured_drive(0), measured_drive(1)], [measured_drive(2)], CHANNELS, RATE)
-
-
-def test_the_oracle_sees_larger_faults_sooner_and_what_is_not_finite_at_once(oracle):
+def test_the_oracle_sees_larger_faults_sooner_and_what_is_not_finite_at_once():
+    oracle = learn_oracle([measured_drive(0), measured_drive(1)], [measured_drive(2)], CHANNELS, RATE)
     drive = {name: np.array(measured_drive(3)[name]) for name in CHANNELS}
     ramp = np.maximum(np.arange(len(drive["ay"])) - 2000, 0) / RATE
     seen = [oracle.sees(drive, {**drive, "ay": drive["ay"] + slope * ramp}, 2000) for slope in (1e-4, 0.3, 1.0, 5.0)]

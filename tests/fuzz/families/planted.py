@@ -15,7 +15,6 @@ from vehest.data.errors import DataError
 from vehest.data.limits import Limits, use_limits
 from vehest.sources.limited import read_limited
 
-Answer = tuple[dict[str, object], dict[str, object]]
 MUCH = 2400 * 2**20  # bytes
 
 
