@@ -169,6 +169,7 @@ def test_both_schemes_have_the_39_candidates_of_table_3_and_three_baselines():
         (BOTH, {"parts": {"scheme_1": {"split": "forth", "sweeps": CANDIDATES}}}, "needs part 'scheme_2'"),
         ("pipelines/x.yaml", {"based_on": "turned", "study": "x"}, "is based on another pipeline itself"),
         ("pipelines/x.yaml", {"based_on": "no_such", "study": "x"}, "there is no pipeline 'no_such'"),
+        ("pipelines/x.yaml", {"based_on": "mine", "study": "x"}, "'mine', only a data set: 'vehest data usable mine' says"),
         (
             "pipelines/x.yaml",
             {"based_on": "both", "study": "x", "parts": {"scheme_3": {"split": "back"}}},

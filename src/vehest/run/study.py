@@ -34,7 +34,7 @@ from vehest.run.config import (
     parsed,
     value_of,
 )
-from vehest.run.config_files import find_pipeline, pipeline_names
+from vehest.run.config_files import choices, find_pipeline, pipeline_names
 from vehest.run.evaluate_faults import faults_of
 from vehest.run.failures import Failure, failure_of
 from vehest.run.train import TrainJob, new_estimator
@@ -150,6 +150,8 @@ def _content_of(name: str, *, as_base: bool = False) -> tuple[Path, dict[str, An
     if file is None:
         close = difflib.get_close_matches(Path(name).stem, pipeline_names(), n=1)
         hint = f"; did you mean pipelines/{close[0]}.yaml?" if close else ""
+        if name in choices("dataset"):
+            hint = f", only a data set: 'vehest data usable {name}' says what its recordings suffice for"
         raise MissingError(f"there is no pipeline '{name}'{hint} (there are: {', '.join(pipeline_names())})")
     try:
         content = read_yaml(file)
