@@ -252,9 +252,7 @@ def test_training_on_a_log_that_lacks_a_channel_is_refused_with_the_remedy_which
         ),
     )
     assert not list((place.folder / "outputs").glob("downsample/*")), "it is said before recordings are resampled"
-    file = place.folder / "conf" / "dataset" / "logged.yaml"
-    transforms = [{"name": "acceleration_from_speed"}, {"name": "velocity_from_sideslip"}]
-    file.write_text(yaml.safe_dump(yaml.safe_load(file.read_text()) | {"transforms": transforms}, allow_unicode=True))
+    place.change("conf/dataset/logged.yaml", transforms=[{"name": "acceleration_from_speed"}, {"name": "velocity_from_sideslip"}])
     few = ("training.grid=1", "training.max_evaluations=10")
     place.done("train", "estimator=luenberger", "split=logged", "tracking=none", *few)
 
@@ -357,10 +355,8 @@ def test_evaluation_grid_is_no_finer_than_a_log_of_10_hz(place):
 
 def test_lowest_rate_of_all_data_sets_of_a_split_counts(place):
     add_logged(place, FULL)
-    file = place.folder / "conf" / "split" / "logged.yaml"
-    split = yaml.safe_load(file.read_text())
-    split["tests"]["other"] = [{"dataset": "mine", "recording": "three"}]  # sampled at 100 Hz
-    file.write_text(yaml.safe_dump(split))
+    tests = {"test": [{"recording": "lap3"}], "other": [{"dataset": "mine", "recording": "three"}]}  # the latter sampled at 100 Hz
+    place.change("conf/split/logged.yaml", tests=tests)
     add_study(place, ["estimator=luenberger", "training.grid=1", "training.max_evaluations=10"])
     out, err = place.done("run", "logged", "--json", "tracking=none")
     assert "luenberger runs at 50 Hz instead of its 100 Hz" in " ".join(err.split())
