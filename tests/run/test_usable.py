@@ -1,9 +1,7 @@
 """What estimators lack is said before anything is trained, what is promised to supply it does, and rates fit the recordings."""
 
 import json
-from copy import deepcopy
 from dataclasses import replace
-from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -23,7 +21,6 @@ from vehest.data.store import write_recording
 from vehest.data.transforms import TRANSFORMS, transform_from_config
 from vehest.estimators.base import FitData
 from vehest.estimators.registry import estimator_class, estimator_names
-from vehest.run import usable
 from vehest.run.comparison import lower_rate
 from vehest.run.config import compose_config
 from vehest.run.train import new_estimator
@@ -46,15 +43,6 @@ def log(channels, rate_hz=50.0, seed=1, seconds=30.0, name="lap"):
     known = {**drive.channels, "steer": steer, "handwheel": RATIO * steer}
     known |= {f"wheel_speed_{wheel}": drive["vx"] / RADIUS for wheel in WHEELS}
     return replace(drive, channels={channel: known[channel] for channel in sorted(channels)})
-
-
-@pytest.fixture(autouse=True, scope="module")
-def _composed_once():
-    """The configuration of each estimator is composed once for all tables."""
-    composed = cache(lambda command, *overrides: compose_config(command, list(overrides)))
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(usable, "compose_config", lambda command, overrides: deepcopy(composed(command, *overrides)))
-        yield
 
 
 def rows(recording):
