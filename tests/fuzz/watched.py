@@ -11,7 +11,7 @@ import types
 from pathlib import Path
 
 import vehest
-from processes import status_kb
+from processes import die_with_parent, status_kb
 
 ADDRESS_SPACE = 4 * 2**30
 FILE_SIZE = 2**30
@@ -152,6 +152,7 @@ def become(case, command):
     code = 1
     try:
         os.setsid()
+        die_with_parent()
         report = _prepare(case, command)
         main = _main_of(sys.argv[1:])
         watch = Watch(case.folder, report)
