@@ -92,11 +92,11 @@ def write_yaml(file, content):
     file.write_text(yaml.safe_dump(content, allow_unicode=True, sort_keys=False), encoding="utf-8")
 
 
-def write_drives(folder):
+def write_drives(folder, seconds=30.0):
     """The tables of `DATASET`."""
     (folder / "raw").mkdir(exist_ok=True)
     for seed, name in enumerate(("one", "two", "three"), start=1):
-        write_csv(folder / "raw" / f"{name}.csv", seed)
+        write_csv(folder / "raw" / f"{name}.csv", seed, seconds)
 
 
 def write_steered(folder, names):

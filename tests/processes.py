@@ -15,14 +15,13 @@ from types import SimpleNamespace
 HANGS = 900.0  # s after which a test fails; until then it waits for what happens
 MOMENT = 0.02  # s between two looks
 PR_SET_PDEATHSIG = 1  # of Linux's prctl
-_libc = ctypes.CDLL(None)
+die_with_parent = partial(ctypes.CDLL(None).prctl, PR_SET_PDEATHSIG, signal.SIGKILL)
 _started = []
 
 
 def start(command, **options):
     """Start a process that leads a session of its own; see `end_all`."""
-    dies = partial(_libc.prctl, PR_SET_PDEATHSIG, signal.SIGKILL)  # with its parent
-    process = subprocess.Popen(list(map(str, command)), start_new_session=True, preexec_fn=dies, **options)
+    process = subprocess.Popen(list(map(str, command)), start_new_session=True, preexec_fn=die_with_parent, **options)
     _started.append(process)
     return process
 
@@ -50,6 +49,12 @@ def is_alive(pid):
     except (FileNotFoundError, ProcessLookupError):
         return False
     return state not in "ZX"
+
+
+def status_kb(field, pid="self"):
+    """A figure of /proc/PID/status [kB]."""
+    with open(f"/proc/{pid}/status", encoding="utf-8") as stream:
+        return next(int(line.split()[1]) for line in stream if line.startswith(f"{field}:"))
 
 
 class Striking:
@@ -108,8 +113,7 @@ def _read_order(order, answers):
         sys.stdout = sys.stderr = open(os.devnull, "w")  # noqa: SIM115 - as long as the process lives
         with os.fdopen(order, "rb") as told, os.fdopen(answers, "wb") as stream:
             request = json.load(told)
-            held = next(line for line in Path("/proc/self/status").read_text().splitlines() if line.startswith("VmData"))
-            _send(stream, *_answer(request | {"memory": request["memory"] + 1024 * int(held.split()[1])}))
+            _send(stream, *_answer(request | {"memory": request["memory"] + 1024 * status_kb("VmData")}))
     finally:
         os._exit(0)
 

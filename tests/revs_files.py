@@ -27,6 +27,9 @@ PARAMETERS = {
     "roadWheelAngleFL": ("°", [-6.7, 0.0, 6.9]),
     "roadWheelAngleFR": ("°", [-6.9, 0.0, 6.7]),
 }
+INS = {"vx": "vxCG", "ax": "axCG", "ay": "ayCG", "vy_ref": "vyCG"}
+INS_DEGREES = {"yaw_rate": "yawRate", "roll": "rollAngle", "pitch": "pitchAngle", "roll_rate": "rollRate"}
+INS_DEGREES |= {"pitch_rate": "pitchRate", "sideslip_ref": "sideSlip"}
 
 
 def _columns():
@@ -82,7 +85,9 @@ def smooth_drive(seconds, start_time=0.0, decimals=None):
     truth |= {"vx_ref": vx, "vy_ref": vy, "sideslip_ref": np.arctan2(vy, vx)}
     truth["handwheel"] = 1.2 * np.sin(0.5 * time + 0.5) + 0.01 * np.sin(40.0 * time)
     truth["steer"] = truth["handwheel"] / 13.3
-    signals = _ins_signals({name: samples[:: CSV_RATE_HZ // INS_RATE_HZ] for name, samples in truth.items()})
+    step = CSV_RATE_HZ // INS_RATE_HZ
+    signals = {column: truth[name][::step] for name, column in INS.items()}
+    signals |= {column: np.rad2deg(truth[name][::step]) for name, column in INS_DEGREES.items()}
     signals["handwheelAngle"] = np.rad2deg(truth["handwheel"])
     if decimals is not None:
         signals = {name: np.round(samples, decimals) for name, samples in signals.items()}
@@ -111,15 +116,6 @@ def write_vehicle_parameters(path):
     columns = [[name, unit, *map(str, values)] for name, (unit, values) in PARAMETERS.items()]
     lines = map(",".join, zip_longest(*columns, fillvalue=""))
     path.write_bytes(("\r\n".join(lines) + "\r\n").encode("latin-1"))
-
-
-def _ins_signals(channels):
-    """Columns of the INS from channels in SI units."""
-    plain = {"vx": "vxCG", "ax": "axCG", "ay": "ayCG", "vy_ref": "vyCG"}
-    angular = {"yaw_rate": "yawRate", "roll": "rollAngle", "pitch": "pitchAngle", "roll_rate": "rollRate"}
-    angular |= {"pitch_rate": "pitchRate", "sideslip_ref": "sideSlip"}
-    signals = {column: np.asarray(channels[name]) for name, column in plain.items() if name in channels}
-    return signals | {column: np.rad2deg(channels[name]) for name, column in angular.items() if name in channels}
 
 
 def _held(drive, name, rate):

@@ -6,7 +6,6 @@ from pathlib import Path
 
 import pandas as pd
 import pytest
-import yaml
 
 from conftest import planar_drive
 from vehest.bus.view import View
@@ -25,9 +24,9 @@ def bus(place):
     """A log of ten seconds, its DBC, and a data set that describes both."""
     write_log(planar_drive(10.0, 100.0, seed=2), place.folder / "raw" / "bus", jitter=0.001, lost=0.01)
     channels = {name: SIGNALS[name] for name in ("vx", "yaw_rate", "ax", "ay")}
-    described = {"name": "bus", "kind": "simulated", "vehicle": "car", "licence": "none", "citation": "none", "source": "can"}
-    described |= {"path": "${root}/bus", "files": "*.asc", "dbc": "${root}/bus/car.dbc", "rate_hz": 100, "channels": channels}
-    (place.folder / "conf" / "dataset" / "bus.yaml").write_text(yaml.safe_dump(described, allow_unicode=True))
+    described = {"kind": "simulated", "vehicle": "car", "licence": "none", "citation": "none", "source": "can", "rate_hz": 100}
+    described |= {"path": "${root}/bus", "files": "*.asc", "dbc": "${root}/bus/car.dbc", "channels": channels}
+    place.change("conf/dataset/bus.yaml", name="bus", **described)
     return place
 
 

@@ -30,8 +30,7 @@ def with_a_checkpoint(output, but=None):
 
 def test_processes_of_this_machine_give_the_bits_of_the_local_launcher(folder, alone, tmp_path):  # noqa: F811
     output = with_recordings(alone["forty"], tmp_path / "out")
-    driver = Driver(folder, output, "sweep", *FORTY, "--launcher", "slurm", "--address", "local", "-j", "2")
-    assert driver.ended() == 0, driver.said
+    Driver(folder, output, "sweep", *FORTY, "--launcher", "slurm", "--address", "local", "-j", "2").ends()
     assert metrics(output) == metrics(alone["forty"])
     assert weights(output) == weights(alone["forty"])
     assert not list(output.glob("clusters/*")), "what was handed over is forgotten"
@@ -44,7 +43,7 @@ def test_a_queue_gives_the_same_although_a_job_dies_and_another_is_put_back(fold
     os.kill(lost["pid"], signal.SIGKILL)
     put_back = driver.sees(lambda: with_a_checkpoint(output, but=lost))
     os.kill(put_back["pid"], signal.SIGUSR2)
-    assert driver.ended() == 0, driver.said
+    driver.ends()
     assert metrics(output) == metrics(alone["longer"])
     assert weights(output) == weights(alone["longer"])
     assert "its job ended without an outcome" in driver.said
@@ -56,9 +55,8 @@ def test_ctrl_c_takes_jobs_back_and_the_next_call_goes_on(folder, alone, queue, 
     driver = Driver(folder, output, "sweep", *LONGER, "--launcher", "slurm", **environment)
     driver.sees(lambda: with_a_checkpoint(output))
     driver.process.send_signal(signal.SIGINT)
-    assert driver.ended() == 130, driver.said
-    again = Driver(folder, output, "sweep", *LONGER, "--launcher", "slurm", **environment)
-    assert again.ended() == 0, again.said
+    driver.ends(130)
+    Driver(folder, output, "sweep", *LONGER, "--launcher", "slurm", **environment).ends()
     assert metrics(output) == metrics(alone["longer"])
 
 
@@ -70,11 +68,10 @@ def test_a_queue_that_takes_no_more_jobs_ends_the_command_and_the_next_call_goes
     lost = driver.sees(lambda: with_a_checkpoint(output))
     sbatch.write_text("#!/bin/sh\necho 'sbatch: error: the account is out of hours' >&2\nexit 1\n")
     os.kill(lost["pid"], signal.SIGKILL)
-    assert driver.ended() == 4, driver.said
+    driver.ends(4)
     assert "error: SLURM takes no jobs" in driver.said.rstrip().splitlines()[-1]
     assert "out of hours" in driver.said
     assert "Traceback" not in driver.said
     sbatch.write_text(takes_jobs)
-    again = Driver(folder, output, "sweep", *LONGER, "--launcher", "slurm", **environment)
-    assert again.ended() == 0, again.said
+    Driver(folder, output, "sweep", *LONGER, "--launcher", "slurm", **environment).ends()
     assert metrics(output) == metrics(alone["longer"])

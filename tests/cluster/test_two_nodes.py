@@ -9,6 +9,7 @@ import pytest
 from two_nodes import Driver, TwoNodes, manifests, metrics, sweep_of, under_way, weights, with_recordings
 
 from place import Place
+from processes import HANGS
 
 pytestmark = [
     pytest.mark.cluster,
@@ -43,10 +44,8 @@ class Alone(dict[str, Path]):
 
     def __missing__(self, name):
         words = {"forty": FORTY, "longer": LONGER}[name]
-        driver = Driver(self._folder, self._folder / f"alone-{name}", "sweep", *words, "--jobs", "2")
-        assert driver.ended() == 0, driver.said
-        self[name] = driver.output
-        return driver.output
+        self[name] = Driver(self._folder, self._folder / f"alone-{name}", "sweep", *words, "--jobs", "2").ends().output
+        return self[name]
 
 
 @pytest.fixture(scope="session")
@@ -78,25 +77,21 @@ def swept(cluster, folder, output, *words, alone=False):
 
 def test_a_sweep_of_forty_trainings_has_the_bits_of_the_local_launcher(cluster, folder, alone, tmp_path):
     output = with_recordings(alone["forty"], tmp_path / "out")
-    driver = swept(cluster, folder, output, *FORTY)
-    assert driver.ended() == 0, driver.said
+    driver = swept(cluster, folder, output, *FORTY).ends()
     assert "2 machines, 2 cores" in driver.said
     assert (len(metrics(output)), metrics(output), weights(output)) == (40, metrics(alone["forty"]), weights(alone["forty"]))
     assert sweep_of(output).equals(sweep_of(alone["forty"]))
     before = manifests(output)
     assert len(before) == 40
-    again = swept(cluster, folder, output, *FORTY, "--name", "again")
-    assert again.ended() == 0, again.said
+    swept(cluster, folder, output, *FORTY, "--name", "again").ends()
     assert manifests(output) == before, "nothing was trained again"
 
 
 def test_the_quickstart_has_the_bits_of_the_local_launcher(cluster, tmp_path):
     words = ("run", "quickstart", "training.max_epochs=2", "tracking=none")
-    alone = Driver(tmp_path, tmp_path / "alone", *words, "--jobs", "2")
-    assert alone.ended() == 0, alone.said
+    alone = Driver(tmp_path, tmp_path / "alone", *words, "--jobs", "2").ends()
     output = with_recordings(alone.output, tmp_path / "out")
-    driver = Driver(tmp_path, output, *words, "--launcher", "ray", "--address", cluster.address)
-    assert driver.ended() == 0, driver.said
+    Driver(tmp_path, output, *words, "--launcher", "ray", "--address", cluster.address).ends()
     assert (len(metrics(output)), metrics(output), weights(output)) == (13, metrics(alone.output), weights(alone.output))
     (page,), (page_alone,) = (list(root.glob("report/*/metrics.csv")) for root in (output, alone.output))
     assert page.read_bytes() == page_alone.read_bytes()
@@ -108,7 +103,7 @@ def test_a_killed_worker_is_replaced_and_the_bits_are_the_same(cluster, folder, 
     lost = driver.sees(lambda: under_way(output))[0]
     before = manifests(output)
     os.kill(lost["pid"], signal.SIGKILL)
-    assert driver.ended() == 0, driver.said
+    driver.ends()
     assert (metrics(output), weights(output)) == (metrics(alone["longer"]), weights(alone["longer"]))
     assert "again   ray        A worker died" in driver.said
     assert before.items() <= manifests(output).items(), "nothing that had finished was trained again"
@@ -121,7 +116,7 @@ def test_a_lost_node_takes_nothing_that_was_finished(mortal, folder, alone, tmp_
     driver.sees(lambda: [entry for entry in under_way(output) if mortal.holds(mortal.nodes[1], entry["pid"])])
     before = manifests(output)
     mortal.lose(mortal.nodes[1])
-    assert driver.ended() == 0, driver.said
+    driver.ends()
     assert (metrics(output), weights(output)) == (metrics(alone["longer"]), weights(alone["longer"]))
     assert before.items() <= manifests(output).items()
 
@@ -131,12 +126,11 @@ def test_ctrl_c_loses_nothing_and_the_next_call_goes_on(cluster, folder, alone, 
     driver = swept(cluster, folder, output, *LONGER)
     driver.sees(lambda: under_way(output))
     driver.process.send_signal(signal.SIGINT)
-    assert driver.ended() == 130, driver.said
+    driver.ends(130)
     assert not list(output.glob("sweep/*"))
     assert list(output.glob("checkpoints/*")), "what was under way is kept"
     before = {name: text for name, text in manifests(output).items() if b'"status": "complete"' in text}
-    again = swept(cluster, folder, output, *LONGER)
-    assert again.ended() == 0, again.said
+    swept(cluster, folder, output, *LONGER).ends()
     assert (metrics(output), weights(output)) == (metrics(alone["longer"]), weights(alone["longer"]))
     assert before.items() <= manifests(output).items()
 
@@ -147,7 +141,7 @@ def test_nodes_that_do_not_share_the_output_root_get_copies_and_send_artefacts_b
     driver = swept(mortal, folder, output, *LONGER, alone=True)
     driver.sees(lambda: list((tmp_path / "hidden" / "checkpoints").glob("*/checkpoint.safetensors")))
     mortal.lose(mortal.nodes[1])
-    assert driver.ended() == 0, driver.said
+    driver.ends()
     assert "does not share the output root" in driver.said
     assert (metrics(output), weights(output)) == (metrics(alone["longer"]), weights(alone["longer"]))
 
@@ -162,11 +156,10 @@ def test_a_group_that_ends_every_worker_fails_alone_and_the_others_are_kept(clus
         entry = driver.sees(lambda: next((e for e in under_way(output) if e["name"] == poisoned and e["pid"] not in killed), None))
         killed.add(entry["pid"])
         os.kill(entry["pid"], signal.SIGKILL)
-    assert driver.ended() == 5, driver.said
+    driver.ends(5)
     assert "3 times; --launcher local shows what ends it" in driver.said
     assert len(metrics(output)) == 3
-    again = swept(cluster, folder, output, *one_seed)
-    assert again.ended() == 0, again.said
+    swept(cluster, folder, output, *one_seed).ends()
     assert len(metrics(output)) == 4
     assert metrics(output).items() <= metrics(alone["longer"]).items()
 
@@ -176,9 +169,8 @@ def test_the_head_lost_loses_nothing_that_was_finished(mortal, folder, alone, tm
     driver = swept(mortal, folder, output, *LONGER)
     driver.sees(lambda: under_way(output))
     mortal.lose(mortal.nodes[0])
-    assert driver.ended() != 0
+    assert driver.process.wait(HANGS) != 0
     before = manifests(output)
-    again = Driver(folder, output, "sweep", *LONGER, "--jobs", "2")
-    assert again.ended() == 0, again.said
+    Driver(folder, output, "sweep", *LONGER, "--jobs", "2").ends()
     assert metrics(output) == metrics(alone["longer"])
     assert before.items() <= manifests(output).items()

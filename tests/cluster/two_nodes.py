@@ -5,6 +5,7 @@ import shutil
 import signal
 import sys
 from contextlib import suppress
+from functools import partial
 from pathlib import Path
 
 import pandas as pd
@@ -76,9 +77,10 @@ class Driver:
             own = {**os.environ, "VEHEST_OUTPUT": str(output), **environment}
             self.process = start(command, cwd=folder, stdout=log, stderr=log, env=own)
 
-    def ended(self):
-        """Exit code, once it has one."""
-        return self.process.wait(HANGS)
+    def ends(self, code=0):
+        """Wait for the end; another exit code fails the test."""
+        assert self.process.wait(HANGS) == code, self.said
+        return self
 
     def sees(self, event):
         """Wait for an event; a command that ends before it fails the test."""
@@ -101,19 +103,14 @@ def under_way(output):
     return found
 
 
-def manifests(output):
-    """Finished model -> its manifest, with the time at which it was made."""
-    return {file.parent.name: file.read_bytes() for file in sorted((output / "train").glob("[!.]*/manifest.json"))}
+def files(pattern, output):
+    """Artefact -> its file of a pattern."""
+    return {file.parent.name: file.read_bytes() for file in sorted(output.glob(pattern))}
 
 
-def metrics(output):
-    """Evaluation -> its figures as they are written, to the last digit."""
-    return {folder.name: (folder / "metrics.csv").read_text() for folder in sorted((output / "evaluate").iterdir()) if folder.is_dir()}
-
-
-def weights(output):
-    """Model -> its weights."""
-    return {file.parent.name: file.read_bytes() for file in sorted((output / "train").glob("*/model.safetensors"))}
+manifests = partial(files, "train/[!.]*/manifest.json")  # with the time at which a model was made
+metrics = partial(files, "evaluate/*/metrics.csv")
+weights = partial(files, "train/*/model.safetensors")
 
 
 def sweep_of(output):

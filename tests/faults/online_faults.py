@@ -42,7 +42,8 @@ HEADER = ["data", "kind", "estimator", "rate_hz", "fault", "channel", "severity"
 HEADER += ["usual_error_deg", "error_while_faulted_deg", "error_after_deg", "recovered"]
 
 CAR = "estimator.car={mass: 982, yaw_inertia: 1605.4145, cg_to_front_axle: 1.33, cg_to_rear_axle: 1.07, cg_height: 0.45}"
-SHORT = ("training.method=data", "training.restarts=1", "training.generations=40")
+SHORT = ("tyres_from='*'", "method=data", "restarts=1", "generations=40")
+IDENTIFIED = ("estimator.inputs=imu", CAR, *(f"training.identification.{word}" for word in SHORT))
 FERRARI = {
     "zero": (),
     "static_map": (),
@@ -57,25 +58,10 @@ FERRARI = {
     "lstm": ("estimator.n_states=5", "training.max_epochs=30"),
     "velocity_gru": ("estimator.inputs=[vx,yaw_rate,ay,ax]", "estimator.outputs=[vx,vy]", "training.phase.max_epochs=20"),
     "velocity_lstm": ("estimator.inputs=[vx,yaw_rate,ay,ax]", "estimator.outputs=[vx,vy]", "training.phase.max_epochs=20"),
-    "dugoff_ukf": ("estimator.inputs=imu", CAR, "training.tyres_from='*'", *SHORT),
+    "dugoff_ukf": ("estimator.inputs=imu", CAR, *(f"training.{word}" for word in SHORT)),
     "sideslip_ffnn": ("estimator.inputs=imu", "training.phase.max_epochs=20"),
-    "cnn_ukf": (
-        "estimator.inputs=imu",
-        CAR,
-        "training.identification.tyres_from='*'",
-        *(f"training.identification.{word.removeprefix('training.')}" for word in SHORT),
-        "training.pre_training.max_epochs=10",
-        "training.end_to_end.max_epochs=1",
-    ),
-    "ensemble_ukf": (
-        "estimator.inputs=imu",
-        CAR,
-        "training.identification.tyres_from='*'",
-        *(f"training.identification.{word.removeprefix('training.')}" for word in SHORT),
-        "training.scaling_trials=5",
-        "estimator.members=3",
-        "training.phase.max_epochs=10",
-    ),
+    "cnn_ukf": (*IDENTIFIED, "training.pre_training.max_epochs=10", "training.end_to_end.max_epochs=1"),
+    "ensemble_ukf": (*IDENTIFIED, "training.scaling_trials=5", "estimator.members=3", "training.phase.max_epochs=10"),
 }
 SMALL_CAR = {"learned_ukf": ("estimator.dynamics=pacejka", "training.one_step.max_epochs=60", "training.noise.max_epochs=3")}
 SLOW = ("learned_ukf", "kalman", "dugoff_ukf", "factor_graph", "cnn_ukf", "ensemble_ukf")

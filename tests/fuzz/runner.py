@@ -15,6 +15,7 @@ import sys
 import time
 import traceback
 from collections import Counter, namedtuple
+from concurrent.futures import ProcessPoolExecutor, as_completed
 from pathlib import Path
 
 import pandas as pd
@@ -22,6 +23,7 @@ import pandas as pd
 from fuzz.case import GENERATORS, PLANTED, TEMPLATES, Case, is_honest, load_families, schedule
 from fuzz.verdicts import Outcome, differences, judge, last_line, refusal_lines, snapshot
 from fuzz.watched import READER, become
+from processes import die_with_parent, status_kb
 from vehest.data.errors import printable
 
 MOST_WALL_SECONDS = 180.0
@@ -48,15 +50,12 @@ class Fuzzer:
         from fuzz import honest
 
         honest.import_everything()
-        first = self.folder / "templates" / "first"
-        first.mkdir(parents=True)
-        with _quiet(first):
-            honest.warm_up(first)
-        for name in sorted({name for one in self.turns for name in one.needs}):
+        needed = sorted({name for one in self.turns for name in one.needs})
+        for name, make in {"first": honest.warm_up, **{name: TEMPLATES[name] for name in needed}}.items():
             folder = self.folder / "templates" / name
             folder.mkdir(parents=True)
             with _quiet(folder):
-                TEMPLATES[name](folder)
+                make(folder)
 
     def generator_of(self, index):
         """Generator of an input, how often it has had its turn before, and whether the input is to be honest."""
@@ -69,26 +68,10 @@ class Fuzzer:
         """Try inputs in ``jobs`` workers, and report each as it ends."""
         gc.collect()
         gc.freeze()  # what is here stays; children need not copy it to look through it
-        context = multiprocessing.get_context("fork")
-        at, rows = context.Value("q", 0), context.SimpleQueue()
-        workers = [context.Process(target=self._work, args=(indices, at, rows, os.getpid())) for _ in range(min(jobs, len(indices)))]
         sys.stdout.flush()
-        for worker in workers:
-            worker.start()
-        for _ in indices:
-            report(rows.get())
-        for worker in workers:
-            worker.join()
-
-    def _work(self, indices, at, rows, parent):
-        signal.signal(signal.SIGINT, signal.SIG_DFL)
-        while os.getppid() == parent:
-            with at.get_lock():
-                position = at.value
-                at.value += 1
-            if position >= len(indices):
-                return
-            rows.put(self.try_one(indices[position]))
+        with ProcessPoolExecutor(jobs, multiprocessing.get_context("fork"), die_with_parent) as workers:
+            for ended in as_completed([workers.submit(self.try_one, index) for index in indices]):
+                report(ended.result())
 
     def try_one(self, index):
         """Make one input, run its command in a forked child, and judge."""
@@ -131,11 +114,12 @@ def _watch(case, command):
     readers = _Readers(child)
     while not select.select([process], [], [], POLL_SECONDS)[0]:
         readers.look()
-        if _seconds(child, started) - readers.waited > case.seconds or time.monotonic() - started > MOST_WALL_SECONDS:
+        if time.monotonic() - started > min(case.seconds + readers.waited, MOST_WALL_SECONDS):
             os.killpg(child, signal.SIGKILL)
             break
     os.close(process)
-    seconds = max(0.0, _seconds(child, started) - readers.waited)
+    readers.look()
+    seconds = max(0.0, time.monotonic() - started - readers.waited)
     with contextlib.suppress(ProcessLookupError, PermissionError):
         os.killpg(child, signal.SIGKILL)  # whatever it has started; its number is its own until it is waited for
     _, status, used = os.wait4(child, 0)
@@ -170,32 +154,24 @@ class _Readers:
 
     @property
     def waited(self):
-        """Seconds that reading processes waited for a core."""
+        """Seconds that all of them waited for a core."""
         return sum(self._waits.values())
 
     def look(self):
         """Note memory and waiting of those that run."""
         with contextlib.suppress(OSError, IndexError, StopIteration):
-            self.command_kb = max(self.command_kb, _peak_kb(str(self._command)))
+            self._waits[self._command] = _waited(self._command)
+            self.command_kb = max(self.command_kb, status_kb("VmHWM", self._command))
             for task in Path(f"/proc/{self._command}/task").iterdir():
                 for reader in (task / "children").read_text().split():
                     if READER.encode() in Path(f"/proc/{reader}/cmdline").read_bytes():
-                        self.peaks_kb[reader] = _peak_kb(reader)
-                        self._waits[reader] = int(Path(f"/proc/{reader}/schedstat").read_text().split()[1]) / 1e9
+                        self.peaks_kb[reader] = status_kb("VmHWM", reader)
+                        self._waits[reader] = _waited(reader)
 
 
-def _peak_kb(process):
-    with open(f"/proc/{process}/status") as stream:
-        return next(int(line.split()[1]) for line in stream if line.startswith("VmHWM:"))
-
-
-def _seconds(child, started):
-    """Wall clock since the start, less what the child has waited for a core on a machine that has others to serve."""
-    try:
-        waited = int(Path(f"/proc/{child}/schedstat").read_text().split()[1]) / 1e9
-    except (OSError, IndexError):
-        waited = 0.0
-    return time.monotonic() - started - waited
+def _waited(process):
+    """Seconds that a process has waited for a core on a machine that has others to serve."""
+    return int(Path(f"/proc/{process}/schedstat").read_text().split()[1]) / 1e9
 
 
 def _remove(folder):
@@ -224,17 +200,13 @@ def _shown(command, case):
 @contextlib.contextmanager
 def _quiet(folder):
     """Work in a folder, with what is printed kept back."""
-    here, out, err = os.getcwd(), sys.stdout, sys.stderr
-    sys.stdout, sys.stderr = io.StringIO(), io.StringIO()
-    os.chdir(folder)
+    printed = io.StringIO()
     try:
-        yield
+        with contextlib.chdir(folder), contextlib.redirect_stdout(printed), contextlib.redirect_stderr(printed):
+            yield
     except BaseException:
-        out.write(sys.stdout.getvalue() + sys.stderr.getvalue())
+        sys.stdout.write(printed.getvalue())
         raise
-    finally:
-        os.chdir(here)
-        sys.stdout, sys.stderr = out, err
 
 
 def write_rows(rows, path):

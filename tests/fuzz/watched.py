@@ -11,6 +11,7 @@ import types
 from pathlib import Path
 
 import vehest
+from processes import die_with_parent, status_kb
 
 ADDRESS_SPACE = 4 * 2**30
 FILE_SIZE = 2**30
@@ -151,6 +152,7 @@ def become(case, command):
     code = 1
     try:
         os.setsid()
+        die_with_parent()
         report = _prepare(case, command)
         main = _main_of(sys.argv[1:])
         watch = Watch(case.folder, report)
@@ -221,8 +223,8 @@ def _prepare(case, command):
     sys.modules["__main__"] = types.ModuleType("__main__")  # the name of the program follows from it: vehest, not python -m fuzz
     sys.argv = ["vehest", *(os.fsdecode(word) for word in command.argv)]
     sys.path[:] = [str(Path(__file__).parent / "reader"), *(entry for entry in sys.path if entry not in ("", "."))]
-    os.write(report, (json.dumps(["rss", _status("VmRSS")]) + "\n").encode())
-    size = _status("VmSize") * 1024 + ADDRESS_SPACE
+    os.write(report, (json.dumps(["rss", status_kb("VmRSS")]) + "\n").encode())
+    size = status_kb("VmSize") * 1024 + ADDRESS_SPACE
     for limit, value in {"AS": size, "CPU": 90, "FSIZE": FILE_SIZE, "CORE": 0}.items():
         resource.setrlimit(getattr(resource, f"RLIMIT_{limit}"), (value, value))
     return report
@@ -239,9 +241,3 @@ def _redirect(descriptor, path, flags):
     opened = os.open(path, flags, 0o666)
     os.dup2(opened, descriptor)
     os.close(opened)
-
-
-def _status(field):
-    """A figure of /proc/self/status [kB]."""
-    with open("/proc/self/status") as stream:
-        return next(int(line.split()[1]) for line in stream if line.startswith(f"{field}:"))

@@ -225,12 +225,11 @@ def test_without_the_real_recording_the_page_says_how_to_get_it(study):
 def survey_place(place, monkeypatch):
     """A pipeline of three recordings that say they are simulated, and of a data set whose files may be missing."""
     monkeypatch.delenv("VEHEST_DATA")
-    conf = place.folder / "conf" / "dataset"
-    (conf / "mine.yaml").write_text(yaml.safe_dump({**DATASET, "path": str(place.folder / "raw")}, allow_unicode=True))
-    other = {**DATASET, "name": "other", "kind": "real", "vehicle": "another car", "files": "one.csv"}
-    (conf / "other.yaml").write_text(yaml.safe_dump(other, allow_unicode=True))
-    pipeline = {"study": "ground", "report": "proving_ground", "datasets": ["mine"], "optional_datasets": ["other"], "publish": True}
-    (place.folder / "pipelines" / "ground.yaml").write_text(yaml.safe_dump(pipeline))
+    place.change("conf/dataset/mine.yaml", path=str(place.folder / "raw"))
+    other = {"name": "other", "kind": "real", "vehicle": "another car", "files": "one.csv"}
+    place.change("conf/dataset/other.yaml", **DATASET | other)
+    pipeline = {"report": "proving_ground", "datasets": ["mine"], "optional_datasets": ["other"], "publish": True}
+    place.change("pipelines/ground.yaml", study="ground", **pipeline)
     return place
 
 

@@ -220,15 +220,12 @@ def no_reference(data, folder):
 
 
 MADE = (units, german, numbered, unix, flipped, wheels, sideslip, mdf, bag, vbo, two_runs, no_reference)
-FILES = {"numbered": "numbered.txt", "mdf": "drive.mf4", "bag": "drive_bag", "vbo": "lap.vbo", "two_runs": "run_*.csv"}
-LOGS = {make.__name__: (make, FILES.get(make.__name__, f"{make.__name__}.csv")) for make in MADE}
-"""Log -> what writes it, and its files."""
+LOGS = {make.__name__: make for make in MADE}
 
 
-def write_log(name, data, folder):
+def write_log(name, data, folder, logs=LOGS):
     """Write one log into a folder of its own; returns its files."""
-    make, pattern = LOGS[name]
     own = folder / name
     own.mkdir(parents=True)
-    make(data, own)
-    return sorted(own.glob(pattern))
+    logs[name](data, own)
+    return sorted(own.iterdir())

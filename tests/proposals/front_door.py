@@ -9,7 +9,8 @@ import tempfile
 from pathlib import Path
 
 import yaml
-from front_door_logs import LOGS, write_log
+from dressed_logs import write_log
+from front_door_logs import LOGS
 
 EXPECTED = Path(__file__).parent / "front_door.yaml"
 
@@ -37,7 +38,7 @@ def differences(told, code, plain, words):
 def tried(name, data, folder, minutes):
     """Differences from what is expected, and how the way ended."""
     told = yaml.safe_load(EXPECTED.read_text(encoding="utf-8"))[name]
-    files = [str(file) for file in write_log(name, data, folder)]
+    files = [str(file) for file in write_log(name, data, folder, LOGS)]
     code, out, err = vehest(folder, "new", name, *files, "--yes", "--json")
     plain = json.loads(out) if out.strip().startswith("{") else {}
     wrong = differences(told, code, plain, err)

@@ -101,11 +101,3 @@ def no_reference(data, folder):
 
 MADE = (six_seconds, standstill_first, two_speeds, misnamed_lateral, two_yaw_rates, fast_speedometer, wheels_in_kmh, vbox)
 LOGS = {make.__name__: make for make in (*MADE, twenty_seconds, no_reference)}
-
-
-def write_log(name, data, folder):
-    """Write one log into a folder of its own; returns its files."""
-    own = folder / name
-    own.mkdir(parents=True)
-    LOGS[name](data, own)
-    return sorted(own.iterdir())

@@ -7,7 +7,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from place import DATASET, write_csv
+from place import DATASET, write_drives
 from vehest.data.store import read_estimate, read_recording
 from vehest.run.study import read_study
 
@@ -19,8 +19,7 @@ LACKING = ["estimator=kalman"]  # there is no steering angle
 @pytest.fixture
 def across(place):
     """A place with a split in three folds, two vehicles, and a pipeline of either kind."""
-    for seed, name in enumerate(("one", "two", "three"), 1):
-        write_csv(place.folder / "raw" / f"{name}.csv", seed, 60.0)
+    write_drives(place.folder, 60.0)
     place.change("conf/split/folded.yaml", name="folded", dataset="mine", folds={"number": 3, "of": "recordings"})
     for name, train, test in (("forth", "one", "three"), ("back", "three", "one")):
         ranges = {"train": [{"recording": train}], "validation": [{"recording": "two"}], "tests": {"unseen": [{"recording": test}]}}

@@ -18,7 +18,6 @@ import yaml
 from safetensors import SafetensorError
 
 from conftest import planar_drive
-from place import DATASET
 from vehest.data.errors import ConfigurationError, MissingError, is_printable, printable
 from vehest.data.files import no_room, written_aside
 from vehest.data.limits import Limits, use_limits
@@ -73,8 +72,7 @@ def test_wrong_usage_is_one_line_with_the_next_step(place, arguments, words):
 
 
 def test_hostile_names_reach_the_terminal_as_text(place):
-    dataset = {**DATASET, "title": HOSTILE, "licence": HOSTILE, "citation": HOSTILE, "vehicle": HOSTILE}
-    (place.folder / "conf" / "dataset" / "mine.yaml").write_text(yaml.safe_dump(dataset, allow_unicode=True))
+    place.change("conf/dataset/mine.yaml", **dict.fromkeys(("title", "licence", "citation", "vehicle"), HOSTILE))
     (place.folder / "raw" / "one.csv").rename(place.folder / "raw" / f"{HOSTILE.replace('/', '')}.csv")
     table = pd.read_csv(place.folder / "raw" / "two.csv").rename(columns={"Yaw": HOSTILE})
     table.to_csv(place.folder / "raw" / "two.csv", index=False)
@@ -149,13 +147,10 @@ def test_files_whose_names_are_not_utf_8_are_read_and_written(place):
 def test_a_data_set_whose_recordings_names_are_not_utf_8_makes_a_whole_study(place):
     name = os.fsdecode(b"one\xff")
     (place.folder / "raw" / "one.csv").rename(place.folder / "raw" / f"{name}.csv")
-    split = yaml.safe_load((place.folder / "conf" / "split" / "mine.yaml").read_text())
-    split |= {"train": [{"recording": "three"}], "tests": {"test": [{"recording": name}]}}
-    (place.folder / "conf" / "split" / "mine.yaml").write_text(yaml.safe_dump(split))
+    place.change("conf/split/mine.yaml", train=[{"recording": "three"}], tests={"test": [{"recording": name}]})
     sweeps = [["estimator=luenberger", "training.grid=1", "training.max_evaluations=5"]]
-    pipeline = yaml.safe_load((place.folder / "pipelines" / "small.yaml").read_text()) | {"sweeps": sweeps}
-    pipeline |= {"title": "T <script>alert(1)</script>", "about": "<img src=x onerror=alert(1)> [x](javascript:alert(1))"}
-    (place.folder / "pipelines" / "small.yaml").write_text(yaml.safe_dump(pipeline))
+    hostile = {"title": "T <script>alert(1)</script>", "about": "<img src=x onerror=alert(1)> [x](javascript:alert(1))"}
+    place.change("pipelines/small.yaml", sweeps=sweeps, **hostile)
     report = Path(place.told("run", "small", "tracking=none")["report"])
     assert r"recording one\\udcff" in report.with_suffix(".md").read_text(encoding="utf-8")
     for text in (report.read_text(encoding="utf-8"), report.with_suffix(".md").read_text(encoding="utf-8")):
@@ -204,8 +199,7 @@ def _small_disk(size):
 
 def test_a_full_disk_names_its_target_in_every_stage_and_leaves_nothing(place):
     trained = ("estimator=luenberger", "split=mine", "training.grid=1", "training.max_evaluations=5", "tracking=none")
-    pipeline = yaml.safe_load((place.folder / "pipelines" / "small.yaml").read_text())
-    (place.folder / "pipelines" / "small.yaml").write_text(yaml.safe_dump(pipeline | {"sweeps": [[trained[0], *trained[2:4]]]}))
+    place.change("pipelines/small.yaml", sweeps=[[trained[0], *trained[2:4]]])
     drive = planar_drive(30.0, 100.0)
     pd.DataFrame({"time": drive.time, **drive.channels}).to_csv("lap.csv", index=False)
     stages = (

@@ -8,7 +8,7 @@ import shutil
 import pandas as pd
 import pytest
 
-from place import DATASET, write_csv
+from place import DATASET, write_drives
 from vehest.report.document import Document
 from vehest.run.study import jobs_of, read_study
 from vehest.run.train import new_estimator
@@ -27,8 +27,7 @@ CANDIDATES = [
 @pytest.fixture
 def parts_place(place):
     """A place whose data set serves two schemes, and a part whose raw files are elsewhere."""
-    for seed, name in enumerate(("one", "two", "three"), 1):
-        write_csv(place.folder / "raw" / f"{name}.csv", seed, 80.0)
+    write_drives(place.folder, 80.0)
     split = place.change("conf/split/mine.yaml")
     tests = {"c2": [{"recording": "three", "stop": 40}], "f2": [{"recording": "three", "start": 40}]}
     for name, train, validation in (("forth", "one", "two"), ("back", "two", "one")):

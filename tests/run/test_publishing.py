@@ -8,7 +8,6 @@ from types import SimpleNamespace
 import numpy as np
 import pandas as pd
 import pytest
-import yaml
 
 from place import PIPELINE, Place, run_vehest, undrawn
 from vehest.run import published as study_keys
@@ -38,7 +37,7 @@ def published(tmp_path_factory):
         patch.delenv("VEHEST_OUTPUT", raising=False)
         undrawn(patch)
         place = Place(folder, SimpleNamespace(readouterr=lambda: ("", "")))
-        (folder / "pipelines" / "small.yaml").write_text(yaml.safe_dump(QUICK))
+        place.change("pipelines/small.yaml", **QUICK)
         assert place(*RUN)[0] == 0
     return folder
 

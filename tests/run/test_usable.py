@@ -1,9 +1,7 @@
 """What estimators lack is said before anything is trained, what is promised to supply it does, and rates fit the recordings."""
 
 import json
-from copy import deepcopy
 from dataclasses import replace
-from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -23,7 +21,6 @@ from vehest.data.store import write_recording
 from vehest.data.transforms import TRANSFORMS, transform_from_config
 from vehest.estimators.base import FitData
 from vehest.estimators.registry import estimator_class, estimator_names
-from vehest.run import usable
 from vehest.run.comparison import lower_rate
 from vehest.run.config import compose_config
 from vehest.run.train import new_estimator
@@ -46,15 +43,6 @@ def log(channels, rate_hz=50.0, seed=1, seconds=30.0, name="lap"):
     known = {**drive.channels, "steer": steer, "handwheel": RATIO * steer}
     known |= {f"wheel_speed_{wheel}": drive["vx"] / RADIUS for wheel in WHEELS}
     return replace(drive, channels={channel: known[channel] for channel in sorted(channels)})
-
-
-@pytest.fixture(autouse=True, scope="module")
-def _composed_once():
-    """The configuration of each estimator is composed once for all tables."""
-    composed = cache(lambda command, *overrides: compose_config(command, list(overrides)))
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(usable, "compose_config", lambda command, overrides: deepcopy(composed(command, *overrides)))
-        yield
 
 
 def rows(recording):
@@ -252,9 +240,7 @@ def test_training_on_a_log_that_lacks_a_channel_is_refused_with_the_remedy_which
         ),
     )
     assert not list((place.folder / "outputs").glob("downsample/*")), "it is said before recordings are resampled"
-    file = place.folder / "conf" / "dataset" / "logged.yaml"
-    transforms = [{"name": "acceleration_from_speed"}, {"name": "velocity_from_sideslip"}]
-    file.write_text(yaml.safe_dump(yaml.safe_load(file.read_text()) | {"transforms": transforms}, allow_unicode=True))
+    place.change("conf/dataset/logged.yaml", transforms=[{"name": "acceleration_from_speed"}, {"name": "velocity_from_sideslip"}])
     few = ("training.grid=1", "training.max_evaluations=10")
     place.done("train", "estimator=luenberger", "split=logged", "tracking=none", *few)
 
@@ -357,10 +343,8 @@ def test_evaluation_grid_is_no_finer_than_a_log_of_10_hz(place):
 
 def test_lowest_rate_of_all_data_sets_of_a_split_counts(place):
     add_logged(place, FULL)
-    file = place.folder / "conf" / "split" / "logged.yaml"
-    split = yaml.safe_load(file.read_text())
-    split["tests"]["other"] = [{"dataset": "mine", "recording": "three"}]  # sampled at 100 Hz
-    file.write_text(yaml.safe_dump(split))
+    tests = {"test": [{"recording": "lap3"}], "other": [{"dataset": "mine", "recording": "three"}]}  # the latter sampled at 100 Hz
+    place.change("conf/split/logged.yaml", tests=tests)
     add_study(place, ["estimator=luenberger", "training.grid=1", "training.max_evaluations=10"])
     out, err = place.done("run", "logged", "--json", "tracking=none")
     assert "luenberger runs at 50 Hz instead of its 100 Hz" in " ".join(err.split())
