@@ -30,7 +30,6 @@ from vehest.run.config import compose_config
 from vehest.run.console import Messages
 from vehest.run.failures import Failure
 from vehest.run.group import Group
-from vehest.run.launchers.base import Launcher
 from vehest.run.launchers.clusters import RayLauncher
 from vehest.run.launchers.local import LocalLauncher
 from vehest.run.runner import Runner
@@ -53,7 +52,7 @@ def groups_of(output: Path, number: int) -> list[Group]:
     return [Group([plan_training({**config, "seed": seed}, split, data)], split, evaluation) for seed in range(number)]
 
 
-def timed(launcher: Launcher, groups: Sequence[Group]) -> dict[str, float]:
+def timed(launcher: LocalLauncher | RayLauncher, groups: Sequence[Group]) -> dict[str, float]:
     """What launching costs [s]: until the first group begins, and what is added to a task of a group."""
     asked = time.perf_counter()
     begun: list[float] = []

@@ -129,6 +129,8 @@ def development_drives(output: Path) -> list[Stretch]:
 
 def main() -> None:
     """Command line."""
+    if sys.argv[1:] not in ([], ["--trust"]):
+        sys.exit(__doc__)
     output, row = Path(os.environ.get("VEHEST_OUTPUT", "outputs")), chosen_step()
     if "--trust" not in sys.argv:
         write(row, find_model(str(row["model"]), output, print))

@@ -17,12 +17,13 @@ from pathlib import Path
 from typing import Any
 from weakref import WeakKeyDictionary
 
-from vehest.data.estimate import Estimate
+from vehest.data.estimate import Estimate as Estimate
 from vehest.data.files import written_aside
-from vehest.data.recording import Recording
+from vehest.data.recording import Recording as Recording
 from vehest.data.schema import settings_from_config
 from vehest.data.splits import Span
-from vehest.estimators.base import Estimator, FitData
+from vehest.estimators.base import Estimator as Estimator
+from vehest.estimators.base import FitData
 from vehest.estimators.model_files import save_model as _save_model
 from vehest.evaluation import metrics
 from vehest.run.calibrate import Stretch, learn_trust

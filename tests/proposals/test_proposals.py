@@ -556,7 +556,10 @@ def test_a_steering_command_in_counts_is_left_out_unless_its_scale_is_answered(t
     assert np.abs(read_back(made)["steer"] - d["steer"]).max() < 0.01
 
 
-@pytest.mark.parametrize(("name", "unit"), [("vy_ms", "m/s"), ("speed_ms", "m/s"), ("gps_v_ms", "m/s"), ("valve_ms", "ms")])
+@pytest.mark.parametrize(
+    ("name", "unit"),
+    [("vy_ms", "m/s"), ("v_lat_ms", "m/s"), ("wheel_speed_fl_ms", "m/s"), ("gps_v_ms", "m/s"), ("valve_ms", "ms"), ("speed_age_ms", "ms")],
+)
 def test_ms_behind_the_name_of_a_velocity_are_metres_a_second(name, unit):
     assert unit_in_name(name) == unit
 

@@ -81,6 +81,8 @@ def _scan(A, b, Q, C, d, R, y, start, predicted, filtered, innovation, innovatio
                     total += A[k - 1, i, j] * post_mean[k - 1, j]
                     left[i, j] = _row_times(A[k - 1], i, post_cov[k - 1], j)
             x[i] = total
+            if math.isnan(total):
+                return k
         for i in range(n):
             for j in range(n):
                 P[i, j] = start[1][i, j] if k == 0 else Q[k - 1, i, j] + _row_times(left, i, A[k - 1], j)

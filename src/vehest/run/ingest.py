@@ -78,7 +78,7 @@ def write_ingest(config: Config, plan: StagePlan, folder: Path, jobs: int, stop:
         report(done, len(ids), missing[at])
 
     for end in launch(tasks, jobs, stop, begun):
-        if isinstance(end.outcome, Failure):
+        if isinstance(end.outcome, Failure) and missing[end.position]:
             failures.append(end.outcome)
         else:
             done += missing[end.position] != ""

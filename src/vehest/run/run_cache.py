@@ -100,7 +100,7 @@ class RunCache:
         return (record, made) if whole and (output / record.store).exists() else None
 
     def repeat(self, options: RunOptions) -> Ran | None:
-        """The finished study, printed and published as the next run in full would; none where there is no valid record, or under force."""
+        """The finished study, notes printed first, published as a run in full would; none without a valid record, or under force."""
         found = None if options.force else self.load()
         if found is None:
             return None

@@ -189,7 +189,7 @@ def repeated(search: Search) -> Iterator[Proposal]:
             yield from _separated(family, channel)
         elif scaled and family:
             search.free.remove(scaled[0])
-            yield from _scaled_speed(scaled[0], first)
+            yield from _scaled_speed(scaled[0], first, search.turning.decided)
     ay = search.turning.columns.get("ay")
     for column in list(search.free):
         if ay is not None and abs(correlation(column.slow, ay.slow)) > SAME_AY and column.hint("ay") >= 0.0:
@@ -221,9 +221,9 @@ def _unit(column: Candidate, first: Repeat, channel: str, agreeing: float) -> st
     return min(ranked)[1] if min(ranked)[0] < SAME_SCALE else ""
 
 
-def _scaled_speed(column: Candidate, first: Repeat) -> Iterator[Proposal]:
-    """The car's own speed in counts, and the reference's by which it is scaled."""
-    if column.is_reference and not first.column.is_reference:
+def _scaled_speed(column: Candidate, first: Repeat, decided: bool) -> Iterator[Proposal]:
+    """The car's own speed in counts, and the reference's by which it is scaled; the first one's unit may be ``decided`` by the motion."""
+    if column.is_reference and not (first.column.is_reference or first.column.unit or decided):
         column, first = first.column, Repeat(column, UNITS["vx"][0], first.sign)
     name = first.column.name
     speed = first.column.slow * first.sign * si_factor(first.unit, "vx")

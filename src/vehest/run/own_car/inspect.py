@@ -8,7 +8,7 @@ import os
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from fnmatch import filter as matching
-from itertools import product
+from itertools import pairwise, product
 from pathlib import Path
 from typing import Any
 
@@ -176,6 +176,9 @@ def _place(files: Sequence[Path], source: str) -> dict[str, Any]:
         listed = ", ".join(map(str, (folder, *further)))
         raise ConfigurationError(f"the files lie in several folders ({listed}); put them into one, or make a data set of each folder")
     names = sorted({file.name for file in files})
+    for first, second in pairwise(sorted(names, key=lambda name: Path(name).stem)):
+        if Path(first).stem == Path(second).stem:
+            raise ConfigurationError(f"two files are called '{Path(first).stem}'; a recording's name must be unique")
     path = os.path.relpath(folder) if folder.is_relative_to(Path.cwd()) else str(folder)
     if source == "rosbag":
         return {"path": path, "files": [file.name for file in files]}

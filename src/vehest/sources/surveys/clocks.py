@@ -30,6 +30,7 @@ LONG_GAP = 20.0  # steps; where a column counts on, too, a run ends
 MAX_GAP = 1.0  # s without a row, and at least some steps, in which a run ends even so
 FEWEST_STEPS = 5.0  # of such a gap
 REGULAR = 0.8  # share of the steps within half a median step
+GROWING = 0.9  # share of the steps of a column that is named as time; stamps of a coarser resolution are no clock
 MOST_RESTARTS = 0.01  # of the rows
 
 
@@ -43,7 +44,7 @@ def find_clock(
     best, likely, step = None, -1, 0.0
     for name, values in columns.items():
         unit, named = SPELLINGS.get(units.get(name, "").strip().lower(), ""), bool(NAMED.match(plain_name(name)))
-        own = _step(values, is_even=not named)
+        own = _step(values, named=named)
         counts_rows = own == 1.0 and float(values[0]) in (0.0, 1.0) and not (unit or named)
         stamps = None if own is None or counts_rows else _stamps(name, own, unit, named)
         if own is not None and stamps is not None and 2 * bool(unit) + named > likely:
@@ -78,8 +79,8 @@ def plain_name(name: str) -> str:
     return re.sub(r"[\W_]+", " ", apart).strip().lower()
 
 
-def _step(values: FloatArray, *, is_even: bool) -> float | None:
-    """Median step of a column that grows, and ``is_even`` grows evenly, but for restarts; None of another."""
+def _step(values: FloatArray, *, named: bool) -> float | None:
+    """Median step of a column that grows evenly, or that is named as time and repeats seldom, but for restarts; None of another."""
     if len(values) < 10 or not np.isfinite(values).all():
         return None
     steps = np.diff(values)
@@ -87,7 +88,8 @@ def _step(values: FloatArray, *, is_even: bool) -> float | None:
     if (steps < 0).mean() > MOST_RESTARTS or len(grown) < 0.3 * len(steps):  # stamps of too coarse a resolution repeat
         return None
     step = float(np.median(steps)) or float(grown.sum() / len(steps))
-    return step if step > 0 and (not is_even or np.mean(np.abs(steps - step) <= 0.5 * step) >= REGULAR) else None
+    grows = np.mean(steps > 0) >= GROWING if named else np.mean(np.abs(steps - step) <= 0.5 * step) >= REGULAR
+    return step if step > 0 and grows else None
 
 
 def _stamps(name: str, step: float, unit: str, named: bool) -> Stamps | None:

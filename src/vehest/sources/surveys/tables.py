@@ -43,8 +43,9 @@ MARKS = frozenset({"-", "--", "---", "----", "–", "—", "*", "?", "n.a.", "no
 """What loggers and spreadsheets write where there is no sample, in lower case."""
 NUMBER = re.compile(r"\s*[+-]?((\d+(\.\d*)?|\.\d+)(e[+-]?\d+)?|nan|inf(inity)?)\s*", re.IGNORECASE)
 BRACKETED = re.compile(r"^(?P<name>.*?)[\s_]*[\[(<{](?P<unit>[^\])>}]*)[\])>}]\s*$")
-VELOCITY = re.compile(r"(.*_)?v([_xy]|lat|lon)|.*(speed|spd|velo|geschw)", re.IGNORECASE)
-"""Names that end in ms for metres a second."""
+OF = r"([_\s](x|y|lat\w*|lon\w*|[fr][lr]|front|rear|left|right))*"
+VELOCITY = re.compile(rf"(.*[_\s])?(v|v[xy]|vlat|vlon|\w*(speed|spd|velo|geschw)[a-z]*){OF}[_\s]ms", re.IGNORECASE)
+"""Names that end in ms for metres a second, as those of delays and ages do not."""
 ABBREVIATED = {"radps": "rad/s", "degps": "deg/s", "degs": "deg/s", "rads": "rad/s", "ms2": "m/s2", "mss": "m/s2", "kmh": "km/h"}
 
 
@@ -108,7 +109,7 @@ def unit_in_name(name: str) -> str:
         return bracketed["unit"].strip()
     words = re.split(r"[_\s]+", name.strip())
     last = words[-1].lower() if len(words) > 1 else ""
-    if last == "ms" and VELOCITY.match(name):
+    if last == "ms" and VELOCITY.fullmatch(name.strip()):
         return "m/s"
     return ABBREVIATED.get(last) or (last if _is_unit(last) and len(last) > 1 else "")
 
