@@ -105,7 +105,7 @@ def _scan(A, b, Q, C, d, R, y, start, predicted, filtered, innovation, innovatio
             mean[i] = x[i]
             for j in range(n):
                 cov[i, j] = P[i, j]
-        for c in range(m):  # their noise is independent, so one updates the state after the other
+        for c in range(m - 1, -1, -1):  # one after the other, since their noise is independent; the yaw rate before ay keeps more digits
             if not known[c]:
                 continue
             error, variance = y[k, c] - d[k, c], R[k, c]
