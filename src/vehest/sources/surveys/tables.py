@@ -43,8 +43,8 @@ MARKS = frozenset({"-", "--", "---", "----", "–", "—", "*", "?", "n.a.", "no
 """What loggers and spreadsheets write where there is no sample, in lower case."""
 NUMBER = re.compile(r"\s*[+-]?((\d+(\.\d*)?|\.\d+)(e[+-]?\d+)?|nan|inf(inity)?)\s*", re.IGNORECASE)
 BRACKETED = re.compile(r"^(?P<name>.*?)[\s_]*[\[(<{](?P<unit>[^\])>}]*)[\])>}]\s*$")
-OF = r"([_\s](x|y|lat\w*|lon\w*|[fr][lr]|front|rear|left|right))*"
-VELOCITY = re.compile(rf"(.*[_\s])?(v|v[xy]|vlat|vlon|\w*(speed|spd|velo|geschw)[a-z]*){OF}[_\s]ms", re.IGNORECASE)
+PLACE = r"([_\s](x|y|lat\w*|lon\w*|[fr][lr]|front|rear|left|right))*"
+VELOCITY = re.compile(rf"(.*[_\s])?(v|v[xy]|vlat|vlon|\w*(speed|spd|velo|geschw)[a-z]*){PLACE}[_\s]ms", re.IGNORECASE)
 """Names that end in ms for metres a second, as those of delays and ages do not."""
 ABBREVIATED = {"radps": "rad/s", "degps": "deg/s", "degs": "deg/s", "rads": "rad/s", "ms2": "m/s2", "mss": "m/s2", "kmh": "km/h"}
 
