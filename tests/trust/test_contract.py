@@ -137,6 +137,12 @@ def test_an_estimate_never_exceeds_what_the_speed_allows_and_a_lost_estimator_st
     assert said[17] == 0.5
 
 
+def test_a_car_that_stands_has_no_sideslip_and_one_that_slides_across_has():
+    stepper = GuardedStepper(Saying(lambda step: 0.05 if step < 5 else 0.2))
+    said = [stepper.step({"yaw_rate": 0.01 * k, "vx": 0.01 * k, "ay": 0.01 * k})["sideslip"] for k in range(10)]
+    assert said == [0.0] * 5 + [pytest.approx(math.atan2(0.2, 0.01 * k)) for k in range(5, 10)]
+
+
 def test_an_estimator_that_raises_starts_anew_but_programming_errors_are_not_swallowed():
     def says(step):
         if step == 5:

@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 
 from vehest.constants import FloatArray
+from vehest.data import derived
 from vehest.data.channels import CHANNELS
 from vehest.data.errors import ConfigurationError
 from vehest.estimators.base import Estimator
@@ -126,6 +127,7 @@ def context_of(stepper: GuardedStepper, precision: Precision, title: str) -> dic
         "horizon_steps": estimator.horizon_steps,
         "warm_up_steps": estimator.warm_up_steps,
         "guards": guards,
+        "no_sideslip_speed": derived.STANDSTILL_SPEED,
         "standstill_speed": STANDSTILL_SPEED,
         "standstill_yaw_rate": STANDSTILL_YAW_RATE,
         "front": front_end_table(front) if front is not None else None,

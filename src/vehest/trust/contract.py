@@ -7,7 +7,7 @@
 3. After the warm-up of its window the estimate is finite. Where there is none, v fades from the last one to 0.
 4. A channel that health accuses counts as not measured where the method can do without it; an estimator that remembers starts anew once
    the fault is over (`vehest.trust.verdict`).
-5. The estimate stays within what the last accepted speed allows. One that does not for 0.3 s, is not finite or raises starts anew,
+5. The estimate stays within what the last accepted speed allows; at standstill, slower than 0.1 m/s, sideslip is 0. One that does not for 0.3 s, is not finite or raises starts anew,
    with adapting states, such as tyres, at their fitted values.
 """
 
@@ -24,6 +24,7 @@ from typing import Any
 import numpy as np
 
 from vehest.constants import FloatArray
+from vehest.data.derived import STANDSTILL_SPEED
 from vehest.data.errors import DataError
 from vehest.data.estimate import Estimate, Mode
 from vehest.data.recording import Recording
@@ -210,7 +211,7 @@ class GuardedRun:
             return both[: len(values)]
 
         vy = later("vy", self.out)
-        channels = {"vy": vy, "sideslip": np.arctan2(vy, vx), **{name: later(name, values) for name, values in self.others.items()}}
+        channels = {"vy": vy, "sideslip": np.arctan2(vy, vx) * (np.hypot(vx, vy) >= STANDSTILL_SPEED), **{name: later(name, values) for name, values in self.others.items()}}
         if monitor.has_bands:
             channels |= {"band_vy": later("band_vy", bands[:, 0]), "band_sideslip": later("band_sideslip", bands[:, 1])}
         channels |= {"health": verdict.status, "health_reason": verdict.reason}
@@ -319,7 +320,7 @@ class GuardedStepper(Stepper):
         if not math.isnan(motion[0, 0]):
             self._vx[0] = motion[0, 0]
         bands = self._monitor.after(verdict, watched, cleaned, self._vx, self._variance)
-        found = {**self._others, "vy": vy, "sideslip": math.atan2(vy, self._vx[0]) if not math.isnan(self._vx[0]) else math.nan}
+        found = {**self._others, "vy": vy, "sideslip": math.atan2(vy, self._vx[0]) * (math.hypot(self._vx[0], vy) >= STANDSTILL_SPEED)}
         if self._monitor.has_bands:
             found["band_vy"], found["band_sideslip"] = float(bands[0, 0]), float(bands[0, 1])
         found["health"], found["health_reason"] = float(verdict.status[0]), float(verdict.reason[0])

@@ -505,6 +505,9 @@ static void step_row(vehest_state *state, const vehest_real row[C])
     state->vx = is_nan(vx) ? state->vx : vx;
     estimate->vy = state->watch.vy;
     estimate->sideslip = is_nan(state->vx) ? VEHEST_NAN : VEHEST_ATAN2(estimate->vy, state->vx);
+    if (((state->vx * state->vx) + (estimate->vy * estimate->vy)) < 0.00999999978f) { /* standstill */
+        estimate->sideslip = 0.0f;
+    }
     estimate->vx = output.vx;
     estimate->yaw_rate = output.yaw_rate;
     conclude(estimate, cleaned);

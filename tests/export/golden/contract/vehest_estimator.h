@@ -41,7 +41,7 @@ typedef struct {
 
 typedef struct {
     vehest_real vy; /* [m/s] lateral velocity at the centre of gravity, positive to the left; NaN before the first estimate */
-    vehest_real sideslip; /* [rad] atan2(vy, vx); NaN while no speed is known */
+    vehest_real sideslip; /* [rad] atan2(vy, vx), 0 at standstill; NaN while no speed is known */
     vehest_real vx; /* [m/s] the method's own forward velocity; NaN where it has none */
     vehest_real yaw_rate; /* [rad/s] the method's own yaw rate; NaN where it has none */
     vehest_real band_vy; /* [m/s] half width of the calibrated 90 % band of vy; NaN where there is none */
