@@ -319,6 +319,7 @@ class _Scan(torch.autograd.Function):
         observation: Tensor,
         *parameters: Tensor,
     ) -> tuple[Tensor, Tensor]:
+        ctx.set_materialize_grads(False)
         kept = model.kept * tape.moved.shape[1] if any(ctx.needs_input_grad) else 0
         y, u, noises = _by_time(measurements), _by_time(inputs, kept), (_by_time(process), _by_time(observation))
         tape.prior_mean[0], tape.prior_covariance[0] = _beside(mean.detach().numpy()), _beside(covariance.detach().numpy())
@@ -337,7 +338,8 @@ class _Scan(torch.autograd.Function):
         noises = [room(part.shape, part.dtype) for part in (tape.post_covariance, tape.own)]
         noises[0][-1] = 0  # no step leads on from the last sample
         measured, mean, covariance = (np.empty_like(part) for part in (tape.innovation, tape.post_mean[0], tape.post_covariance[0]))
-        bars = (*noises, measured, *(_by_time(part) for part in upstream))
+        posts = zip(upstream, (tape.post_mean, tape.post_covariance), strict=True)
+        bars = (*noises, measured, *(np.zeros_like(like) if part is None else _by_time(part) for part, like in posts))
         gradients: dict[int, list[Array]] = {}
 
         def work(first: int, end: int) -> None:
