@@ -12,7 +12,7 @@ from conftest import planar_drive
 from vehest.data.windows import windows_of
 from vehest.estimators.gru import Gru
 from vehest.estimators.kernels.activation import arctan, rational_tanh, softplus
-from vehest.estimators.kernels.threads import over_members
+from vehest.estimators.kernels.threads import over_members, threads_for_members
 from vehest.estimators.ksnn import Ksnn
 from vehest.estimators.lstm import Lstm
 from vehest.estimators.luenberger import implicit_euler_observer, observe
@@ -89,6 +89,11 @@ def test_every_member_is_worked_on_once_whatever_the_number_of_threads():
             over_members(work, members)
             assert (times == 1).all()
             assert len(workers) <= min(threads, members)
+        barrier = threading.Barrier(4, timeout=60)  # broken unless members still have all four threads
+        with threads_for_members():
+            over_members(lambda first, end: barrier.wait(), 4, pieces=1)
+            assert torch.get_num_threads() == 1
+        assert torch.get_num_threads() == 4
     finally:
         torch.set_num_threads(before)
 

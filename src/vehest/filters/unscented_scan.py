@@ -62,12 +62,14 @@ class PointModel:
     Entries are transition and observation, called with (points, inputs, car, out, first, end), and their adjoints, called with (points,
     inputs, car, upstream, out, gradients, first, end), which add to the gradients of parameters. Sequences lie side by side in points
     (S, n, B), inputs (p, B), what is expected (S, m, B) and gradients, each followed by room for a vector; ``out`` is written from
-    ``first`` to ``end``.
+    ``first`` to ``end``. Where gradients are wanted, inputs have ``kept`` rows a point more, in which entries may leave numbers for their
+    adjoints.
     """
 
     entries: Sequence[Any]
     car: Any = None  # what all are given
     is_compiled = False  # whether the entries are, so that the loop over samples runs without Python
+    kept = 0
     parameters: Sequence[Tensor] = ()  # what gradients are wanted for
     lower: Sequence[float] | None = None  # smallest possible value of each state, (n,); none: everything is possible
 
@@ -317,7 +319,9 @@ class _Scan(torch.autograd.Function):
         observation: Tensor,
         *parameters: Tensor,
     ) -> tuple[Tensor, Tensor]:
-        y, u, noises = _by_time(measurements), _by_time(inputs), (_by_time(process), _by_time(observation))
+        ctx.set_materialize_grads(False)
+        kept = model.kept * tape.moved.shape[1] if any(ctx.needs_input_grad) else 0
+        y, u, noises = _by_time(measurements), _by_time(inputs, kept), (_by_time(process), _by_time(observation))
         tape.prior_mean[0], tape.prior_covariance[0] = _beside(mean.detach().numpy()), _beside(covariance.detach().numpy())
         refused, halves = np.zeros(measurements.shape[::2], np.int64), (1, 2 * len(y))
         run = _forward_by(model, functions, (tape, u[0]))
@@ -334,7 +338,8 @@ class _Scan(torch.autograd.Function):
         noises = [room(part.shape, part.dtype) for part in (tape.post_covariance, tape.own)]
         noises[0][-1] = 0  # no step leads on from the last sample
         measured, mean, covariance = (np.empty_like(part) for part in (tape.innovation, tape.post_mean[0], tape.post_covariance[0]))
-        bars = (*noises, measured, *(_by_time(part) for part in upstream))
+        posts = zip(upstream, (tape.post_mean, tape.post_covariance), strict=True)
+        bars = (*noises, measured, *(np.zeros_like(like) if part is None else _by_time(part) for part, like in posts))
         gradients: dict[int, list[Array]] = {}
 
         def work(first: int, end: int) -> None:
@@ -398,11 +403,12 @@ def _alone_by_time(values: Array) -> Array:
     return out
 
 
-def _by_time(tensor: Tensor) -> Array:
-    """(B, T, ...) -> (T, ..., B), followed by room for a vector."""
+def _by_time(tensor: Tensor, kept: int = 0) -> Array:
+    """(B, T, p, ...) -> (T, p + kept, ..., B), followed by room for a vector."""
     moved = tensor.detach().movedim(0, -1)
-    out: Array = room(tuple(moved.shape), moved.numpy().dtype)
-    torch.from_numpy(out).copy_(moved)
+    steps, rows, *rest = moved.shape
+    out: Array = room((steps, rows + kept, *rest), moved.numpy().dtype)
+    torch.from_numpy(out)[:, :rows].copy_(moved)
     return out
 
 

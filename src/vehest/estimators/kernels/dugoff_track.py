@@ -1,6 +1,7 @@
 """Sigma points through the single track on Dugoff's tyres (`DugoffTrack`), compiled, with the adjoint.
 
-A point's derivatives are those of two numbers by two others: they are written out, and the adjoint multiplies by them.
+A point's derivatives are those of two numbers by two others: they are written out, and the adjoint multiplies by those of both axles'
+forces, which are left for it beside the inputs.
 """
 
 from __future__ import annotations
@@ -15,13 +16,14 @@ from vehest.filters.unscented_steps import at_row, compiled, piece
 from vehest.lanes import choose, each, most, store_some, width
 from vehest.vehicle.dugoff import LARGEST_RATIO, LEAST_COSINE, LEAST_LOAD, LEAST_SHARE, DugoffTrack
 
+DRIVEN = 3  # rows of inputs before those that are kept
 PLAIN, SMOOTH = LARGEST_RATIO["plain"], LARGEST_RATIO["smooth"]
 
 
 class CompiledDugoffTrack(PointModel):
     """A `DugoffTrack` for the unscented filter; nothing of the car is learnt."""
 
-    is_compiled = True
+    is_compiled, kept = True, 4
 
     def __init__(self, track: DugoffTrack) -> None:
         car = track.car
@@ -89,6 +91,21 @@ def _forces(points, s, b, settled, track):  # type: ignore[no-untyped-def]
     return vy, yaw_rate, front * cosine, rear, front_slope * cosine * by_course / vx, -rear_slope / vx
 
 
+@piece
+def _keep(inputs, entry, s, b, by_front, by_rear, end):  # type: ignore[no-untyped-def]
+    """Leave what the forces at point s change by the lateral velocities of their axles, where inputs have rows for it."""
+    row = DRIVEN + 4 * s + 2 * entry
+    if row < inputs.shape[0]:
+        _put(inputs, row, b, by_front, end)
+        _put(inputs, row + 1, b, by_rear, end)
+
+
+@piece
+def _kept(inputs, entry, s, b):  # type: ignore[no-untyped-def]
+    row = DRIVEN + 4 * s + 2 * entry
+    return at_row(inputs, row, b), at_row(inputs, row + 1, b)
+
+
 @compiled
 def _transition(points, inputs, track, out, first, end):  # type: ignore[no-untyped-def]
     car = track[0]
@@ -97,7 +114,8 @@ def _transition(points, inputs, track, out, first, end):  # type: ignore[no-unty
         settled, rolls = _settled(inputs, b, car), at_row(inputs, 0, b) < minimum_speed
         turn = at_row(inputs, 0, b) * at_row(inputs, 1, b) / (front_arm + rear_arm)
         for s in range(points.shape[0]):
-            vy, yaw_rate, front, rear, _, _ = _forces(points, s, b, settled, track)
+            vy, yaw_rate, front, rear, by_front, by_rear = _forces(points, s, b, settled, track)
+            _keep(inputs, 0, s, b, by_front, by_rear, end)
             across = vy + step * ((front + rear) / mass - settled[0] * yaw_rate)
             turning = yaw_rate + step * (front_arm * front - rear_arm * rear) / inertia
             _put(out, 2 * s, b, choose(rolls, rear_arm * turn, across), end)
@@ -110,7 +128,8 @@ def _observation(points, inputs, track, out, first, end):  # type: ignore[no-unt
     for b in range(first, end, width(points)):
         settled = _settled(inputs, b, car)
         for s in range(points.shape[0]):
-            vy, yaw_rate, front, rear, _, _ = _forces(points, s, b, settled, track)
+            vy, yaw_rate, front, rear, by_front, by_rear = _forces(points, s, b, settled, track)
+            _keep(inputs, 1, s, b, by_front, by_rear, end)
             _put(out, m * s, b, (front + rear) / car[0], end)
             _put(out, m * s + 1, b, yaw_rate, end)
             _put(out, m * s + 2, b, front, end)
@@ -124,13 +143,13 @@ def _transition_adjoint(points, inputs, track, upstream, out, gradients, first, 
     car = track[0]
     mass, inertia, front_arm, rear_arm, _, step, minimum_speed = car
     for b in range(first, end, width(points)):
-        settled, rolls = _settled(inputs, b, car), at_row(inputs, 0, b) < minimum_speed
+        vx, rolls = most(at_row(inputs, 0, b), minimum_speed), at_row(inputs, 0, b) < minimum_speed
         for s in range(points.shape[0]):
-            _, _, _, _, by_front, by_rear = _forces(points, s, b, settled, track)
+            by_front, by_rear = _kept(inputs, 0, s, b)
             across, turning = at_row(upstream, 2 * s, b), at_row(upstream, 2 * s + 1, b)
             front_bar = step * (across / mass + turning * front_arm / inertia) * by_front
             rear_bar = step * (across / mass - turning * rear_arm / inertia) * by_rear
-            spun = turning - step * settled[0] * across + front_arm * front_bar - rear_arm * rear_bar
+            spun = turning - step * vx * across + front_arm * front_bar - rear_arm * rear_bar
             _put(out, 2 * s, b, choose(rolls, 0.0, across + front_bar + rear_bar), end)
             _put(out, 2 * s + 1, b, choose(rolls, 0.0, spun), end)
 
@@ -138,12 +157,11 @@ def _transition_adjoint(points, inputs, track, upstream, out, gradients, first, 
 @compiled
 def _observation_adjoint(points, inputs, track, upstream, out, gradients, first, end):  # type: ignore[no-untyped-def]
     car, m = track[0], upstream.shape[1]
-    mass, _, front_arm, rear_arm, _, _, _ = car
+    mass, _, front_arm, rear_arm, _, _, minimum_speed = car
     for b in range(first, end, width(points)):
-        settled = _settled(inputs, b, car)
-        vx = settled[0]
+        vx = most(at_row(inputs, 0, b), minimum_speed)
         for s in range(points.shape[0]):
-            vy, _, _, _, by_front, by_rear = _forces(points, s, b, settled, track)
+            vy, (by_front, by_rear) = at_row(points, 2 * s, b), _kept(inputs, 1, s, b)
             across = at_row(upstream, m * s, b) / mass
             front_bar = (across + at_row(upstream, m * s + 2, b)) * by_front
             rear_bar = (across + at_row(upstream, m * s + 3, b)) * by_rear

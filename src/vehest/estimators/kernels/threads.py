@@ -3,11 +3,29 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
+from contextvars import ContextVar
 from functools import cache
 
 PIECES = 4  # for each thread, so that one that is held up leaves its share to the others
+_allowed = ContextVar("_allowed", default=0)
+
+
+@contextmanager
+def threads_for_members() -> Iterator[None]:
+    """Within, `over_members` has the threads that torch was allowed, and torch one: its small operations would wait for threads held up."""
+    import torch
+
+    threads = torch.get_num_threads()
+    token = _allowed.set(threads)
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(threads)
+        _allowed.reset(token)
 
 
 def over_members(work: Callable[[int, int], None], members: int, pieces: int = PIECES) -> None:
@@ -19,7 +37,7 @@ def over_members(work: Callable[[int, int], None], members: int, pieces: int = P
     if members > 1:
         from torch import get_num_threads
 
-        threads = min(get_num_threads(), members)
+        threads = min(_allowed.get() or get_num_threads(), members)
     if threads == 1:
         work(0, members)
         return

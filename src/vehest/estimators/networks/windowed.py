@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Mapping, Sequence
+from contextlib import nullcontext
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -18,6 +19,7 @@ from vehest.data.recording import Recording
 from vehest.data.windows import window_starts, windows_of
 from vehest.declared import setting
 from vehest.estimators.base import FitData, FitRecord, Stepper, rate
+from vehest.estimators.kernels.threads import threads_for_members
 from vehest.estimators.model_files import load_model
 from vehest.estimators.network import Network
 from vehest.training.context import FitContext
@@ -76,7 +78,9 @@ class WindowedEstimator(Network):
             if started:
                 member.network.load_state_dict({name: torch.as_tensor(values, dtype=dtype) for name, values in started.items()})
         seeds = [member._seed for member in members]
-        return train_members([member.network for member in members], seeds, train, validation, training, context)
+        compiled = training.compiled and hasattr(first.network, "compiled_descent")
+        with threads_for_members() if compiled else nullcontext():
+            return train_members([member.network for member in members], seeds, train, validation, training, context)
 
     def _seeded_network(self, train: list[Recording], dtype: torch.dtype) -> nn.Module:
         """A network to train, with initial weights from the member's seed."""
