@@ -137,7 +137,8 @@ def _repeated(motion: Motion) -> Iterator[Relation]:
         reference, moving = f"{name}_ref", motion.moving
         if name in motion and reference in motion and np.count_nonzero(moving) >= FEWEST_SAMPLES:
             pair = (name, reference)
-            yield from _related(*pair, pair, (1, -1), motion[name][moving], motion[reference][moving], least_correlation=SAME_CORRELATION)
+            both = (motion[one][moving] - motion[one][moving].mean() for one in pair)  # slip is no factor: means alone would agree
+            yield from _related(*pair, pair, (1, -1), *both, least_correlation=SAME_CORRELATION)
     if motion.velocity == "vy_ref" and "sideslip_ref" in motion:
         forwards = motion.moving & (motion.vx > 0.0)  # the angle of a car that goes backwards is taken either way
         shown, expected = motion["sideslip_ref"][forwards], np.arctan2(motion.vy, motion.vx)[forwards]
