@@ -189,7 +189,7 @@ def test_transforms_are_built_from_plain_values():
     # Those of an alignment are built from plain values in test_alignment.py.
     of_an_alignment = {"delay_correction", "offset_correction", "steering_ratio", "steering_curve"}
     assert transform_from_config({"name": "reference_lever", "lever_x": 2.0}) == ReferenceLever(2.0)
-    others = {"resample", "low_pass", "remove_outliers", "mounting_correction", "reference_lever", "speed_from_wheels"}
+    others = {"resample", "low_pass", "remove_outliers", "bridge_impossible", "mounting_correction", "reference_lever", "speed_from_wheels"}
     deriving = {"acceleration_from_speed", "velocity_from_sideslip", "sideslip_from_velocity", "scale_to_wheelbase"}
     assert set(TRANSFORMS) == others | of_an_alignment | deriving
 
