@@ -178,10 +178,12 @@ def test_slow_signals_with_empty_cells_and_marks_of_missing_samples_are_bridged(
 
 
 def test_a_log_without_reference_ranks_nothing_and_one_the_other_way_round_keeps_signs_together(tmp_path):
-    examined = inspect("my_car", [write(tmp_path / "lap.csv", usual(drive()).drop(columns="Beta"))])
+    table = usual(drive()).drop(columns="Beta")
+    examined = inspect("my_car", [write(tmp_path / "lap 1.csv", table.assign(LatAccRear=table["LatAcc"] + 0.01))])
+    assert any("agrees 1.000, as of another place" in text for text in examined.proposals.by_channel["ay"].evidence)
     outcome, _ = write_files(examined, dry_run=True)
     assert (outcome["estimators"], [Path(file).parts[0] for file in outcome["written"]]) == ([], ["conf"])
-    assert outcome["next"][-1].startswith("vehest estimate ")
+    assert outcome["next"][-1].startswith('vehest estimate "')
     table = -usual(drive())
     table["Time [s]"] *= -1.0
     signs = {name: one.sign for name, one in proposed(tmp_path, table).items()}

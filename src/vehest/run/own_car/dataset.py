@@ -40,7 +40,7 @@ LEAST_GAP = 0.05  # s
 GAPS = "samples are missing; only a table with a column of times may lack some, which are bridged, or cut out beyond one second"
 POSE_SECONDS = 0.15  # of the filter that differentiates poses
 CONTRADICTIONS = ("sign", "unit", "impossible", "kinematics")  # checks that contradict a proposal
-REMARKS = (*CONTRADICTIONS, "dropout", "stuck", "held", "reverse")
+REMARKS = (*CONTRADICTIONS, "dropout", "stuck", "held", "reverse", "offset")
 GAIN_APART = 1.15  # factor between the gains of two files, of which each half is beyond the other file's
 LEAST_TURN, TURNING_SECONDS = 0.05, 5.0  # rad/s, and how long a half of a file turns as fast [s]
 
