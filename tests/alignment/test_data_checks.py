@@ -203,7 +203,9 @@ def test_driving_backwards_is_noted_with_its_longest_stretch_and_lowest_speed():
 def test_the_reference_tells_of_driving_backwards_only_where_there_is_no_measured_speed():
     drive = backwards(clean_drive(), (1000, 1150))
     forwards = changed(drive, vx=np.abs)
-    assert not reversing(forwards)
+    assert [(found.level, "has no sign: the car goes backwards 1 times" in found.message) for found in reversing(forwards)] == [
+        ("warning", True)
+    ]
     without = replace(forwards, channels={name: samples for name, samples in forwards.channels.items() if name != "vx"})
     assert [found.channel for found in reversing(without)] == ["vx_ref"]
     assert not reversing(without.select(["yaw_rate", "ay"]))

@@ -127,6 +127,17 @@ def test_outlier_removal_of_short_recordings_stays_within_their_values(length, h
     assert out.max() <= samples.max()
 
 
+@pytest.mark.parametrize("beside", [0.0, 0.03])
+def test_a_few_impossible_samples_are_bridged_by_lines_and_many_stay(beside):
+    line = np.linspace(-5.0, 5.0, 400)
+    spoilt, reach = line.copy(), round(beside * RATE)
+    spoilt[[100, 101]] = 9e3
+    spoilt[100 - reach : 100] = spoilt[102 : 102 + reach] = 70.0  # of a slower signal that was interpolated
+    bridge = transform_from_config({"name": "bridge_impossible", "beside": beside})
+    np.testing.assert_allclose(bridge(recorded(ay=spoilt))["ay"], line, atol=1e-12)
+    np.testing.assert_array_equal(bridge(recorded(ay=100.0 * line))["ay"], 100.0 * line)
+
+
 def rigid_body(lever_x, lever_y, yaw):
     """A car that circles and weaves, seen by a displaced and turned accelerometer, and what it does at its centre of gravity.
 
@@ -189,7 +200,7 @@ def test_transforms_are_built_from_plain_values():
     # Those of an alignment are built from plain values in test_alignment.py.
     of_an_alignment = {"delay_correction", "offset_correction", "steering_ratio", "steering_curve"}
     assert transform_from_config({"name": "reference_lever", "lever_x": 2.0}) == ReferenceLever(2.0)
-    others = {"resample", "low_pass", "remove_outliers", "mounting_correction", "reference_lever", "speed_from_wheels"}
+    others = {"resample", "low_pass", "remove_outliers", "bridge_impossible", "mounting_correction", "reference_lever", "speed_from_wheels"}
     deriving = {"acceleration_from_speed", "velocity_from_sideslip", "sideslip_from_velocity", "scale_to_wheelbase"}
     assert set(TRANSFORMS) == others | of_an_alignment | deriving
 

@@ -178,10 +178,12 @@ def test_slow_signals_with_empty_cells_and_marks_of_missing_samples_are_bridged(
 
 
 def test_a_log_without_reference_ranks_nothing_and_one_the_other_way_round_keeps_signs_together(tmp_path):
-    examined = inspect("my_car", [write(tmp_path / "lap.csv", usual(drive()).drop(columns="Beta"))])
+    table = usual(drive()).drop(columns="Beta")
+    examined = inspect("my_car", [write(tmp_path / "lap 1.csv", table.assign(LatAccRear=table["LatAcc"] + 0.01))])
+    assert any("agrees 1.000, as of another place" in text for text in examined.proposals.by_channel["ay"].evidence)
     outcome, _ = write_files(examined, dry_run=True)
     assert (outcome["estimators"], [Path(file).parts[0] for file in outcome["written"]]) == ([], ["conf"])
-    assert outcome["next"][-1].startswith("vehest estimate ")
+    assert outcome["next"][-1].startswith('vehest estimate "')
     table = -usual(drive())
     table["Time [s]"] *= -1.0
     signs = {name: one.sign for name, one in proposed(tmp_path, table).items()}
@@ -497,13 +499,14 @@ def test_course_and_heading_without_another_reference_and_samples_that_rows_repe
     assert any(one.startswith("yaw_rate: ") for one in remarks)
 
 
-def test_a_few_rows_that_no_vehicle_drives_are_left_out_and_said(tmp_path):
+@pytest.mark.parametrize("suffix", [".csv", ".vbo", ".mf4"])
+def test_a_few_samples_that_no_vehicle_drives_are_bridged_and_said_in_every_format(tmp_path, suffix):
     d = drive()
     table = usual(d)
     table.loc[[2000, 2001], "Speed"] = 9999.0
-    made = drafted(tmp_path, table)
-    assert made.dataset["drop_rows"] == {"lap": [2001, 2002]}
-    assert any("data rows: 2 (2001, 2002)" in note for note in made.notes)
+    made = draft(inspect("my_car", [written(tmp_path / f"lap{suffix}", table)]))
+    assert made.dataset["transforms"][0]["name"] == "bridge_impossible"
+    assert any("bridge_impossible" in note for note in made.notes)
     recording = read_back(made)
     assert (recording.rate_hz, len(recording["vx"])) == (50.0, 6000)
     np.testing.assert_allclose(recording["vx"], d["vx"], atol=0.2)
@@ -613,11 +616,46 @@ def test_a_speed_in_an_unknown_unit_is_scaled_by_that_of_the_reference_wherever_
     assert found["vx"].factor == pytest.approx(0.01, rel=0.01)
 
 
-def test_names_in_shift_jis_are_read(tmp_path):
-    table = usual(drive()).rename(columns={"Speed": "車速[km/h]", "Gyro": "ヨーレート[deg/s]", "LatAcc": "横加速度[g]"})
-    examined = inspect("my_car", [write(tmp_path / "lap.csv", table, encoding="shift_jis")])
-    assert examined.proposals.by_channel["vx"].column == "車速[km/h]"
+@pytest.mark.parametrize(
+    ("encoding", "speed", "rate"),
+    [("cp932", "車速[km/h]", "ヨーレート[°/s]"), ("cp932", "速度[km/h]", "角速度[deg/s]"), ("cp1252", "„v“", "‰r")],
+)
+def test_names_in_shift_jis_are_read_and_windows_1252_is_not_taken_for_it(tmp_path, encoding, speed, rate):
+    table = usual(drive()).rename(columns={"Speed": speed, "Gyro": rate})
+    examined = inspect("my_car", [write(tmp_path / "lap.csv", table, encoding=encoding)])
+    assert [examined.proposals.by_channel[name].column for name in ("vx", "yaw_rate")] == [speed, rate]
     assert read_back(draft(examined))["vx"].mean() == pytest.approx(drive()["vx"].mean(), rel=1e-3)
+
+
+def test_scaled_units_of_a_header_are_read_and_unknown_ones_are_said(tmp_path):
+    d = drive()
+    table = pd.DataFrame(
+        {"t": d["t"], "Speed [cm/s]": 100.0 * d["vx"], "Gyro [mrad/s]": 1e3 * d["r"], "LatAcc [mg]": 1e3 * d["ay"] / 9.80665}
+    )
+    made = drafted(tmp_path, table.assign(**{"LongAcc [mm/s^2]": 1e3 * d["ax"], "VLat [m per s]": d["vx"] * np.tan(d["sideslip"])}))
+    assert {one.channel for one in made.examined.proposals.channels if not one.asked} == {"vx", "yaw_rate", "ay", "ax", "vy_ref"}
+    assert next(note for note in made.notes if "no unit that vehest knows" in note).startswith("'m per s' of 'VLat [m per s]'")
+    for name, expected in (("vx", d["vx"]), ("yaw_rate", d["r"]), ("ay", d["ay"]), ("ax", d["ax"])):
+        np.testing.assert_allclose(read_back(made)[name], expected, atol=1e-4 * np.ptp(expected))
+
+
+def test_files_of_two_cars_are_told_of_and_those_of_one_are_not(tmp_path):
+    table = usual(drive())
+    files = [write(tmp_path / "lap_1.csv", table), write(tmp_path / "lap_2.csv", usual(drive(100.0)))]
+    assert not draft(inspect("my_car", files)).remarks
+    write(files[1], usual(drive(100.0)).assign(Steer=1.5 * table["Steer"]))
+    (remark,) = draft(inspect("my_car", files)).remarks
+    assert remark.startswith("handwheel: in 'lap_2', 1.5 times as large in the same turn as in 'lap_1'")
+
+
+def test_a_speed_without_sign_is_told_of_where_the_car_goes_backwards(tmp_path):
+    d = drive()
+    table = usual(d).drop(columns="Beta")
+    slow, back = 3.0 / d["vx"], slice(2000, 2500)
+    table.loc[2000:2499, "Speed"] = 10.8
+    for name, sign in (("Gyro", -1.0), ("Steer", 1.0), ("LatAcc", 1.0)):
+        table.loc[2000:2499, name] *= sign * slow[back]
+    assert any(one.startswith("vx: has no sign: the car goes backwards") for one in drafted(tmp_path, table).remarks)
 
 
 def test_a_column_that_run_would_refuse_in_the_second_file_is_left_out_unless_answered(tmp_path):

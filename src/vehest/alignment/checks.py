@@ -47,6 +47,7 @@ DROPOUT_BRAKING = 4.0  # m/s², beyond which a wheel may be locked
 DROPOUT_CLEAR_SECONDS = 1.0  # before and after such braking
 REVERSE_SPEED = 0.5  # m/s
 REVERSE_SECONDS = 1.0
+FASTEST_REVERSE, LEAST_TURN = 8.0, 0.03  # m/s, rad/s; between them the signs of ay and steering say which way the car goes
 
 
 def checks_of_recording(recording: Recording) -> list[Finding]:
@@ -247,6 +248,27 @@ def _reverse(recording: Recording, _: BoolArray) -> Iterator[Finding]:
         yield Finding("note", "reverse", speed, message)
 
 
+def _unsigned_speed(recording: Recording, _: BoolArray) -> Iterator[Finding]:
+    """A positive speed while the reference goes backwards, or while ay and steering both oppose the yaw rate for a part of the drive."""
+    angle = next((name for name in ("steer", "handwheel") if name in recording), "")
+    if "vx" not in recording or ("vx_ref" not in recording and not {"yaw_rate", "ay", angle} <= set(recording.channels)):
+        return
+    if "vx_ref" in recording:
+        backwards = recording["vx_ref"] < -REVERSE_SPEED
+    else:
+        second = np.full(min(round(recording.rate_hz) or 1, len(recording)), 1.0)
+        rate, ay, turned = (np.convolve(recording[name], second / len(second), "same") for name in ("yaw_rate", "ay", angle))
+        turns = np.abs(rate) > LEAST_TURN
+        against = turns & (ay * rate < 0.0) & (turned * rate < 0.0)
+        is_part = np.count_nonzero(against) < 0.5 * np.count_nonzero(turns)  # else a channel's sign is wrong
+        backwards = against & (recording["vx"] < FASTEST_REVERSE) & is_part
+    runs = true_runs(backwards & (recording["vx"] > REVERSE_SPEED))
+    runs = runs[runs[:, 1] - runs[:, 0] >= REVERSE_SECONDS * recording.rate_hz]
+    if len(runs):
+        message = f"has no sign: the car goes backwards {len(runs)} times while it counts up, the longest {_longest(runs, recording)}"
+        yield Finding("warning", "reverse", "vx", f"{message}; leave the range out (start and stop of a split), or log a signed speed")
+
+
 def _longest(runs: NDArray[np.int64], recording: Recording) -> str:
     begin, end = runs[np.argmax(runs[:, 1] - runs[:, 0])].tolist()
     return f"for {(end - begin) / recording.rate_hz:.3g} s from {recording.time[begin]:.12g} s"
@@ -262,4 +284,5 @@ _CHECKS: tuple[Callable[[Recording, BoolArray], Iterable[Finding]], ...] = (
     _steering_offset,
     _wheel_dropout,
     _reverse,
+    _unsigned_speed,
 )

@@ -22,7 +22,7 @@ LEAST_SECONDS = 10.0  # of filtered samples
 STEADY_CORRELATION = 0.7
 SIGN_CORRELATION = 0.3  # of relations with derivatives
 SCALE_CORRELATION = 0.8
-SAME_CORRELATION = 0.95  # of one quantity measured twice; a driven wheel that spins is no wrong unit
+SAME_CORRELATION = 0.95  # of one angle measured twice
 LEAST_ACCELERATION = 0.2  # m/s², standard deviation
 LEAST_SLIDING = 1e-3  # m/s²
 LEAST_SIDESLIP = 1e-3  # rad
@@ -137,7 +137,8 @@ def _repeated(motion: Motion) -> Iterator[Relation]:
         reference, moving = f"{name}_ref", motion.moving
         if name in motion and reference in motion and np.count_nonzero(moving) >= FEWEST_SAMPLES:
             pair = (name, reference)
-            yield from _related(*pair, pair, (1, -1), motion[name][moving], motion[reference][moving], least_correlation=SAME_CORRELATION)
+            steady = (motion[one][moving] - motion[one][moving].mean() for one in pair)  # slip is no factor: means alone would agree
+            yield from _related(*pair, pair, (1, -1), *steady)
     if motion.velocity == "vy_ref" and "sideslip_ref" in motion:
         forwards = motion.moving & (motion.vx > 0.0)  # the angle of a car that goes backwards is taken either way
         shown, expected = motion["sideslip_ref"][forwards], np.arctan2(motion.vy, motion.vx)[forwards]

@@ -33,6 +33,7 @@ from vehest.data.schema import validated
 
 LONGEST_DIRECT = 8192  # taps up to which a filter is summed sample by sample; longer ones through their spectra
 OUTPUTS_AT_ONCE = 4096  # that a resampling sums side by side
+MOST_BRIDGED = 0.1  # of a channel's samples
 VALUES_AT_ONCE = 1 << 20  # samples that are compared at a time, windows included
 
 
@@ -192,6 +193,24 @@ class RemoveOutliers:
 
 
 @dataclass(frozen=True)
+class BridgeImpossible:
+    """Replace samples beyond what a vehicle can do by straight lines, in channels with a few of them; offline."""
+
+    beside: Annotated[float, Field(ge=0.0)] = 0.0  # reach of a line to either side, where a slower signal was interpolated [s]
+
+    def __call__(self, recording: Recording) -> Recording:
+        """Bridge them; a channel with more than a tenth of them stays, whose unit is then wrong."""
+        around = np.ones(2 * round(self.beside * recording.rate_hz) + 1)
+        places, changed = np.arange(len(recording)), {}
+        for name, samples in recording.channels.items():
+            beyond = (samples < CHANNELS[name].low) | (samples > CHANNELS[name].high)
+            near = np.convolve(beyond, around)[len(around) // 2 :][: len(beyond)] > 0.5
+            if 0.0 < near.mean() <= MOST_BRIDGED:
+                changed[name] = np.where(near, np.interp(places, places[~near], samples[~near]), samples)
+        return recording.with_channels(changed)
+
+
+@dataclass(frozen=True)
 class MountingCorrection:
     """Bring the accelerometer's readings to the centre of gravity and the vehicle's axes, in the plane.
 
@@ -294,6 +313,7 @@ TRANSFORMS: dict[str, type[Any]] = {
     "resample": Resample,
     "low_pass": LowPass,
     "remove_outliers": RemoveOutliers,
+    "bridge_impossible": BridgeImpossible,
     "mounting_correction": MountingCorrection,
     "reference_lever": ReferenceLever,
     "delay_correction": DelayCorrection,

@@ -7,10 +7,10 @@ import math
 from vehest.data.errors import DataError
 
 _FACTORS = {  # SI unit -> unit -> factor that makes it SI
-    "m/s": {"m/s": 1.0, "km/h": 1.0 / 3.6, "mph": 0.44704, "knots": 1852.0 / 3600.0},
-    "m/s²": {"m/s²": 1.0, "m/s^2": 1.0, "m/s2": 1.0, "g": 9.80665},
-    "rad": {"rad": 1.0, "deg": math.pi / 180.0},
-    "rad/s": {"rad/s": 1.0, "deg/s": math.pi / 180.0, "rpm": math.pi / 30.0},
+    "m/s": {"m/s": 1.0, "km/h": 1.0 / 3.6, "mph": 0.44704, "knots": 1852.0 / 3600.0, "ft/s": 0.3048, "cm/s": 0.01, "mm/s": 0.001},
+    "m/s²": {"m/s²": 1.0, "m/s^2": 1.0, "m/s2": 1.0, "g": 9.80665, "mg": 9.80665e-3, "ft/s²": 0.3048, "cm/s²": 0.01, "mm/s²": 0.001},
+    "rad": {"rad": 1.0, "deg": math.pi / 180.0, "mrad": 0.001},
+    "rad/s": {"rad/s": 1.0, "deg/s": math.pi / 180.0, "rpm": math.pi / 30.0, "mrad/s": 0.001},
     "N": {"N": 1.0, "kN": 1e3},
     "N·m": {"N·m": 1.0, "Nm": 1.0},
     "Pa": {"Pa": 1.0, "kPa": 1e3, "MPa": 1e6, "bar": 1e5, "psi": 6894.757293168361},

@@ -194,7 +194,8 @@ def _assigned(columns: Sequence[Candidate], search: Search | None, wheels: Wheel
         for own in (*_turning_proposals(search.turning), *repeated(search)):
             before = found.get(own.channel)
             if before is not None and before.column == own.column:
-                own = replace(own, evidence=(*before.evidence, *own.evidence), asked=own.asked or before.asked)
+                evidence, asked, others = (*before.evidence, *own.evidence), own.asked or before.asked, own.others or before.others
+                own = replace(own, evidence=evidence, asked=asked, others=others)
             found[own.channel] = own
         fitting, notes = fitting_channels(search)
         found |= fitting

@@ -171,7 +171,7 @@ class Repeat(NamedTuple):
 
 
 def repeated(search: Search) -> Iterator[Proposal]:
-    """Proposals for speeds and yaw rates that are measured twice, those of the motion among them."""
+    """Proposals for speeds, yaw rates and lateral accelerations that are measured twice, those of the motion among them."""
     for channel in SAME_NAMED:
         first = Repeat(search.turning.columns[channel], search.turning.units[channel], search.turning.signs[channel])
         same, scaled = [], []
@@ -194,6 +194,8 @@ def repeated(search: Search) -> Iterator[Proposal]:
     for column in list(search.free):
         if ay is not None and abs(correlation(column.slow, ay.slow)) > SAME_AY and column.hint("ay") >= 0.0:
             search.free.remove(column)
+            text = f"'{column.name}' agrees {abs(correlation(column.slow, ay.slow)):.3f}, as of another place or filtered"
+            yield Proposal(ay.name, "ay", search.turning.units["ay"], search.turning.signs["ay"], (text,))
 
 
 def reference_speed(found: dict[str, Proposal]) -> dict[str, Proposal]:

@@ -14,6 +14,7 @@ import numpy as np
 from vehest.alignment.align import align
 from vehest.alignment.checks import checks_of_recording
 from vehest.alignment.delays import Late, late_channels
+from vehest.alignment.motion import rms
 from vehest.alignment.proposals.proposal import Proposal
 from vehest.alignment.settings import AlignmentSettings
 from vehest.constants import FloatArray
@@ -37,10 +38,11 @@ POLICIES = {"vbo": ("strict", "interpolate"), **dict.fromkeys(TABLES, ("strict",
 BAG_HZ = 100.0
 LEAST_GAP = 0.05  # s
 GAPS = "samples are missing; only a table with a column of times may lack some, which are bridged, or cut out beyond one second"
-MOST_STRAY = 0.002  # of the rows
 POSE_SECONDS = 0.15  # of the filter that differentiates poses
 CONTRADICTIONS = ("sign", "unit", "impossible", "kinematics")  # checks that contradict a proposal
-REMARKS = (*CONTRADICTIONS, "dropout", "stuck", "held")
+REMARKS = (*CONTRADICTIONS, "dropout", "stuck", "held", "reverse", "offset")
+GAIN_APART = 1.15  # factor between the gains of two files, of which each half is beyond the other file's
+LEAST_TURN, TURNING_SECONDS = 0.05, 5.0  # rad/s, and how long a half of a file turns as fast [s]
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,10 +80,14 @@ def draft(examined: Examined) -> Draft:
     dataset = _dataset(examined)
     speed = [{"name": "speed_from_wheels", "wheel_radius": proposals.wheel_radius}] if proposals.wheel_radius is not None else []
     dataset, recordings = _read_strictest(dataset | {"transforms": speed})
+    bridging, notes = _bridging(examined, recordings), [*proposals.notes]
+    if bridging:
+        recordings = _recordings(dataset := dataset | {"transforms": [*bridging, *speed]})
+        notes.append("a few samples beyond what a vehicle can do are bridged by lines (bridge_impossible)")
     longest = max(recordings, key=lambda own: own.duration)
-    late, ratio, notes = late_channels(longest), None, [*proposals.notes]
+    late, ratio = late_channels(longest), None
     for stem, rows in dataset.get("drop_rows", {}).items():
-        why = f"beyond what a vehicle can do, written twice, or {BRIDGED:g} s and more without a sample"
+        why = f"written twice, or {BRIDGED:g} s and more without a sample"
         notes.append(f"left out of '{stem}' by drop_rows, {why}: data rows: {counted([str(row) for row in rows])}")
     if vehicle["wheelbase"] and vehicle["steering_ratio"] is None and "handwheel" in longest:
         try:
@@ -92,7 +98,8 @@ def draft(examined: Examined) -> Draft:
     if pause := dataset.get("max_gap"):
         of_file = Counter(str(one.provenance.get("file")) for one in recordings)
         notes += [f"'{file}' pauses for more than {pause:g} s and makes {n} recordings" for file, n in of_file.items() if n > 1]
-    dataset |= {"transforms": _transforms(examined, longest, late, speed, vehicle["steering_ratio"] or (ratio[0] if ratio else None))}
+    made = _transforms(examined, longest, late, speed, vehicle["steering_ratio"] or (ratio[0] if ratio else None))
+    dataset |= {"transforms": [*bridging, *made]}
     recordings = _recordings(dataset)
     channels = tuple(
         replace(one, delay=late[one.channel].delay).with_evidence(late[one.channel].evidence) if one.channel in late else one
@@ -131,9 +138,34 @@ def _remarks(longest: Recording, recordings: Sequence[Recording]) -> list[str]:
     found = [("", one) for one in checks_of_recording(longest) if one.check in REMARKS]
     by_file = {own.provenance.get("file"): own for own in sorted(recordings, key=lambda own: own.duration)}
     by_file.pop(longest.provenance.get("file"), None)
+    unlike, gains = [], _gains(longest)
     for own in by_file.values():
         found += [(f"in '{own.id}', ", one) for one in checks_of_recording(own) if one.check in CONTRADICTIONS]
-    return [f"{one.channel}: {where}{one.message}" if one.channel else where + one.message for where, one in found if one.level != "note"]
+        for name, (low, high) in _gains(own).items():
+            least, most = gains.get(name, (low, high))
+            if low > GAIN_APART * most or least > GAIN_APART * high:
+                what = f"{math.sqrt(low * high / (least * most)):.2g} times as large in the same turn as in '{longest.id}'"
+                unlike.append(f"{name}: in '{own.id}', {what}; is it of another car? Then make a data set of each")
+    worded = [f"{one.channel}: {where}{one.message}" if one.channel else where + one.message for where, one in found if one.level != "note"]
+    return worded + unlike
+
+
+def _gains(recording: Recording) -> dict[str, tuple[float, float]]:
+    """Channel -> the smaller and the larger of two halves' gain: ay over vx·yaw_rate, steering over yaw_rate/vx beside understeer."""
+    found: dict[str, list[float]] = {}
+    if not {"vx", "yaw_rate"} <= set(recording.channels):
+        return {}
+    for half in (slice(0, len(recording) // 2), slice(len(recording) // 2, None)):
+        speed, rate = recording["vx"][half], recording["yaw_rate"][half]
+        used = (speed > 0.2 * float(np.quantile(speed, 0.99))) & (np.abs(rate) > LEAST_TURN) & (speed > 0.0)
+        if np.count_nonzero(used) < TURNING_SECONDS * recording.rate_hz:
+            return {}
+        turn = np.stack([rate / speed, speed * rate, np.ones(len(speed))], axis=1)[used]
+        if "ay" in recording:
+            found.setdefault("ay", []).append(rms(recording["ay"][half][used]) / rms(turn[:, 1]))
+        for name in {"handwheel", "steer"} & set(recording.channels):
+            found.setdefault(name, []).append(abs(float(np.linalg.lstsq(turn, recording[name][half][used], rcond=None)[0][0])))
+    return {name: (min(own), max(own)) for name, own in found.items()}
 
 
 def _dataset(examined: Examined) -> dict[str, Any]:
@@ -159,7 +191,7 @@ def _dataset(examined: Examined) -> dict[str, Any]:
                 stem: [f"{first + 1}-{last}" for first, last in true_runs(np.asarray(own.max(axis=0) > BRIDGED))]
                 for stem, own in gaps.items()
             }
-            dropped = {own.file.stem: [*holes[own.file.stem], *_stray_rows(own, proposals.channels)] for own in examined.logs}
+            dropped = {own.file.stem: [*holes[own.file.stem], *_rows_written_twice(own)] for own in examined.logs}
             dataset |= {"drop_rows": named} if (named := {stem: rows for stem, rows in dropped.items() if rows}) else {}
             if any(holes.values()) and "runs" not in log.options:
                 dataset["max_gap"] = log.options.get("max_gap", MAX_GAP)
@@ -182,13 +214,10 @@ def _entry(one: Proposal, place: Mapping[str, Any], header: str = "") -> dict[st
     return {**place, "unit": unit} | sign | ({"factor": factor} if factor != 1.0 else {})
 
 
-def _stray_rows(log: Log, channels: Sequence[Proposal]) -> list[int]:
-    """Rows, from 1, in which a channel is beyond what a vehicle can do, where they are as few as spikes, and rows written twice."""
-    columns = {column.name: column.values for column in log.columns}
-    beyond = np.any([one.beyond(columns[one.column]) for one in channels], axis=0)
-    rows = np.nan_to_num([*([] if log.seconds is None else [log.seconds]), *columns.values()])
-    twice = (np.diff(rows, prepend=np.nan) == 0.0).all(axis=0)
-    return (np.flatnonzero(beyond & (beyond.mean() <= MOST_STRAY) | twice) + 1).tolist()
+def _rows_written_twice(log: Log) -> list[int]:
+    """From 1."""
+    rows = np.nan_to_num([*([] if log.seconds is None else [log.seconds]), *(column.values for column in log.columns)])
+    return (np.flatnonzero((np.diff(rows, prepend=np.nan) == 0.0).all(axis=0)) + 1).tolist()
 
 
 def _has_gaps(examined: Examined, log: Log, column: str) -> bool:
@@ -251,6 +280,16 @@ def _rate_and_gap(column: RawColumn, shorter: float = math.inf) -> tuple[float, 
     stamps = column.stamps[np.isfinite(column.values)]
     gaps = np.diff(stamps)
     return rate_of(stamps), float(gaps[gaps <= shorter].max(initial=0.0))
+
+
+def _bridging(examined: Examined, recordings: Sequence[Recording]) -> list[dict[str, Any]]:
+    """The transform that bridges impossible samples, as far to either side as the slowest signal was interpolated, if there are any."""
+    channels = [(CHANNELS[name], samples) for own in recordings for name, samples in own.channels.items()]
+    if not any((samples < own.low).any() or (samples > own.high).any() for own, samples in channels):
+        return []
+    used = {one.column for one in examined.proposals.channels}
+    rates = [rate_of(own.stamps) for own in examined.log.columns if own.stamps is not None and own.name in used]
+    return [{"name": "bridge_impossible", **({"beside": math.ceil(1e3 / min(rates)) / 1e3} if rates else {})}]
 
 
 def _transforms(

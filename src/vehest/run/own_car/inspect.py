@@ -113,6 +113,9 @@ def inspect(name: str, files: Sequence[Path], vehicle: Mapping[str, float | None
         unread = f"; not read: {longest.skipped[0]}" if longest.skipped else ""
         raise DataError(f"'{longest.file}': no column is recognised as a channel, by name or by motion, of {names}{unread}")
     computed = [f"'{own}' is left out: the difference of '{of}' from row to row, and no measurement" for own, of in differences.items()]
+    used = {one.column: one.unit for one in proposals.channels}
+    foreign = [own for own in longest.columns if own.name in used and own.unit.strip("-[]() 1") and plain_unit(own.unit) is None]
+    computed += [f"'{own.unit}' of '{own.name}' is no unit that vehest knows; by size and motion it is {used[own.name]}" for own in foreign]
     shadowed = [f"'{name}' is a data set that comes with vehest, too; in this folder it is yours"] if name in choices("dataset") else []
     proposals = replace(proposals, notes=(*proposals.notes, *computed, *_notes(longest, logs), *(shadowed if not existing else [])))
     timed = longest.seconds is not None or any(column.stamps is not None for column in longest.columns)

@@ -8,6 +8,7 @@ from contextlib import ExitStack
 from dataclasses import asdict, dataclass, field
 from importlib.metadata import entry_points
 from itertools import cycle, pairwise
+from subprocess import list2cmdline
 from typing import Any
 
 import yaml
@@ -172,7 +173,8 @@ def _next_commands(made: Draft, plan: Plan) -> list[str]:
     file = next((own for own in made.examined.files if longest.id in (own.stem, f"{own.stem}_run_{longest.id.rpartition('_')[2]}")), file)
     run = [] if longest.id == file.stem else [f"+dataset.run={longest.id.rpartition('_')[2]}"]
     settings = [f"estimator.wheelbase={made.examined.vehicle['wheelbase'] or ASSUMED_WHEELBASE:g}"]
-    return [*commands, " ".join(["vehest estimate", str(file), f"dataset={name}", *run, *settings, "-o estimate.parquet"])]
+    words = ["vehest", "estimate", str(file), f"dataset={name}", *run, *settings, "-o", "estimate.parquet"]
+    return [*commands, list2cmdline(words)]  # double quotes around blanks, which shells of Windows and POSIX read
 
 
 def found_in(examined: Examined) -> dict[str, Any]:

@@ -38,6 +38,7 @@ LONGEST_LINE = csv.field_size_limit()
 MOST_LINES = 600  # of them, those before the names included
 DELIMITERS = (";", "\t", ",", "|", " ")
 LEAST_NUMBERS = 0.5  # share of a row's cells that are numbers or empty
+WIDE = re.compile(r"[ぁ-ヿ一-鿿]{2}")  # letters of Japanese, which accents in Windows-1252 make only one by one
 CONTROLS, MOST_CONTROLS = re.compile(rb"[\x00-\x08\x0b\x0e-\x1f]"), 0.01
 MARKS = frozenset({"-", "--", "---", "----", "–", "—", "*", "?", "n.a.", "none", "missing", "invalid", "inv", "void", "#value!", "#div/0!"})
 """What loggers and spreadsheets write where there is no sample, in lower case."""
@@ -187,9 +188,11 @@ def _decoded(head: bytes, file: Path) -> tuple[str, str]:
     try:
         return "utf8", codecs.getincrementaldecoder("utf-8-sig")().decode(head, final=len(head) < HEAD)
     except UnicodeDecodeError:
-        for encoding in ("cp1252", "shift_jis") if re.search(rb"[\x80-\x9f]", head) else ():
+        for encoding in ("cp932", "cp1252") if re.search(rb"[\x80-\x9f]", head) else ():  # cp932: Shift-JIS as Windows writes it
             with suppress(UnicodeDecodeError):
-                return encoding, codecs.getincrementaldecoder(encoding)().decode(head, final=len(head) < HEAD)
+                text = codecs.getincrementaldecoder(encoding)().decode(head, final=len(head) < HEAD)
+                if encoding == "cp1252" or WIDE.search(text):
+                    return encoding, text
         return "latin-1", head.decode("latin-1")
 
 
