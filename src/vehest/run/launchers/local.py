@@ -12,14 +12,16 @@ from dataclasses import dataclass, field
 from functools import partial
 from multiprocessing import get_context, parent_process
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from vehest.data.limits import Limits, current_limits, use_limits
 from vehest.run.failures import Failure, failure_of
-from vehest.run.group import Group
 from vehest.run.locks import Waiting
 from vehest.run.signals import StopSignals, TimeLimit
 from vehest.training.context import Progress
+
+if TYPE_CHECKING:
+    from vehest.run.group import Group  # with torch, which processes of an ingest do without
 
 Task = Callable[[Callable[[], bool], Callable[[Progress | Waiting], None]], Any]  # a function of (should_stop, on_progress), picklable
 Reporter = Callable[[int, Progress | Waiting | None], None]

@@ -65,7 +65,7 @@ OVERSPEED = 1.1  # speed of the driven wheels over the car's top speed at which 
 LARGEST_LOAD_FACTOR = 1.5
 """Wheel load over static load that sub-steps are stable for; assumed: at low speed, load transfer is that of braking."""
 
-_kernel = numba.njit(error_model="numpy")  # as in NumPy, a division by zero gives an infinite value, which the plant reports
+_kernel = numba.njit(error_model="numpy", no_cpython_wrapper=True, no_cfunc_wrapper=True)
 
 
 # Places of the groups in a parameter vector.
