@@ -73,7 +73,7 @@ def loop(flat, given, series, starts, targets, batch, values, gradient, losses, 
                 step_of_adam(own, gradient[m], adam, m, number + 1)
 
 
-@part()
+@part(_nrt=False)
 def _arguments(flat, size, room, k):  # type: ignore[no-untyped-def]
     """Arguments of the gates at step k; a candidate's is without U_n h, which is one row later. Returns where they are kept."""
     gates, states, channels = size
@@ -98,7 +98,7 @@ def _arguments(flat, size, room, k):  # type: ignore[no-untyped-def]
     return at
 
 
-@part()
+@part(_nrt=False)
 def _gru(row, kept, state, first):  # type: ignore[no-untyped-def]
     """One step from its gates' arguments; leaves reset, update, candidate and U_n h."""
     lanes = width(state)
@@ -111,7 +111,7 @@ def _gru(row, kept, state, first):  # type: ignore[no-untyped-def]
         store(state, unit, candidate + load(kept, at + row) * (load(state, unit) - candidate))
 
 
-@part()
+@part(_nrt=False)
 def _lstm(row, kept, state, first):  # type: ignore[no-untyped-def]
     """The same; leaves the four gates, tanh of the new cell, and the cell before."""
     lanes = width(state)
@@ -129,7 +129,7 @@ def _lstm(row, kept, state, first):  # type: ignore[no-untyped-def]
         store(state, unit, load(kept, at + 2 * row) * shown)
 
 
-@part()
+@part(_nrt=False)
 def _gru_adjoint(size, room, k):  # type: ignore[no-untyped-def]
     """Adjoint of one step: ``state`` is that of the state after it, then before it; what is kept becomes the arguments' adjoints."""
     _, states, channels = size
@@ -148,7 +148,7 @@ def _gru_adjoint(size, room, k):  # type: ignore[no-untyped-def]
         store(state, unit, bar * update)
 
 
-@part()
+@part(_nrt=False)
 def _lstm_adjoint(size, room, k):  # type: ignore[no-untyped-def]
     """The same; the second half of ``state`` is that of the cell."""
     _, states, _ = size
@@ -168,13 +168,13 @@ def _lstm_adjoint(size, room, k):  # type: ignore[no-untyped-def]
         store(state, unit, bar * 0)
 
 
-@part()
+@part(_nrt=False)
 def _row_of_state(gates, g):  # type: ignore[no-untyped-def]
     """Which kept row is the adjoint of what the state adds to gate g's argument: a candidate's is its own times the reset."""
     return 3 if gates == GRU and g == 2 else g
 
 
-@part()
+@part(_nrt=False)
 def _to_state(flat, size, kept, first, state):  # type: ignore[no-untyped-def]
     """Add what goes through the gates' arguments to the adjoint of the state before."""
     gates, states, channels = size
@@ -188,7 +188,7 @@ def _to_state(flat, size, kept, first, state):  # type: ignore[no-untyped-def]
         store(state, j * lanes, bar)
 
 
-@part()
+@part(_nrt=False)
 def _sum(size, room, sums):  # type: ignore[no-untyped-def]
     """Gradients by the weights: products of the arguments' adjoints and the inputs, over all steps, a few inputs at a time in registers."""
     gates, states, channels = size
@@ -210,7 +210,7 @@ def _sum(size, room, sums):  # type: ignore[no-untyped-def]
                 _sum_block(seen, kept, sums, here, first, count, (steps, row, inputs), weights * lanes)
 
 
-@part()
+@part(_nrt=False)
 def _sum_block(seen, kept, sums, at, first, count, strides, weights):  # type: ignore[no-untyped-def]
     """Of ``count`` inputs from ``first`` on, with one row of adjoints; the last block may overlap the one before."""
     steps, row, inputs = strides
