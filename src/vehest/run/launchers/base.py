@@ -21,7 +21,6 @@ if TYPE_CHECKING:
     Launcher = LocalLauncher | RayLauncher | SlurmLauncher
 
 LAUNCHERS = ("local", "ray", "slurm")
-COLLECT_EVERY = 10_000  # new objects, after which Python looks for cycles; at its own 700, libraries and compilers spend 8 % of a run on it
 
 
 @dataclass(frozen=True)

@@ -17,7 +17,6 @@ from typing import TYPE_CHECKING, Any
 
 from vehest.data.limits import Limits, current_limits, use_limits
 from vehest.run.failures import Failure, failure_of
-from vehest.run.launchers.base import COLLECT_EVERY
 from vehest.run.locks import Waiting
 from vehest.run.signals import StopSignals, TimeLimit
 from vehest.training.context import Progress
@@ -120,7 +119,7 @@ def _start_worker(stopping: Any, messages: Any, limits: Limits) -> None:
     """Leave signals to the parent, and end with it."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     signal.signal(signal.SIGTERM, signal.SIG_IGN)
-    gc.set_threshold(COLLECT_EVERY)
+    gc.set_threshold(10_000)  # as cli.main does
     threading.Thread(target=_end_with_parent, daemon=True).start()
     _worker.update(stopping=stopping, messages=messages, limits=limits)
 
