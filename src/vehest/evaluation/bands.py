@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 
 import numpy as np
-from scipy import stats
+import scipy
 
 from vehest.constants import FloatArray
 from vehest.evaluation.blocks import LEAST_BLOCKS, block_labels, block_sums, segments_of
@@ -144,10 +144,10 @@ def proportion_interval(sums: FloatArray, sizes: FloatArray) -> tuple[float, flo
     independent = float(n_blocks)
     if 0.0 < share < 1.0 and variance > 0.0:
         tail = 0.5 + CONFIDENCE / 2.0
-        fewer = float(stats.norm.ppf(tail) / stats.t.ppf(tail, n_blocks - 1)) ** 2
+        fewer = float(scipy.special.ndtri(tail) / scipy.special.stdtrit(n_blocks - 1, tail)) ** 2
         independent = min(share * (1.0 - share) / variance * fewer, float(sizes.sum()))
     hits, misses = share * independent, (1.0 - share) * independent
     outside = (1.0 - CONFIDENCE) / 2.0
-    low = float(stats.beta.ppf(outside, hits, misses + 1.0)) if hits > 0 else 0.0
-    high = float(stats.beta.ppf(1.0 - outside, hits + 1.0, misses)) if misses > 0 else 1.0
+    low = float(scipy.special.betaincinv(hits, misses + 1.0, outside)) if hits > 0 else 0.0
+    high = float(scipy.special.betaincinv(hits + 1.0, misses, 1.0 - outside)) if misses > 0 else 1.0
     return low, high

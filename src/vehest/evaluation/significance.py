@@ -6,8 +6,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy import stats
 
 from vehest.constants import FloatArray
 from vehest.data.errors import DataError
@@ -31,7 +31,7 @@ class Interval:
 
     def at(self, confidence: float) -> tuple[float, float]:
         """Both ends at another confidence than 95 %."""
-        half = float(stats.t.ppf(0.5 + confidence / 2.0, self.dof)) * self.error
+        half = float(scipy.special.stdtrit(self.dof, 0.5 + confidence / 2.0)) * self.error
         return self.value - half, self.value + half
 
 
@@ -206,14 +206,14 @@ def _degrees_of_freedom(sums: Sequence[FloatArray], sizes: FloatArray, means: Se
 
 def _interval(value: float, drawn: FloatArray, dof: float) -> Interval:
     error = float(np.std(drawn))
-    half = float(stats.t.ppf(0.5 + CONFIDENCE / 2.0, dof)) * error
+    half = float(scipy.special.stdtrit(dof, 0.5 + CONFIDENCE / 2.0)) * error
     ratio = abs(value) / error if error > 0 else (np.inf if value else 0.0)
-    return Interval(value, value - half, value + half, 2.0 * float(stats.t.sf(ratio, dof)), error, dof)
+    return Interval(value, value - half, value + half, 2.0 * float(scipy.special.stdtr(dof, -ratio)), error, dof)
 
 
 def _logarithmic(value: float, drawn: FloatArray, dof: float) -> Interval:
     """Of a positive figure, symmetric on a logarithmic axis."""
     finite = drawn[np.isfinite(drawn) & (drawn > 0)]
     error = float(np.std(np.log(finite / value)))
-    factor = float(np.exp(stats.t.ppf(0.5 + CONFIDENCE / 2.0, dof) * error))
+    factor = float(np.exp(scipy.special.stdtrit(dof, 0.5 + CONFIDENCE / 2.0) * error))
     return Interval(value, value / factor, value * factor, np.nan, error * value, dof)

@@ -10,13 +10,14 @@ eighty arrays one by one takes longer than a row.
 from __future__ import annotations
 
 import math
-from functools import cache, partial
+from functools import cache, partial, reduce
 from itertools import accumulate
 from typing import Any, get_args, get_type_hints
 
 import numpy as np
 from numba import config, types
-from numba.extending import intrinsic
+from numba.core.typing.templates import AttributeTemplate, infer_getattr
+from numba.extending import intrinsic, lower_getattr_generic, models, register_model
 from numba.np.arrayobj import make_array, populate_array
 
 from vehest.constants import FloatArray
@@ -59,52 +60,85 @@ def allocated(kind: Any, sizes: Any) -> FloatArray:
     return np.zeros(views(kind, np.broadcast_to(0.0, 1 << 40), sizes)[1])
 
 
+class Views(types.Type):  # type: ignore[misc]
+    """Type of a named tuple in compiled code: where it begins, and the sizes. A field is opened where it is read, since functions
+    that hand over all of them, some thousand numbers, compile a fifth longer."""
+
+    def __init__(self, kind: Any, sizes: Any) -> None:
+        super().__init__(f"views({kind.__qualname__}, {sizes})")
+        self.kind, self.sizes = kind, sizes
+
+
+@register_model(Views)
+class _Model(models.StructModel):  # type: ignore[misc]
+    def __init__(self, manager: Any, own: Views) -> None:
+        super().__init__(manager, own, [("data", types.voidptr), ("sizes", own.sizes)])
+
+
+def _compiled_type(own: Any, sizes: Any) -> Any:
+    """Type of a field, or of a named tuple, in compiled code; one of scalars is a tuple of numbers."""
+    if hasattr(own, "_fields"):
+        inner = [_compiled_type(field, sizes) for field in _fields(own).values()]
+        return types.BaseTuple.from_types(inner, own) if set(inner) <= {types.int64, types.float64} else Views(own, sizes)
+    scalar = types.int64 if own[0] is np.int64 else types.float64
+    return scalar if own[1] is None else types.Array(scalar, len(own[1]), "C")
+
+
+@infer_getattr
+class _Attributes(AttributeTemplate):  # type: ignore[misc]
+    key = Views
+
+    def generic_resolve(self, own: Views, name: str) -> Any:
+        return _compiled_type(_fields(own.kind)[name], own.sizes)
+
+
+@lower_getattr_generic(Views)  # type: ignore[untyped-decorator]
+def _opened_field(context: Any, builder: Any, own: Views, value: Any, name: str) -> Any:
+    proxy, whole = context.make_helper(builder, own, value), partial(context.get_constant, types.intp)
+
+    def lengths(declared: Any) -> list[Any]:
+        words = declared[1] or ()
+        return [whole(int(w)) if w.isdigit() else builder.extract_value(proxy.sizes, own.sizes.fields.index(w)) for w in words]
+
+    def numbers(declared: Any) -> Any:
+        """How many a field has."""
+        if not hasattr(declared, "_fields"):
+            return reduce(builder.mul, lengths(declared), whole(1))
+        return reduce(builder.add, (numbers(inner) for field, inner in _fields(declared).items() if field != "every"), whole(0))
+
+    fields = _fields(own.kind)
+    before = [numbers(fields[field]) for field in list(fields)[: list(fields).index(name)] if field != "every"]
+    data = builder.gep(proxy.data, [builder.mul(reduce(builder.add, before, whole(0)), whole(8))])
+    of = _compiled_type(fields[name], own.sizes)
+    if not isinstance(of, types.Array):
+        return _loaded(context, builder, of, data, proxy.sizes)
+    array, shape = make_array(of)(context, builder), lengths(fields[name])
+    strides = list(accumulate(reversed(shape[1:]), builder.mul, initial=whole(8)))[::-1]
+    populate_array(array, builder.bitcast(data, context.get_value_type(of.dtype).as_pointer()), shape, strides, whole(8), None)
+    return array._getvalue()
+
+
 @intrinsic
 def open_views(typing_context, kind, flat, sizes):  # type: ignore[no-untyped-def]
     """`views` from the first number on, compiled: without references, so that the flat array has to outlive them."""
 
     def code(context: Any, builder: Any, signature: Any, values: Any) -> Any:
-        whole = partial(context.get_constant, types.intp)
         data = builder.bitcast(make_array(flat)(context, builder, values[1]).data, context.get_value_type(types.voidptr))
-        place = whole(0)  # in bytes
+        return _loaded(context, builder, signature.return_type, data, values[2])
 
-        def length(word: str) -> Any:
-            return whole(int(word)) if word.isdigit() else builder.extract_value(values[2], sizes.fields.index(word))
-
-        def opened(own: Any) -> Any:
-            nonlocal place
-            found = []
-            for (name, declared), of in zip(_fields(own.instance_class).items(), own, strict=True):
-                if isinstance(of, types.BaseTuple):
-                    found.append(opened(of))
-                    continue
-                array = make_array(of)(context, builder) if isinstance(of, types.Array) else None
-                element = context.get_value_type(of.dtype if array else of).as_pointer()
-                pointer = builder.bitcast(builder.gep(data, [place]), element)
-                shape = [length(word) for word in declared[1] or ()]
-                strides = list(accumulate(reversed(shape), builder.mul, initial=whole(8)))
-                if array:
-                    populate_array(array, pointer, shape, strides[-2::-1], whole(8), None)
-                found.append(array._getvalue() if array else builder.load(pointer))
-                if name != "every":
-                    place = builder.add(place, strides[-1])
-            return context.make_tuple(builder, own, found)
-
-        return opened(signature.return_type)
-
-    return _compiled_type(kind.instance_class)(kind, flat, sizes), code
+    return _compiled_type(kind.instance_class, sizes)(kind, flat, sizes), code
 
 
-def _compiled_type(kind: Any) -> Any:
-    """Type of a named tuple in compiled code."""
-
-    def of(own: Any) -> Any:
-        if hasattr(own, "_fields"):
-            return _compiled_type(own)
-        scalar = types.int64 if own[0] is np.int64 else types.float64
-        return scalar if own[1] is None else types.Array(scalar, len(own[1]), "C")
-
-    return types.BaseTuple.from_types([of(own) for own in _fields(kind).values()], kind)
+def _loaded(context: Any, builder: Any, of: Any, data: Any, sizes: Any) -> Any:
+    """Views, a tuple of numbers or a number that begins at ``data``."""
+    if isinstance(of, Views):
+        own = context.make_helper(builder, of)
+        own.data, own.sizes = data, sizes
+        return own._getvalue()
+    if isinstance(of, types.BaseTuple):
+        places = [builder.gep(data, [context.get_constant(types.intp, 8 * at)]) for at in range(len(of))]
+        return context.make_tuple(builder, of, [_loaded(context, builder, own, at, sizes) for own, at in zip(of, places, strict=True)])
+    return builder.load(builder.bitcast(data, context.get_value_type(of).as_pointer()))
 
 
 if config.DISABLE_JIT:

@@ -105,7 +105,7 @@ def loop(flat, given, series, starts, targets, batch, values, gradient, losses, 
                 step_of_adam(flat[m], gradient[m], adam, m, number + 1)
 
 
-@part()
+@part(_nrt=False)
 def _forward(car, room, k, v, u):  # type: ignore[no-untyped-def]
     """v and û after a step of all lanes."""
     theta, n_local, n_hidden, step, per_width = car
@@ -155,7 +155,7 @@ def _forward(car, room, k, v, u):  # type: ignore[no-untyped-def]
     return g1 * v + b1 * slip - omega * f1, g2 * u + b2 * thrust - f2
 
 
-@part()
+@part(_nrt=False)
 def _model(position, n_local):  # type: ignore[no-untyped-def]
     """First active local model of each lane."""
     model = position * 0
@@ -164,7 +164,7 @@ def _model(position, n_local):  # type: ignore[no-untyped-def]
     return model
 
 
-@part()
+@part(_nrt=False)
 def _chosen(theta, column, model, n_local, row):  # type: ignore[no-untyped-def]
     """w₂, b₂, w₃ of one neuron of the lanes' active models."""
     w2, b2, w3 = model * 0 + theta[column], model * 0 + theta[column + 1], model * 0 + theta[column + 2]
@@ -174,7 +174,7 @@ def _chosen(theta, column, model, n_local, row):  # type: ignore[no-untyped-def]
     return w2, b2, w3
 
 
-@part()
+@part(_nrt=False)
 def _backward(car, room, k, to_v, to_u, sums):  # type: ignore[no-untyped-def]
     """Adjoint of one step: derivatives by v and û before it from those after it; ``sums`` adds up those by parameters."""
     theta, n_local, n_hidden, step, per_width = car

@@ -39,10 +39,11 @@ def loop(flat, given, series, starts, targets, batch, values, gradient, losses, 
                 gather(measured, channels, starts[m, start:end], first, rows, seen, inputs)
                 state[:] = 0
                 for k in range(n_window):
+                    at = _arguments(own, size, room, k)
                     if gates == GRU:
-                        _gru(own, size, room, k)
+                        _gru(states * lanes, kept, state, at)
                     else:
-                        _lstm(own, size, room, k)
+                        _lstm(states * lanes, kept, state, at)
                 value = load(state, 0) * 0 + own[read + states]
                 for i in range(states):
                     value = value + own[read + i] * load(state, i * lanes)
@@ -59,9 +60,10 @@ def loop(flat, given, series, starts, targets, batch, values, gradient, losses, 
                         store(state, (states + i) * lanes, slope * 0)
                     for k in range(n_window - 1, -1, -1):
                         if gates == GRU:
-                            _gru_adjoint(own, size, room, k)
+                            _gru_adjoint(size, room, k)
                         else:
-                            _lstm_adjoint(own, size, room, k)
+                            _lstm_adjoint(size, room, k)
+                        _to_state(own, size, kept, k * KEPT * states * lanes, state)
                     _sum(size, room, sums)
             if gradient.size:
                 for j in range(own.size):
@@ -71,7 +73,7 @@ def loop(flat, given, series, starts, targets, batch, values, gradient, losses, 
                 step_of_adam(own, gradient[m], adam, m, number + 1)
 
 
-@part()
+@part(_nrt=False)
 def _arguments(flat, size, room, k):  # type: ignore[no-untyped-def]
     """Arguments of the gates at step k; a candidate's is without U_n h, which is one row later. Returns where they are kept."""
     gates, states, channels = size
@@ -96,13 +98,10 @@ def _arguments(flat, size, room, k):  # type: ignore[no-untyped-def]
     return at
 
 
-@part()
-def _gru(flat, size, room, k):  # type: ignore[no-untyped-def]
-    """One step; leaves reset, update, candidate and U_n h."""
-    _, states, _ = size
-    _, kept, state = room
-    lanes, row = width(flat), states * width(flat)
-    first = _arguments(flat, size, room, k)
+@part(_nrt=False)
+def _gru(row, kept, state, first):  # type: ignore[no-untyped-def]
+    """One step from its gates' arguments; leaves reset, update, candidate and U_n h."""
+    lanes = width(state)
     for at in range(first, first + 2 * row, lanes):
         store(kept, at, sigmoid(load(kept, at)))
     for unit in range(0, row, lanes):
@@ -112,13 +111,10 @@ def _gru(flat, size, room, k):  # type: ignore[no-untyped-def]
         store(state, unit, candidate + load(kept, at + row) * (load(state, unit) - candidate))
 
 
-@part()
-def _lstm(flat, size, room, k):  # type: ignore[no-untyped-def]
-    """One step; leaves the four gates, tanh of the new cell, and the cell before."""
-    _, states, _ = size
-    _, kept, state = room
-    lanes, row = width(flat), states * width(flat)
-    first = _arguments(flat, size, room, k)
+@part(_nrt=False)
+def _lstm(row, kept, state, first):  # type: ignore[no-untyped-def]
+    """The same; leaves the four gates, tanh of the new cell, and the cell before."""
+    lanes = width(state)
     for at in range(first, first + 3 * row, lanes):
         store(kept, at, sigmoid(load(kept, at)))
     for unit in range(0, row, lanes):
@@ -133,12 +129,12 @@ def _lstm(flat, size, room, k):  # type: ignore[no-untyped-def]
         store(state, unit, load(kept, at + 2 * row) * shown)
 
 
-@part()
-def _gru_adjoint(flat, size, room, k):  # type: ignore[no-untyped-def]
+@part(_nrt=False)
+def _gru_adjoint(size, room, k):  # type: ignore[no-untyped-def]
     """Adjoint of one step: ``state`` is that of the state after it, then before it; what is kept becomes the arguments' adjoints."""
     _, states, channels = size
     seen, kept, state = room
-    lanes, row = width(flat), states * width(flat)
+    lanes, row = width(state), states * width(state)
     now, first = k * (channels + states) * lanes, k * KEPT * row
     for i in range(states):
         at, unit = first + i * lanes, i * lanes
@@ -150,15 +146,14 @@ def _gru_adjoint(flat, size, room, k):  # type: ignore[no-untyped-def]
         store(kept, at + 2 * row, inner)
         store(kept, at + 3 * row, inner * reset)
         store(state, unit, bar * update)
-    _to_state(flat, size, kept, first, state)
 
 
-@part()
-def _lstm_adjoint(flat, size, room, k):  # type: ignore[no-untyped-def]
+@part(_nrt=False)
+def _lstm_adjoint(size, room, k):  # type: ignore[no-untyped-def]
     """The same; the second half of ``state`` is that of the cell."""
     _, states, _ = size
     _, kept, state = room
-    lanes, row = width(flat), states * width(flat)
+    lanes, row = width(state), states * width(state)
     first = k * KEPT * row
     for i in range(states):
         at, unit = first + i * lanes, i * lanes
@@ -171,16 +166,15 @@ def _lstm_adjoint(flat, size, room, k):  # type: ignore[no-untyped-def]
         store(kept, at + 3 * row, cell * admit * (1 - offer * offer))
         store(state, row + unit, cell * keep)
         store(state, unit, bar * 0)
-    _to_state(flat, size, kept, first, state)
 
 
-@part()
+@part(_nrt=False)
 def _row_of_state(gates, g):  # type: ignore[no-untyped-def]
     """Which kept row is the adjoint of what the state adds to gate g's argument: a candidate's is its own times the reset."""
     return 3 if gates == GRU and g == 2 else g
 
 
-@part()
+@part(_nrt=False)
 def _to_state(flat, size, kept, first, state):  # type: ignore[no-untyped-def]
     """Add what goes through the gates' arguments to the adjoint of the state before."""
     gates, states, channels = size
@@ -194,7 +188,7 @@ def _to_state(flat, size, kept, first, state):  # type: ignore[no-untyped-def]
         store(state, j * lanes, bar)
 
 
-@part()
+@part(_nrt=False)
 def _sum(size, room, sums):  # type: ignore[no-untyped-def]
     """Gradients by the weights: products of the arguments' adjoints and the inputs, over all steps, a few inputs at a time in registers."""
     gates, states, channels = size
@@ -210,13 +204,13 @@ def _sum(size, room, sums):  # type: ignore[no-untyped-def]
             for k in range(steps):
                 offset = offset + load(kept, k * KEPT * row + at)
             store(sums, (gates * states * (channels + states) + unit) * lanes, offset)
-            _sum_block(seen, kept, sums, at, 0, channels, (steps, row, inputs), unit * channels * lanes)
-            at = _row_of_state(gates, g) * row + i * lanes
-            weights = (gates * states * channels + unit * states) * lanes
-            _sum_block(seen, kept, sums, at, channels, states, (steps, row, inputs), weights)
+            for first in range(0, channels + 1, channels):  # measurements, then states; a zero by itself would be compiled for anew
+                here = (g if first == 0 else _row_of_state(gates, g)) * row + i * lanes
+                weights, count = (unit * channels, channels) if first == 0 else (gates * states * channels + unit * states, states)
+                _sum_block(seen, kept, sums, here, first, count, (steps, row, inputs), weights * lanes)
 
 
-@part()
+@part(_nrt=False)
 def _sum_block(seen, kept, sums, at, first, count, strides, weights):  # type: ignore[no-untyped-def]
     """Of ``count`` inputs from ``first`` on, with one row of adjoints; the last block may overlap the one before."""
     steps, row, inputs = strides

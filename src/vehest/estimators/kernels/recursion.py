@@ -81,7 +81,7 @@ class Recursion(NamedTuple):
         return values
 
 
-@part()
+@part(_nrt=False)
 def gather(series, channels, starts, first, rows, seen, stride):  # type: ignore[no-untyped-def]
     """Windows ``first`` and later of a series, (T · channels,), side by side, ``stride`` rows of lanes a sample, as many as fit.
 
@@ -96,7 +96,7 @@ def gather(series, channels, starts, first, rows, seen, stride):  # type: ignore
                 seen[at + lane] = series[rows[lane] + k * channels + c]
 
 
-@part()
+@part(_nrt=False)
 def slopes_of(values, targets, first, squared, scratch):  # type: ignore[no-untyped-def]
     """Derivatives of what is minimised by the predictions of a block of lanes into ``scratch``; 0 in lanes without a window."""
     count = values.size
@@ -107,7 +107,7 @@ def slopes_of(values, targets, first, squared, scratch):  # type: ignore[no-unty
         scratch[lane] = slope
 
 
-@part()
+@part(_nrt=False)
 def squared_error(values, targets):  # type: ignore[no-untyped-def]
     """Sum of squared errors, in double precision."""
     result = 0.0
@@ -117,7 +117,7 @@ def squared_error(values, targets):  # type: ignore[no-untyped-def]
     return result
 
 
-@part()
+@part(_nrt=False)
 def step_of_adam(flat, gradient, adam, m, batches):  # type: ignore[no-untyped-def]
     """Step ``batches`` of this call for member m, as `torch.optim.Adam` takes it, back into the bounds (Kingma & Ba 2015, Algorithm 1).
 
@@ -136,7 +136,7 @@ def step_of_adam(flat, gradient, adam, m, batches):  # type: ignore[no-untyped-d
             average[m, j] += (flat[j] - average[m, j]) * number((1 - averaging) / (1 - averaging**t))
 
 
-@part()
+@part(_nrt=False)
 def add(sums, at, value):  # type: ignore[no-untyped-def]
     """Add to what stands in lanes from a place on."""
     store(sums, at, load(sums, at) + value)

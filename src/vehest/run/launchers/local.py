@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import os
 import signal
 import threading
@@ -12,14 +13,16 @@ from dataclasses import dataclass, field
 from functools import partial
 from multiprocessing import get_context, parent_process
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from vehest.data.limits import Limits, current_limits, use_limits
 from vehest.run.failures import Failure, failure_of
-from vehest.run.group import Group
 from vehest.run.locks import Waiting
 from vehest.run.signals import StopSignals, TimeLimit
 from vehest.training.context import Progress
+
+if TYPE_CHECKING:
+    from vehest.run.group import Group  # with torch, which processes of an ingest do without
 
 Task = Callable[[Callable[[], bool], Callable[[Progress | Waiting], None]], Any]  # a function of (should_stop, on_progress), picklable
 Reporter = Callable[[int, Progress | Waiting | None], None]
@@ -116,6 +119,7 @@ def _start_worker(stopping: Any, messages: Any, limits: Limits) -> None:
     """Leave signals to the parent, and end with it."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     signal.signal(signal.SIGTERM, signal.SIG_IGN)
+    gc.set_threshold(10_000)  # as cli.main does
     threading.Thread(target=_end_with_parent, daemon=True).start()
     _worker.update(stopping=stopping, messages=messages, limits=limits)
 

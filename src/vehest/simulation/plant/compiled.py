@@ -65,7 +65,9 @@ OVERSPEED = 1.1  # speed of the driven wheels over the car's top speed at which 
 LARGEST_LOAD_FACTOR = 1.5
 """Wheel load over static load that sub-steps are stable for; assumed: at low speed, load transfer is that of braking."""
 
-_kernel = numba.njit(error_model="numpy")  # as in NumPy, a division by zero gives an infinite value, which the plant reports
+# As in NumPy, a division by zero gives an infinite value, which the plant reports. Wrappers for Python, which unpack tuples of a hundred
+# numbers, and references of arrays, counted in every function, would take almost half of the time to compile.
+_kernel = numba.njit(error_model="numpy", no_cpython_wrapper=True, no_cfunc_wrapper=True, _nrt=False)
 
 
 # Places of the groups in a parameter vector.
@@ -77,7 +79,7 @@ _FRICTIONS = tuple(tyre + TyreValues._fields.index(name) for tyre in (_FRONT, _R
 _LENGTHS = tuple(len(values_class._fields) for values_class in (SteeringValues, LongitudinalValues, TyreValues))
 
 
-@_kernel
+@numba.njit(error_model="numpy", no_cpython_wrapper=True, no_cfunc_wrapper=True)  # it makes an array
 def _unpack(vector, friction):  # type: ignore[no-untyped-def]
     """MultiBodyValues of a parameter vector, friction scaled. Nested tuples as arguments would cost as much as ten evaluations."""
     values = vector.copy()
@@ -275,7 +277,7 @@ class _Kept:
             self.dispatcher = numba.njit(cache=True, error_model="numpy")(function)
             self.lock = Path(self.dispatcher.stats.cache_path) / f"{Path(__file__).stem}.lock"
         except RuntimeError:  # no place for a cache
-            self.dispatcher = _kernel(function)
+            self.dispatcher = numba.njit(error_model="numpy")(function)
 
     def __call__(self, *arguments: Any) -> Any:
         if self._is_ready:

@@ -58,7 +58,7 @@ _Axle = namedtuple("_Axle", "vy joint lever track mass inertia static spring dam
 _Suspension = namedtuple("_Suspension", "left right joint joint_rate camber_left camber_right")
 _Wheels = namedtuple("_Wheels", "along_left along_right across_left across_right load_left load_right")
 
-_kernel = numba.njit(error_model="numpy")
+_kernel = numba.njit(error_model="numpy", no_cpython_wrapper=True, no_cfunc_wrapper=True, _nrt=False)
 
 
 @_kernel

@@ -49,7 +49,7 @@ X, Y, STEER, VX, YAW, YAW_RATE, ROLL, ROLL_RATE, PITCH, PITCH_RATE, VY, HEAVE = 
 VY_FRONT, VY_REAR = 15, 20
 FIRST_WHEEL = 23  # places in the library's state vector; from FIRST_WHEEL on left front, right front, left rear, right rear by its names
 
-_kernel = numba.njit(error_model="numpy")
+_kernel = numba.njit(error_model="numpy", no_cpython_wrapper=True, no_cfunc_wrapper=True, _nrt=False)
 
 
 @_kernel
