@@ -1,6 +1,7 @@
 """The bank of filters of the self-calibrating estimator and the check that weighs it against others, compiled.
 
-sample -> lags -> each filter: predict, measured speed, rear axle -> weights by likelihood -> residuals of the candidates -> weights -> vy
+samples -> network, lags -> filters, side by side in vectors: predict, measured speed, rear axle -> weights by likelihood
+    -> residuals of the candidates -> weights -> vy
 
 A state is [v, u, β_y, β_x, κ, b, C, e]: velocities of the inertial unit, offsets of the accelerometer, roll leakage of ay, distance and
 compliance of the rear axle, and the axle's correlated error in units of its size.
@@ -15,7 +16,7 @@ import numpy as np
 
 from vehest.constants import FloatArray
 from vehest.estimators.kernels.compiling import entry, part
-from vehest.lanes import choose, least, load, most, root, store, total, width
+from vehest.lanes import BYTES, choose, least, load, most, root, store, total, width
 
 STATES = 8
 V, U, OFFSET_Y, OFFSET_X, LEAKAGE, REAR, COMPLIANCE, ERROR = range(STATES)
@@ -27,8 +28,9 @@ YAW_RATE, AY, AX, SUM_AY, SUM_TURN, SUM_ONE, SPEED, SUM_AY_1, SUM_TURN_1, SUM_AX
 SLOW_AY, TIME, POWER, PREDICTED, AX_OF_SPEED, SLIP = range(10, LAGS)
 # of a candidate: low-passed v, sum of ω v, slow parts of both residuals, moments of the residuals, last v
 SMOOTH, SUM_TURN_V, SLOW_Y, SLOW_X, SQUARE_Y, CROSS_Y, SQUARE_X, LAST = range(8)
-# rows of the bank, a filter in each lane: states, the upper triangle of the covariances (at `AT`), and these
-AT = STATES + np.array([[min(i, c) * (2 * STATES - 1 - min(i, c)) // 2 + max(i, c) for c in range(STATES)] for i in range(STATES)])
+# rows of the bank, a filter in each lane: states, the upper triangle of the covariances (whose numbers begin at `AT`), and these
+AT = np.array([[min(i, c) * (2 * STATES - 1 - min(i, c)) // 2 + max(i, c) for c in range(STATES)] for i in range(STATES)])
+AT = (STATES + AT) * (BYTES // 8)
 GRIP, WEIGHT, KNOWN = range(STATES + 36, STATES + 39)  # grip limit, weight among all filters and among those without the network's
 COST, TOTAL = STATES + 39, STATES + 41  # of both measurements: what lowers the log likelihood, variance of the residual
 ROW, SHARED, ROWS = STATES + 43, STATES + 51, STATES + 59  # derivatives of a measurement, its covariances with the states
@@ -74,28 +76,28 @@ def _rear_slip(f, lags, turning, n):  # type: ignore[no-untyped-def]
 def _predict(f, n, decay, prior, spread, ay, ax, turn, yaw_rate, unsteady):  # type: ignore[no-untyped-def]
     """v' = (1 - κ) ay - β_y - ω u, u' = ax - β_x + ω v; the other states decay to their priors."""
     lanes = width(f)
-    v, v_v, v_u, u_u = load(f, V * lanes), load(f, AT[V, V] * lanes), load(f, AT[V, U] * lanes), load(f, AT[U, U] * lanes)
+    v, v_v, v_u, u_u = load(f, V * lanes), load(f, AT[V, V]), load(f, AT[V, U]), load(f, AT[U, U])
     store(f, V * lanes, v + n.dt * (ay * (1.0 - load(f, LEAKAGE * lanes)) - load(f, OFFSET_Y * lanes) - turn))
     store(f, U * lanes, load(f, U * lanes) + n.dt * (ax - load(f, OFFSET_X * lanes) + yaw_rate * v))
-    u_v = v_u + n.dt * (yaw_rate * v_v - load(f, AT[V, OFFSET_X] * lanes))  # here of A P, below of A P A'
-    u_u += n.dt * (yaw_rate * v_u - load(f, AT[U, OFFSET_X] * lanes))
-    v_v -= n.dt * (ay * load(f, AT[V, LEAKAGE] * lanes) + load(f, AT[V, OFFSET_Y] * lanes))
-    v_u -= n.dt * (ay * load(f, AT[U, LEAKAGE] * lanes) + load(f, AT[U, OFFSET_Y] * lanes))
-    for c in range(OFFSET_Y, STATES):
-        of_v = load(f, AT[V, c] * lanes)
-        store(f, AT[V, c] * lanes, of_v - n.dt * (ay * load(f, AT[LEAKAGE, c] * lanes) + load(f, AT[OFFSET_Y, c] * lanes)))
-        store(f, AT[U, c] * lanes, load(f, AT[U, c] * lanes) + n.dt * (yaw_rate * of_v - load(f, AT[OFFSET_X, c] * lanes)))
-    v_u += n.dt * (yaw_rate * v_v - load(f, AT[V, OFFSET_X] * lanes))
-    v_v -= n.dt * (ay * load(f, AT[V, LEAKAGE] * lanes) + load(f, AT[V, OFFSET_Y] * lanes))
-    u_u += n.dt * (yaw_rate * u_v - load(f, AT[U, OFFSET_X] * lanes))
-    store(f, AT[V, V] * lanes, v_v + n.dt * (n.noise_vy**2 + (n.noise_delay * unsteady) ** 2))
-    store(f, AT[V, U] * lanes, v_u)
-    store(f, AT[U, U] * lanes, u_u + n.dt * n.noise_vx**2)
-    for c in range(OFFSET_Y, STATES):
+    u_v = v_u + n.dt * (yaw_rate * v_v - load(f, AT[V, OFFSET_X]))  # here of A P, below of A P A'
+    u_u += n.dt * (yaw_rate * v_u - load(f, AT[U, OFFSET_X]))
+    v_v -= n.dt * (ay * load(f, AT[V, LEAKAGE]) + load(f, AT[V, OFFSET_Y]))
+    v_u -= n.dt * (ay * load(f, AT[U, LEAKAGE]) + load(f, AT[U, OFFSET_Y]))
+    for c in range(OFFSET_Y, len(decay)):
+        of_v = load(f, AT[V, c])
+        store(f, AT[V, c], of_v - n.dt * (ay * load(f, AT[LEAKAGE, c]) + load(f, AT[OFFSET_Y, c])))
+        store(f, AT[U, c], load(f, AT[U, c]) + n.dt * (yaw_rate * of_v - load(f, AT[OFFSET_X, c])))
+    v_u += n.dt * (yaw_rate * v_v - load(f, AT[V, OFFSET_X]))
+    v_v -= n.dt * (ay * load(f, AT[V, LEAKAGE]) + load(f, AT[V, OFFSET_Y]))
+    u_u += n.dt * (yaw_rate * u_v - load(f, AT[U, OFFSET_X]))
+    store(f, AT[V, V], v_v + n.dt * (n.noise_vy**2 + (n.noise_delay * unsteady) ** 2))
+    store(f, AT[V, U], v_u)
+    store(f, AT[U, U], u_u + n.dt * n.noise_vx**2)
+    for c in range(OFFSET_Y, len(decay)):
         store(f, c * lanes, prior[c] + decay[c] * (load(f, c * lanes) - prior[c]))
         for i in range(c + 1):
-            store(f, AT[i, c] * lanes, load(f, AT[i, c] * lanes) * (decay[i] * decay[c]))
-        store(f, AT[c, c] * lanes, load(f, AT[c, c] * lanes) + spread[c] ** 2 * (1.0 - decay[c] ** 2))
+            store(f, AT[i, c], load(f, AT[i, c]) * (decay[i] * decay[c]))
+        store(f, AT[c, c], load(f, AT[c, c]) + spread[c] ** 2 * (1.0 - decay[c] ** 2))
 
 
 @part()
@@ -103,12 +105,12 @@ def _speed(f, speed, n):  # type: ignore[no-untyped-def]
     """u as measured: residual and its variance."""
     lanes = width(f)
     for i in range(STATES):
-        store(f, (SHARED + i) * lanes, load(f, AT[i, U] * lanes))
-    return speed - load(f, U * lanes), load(f, AT[U, U] * lanes) + n.noise_speed**2
+        store(f, (SHARED + i) * lanes, load(f, AT[i, U]))
+    return speed - load(f, U * lanes), load(f, AT[U, U]) + n.noise_speed**2
 
 
 @part()
-def _axle(f, n, lags, turning, speed, size):  # type: ignore[no-untyped-def]
+def _axle(f, n, lags, turning, speed, size, states):  # type: ignore[no-untyped-def]
     """0 = v - b ω + C u φ(a_r) + s e at the rear axle, low-passed: v - τ dv/dt stands for the low-passed v.
 
     Returns the residual, its variance, and half the square of what the grip limit rules out, over a sample.
@@ -127,10 +129,10 @@ def _axle(f, n, lags, turning, speed, size):  # type: ignore[no-untyped-def]
     store(f, (ROW + COMPLIANCE) * lanes, speed * slip)
     store(f, (ROW + ERROR) * lanes, size)
     variance = 0.0 * slip + n.axle_white**2 + n.axle_white_share * size**2
-    for i in range(STATES):
+    for i in range(states):
         shared = 0.0 * slip
-        for c in range(STATES):
-            shared += load(f, AT[i, c] * lanes) * load(f, (ROW + c) * lanes)
+        for c in range(states):
+            shared += load(f, AT[i, c]) * load(f, (ROW + c) * lanes)
         store(f, (SHARED + i) * lanes, shared)
         variance += load(f, (ROW + i) * lanes) * shared
     surplus = least(excess / n.grip_excess, n.gate)
@@ -142,27 +144,27 @@ def _roll(f, yaw_rate):  # type: ignore[no-untyped-def]
     """v = b ω of a car that rolls slowly: residual and its variance."""
     lanes = width(f)
     for i in range(STATES):
-        store(f, (SHARED + i) * lanes, load(f, AT[i, V] * lanes) - yaw_rate * load(f, AT[i, REAR] * lanes))
+        store(f, (SHARED + i) * lanes, load(f, AT[i, V]) - yaw_rate * load(f, AT[i, REAR]))
     variance = load(f, (SHARED + V) * lanes) - yaw_rate * load(f, (SHARED + REAR) * lanes) + ROLLING**2
     return load(f, REAR * lanes) * yaw_rate - load(f, V * lanes), variance
 
 
 @part()
-def _update(f, residual, variance, gate, learns):  # type: ignore[no-untyped-def]
+def _update(f, residual, variance, gate, learns, states):  # type: ignore[no-untyped-def]
     """Take a measurement whose covariances with the states are known; returns half the square of its normalised residual.
 
     Beyond ``gate`` deviations a residual is cut off; parameters stay where the filter does not learn (a Schmidt-Kalman update).
     """
     lanes, limit, inverse = width(f), gate * root(variance), 1.0 / variance
     residual = most(least(residual, limit), -limit)
-    for i in range(STATES):
+    for i in range(states):
         held = not learns and LEAKAGE <= i <= COMPLIANCE
         gain = load(f, (SHARED + i) * lanes) * inverse
         if not held:
             store(f, i * lanes, load(f, i * lanes) + gain * residual)
-        for c in range(i, STATES):
+        for c in range(i, states):
             if not (held and c <= COMPLIANCE):
-                store(f, AT[i, c] * lanes, load(f, AT[i, c] * lanes) - gain * load(f, (SHARED + c) * lanes))
+                store(f, AT[i, c], load(f, AT[i, c]) - gain * load(f, (SHARED + c) * lanes))
     return 0.5 * residual * residual * inverse
 
 
@@ -266,11 +268,11 @@ def scan(n, grips, start, prior, spread, decay, theta, state, samples, found, pa
         state: a `State`.
         samples: yaw_rate, vx, ay, ax, (T, 4).
         found: output, vy and its variance, (T, 2).
-        parameters: output, mean and variance over the bank of states, (T, 16).
+        parameters: output, mean and variance over the bank of states, (T, 16), or (1, 16) for the last sample alone.
     """
     g, g_1, g_slow = -math.expm1(-n.dt / n.axle_lag), -math.expm1(-n.dt / n.residual_time), -math.expm1(-n.dt / n.slow_time)
     lags, log_weights, lanes, count, steps = state.lags, state.log_weights, width(grips), len(grips), len(state.window)
-    bank, own = np.zeros(((count + lanes - 1) // lanes, ROWS * lanes)), np.zeros((4, 4))
+    bank, own = np.zeros(((count + lanes - 1) // lanes, ROWS * lanes)), np.zeros((3, 4))
     values, left, sample, last = own[0], own[1], own[2], state.last
     for k in range(len(bank) * lanes):  # lanes beyond the last filter are as that one, without weight
         j, f = min(k, count - 1), bank[k // lanes]
@@ -278,7 +280,7 @@ def scan(n, grips, start, prior, spread, decay, theta, state, samples, found, pa
         for i in range(STATES):
             f[i * lanes + k % lanes] = state.means[j, i]
             for c in range(i, STATES):
-                f[AT[i, c] * lanes + k % lanes] = state.covariances[j, i, c]
+                f[AT[i, c] + k % lanes] = state.covariances[j, i, c]
     series = np.zeros((5, steps + len(samples) + lanes))  # the window and the samples after it, and the network's v
     for t in range(steps + len(samples)):
         for i in range(4):
@@ -313,11 +315,11 @@ def scan(n, grips, start, prior, spread, decay, theta, state, samples, found, pa
                 if k == 0:
                     residual, variance = _speed(f, speed, n)
                 elif moving:
-                    residual, variance, surplus = _axle(f, n, lags, turning, speed, size)
+                    residual, variance, surplus = _axle(f, n, lags, turning, speed, size, len(prior))
                 else:
                     residual, variance = _roll(f, sample[0])
                 store(f, (TOTAL + k) * lanes, variance)
-                store(f, (COST + k) * lanes, _update(f, residual, variance, n.gate, moving) + surplus)
+                store(f, (COST + k) * lanes, _update(f, residual, variance, n.gate, moving, len(prior)) + surplus)
         if moving:
             for j in range(count):
                 f, lane = bank[j // lanes], j % lanes
@@ -325,11 +327,12 @@ def scan(n, grips, start, prior, spread, decay, theta, state, samples, found, pa
                 likelihood = -cost - 0.5 * math.log(f[TOTAL * lanes + lane] * f[(TOTAL + 1) * lanes + lane])
                 log_weights[j] = start[j] + (log_weights[j] - start[j]) * (1.0 - n.dt / n.memory) + likelihood
             _weigh(bank, log_weights)
-        rear = _mixture(bank, parameters[t])
-        values[BANK], values[NETWORK] = parameters[t, V] + n.rear_known * (n.rear - rear) * sample[0], series[4, t]
+        known = parameters[min(t, len(parameters) - 1)]
+        rear = _mixture(bank, known)
+        values[BANK], values[NETWORK] = known[V] + n.rear_known * (n.rear - rear) * sample[0], series[4, t]
         values[STEADY] = sample[0] * (n.rear - n.compliance * speed * speed)
         _judge(values, state.candidates, state.weights, left, lags, sample, yaw_rate, n, g_1, g_slow, moving)
-        _combine(values, state.weights, left, parameters[t], sample, n, found[t])
+        _combine(values, state.weights, left, known, sample, n, found[t])
         for i in range(4):
             last[i] = sample[i]
     lags[PREDICTED] = series[4, len(samples)]
@@ -340,7 +343,7 @@ def scan(n, grips, start, prior, spread, decay, theta, state, samples, found, pa
         for i in range(STATES):
             state.means[j, i] = bank[j // lanes, i * lanes + j % lanes]
             for c in range(STATES):
-                state.covariances[j, i, c] = bank[j // lanes, AT[i, c] * lanes + j % lanes]
+                state.covariances[j, i, c] = bank[j // lanes, AT[i, c] + j % lanes]
 
 
 @part()
@@ -376,7 +379,7 @@ def _mixture(bank, found):  # type: ignore[no-untyped-def]
             mean += total(load(bank[b], own * lanes) * load(bank[b], i * lanes))
         for b in range(len(bank)):
             off = load(bank[b], i * lanes) - mean
-            variance += total(load(bank[b], own * lanes) * (load(bank[b], AT[i, i] * lanes) + off * off))
+            variance += total(load(bank[b], own * lanes) * (load(bank[b], AT[i, i]) + off * off))
         found[i], found[STATES + i] = mean, variance
     for b in range(len(bank)):
         rear += total(load(bank[b], WEIGHT * lanes) * load(bank[b], REAR * lanes))
