@@ -101,12 +101,13 @@ def _predict(f, n, decay, prior, spread, ay, ax, turn, yaw_rate, unsteady):  # t
 
 
 @part()
-def _speed(f, speed, n):  # type: ignore[no-untyped-def]
-    """u as measured: residual and its variance."""
+def _of_two(f, one, other, factor, measured, variance):  # type: ignore[no-untyped-def]
+    """A state plus a factor times another, as measured: residual and its variance."""
     lanes = width(f)
     for i in range(STATES):
-        store(f, (SHARED + i) * lanes, load(f, AT[i, U]))
-    return speed - load(f, U * lanes), load(f, AT[U, U]) + n.noise_speed**2
+        store(f, (SHARED + i) * lanes, load(f, AT[i, one]) + factor * load(f, AT[i, other]))
+    whole = load(f, (SHARED + one) * lanes) + factor * load(f, (SHARED + other) * lanes) + variance
+    return measured - load(f, one * lanes) - factor * load(f, other * lanes), whole
 
 
 @part()
@@ -137,16 +138,6 @@ def _axle(f, n, lags, turning, speed, size, states):  # type: ignore[no-untyped-
         variance += load(f, (ROW + i) * lanes) * shared
     surplus = least(excess / n.grip_excess, n.gate)
     return residual, variance, 0.5 * n.dt * surplus * surplus
-
-
-@part()
-def _roll(f, yaw_rate):  # type: ignore[no-untyped-def]
-    """v = b ω of a car that rolls slowly: residual and its variance."""
-    lanes = width(f)
-    for i in range(STATES):
-        store(f, (SHARED + i) * lanes, load(f, AT[i, V]) - yaw_rate * load(f, AT[i, REAR]))
-    variance = load(f, (SHARED + V) * lanes) - yaw_rate * load(f, (SHARED + REAR) * lanes) + ROLLING**2
-    return load(f, REAR * lanes) * yaw_rate - load(f, V * lanes), variance
 
 
 @part()
@@ -310,14 +301,14 @@ def scan(n, grips, start, prior, spread, decay, theta, state, samples, found, pa
         for b in range(len(bank)):
             f = bank[b]
             _predict(f, n, decay, prior, spread, ay, ax, turn, yaw_rate, turning * speed)
-            for k in range(2):  # the speed is measured, and the rear axle
+            for k in range(2):  # the speed is measured, and the rear axle, which rolls (v = b ω) where the car is slow
                 surplus = 0.0 * load(f, 0)
                 if k == 0:
-                    residual, variance = _speed(f, speed, n)
+                    residual, variance = _of_two(f, U, U, 0.0, speed, n.noise_speed**2)
                 elif moving:
                     residual, variance, surplus = _axle(f, n, lags, turning, speed, size, len(prior))
                 else:
-                    residual, variance = _roll(f, sample[0])
+                    residual, variance = _of_two(f, V, REAR, -sample[0], 0.0, ROLLING**2)
                 store(f, (TOTAL + k) * lanes, variance)
                 store(f, (COST + k) * lanes, _update(f, residual, variance, n.gate, moving, len(prior)) + surplus)
         if moving:
