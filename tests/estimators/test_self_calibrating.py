@@ -134,6 +134,21 @@ def test_network_inside_is_the_one_that_comes_with_vehest_and_ax_may_be_missing(
     assert np.std(found[400:, 0] - vy[400:]) < 0.5 * np.std(vy[400:])
 
 
+def test_filters_do_not_depend_on_their_lanes():
+    samples, _ = drive(20.0)
+    grips, order = np.linspace(4.0, 25.0, 12), np.random.default_rng(0).permutation(12)
+    models = [model_of(grips=own.tolist()) for own in (grips, grips[order])]
+    (found, states, last), (other, of_other, permuted) = (model.trace(samples, model.first_state(samples[0], {})) for model in models)
+    np.testing.assert_allclose(np.hstack([found, states]), np.hstack([other, of_other]), rtol=1e-8, atol=1e-12)
+    np.testing.assert_allclose(last.means[:12][order], permuted.means[:12], rtol=1e-8, atol=1e-12)
+    np.testing.assert_array_equal(last.covariances, last.covariances.transpose(0, 2, 1))
+
+
+def test_tanh_of_vectors():
+    x = np.concatenate([np.linspace(-40.0, 40.0, 100_001), np.logspace(-12.0, 0.0, 1000)])
+    np.testing.assert_allclose(kernel._tanh.py_func(x), np.tanh(x), rtol=3e-15)
+
+
 def test_finds_the_rear_axle_and_tells_how_well():
     z_scores, shares, of_priors = [], [], []
     for seed in range(6):

@@ -6,6 +6,7 @@ import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from fractions import Fraction
+from functools import cache
 from typing import Annotated, Any, ClassVar, Literal
 
 import numpy as np
@@ -382,16 +383,32 @@ def _resampled(samples: FloatArray, up: int, down: int, taps: FloatArray, n_out:
     extended = _extended(samples, margin)
     rows = np.ascontiguousarray(np.pad(extended, (0, -len(extended) % down)).reshape(-1, down).T)  # (down, steps)
     filtered = np.zeros(n_out)
-    for phase in range(min(up, n_out)):
-        own = filtered[phase::up]
-        newest = margin * up + half + phase * down  # place of the filter's last tap on the grid of up times the rate
-        reached = range(-(-(newest - 2 * half) // up), newest // up + 1)
-        for begin in range(0, len(own), OUTPUTS_AT_ONCE):
-            part = own[begin : begin + OUTPUTS_AT_ONCE]
-            for sample in reached:
-                at = sample // down + begin
-                part += rows[sample % down, at : at + len(part)] * (up * taps[newest - up * sample])
+    _compiled_sums()(rows, up * taps, up, margin * up + half, filtered)
     return filtered
+
+
+@cache
+def _compiled_sums() -> Callable[..., None]:
+    """`_sums` compiled, for which importing this module is not worth importing numba."""
+    import numba
+
+    return numba.njit(cache=True, nogil=True, error_model="numpy")(_sums)  # type: ignore[no-any-return]
+
+
+def _sums(rows, taps, up, newest, filtered):  # type: ignore[no-untyped-def]
+    """Add what each sample gives to the outputs; ``newest``: place of the first output's last tap on the grid of up times the rate."""
+    down, sums = len(rows), np.empty(OUTPUTS_AT_ONCE)
+    for begin in range(0, len(filtered), OUTPUTS_AT_ONCE * up):
+        for phase in range(min(up, len(filtered) - begin)):
+            count = min((len(filtered) - begin - phase + up - 1) // up, OUTPUTS_AT_ONCE)
+            sums[:] = 0.0
+            last = newest + phase * down
+            for sample in range(-((len(taps) - 1 - last) // up), last // up + 1):
+                row, first, tap = rows[sample % down], np.uint64(sample // down + begin // up), taps[last - up * sample]
+                for i in range(count):
+                    sums[i] += row[first + np.uint64(i)] * tap
+            for i in range(count):
+                filtered[begin + phase + i * up] = sums[i]
 
 
 def _extended(samples: FloatArray, margin: int) -> FloatArray:

@@ -193,13 +193,16 @@ class SelfCalibrating(Recursive):
         if self.smoothed:
             found = _smoothed(self, samples, state)
         else:
-            found, _, state = self.trace(samples, state)
+            found, _, state = self.trace(samples, state, 1)
         return {"vy": found[:, 0].copy(), "covariance": found[:, 1].reshape(-1, 1, 1).copy()}, state
 
-    def trace(self, samples: FloatArray, state: kernel.State) -> tuple[FloatArray, FloatArray, kernel.State]:
-        """vy and its variance, (T, 2), means and variances of the states over the bank, (T, 16), and the state after the last sample."""
+    def trace(self, samples: FloatArray, state: kernel.State, kept: int | None = None) -> tuple[FloatArray, FloatArray, kernel.State]:
+        """vy and its variance, (T, 2), means and variances of the states over the bank, (T, 16), and the state after the last sample.
+
+        With ``kept=1`` those of the states are of the last sample alone.
+        """
         state = kernel.State(*(part.copy() for part in state))
-        found, parameters = np.empty((len(samples), 2)), np.empty((len(samples), 2 * kernel.STATES))
+        found, parameters = np.empty((len(samples), 2)), np.empty((kept or len(samples), 2 * kernel.STATES))
         rows = self.with_ax(samples)
         kernel.scan(self.numbers(), *self.bank_arrays, *self.prior, self.decay, self.network, state, rows, found, parameters)
         return found, parameters, state

@@ -11,6 +11,8 @@ import json
 from array import array
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from contextvars import copy_context
 from dataclasses import replace
 from itertools import chain
 from pathlib import Path
@@ -150,7 +152,7 @@ def estimate_file(words: Sequence[str], out: Path, *, strict: bool = False, car:
             first = joined(list(drive))
             drive = iter([first])
         needed = resampled_parts((part.select(model.channels) for part in drive), model.settings.rate_hz, model.preparation)
-        estimates = report.counted(run(part.channels, part) for part in needed)
+        estimates = report.counted(_estimates(run, needed))
         if log:
             (estimate,) = estimates
             write_log(estimate, first, file, out)
@@ -171,6 +173,17 @@ def estimate_file(words: Sequence[str], out: Path, *, strict: bool = False, car:
         "findings": findings,
         **({"note": " ".join(read_description(folder).about.note.split())} if name in WITH_VEHEST else {}),
     }
+
+
+def _estimates(run: GuardedRun, parts: Iterable[Recording]) -> Iterator[Estimate]:
+    """The estimates of parts, each made by a thread, in compiled code, while the next part is read, checked and resampled."""
+    with ThreadPoolExecutor(1) as thread:
+        going: list[Future[Estimate]] = []
+        for part in parts:
+            going.append(thread.submit(copy_context().run, run, part.channels, part))
+            if len(going) > 1:
+                yield going.pop(0).result()
+        yield going.pop().result()
 
 
 def split_settings(overrides: Sequence[str]) -> tuple[dict[str, Any], list[str]]:
@@ -334,7 +347,7 @@ class _Report:
         self.seconds = 0.0
         self.samples = self.estimated = self.invalid = 0
         self.extremes: list[float] = []
-        self.half = array("d")  # widths of the band
+        self.half = array("f")  # widths of the band
         self.reasons: Counter[float] = Counter()
 
     def checked(self, parts: Iterable[tuple[Recording, list[Finding]]]) -> Iterator[Recording]:
@@ -357,7 +370,7 @@ class _Report:
             self.extremes += [float(np.fmin.reduce(degrees)), float(np.fmax.reduce(degrees))]
             self.samples, self.estimated = self.samples + len(part), self.estimated + int(known.sum())
             if "band_sideslip" in part.channels:
-                self.half.frombytes(part["band_sideslip"][~np.isnan(part["band_sideslip"])].tobytes())
+                self.half.frombytes(part["band_sideslip"][~np.isnan(part["band_sideslip"])].astype(np.float32).tobytes())
             status, reasons = part["health"][known], part["health_reason"][known]
             self.invalid += int((status > 0).sum())
             found, counts = np.unique(reasons[(status > 0) & (reasons > 0)], return_counts=True)
@@ -379,7 +392,7 @@ class _Report:
             "sideslip_deg": {end: round(float(take.reduce(self.extremes)), 3) for end, take in (("min", np.fmin), ("max", np.fmax))},
         }
         if "band_sideslip" in last.channels:
-            half = np.frombuffer(self.half)
+            half = np.frombuffer(self.half, np.float32)
             np.degrees(half, out=half)
             middle = float(np.median(half, overwrite_input=True)) if len(half) else 0.0
             band = {"median": round(middle, 3), "largest": round(float(half.max()), 3)} if len(half) else {}

@@ -1,6 +1,7 @@
 """The bank of filters of the self-calibrating estimator and the check that weighs it against others, compiled.
 
-sample -> lags -> each filter: predict, measured speed, rear axle -> weights by likelihood -> residuals of the candidates -> weights -> vy
+samples -> network, lags -> filters, side by side in vectors: predict, measured speed, rear axle -> weights by likelihood
+    -> residuals of the candidates -> weights -> vy
 
 A state is [v, u, β_y, β_x, κ, b, C, e]: velocities of the inertial unit, offsets of the accelerometer, roll leakage of ay, distance and
 compliance of the rear axle, and the axle's correlated error in units of its size.
@@ -15,6 +16,7 @@ import numpy as np
 
 from vehest.constants import FloatArray
 from vehest.estimators.kernels.compiling import entry, part
+from vehest.lanes import BYTES, choose, least, load, most, root, store, total, width
 
 STATES = 8
 V, U, OFFSET_Y, OFFSET_X, LEAKAGE, REAR, COMPLIANCE, ERROR = range(STATES)
@@ -26,6 +28,12 @@ YAW_RATE, AY, AX, SUM_AY, SUM_TURN, SUM_ONE, SPEED, SUM_AY_1, SUM_TURN_1, SUM_AX
 SLOW_AY, TIME, POWER, PREDICTED, AX_OF_SPEED, SLIP = range(10, LAGS)
 # of a candidate: low-passed v, sum of ω v, slow parts of both residuals, moments of the residuals, last v
 SMOOTH, SUM_TURN_V, SLOW_Y, SLOW_X, SQUARE_Y, CROSS_Y, SQUARE_X, LAST = range(8)
+# rows of the bank, a filter in each lane: states, the upper triangle of the covariances (whose numbers begin at `AT`), and these
+AT = np.array([[min(i, c) * (2 * STATES - 1 - min(i, c)) // 2 + max(i, c) for c in range(STATES)] for i in range(STATES)])
+AT = (STATES + AT) * (BYTES // 8)
+GRIP, WEIGHT, KNOWN = range(STATES + 36, STATES + 39)  # grip limit, weight among all filters and among those without the network's
+COST, TOTAL = STATES + 39, STATES + 41  # of both measurements: what lowers the log likelihood, variance of the residual
+ROW, SHARED, ROWS = STATES + 43, STATES + 51, STATES + 59  # derivatives of a measurement, its covariances with the states
 LEAST_LIMIT = 0.3  # of a grip limit that longitudinal acceleration leaves
 ROLLING = 0.05  # m/s: deviation of v = b ω of a car that rolls slowly
 
@@ -44,109 +52,148 @@ class State(NamedTuple):
 
 
 @part()
-def _rear_slip(force, grip, lags, n):  # type: ignore[no-untyped-def]
-    """φ and dφ/da of the rear axle, and the acceleration beyond its limit; a filter without a grip limit (0) takes φ of the network.
+def _rear_slip(f, lags, turning, n):  # type: ignore[no-untyped-def]
+    """φ and dφ/da of the rear axle, and its acceleration beyond the limit; a filter without a grip limit (0) takes φ of the network.
 
     φ = a_m (1 - (1 - |a|/a_m)^p)/p with the sign of a, a_m what the longitudinal acceleration leaves of the grip limit.
     """
-    if grip <= 0.0:
-        return lags[SLIP], 0.0, 0.0
-    limit = math.sqrt(max(grip * grip - lags[AX] ** 2, (LEAST_LIMIT * grip) ** 2))
-    share = min(abs(force) / limit, n.largest_share)
-    left = (1.0 - share) ** n.exponent
-    return math.copysign(limit * (1.0 - left) / n.exponent, force), left / (1.0 - share), max(abs(force) - limit, 0.0)
+    lanes = width(f)
+    grip = load(f, GRIP * lanes)
+    force = (lags[AY] - load(f, OFFSET_Y * lanes)) * (1.0 - load(f, LEAKAGE * lanes)) - load(f, REAR * lanes) * turning
+    limit = choose(grip > 0.0, root(most(grip * grip - lags[AX] ** 2, LEAST_LIMIT**2 * grip * grip)), 1.0)
+    rest = 1.0 - least(abs(force) / limit, n.largest_share)
+    store(f, SHARED * lanes, rest)
+    for k in range(SHARED * lanes, (SHARED + 1) * lanes):
+        if f[k + (GRIP - SHARED) * lanes] > 0.0:
+            f[k] **= n.exponent
+    left = load(f, SHARED * lanes)
+    slip, excess = limit * (1.0 - left) / n.exponent, most(abs(force) - limit, 0.0)
+    slip = choose(grip > 0.0, choose(force < 0.0, -slip, slip), lags[SLIP])
+    return slip, choose(grip > 0.0, left / rest, 0.0), choose(grip > 0.0, excess, 0.0)
 
 
 @part()
-def _predict(x, p, n, decay, prior, spread, ay, ax, turn, yaw_rate, unsteady):  # type: ignore[no-untyped-def]
+def _predict(f, n, decay, prior, spread, ay, ax, turn, yaw_rate, unsteady):  # type: ignore[no-untyped-def]
     """v' = (1 - κ) ay - β_y - ω u, u' = ax - β_x + ω v; the other states decay to their priors."""
-    v = x[V]
-    x[V] += n.dt * (ay * (1.0 - x[LEAKAGE]) - x[OFFSET_Y] - turn)
-    x[U] += n.dt * (ax - x[OFFSET_X] + yaw_rate * v)
-    for c in range(STATES):
-        of_v = p[V, c] - n.dt * (ay * p[LEAKAGE, c] + p[OFFSET_Y, c])
-        of_u = p[U, c] + n.dt * (yaw_rate * p[V, c] - p[OFFSET_X, c])
-        p[V, c], p[U, c] = of_v, of_u
-    for c in range(STATES):
-        of_v = p[c, V] - n.dt * (ay * p[c, LEAKAGE] + p[c, OFFSET_Y])
-        of_u = p[c, U] + n.dt * (yaw_rate * p[c, V] - p[c, OFFSET_X])
-        p[c, V], p[c, U] = of_v, of_u
-    for i in range(OFFSET_Y, STATES):
-        x[i] = prior[i] + decay[i] * (x[i] - prior[i])
-        for c in range(STATES):
-            p[i, c] *= decay[i]
-            p[c, i] *= decay[i]
-        p[i, i] += spread[i] ** 2 * (1.0 - decay[i] ** 2)
-    p[V, V] += n.dt * (n.noise_vy**2 + (n.noise_delay * unsteady) ** 2)
-    p[U, U] += n.dt * n.noise_vx**2
+    lanes = width(f)
+    v, v_v, v_u, u_u = load(f, V * lanes), load(f, AT[V, V]), load(f, AT[V, U]), load(f, AT[U, U])
+    store(f, V * lanes, v + n.dt * (ay * (1.0 - load(f, LEAKAGE * lanes)) - load(f, OFFSET_Y * lanes) - turn))
+    store(f, U * lanes, load(f, U * lanes) + n.dt * (ax - load(f, OFFSET_X * lanes) + yaw_rate * v))
+    u_v = v_u + n.dt * (yaw_rate * v_v - load(f, AT[V, OFFSET_X]))  # here of A P, below of A P A'
+    u_u += n.dt * (yaw_rate * v_u - load(f, AT[U, OFFSET_X]))
+    v_v -= n.dt * (ay * load(f, AT[V, LEAKAGE]) + load(f, AT[V, OFFSET_Y]))
+    v_u -= n.dt * (ay * load(f, AT[U, LEAKAGE]) + load(f, AT[U, OFFSET_Y]))
+    for c in range(OFFSET_Y, len(decay)):
+        of_v = load(f, AT[V, c])
+        store(f, AT[V, c], of_v - n.dt * (ay * load(f, AT[LEAKAGE, c]) + load(f, AT[OFFSET_Y, c])))
+        store(f, AT[U, c], load(f, AT[U, c]) + n.dt * (yaw_rate * of_v - load(f, AT[OFFSET_X, c])))
+    v_u += n.dt * (yaw_rate * v_v - load(f, AT[V, OFFSET_X]))
+    v_v -= n.dt * (ay * load(f, AT[V, LEAKAGE]) + load(f, AT[V, OFFSET_Y]))
+    u_u += n.dt * (yaw_rate * u_v - load(f, AT[U, OFFSET_X]))
+    store(f, AT[V, V], v_v + n.dt * (n.noise_vy**2 + (n.noise_delay * unsteady) ** 2))
+    store(f, AT[V, U], v_u)
+    store(f, AT[U, U], u_u + n.dt * n.noise_vx**2)
+    for c in range(OFFSET_Y, len(decay)):
+        store(f, c * lanes, prior[c] + decay[c] * (load(f, c * lanes) - prior[c]))
+        for i in range(c + 1):
+            store(f, AT[i, c], load(f, AT[i, c]) * (decay[i] * decay[c]))
+        store(f, AT[c, c], load(f, AT[c, c]) + spread[c] ** 2 * (1.0 - decay[c] ** 2))
 
 
 @part()
-def _update(x, p, row, residual, variance, gate, learns, scratch):  # type: ignore[no-untyped-def]
-    """Take a measurement with the given row of derivatives; returns its log likelihood.
+def _of_two(f, one, other, factor, measured, variance):  # type: ignore[no-untyped-def]
+    """A state plus a factor times another, as measured: residual and its variance."""
+    lanes = width(f)
+    for i in range(STATES):
+        store(f, (SHARED + i) * lanes, load(f, AT[i, one]) + factor * load(f, AT[i, other]))
+    whole = load(f, (SHARED + one) * lanes) + factor * load(f, (SHARED + other) * lanes) + variance
+    return measured - load(f, one * lanes) - factor * load(f, other * lanes), whole
+
+
+@part()
+def _axle(f, n, lags, turning, speed, size, states):  # type: ignore[no-untyped-def]
+    """0 = v - b ω + C u φ(a_r) + s e at the rear axle, low-passed: v - τ dv/dt stands for the low-passed v.
+
+    Returns the residual, its variance, and half the square of what the grip limit rules out, over a sample.
+    """
+    lanes = width(f)
+    offset, rear, compliance = load(f, OFFSET_Y * lanes), load(f, REAR * lanes), load(f, COMPLIANCE * lanes)
+    own = 1.0 - load(f, LEAKAGE * lanes)
+    slip, slope, excess = _rear_slip(f, lags, turning, n)
+    smooth = load(f, V * lanes) - lags[SUM_AY] * own + offset * lags[SUM_ONE] + lags[SUM_TURN]
+    residual = rear * lags[YAW_RATE] - compliance * speed * slip - size * load(f, ERROR * lanes) - smooth
+    gain = compliance * speed * slope
+    store(f, (ROW + V) * lanes, 1.0)
+    store(f, (ROW + OFFSET_Y) * lanes, lags[SUM_ONE] - gain * own)
+    store(f, (ROW + LEAKAGE) * lanes, lags[SUM_AY] - gain * (lags[AY] - offset))
+    store(f, (ROW + REAR) * lanes, choose(load(f, GRIP * lanes) > 0.0, -lags[YAW_RATE] - gain * turning, 0.0))
+    store(f, (ROW + COMPLIANCE) * lanes, speed * slip)
+    store(f, (ROW + ERROR) * lanes, size)
+    variance = 0.0 * slip + n.axle_white**2 + n.axle_white_share * size**2
+    for i in range(states):
+        shared = 0.0 * slip
+        for c in range(states):
+            shared += load(f, AT[i, c]) * load(f, (ROW + c) * lanes)
+        store(f, (SHARED + i) * lanes, shared)
+        variance += load(f, (ROW + i) * lanes) * shared
+    surplus = least(excess / n.grip_excess, n.gate)
+    return residual, variance, 0.5 * n.dt * surplus * surplus
+
+
+@part()
+def _update(f, residual, variance, gate, learns, states):  # type: ignore[no-untyped-def]
+    """Take a measurement whose covariances with the states are known; returns half the square of its normalised residual.
 
     Beyond ``gate`` deviations a residual is cut off; parameters stay where the filter does not learn (a Schmidt-Kalman update).
     """
-    total = variance
-    for i in range(STATES):
-        scratch[i] = 0.0
-        for c in range(STATES):
-            scratch[i] += p[i, c] * row[c]
-    for i in range(STATES):
-        total += row[i] * scratch[i]
-    square = residual * residual / total
-    if square > gate * gate:
-        residual *= gate / math.sqrt(square)
-        square = gate * gate
-    for i in range(STATES):
+    lanes, limit, inverse = width(f), gate * root(variance), 1.0 / variance
+    residual = most(least(residual, limit), -limit)
+    for i in range(states):
         held = not learns and LEAKAGE <= i <= COMPLIANCE
+        gain = load(f, (SHARED + i) * lanes) * inverse
         if not held:
-            x[i] += scratch[i] / total * residual
-        for c in range(STATES):
-            if not (held and LEAKAGE <= c <= COMPLIANCE):
-                p[i, c] -= scratch[i] * scratch[c] / total
-    return -0.5 * (square + math.log(total))
+            store(f, i * lanes, load(f, i * lanes) + gain * residual)
+        for c in range(i, states):
+            if not (held and c <= COMPLIANCE):
+                store(f, AT[i, c], load(f, AT[i, c]) - gain * load(f, (SHARED + c) * lanes))
+    return 0.5 * residual * residual * inverse
 
 
 @part()
-def _axle(x, p, grip, n, lags, turning, speed, size, row, scratch):  # type: ignore[no-untyped-def]
-    """0 = v - b ω + C u φ(a_r) + s e at the rear axle, low-passed: v - τ dv/dt stands for the low-passed v."""
-    own, force = 1.0 - x[LEAKAGE], (lags[AY] - x[OFFSET_Y]) * (1.0 - x[LEAKAGE]) - x[REAR] * turning
-    slip, slope, excess = _rear_slip(force, grip, lags, n)
-    smooth = x[V] - lags[SUM_AY] * own + x[OFFSET_Y] * lags[SUM_ONE] + lags[SUM_TURN]
-    residual = x[REAR] * lags[YAW_RATE] - x[COMPLIANCE] * speed * slip - size * x[ERROR] - smooth
-    gain = x[COMPLIANCE] * speed * slope
-    row[V], row[U], row[OFFSET_X] = 1.0, 0.0, 0.0
-    row[OFFSET_Y] = lags[SUM_ONE] - gain * own
-    row[LEAKAGE] = lags[SUM_AY] - gain * (lags[AY] - x[OFFSET_Y])
-    row[REAR] = -lags[YAW_RATE] - gain * turning if grip > 0.0 else 0.0
-    row[COMPLIANCE] = speed * slip
-    row[ERROR] = size
-    surplus = 0.5 * min(excess / n.grip_excess, n.gate) ** 2 * n.dt  # which the grip limit rules out
-    return _update(x, p, row, residual, n.axle_white**2 + n.axle_white_share * size**2, n.gate, True, scratch) - surplus
+def _tanh(x):  # type: ignore[no-untyped-def]
+    """tanh to 1e-15 by Lambert's continued fraction n/d at x/8, then tanh(2y) = 2nd/(d² + n²) thrice (see `activation.rational_tanh`)."""
+    y = 0.125 * least(most(x, -20.0), 20.0)
+    s = y * y
+    n = y * (135135.0 + s * (17325.0 + s * (378.0 + s)))
+    d = 135135.0 + s * (62370.0 + s * (3150.0 + s * 28.0))
+    n, d = 2.0 * n * d, d * d + n * n
+    n, d = 2.0 * n * d, d * d + n * n
+    return 2.0 * n * d / (d * d + n * n)
 
 
 @part()
-def _network(theta, width, window, dt):  # type: ignore[no-untyped-def]
-    """KS-NN without biases, v one step after the window (Da Lio et al. 2023, Eqs. 7 and 8); rows of ``theta`` as in `kernels.ksnn`."""
-    v, u = 0.0, window[0, 1]
-    local = theta.shape[0]
-    for k in range(len(window)):
-        yaw_rate, speed, ay, ax = window[k, 0], window[k, 1], window[k, 2], window[k, 3]
-        place = min(abs(yaw_rate) / width * (local - 1), local - 1.0)
-        slip, thrust, error = dt * (ay - speed * yaw_rate), dt * (ax + v * yaw_rate), u - speed
-        next_v, next_u = 0.0, 0.0
+def _network(theta, yaw_rate_max, series, first, steps, dt):  # type: ignore[no-untyped-def]
+    """KS-NN without biases, v one step after windows that begin at sample ``first`` and those next to it, side by side.
+
+    Da Lio et al. 2023, Eqs. 7 and 8; rows of ``theta`` as in `kernels.ksnn`, of ``series`` as in `scan`'s samples.
+    """
+    local, half, row = theta.shape[0], (theta.shape[1] - 8) // 6, series.shape[1]
+    u = load(series, row + first)
+    v = 0.0 * u
+    for at in range(first, first + steps):
+        yaw_rate, speed = load(series, at), load(series, row + at)
+        place = least(abs(yaw_rate) * ((local - 1) / yaw_rate_max), local - 1.0)
+        slip, thrust = dt * (load(series, 2 * row + at) - speed * yaw_rate), dt * (load(series, 3 * row + at) + v * yaw_rate)
+        error, next_v, next_u = u - speed, 0.0 * u, 0.0 * u
         for m in range(local):
-            share = 1.0 - abs(place - m)
-            if share > 0.0:
-                f1, f2 = theta[m, 4] * error + theta[m, 5], theta[m, 6] * error + theta[m, 7]
-                half = (theta.shape[1] - 8) // 6
-                for q in range(half):
-                    one, two = 8 + 3 * q, 8 + 3 * (half + q)
-                    f1 += theta[m, one + 2] * math.tanh(theta[m, one] * error + theta[m, one + 1])
-                    f2 += theta[m, two + 2] * math.tanh(theta[m, two] * error + theta[m, two + 1])
-                next_v += share * (theta[m, 0] * v + theta[m, 2] * slip - yaw_rate * f1)
-                next_u += share * (theta[m, 1] * u + theta[m, 3] * thrust - f2)
+            share = most(1.0 - abs(place - m), 0.0)
+            f1, f2 = theta[m, 4] * error + theta[m, 5], theta[m, 6] * error + theta[m, 7]
+            for q in range(half):
+                one, two = 8 + 3 * q, 8 + 3 * (half + q)
+                f1 += theta[m, one + 2] * _tanh(theta[m, one] * error + theta[m, one + 1])
+                f2 += theta[m, two + 2] * _tanh(theta[m, two] * error + theta[m, two + 1])
+            next_v += share * (theta[m, 0] * v + theta[m, 2] * slip - yaw_rate * f1)
+            next_u += share * (theta[m, 1] * u + theta[m, 3] * thrust - f2)
         v, u = next_v, next_u
     return v
 
@@ -198,7 +245,7 @@ def _judge(found, own, weights, left, lags, sample, yaw_rate, n, g_1, g_slow, mo
     _normalise(weights, weights, CANDIDATES)
 
 
-@entry()
+@entry(nogil=True)
 def scan(n, grips, start, prior, spread, decay, theta, state, samples, found, parameters):  # type: ignore[no-untyped-def]
     """Go through samples; changes ``state`` in place.
 
@@ -212,56 +259,122 @@ def scan(n, grips, start, prior, spread, decay, theta, state, samples, found, pa
         state: a `State`.
         samples: yaw_rate, vx, ay, ax, (T, 4).
         found: output, vy and its variance, (T, 2).
-        parameters: output, mean and variance over the bank of states, (T, 16).
+        parameters: output, mean and variance over the bank of states, (T, 16), or (1, 16) for the last sample alone.
     """
     g, g_1, g_slow = -math.expm1(-n.dt / n.axle_lag), -math.expm1(-n.dt / n.residual_time), -math.expm1(-n.dt / n.slow_time)
-    means, lags, last, window = state.means, state.lags, state.last, state.window
-    row, scratch, values, left = np.zeros(STATES), np.zeros(STATES), np.zeros(CANDIDATES), np.zeros(CANDIDATES)
-    weights = np.empty(len(grips))
+    lags, log_weights, lanes, count, steps = state.lags, state.log_weights, width(grips), len(grips), len(state.window)
+    bank, own = np.zeros(((count + lanes - 1) // lanes, ROWS * lanes)), np.zeros((3, 4))
+    values, left, sample, last = own[0], own[1], own[2], state.last
+    for k in range(len(bank) * lanes):  # lanes beyond the last filter are as that one, without weight
+        j, f = min(k, count - 1), bank[k // lanes]
+        f[GRIP * lanes + k % lanes] = grips[j]
+        for i in range(STATES):
+            f[i * lanes + k % lanes] = state.means[j, i]
+            for c in range(i, STATES):
+                f[AT[i, c] + k % lanes] = state.covariances[j, i, c]
+    series = np.zeros((5, steps + len(samples) + lanes))  # the window and the samples after it, and the network's v
+    for t in range(steps + len(samples)):
+        for i in range(4):
+            series[i, t] = state.window[t, i] if t < steps else samples[t - steps, i]
+        if n.without_ax and t >= steps:
+            series[3, t] = (series[1, t] - lags[AX_OF_SPEED]) / n.axle_lag
+            lags[AX_OF_SPEED] += g * (series[1, t] - lags[AX_OF_SPEED])
+    for t in range(0, len(samples), lanes):
+        store(series[4], t + 1, _network(theta, n.yaw_rate_max, series, t + 1, steps, n.dt))
+    series[4, 0] = lags[PREDICTED]
+    _weigh(bank, log_weights)
     for t in range(len(samples)):
-        sample = samples[t].copy()
-        if n.without_ax:
-            sample[3] = (sample[1] - lags[AX_OF_SPEED]) / n.axle_lag
-            lags[AX_OF_SPEED] += g * (sample[1] - lags[AX_OF_SPEED])
+        for i in range(4):
+            sample[i] = series[i, steps + t]
         turning = _advance_lags(lags, sample, last, n, g, g_1, g_slow)
-        slip = (n.rear * sample[0] - lags[PREDICTED]) / (n.compliance * max(sample[1], n.minimum_speed))
+        slip = (n.rear * sample[0] - series[4, t]) / (n.compliance * max(sample[1], n.minimum_speed))
         lags[SLIP] += g * (slip - lags[SLIP])
         speed, moving = sample[1], sample[1] > n.minimum_speed
         yaw_rate, turn = (last[0] + sample[0]) / 2.0, (last[0] * last[1] + sample[0] * speed) / 2.0
         ay, ax = (last[2] + sample[2]) / 2.0, (last[3] + sample[3]) / 2.0
-        _normalise(state.log_weights, weights, len(grips))
         size = 0.0
-        for j in range(len(grips)):
-            x = means[j]
-            force = (lags[AY] - x[OFFSET_Y]) * (1.0 - x[LEAKAGE]) - x[REAR] * turning
-            slip, slope, _ = _rear_slip(force, grips[j], lags, n)
-            bent = n.axle_per_slip * abs(slip) + n.axle_per_bend * max(slope - 1.0, 0.0) + n.axle_per_slope * slope
-            size += weights[j] * (n.axle_constant + max(speed, 0.0) * (n.axle_per_speed + n.compliance * bent))
-        for j in range(len(grips)):
-            x, p = means[j], state.covariances[j]
-            _predict(x, p, n, decay, prior, spread, ay, ax, turn, yaw_rate, turning * speed)
-            row[:] = 0.0
-            row[U] = 1.0
-            likelihood = _update(x, p, row, speed - x[U], n.noise_speed**2, n.gate, moving, scratch)
-            if moving:
-                likelihood += _axle(x, p, grips[j], n, lags, turning, speed, size, row, scratch)
-                state.log_weights[j] = start[j] + (state.log_weights[j] - start[j]) * (1.0 - n.dt / n.memory) + likelihood
-            else:
-                row[:] = 0.0
-                row[V], row[REAR] = 1.0, -sample[0]
-                _update(x, p, row, x[REAR] * sample[0] - x[V], ROLLING**2, n.gate, False, scratch)
-        _mixture(means, state.covariances, state.log_weights, weights, parameters[t])
-        values[BANK], values[NETWORK] = 0.0, lags[PREDICTED]
-        for j in range(len(grips)):
-            values[BANK] += weights[j] * (means[j, V] + n.rear_known * (n.rear - means[j, REAR]) * sample[0])
+        for b in range(len(bank) if moving else 0):
+            slips, slope, _ = _rear_slip(bank[b], lags, turning, n)
+            bent = n.axle_per_slip * abs(slips) + n.axle_per_bend * most(slope - 1.0, 0.0) + n.axle_per_slope * slope
+            sizes = n.axle_constant + speed * (n.axle_per_speed + n.compliance * bent)
+            size += total(load(bank[b], WEIGHT * lanes) * sizes)
+        for b in range(len(bank)):
+            f = bank[b]
+            _predict(f, n, decay, prior, spread, ay, ax, turn, yaw_rate, turning * speed)
+            for k in range(2):  # the speed is measured, and the rear axle, which rolls (v = b ω) where the car is slow
+                surplus = 0.0 * load(f, 0)
+                if k == 0:
+                    residual, variance = _of_two(f, U, U, 0.0, speed, n.noise_speed**2)
+                elif moving:
+                    residual, variance, surplus = _axle(f, n, lags, turning, speed, size, len(prior))
+                else:
+                    residual, variance = _of_two(f, V, REAR, -sample[0], 0.0, ROLLING**2)
+                store(f, (TOTAL + k) * lanes, variance)
+                store(f, (COST + k) * lanes, _update(f, residual, variance, n.gate, moving, len(prior)) + surplus)
+        if moving:
+            for j in range(count):
+                f, lane = bank[j // lanes], j % lanes
+                cost = f[COST * lanes + lane] + f[(COST + 1) * lanes + lane]
+                likelihood = -cost - 0.5 * math.log(f[TOTAL * lanes + lane] * f[(TOTAL + 1) * lanes + lane])
+                log_weights[j] = start[j] + (log_weights[j] - start[j]) * (1.0 - n.dt / n.memory) + likelihood
+            _weigh(bank, log_weights)
+        known = parameters[min(t, len(parameters) - 1)]
+        rear = _mixture(bank, known)
+        values[BANK], values[NETWORK] = known[V] + n.rear_known * (n.rear - rear) * sample[0], series[4, t]
         values[STEADY] = sample[0] * (n.rear - n.compliance * speed * speed)
         _judge(values, state.candidates, state.weights, left, lags, sample, yaw_rate, n, g_1, g_slow, moving)
-        _combine(values, state.weights, left, parameters[t], sample, n, found[t])
-        for j in range(len(sample)):  # slices would compile for seconds
-            for i in range(len(window) - 1):
-                window[i, j] = window[i + 1, j]
-            window[-1, j] = last[j] = sample[j]
-        lags[PREDICTED] = _network(theta, n.yaw_rate_max, window, n.dt)
+        _combine(values, state.weights, left, known, sample, n, found[t])
+        for i in range(4):
+            last[i] = sample[i]
+    lags[PREDICTED] = series[4, len(samples)]
+    for t in range(steps):
+        for i in range(4):
+            state.window[t, i] = series[i, len(samples) + t]
+    for j in range(count):
+        for i in range(STATES):
+            state.means[j, i] = bank[j // lanes, i * lanes + j % lanes]
+            for c in range(STATES):
+                state.covariances[j, i, c] = bank[j // lanes, AT[i, c] + j % lanes]
+
+
+@part()
+def _weigh(bank, log_weights):  # type: ignore[no-untyped-def]
+    """Weights of the filters from their logarithms, with and without the last, the network's; of sum 1."""
+    lanes, others, largest, sum_ = width(bank), len(log_weights) - 1, log_weights[0], 0.0
+    for j in range(others):
+        largest = max(largest, log_weights[j])
+    for j in range(others):
+        weight = math.exp(log_weights[j] - largest)
+        bank[j // lanes, KNOWN * lanes + j % lanes] = weight
+        sum_ += weight
+    lead = log_weights[others] - largest
+    share, own = math.exp(min(-lead, 0.0)), math.exp(min(lead, 0.0))
+    whole = sum_ * share + own
+    for b in range(len(bank)):
+        known = load(bank[b], KNOWN * lanes)
+        store(bank[b], WEIGHT * lanes, known * (share / whole))
+        store(bank[b], KNOWN * lanes, known * (1.0 / sum_))
+    bank[others // lanes, WEIGHT * lanes + others % lanes] = own / whole
+
+
+@part()
+def _mixture(bank, found):  # type: ignore[no-untyped-def]
+    """Mean and variance of the states over the bank, differences between filters included; of b and C without the network's filter.
+
+    Returns the mean of b with it.
+    """
+    lanes, rear = width(bank), 0.0
+    for i in range(STATES):
+        own, mean, variance = KNOWN if REAR <= i <= COMPLIANCE else WEIGHT, 0.0, 0.0
+        for b in range(len(bank)):
+            mean += total(load(bank[b], own * lanes) * load(bank[b], i * lanes))
+        for b in range(len(bank)):
+            off = load(bank[b], i * lanes) - mean
+            variance += total(load(bank[b], own * lanes) * (load(bank[b], AT[i, i]) + off * off))
+        found[i], found[STATES + i] = mean, variance
+    for b in range(len(bank)):
+        rear += total(load(bank[b], WEIGHT * lanes) * load(bank[b], REAR * lanes))
+    return rear
 
 
 @part()
@@ -275,19 +388,6 @@ def _normalise(log_weights, weights, count):  # type: ignore[no-untyped-def]
         total += weights[j]
     for j in range(count):
         weights[j] /= total
-
-
-@part()
-def _mixture(means, covariances, log_weights, weights, found):  # type: ignore[no-untyped-def]
-    """Mean and variance of the states over the bank, differences between filters included; of b and C without the network's filter."""
-    found[:] = 0.0
-    for i in range(STATES):
-        filters = len(weights) - 1 if REAR <= i <= COMPLIANCE else len(weights)
-        _normalise(log_weights, weights, filters)
-        for j in range(filters):
-            found[i] += weights[j] * means[j, i]
-        for j in range(filters):
-            found[STATES + i] += weights[j] * (covariances[j, i, i] + (means[j, i] - found[i]) ** 2)
 
 
 @part()
