@@ -117,6 +117,14 @@ without reference; – where there are none, or `vehest identify` refuses number
 Small cars are seen at their wheelbase: times and speeds scale with its root, tyres slip more, the network does not count,
 and steady cornering counts the more the smaller they are.
 
+## Drives that are worse than the shipped model
+
+By more than a tenth: {behind} drives; v = 0 errs there by {least_zero} to {most_zero}°,
+the shipped model by at most {most_shipped}°, the filter by at most {most_own}°.
+The largest FVU, {largest_fvu}, is of {of_drive}, RMSE(β) {its_own}°, of v = 0 {its_zero}°.
+
+{worse}
+
 {changed}"""
 
 
@@ -128,6 +136,8 @@ class Errors(NamedTuple):
     within: FloatArray
     reference: FloatArray
     time: FloatArray
+    title: str
+    speed: float  # median [m/s]
 
 
 def drives_of(car: Car, runner: Runner, root: str) -> Iterator[Recording]:
@@ -212,7 +222,15 @@ def errors_of(car: Car, recording: Recording, shipped: Estimator, others: Mappin
     angle = {name: np.degrees(np.arctan2(vy, speed) - np.arctan2(truth, speed))[moving] ** 2 for name, vy in found.items()}
     within = (np.abs(found["cold"] - truth) < 1.645 * np.sqrt(variance))[moving]
     time = np.arange(len(speed))[moving] / plain.rate_hz
-    return Errors(angle, {name: (vy - truth)[moving] ** 2 for name, vy in found.items()}, within, truth[moving], time)
+    return Errors(
+        angle,
+        {name: (vy - truth)[moving] ** 2 for name, vy in found.items()},
+        within,
+        truth[moving],
+        time,
+        recording.id,
+        float(np.median(speed[moving])),
+    )
 
 
 def scored(car: Car, runner: Runner, root: str, shipped: Estimator) -> list[Errors]:
@@ -293,7 +311,7 @@ def report(found: Mapping[Car, Sequence[Errors]], changed: Sequence[str]) -> str
     ratios = {car: ratio_interval(drives) for car, drives in found.items() if np.isfinite(rmse(drives, "shipped"))}
     limits = {car.title: ratio_interval(found[car], "car not given")[1] for car in ratios if car.title in SHIPS_ON}
     ships = len(limits) == len(SHIPS_ON) and max(limits.values()) <= LARGEST_RATIO
-    rows, drives_below, by_time, ablated = [], [], [], []
+    rows, drives_below, by_time, ablated, worse = [], [], [], [], []
     for car, drives in found.items():
         title, shares = f"{car.title} ({car.origin})", [fvu(drive, "cold") for drive in drives]
         drives_below += [rmse([drive], "cold") < rmse([drive], "v = 0") for drive in drives]
@@ -307,12 +325,18 @@ def report(found: Mapping[Car, Sequence[Errors]], changed: Sequence[str]) -> str
             sum(rmse([drive], "cold") > limit * rmse([drive], name) for drive in drives)
             for limit, name in ((1.0, "v = 0"), (1.1, "shipped"))
         ]
+        for drive in drives if car in ratios else ():
+            zero, shipped, own = (rmse([drive], name) for name in ("v = 0", "shipped", "cold"))
+            if own > 1.1 * shipped:
+                worse.append((f"{title}, {drive.title}", drive.speed, zero, shipped, own))
         counts = [str(len(drives)), str(above[0]), str(above[1]) if car in ratios else "–"]
         rows.append([*about, f"{fixed(float(np.median(shares)), 3)} ({fixed(max(shares), 2)})", band, *counts])
         early = ((0.0, 10.0), (10.0, 30.0), (30.0, 60.0), (60.0, 300.0), (300.0, 1e9))
         parts = [np.concatenate([d.sideslip["cold"][(d.time >= low) & (d.time < high)] for d in drives]) for low, high in early]
         by_time.append([title, *[fixed(float(np.sqrt(part.mean())), 2) if len(part) > BLOCK // 4 else "–" for part in parts]])
         ablated.append([title, *[fixed(rmse(drives, name), 2) for name in ABLATIONS]])
+    heads = ("drive", "median speed [m/s]", "v = 0", "shipped", "self-calibrating")
+    of_drive = max((drive for drives in found.values() for drive in drives), key=lambda drive: fvu(drive, "cold"))
     return PAGE.format(
         choices=CHOICES,
         verdict="meets" if ships else "does not meet",
@@ -323,6 +347,14 @@ def report(found: Mapping[Car, Sequence[Errors]], changed: Sequence[str]) -> str
         errors="\n".join(table(HEADS, rows)),
         by_time="\n".join(table(["car", "0 to 10 s", "10 to 30 s", "30 to 60 s", "60 to 300 s", "later"], by_time)),
         ablated="\n".join(table(["car", *ABLATIONS], ablated)),
+        worse="\n".join(table(heads, [[name, fixed(speed, 1), *(fixed(one, 2) for one in own)] for name, speed, *own in worse])),
+        behind=len(worse),
+        least_zero=fixed(min(row[2] for row in worse), 2),
+        **{name: fixed(max(row[at] for row in worse), 2) for at, name in enumerate(("most_zero", "most_shipped", "most_own"), 2)},
+        of_drive=of_drive.title,
+        largest_fvu=fixed(fvu(of_drive, "cold"), 2),
+        its_own=fixed(rmse([of_drive], "cold"), 2),
+        its_zero=fixed(rmse([of_drive], "v = 0"), 2),
         changed="\n".join(changed),
     )
 

@@ -97,22 +97,8 @@ class Ksnn(WindowedEstimator):
 
     def c_values(self) -> dict[str, Any]:
         """Its local models and their neurons."""
-        s, w = self.settings, {name: values.astype(np.float64) for name, values in self.weights().items()}
-        parts = [w["gamma"], w["beta"], w["linear_weight"]]
-        if s.bias:
-            parts.append(w["linear_bias"] + (w["output_bias"] if s.n_hidden else 0.0))
-        neurons = [w["hidden_weight"], w["output_weight"], *([w["hidden_bias"]] if s.bias else [])] if s.n_hidden else []
-        return {
-            "window": s.window,
-            "local": s.n_local,
-            "active": min(s.n_local, 2),
-            "hidden": s.n_hidden,
-            "bias": s.bias,
-            "step": 1.0 / s.rate_hz,
-            "per_width": (s.n_local - 1) / float(w["yaw_rate_max"]),
-            "linear": np.concatenate(parts, axis=1),
-            "neurons": np.stack(neurons, axis=-1) if neurons else None,
-        }
+        weights = {name: values.astype(np.float64) for name, values in self.weights().items()}
+        return kernel.c_tables(kernel.packed(weights), self.window, self.rate_hz, float(weights["yaw_rate_max"]), bias=self.bias)
 
 
 ESTIMATOR = Ksnn

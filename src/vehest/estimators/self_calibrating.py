@@ -17,7 +17,7 @@ from vehest.data.errors import ConfigurationError
 from vehest.declared import setting
 from vehest.estimators.base import rate, require_shapes
 from vehest.estimators.kernels import self_calibrating as kernel
-from vehest.estimators.kernels.ksnn import packed
+from vehest.estimators.kernels.ksnn import c_tables, packed
 from vehest.estimators.ksnn import Ksnn
 from vehest.estimators.model_files import load_model
 from vehest.estimators.recursive import Recursive
@@ -161,6 +161,13 @@ class SelfCalibrating(Recursive):
         times = np.array([np.inf, np.inf, self.offset_ay_time, self.offset_ax_time, np.inf, np.inf, np.inf, self.axle_error_time])
         return np.exp(-1.0 / (self.rate_hz * times * math.sqrt(self.wheelbase / TYPICAL_WHEELBASE)))
 
+    @property
+    def noise(self) -> FloatArray:
+        """Variances by which states grow in a sample of steady driving, (8,)."""
+        n, noise = self.numbers(), np.square(self.prior[1]) * (1.0 - np.square(self.decay))
+        noise[[kernel.V, kernel.U]] = n.dt * n.noise_vy**2, n.dt * n.noise_vx**2
+        return noise
+
     def numbers(self) -> Any:
         """What the compiled recursion takes: numeric settings, times scaled, and what follows from them."""
         own = {name: float(value) for name, value in vars(self.settings).items() if name in Numbers._fields}
@@ -215,17 +222,15 @@ class SelfCalibrating(Recursive):
         """Numbers, priors and the network."""
         n, (mean, deviation), (grips, start) = self.numbers(), self.prior, self.bank_arrays
         gains = {"g": n.axle_lag, "g_1": n.residual_time, "g_slow": n.slow_time}
-        numbers = n._asdict() | {name: -math.expm1(-n.dt / time) for name, time in gains.items()}
-        return {
-            "numbers": numbers,
+        return c_tables(self.network, WINDOW, self.rate_hz, self._width, bias=True) | {
+            "numbers": n._asdict() | {name: -math.expm1(-n.dt / time) for name, time in gains.items()},
             "grips": grips,
             "start": start,
             "prior": mean,
             "spread": deviation,
             "decay": self.decay,
+            "noise": self.noise,
             "odds": np.log([1.0, n.network_odds, n.steady_odds]),
-            "theta": self.network,
-            "window": WINDOW,
             "measured_ax": self.measured_ax,
             "least_limit": kernel.LEAST_LIMIT,
             "rolling": kernel.ROLLING,
@@ -276,8 +281,8 @@ def _smoothed(estimator: Any, samples: FloatArray, state: kernel.State) -> Float
     turn = (np.append(before[0] * before[1], turn[:-1]) + turn) / 2.0
     constant = mean * (1.0 - decay)
     constant[[kernel.V, kernel.U]] = 0.0
-    noise = np.square(deviation) * (1.0 - np.square(decay))
-    noise[kernel.U] = n.dt * n.noise_vx**2
+    noise = np.tile(estimator.noise, (len(rows), 1))
+    noise[:, kernel.V] += n.dt * (n.noise_delay * turning / n.dt * rows[:, 1]) ** 2
     x, p = means[-1].copy(), covariances[-1].copy()
     found = np.empty((len(rows), 3))
     for k in range(len(rows) - 1, -1, -1):
@@ -290,8 +295,7 @@ def _smoothed(estimator: Any, samples: FloatArray, state: kernel.State) -> Float
         step *= decay[:, None]
         predicted = step @ means[k - 1] + constant
         predicted[[kernel.V, kernel.U]] += n.dt * (middle[k, 2] - turn[k]), n.dt * middle[k, 3]
-        noise[kernel.V] = n.dt * (n.noise_vy**2 + (n.noise_delay * turning[k] / n.dt * rows[k, 1]) ** 2)
-        spread = step @ covariances[k - 1] @ step.T + np.diag(noise)
+        spread = step @ covariances[k - 1] @ step.T + np.diag(noise[k])
         gain = np.linalg.solve(spread, step @ covariances[k - 1]).T
         x, p = means[k - 1] + gain @ (x - predicted), covariances[k - 1] + gain @ (p - spread) @ gain.T
     own = found[:, 0] + n.rear_known * (n.rear - found[:, 1]) * rows[:, 0]

@@ -49,6 +49,22 @@ def packed(parameters: Mapping[str, FloatArray]) -> FloatArray:
     return np.concatenate(pieces, -1)
 
 
+def c_tables(theta: FloatArray, window: int, rate_hz: float, yaw_rate_max: float, *, bias: bool) -> dict[str, Any]:
+    """What the C takes of a network with rows of `packed`, (P, 8 + 6 Q); without ``bias`` their biases are left out."""
+    n_local, n_hidden = len(theta), (theta.shape[1] - LINEAR) // 6
+    return {
+        "window": window,
+        "local": n_local,
+        "active": min(n_local, 2),
+        "hidden": n_hidden,
+        "bias": bias,
+        "step": 1.0 / rate_hz,
+        "per_width": (n_local - 1) / yaw_rate_max,
+        "linear": theta[:, [0, 1, 2, 3, 4, 6] + [5, 7] * bias],
+        "neurons": theta[:, LINEAR:].reshape(n_local, 2, n_hidden, 3)[..., [0, 2] + [1] * bias],
+    }
+
+
 def recursion_of(settings: Any, yaw_rate_max: float) -> Recursion:
     """The recursion of a network with parameters in the order of `shapes_of`; its last local model is centred at a yaw rate [rad/s]."""
     own, views, first = settings, {}, 0

@@ -57,26 +57,13 @@ static inline vehest_real tanh_of(vehest_real x)
     return 2.0 * second / (1.0 + second * second);
 }
 
-void vehest_method_start(vehest_method *m)
+/* Put a sample into the window, with the coefficients of Eq. 9. */
+static void keep(vehest_method *m, vehest_real omega, vehest_real speed, vehest_real ay, vehest_real ax)
 {
-    m->next = 0;
-    m->count = 0;
-}
-
-bool vehest_method_step(vehest_method *m, const vehest_real sample[VEHEST_CHANNELS], vehest_method_output *output)
-{
-    const vehest_real omega = sample[VEHEST_YAW_RATE]; /* [rad/s] */
-    const vehest_real speed = sample[VEHEST_VX];       /* [m/s] */
     const int32_t own = m->next;
     vehest_real row[6] = {0.0};
-    vehest_real v, u;
-    int32_t at;
     vehest_real position = VEHEST_ABS(omega) * PER_WIDTH; /* along the local models, 0 ... LOCAL - 1 */
 
-    output->vy = VEHEST_NAN;
-    output->vx = VEHEST_NAN;
-    output->yaw_rate = VEHEST_NAN;
-    output->vy_variance = VEHEST_NAN;
     position = position < 1.0 ? position : 1.0;
     for (int p = 0; p < LOCAL; p++) { /* Eq. 9: triangles along |omega| */
         const vehest_real away = VEHEST_ABS(position - (vehest_real)p);
@@ -87,8 +74,8 @@ bool vehest_method_step(vehest_method *m, const vehest_real sample[VEHEST_CHANNE
     }
     m->window[own].omega = omega;
     m->window[own].speed = speed;
-    m->window[own].forced = row[2] * (TAU * (sample[VEHEST_AY] - speed * omega));
-    m->window[own].thrust = TAU * sample[VEHEST_AX];
+    m->window[own].forced = row[2] * (TAU * (ay - speed * omega));
+    m->window[own].thrust = TAU * ax;
     m->window[own].gamma[0] = row[0];
     m->window[own].gamma[1] = row[1];
     m->window[own].beta = row[3];
@@ -102,13 +89,14 @@ bool vehest_method_step(vehest_method *m, const vehest_real sample[VEHEST_CHANNE
     m->window[own].share[0] = 1.0 - m->window[own].share[1];
     m->next = own + 1 < WINDOW ? own + 1 : 0;
     m->count = m->count < WINDOW ? m->count + 1 : WINDOW;
-    if (m->count < WINDOW) {
-        return true; /* vy stays NaN until the window is full */
-    }
+}
 
-    at = m->next; /* the oldest sample */
-    v = 0.0;
-    u = m->window[at].speed;
+/* v one step after a full window, from v = 0 and u^ = u_m at its oldest sample. */
+static vehest_real network_of(const vehest_method *m)
+{
+    int32_t at = m->next;
+    vehest_real v = 0.0, u = m->window[at].speed;
+
     for (int k = 0; k < WINDOW; k++) { /* Eqs. 7 and 8 */
         const vehest_real error = u - m->window[at].speed;
         const vehest_real thrust = m->window[at].thrust + TAU * v * m->window[at].omega;
@@ -138,6 +126,22 @@ bool vehest_method_step(vehest_method *m, const vehest_real sample[VEHEST_CHANNE
         u = m->window[at].gamma[1] * u + m->window[at].beta * thrust - f2;
         at = at + 1 < WINDOW ? at + 1 : 0;
     }
-    output->vy = v;
+    return v;
+}
+
+void vehest_method_start(vehest_method *m)
+{
+    m->next = 0;
+    m->count = 0;
+}
+
+bool vehest_method_step(vehest_method *m, const vehest_real sample[VEHEST_CHANNELS], vehest_method_output *output)
+{
+    output->vy = VEHEST_NAN;
+    output->vx = VEHEST_NAN;
+    output->yaw_rate = VEHEST_NAN;
+    output->vy_variance = VEHEST_NAN;
+    keep(m, sample[VEHEST_YAW_RATE], sample[VEHEST_VX], sample[VEHEST_AY], sample[VEHEST_AX]);
+    output->vy = m->count < WINDOW ? VEHEST_NAN : network_of(m); /* NaN until the window is full */
     return true;
 }
