@@ -311,7 +311,8 @@ def report(found: Mapping[Car, Sequence[Errors]], changed: Sequence[str]) -> str
     ratios = {car: ratio_interval(drives) for car, drives in found.items() if np.isfinite(rmse(drives, "shipped"))}
     limits = {car.title: ratio_interval(found[car], "car not given")[1] for car in ratios if car.title in SHIPS_ON}
     ships = len(limits) == len(SHIPS_ON) and max(limits.values()) <= LARGEST_RATIO
-    rows, drives_below, by_time, ablated, worse = [], [], [], [], []
+    rows, drives_below, by_time, ablated = [], [], [], []
+    worse: list[tuple[str, float, float, float, float]] = []
     for car, drives in found.items():
         title, shares = f"{car.title} ({car.origin})", [fvu(drive, "cold") for drive in drives]
         drives_below += [rmse([drive], "cold") < rmse([drive], "v = 0") for drive in drives]
@@ -349,8 +350,10 @@ def report(found: Mapping[Car, Sequence[Errors]], changed: Sequence[str]) -> str
         ablated="\n".join(table(["car", *ABLATIONS], ablated)),
         worse="\n".join(table(heads, [[name, fixed(speed, 1), *(fixed(one, 2) for one in own)] for name, speed, *own in worse])),
         behind=len(worse),
-        least_zero=fixed(min(row[2] for row in worse), 2),
-        **{name: fixed(max(row[at] for row in worse), 2) for at, name in enumerate(("most_zero", "most_shipped", "most_own"), 2)},
+        least_zero=fixed(min((row[2] for row in worse), default=0.0), 2),
+        most_zero=fixed(max((row[2] for row in worse), default=0.0), 2),
+        most_shipped=fixed(max((row[3] for row in worse), default=0.0), 2),
+        most_own=fixed(max((row[4] for row in worse), default=0.0), 2),
         of_drive=of_drive.title,
         largest_fvu=fixed(fvu(of_drive, "cold"), 2),
         its_own=fixed(rmse([of_drive], "cold"), 2),

@@ -7,8 +7,8 @@
 3. After the warm-up of its window the estimate is finite. Where there is none, v fades from the last one to 0.
 4. A channel that health accuses counts as not measured where the method can do without it; an estimator that remembers starts anew once
    the fault is over (`vehest.trust.verdict`).
-5. The estimate stays within what the last accepted speed allows; at standstill, slower than 0.1 m/s, sideslip is 0. One that does not for 0.3 s, is not finite or raises starts anew,
-   with adapting states, such as tyres, at their fitted values.
+5. The estimate stays within what the last accepted speed allows. One that does not for 0.3 s, is not finite or raises starts anew,
+   with adapting states, such as tyres, at their fitted values. Slower than 0.1 m/s, at standstill, the car has no sideslip: 0.
 """
 
 from __future__ import annotations
@@ -211,7 +211,8 @@ class GuardedRun:
             return both[: len(values)]
 
         vy = later("vy", self.out)
-        channels = {"vy": vy, "sideslip": np.arctan2(vy, vx) * (np.hypot(vx, vy) >= STANDSTILL_SPEED), **{name: later(name, values) for name, values in self.others.items()}}
+        channels = {"vy": vy, "sideslip": np.arctan2(vy, vx) * (np.hypot(vx, vy) >= STANDSTILL_SPEED)}
+        channels |= {name: later(name, values) for name, values in self.others.items()}
         if monitor.has_bands:
             channels |= {"band_vy": later("band_vy", bands[:, 0]), "band_sideslip": later("band_sideslip", bands[:, 1])}
         channels |= {"health": verdict.status, "health_reason": verdict.reason}
