@@ -271,7 +271,7 @@ def _smoothed(estimator: Any, samples: FloatArray, state: kernel.State) -> Float
         state: before the first of them.
     """
     _, _, last = estimator.trace(samples, state)
-    best, n, (mean, deviation), decay = int(np.argmax(last.log_weights)), estimator.numbers(), estimator.prior, estimator.decay
+    best, n, mean, decay = int(np.argmax(last.log_weights)), estimator.numbers(), estimator.prior[0], estimator.decay
     state = kernel.State(*(part.copy() for part in state))
     rows, before = estimator.with_ax(samples).copy(), state.last.copy()
     means, covariances = np.empty((len(rows), kernel.STATES)), np.empty((len(rows), kernel.STATES, kernel.STATES))
