@@ -90,13 +90,9 @@ def test_reference_lever_brings_velocities_to_the_centre_of_gravity():
     np.testing.assert_allclose(moved["sideslip_ref"], np.arctan2(vy, vx))
 
 
-def drive_signal(length=2000):
-    time = np.arange(length) / RATE
-    return 4.0 * np.sin(2 * np.pi * 0.3 * time) + np.sin(2 * np.pi * 1.1 * time + 1.0)
-
-
 def test_outlier_removal_removes_planted_spikes_and_keeps_steps_and_ramps():
-    clean = drive_signal()
+    time = np.arange(2000) / RATE
+    clean = 4.0 * np.sin(2 * np.pi * 0.3 * time) + np.sin(2 * np.pi * 1.1 * time + 1.0)
     spikes = np.random.default_rng(3).choice(np.arange(0, len(clean), 8), 60, replace=False)
     spoilt = clean.copy()
     spoilt[spikes] += np.random.default_rng(4).choice([-1.0, 1.0], 60) * np.random.default_rng(5).uniform(3, 50, 60)

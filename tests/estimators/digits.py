@@ -10,20 +10,14 @@ def _digest(tensors):
     return hashlib.sha256(b"".join(tensor.detach().numpy().tobytes() for tensor in tensors)).hexdigest()
 
 
-def _networks():
+if sys.argv[1] == "networks":
     from test_kernels import STRUCTURES, _problem
 
     for estimator in STRUCTURES[2:5]:  # KS-NN and GRU; an LSTM is compiled as a GRU is
         print(estimator.name, estimator.variant, _digest(_problem(estimator, torch.float32)(True)))
-
-
-def _cars():
+else:
     from test_planar_car import CARS, a_car, through_the_filter
 
     for kind in CARS:
         mean, gradients = through_the_filter(a_car(kind, torch.float32), True, torch.float32)
         print(kind, _digest([mean, *gradients.values()]))
-
-
-if __name__ == "__main__":
-    {"networks": _networks, "cars": _cars}[sys.argv[1]]()

@@ -7,16 +7,7 @@ from scipy.stats import multivariate_normal
 
 from point_models import covariances
 from vehest.filters.noise_levels import high_passed_level
-from vehest.filters.noise_models import (
-    DEVIATION,
-    FLOOR,
-    ConstantNoise,
-    StateDependentNoise,
-    _Products,
-    compiled_noise,
-    entropy,
-    with_entropy,
-)
+from vehest.filters.noise_models import DEVIATION, FLOOR, ConstantNoise, StateDependentNoise, compiled_noise, entropy, with_entropy
 
 STATE, INPUTS = torch.randn(7, 5, generator=torch.Generator().manual_seed(0)), torch.zeros(7, 2)
 START = [1e-3, 1e-3, 1e-2, 1e-2, 1e-5]
@@ -109,14 +100,3 @@ def test_level_of_white_noise_is_its_share_above_the_cutoff_without_slow_signals
     assert high_passed_level([offset], 0.2) == pytest.approx(without, rel=1e-6)
     with pytest.raises(ValueError, match="samples without a gap"):
         high_passed_level([np.zeros(50)], 0.2)
-
-
-def test_products_of_small_factors_and_their_gradients_are_those_of_torch():
-    given = [torch.randn(3, 40, 15, generator=torch.Generator().manual_seed(0)).requires_grad_() for _ in range(2)]
-    lower = torch.zeros(3, 40, 5, 5)
-    lower[..., *torch.tril_indices(5, 5)] = given[0]
-    upstream = torch.randn(3, 40, 5, 5, generator=torch.Generator().manual_seed(1))
-    for product in (lower @ lower.mT, _Products.apply(given[1], 5)):
-        product.backward(upstream)
-    torch.testing.assert_close(_Products.apply(given[1], 5), lower @ lower.mT, rtol=1e-6, atol=1e-6)
-    torch.testing.assert_close(given[1].grad, given[0].grad, rtol=1e-5, atol=1e-5)

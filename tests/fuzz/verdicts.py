@@ -83,7 +83,8 @@ def _about_lines(case, command, outcome):
     if case.honest:
         yield "refused", f"exit code {outcome.exit_code}: {last_line(outcome.stderr)}"
     lines = refusal_lines(outcome.stderr)
-    if not lines and not (_prints_findings(command) and outcome.stdout.strip()):
+    words = [os.fsdecode(word) for word in command.argv[:2]]  # these say on standard output what is wrong, and leave with a code by it
+    if not lines and not ((words[:1] == ["doctor"] or words == ["data", "check"]) and outcome.stdout.strip()):
         yield "silent", f"exit code {outcome.exit_code}"
     if len(lines) > 1 or any(not line.startswith("error: ") for line in lines):
         yield "several lines", f"{len(lines)} lines, first {lines[0][:120]!r}"
@@ -100,22 +101,12 @@ def last_line(text):
     return lines[-1] if lines else ""
 
 
-def _prints_findings(command):
-    """Whether a command says on standard output what is wrong, and leaves with a code by it."""
-    words = [os.fsdecode(word) for word in command.argv[:2]]
-    return words[:1] == ["doctor"] or words == ["data", "check"]
-
-
 def _is_allowed(path, case, command):
     place = case.place.relative_to(case.folder).as_posix()
     roots = [f"{place}/{name}" for name in ("outputs", *command.targets)] + ["tmp"]
-    return any(path == root or path.startswith(f"{root}/") for root in roots) or _is_aside_of(path, roots)
-
-
-def _is_aside_of(path, roots):
-    """Whether a path is what a target is written to first."""
-    folder, _, name = path.rpartition("/")
-    return name.startswith(ASIDE_PREFIX) and any(root.rpartition("/")[0] == folder for root in roots)
+    folder, _, name = path.rpartition("/")  # a target is first written beside it
+    is_aside = name.startswith(ASIDE_PREFIX) and any(root.rpartition("/")[0] == folder for root in roots)
+    return is_aside or any(path == root or path.startswith(f"{root}/") for root in roots)
 
 
 def snapshot(folder):

@@ -204,12 +204,6 @@ def one_round(position, wanted, output, reference, draw):
     return kills, rows
 
 
-def still_wanted(missing):
-    """For the next round: of each stage a kill that is missing most."""
-    chosen = [(stage, max(SIGNALS, key=lambda one, stage=stage: (missing[stage, one], -SIGNALS.index(one)))) for stage in STAGES]
-    return [wanted for wanted in chosen if missing[wanted] > 0]
-
-
 def rounds(missing, draw, scratch, out):
     """Run rounds until every kill was made; how many were bad."""
     os.chdir(scratch)  # runs find the configuration that came with the package
@@ -224,7 +218,9 @@ def rounds(missing, draw, scratch, out):
         while missing.total() > 0:
             if position > limit:
                 raise SystemExit("moments are missed again and again")
-            kills, rows = one_round(position, still_wanted(missing), scratch / f"round{position}", reference, draw)
+            wanted = [(stage, max(SIGNALS, key=lambda one, stage=stage: (missing[stage, one], -SIGNALS.index(one)))) for stage in STAGES]
+            wanted = [kill for kill in wanted if missing[kill] > 0]  # of each stage one that is missing most
+            kills, rows = one_round(position, wanted, scratch / f"round{position}", reference, draw)
             missing -= Counter((kill.stage, kill.number) for kill in kills)
             writer.writerows([number + place, *row] for place, row in enumerate(rows))
             stream.flush()

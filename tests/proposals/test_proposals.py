@@ -646,6 +646,8 @@ def test_files_of_two_cars_are_told_of_and_those_of_one_are_not(tmp_path):
     write(files[1], usual(drive(100.0)).assign(Steer=1.5 * table["Steer"]))
     (remark,) = draft(inspect("my_car", files)).remarks
     assert remark.startswith("handwheel: in 'lap_2', 1.5 times as large in the same turn as in 'lap_1'")
+    write(files[1], usual(drive(100.0)).assign(Steer=0.0))  # a sensor that is not plugged in is no other car
+    assert not any("another car" in one for one in draft(inspect("my_car", files)).remarks)
 
 
 def test_a_speed_without_sign_is_told_of_where_the_car_goes_backwards(tmp_path):

@@ -162,7 +162,7 @@ def test_a_unit_that_the_file_contradicts_is_refused(tmp_path):
 
 
 def test_spellings_are_known_where_they_mean_one_thing():
-    known = {"Â°/s": "deg/s", "1/min": "rpm", "m/s^2": "m/s²", "MPa": "MPa", "mPa": "another unit"}
+    known = {"Â°/s": "deg/s", "1/min": "rpm", "m/s^2": "m/s²", "[m/sec²]": "m/s²", "m/(s^2)": "m/s²", "MPa": "MPa", "mPa": "another unit"}
     unclear = dict.fromkeys(("KN", "Grad"))  # kilonewton or knots; degrees in German, gon elsewhere
     assert {text: plain_unit(text) for text in (known | unclear)} == known | unclear
 

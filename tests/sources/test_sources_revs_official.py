@@ -93,19 +93,17 @@ def with_cell(line, column, text):
     return change
 
 
-def without_lines(first, last):
-    return lambda content: b"".join(line for number, line in enumerate(content.splitlines(True), 1) if not first <= number <= last)
-
-
-def cut_in_row(content):
-    return content[: content.rindex(b",", 0, len(content) - 200)]
-
-
 MALFORMED = {
-    "cut in a row": (cut_in_row, r"Row #\d+: Expected 55 columns, got \d+.* is it truncated"),
+    "cut in a row": (
+        lambda content: content[: content.rindex(b",", 0, len(content) - 200)],
+        r"Row #\d+: Expected 55 columns, got \d+.* is it truncated",
+    ),
     "text": (with_cell(500, "vyCG", "n/a?"), r"column 'vyCG' holds the text 'n/a\?' in data row 488"),
     "blank after the head": (with_cell(500, "vyCG", ""), r"channel 'vy_ref' holds 1 NaN between 0.487 s and 0.487 s"),
-    "no units": (without_lines(12, 12), "line 12 should hold units of the 55 columns"),
+    "no units": (
+        lambda content: b"".join((lines := content.splitlines(True))[:11] + lines[12:]),
+        "line 12 should hold units of the 55 columns",
+    ),
     "UTF-16": (lambda content: content.decode("latin-1").encode("utf-16"), "line 11 should name the columns and has no 'time'"),
 }
 

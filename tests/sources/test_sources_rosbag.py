@@ -149,16 +149,11 @@ def folder(bags, tmp_path):
     return Path(shutil.copytree(bags, tmp_path / "bags"))
 
 
-def filter_gain(pulsation):
-    """What a Savitzky-Golay derivative of second order makes of a rotation: its slope is Σ k·x_k / Σ k²."""
-    k = np.arange(1, WINDOW // 2 + 1)
-    return float((k * np.sin(pulsation * k / 100.0)).sum() / (k**2).sum() * 100.0 / pulsation)
-
-
 def test_a_circle_comes_back_from_its_poses(bags):
     """In body axes the velocity is constant: what is left is the filter's gain, 0.9996 here, and the stamps' nanoseconds."""
     recording = read(bags)
-    gain = filter_gain(YAW_RATE)
+    k = np.arange(1, WINDOW // 2 + 1)  # the slope of a Savitzky-Golay derivative of second order is Σ k·x_k / Σ k²
+    gain = float((k * np.sin(YAW_RATE * k / 100.0)).sum() / (k**2).sum() * 100.0 / YAW_RATE)
     assert gain == pytest.approx(1 - YAW_RATE**2 * 1.18e-3 / 6, abs=1e-6)  # second term: Σk⁴/Σk² = 11.8 samples² at 100 Hz
     for name, expected in (("vx", gain * VX), ("vy", gain * VY), ("yaw_rate", YAW_RATE), ("sideslip", np.arctan2(VY, VX))):
         np.testing.assert_allclose(recording[f"{name}_ref"][WINDOW:-WINDOW], expected, rtol=0, atol=1e-6)  # where no end is touched
@@ -306,10 +301,6 @@ def test_a_misspelt_declaration_is_refused(bags):
         assert said in refused(bags, ConfigurationError, **changes)
 
 
-def real_configuration(root):
-    return yaml.safe_load(CONFIGURATION.read_text(encoding="utf-8").replace("${root}", str(root)))
-
-
 def identify(car, root):
     """Every figure that docs/identify.py prints of a car, by name."""
     parts = runpy.run_path(str(ROOT / "docs" / "identify.py"))[car](root / car)
@@ -330,7 +321,7 @@ def test_declared_constants_of_tables_are_those_that_the_data_show(data_root):
 def test_declared_constants_are_those_that_the_data_show(data_root):
     """Within two of the standard deviations that the script prints; what the publishers' files fix exactly, to a millionth."""
     identified = identify("f1tenth", data_root)
-    declared = real_configuration(data_root)
+    declared = yaml.safe_load(CONFIGURATION.read_text(encoding="utf-8").replace("${root}", str(data_root)))
     channels, pose = declared["channels"], declared["pose"]
     assert abs(pose["yaw"] - identified["body_yaw"]) < 2 * identified["body_yaw_sd"]
     rpm = 1 / channels["vx"]["factor"]

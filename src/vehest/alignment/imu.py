@@ -84,7 +84,10 @@ def fit_imu(recording: Recording, settings: AlignmentSettings, names: Sequence[s
     model = ImuModel(signals)
     start, (predicted, columns) = dict(NOTHING), model(NOTHING)
     if "yaw" in names:
-        start["yaw"] = _turned_by(predicted, model.measured, with_offsets="offset_ax" in names)
+        expected, shown = (rows[0] + 1j * rows[1] for rows in (predicted, model.measured))
+        if "offset_ax" in names:
+            expected, shown = expected - expected.mean(), shown - shown.mean()
+        start["yaw"] = -float(np.angle(np.vdot(expected, shown)))  # brings both together best, without delay and lever arm
     correlation = _cross_correlation(signals, start["yaw"], settings)
     if "delay" in names:
         _require_peak(recording, correlation, settings)
@@ -259,14 +262,6 @@ class Fit:
     def information(self) -> FloatArray:
         """Inverse of the covariance, were the errors white, (P, P)."""
         return np.einsum("pct,qct,c->pq", self.columns, self.columns, self.weights, optimize=True) + self.prior
-
-
-def _turned_by(predicted: FloatArray, measured: FloatArray, *, with_offsets: bool) -> float:
-    """The rotation that brings reference and sensor together best, without delay and lever arm."""
-    expected, shown = (rows[0] + 1j * rows[1] for rows in (predicted, measured))
-    if with_offsets:
-        expected, shown = expected - expected.mean(), shown - shown.mean()
-    return -float(np.angle(np.vdot(expected, shown)))
 
 
 def _cross_correlation(signals: Signals, yaw: float, settings: AlignmentSettings) -> Correlation:

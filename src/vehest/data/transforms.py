@@ -205,8 +205,7 @@ class BridgeImpossible:
         places, changed = np.arange(len(recording)), {}
         for name, samples in recording.channels.items():
             beyond = (samples < CHANNELS[name].low) | (samples > CHANNELS[name].high)
-            near = np.convolve(beyond, around)[len(around) // 2 :][: len(beyond)] > 0.5
-            if 0.0 < near.mean() <= MOST_BRIDGED:
+            if beyond.any() and (near := np.convolve(beyond, around)[len(around) // 2 :][: len(beyond)] > 0.5).mean() <= MOST_BRIDGED:
                 changed[name] = np.where(near, np.interp(places, places[~near], samples[~near]), samples)
         return recording.with_channels(changed)
 

@@ -124,7 +124,9 @@ class Estimator(ABC):
         if not own and len(bases) == 1:
             return
         kinds = {name: cls.__annotations__[name] for name in own}
-        described = [(name, _optional(kind) if own[name].default is None else kind, own[name]) for name, kind in kinds.items()]
+        optional = [name for name, value in own.items() if value.default is None]
+        kinds |= {name: f"{kind} | None" if isinstance(kind := kinds[name], str) else kind | None for name in optional}
+        described = [(name, kind, own[name]) for name, kind in kinds.items()]
         cls.settings_type = make_dataclass("settings_type", described, bases=tuple(bases), frozen=True)
         cls.settings_type.__module__, cls.settings_type.__qualname__ = cls.__module__, f"{cls.__qualname__}.settings_type"
         for name in own:
@@ -371,8 +373,3 @@ class RunStepper(Stepper):
             row_of_vy = estimator.covariance_of.index("vy")
             values["vy_variance"] = float(covariance[0, row_of_vy, row_of_vy])
         return values
-
-
-def _optional(kind: Any) -> Any:
-    """A type, or its name as an annotation has it, or None."""
-    return f"{kind} | None" if isinstance(kind, str) else kind | None

@@ -174,17 +174,13 @@ class RationalFilter(SideslipFilter):
     def variant(self) -> str:
         """The paper's name for these tyres, and whether the filter is another one, holds them straight ahead, or has a gate."""
         kind = KINDS[self.tyres][0] + ("_ukf" if self.filter == "unscented" else "")
-        return kind + ("_held" if self._holds else "") + self.gate_suffix
+        return kind + ("_held" if self.adapted and self.adapt_above > 0.0 else "") + self.gate_suffix
 
     @property
     def full_title(self) -> str:
         """The paper's name for these tyres, and the filter."""
-        held = ", tyres held straight ahead" if self._holds else ""
+        held = ", tyres held straight ahead" if self.adapted and self.adapt_above > 0.0 else ""
         return f"{KINDS[self.tyres][1]}, {self.filter} Kalman filter{held}{self.gate_title}"
-
-    @property
-    def _holds(self) -> bool:
-        return bool(self.adapted) and self.adapt_above > 0.0
 
     @property
     def n_parameters(self) -> int:
@@ -237,7 +233,7 @@ class RationalFilter(SideslipFilter):
             metrics |= {"evaluations": search.evaluations, "best_train_loss": search.cost, "levels_at_limits": int(at_limits.sum())}
             self.values = extended._calibrated(search.best[:n], drives)
             interrupted = search.interrupted
-        if data.validation and all(_has_reference(recording) for recording in data.validation):
+        if data.validation and all("sideslip_ref" in own or "vy_ref" in own for own in data.validation):
             skip = round(training.skip_seconds * self.rate_hz)
             metrics["best_validation_loss"] = self._cost(self._drives(data.validation), self.values, skip)
         metrics |= {f"noise_{name}": self.values[name] for name in self.level_names}
@@ -535,13 +531,9 @@ def _covariances_of_logarithms(motion: AxleMotion, kind: Literal["linear", "rati
     return found
 
 
-def _has_reference(recording: Recording) -> bool:
-    return "sideslip_ref" in recording or "vy_ref" in recording
-
-
 def _reference(recording: Recording) -> FloatArray:
     """Reference sideslip [rad], (T,)."""
-    if not _has_reference(recording):
+    if "sideslip_ref" not in recording and "vy_ref" not in recording:
         raise DataError(f"recording '{recording.id}' has neither sideslip_ref nor vy_ref to tune noise levels on; set training.method=data")
     return recording["sideslip_ref"] if "sideslip_ref" in recording else np.arctan2(recording["vy_ref"], recording["vx"])
 

@@ -7,7 +7,7 @@ import time
 from collections import namedtuple
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
-from functools import cache
+from functools import cache, partial
 from typing import Any, ClassVar
 
 import numba
@@ -19,6 +19,8 @@ from vehest.data.recording import Recording
 from vehest.estimators.base import Estimator, FitData, FitRecord, require_learnable, require_shapes
 from vehest.training.context import FitContext, NoTraining
 from vehest.training.search import nelder_mead_over_grid
+
+_numbers_type: Any = cache(partial(namedtuple, "Numbers"))  # one type a family, so that numba compiles its ``step`` once
 
 
 def compiled(step: Callable[..., Any]) -> Any:
@@ -155,12 +157,6 @@ class Recursive(Estimator):
 def _fitted_number(name: str) -> property:
     """Attribute of an estimator that is one of its ``values``."""
     return property(lambda own: own.values[name], lambda own, value: own.values.update({name: float(value)}))
-
-
-@cache
-def _numbers_type(names: tuple[str, ...]) -> Any:
-    """One type a family, so that numba compiles its ``step`` once."""
-    return namedtuple("Numbers", names)
 
 
 @numba.njit(error_model="numpy")

@@ -270,7 +270,8 @@ def split_noise(series: Sequence[FloatArray], rate_hz: float) -> Noise:
     """
     block = max(round(BLOCK_SECONDS * rate_hz), 1)
     means = [samples[: len(samples) // block * block].reshape(-1, block).mean(1) for samples in series]
-    lags = [_covariance(means, lag) for lag in range(3)]
+    products = [[own[lag:] * own[: len(own) - lag] for own in means if len(own) > lag] for lag in range(3)]
+    lags = [float(np.concatenate(own).mean()) if own else 0.0 for own in products]
     variance = _rms(series) ** 2
     if not min(lags[:2]) > 0:
         return Noise(min(max(lags[0], 0.0) * BLOCK_SECONDS, variance / rate_hz), 0.0, SLOW_SECONDS[0])
@@ -281,12 +282,6 @@ def split_noise(series: Sequence[FloatArray], rate_hz: float) -> Noise:
     slow = min(lags[1] / (ratio * apart), lags[0] / together)
     white = min((lags[0] - slow * together) * BLOCK_SECONDS, max(variance - slow, 0.0) / rate_hz)
     return Noise(max(white, 0.0), math.sqrt(slow), BLOCK_SECONDS / x)
-
-
-def _covariance(series: Sequence[FloatArray], lag: int) -> float:
-    """Mean product of values so many apart, about zero."""
-    products = [own[lag:] * own[: len(own) - lag] for own in series if len(own) > lag]
-    return float(np.concatenate(products).mean()) if products else 0.0
 
 
 def gauss_markov(series: Sequence[FloatArray], rate_hz: float) -> Noise:
@@ -336,15 +331,11 @@ def _unexplained(series: Sequence[tuple[FloatArray, FloatArray, FloatArray]], ra
 
 
 def _fitted_axle(parts: Sequence[Drive], inputs: set[str], front: bool) -> Axle:
-    columns = [_axle_columns(own, inputs, front) for own in parts]
-    coefficients = np.linalg.lstsq(np.concatenate(columns), np.concatenate([_target(own, front) for own in parts]), rcond=None)[0]
-    left = [_target(own, front) - known @ coefficients for own, known in zip(parts, columns, strict=True)]
+    columns = [_axle_columns(own, inputs, front) for own in parts]  # slip and arm make up v, or v - δ u
+    targets = [own.vy_ref - own.inputs["steer"] * own.inputs["vx"] if front else own.vy_ref for own in parts]
+    coefficients = np.linalg.lstsq(np.concatenate(columns), np.concatenate(targets), rcond=None)[0]
+    left = [target - known @ coefficients for target, known in zip(targets, columns, strict=True)]
     return Axle(coefficients, split_noise(left, parts[0].rate_hz))
-
-
-def _target(drive: Drive, front: bool) -> FloatArray:
-    """v, or v - δ u, of which an axle's slip and arm make up the rest."""
-    return drive.vy_ref - drive.inputs["steer"] * drive.inputs["vx"] if front else drive.vy_ref
 
 
 def _axle_columns(drive: Drive, inputs: set[str], front: bool) -> FloatArray:

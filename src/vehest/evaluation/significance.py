@@ -7,7 +7,6 @@ from dataclasses import dataclass
 
 import numpy as np
 import scipy
-from numpy.typing import NDArray
 
 from vehest.constants import FloatArray
 from vehest.data.errors import DataError
@@ -180,18 +179,13 @@ def _resampled(pairs: Sequence[Pair], sizes: FloatArray, n_resamples: int) -> Fl
                     continue
                 for side, own in enumerate(pair):
                     if (id(own), side) not in known:
-                        known[id(own), side] = _mean_and_median(counts @ own.T / (counts @ sizes)[:, None], seeds[side])
+                        losses = np.take_along_axis(counts @ own.T / (counts @ sizes)[:, None], seeds[side], axis=1)
+                        fewer = losses[:, : max(len(own) - 1, 1)]
+                        known[id(own), side] = fewer.mean(axis=1), np.median(losses if len(own) > 2 else fewer, axis=1)
                 (first, first_median), (second, second_median) = (known[id(own), side] for side, own in enumerate(pair))
                 with np.errstate(invalid="ignore"):
                     drawn[position, :, part] = first - second, first_median - second_median, np.sqrt(first) - np.sqrt(second)
     return drawn
-
-
-def _mean_and_median(losses: FloatArray, seeds: NDArray[np.int64]) -> tuple[FloatArray, FloatArray]:
-    """Over the drawn seeds of each resample, (n,), of losses (n, S)."""
-    drawn = np.take_along_axis(losses, seeds, axis=1)
-    fewer = drawn[:, : max(losses.shape[1] - 1, 1)]
-    return fewer.mean(axis=1), np.median(drawn if losses.shape[1] > 2 else fewer, axis=1)
 
 
 def _degrees_of_freedom(sums: Sequence[FloatArray], sizes: FloatArray, means: Sequence[FloatArray]) -> float:

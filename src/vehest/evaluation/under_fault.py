@@ -52,7 +52,7 @@ def errors_under_fault(parts: Sequence[Scored], nominal: Sequence[Scored], windo
     """
     found = {}
     pairs = list(zip(parts, windows, strict=True))
-    during = [_during(part.time, window) for part, window in pairs]
+    during = [(part.time >= window[0] - _CLOCK) & (part.time < window[1] - _CLOCK) for part, window in pairs]
     after = [part.time >= window[1] + SETTLED_SECONDS - _CLOCK for part, window in pairs]
     for subset, masks in ((FAULTED, during), (AFTER, after)):
         if any(mask.any() for mask in masks):
@@ -71,7 +71,7 @@ def flags_under_fault(parts: Sequence[Scored], flagged: Sequence[Flags], windows
     """
     inside, valid, delays, undetected = [], [], [], []
     for part, (band, health), window in zip(parts, flagged, windows, strict=True):
-        during = _during(part.time, window)
+        during = (part.time >= window[0] - _CLOCK) & (part.time < window[1] - _CLOCK)
         error = np.remainder(part.sideslip - part.sideslip_ref + np.pi, 2.0 * np.pi) - np.pi
         known = during & np.isfinite(band)
         inside.append((np.abs(error) <= band)[known])
@@ -89,10 +89,6 @@ def flags_under_fault(parts: Sequence[Scored], flagged: Sequence[Flags], windows
     if delays:
         figures |= {"missed_detections": (len(delays) - len(found)) / len(delays), "max_error_sideslip_undetected": max(undetected)}
     return figures
-
-
-def _during(time: FloatArray, window: Window) -> NDArray[np.bool_]:
-    return (time >= window[0] - _CLOCK) & (time < window[1] - _CLOCK)
 
 
 def _errors(parts: Sequence[Scored], masks: Sequence[NDArray[np.bool_]]) -> dict[str, float]:

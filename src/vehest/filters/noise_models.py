@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import Any
 
 import numba
 import numpy as np
@@ -52,9 +51,7 @@ class ConstantNoise(nn.Module):
     def forward(self, state: Tensor, inputs: Tensor) -> Tensor:
         """The covariance, (..., n, n), the same for every state (..., k)."""
         factor = self.factor * self.unit[_lower(self.n)[0]] * self.learnt
-        lower = factor.new_zeros(self.n, self.n)
-        lower[_lower(self.n)] = factor
-        return (lower @ lower.mT + FLOOR * torch.eye(self.n, dtype=factor.dtype)).expand(*state.shape[:-1], self.n, self.n)
+        return _product(factor, self.n, FLOOR).expand(*state.shape[:-1], self.n, self.n)
 
 
 class StateDependentNoise(nn.Module):
@@ -97,8 +94,8 @@ class StateDependentNoise(nn.Module):
     def forward(self, state: Tensor, inputs: Tensor) -> Tensor:
         """The covariance of each state, (..., n, n)."""
         factor = nn.functional.linear(state / self.state_unit, self.weight, self.offset) * self.unit[_lower(self.constant.n)[0]]
-        varying: Tensor = _Products.apply(factor * self.constant.learnt, self.constant.n)  # type: ignore[no-untyped-call]
-        return self.constant(state, inputs) + SCALE * varying
+        factor = factor * self.constant.learnt
+        return self.constant(state, inputs) + SCALE * _product(factor, self.constant.n, 0.0)
 
 
 def entropy(covariance: Tensor) -> Tensor:
@@ -113,47 +110,12 @@ def with_entropy(covariance: Tensor, least: float) -> Tensor:
     return torch.exp(2.0 / covariance.shape[-1] * short)[..., None, None] * covariance
 
 
-class _Products(torch.autograd.Function):
-    """L Lᵀ of the entries of L row by row, (..., n (n + 1) / 2) -> (..., n, n), with the bits of torch's, which is made for larger n."""
-
-    @staticmethod
-    def forward(ctx: Any, factor: Tensor, n: int) -> Tensor:
-        ctx.entries = factor.detach().contiguous().numpy().reshape(-1, factor.shape[-1])
-        out = np.empty((len(ctx.entries), n, n), ctx.entries.dtype)
-        _products(ctx.entries, out)
-        return torch.from_numpy(out).reshape(*factor.shape[:-1], n, n)
-
-    @staticmethod
-    def backward(ctx: Any, *upstream: Tensor) -> tuple[Tensor | None, ...]:
-        (bars,), out = upstream, np.empty_like(ctx.entries)
-        _products_adjoint(ctx.entries, bars.contiguous().numpy().reshape(-1, *bars.shape[-2:]), out)
-        return torch.from_numpy(out).reshape(*bars.shape[:-2], -1), None
-
-
-@numba.njit(cache=True, nogil=True, error_model="numpy")
-def _products(entries, out):  # type: ignore[no-untyped-def]
-    n = out.shape[1]
-    for b in range(len(entries)):
-        for i in range(n):
-            for j in range(i + 1):
-                total = entries.dtype.type(0)
-                for k in range(j + 1):
-                    total += entries[b, i * (i + 1) // 2 + k] * entries[b, j * (j + 1) // 2 + k]
-                out[b, i, j] = out[b, j, i] = total
-
-
-@numba.njit(cache=True, nogil=True, error_model="numpy")
-def _products_adjoint(entries, bars, out):  # type: ignore[no-untyped-def]
-    n = bars.shape[1]
-    for b in range(len(entries)):
-        for i in range(n):
-            for j in range(i + 1):
-                along = across = entries.dtype.type(0)
-                for k in range(j, n):
-                    value = entries[b, k * (k + 1) // 2 + j]
-                    along += bars[b, i, k] * value
-                    across += value * bars[b, k, i]
-                out[b, i * (i + 1) // 2 + j] = along + across
+def _product(factor: Tensor, n: int, floor: float) -> Tensor:
+    """L Lᵀ + floor · I of the entries of L row by row, (..., n (n + 1) / 2) -> (..., n, n)."""
+    rows, columns = _lower(n)
+    lower = factor.new_zeros(*factor.shape[:-1], n, n)
+    lower[..., rows, columns] = factor
+    return lower @ lower.mT + floor * torch.eye(n, dtype=factor.dtype, device=factor.device)
 
 
 def _lower(n: int) -> tuple[Tensor, Tensor]:

@@ -339,7 +339,7 @@ class _Scan(torch.autograd.Function):
         noises[0][-1] = 0  # no step leads on from the last sample
         measured, mean, covariance = (np.empty_like(part) for part in (tape.innovation, tape.post_mean[0], tape.post_covariance[0]))
         posts = zip(upstream, (tape.post_mean, tape.post_covariance), strict=True)
-        bars = (*noises, measured, *(np.zeros_like(like) if part is None else _by_time(part) for part, like in posts))
+        bars = (*noises, measured, *(room(own.shape, own.dtype, np.zeros) if part is None else _by_time(part) for part, own in posts))
         gradients: dict[int, list[Array]] = {}
 
         def work(first: int, end: int) -> None:

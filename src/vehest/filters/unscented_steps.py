@@ -40,10 +40,10 @@ ARGUMENTS: dict[str, Any] = {
 piece = numba.njit(forceinline=True, no_cpython_wrapper=True, no_cfunc_wrapper=True, error_model="numpy", boundscheck=False)
 
 
-def room(shape: tuple[int, ...], dtype: Any) -> Any:
-    """An array, not filled, that vectors may be read beyond."""
+def room(shape: tuple[int, ...], dtype: Any, make: Any = np.empty) -> Any:
+    """An array that vectors may be read beyond, not filled or as ``make`` fills it."""
     count, size = math.prod(shape), np.dtype(dtype).itemsize
-    return np.empty(count + BYTES // size, dtype)[:count].reshape(shape)
+    return make(count + BYTES // size, dtype)[:count].reshape(shape)
 
 
 def types_of(step: Any, dtype: Any) -> tuple[Any, ...]:

@@ -255,17 +255,13 @@ def _markdown(document: Document, numbers: Mapping[int, str]) -> str:
             parts.append(_harmless(block.strip()))
         elif isinstance(block, Table):
             parts.append(f"**{numbers[position]}.** {_harmless(block.caption)} ([CSV](tables/{block.name}.csv))")
-            parts.append(_pipe_table(block))
+            headers, rows, numeric = formatted(block)
+            lines = [headers, ["--:" if is_number else ":--" for is_number in numeric], *rows]
+            parts.append("\n".join("| " + " | ".join(_in_pipes(cell) for cell in line) + " |" for line in lines))
         else:
             parts.append(f"![{_spoken(block.caption)}](figures/{block.name}.png)")
             parts.append(f"**{numbers[position]}.** {_harmless(block.caption)} ([SVG](figures/{block.name}.svg))")
     return "\n\n".join(parts) + "\n"
-
-
-def _pipe_table(table: Table) -> str:
-    headers, rows, numeric = formatted(table)
-    lines = [headers, ["--:" if is_number else ":--" for is_number in numeric], *rows]
-    return "\n".join("| " + " | ".join(_in_pipes(cell) for cell in line) + " |" for line in lines)
 
 
 def _in_pipes(cell: str) -> str:

@@ -166,12 +166,12 @@ class Reliability:
 
 def reliability_figure(levels: Sequence[float], rows: Sequence[Reliability]) -> MatplotlibFigure:
     """Coverage over nominal level, one line an estimator with its name at the end; on the diagonal bands say what they hold."""
-    nominal = np.array(levels)
+    nominal, aside = np.array(levels), SIDESTEP * (np.arange(len(rows)) - 0.5 * (len(rows) - 1))
     with new_figure(SINGLE_COLUMN * 1.55, 3.2) as figure:
         axes = figure.add_subplot()
         axes.plot([0.0, 1.0], [0.0, 1.0], color=REFERENCE.colour, linewidth=0.7)
         for position, row in enumerate(rows):
-            at = nominal + _aside(position, len(rows))
+            at = nominal + aside[position]
             axes.vlines(at, row.low, row.high, color=row.line.colour, linewidth=0.8, alpha=0.6)
             axes.plot(at, row.coverage, color=row.line.colour, linestyle=row.line.dash, marker=row.line.marker)
         lowest = float(np.nanmin([[row.coverage.min(), np.nanmin(row.low, initial=1.0)] for row in rows]))
@@ -186,7 +186,7 @@ def reliability_figure(levels: Sequence[float], rows: Sequence[Reliability]) -> 
         for position, (row, height) in enumerate(zip(rows, heights, strict=True)):
             axes.annotate(
                 row.label,
-                (float(nominal[-1]) + _aside(position, len(rows)), float(row.coverage[-1])),
+                (float(nominal[-1] + aside[position]), float(row.coverage[-1])),
                 (1.02, height),
                 color=row.line.colour,
                 fontsize=6.5,
@@ -195,10 +195,6 @@ def reliability_figure(levels: Sequence[float], rows: Sequence[Reliability]) -> 
                 arrowprops={"arrowstyle": "-", "color": row.line.colour, "linewidth": 0.4, "shrinkA": 1, "shrinkB": 2, "relpos": (0, 0.5)},
             )
     return figure
-
-
-def _aside(position: int, count: int) -> float:
-    return SIDESTEP * (position - 0.5 * (count - 1))
 
 
 def _apart(heights: Sequence[float], step: float, top: float) -> list[float]:

@@ -145,7 +145,7 @@ def estimate_file(words: Sequence[str], out: Path, *, strict: bool = False, car:
             note("compiling once, about 20 s")
         if any(key_of(override).split(".")[0] == "downsample" for override in overrides):
             model.preparation = config["downsample"]
-        run, log = _run_on(model, trust, first), out.suffix.lower() in LOGS
+        run, log = GuardedRun(model, trust, elsewhere=is_other_vehicle(trust, first)), out.suffix.lower() in LOGS
         report = _Report(model, trust, accepted, f"'{file}'" if strict else None)
         drive = report.checked(chain([(first, known)], parts))
         if log or not run.takes_parts:
@@ -275,12 +275,8 @@ def wheelbase_findings(recording: Recording, wheelbase: float | None) -> list[Fi
 
 def estimate_recording(model: Estimator, recording: Recording, trust: Trust | None = None) -> Estimate:
     """Bring a recording to the model's rate and run the model on it, guarded as online (`vehest.trust.contract`); raises `DataError`."""
-    needed = prepared_recording(model, recording)
-    return require_estimate(model, recording, _run_on(model, trust, recording)(needed.channels, needed))
-
-
-def _run_on(model: Estimator, trust: Trust | None, recording: Recording) -> GuardedRun:
-    return GuardedRun(model, trust, elsewhere=is_other_vehicle(trust, recording))
+    needed, run = prepared_recording(model, recording), GuardedRun(model, trust, elsewhere=is_other_vehicle(trust, recording))
+    return require_estimate(model, recording, run(needed.channels, needed))
 
 
 def prepared_recording(model: Estimator, recording: Recording, rate_hz: float | None = None) -> Recording:

@@ -122,7 +122,7 @@ class Tracker:
             remove_leftovers(self.output)
             if not store.exists():
                 with written_aside(store) as aside:  # a process that is killed here leaves no store with half of its tables
-                    MlflowClient(_sqlite(aside)).search_experiments(max_results=1)
+                    MlflowClient(f"sqlite:///{aside.resolve()}").search_experiments(max_results=1)
             address = f"{regular_file(store).resolve().as_uri()}?mode=rw"
             with closing(sqlite3.connect(address, uri=True)) as connection:  # MLflow retries a damaged store for hours
                 connection.execute("select name from sqlite_master").fetchall()
@@ -141,11 +141,7 @@ class Tracker:
 
     @property
     def _address(self) -> str:
-        return str(self.config.get("uri") or _sqlite(self.output / STORE))
-
-
-def _sqlite(file: Path) -> str:
-    return f"sqlite:///{file.resolve()}"
+        return str(self.config.get("uri") or f"sqlite:///{(self.output / STORE).resolve()}")
 
 
 def _flattened(config: Mapping[str, Any], prefix: str = "") -> dict[str, str]:

@@ -102,7 +102,7 @@ def usability(
     settings, without = _settings_without(config, missing.unsupplied, recordings, to_estimate)
     patterns = estimator.unmatched_patterns(training, [one.id for one in recordings]) if recordings else ()
     own_rate = estimator.settings.rate_hz
-    rate, gappy = min([own_rate, *(one.rate_hz for one in both)]), _gappy(both)
+    rate, gappy = min([own_rate, *(one.rate_hz for one in both)]), {name for one in both for name in one.gappy}
     gaps = tuple(channel for channel in estimator.channels if channel in gappy and channel not in estimator.skippable)
     return Usability(name, rate, own_rate, missing, gaps, settings, without, patterns, car=car_parameters(own))
 
@@ -204,13 +204,10 @@ def lacking_to_train(estimator: Estimator, training: Any, channels: Collection[s
 
 
 def _with_supplies(read: Sequence[str], learnt: Sequence[str], recordings: Sequence[RecordingSummary]) -> Missing:
-    held, gappy, rate = common_channels(recordings), _gappy(recordings), min((own.rate_hz for own in recordings), default=0.0)
+    held, gappy = common_channels(recordings), frozenset(name for own in recordings for name in own.gappy)
+    rate = min((own.rate_hz for own in recordings), default=0.0)
     supplies = {name: derivation_of(name, held, gappy, rate) for name in (*read, *learnt)}
     return Missing(list(dict.fromkeys(read)), list(dict.fromkeys(learnt)), supplies)
-
-
-def _gappy(recordings: Sequence[RecordingSummary]) -> frozenset[str]:
-    return frozenset(name for recording in recordings for name in recording.gappy)
 
 
 def _settings_without(

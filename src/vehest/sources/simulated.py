@@ -95,7 +95,7 @@ class SimulatedSource(Source):
 
     def inputs(self) -> dict[str, str | Path]:
         """The multi-body plant's library and its version, where a vehicle is driven by it; there are no files."""
-        if all(_is_planar(vehicle) for vehicle in self.vehicles.values()):
+        if all(vehicle.get("plant") == PLANAR for vehicle in self.vehicles.values()):
             return {}
         return {"commonroad-vehicle-models": metadata.version("commonroad-vehicle-models")}
 
@@ -121,10 +121,13 @@ class SimulatedSource(Source):
         from vehest.simulation.sensors.config import sensor_levels_from_config
 
         drive, seed = self.drives[drive_id], self.seed_of(drive_id)
-        vehicle = self._vehicle_of(drive)
+        name = next(iter(self.vehicles)) if drive.vehicle is None and len(self.vehicles) == 1 else str(drive.vehicle)
+        if name not in self.vehicles:
+            raise ConfigurationError(f"drive '{drive.id}': vehicle '{name}' is not one of: {', '.join(self.vehicles)}")
+        vehicle = self.vehicles[name]
         stability_control = self.options.stability_control if drive.stability_control is None else drive.stability_control
         sensors = self.sensors if drive.sensors is None else sensor_levels_from_config(drive.sensors)
-        manoeuvres: Mapping[str, Any] = PLANAR_MANOEUVRES if _is_planar(vehicle) else MANOEUVRES
+        manoeuvres: Mapping[str, Any] = PLANAR_MANOEUVRES if vehicle.get("plant") == PLANAR else MANOEUVRES
         return partial(
             _simulator_of(vehicle, variations, seed, drive, stability_control),
             id=drive_id,
@@ -160,16 +163,6 @@ class SimulatedSource(Source):
             drives |= dict.fromkeys(own, entry)
         return drives
 
-    def _vehicle_of(self, drive: Drive) -> Mapping[str, Any]:
-        name = next(iter(self.vehicles)) if drive.vehicle is None and len(self.vehicles) == 1 else str(drive.vehicle)
-        if name not in self.vehicles:
-            raise ConfigurationError(f"drive '{drive.id}': vehicle '{name}' is not one of: {', '.join(self.vehicles)}")
-        return self.vehicles[name]
-
-
-def _is_planar(vehicle: Mapping[str, Any]) -> bool:
-    return vehicle.get("plant") == PLANAR
-
 
 def _simulator_of(
     vehicle: Mapping[str, Any], variations: Sequence[Any], seed: int, drive: Drive | None = None, stability_control: bool = False
@@ -181,7 +174,7 @@ def _simulator_of(
     from vehest.simulation.plant.parameters import loaded, vehicle_from_configuration
 
     payload, tyres = (drive.payload, drive.tyres) if drive else (None, None)
-    if _is_planar(vehicle):
+    if vehicle.get("plant") == PLANAR:
         if payload or tyres:
             raise ConfigurationError(f"vehicle '{vehicle.get('name')}': payload and tyres are of the multi-body plant only; leave them out")
         if stability_control:

@@ -270,6 +270,8 @@ def _leaderboard_table(artefacts: PartArtefacts, board: pd.DataFrame, name: str,
     decimals, has_bound = decimals_for(frame["rmse_sideslip"].tolist()), frame[_BOUND].notna().any()
     bound = " Bound: the Cramér-Rao bound for what the estimator reads, as in the table of floors."
     frame["interval"] = [interval_in_words(row, decimals) for row in frame.to_dict("records")]
+    folders = {(*model.name, model.seed): model.model_folder for model in artefacts.models}
+    chosen = [folders[row["estimator"], row["variant"], row["seed"]] for row in board.to_dict("records")]
     standing = Table(
         name,
         f"Estimators on test set `{test_set}`. RMSE(β) is taken over all seeds together, the lowest first, with its 95 % interval for "
@@ -292,7 +294,8 @@ def _leaderboard_table(artefacts: PartArtefacts, board: pd.DataFrame, name: str,
             "fvu": Column("FVU"),
             **({_BOUND: Column("bound [deg]", decimals=decimals)} if has_bound else {}),
         },
-        _links(artefacts, board),
+        # a report lies beside the other stages' folders, at OUTPUT/report/STUDY-KEY
+        [ModelLink(f"../../{own.parent.name}/{own.name}/", f"vehest estimate {own.name} lap.csv -o out.parquet") for own in chosen],
     )
     seeds = Table(
         f"{name}_seeds",
@@ -314,13 +317,6 @@ def _leaderboard_table(artefacts: PartArtefacts, board: pd.DataFrame, name: str,
         },
     )
     return [standing, seeds]
-
-
-def _links(artefacts: PartArtefacts, board: pd.DataFrame) -> list[ModelLink]:
-    """The chosen seed's model of each row; a report lies beside the other stages' folders, at OUTPUT/report/STUDY-KEY."""
-    folders = {(*model.name, model.seed): model.model_folder for model in artefacts.models}
-    rows = [folders[row["estimator"], row["variant"], row["seed"]] for row in board.to_dict("records")]
-    return [ModelLink(f"../../{own.parent.name}/{own.name}/", f"vehest estimate {own.name} lap.csv -o out.parquet") for own in rows]
 
 
 def _shown(board: pd.DataFrame, named: Name | None = None) -> pd.DataFrame:

@@ -95,7 +95,9 @@ def curves_of(parts: Sequence[PartArtefacts]) -> list[Curve]:
 def _curve(test_set: str, parts: Sequence[PartArtefacts]) -> Curve:
     models: dict[tuple[str, str, str, float], list[EvaluatedModel]] = {}
     for part in parts:
-        minutes = _asked_for(part, minutes_of(part))
+        named, there = re.search(r"_([\d.]+)min(_at_[\d.]+)?$", part.split.name), minutes_of(part)
+        wanted = float(named[1]) if named is not None else math.nan  # by split.minutes, which the split's name then ends in
+        minutes = wanted if abs(there - wanted) <= NEARLY * wanted else round(there, 2)
         for model in part.models:
             models.setdefault((*model.name, start_of(model.training), minutes), []).append(model)
     counts = Counter((estimator, variant) for estimator, variant, _, _ in models)
@@ -117,13 +119,6 @@ def _same(plain: Point, tuned: Point) -> bool:
     """Whether two points differ in what their trainings start from alone."""
     same = (plain.estimator, plain.variant, plain.minutes) == (tuned.estimator, tuned.variant, tuned.minutes)
     return same and plain.start == SCRATCH != tuned.start
-
-
-def _asked_for(part: PartArtefacts, minutes: float) -> float:
-    """The minutes that ``split.minutes`` asked for, which the split's name ends in, where there are about as many; else those there are."""
-    named = re.search(r"_([\d.]+)min(_at_[\d.]+)?$", part.split.name)
-    asked = float(named[1]) if named is not None else math.nan
-    return asked if abs(minutes - asked) <= NEARLY * asked else round(minutes, 2)
 
 
 def start_of(training: Mapping[str, object]) -> str:

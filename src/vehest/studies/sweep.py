@@ -71,7 +71,7 @@ class SweepArtefacts:
             rows.append(row)
         table = pd.DataFrame(rows)
         table["chosen"] = False
-        if VALIDATION in self.sets and not any(is_of_fault(key) for key in self.keys):
+        if VALIDATION in self.sets and not any(key.split(".")[0] == "fault" for key in self.keys):
             mean = table[f"{METRIC}.{VALIDATION}"].where(table["n_failed"] == 0).to_numpy(dtype=float)
             if np.isfinite(mean).any():
                 table.loc[int(np.argmin(np.where(np.isfinite(mean), mean, np.inf))), "chosen"] = True
@@ -92,11 +92,6 @@ def build(artefacts: SweepArtefacts) -> Document:
     if any(model.estimator == "ksnn" for model in part.models):
         blocks.append(PATENT_NOTE)
     return Document(f"Sweep {part.study}", blocks)
-
-
-def is_of_fault(key: str) -> bool:
-    """Whether a key says under which fault is evaluated, rather than what is trained."""
-    return key.split(".")[0] == "fault"
 
 
 def interval(values: FloatArray) -> tuple[float, float]:
@@ -245,7 +240,7 @@ def _kinds(artefacts: SweepArtefacts, name: str) -> str:
 
 
 def _chosen_sentence(artefacts: SweepArtefacts) -> str:
-    if any(is_of_fault(key) for key in artefacts.keys):
+    if any(key.split(".")[0] == "fault" for key in artefacts.keys):
         return "No combination is chosen: the combinations differ in faults, which are conditions of the evaluation and no settings."
     table = artefacts.table
     if not table["chosen"].any():

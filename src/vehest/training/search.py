@@ -126,7 +126,9 @@ def optuna_search(
     for stage in range(stages):
         if rows:
             best, width = _record(rows, len(rows), False).best, width * shrink
-            own = [_around(value, low, high, width * (high - low)) for value, (low, high) in zip(best, box, strict=True)]
+            widths = [width * (high - low) for low, high in box]  # of ranges about the best, moved inside the bounds
+            starts = [min(max(v - 0.5 * w, low), high - w) for v, w, (low, high) in zip(best, widths, box, strict=True)]
+            own = [(start, start + w) for start, w in zip(starts, widths, strict=True)]
         share = trials * (stage + 1) // stages - trials * stage // stages
         study = optuna.create_study(sampler=optuna.samplers.TPESampler(seed=seed + stage))
         distributions = {str(k): optuna.distributions.FloatDistribution(low, high) for k, (low, high) in enumerate(own)}
@@ -141,9 +143,3 @@ def optuna_search(
             study.tell(trial, float(rows[-1][-1]))
             context.on_progress(Progress(number + 1, share, 1, 1, lowest))
     return _record(rows, len(rows), False)
-
-
-def _around(value: float, low: float, high: float, width: float) -> tuple[float, float]:
-    """A range of this width about a value, moved inside the bounds."""
-    start = min(max(value - 0.5 * width, low), high - width)
-    return start, start + width

@@ -211,7 +211,7 @@ class GuardedRun:
             return both[: len(values)]
 
         vy = later("vy", self.out)
-        channels = {"vy": vy, "sideslip": np.arctan2(vy, vx) * (np.hypot(vx, vy) >= STANDSTILL_SPEED)}
+        channels = {"vy": vy, "sideslip": np.where(np.hypot(vx, vy) < STANDSTILL_SPEED, 0.0, np.arctan2(vy, vx))}
         channels |= {name: later(name, values) for name, values in self.others.items()}
         if monitor.has_bands:
             channels |= {"band_vy": later("band_vy", bands[:, 0]), "band_sideslip": later("band_sideslip", bands[:, 1])}
@@ -321,7 +321,8 @@ class GuardedStepper(Stepper):
         if not math.isnan(motion[0, 0]):
             self._vx[0] = motion[0, 0]
         bands = self._monitor.after(verdict, watched, cleaned, self._vx, self._variance)
-        found = {**self._others, "vy": vy, "sideslip": math.atan2(vy, self._vx[0]) * (math.hypot(self._vx[0], vy) >= STANDSTILL_SPEED)}
+        vx = float(self._vx[0])
+        found = {**self._others, "vy": vy, "sideslip": 0.0 if math.hypot(vx, vy) < STANDSTILL_SPEED else math.atan2(vy, vx)}
         if self._monitor.has_bands:
             found["band_vy"], found["band_sideslip"] = float(bands[0, 0]), float(bands[0, 1])
         found["health"], found["health_reason"] = float(verdict.status[0]), float(verdict.reason[0])

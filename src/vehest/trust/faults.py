@@ -197,10 +197,6 @@ def _held(at: FaultedChannel) -> FloatArray:
     return at.inside[np.arange(len(at.inside)) // samples * samples]
 
 
-def _huge(at: FaultedChannel) -> FloatArray:
-    return np.where(at.drawn(HUGE_SHARE), at.signs() * at.size * at.range, at.inside)
-
-
 def _saturation(at: FaultedChannel) -> FloatArray:
     limit = at.size * _reach(at.inside)
     return np.clip(at.inside, -limit, limit)
@@ -242,7 +238,9 @@ KINDS: dict[str, Kind] = {
     "unit": Kind(None, ANY, lambda at: at.inside * at.size),
     "nan": Kind((0.1, 0.5, 1.0), SHARE, lambda at: np.where(at.pieces(), np.nan, at.inside)),  # share of the samples
     "inf": Kind((0.01, 0.1, 1.0), SHARE, lambda at: np.where(at.drawn(at.size), at.signs() * np.inf, at.inside)),  # at least one
-    "huge": Kind((10.0, 1e4, 1e200), POSITIVE, _huge),  # times the channel's physical range
+    "huge": Kind(  # times the channel's physical range
+        (10.0, 1e4, 1e200), POSITIVE, lambda at: np.where(at.drawn(HUGE_SHARE), at.signs() * at.size * at.range, at.inside)
+    ),
     "held": Kind((0.1, 0.25, 0.5), POSITIVE, _held),  # s, at least two samples
     "lost_wheel": Kind((math.nan, 1.5, 0.0), FACTOR, _lost_wheel),  # factor of the speed; NaN: drops out
 }

@@ -148,17 +148,12 @@ def stops_of(parts: Sequence[FloatArray], name: str) -> tuple[float, float]:
     if name in STEERING and any(np.isfinite(part).any() for part in parts):
         for side, sign in enumerate((-1.0, 1.0)):
             farthest = max(float(np.nanmax(sign * part, initial=-ENDLESS)) for part in parts)
-            stayed = [_stayed(sign * part, STOP_TOLERANCE * farthest) for part in parts]
+            still = [np.abs(np.diff(part)) <= STOP_TOLERANCE * farthest for part in parts]
+            stayed = [sign * part[2:][own[1:] & own[:-1]] for part, own in zip(parts, still, strict=True)]  # equal the two before them
             reached = [value for values in stayed for value in values if value >= NEAR_STOP * farthest]
             if farthest > 0 and reached:
                 stops[side] = sign * (float(np.median(reached)) - STOP_TOLERANCE * farthest)
     return stops[0], stops[1]
-
-
-def _stayed(values: FloatArray, tolerance: float) -> FloatArray:
-    """Those values that the two before them equal, within a tolerance."""
-    still = np.abs(np.diff(values)) <= tolerance
-    return values[2:][still[1:] & still[:-1]]
 
 
 def _moves(recording: Recording) -> NDArray[np.bool_]:

@@ -71,7 +71,8 @@ def propose(columns: Sequence[tuple[str, str, FloatArray, str]], rate_hz: float 
     wheels = find_wheels(found)
     found = [one for one in found if not any(role.startswith("wheel_speed") for role in one.hints)]
     found += speed_of_wheels(found, wheels, rate)
-    stands = _stands(found)
+    speeds = [one for one in found if "vx" in one.hints and one.unit and one.measures("vx")]
+    stands = bool(speeds) and all(one.size * si_factor(one.unit, "vx") < STANDING for one in speeds)
     turning = [] if stands else find_turning(found)
     guessed = _rate_by_ax(_of(found, turning[0], rate)) if turning and rate_hz is None else None
     if guessed is not None:
@@ -137,12 +138,6 @@ def _speedometer(proposals: Proposals, turning: Turning, wheels: Wheels) -> tupl
 def _excess(*scales: float) -> str:
     size = " to ".join(dict.fromkeys(f"{abs(100.0 * (1.0 / scale - 1.0)):.0f}" for scale in scales))
     return f"{size} % too {'much' if scales[0] < 1.0 else 'little'}"
-
-
-def _stands(columns: Sequence[Candidate]) -> bool:
-    """Whether every column that is named as a speed, in a unit that the header gives, shows a car that stands."""
-    speeds = [one for one in columns if "vx" in one.hints and one.unit and one.measures("vx")]
-    return bool(speeds) and all(one.size * si_factor(one.unit, "vx") < STANDING for one in speeds)
 
 
 def _search(columns: Sequence[Candidate], turning: Sequence[Turning], rate_hz: float) -> Search | None:

@@ -119,7 +119,7 @@ class CarFilter(nn.Module):
         """
         if states is not None or self.constant:
             at = initial.mean.new_zeros(1, 1, len(STATES)) if states is None else states
-            process, observation = self._process_noise(at, inputs), self.observation_noise(at, inputs)
+            process, observation = with_entropy(self.process_noise(at, inputs), LEAST_ENTROPY), self.observation_noise(at, inputs)
         else:
             process, observation = self.noise_at()  # type: ignore[assignment]
         return unscented_scan(
@@ -141,7 +141,8 @@ class CarFilter(nn.Module):
             return compiled_noise(self.process_noise, LEAST_ENTROPY), compiled_noise(self.observation_noise)
         nothing = self.initial_noise.unit.new_zeros(1, len(STATES))
         with torch.no_grad():
-            return self._process_noise(nothing, nothing).numpy(), self.observation_noise(nothing, nothing).numpy()
+            process = with_entropy(self.process_noise(nothing, nothing), LEAST_ENTROPY)
+            return process.numpy(), self.observation_noise(nothing, nothing).numpy()
 
     def begin_noise(self, drives: Sequence[Drive], start_spread: float) -> None:
         """Start noise from one-step and measurement residuals at the true states of drives.
@@ -190,6 +191,3 @@ class CarFilter(nn.Module):
         with torch.no_grad():
             initial = Gaussian(drives.states[:, 0], self.initial_covariance())
             return self.filtered(drives.measurements, drives.inputs, initial).steps.filtered.mean
-
-    def _process_noise(self, states: Tensor, inputs: Tensor) -> Tensor:
-        return with_entropy(self.process_noise(states, inputs), LEAST_ENTROPY)

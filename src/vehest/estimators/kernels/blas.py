@@ -8,13 +8,10 @@ from functools import cache
 import scipy.linalg.cython_blas  # noqa: F401 - loads the library that compiled code calls
 from threadpoolctl import ThreadpoolController
 
+_controller = cache(ThreadpoolController)
+
 
 def one_blas_thread() -> AbstractContextManager[object]:
     """Matrix products within stay on their thread: those of small blocks gain nothing from more, and several threads call them."""
-    limited: AbstractContextManager[object] = _blas().limit(limits=1)
+    limited: AbstractContextManager[object] = _controller().limit(limits=1, user_api="blas")
     return limited
-
-
-@cache
-def _blas() -> ThreadpoolController:
-    return ThreadpoolController().select(user_api="blas")

@@ -190,15 +190,13 @@ class RayLauncher:
             raise MissingError(f"there is no Ray cluster at '{self._address}' ({_line(error)}); ray start --head starts one") from error
         finally:
             signal.signal(signal.SIGTERM, handler)  # Ray replaces it
-        ray._private.worker.print_to_stdstream = self._print  # would go to standard output
+        # instead of standard output
+        ray._private.worker.print_to_stdstream = lambda data, **_: self._messages.line("again", "ray", data["lines"][0].partition("\n")[0])
         self._ray, self._mark = ray, new_mark(self._output)
         self._task = ray.remote(num_cpus=1, max_retries=TIMES - 1)(_run)
         n_nodes = sum(node["Alive"] for node in ray.nodes())
         machines = f"{n_nodes} machine{'s' if n_nodes > 1 else ''}, {self.cores} cores"
         self._messages.line("note", "cluster", ray.get_runtime_context().gcs_address, machines)
-
-    def _print(self, data: Mapping[str, Any], **_: Any) -> None:
-        self._messages.line("again", "ray", str(data["lines"][0]).partition("\n")[0])
 
     def _begin(self, position: int, group: Group) -> Any:
         spec, copies = task_of(position, group, self._output, self._mark), []

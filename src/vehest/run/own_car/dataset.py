@@ -24,6 +24,7 @@ from vehest.data.errors import ConfigurationError, DataError, VehestError
 from vehest.data.recording import Recording
 from vehest.data.recording_summary import RecordingSummary, common_channels, summary_of
 from vehest.data.runs import true_runs
+from vehest.data.transforms import MOST_BRIDGED
 from vehest.data.units import factor_to_si
 from vehest.run.own_car.inspect import BRIDGED, EVIDENCE_HZ, TABLES, Examined, rate_of
 from vehest.run.printing import counted
@@ -160,12 +161,13 @@ def _gains(recording: Recording) -> dict[str, tuple[float, float]]:
         used = (speed > 0.2 * float(np.quantile(speed, 0.99))) & (np.abs(rate) > LEAST_TURN) & (speed > 0.0)
         if np.count_nonzero(used) < TURNING_SECONDS * recording.rate_hz:
             return {}
-        turn = np.stack([rate / speed, speed * rate, np.ones(len(speed))], axis=1)[used]
+        speed, rate = speed[used], rate[used]
+        turn = np.stack([rate / speed, speed * rate, np.ones(len(speed))], axis=1)
         if "ay" in recording:
             found.setdefault("ay", []).append(rms(recording["ay"][half][used]) / rms(turn[:, 1]))
         for name in {"handwheel", "steer"} & set(recording.channels):
             found.setdefault(name, []).append(abs(float(np.linalg.lstsq(turn, recording[name][half][used], rcond=None)[0][0])))
-    return {name: (min(own), max(own)) for name, own in found.items()}
+    return {name: (min(own), max(own)) for name, own in found.items() if min(own) > 0.0}
 
 
 def _dataset(examined: Examined) -> dict[str, Any]:
@@ -285,7 +287,7 @@ def _rate_and_gap(column: RawColumn, shorter: float = math.inf) -> tuple[float, 
 def _bridging(examined: Examined, recordings: Sequence[Recording]) -> list[dict[str, Any]]:
     """The transform that bridges impossible samples, as far to either side as the slowest signal was interpolated, if there are any."""
     channels = [(CHANNELS[name], samples) for own in recordings for name, samples in own.channels.items()]
-    if not any((samples < own.low).any() or (samples > own.high).any() for own, samples in channels):
+    if not any(0.0 < ((samples < own.low) | (samples > own.high)).mean() <= MOST_BRIDGED for own, samples in channels):
         return []
     used = {one.column for one in examined.proposals.channels}
     rates = [rate_of(own.stamps) for own in examined.log.columns if own.stamps is not None and own.name in used]

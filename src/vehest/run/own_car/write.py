@@ -226,7 +226,9 @@ def _words(made: Draft, plan: Plan, left: Sequence[Question]) -> list[str]:
 def _plan_of(made: Draft, further: Sequence[str]) -> Plan:
     """Sweeps over the families that recordings and known values of the car allow; an empty plan where they allow none."""
     contents, vehicle = made.contents, made.examined.vehicle
-    plan, values, seconds, slowest = Plan(), _car(vehicle), _shortest_range(made), min(own.rate_hz for own in contents)
+    plan, values, slowest, cut = Plan(), _car(vehicle), min(own.rate_hz for own in contents), _cut(made)
+    shares = [0.2 * made.durations[own] for own in cut] if cut else [made.durations[own] for own in _kept(made)]
+    seconds = min(shares, default=0.0)  # the shortest of the longest range for training and all those for validation
     own = [(GIVEN, name) for name in further if not estimator_class(name).trials]
     trials = sorted([*own, *((trial, name) for name in estimator_names() for trial in estimator_class(name).trials)])
     sweeps: dict[tuple[str, str, int], list[str]] = {}
@@ -259,13 +261,6 @@ def _car(vehicle: Mapping[str, float | None]) -> dict[str, str]:
     values |= {"cg_to_front_axle": half, "cg_to_rear_axle": half}
     values |= {"cornering_stiffness_front": stiffness, "cornering_stiffness_rear": stiffness}
     return {name: f"{value:.4g}" for name, value in values.items()} | {"wheelbase": f"{wheelbase:g}"}
-
-
-def _shortest_range(made: Draft) -> float:
-    """Of the longest range for training and all those for validation, the shortest [s]."""
-    if cut := _cut(made):
-        return 0.2 * min(made.durations[own] for own in cut)
-    return min((made.durations[own] for own in _kept(made)), default=0.0)
 
 
 def _lack(name: str, words: Sequence[str], contents: Sequence[RecordingSummary], samples: int, seconds: float) -> str:

@@ -26,6 +26,7 @@ from vehest.constants import FloatArray
 from vehest.data.errors import ConfigurationError
 from vehest.data.schema import validated
 
+_published = cache(setup_vehicle_parameters)  # reads the library's files, which takes 20 ms
 LIBRARY = "commonroad-vehicle-models"
 LIBRARY_VERSION = metadata.version(LIBRARY)  # of the package whose parameter files are read
 
@@ -137,12 +138,6 @@ def library_parameters(vehicle: Vehicle) -> VehicleParameters:
     known_to_library = {name: value for name, value in vehicle.overrides.items() if name != REAR_TYRE}
     _override(parameters, known_to_library, vehicle.name, prefix="")
     return parameters
-
-
-@cache
-def _published(parameter_set: int) -> VehicleParameters:
-    """Read from the library's files, which takes 20 ms."""
-    return setup_vehicle_parameters(parameter_set)
 
 
 def rear_tyre(vehicle: Vehicle) -> TireParameters:

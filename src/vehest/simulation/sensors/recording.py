@@ -95,9 +95,10 @@ def _inertial(motion: Motion, levels: SensorLevels, seed: int) -> dict[str, Floa
     """True angular velocities and specific forces where the inertial unit sits, along its axes."""
     mounting = levels.imu
     rates, force = body_rates(motion, levels.tilt), specific_force(motion, levels.tilt)
-    lever = np.array([mounting.lever_x, mounting.lever_y, mounting.lever_z])
-    if lever.any():
-        force = force + _lever_acceleration(rates, lever, motion.rate_hz)
+    lever = np.array([[mounting.lever_x], [mounting.lever_y], [mounting.lever_z]])
+    if lever.any():  # dω/dt × l + ω × (ω × l), as of a rigid body
+        angular = np.gradient(rates, axis=1) * motion.rate_hz if rates.shape[1] > 1 else np.zeros_like(rates)
+        force = force + (np.cross(angular, lever, axis=0) + np.cross(rates, np.cross(rates, lever, axis=0), axis=0))
     angles = np.array([mounting.roll, mounting.pitch, mounting.yaw])
     if mounting.misalignment:
         angles = angles + mounting.misalignment * stream(seed, "imu.misalignment").standard_normal(3)
@@ -110,14 +111,6 @@ def _inertial(motion: Motion, levels: SensorLevels, seed: int) -> dict[str, Floa
             shaking = stream(seed, f"vibration.{name}").standard_normal(len(motion))
             felt[name] = felt[name] + by_speed * np.abs(motion.wheel_speed.mean(axis=1)) * shaking
     return felt
-
-
-def _lever_acceleration(rates: FloatArray, lever: FloatArray, rate_hz: float) -> FloatArray:
-    """dω/dt × l + ω × (ω × l) of a point at ``lever`` (3,) of a rigid body that turns with ``rates`` (3, T), shape (3, T)."""
-    angular = np.gradient(rates, axis=1) * rate_hz if rates.shape[1] > 1 else np.zeros_like(rates)
-    arm = lever[:, None]
-    turning = np.cross(rates, arm, axis=0)
-    return np.cross(angular, arm, axis=0) + np.cross(rates, turning, axis=0)
 
 
 def _turned(vector: FloatArray, roll: FloatArray | float, pitch: FloatArray | float, yaw: FloatArray | float = 0.0) -> FloatArray:
