@@ -6,7 +6,7 @@ Group -> existing artefacts -> locks -> fit -> model -> calibration -> evaluatio
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import ExitStack, contextmanager, nullcontext
+from contextlib import AbstractContextManager, ExitStack, contextmanager, nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -92,8 +92,7 @@ class Group:
                 waiting = [job for job in waiting if job not in jobs]
             members = []
             for job in self.jobs:
-                missing = any(map(has_to_compile, (SLOW_KERNEL, FLOOR_KERNEL)))  # then one process compiles, and others wait for it
-                with held(Lock(job.plan.output, "compile", "health"), should_stop) if missing else nullcontext():
+                with _compiled_by_one(job.plan.output, should_stop):
                     members.append(_member(self, job, models[job.plan.key], made))
             return members
 
@@ -122,6 +121,12 @@ def _member(
     if group.evaluation is not None:
         evaluation = made(*group.evaluation.of(model, calibration))
     return Member(job, model, evaluation, calibration, finished=group.evaluation is None or evaluation is not None)
+
+
+def _compiled_by_one(output: Path, should_stop: Callable[[], bool]) -> AbstractContextManager[object]:
+    """While kernels of calibration and evaluation are not in the compile cache, one process compiles them, and others wait for it."""
+    missing = any(map(has_to_compile, (SLOW_KERNEL, FLOOR_KERNEL)))
+    return held(Lock(output, "compile", "health"), should_stop) if missing else nullcontext()
 
 
 @contextmanager

@@ -61,8 +61,7 @@ def allocated(kind: Any, sizes: Any) -> FloatArray:
 
 
 class Views(types.Type):  # type: ignore[misc]
-    """Type of a named tuple in compiled code: where it begins, and the sizes. A field is opened where it is read, since functions
-    that hand over all of them, some thousand numbers, compile a fifth longer."""
+    """Type of a named tuple in compiled code: where it begins, and sizes. Handing over all fields would compile a fifth longer."""
 
     def __init__(self, kind: Any, sizes: Any) -> None:
         super().__init__(f"views({kind.__qualname__}, {sizes})")

@@ -18,13 +18,12 @@ def threads_for_members() -> Iterator[None]:
     """Within, `over_members` has the threads that torch was allowed, and torch one: its small operations would wait for threads held up."""
     import torch
 
-    threads = torch.get_num_threads()
-    token = _allowed.set(threads)
+    token = _allowed.set(torch.get_num_threads())
     torch.set_num_threads(1)
     try:
         yield
     finally:
-        torch.set_num_threads(threads)
+        torch.set_num_threads(_allowed.get())
         _allowed.reset(token)
 
 
