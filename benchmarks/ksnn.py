@@ -5,8 +5,8 @@ depend on values), in float32, batches of 64 windows, with the validation loss a
 autograd and Adam, one network at a time; it is timed on one epoch of one seed, and 64 seeds take 64 times as long. Both ways are allowed
 two threads, the seeds together are timed from the end of the first epoch, each way runs in a process of its own, after a warm-up, and the
 ways take turns; a figure is the best of the rounds, for both alike, memory the peak of the process so far. The first epoch's validation
-losses are compared. Two peers stand beside, measured once: all seeds batched by torch.func.vmap over the readable module, and the plain
-loop with that module through torch.compile, after its compilation. BENCH_BUSY=1 keeps a core busy (beside.py), without peers.
+losses are compared. A peer stands beside, timed once: all seeds batched by torch.func.vmap over the readable module (cells of plain
+tensors). BENCH_BUSY=1 keeps a core busy (beside.py), without the peer.
 """
 
 from __future__ import annotations
@@ -77,20 +77,19 @@ def together(name: str, config: dict[str, Any], seeds: int, compiled: bool = Tru
     return epochs * seeds * _steps() / seconds, _peak(), losses
 
 
-def plain(name: str, config: dict[str, Any], seeds: int, compile_it: bool = False) -> Figures:
+def plain(name: str, config: dict[str, Any], seeds: int) -> Figures:
     """The same for a few seeds one after another."""
     import torch
 
     torch.set_num_threads(THREADS)
-    made: dict[str, Any] = {}
-    plain_epoch(name, config, 0, made, compile_it, batches=10)
+    plain_epoch(name, config, 0, batches=10)
     started = time.perf_counter()
-    losses = [plain_epoch(name, config, seed, made, compile_it) for seed in range(PLAIN_SEEDS)]
+    losses = [plain_epoch(name, config, seed) for seed in range(PLAIN_SEEDS)]
     return PLAIN_SEEDS * _steps() / (time.perf_counter() - started), _peak(), losses
 
 
-def plain_epoch(name: str, config: dict[str, Any], seed: int, made: dict[str, Any], compile_it: bool, batches: int | None = None) -> float:
-    """Train one network for an epoch as one would write it down; its validation loss [m²/s²]. ``made`` keeps the network for the next."""
+def plain_epoch(name: str, config: dict[str, Any], seed: int, batches: int | None = None) -> float:
+    """Train one network for an epoch as one would write it down; its validation loss [m²/s²]."""
     import torch
 
     from vehest.data.windows import windows_of
@@ -100,8 +99,7 @@ def plain_epoch(name: str, config: dict[str, Any], seed: int, made: dict[str, An
 
     estimator = estimator_class(name).from_config(config)
     train, validation = drives()
-    network = made.setdefault("network", estimator.network_for([train]))
-    predicted = made.setdefault("compiled", torch.compile(network)) if compile_it else network
+    network = estimator.network_for([train])
     network.reset(torch.Generator().manual_seed(seed))
     optimiser = torch.optim.Adam(network.parameters(), lr=1e-3)
     learnt, held_out = (windows_of([part], estimator.channels, "vy_ref", WINDOW) for part in (train, validation))
@@ -110,7 +108,7 @@ def plain_epoch(name: str, config: dict[str, Any], seed: int, made: dict[str, An
     order = torch.randperm(len(starts), generator=torch.Generator().manual_seed(_shuffle_seed(seed)))
     for batch in order.split(BATCH)[:batches]:
         optimiser.zero_grad()
-        loss = (predicted(series[starts[batch].unsqueeze(-1) + rows]) - targets[batch]).square().mean()
+        loss = (network(series[starts[batch].unsqueeze(-1) + rows]) - targets[batch]).square().mean()
         loss.backward()
         optimiser.step()
         with torch.no_grad():
@@ -130,19 +128,14 @@ def _peak() -> float:
 
 
 def measured(name: str, config: dict[str, Any], seeds: int, pools: list[ProcessPoolExecutor]) -> list[Figures]:
-    """Best rounds of the plain loop and of all seeds together; then, where no core is kept busy, one of vmap and of torch.compile."""
+    """Best rounds of the plain loop and of all seeds together; then, where no core is kept busy, one epoch by vmap."""
     rounds = [
-        [pool.submit(way, name, config, seeds).result() for pool, way in zip(pools, (plain, together), strict=True)] for _ in range(ROUNDS)
+        [pool.submit(way, name, config, seeds).result() for pool, way in zip(pools[:2], (plain, together), strict=True)]
+        for _ in range(ROUNDS)
     ]
     ways = zip(*rounds, strict=True)
     found = [(max(run[0] for run in way), max(run[1] for run in way), way[0][2]) for way in ways]
-    if BUSY:
-        return found
-    return [
-        *found,
-        pools[1].submit(together, name, config, seeds, False, 1).result(),
-        pools[0].submit(plain, name, config, seeds, True).result(),
-    ]
+    return found if BUSY else [*found, pools[2].submit(together, name, config, seeds, False, 1).result()]
 
 
 def main() -> None:
@@ -150,7 +143,7 @@ def main() -> None:
     from vehest.run.artefacts import library_versions
 
     with ExitStack() as stack:
-        pools = [stack.enter_context(ProcessPoolExecutor(1, mp_context=get_context("spawn"))) for _ in range(2)]
+        pools = [stack.enter_context(ProcessPoolExecutor(1, mp_context=get_context("spawn"))) for _ in range(3)]
         figures = {structure: measured(*asked[:3], pools) for structure, asked in STRUCTURES.items()}
     cases = []
     for structure, (baseline, ours, *peers) in figures.items():
@@ -173,9 +166,9 @@ def main() -> None:
             }
         )
         entry = cases[-1]
-        for peer, figure in zip(("vmap", "compile"), peers, strict=False):
-            entry |= {f"{peer}_seconds": round(steps / figure[0], 4), f"ratio_to_{peer}": round(ours[0] / figure[0], 2)}
-            entry[f"{peer}_relative_difference_of_losses"] = float(f"{abs(figure[2][0] - baseline[2][0]) / baseline[2][0]:.1e}")
+        for batched in peers:
+            entry |= {"vmap_seconds": round(steps / batched[0], 4), "ratio_to_vmap": round(ours[0] / batched[0], 2)}
+            entry["vmap_relative_difference_of_losses"] = float(f"{abs(batched[2][0] / baseline[2][0] - 1.0):.1e}")
         print(
             f"{entry['ratio']:6.1f} x (at least {least})  {entry['case']}  "
             f"({baseline[0]:.0f} -> {ours[0]:.0f} steps a second, {ours[1]:.0f} MB, losses differ by {difference:.1e})",
