@@ -133,8 +133,7 @@ def measured(name: str, config: dict[str, Any], seeds: int, pools: list[ProcessP
         [pool.submit(way, name, config, seeds).result() for pool, way in zip(pools[:2], (plain, together), strict=True)]
         for _ in range(ROUNDS)
     ]
-    ways = zip(*rounds, strict=True)
-    found = [(max(run[0] for run in way), max(run[1] for run in way), way[0][2]) for way in ways]
+    found = [(max(run[0] for run in way), max(run[1] for run in way), way[0][2]) for way in zip(*rounds, strict=True)]
     return found if BUSY else [*found, pools[2].submit(together, name, config, seeds, False, 1).result()]
 
 
